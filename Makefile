@@ -1,0 +1,52 @@
+# make demo: see it work.  make help: the rest.
+PYTHON ?= python3
+VENV := .venv
+RUN_MANIFEST ?= data_manifests/demo.yaml
+# For example PIP_ARGS="--extra-index-url https://download.pytorch.org/whl/cpu" to get torch without CUDA.
+PIP_ARGS ?=
+INSTALLED := $(VENV)/.installed
+BIN := $(VENV)/bin
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help demo run test test-slow lab lint bench clean
+
+help:  ## list the targets
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */  make \1|/' | column -t -s '|'
+
+demo: $(INSTALLED)  ## render a small capture, localize all nine pairs, write a report
+	$(BIN)/python -m toolkit run data_manifests/demo.yaml
+
+run: $(INSTALLED)  ## run RUN_MANIFEST=data_manifests/<yours>.yaml
+	$(BIN)/python -m toolkit run $(RUN_MANIFEST)
+
+test: $(INSTALLED)  ## the default tests, about a minute or two
+	$(BIN)/python -m pytest
+
+test-slow: $(INSTALLED)  ## whole runs, and accuracy on real captures where they are present
+	$(BIN)/python -m pytest -m slow
+
+lab: $(INSTALLED)  ## JupyterLab on the notebooks
+	$(BIN)/python -m jupyterlab --notebook-dir notebooks
+
+lint: $(INSTALLED)  ## ruff and mypy
+	$(BIN)/python -m ruff check .
+	$(BIN)/python -m mypy
+
+bench: $(INSTALLED)  ## timings; see benchmarks/
+	$(BIN)/python -m benchmarks
+
+clean:  ## remove caches and the environment; runs/ and data/ stay
+	rm -rf $(VENV) *.egg-info build dist .mypy_cache .pytest_cache .ruff_cache
+
+# Installed once, and again when a dependency changes.
+$(INSTALLED): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "Python 3.11 or newer is needed; '$(PYTHON)' is $$($(PYTHON) --version 2>&1 || echo missing)." \
+	         "Install it, or name it: make demo PYTHON=python3.11"; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' || \
+	  { echo "'$(PYTHON)' cannot make virtual environments." \
+	         "On Debian and Ubuntu: sudo apt install python3-venv"; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install $(PIP_ARGS) --constraint constraints.txt --editable '.[dev]'
+	@touch $@

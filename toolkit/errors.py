@@ -1,0 +1,21 @@
+"""Errors whose message is meant for the user: what was found, where, what was expected, what to do."""
+
+
+class ToolkitError(Exception):
+    """Base of all errors that the command line prints without a traceback."""
+
+
+class CaptureError(ToolkitError):
+    """A capture folder or one of its files is not as the format wants it."""
+
+
+class ManifestError(ToolkitError):
+    """A manifest or a parameter is not valid."""
+
+
+class ArtefactError(ToolkitError):
+    """A file that an earlier stage should have written is missing, torn or made from something else."""
+
+
+class ImageError(ToolkitError):
+    """An image file is missing or cannot be decoded."""
