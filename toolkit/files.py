@@ -1,0 +1,159 @@
+"""Artefacts on disk: written whole or not at all, each with a record of what it was made from."""
+
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from toolkit import __version__
+
+
+@contextmanager
+def write_atomic(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path` that is moved into place when the block ends without an error.
+
+    A killed or failing writer leaves the old file, or none, under the final name.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=f".partial{path.suffix}", dir=path.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        # mkstemp makes private files; an artefact is as readable as any other file of the user.
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)
+        temporary.replace(path)
+    finally:
+        with suppress(FileNotFoundError):
+            temporary.unlink()
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file in one piece (see `write_atomic`)."""
+    with write_atomic(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def fingerprint(value: Any) -> str:
+    """Return 16 hex digits that identify a nest of dicts, lists, strings, numbers, None and paths."""
+    canonical = json.dumps(value, sort_keys=True, separators=(",", ":"), default=_jsonable)
+    return hashlib.sha256(canonical.encode()).hexdigest()[:16]
+
+
+def file_fingerprint(path: str | Path) -> str:
+    """Return 16 hex digits that identify a file's content by its bytes."""
+    digest = hashlib.sha256()
+    with open(path, "rb") as stream:
+        while block := stream.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()[:16]
+
+
+def files_fingerprint(paths: list[Path]) -> str:
+    """Return 16 hex digits that identify many files by name, size and time of change, without reading them."""
+    rows = []
+    for path in paths:
+        try:
+            stat = path.stat()
+            rows.append([path.name, stat.st_size, stat.st_mtime_ns])
+        except FileNotFoundError:
+            rows.append([path.name, None, None])
+    return fingerprint(rows)
+
+
+def sidecar_path(path: str | Path) -> Path:
+    """Return where the record of what an artefact was made from is kept: `<name>.meta.json` beside it."""
+    path = Path(path)
+    return path.with_name(path.name + ".meta.json")
+
+
+def write_sidecar(path: str | Path, settings: dict[str, Any]) -> None:
+    """Record the settings and inputs that the artefact `path` was made from.
+
+    Call it after the artefact stands: an artefact without a matching record is made again.
+    """
+    record = {"version": __version__, "fingerprint": fingerprint(settings), "settings": settings}
+    write_text(sidecar_path(path), json.dumps(record, indent=1, default=_jsonable) + "\n")
+
+
+def is_current(path: str | Path, settings: dict[str, Any]) -> bool:
+    """Tell whether the artefact `path` exists and was made by this version from exactly these settings."""
+    if not Path(path).exists():
+        return False
+    try:
+        record = json.loads(sidecar_path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return bool(record.get("version") == __version__ and record.get("fingerprint") == fingerprint(settings))
+
+
+def _jsonable(value: Any) -> Any:
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "item"):  # a numpy scalar
+        return value.item()
+    raise TypeError(f"Settings must be JSON: {value!r} is a {type(value).__name__}.")
+
+
+@dataclass(frozen=True)
+class SceneFiles:
+    """Where the files of one scene lie in a run folder."""
+
+    run: Path
+    """The run folder, `<output_root>/<manifest name>`."""
+    scene: str
+    """Name of the capture's folder."""
+
+    @property
+    def root(self) -> Path:
+        return Path(self.run) / self.scene
+
+    @property
+    def embeddings(self) -> Path:
+        return self.root / "embeddings"
+
+    @property
+    def features(self) -> Path:
+        return self.root / "features"
+
+    @property
+    def maps(self) -> Path:
+        return self.root / "map"
+
+    @property
+    def retrieval_dir(self) -> Path:
+        return self.root / "retrieval"
+
+    @property
+    def poses_dir(self) -> Path:
+        return self.root / "poses"
+
+    @property
+    def evaluation(self) -> Path:
+        return self.root / "evaluation"
+
+    @property
+    def visualization(self) -> Path:
+        return self.root / "visualization"
+
+    def retrieval(self, map_device: str, query_device: str) -> Path:
+        return self.retrieval_dir / f"{pair_name(self.scene, map_device, query_device)}.jsonl"
+
+    def poses_txt(self, map_device: str, query_device: str) -> Path:
+        return self.poses_dir / f"{pair_name(self.scene, map_device, query_device)}.txt"
+
+    def poses_csv(self, map_device: str, query_device: str) -> Path:
+        return self.poses_dir / f"{pair_name(self.scene, map_device, query_device)}.csv"
+
+
+def pair_name(scene: str, map_device: str, query_device: str) -> str:
+    """Return the file stem of a map x query pair, as the challenge names it."""
+    return f"{scene}_map_{map_device}_query_{query_device}"

@@ -1,0 +1,118 @@
+"""SE(3) and SO(3) on arrays. Poses are `a_from_b`, (..., 4, 4) float64; quaternions are qw qx qy qz.
+
+All functions are batched over leading dimensions.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def quaternion_to_rotation(qwxyz: ArrayLike) -> Array:
+    """Return the rotation matrices (..., 3, 3) of quaternions (..., 4); they need not be unit.
+
+    Raises:
+        ValueError: a quaternion is zero or not finite.
+    """
+    q = np.asarray(qwxyz, np.float64)
+    if q.shape[-1:] != (4,):
+        raise ValueError(f"Expected quaternions of shape (..., 4), got {q.shape}.")
+    norm = np.linalg.norm(q, axis=-1, keepdims=True)
+    if not np.all(np.isfinite(norm)) or np.any(norm < 1e-12):
+        raise ValueError("A quaternion is zero or not finite; expected qw qx qy qz of length 1.")
+    w, x, y, z = np.moveaxis(q / norm, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def rotation_to_quaternion(rotation: ArrayLike) -> Array:
+    """Return unit quaternions (..., 4), qw >= 0, of rotation matrices (..., 3, 3).
+
+    The branch with the largest of the four components is taken for each matrix (Shepperd 1978), which stays
+    exact at 180 degrees.
+    """
+    R = np.asarray(rotation, np.float64)
+    if R.shape[-2:] != (3, 3):
+        raise ValueError(f"Expected rotations of shape (..., 3, 3), got {R.shape}.")
+    m00, m11, m22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    a, b, c = R[..., 2, 1], R[..., 0, 2], R[..., 1, 0]
+    d, e, f = R[..., 1, 2], R[..., 2, 0], R[..., 0, 1]
+    # Each row is 4 * q_k * q for one k: any of them is the quaternion up to scale.
+    rows = np.stack(
+        [
+            np.stack([1 + m00 + m11 + m22, a - d, b - e, c - f], -1),
+            np.stack([a - d, 1 + m00 - m11 - m22, c + f, b + e], -1),
+            np.stack([b - e, c + f, 1 - m00 + m11 - m22, a + d], -1),
+            np.stack([c - f, b + e, a + d, 1 - m00 - m11 + m22], -1),
+        ],
+        axis=-2,
+    )
+    best = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
+    q = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., :1] < 0, -q, q)
+
+
+def pose_from_qt(qt: ArrayLike) -> Array:
+    """Return poses (..., 4, 4) from rows qw qx qy qz tx ty tz, (..., 7)."""
+    qt = np.asarray(qt, np.float64)
+    pose = np.zeros((*qt.shape[:-1], 4, 4))
+    pose[..., :3, :3] = quaternion_to_rotation(qt[..., :4])
+    pose[..., :3, 3] = qt[..., 4:7]
+    pose[..., 3, 3] = 1.0
+    return pose
+
+
+def qt_from_pose(pose: ArrayLike) -> Array:
+    """Return rows qw qx qy qz tx ty tz, (..., 7), of poses (..., 4, 4)."""
+    pose = np.asarray(pose, np.float64)
+    return np.concatenate([rotation_to_quaternion(pose[..., :3, :3]), pose[..., :3, 3]], axis=-1)
+
+
+def make_pose(rotation: ArrayLike, translation: ArrayLike) -> Array:
+    """Return a_from_b, (..., 4, 4), from its rotation (..., 3, 3) and translation (..., 3)."""
+    rotation, translation = np.asarray(rotation, np.float64), np.asarray(translation, np.float64)
+    pose = np.zeros((*np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1]), 4, 4))
+    pose[..., :3, :3], pose[..., :3, 3], pose[..., 3, 3] = rotation, translation, 1.0
+    return pose
+
+
+def invert(a_from_b: ArrayLike) -> Array:
+    """Return b_from_a, (..., 4, 4), of rigid poses (..., 4, 4)."""
+    pose = np.asarray(a_from_b, np.float64)
+    Rt = np.swapaxes(pose[..., :3, :3], -1, -2)
+    return make_pose(Rt, -(Rt @ pose[..., :3, 3:])[..., 0])
+
+
+def transform(a_from_b: ArrayLike, points_in_b: ArrayLike) -> Array:
+    """Return points in frame a, (..., N, 3), of points in frame b, (..., N, 3)."""
+    pose, points = np.asarray(a_from_b, np.float64), np.asarray(points_in_b, np.float64)
+    return points @ np.swapaxes(pose[..., :3, :3], -1, -2) + pose[..., None, :3, 3]
+
+
+def rotation_angle_deg(rotation: ArrayLike) -> Array:
+    """Return the angle, degrees in [0, 180], of rotations (..., 3, 3).
+
+    From atan2 of the skew part and the trace: exact near 0, where arccos of the trace alone is not.
+    """
+    R = np.asarray(rotation, np.float64)
+    skew = np.stack(
+        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1
+    )
+    trace = np.trace(R, axis1=-2, axis2=-1)
+    return np.degrees(np.arctan2(np.linalg.norm(skew, axis=-1), trace - 1.0))
+
+
+def pose_error(world_from_estimated: ArrayLike, world_from_true: ArrayLike) -> tuple[Array, Array]:
+    """Return the rotation error, degrees, and the translation error, metres, of poses (..., 4, 4).
+
+    As the LaMAR benchmark defines them: the angle and the length of inverse(estimated) @ true.
+    """
+    estimated_from_true = invert(world_from_estimated) @ np.asarray(world_from_true, np.float64)
+    distance_m = np.linalg.norm(estimated_from_true[..., :3, 3], axis=-1)
+    return rotation_angle_deg(estimated_from_true[..., :3, :3]), distance_m
