@@ -1,0 +1,318 @@
+"""Text tables of the capture format, and rows found by key, at the speed of Arrow.
+
+Lines of comma-separated values with `#` comments and blank lines anywhere, spaces around values, Windows
+line ends, a byte-order mark, and further columns that are passed over or kept as one text. A file is cut into
+blocks of whole lines; Arrow splits and converts them, two at a time, so that nothing loops over rows in
+Python and line numbers are at hand for messages.
+"""
+
+import os
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from toolkit.errors import CaptureError
+from toolkit.files import write_atomic
+
+Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
+Columns = Sequence[tuple[str, str]]
+
+# Column types: an integer, a finite number, a text that must not be empty, any text.
+INTEGER, NUMBER, ID, TEXT = "integer", "finite number", "id", "text"
+POSE = tuple((name, NUMBER) for name in ("qw", "qx", "qy", "qz", "tx", "ty", "tz"))
+POSE_NAMES = tuple(name for name, _ in POSE)
+
+
+@dataclass
+class TextTable:
+    """The well-formed rows of a text file, and where the others are."""
+
+    path: Path
+    columns: dict[str, pa.Array]
+    """Values by column name; `extra`, where asked for, is what follows the last column, as one text."""
+    lines: Ints
+    """Line number of each row, from 1."""
+    problems: list[tuple[int, str]]
+    """Line number (0: the file itself) and what is wrong, for lines that are left out."""
+    has_extra: bool
+    """Whether any line has more columns than asked for."""
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def numbers(self, names: Sequence[str]) -> Floats:
+        """Return number columns side by side, (N, len(names))."""
+        return np.stack([self.columns[name].to_numpy() for name in names], axis=1)
+
+    def where(self, row: int) -> str:
+        return f"{self.path}, line {self.lines[row]}"
+
+
+def read_table(path: Path, columns: Columns, strict: bool = True, extra: bool = False) -> TextTable:
+    """Read a comma-separated text file of the capture format.
+
+    Args:
+        columns: name and type of each column, as in COLUMNS.
+        strict: raise at a malformed line; else leave it out and list it in `.problems`.
+        extra: keep what follows the last column, as column `extra`.
+
+    Raises:
+        CaptureError: the file is missing, or (strict) a line is malformed: says which, what is there and what
+            belongs there.
+    """
+    try:
+        spans = _line_blocks(path)
+    except FileNotFoundError:
+        message = f"file not found; expected lines of `{_layout(columns)}`"
+        if strict:
+            raise CaptureError(f"{path}: {message}. Is this a whole session?") from None
+        empty = {name: pa.array([], _ARROW_TYPES[kind]) for name, kind in [*columns, ("extra", TEXT)]}
+        return TextTable(path, empty, np.zeros(0, np.int64), [(0, message)], False)
+    except OSError as error:
+        raise CaptureError(f"File cannot be read: {path} ({error}).") from None
+
+    def parse(span: tuple[int, int]) -> _Block:
+        start, end = span
+        with open(path, "rb") as stream:
+            stream.seek(start)
+            return _parse_block(stream.read(end - start), start == 0, columns, extra)
+
+    with ThreadPoolExecutor(2) as pool:
+        blocks = list(pool.map(parse, spans))
+    first = np.cumsum([0, *(block.count for block in blocks)])[:-1]
+    problems = [
+        (int(start + line), what)
+        for start, block in zip(first, blocks, strict=True)
+        for line, what in block.problems
+    ]
+    if strict and problems:
+        line, what = problems[0]
+        more = f" ({len(problems) - 1} more such lines.)" if len(problems) > 1 else ""
+        raise CaptureError(
+            f"{path}, line {line}: {what}. Correct or remove the line; "
+            f"`python -m toolkit check CAPTURE` lists all problems.{more}"
+        )
+    kinds = dict(columns) | ({"extra": TEXT} if extra else {})
+    values = {
+        # Each block lets go of a column as it is joined, so that the table is never in memory twice.
+        name: pa.concat_arrays(
+            [pa.array([], _ARROW_TYPES[kind]), *(block.columns.pop(name) for block in blocks)]
+        )
+        for name, kind in kinds.items()
+    }
+    lines = [start + block.lines for start, block in zip(first, blocks, strict=True)]
+    return TextTable(
+        path,
+        values,
+        np.concatenate([np.zeros(0, np.int64), *lines]),
+        problems,
+        any(block.has_extra for block in blocks),
+    )
+
+
+@dataclass
+class _Block:
+    """Some lines of a file; line numbers count from 1 in the block."""
+
+    columns: dict[str, pa.Array]
+    lines: Ints
+    count: int
+    problems: list[tuple[int, str]]
+    has_extra: bool
+
+
+_ARROW_TYPES = {INTEGER: pa.int64(), NUMBER: pa.float64(), ID: pa.large_string(), TEXT: pa.large_string()}
+# Small enough that two in flight cost little memory, large enough to hide the overhead.
+_BLOCK_BYTES = 1 << 20
+
+
+def _layout(columns: Columns) -> str:
+    return ", ".join(name for name, _ in columns)
+
+
+def _line_blocks(path: Path) -> list[tuple[int, int]]:
+    """Cut a file into spans of bytes that end at line ends."""
+    borders = [0]
+    with open(path, "rb") as stream:
+        size = stream.seek(0, os.SEEK_END)
+        while borders[-1] < size:
+            stream.seek(min(borders[-1] + _BLOCK_BYTES, size))
+            stream.readline()
+            borders.append(stream.tell())
+    return list(pairwise(borders))
+
+
+def _parse_block(data: bytes, first: bool, columns: Columns, keep_extra: bool) -> _Block:
+    """Split and convert the whole lines of `data`; `first` tells that they start the file."""
+    if first and data.startswith(b"\xef\xbb\xbf"):  # the mark that Windows editors put before UTF-8
+        data = data[3:]
+    problems: list[tuple[int, str]] = []
+    try:
+        data.decode()
+    except UnicodeDecodeError:
+        repaired = [_decode(line, number, problems) for number, line in enumerate(data.split(b"\n"), 1)]
+        data = "\n".join(repaired).encode()
+    if not data.endswith(b"\n"):
+        data += b"\n"
+    ends = np.flatnonzero(np.frombuffer(data, np.uint8) == ord("\n"))
+    offsets = np.zeros(len(ends) + 1, np.int64)
+    offsets[1:] = ends + 1
+    text = pa.LargeStringArray.from_buffers(len(ends), pa.py_buffer(offsets), pa.py_buffer(data))
+    text = pc.ascii_trim_whitespace(text)
+    # A line of a file that is not UTF-8 has its problem already; it was made a comment.
+    kept = pc.invert(pc.or_(pc.starts_with(text, "#"), pc.equal(text, "")))
+    text, lines = text.filter(kept), np.flatnonzero(kept.to_numpy(zero_copy_only=False)) + 1
+
+    width = len(columns)
+    values = pc.split_pattern(text, ",", max_splits=width)
+    counts = pc.list_value_length(values).to_numpy()
+    if np.any(counts < width):
+        wanted = f"expected {width}: {_layout(columns)}"
+        for row in np.flatnonzero(counts < width):
+            found = f"found {counts[row]} value{'s' if counts[row] > 1 else ''} in {_shorten(text[row])}"
+            problems.append((int(lines[row]), f"{found}, {wanted}"))
+        good = counts >= width
+        values, lines, counts = values.filter(pa.array(good)), lines[good], counts[good]
+
+    arrays: dict[str, pa.Array] = {}
+    bad = np.zeros(len(lines), bool)
+    for index, (name, kind) in enumerate(columns):
+        column = pc.ascii_trim_whitespace(pc.list_element(values, index))
+        arrays[name], wrong = convert(column, kind)
+        for row in np.flatnonzero(wrong & ~bad):
+            found = repr(column[row].as_py())
+            problems.append((int(lines[row]), f"found {name} = {found}, expected {_EXPECTED[kind]}"))
+        bad |= wrong
+    has_extra = bool(np.any(counts > width))
+    if keep_extra:
+        # An extra value lies right after the `width` others of its line.
+        place = np.cumsum(counts) - 1
+        extra = pc.ascii_trim_whitespace(values.flatten().take(pa.array(place)))
+        arrays["extra"] = pc.if_else(pa.array(counts > width), extra, "")
+    if columns[-len(POSE) :] == POSE:
+        q = np.stack([arrays[name].to_numpy() for name, _ in POSE[:4]], axis=1)
+        zero = (np.einsum("ij,ij->i", q, q) < 1e-12) & ~bad
+        problems += [
+            (int(lines[row]), "found a zero quaternion, expected length 1") for row in np.flatnonzero(zero)
+        ]
+        bad |= zero
+    if bad.any():
+        good_rows = pa.array(~bad)
+        arrays, lines = {name: array.filter(good_rows) for name, array in arrays.items()}, lines[~bad]
+    return _Block(arrays, lines, len(ends), sorted(problems), has_extra)
+
+
+_EXPECTED = {
+    INTEGER: "an integer (microseconds)",
+    NUMBER: "a finite number",
+    ID: "a text that is not empty",
+}
+
+
+def convert(column: pa.Array, kind: str) -> tuple[pa.Array, NDArray[np.bool_]]:
+    """Return a column converted to its type, and which values are wrong (0 or empty there)."""
+    if kind == TEXT:
+        return column, np.zeros(len(column), bool)
+    if kind == ID:
+        return column, pc.equal(column, "").to_numpy(zero_copy_only=False)
+    wrong = np.zeros(len(column), bool)
+    try:
+        converted = column.cast(_ARROW_TYPES[kind])
+    except pa.ArrowInvalid:  # find the values one by one; only a block with a malformed line comes here
+        scalars = []
+        for row, value in enumerate(column):
+            try:
+                scalars.append(value.cast(_ARROW_TYPES[kind]).as_py())
+            except pa.ArrowInvalid:
+                wrong[row] = True
+                scalars.append(0)
+        converted = pa.array(scalars, _ARROW_TYPES[kind])
+    if kind == NUMBER:
+        wrong |= ~np.isfinite(converted.to_numpy())
+    return converted, wrong
+
+
+def _decode(line: bytes, number: int, problems: list[tuple[int, str]]) -> str:
+    try:
+        return line.decode()
+    except UnicodeDecodeError as error:
+        problems.append((number, f"found bytes that are not UTF-8 ({error.reason}), expected UTF-8 text"))
+        return "#"
+
+
+def _shorten(text: object) -> str:
+    shown = str(text)
+    return repr(shown if len(shown) <= 60 else shown[:57] + "...")
+
+
+def as_strings(ids: Any) -> pa.Array:
+    """Return ids (a sequence, array or Series of str) as one Arrow array."""
+    if isinstance(ids, (pd.Series, pd.api.extensions.ExtensionArray)):
+        ids = pa.array(ids)
+    elif not isinstance(ids, (pa.Array, pa.ChunkedArray)):
+        ids = pa.array(np.asarray(ids, object).ravel(), pa.large_string())
+    if isinstance(ids, pa.ChunkedArray):
+        ids = ids.combine_chunks()
+    return ids if ids.type == pa.large_string() else ids.cast(pa.large_string())
+
+
+def codes_of(ids: pa.Array, known: pa.Array) -> Ints:
+    """Return the place of each id in `known`, -1 where it is not there."""
+    found = pc.fill_null(pc.index_in(ids, value_set=known), -1)
+    return found.to_numpy(zero_copy_only=False).astype(np.int64)
+
+
+class KeyIndex:
+    """Finds rows of a table by (timestamp, id)."""
+
+    def __init__(self, timestamps: Ints, ids: Any) -> None:
+        ids = as_strings(ids)
+        self._times = np.unique(timestamps)
+        self._ids = pc.unique(ids)
+        keys = self._keys(timestamps, ids)
+        self._order = np.argsort(keys, kind="stable")
+        self._sorted = keys[self._order]
+
+    def _keys(self, timestamps: Ints, ids: Any) -> Ints:
+        times = np.searchsorted(self._times, timestamps)
+        codes = codes_of(as_strings(ids), self._ids)
+        known = (codes >= 0) & (times < len(self._times))
+        if len(self._times):
+            known &= self._times[np.minimum(times, len(self._times) - 1)] == timestamps
+        return np.where(known, times * len(self._ids) + codes, -1)
+
+    def find(self, timestamps: Ints, ids: Any) -> Ints:
+        """Return the first row of each key, (n,) int64, -1 where there is none."""
+        keys = self._keys(timestamps, ids)
+        if not len(self._sorted):
+            return np.full(len(keys), -1, np.int64)
+        place = np.minimum(np.searchsorted(self._sorted, keys), len(self._sorted) - 1)
+        return np.where((self._sorted[place] == keys) & (keys >= 0), self._order[place], -1)
+
+    def find_all(self, timestamps: Ints, ids: Any) -> list[Ints]:
+        """Return all rows of each key, in the table's order."""
+        keys = self._keys(timestamps, ids)
+        starts, ends = np.searchsorted(self._sorted, keys), np.searchsorted(self._sorted, keys, side="right")
+        ends = np.where(keys >= 0, ends, starts)
+        return [self._order[start:end] for start, end in zip(starts, ends, strict=True)]
+
+    def repeated(self) -> Ints:
+        """Return the rows whose key an earlier row has already, ascending."""
+        return np.sort(self._order[1:][self._sorted[1:] == self._sorted[:-1]])
+
+
+def write_table(path: Path, header: str | None, rows: Iterable[str]) -> None:
+    with write_atomic(path) as temporary, open(temporary, "w", encoding="utf-8", newline="\n") as stream:
+        if header is not None:
+            stream.write(f"# {header}\n")
+        stream.writelines(f"{row}\n" for row in rows)
