@@ -1,0 +1,159 @@
+"""The embed stage: what it writes, that counts balance, what it reuses."""
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+
+from toolkit.capture import Trajectory, write_session
+from toolkit.embed import embed_sessions
+from toolkit.errors import ManifestError, ToolkitError
+from toolkit.retrieve import load_embeddings
+
+HL_RIG = "hl_a/rig"
+
+
+def write_tiny_capture(root: Path) -> Path:
+    """Photographs of three textured walls: ios without a rig and hl with one, each with a map and a query."""
+    rng = np.random.default_rng(0)
+    walls = []
+    for _ in range(3):
+        grids = (rng.random((size, 2 * size)) for size in (6, 20, 60))
+        layers = [cv2.resize(grid, (640, 320), interpolation=cv2.INTER_CUBIC) for grid in grids]
+        walls.append(np.clip(255 * sum(layers) / 3, 0, 255).astype(np.uint8))
+    identity = [1.0, 0, 0, 0, 0, 0, 0]
+    for device, sensors in {"ios": ["cam"], "hl": ["left", "right"]}.items():
+        for split, offset in {"map": 0, "query": 25}.items():
+            path = root / "sessions" / f"{device}_{split}"
+            images, poses = [], []
+            for wall, picture in enumerate(walls):
+                for view in range(2 if split == "map" else 1):
+                    time = 1000 + 10 * wall + view
+                    poses.append(
+                        (
+                            time,
+                            HL_RIG if device == "hl" else f"{device}_a/cam",
+                            [1, 0, 0, 0, wall * 10 + view, 0, 0],
+                        )
+                    )
+                    for index, sensor in enumerate(sensors):
+                        name = f"{device}_a/images/{sensor}/{time}.png"
+                        images.append((time, f"{device}_a/{sensor}", name))
+                        x = offset + 40 * view + 60 * index
+                        crop = picture[20:260, x : x + 320]
+                        (path / "raw_data" / name).parent.mkdir(parents=True, exist_ok=True)
+                        cv2.imwrite(str(path / "raw_data" / name), crop)
+            times, ids, values = zip(*poses, strict=True)
+            trajectory = Trajectory.from_poses(times, ids, np.tile(np.eye(4), (len(ids), 1, 1)))
+            trajectory.qt[:] = np.array(values)
+            write_session(
+                path,
+                [(f"{device}_a/{s}", s, "camera", "PINHOLE", 320, 240, 300, 300, 160, 120) for s in sensors],
+                [(HL_RIG, f"hl_a/{s}", identity) for s in sensors] if device == "hl" else None,
+                trajectory if split == "map" else None,
+                images,
+                subsessions=[f"{device}_a"],
+                keyframes={"pruned_subsampled": pd.DataFrame({"timestamp": times, "device_id": ids})}
+                if split == "query"
+                else None,
+                ground_truth=trajectory if split == "query" else None,
+            )
+    return root
+
+
+@pytest.fixture
+def tiny(tmp_path: Path) -> Path:
+    return write_tiny_capture(tmp_path / "TINY")
+
+
+def test_files_and_counts(tiny: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run" / "embeddings"
+    table = embed_sessions(tiny / "sessions", out)
+    assert table[["session", "images", "embedded", "unreadable"]].to_numpy().tolist() == [
+        ["ios_map", 6, 6, 0],
+        ["ios_query", 3, 3, 0],
+        ["hl_map", 12, 12, 0],
+        ["hl_query", 6, 6, 0],
+    ]
+    matrix = np.load(out / "hl_map" / "hl_a" / "hl_a.npy")
+    manifest = pd.read_csv(out / "hl_map" / "hl_a" / "manifest.csv")
+    assert matrix.dtype == np.float32
+    np.testing.assert_allclose(np.linalg.norm(matrix, axis=1), 1, atol=1e-5)
+    assert list(manifest.columns) == ["row_index", "device_id", "sensor_id", "timestamp", "abs_path"]
+    assert manifest.iloc[1].tolist() == [
+        1, HL_RIG, "hl_a/right", 1000, "TINY/sessions/hl_map/raw_data/hl_a/images/right/1000.png",
+    ]  # fmt: skip
+    assert (tmp_path / "run" / "features").is_dir()
+    assert not list(out.rglob("*.partial*")), "nothing temporary is left"
+
+
+def test_unreadable_images_are_listed(tiny: Path, tmp_path: Path) -> None:
+    raw = tiny / "sessions" / "ios_map" / "raw_data" / "ios_a" / "images" / "cam"
+    (raw / "1000.png").write_bytes(b"not an image")
+    (raw / "1010.png").unlink()
+    row = embed_sessions(tiny / "sessions", tmp_path / "e", device="ios").iloc[0]
+    assert (row["images"], row["embedded"], row["unreadable"]) == (6, 4, 2)
+    folder = tmp_path / "e" / "ios_map" / "ios_a"
+    failed = pd.read_csv(folder / "failed.csv")
+    assert failed["timestamp"].tolist() == [1000, 1010]
+    assert failed["reason"].str.contains("decoded|found").all()
+    matrix, table = load_embeddings(folder)
+    assert len(matrix) == 4
+    assert table["timestamp"].tolist() == [1001, 1011, 1020, 1021]
+
+
+def test_reuse_and_resume(tiny: Path, tmp_path: Path) -> None:
+    out = tmp_path / "e"
+    embed_sessions(tiny / "sessions", out)
+    before = {path: path.read_bytes() for path in out.rglob("*.npy")}
+    assert embed_sessions(tiny / "sessions", out)["skipped"].all()
+
+    # A killed run: one subsession has its matrix but no record of what it was made from.
+    (out / "hl_map" / "hl_a" / "hl_a.npy.meta.json").unlink()
+    again = embed_sessions(tiny / "sessions", out)
+    assert again.loc[~again["skipped"], "session"].tolist() == ["hl_map"]
+    assert {path: path.read_bytes() for path in out.rglob("*.npy")} == before
+
+    assert not embed_sessions(tiny / "sessions", out, normalize=False)["skipped"].any()
+    assert not embed_sessions(tiny / "sessions", out, dtype="float16")["skipped"].any()
+    assert load_embeddings(out / "ios_map")[0].dtype == np.float32
+
+
+def test_a_changed_query_or_map_image(tiny: Path, tmp_path: Path) -> None:
+    out = tmp_path / "e"
+    embed_sessions(tiny / "sessions", out)
+    for session, stale in {
+        "ios_query": ["ios_query"],
+        "ios_map": ["ios_map", "ios_query", "hl_map", "hl_query"],
+    }.items():
+        raw = tiny / "sessions" / session / "raw_data" / "ios_a" / "images" / "cam"
+        shutil.copy(raw / "1010.png", raw / "1000.png")
+        table = embed_sessions(tiny / "sessions", out)
+        assert table.loc[~table["skipped"], "session"].tolist() == stale
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"device": "spot"}, "ios, hl"),
+        ({"subsession": "nope"}, "ios_a"),
+        ({"dtype": "int8"}, "float16"),
+        ({"batch_size": 0}, "at least 1"),
+        ({"compute_device": "tpu"}, "auto, cpu or cuda"),
+    ],
+)
+def test_refused_parameters(tiny: Path, tmp_path: Path, parameters: dict[str, object], message: str) -> None:
+    with pytest.raises(ManifestError, match=message):
+        embed_sessions(tiny / "sessions", tmp_path / "e", **parameters)  # type: ignore[arg-type]
+
+
+def test_no_map_no_vocabulary(tiny: Path, tmp_path: Path) -> None:
+    for device in ("ios", "hl"):
+        shutil.rmtree(tiny / "sessions" / f"{device}_map")
+    with pytest.raises(ToolkitError, match="_map session"):
+        embed_sessions(tiny / "sessions", tmp_path / "e")
+    with pytest.raises(ToolkitError, match="use model `vlad`"):
+        embed_sessions(tiny / "sessions", tmp_path / "e", model="megaloc")

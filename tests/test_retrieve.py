@@ -1,0 +1,190 @@
+"""Search and the retrieve stage."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from test_embed import HL_RIG, write_tiny_capture
+
+from toolkit.capture import Capture
+from toolkit.embed import embed_sessions
+from toolkit.errors import ArtefactError, CaptureError, ManifestError
+from toolkit.retrieve import load_embeddings, retrieve_pairs, search
+
+BACKENDS = ["faiss", "torch", "numpy"]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_search_is_the_sorted_product(backend: str) -> None:
+    rng = np.random.default_rng(0)
+    query, database = rng.normal(size=(7, 12)), rng.normal(size=(200, 12))
+    scores, indices = search(query, database, 5, backend)
+    full = (query.astype(np.float32).astype(float) @ database.astype(np.float32).astype(float).T).astype(
+        np.float32
+    )
+    np.testing.assert_array_equal(indices, np.argsort(-full, axis=1, kind="stable")[:, :5])
+    np.testing.assert_allclose(scores, -np.sort(-full, axis=1)[:, :5], rtol=1e-6)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_equal_scores_come_by_index(backend: str) -> None:
+    rng = np.random.default_rng(0)
+    database = np.repeat(rng.normal(size=(4, 300)), 100, axis=0)[rng.permutation(400)]
+    query = np.concatenate([database[:3], np.zeros((1, 300))])
+    scores, indices = search(query, database, 6, backend)
+    for row in range(3):
+        same = np.flatnonzero((database == query[row]).all(axis=1))
+        assert indices[row].tolist() == same[:6].tolist()
+    assert indices[3].tolist() == list(range(6))
+    assert not scores[3].any()
+
+
+def test_search_limits() -> None:
+    scores, indices = search(np.ones((2, 3)), np.ones((4, 3), np.float16), 10)
+    assert indices.tolist() == [[0, 1, 2, 3]] * 2, "k beyond the database: all of it"
+    assert search(np.ones((0, 3)), np.ones((4, 3)), 2)[0].shape == (0, 2)
+    with pytest.raises(ValueError, match="2 dimensions, the database 3"):
+        search(np.ones((2, 2)), np.ones((4, 3)), 1)
+    with pytest.raises(ValueError, match="database has 1 rows with NaN or infinite values, first row 2"):
+        search(np.ones((2, 3)), np.array([[0, 0, 0], [1, 1, 1], [0, np.nan, 1]]), 1)
+    with pytest.raises(ValueError, match="k is 0"):
+        search(np.ones((2, 3)), np.ones((4, 3)), 0)
+    with pytest.raises(ValueError, match="shape"):
+        search(np.ones(3), np.ones((4, 3)), 1)
+    assert scores.dtype == np.float32
+
+
+@pytest.fixture
+def tiny(tmp_path: Path) -> Path:
+    capture = write_tiny_capture(tmp_path / "TINY")
+    embed_sessions(capture / "sessions", tmp_path / "embeddings")
+    return capture
+
+
+def lines(path: str | Path) -> list[dict]:
+    return [json.loads(line) for line in Path(path).read_text().splitlines()]
+
+
+def test_all_pairs(tiny: Path, tmp_path: Path) -> None:
+    table = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", topk=4)
+    assert table[["map_device", "query_device", "queries", "database"]].to_numpy().tolist() == [
+        ["ios", "ios", 3, 6],
+        ["ios", "hl", 6, 6],
+        ["hl", "ios", 3, 12],
+        ["hl", "hl", 6, 12],
+    ]
+    path = tmp_path / "retrieval" / "TINY_map_hl_query_hl.jsonl"
+    assert table["path"].iloc[3] == str(path)
+    records = lines(path)
+    first = records[0]
+    assert list(first) == ["path", "subsession", "device_id", "sensor_id", "timestamp", "Trs", "topk"]
+    assert list(first["topk"][0]) == ["rank", "score", "subsession", "timestamp", "sensor_id", "path", "Tws"]
+    assert (first["subsession"], first["device_id"], first["timestamp"]) == ("hl_a", HL_RIG, "1000")
+    assert first["path"] == "TINY/sessions/hl_query/raw_data/hl_a/images/left/1000.png"
+    assert [reference["rank"] for reference in first["topk"]] == [1, 2, 3, 4]
+    for row in table["path"]:
+        for record in lines(row):
+            best = record["topk"][0]
+            assert int(best["timestamp"]) // 10 == int(record["timestamp"]) // 10, "the same wall"
+            wall, view = divmod(int(best["timestamp"]) - 1000, 10)
+            assert best["Tws"][0] == [1.0, 0.0, 0.0, wall * 10 + view]
+            assert np.shape(record["Trs"]) == (4, 4)
+
+
+def test_backends_write_the_same_and_files_are_reused(tiny: Path, tmp_path: Path) -> None:
+    retrieve_pairs(tiny / "sessions", tmp_path / "embeddings")
+    retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", out_jsonl=tmp_path / "torch", use_faiss=False)
+    for path in (tmp_path / "retrieval").glob("*.jsonl"):
+        assert path.read_bytes() == (tmp_path / "torch" / path.name).read_bytes()
+    assert retrieve_pairs(tiny / "sessions", tmp_path / "embeddings")["skipped"].all()
+    assert not retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", topk=3)["skipped"].any()
+    embed_sessions(tiny / "sessions", tmp_path / "embeddings", dtype="float16")
+    assert not retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", topk=3)["skipped"].any()
+
+
+def test_missing_images_and_poses_are_reported(
+    tiny: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name in ("left/1000.png", "right/1000.png", "right/1010.png"):
+        (tiny / "sessions" / "hl_query" / "raw_data" / "hl_a" / "images" / name).unlink()
+    poses = tiny / "sessions" / "hl_map" / "trajectories.txt"
+    poses.write_text("\n".join(poses.read_text().splitlines()[:-1]) + "\n")
+    embed_sessions(tiny / "sessions", tmp_path / "embeddings", device="hl")
+    out = tmp_path / "one.jsonl"
+    row = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", "hl", "hl", out).iloc[0]
+    assert (row["keyframes"], row["keyframes_missing"], row["queries"], row["images_missing"]) == (3, 1, 3, 3)
+    assert (row["database"], row["unposed"]) == (10, 2)
+    assert "1 of 3 keyframes have no embedded image" in caplog.text
+    assert len(lines(out)) == 3
+
+
+def test_only_listed_keyframes(tiny: Path, tmp_path: Path) -> None:
+    (tiny / "sessions" / "ios_query" / "proc" / "keyframes_few.txt").write_text(
+        "1010, ios_a/cam\n1020, another_device\n"
+    )
+    row = retrieve_pairs(
+        tiny / "sessions", tmp_path / "embeddings", "ios", "ios", queries="keyframes_few"
+    ).iloc[0]
+    assert (row["keyframes"], row["keyframes_missing"], row["queries"]) == (2, 1, 1)
+    assert [record["timestamp"] for record in lines(row["path"])] == ["1010"]
+
+
+def test_refused(tiny: Path, tmp_path: Path) -> None:
+    sessions, embeddings = tiny / "sessions", tmp_path / "embeddings"
+    with pytest.raises(ArtefactError, match=r"run the embed stage first.*--only embed"):
+        retrieve_pairs(sessions, tmp_path / "nowhere")
+    with pytest.raises(ManifestError, match=r"map_device is 'spot'.*ios, hl"):
+        retrieve_pairs(sessions, embeddings, "spot")
+    with pytest.raises(CaptureError, match="pruned_subsampled"):
+        retrieve_pairs(sessions, embeddings, queries="nope")
+    with pytest.raises(ManifestError, match="for 4 pairs"):
+        retrieve_pairs(sessions, embeddings, out_jsonl=tmp_path / "one.jsonl")
+    with pytest.raises(ManifestError, match="topk"):
+        retrieve_pairs(sessions, embeddings, topk=0)
+
+
+def test_embeddings_that_do_not_fit(tiny: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "embeddings" / "ios_map" / "ios_a"
+    matrix, table = load_embeddings(folder)
+    assert table["subsession"].unique().tolist() == ["ios_a"]
+    np.save(folder / "ios_a.npy", matrix[:, :3])
+    with pytest.raises(ArtefactError, match="different models"):
+        retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", "ios", "hl", skip_existing=False)
+    np.save(folder / "ios_a.npy", np.full_like(matrix, np.nan))
+    with pytest.raises(ArtefactError, match="NaN"):
+        retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", "ios", "hl", skip_existing=False)
+    np.save(folder / "ios_a.npy", matrix[1:])
+    with pytest.raises(ArtefactError, match=r"does not fit ios_a.npy"):
+        load_embeddings(folder)
+    np.save(folder / "ios_a.npy", matrix)
+    manifest = pd.read_csv(folder / "manifest.csv")
+    manifest["abs_path"] = manifest["abs_path"].str.replace("1000", "9")
+    manifest.to_csv(folder / "manifest.csv", index=False)
+    with pytest.raises(ArtefactError, match="another capture"):
+        retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", "ios", "hl", skip_existing=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", ["STRECHA", "STRECHA_HARD"])
+def test_real_photographs_find_views_of_the_same_place(
+    captures_root: Path, tmp_path: Path, scene: str
+) -> None:
+    sessions = captures_root / scene / "sessions"
+    embed_sessions(sessions, tmp_path / "embeddings")
+    capture = Capture.from_sessions_root(sessions)
+    for row in retrieve_pairs(sessions, tmp_path / "embeddings").itertuples():
+        session = capture[f"{row.query_device}_query"]
+        names = [f"{scene}/sessions/{session.image_name(index)}" for index in range(len(session.images))]
+        true = dict(zip(names, session.world_from_cam(ground_truth=True), strict=True))
+        hits = []
+        for record in lines(row.path):
+            world_from_query = true[record["path"]]
+            poses = np.array([reference["Tws"] for reference in record["topk"]])
+            distance_m = np.linalg.norm(poses[:, :3, 3] - world_from_query[:3, 3], axis=1)
+            hits.append(
+                (distance_m < 8) & (poses[:, :3, 2] @ world_from_query[:3, 2] > np.cos(np.radians(45)))
+            )
+        assert np.mean(np.any(hits, axis=1)) == 1, (row.map_device, row.query_device)
+        assert np.mean(np.any(np.array(hits)[:, :5], axis=1)) >= 0.95, (row.map_device, row.query_device)

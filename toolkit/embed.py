@@ -1,0 +1,285 @@
+"""Global descriptors of all images of a capture: one matrix and one table a subsession."""
+
+import logging
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from tqdm.auto import tqdm
+
+from toolkit.capture import Capture, Session
+from toolkit.embedders import Embedder, create_embedder, resolve_name
+from toolkit.errors import ImageError, ManifestError, ToolkitError
+from toolkit.features import FeatureSettings, LocalFeatures, extract_session
+from toolkit.files import files_fingerprint, fingerprint, is_current, write_atomic, write_sidecar
+from toolkit.images import prefetch, read_image
+
+log = logging.getLogger(__name__)
+
+VOCABULARY_IMAGES = 2048
+"""Map images that the vocabulary is learnt from at most, spread evenly: bounds time and memory."""
+
+
+def embed_sessions(
+    sessions_root: str | Path,
+    out_dir: str | Path,
+    device: str = "auto",
+    subsession: str = "all",
+    batch_size: int = 8,
+    compute_device: str = "auto",
+    normalize: bool = True,
+    skip_existing: bool = True,
+    dtype: str = "float32",
+    model: str = "vlad",
+    features_dir: str | Path | None = None,
+    dim: int | None = None,
+    seed: int = 0,
+) -> pd.DataFrame:
+    """Write `<out_dir>/<session>/<subsession>/<subsession>.npy` (N, D) and its `manifest.csv`.
+
+    Images that cannot be read are left out of both, and listed with the reason in `failed.csv` beside them.
+
+    Args:
+        sessions_root: `<capture>/sessions`.
+        out_dir: the embeddings folder; the vocabulary goes there too.
+        device: `ios`, `hl`, `spot`, or `auto`: all that the capture has.
+        subsession: one subsession's name, or `all`.
+        batch_size: images a batch.
+        compute_device: `auto`, `cpu`, `cuda`: where a network runs. `vlad` runs on the CPU.
+        normalize: L2-normalise the rows.
+        skip_existing: reuse subsessions made from the same images and settings.
+        dtype: `float32` or `float16`, of the files.
+        model: an embedder's name, or `auto`.
+        features_dir: folder of the local features that stages share; `<out_dir>/../features` where None.
+        dim: most dimensions of `vlad`; its default where None.
+        seed: of the vocabulary.
+
+    Returns:
+        One row a subsession: session, subsession, images, embedded, unreadable, seconds, skipped, model, dim.
+    """
+    if dtype not in ("float32", "float16"):
+        raise ManifestError(f"dtype is {dtype!r}; expected float32 or float16.")
+    if batch_size < 1:
+        raise ManifestError(f"batch_size is {batch_size}; expected at least 1.")
+    if compute_device.split(":")[0] not in ("auto", "cpu", "cuda"):
+        raise ManifestError(f"compute_device is {compute_device!r}; expected auto, cpu or cuda.")
+    out_dir = Path(out_dir)
+    features_dir = Path(features_dir) if features_dir is not None else out_dir.parent / "features"
+    capture = Capture.from_sessions_root(sessions_root)
+    jobs = _jobs(capture, device, subsession)
+    name = resolve_name(model)
+    if model == "auto":
+        log.info("model auto: %s", name)
+    if name == "vlad":
+        embedder = create_embedder(
+            name, vocabulary=_vocabulary(capture, out_dir, features_dir, dim, seed, skip_existing)
+        )
+    else:
+        embedder = create_embedder(name, device=compute_device)
+    table = []
+    for session, part, rows in jobs:
+        started = time.perf_counter()
+        folder = out_dir / session.id / part
+        matrix_path = folder / f"{Path(part).name}.npy"
+        record = {
+            "embedder": embedder.settings,
+            "features": asdict(FeatureSettings()) if embedder.inputs == "features" else None,
+            "images": _images_fingerprint(session, rows),
+            "normalize": normalize,
+            "dtype": dtype,
+        }
+        skipped = skip_existing and (folder / "manifest.csv").exists() and is_current(matrix_path, record)
+        if skipped:
+            embedded = len(np.load(matrix_path, mmap_mode="r"))
+        else:
+            matrix, failed = _embed_rows(embedder, session, part, rows, batch_size, features_dir)
+            if normalize:
+                matrix /= np.maximum(np.linalg.norm(matrix, axis=1, keepdims=True), 1e-12)
+            embedded = len(matrix)
+            _write(matrix_path, matrix.astype(dtype), _manifest(capture, session, rows, failed), failed)
+            write_sidecar(matrix_path, record)
+            if failed:
+                log.warning("%s/%s: %d of %d images cannot be read, see %s",
+                            session.id, part, len(failed), len(rows), folder / "failed.csv")  # fmt: skip
+        table.append(
+            {
+                "session": session.id,
+                "subsession": part,
+                "images": len(rows),
+                "embedded": embedded,
+                "unreadable": len(rows) - embedded,
+                "seconds": round(time.perf_counter() - started, 3),
+                "skipped": skipped,
+                "model": name,
+                "dim": embedder.dim,
+            }
+        )
+    return pd.DataFrame(table)
+
+
+def camera_rows(session: Session) -> NDArray[np.intp]:
+    """Return the rows of `session.images` that were taken by cameras, in file order."""
+    sensors = session.images["sensor_id"]
+    cameras = {sensor: session.is_camera(sensor) for sensor in sensors.unique()}
+    return np.flatnonzero(sensors.map(cameras).to_numpy(bool))
+
+
+def _jobs(capture: Capture, device: str, subsession: str) -> list[tuple[Session, str, NDArray[np.intp]]]:
+    """Return the subsessions to embed: session, subsession, image rows."""
+    if device not in ("auto", "all", *capture.devices):
+        raise ManifestError(
+            f"device is {device!r}; {capture.name} has {', '.join(capture.devices)} (or `auto`)."
+        )
+    devices = capture.devices if device in ("auto", "all") else [device]
+    names = [f"{key}_{split}" for key in devices for split in ("map", "query")]
+    jobs, known = [], []
+    for session in (capture[name] for name in names if name in capture):
+        rows = camera_rows(session)
+        parts = session.subsession_of(rows)
+        # Images outside every listed subsession are embedded too, under the session's name.
+        parts = np.where(parts == "", session.id, parts)
+        for part in dict.fromkeys(parts.tolist()):
+            known.append(part)
+            if subsession in ("all", part):
+                jobs.append((session, part, rows[parts == part]))
+    if not jobs:
+        raise ManifestError(
+            f"No images of subsession {subsession!r} in {', '.join(names)}; known: {', '.join(known)}."
+        )
+    return jobs
+
+
+def _vocabulary(
+    capture: Capture, out_dir: Path, features_dir: Path, dim: int | None, seed: int, skip_existing: bool
+) -> Path:
+    """Learn the VLAD vocabulary from the map images of all devices, unless a current one is there."""
+    from toolkit.embedders.vlad import Vlad, VladSettings
+
+    maps = [capture[name] for name in capture if capture[name].split == "map"]
+    if not maps:
+        raise ToolkitError(
+            f"{capture.path}/sessions has no <device>_map session; `vlad` learns its vocabulary from the map."
+        )
+    settings = VladSettings() if dim is None else VladSettings(dim=dim)
+    every = [(session.id, int(row)) for session in maps for row in camera_rows(session)]
+    picked = np.linspace(0, len(every) - 1, min(len(every), VOCABULARY_IMAGES)).astype(int).tolist()
+    chosen: dict[str, list[int]] = {}
+    for name, row in (every[index] for index in picked):
+        chosen.setdefault(name, []).append(row)
+    record = {
+        "vlad": asdict(settings),
+        "features": asdict(FeatureSettings()),
+        "images": {name: _images_fingerprint(capture[name], np.array(rows)) for name, rows in chosen.items()},
+        "seed": seed,
+    }
+    path = out_dir / "vlad.npz"
+    if skip_existing and is_current(path, record):
+        return path
+    stores = {
+        name: extract_session(capture[name], features_dir, rows=np.array(rows))
+        for name, rows in chosen.items()
+    }
+    keys = [(name, capture[name].image_name(row)) for name, rows in chosen.items() for row in rows]
+    keys = [(name, image) for name, image in keys if image in stores[name]]
+
+    def features() -> Iterator[LocalFeatures]:
+        for name, image in tqdm(keys, desc="vocabulary", unit="image"):
+            yield stores[name][image]
+
+    vlad = Vlad.learn(features, len(keys), settings, seed)
+    vlad.save(path)
+    write_sidecar(path, record)
+    return path
+
+
+def _embed_rows(
+    embedder: Embedder,
+    session: Session,
+    part: str,
+    rows: NDArray[np.intp],
+    batch_size: int,
+    features_dir: Path,
+) -> tuple[NDArray[np.float32], dict[int, str]]:
+    """Return the vectors of the readable images, in order, and why the others (by row) have none."""
+    failed: dict[int, str] = {}
+
+    def from_features() -> Iterator[Any]:
+        store = extract_session(session, features_dir, rows=rows)
+        for row in rows.tolist():
+            name = session.image_name(row)
+            if name in store:
+                yield store[name]
+            else:
+                failed[row] = store.failed.get(name, "no local features were extracted")
+
+    def read(row: int) -> NDArray[np.uint8] | tuple[int, str]:
+        try:
+            return read_image(session.image_path(row))
+        except ImageError as error:
+            return row, str(error)
+
+    def from_images() -> Iterator[Any]:
+        for image in prefetch(read, rows.tolist(), ahead=batch_size):
+            if isinstance(image, tuple):
+                failed[image[0]] = image[1]
+            else:
+                yield image
+
+    inputs = from_features() if embedder.inputs == "features" else from_images()
+    blocks = [np.zeros((0, embedder.dim), np.float32)]
+    with tqdm(total=len(rows), desc=f"embed {session.id}/{part}", unit="image") as bar:
+        for batch in _batches(inputs, batch_size):
+            blocks.append(embedder.embed(batch))
+            bar.update(len(batch))
+    return np.concatenate(blocks), failed
+
+
+def _batches(items: Iterable[Any], size: int) -> Iterator[list[Any]]:
+    iterator = iter(items)
+    while batch := list(islice(iterator, size)):
+        yield batch
+
+
+def _images_fingerprint(session: Session, rows: NDArray[np.intp]) -> str:
+    """Identify images by their keys, and their files by name, size and time of change."""
+    table = session.images.iloc[rows]
+    keys = [table[column].tolist() for column in ("timestamp", "sensor_id", "path")]
+    files = files_fingerprint([session.image_path(int(row)) for row in rows])
+    return fingerprint([keys, session.device_ids[rows].tolist(), files])
+
+
+def _manifest(
+    capture: Capture, session: Session, rows: NDArray[np.intp], failed: dict[int, str]
+) -> pd.DataFrame:
+    table = session.images.iloc[rows]
+    manifest = pd.DataFrame(
+        {
+            "device_id": session.device_ids[rows],
+            "sensor_id": table["sensor_id"].to_numpy(),
+            "timestamp": table["timestamp"].to_numpy(),
+            "abs_path": [f"{capture.name}/sessions/{session.image_name(int(row))}" for row in rows],
+        }
+    )
+    manifest["reason"] = [failed.get(int(row), "") for row in rows]
+    return manifest
+
+
+def _write(path: Path, matrix: NDArray[Any], manifest: pd.DataFrame, failed: dict[int, str]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    missing = path.parent / "failed.csv"
+    if failed:
+        with write_atomic(missing) as temporary:
+            manifest[manifest["reason"] != ""].to_csv(temporary, index=False)
+    else:
+        missing.unlink(missing_ok=True)
+    embedded = manifest[manifest["reason"] == ""].drop(columns="reason").reset_index(drop=True)
+    with write_atomic(path.parent / "manifest.csv") as temporary:
+        embedded.to_csv(temporary, index_label="row_index")
+    with write_atomic(path) as temporary, open(temporary, "wb") as stream:
+        np.save(stream, matrix)

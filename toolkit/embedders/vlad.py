@@ -1,0 +1,218 @@
+"""VLAD of RootSIFT: a global descriptor without weights, its vocabulary learnt from the map's images.
+
+Residuals of whitened local descriptors to their visual word are summed per word (Jegou et al., CVPR 2010),
+each residual and each word's sum normalised (Delhumeau et al., ACM MM 2013; Arandjelovic and Zisserman,
+CVPR 2013), and projected to the principal directions of the map's images.
+"""
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from toolkit.errors import ArtefactError, ToolkitError
+from toolkit.features import DESCRIPTOR_SCALE, LocalFeatures
+from toolkit.files import file_fingerprint, write_atomic
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class VladSettings:
+    """How a VLAD is built; part of every fingerprint that rests on it."""
+
+    words: int = 256
+    """Visual words; fewer where the map has too few descriptors."""
+    local_dim: int = 64
+    """Local descriptors are PCA-whitened to this length."""
+    min_scale_px: float = 1.6
+    """Finer keypoints are left out: blur, noise and another camera's resolution change them first.
+    The standard deviation of the blob in pixels of the image as stored."""
+    min_features: int = 300
+    """At least this many of the coarsest keypoints are taken, however fine they are."""
+    dim: int = 512
+    """Most dimensions of the result; it cannot have more than there are map images."""
+    prior_images: int = 2000
+    """Shrinkage of the whitening: the weight, in images, of the belief that all directions vary alike.
+    Directions learnt from a hundred images say where those were taken, not what repeats between places."""
+    sample_descriptors: int = 50_000
+    """Local descriptors that the vocabulary is learnt from."""
+    iterations: int = 15
+    """Rounds of k-means."""
+
+
+class Vlad:
+    """A learnt VLAD: turns the local features of images into global descriptors."""
+
+    name = "vlad"
+    inputs: Literal["features"] = "features"
+
+    def __init__(self, settings: VladSettings, arrays: dict[str, Floats], fingerprint: str = ""):
+        self._settings = settings
+        self._fingerprint = fingerprint
+        self.local_mean, self.local_projection = arrays["local_mean"], arrays["local_projection"]
+        self.centroids, self.projection = arrays["centroids"], arrays["projection"]
+
+    @property
+    def dim(self) -> int:
+        return int(self.projection.shape[1])
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return {"name": self.name, **asdict(self._settings), "vocabulary": self._fingerprint}
+
+    def embed(self, inputs: Sequence[LocalFeatures]) -> Floats:
+        """Return the global descriptors (B, dim) of images; rows of zeros where an image has no features.
+
+        Similarities are exact dot products; normalise the rows for cosines.
+        """
+        return self._aggregate(inputs) @ self.projection
+
+    @classmethod
+    def learn(
+        cls,
+        features: Callable[[], Iterable[LocalFeatures]],
+        count: int,
+        settings: VladSettings | None = None,
+        seed: int = 0,
+    ) -> "Vlad":
+        """Learn vocabulary and projection from `count` map images; the same input gives the same bytes.
+
+        Args:
+            features: yields the features of the same images in the same order each time it is called (it is
+                called twice: memory does not grow with the number of local features).
+            count: how many images it yields.
+
+        Raises:
+            ToolkitError: the images have no local features.
+        """
+        settings = settings or VladSettings()
+        rng = np.random.default_rng(seed)
+        share = -(-settings.sample_descriptors // max(count, 1))
+        parts = []
+        for image in features():
+            descriptors = _select(image, settings)
+            parts.append(descriptors[np.sort(rng.permutation(len(descriptors))[:share])])
+        sample = np.concatenate(parts) if parts else np.zeros((0, 1), np.float32)
+        if len(sample) < 2:
+            raise ToolkitError(
+                f"A VLAD vocabulary cannot be learnt: {count} map images gave {len(sample)} local features. "
+                f"Check that they can be read and are not blank (`python -m toolkit check CAPTURE`)."
+            )
+        mean = sample.mean(axis=0)
+        variance, directions = np.linalg.eigh(np.cov((sample - mean).T.astype(np.float64)))
+        keep = np.argsort(-variance, kind="stable")[: min(settings.local_dim, len(sample) - 1)]
+        # An almost constant direction would be blown up to noise.
+        scale = np.sqrt(np.maximum(variance[keep], 1e-4 * variance.max() + 1e-12))
+        arrays: dict[str, Floats] = {
+            "local_mean": mean.astype(np.float32),
+            "local_projection": (directions[:, keep] / scale).astype(np.float32),
+            "projection": np.zeros((0, 0), np.float32),
+        }
+        local = _unit(((sample - arrays["local_mean"]) @ arrays["local_projection"]).astype(np.float32))
+        words = max(1, min(settings.words, len(local) // 8))
+        arrays["centroids"] = _kmeans(local, words, settings.iterations, rng)
+        vlad = cls(settings, arrays)
+        vectors = np.concatenate([vlad._aggregate([image]) for image in features()])
+        vlad.projection = _principal_projection(vectors, settings)
+        return vlad
+
+    @classmethod
+    def load(cls, vocabulary: str | Path) -> "Vlad":
+        """Read a vocabulary that `save` wrote."""
+        try:
+            with np.load(vocabulary) as stored:
+                arrays = {name: stored[name] for name in stored.files}
+            settings = VladSettings(**json.loads(str(arrays.pop("settings"))))
+            return cls(settings, arrays, file_fingerprint(vocabulary))
+        except FileNotFoundError:
+            raise ArtefactError(f"No VLAD vocabulary {vocabulary}; run the embed stage first.") from None
+        except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
+            raise ArtefactError(
+                f"Not a VLAD vocabulary: {vocabulary} ({error}). Delete it and embed again."
+            ) from error
+
+    def save(self, path: str | Path) -> None:
+        """Write the vocabulary, .npz, and take its bytes as identity."""
+        arrays = {
+            "settings": np.array(json.dumps(asdict(self._settings))),
+            "local_mean": self.local_mean,
+            "local_projection": self.local_projection,
+            "centroids": self.centroids,
+            "projection": self.projection,
+        }
+        with write_atomic(path) as temporary, open(temporary, "wb") as stream:
+            np.savez(stream, allow_pickle=False, **arrays)
+        self._fingerprint = file_fingerprint(path)
+
+    def _aggregate(self, images: Sequence[LocalFeatures]) -> Floats:
+        """Return the VLADs (B, words * local_dim) before projection, of length 1 or 0."""
+        words, size = self.centroids.shape
+        vectors = np.zeros((len(images), words, size), np.float32)
+        for vector, image in zip(vectors, images, strict=True):
+            descriptors = _select(image, self._settings)
+            if not len(descriptors):
+                continue
+            local = _unit(((descriptors - self.local_mean) @ self.local_projection).astype(np.float32))
+            nearest = _assign(local, self.centroids)
+            residuals = _unit(local - self.centroids[nearest])
+            order = np.argsort(nearest, kind="stable")
+            present, starts = np.unique(nearest[order], return_index=True)
+            vector[present] = _unit(np.add.reduceat(residuals[order], starts, axis=0).astype(np.float32))
+        flat = vectors.reshape(len(images), words * size)
+        return _unit(np.sign(flat) * np.sqrt(np.abs(flat)))
+
+
+def _select(image: LocalFeatures, settings: VladSettings) -> Floats:
+    """Return the RootSIFT vectors (N, 128) of the keypoints that are coarse enough, in their order."""
+    scales = image.scales
+    chosen = np.flatnonzero(scales >= settings.min_scale_px)
+    if len(chosen) < settings.min_features:
+        chosen = np.sort(np.argsort(-scales, kind="stable")[: settings.min_features])
+    return image.descriptors[chosen].astype(np.float32) / np.float32(DESCRIPTOR_SCALE)
+
+
+def _unit(rows: Floats) -> Floats:
+    unit: Floats = rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), np.float32(1e-9))
+    return unit
+
+
+def _assign(points: Floats, centroids: Floats) -> NDArray[np.intp]:
+    """Return the nearest centroid of each point, (N,)."""
+    return np.asarray((points @ centroids.T - 0.5 * (centroids**2).sum(axis=1)).argmax(axis=1))
+
+
+def _kmeans(points: Floats, words: int, iterations: int, rng: np.random.Generator) -> Floats:
+    """Return centroids (words, D) by Lloyd's rounds from a random choice of points."""
+    centroids = points[np.sort(rng.permutation(len(points))[:words])].copy()
+    for _ in range(iterations):
+        nearest = _assign(points, centroids)
+        order = np.argsort(nearest, kind="stable")
+        present, starts, counts = np.unique(nearest[order], return_index=True, return_counts=True)
+        centroids[present] = np.add.reduceat(points[order], starts, axis=0) / counts[:, None]
+        empty = np.setdiff1d(np.arange(words), present)
+        centroids[empty] = points[rng.integers(len(points), size=len(empty))]
+    return centroids
+
+
+def _principal_projection(vectors: Floats, settings: VladSettings) -> Floats:
+    """Return the projection (D, dim) to the map's principal directions, with shrunken whitening.
+
+    Not centred: as long as no direction is cut, map images rank by similarity to a query as their whole VLADs
+    do, and a query with nothing in common with the map stays short.
+    """
+    count = len(vectors)
+    energy, weights = np.linalg.eigh((vectors @ vectors.T).astype(np.float64))
+    order = np.argsort(-energy, kind="stable")[: settings.dim]
+    order = order[energy[order] > 1e-5 * energy.max()]
+    energy = energy[order]
+    basis = vectors.T @ (weights[:, order] / np.sqrt(energy)).astype(np.float32)
+    mean_energy = energy.mean()
+    # The posterior of the energies under a prior of `prior_images` images that say: all alike.
+    shrunk = (count * energy + settings.prior_images * mean_energy) / (count + settings.prior_images)
+    return (basis * np.sqrt(mean_energy / shrunk)).astype(np.float32)
