@@ -1,0 +1,1 @@
+"""Localizers: a query's features and its references in, a pose and how far to trust it out."""

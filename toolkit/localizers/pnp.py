@@ -1,0 +1,498 @@
+"""Localize by matching a query's features to triangulated map points, and PnP for single cameras and rigs.
+
+In two steps. First, descriptors alone: the query against its retrieved references, then LO-RANSAC. Then, with that
+pose, the points of all covisible map images are projected into the query and matched only near where they should be,
+which finds several times as many and makes the pose more precise.
+"""
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from threading import Lock
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from toolkit import geometry
+from toolkit.features import FeatureStore, LocalFeatures
+from toolkit.mapping import LocalMap, in_view, view_bounds
+from toolkit.matching import mutual_matches, similarity, unit_descriptors
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class PnpSettings:
+    """How queries are localized; part of the poses' fingerprint. Angles are seen from the camera."""
+
+    max_map_features: int = 1000
+    """Features of a map image that are used at most, those of the longest tracks."""
+    max_query_features: int = 1536
+    """Features of a query image that are matched by descriptors alone, the strongest; guided passes use all."""
+    ratio: float = 0.85
+    """Lowe's ratio between a query and one reference."""
+    ransac_max_error_deg: float = 0.45
+    """Largest reprojection error of an inlier in RANSAC."""
+    ransac_max_trials: int = 20000
+    clear_inlier_ratio: float = 0.4
+    """With more inliers than this share of the matches, no other pose is looked for."""
+    guided_radii_deg: tuple[float, ...] = (0.7, 0.35)
+    """Search radius around a projected map point, one guided pass each."""
+    guided_min_score: float = 0.75
+    """Least cosine similarity of a match in the guided passes."""
+    guided_images: int = 12
+    """Covisible map images whose points are projected."""
+    max_error_deg: float = 0.17
+    """Largest reprojection error of an inlier of the final pose."""
+    min_inliers: int = 12
+    """Fewer independently matched inliers than this are no pose."""
+    ok_inliers: int = 30
+    """Independently matched inliers that a pose needs to be `ok`."""
+    ok_rival_support: float = 0.8
+    """Support of the best other pose, relative to this one's, up to which a pose is `ok`."""
+    ok_position_std_m: float = 0.1
+    """Largest standard deviation of the position for a pose to be `ok`."""
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """The answer for one query device: a pose, or why there is none."""
+
+    status: str
+    """`ok`, `low_confidence`, or `failed: <reason>`."""
+    world_from_rig: Floats | None = None
+    """(4, 4); for a single camera the rig is the camera."""
+    covariance: Floats | None = None
+    """(6, 6) of a small motion of the rig in its own frame: rotation, radians, then translation, metres."""
+    num_matches: int = 0
+    """2D-3D matches found from descriptors alone."""
+    num_inliers: int = 0
+    """Of these, within `ransac_max_error_deg` of the final pose."""
+    num_guided: int = 0
+    """Matches that the final pose rests on, within `max_error_deg`."""
+    rmse_px: float = float("nan")
+    rival_support: float = 0.0
+    """Guided matches of the best clearly different pose, relative to this one's; 0 where there is none."""
+    references: tuple[int, ...] = ()
+    """Map images that the matches came from."""
+    camera_index: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(num_guided,) camera of the rig."""
+    pixels: Floats = field(default_factory=lambda: np.zeros((0, 2)))
+    """(num_guided, 2)."""
+    point_index: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(num_guided,) map point."""
+
+    @property
+    def position_std_m(self) -> float:
+        return (
+            float(np.sqrt(np.trace(self.covariance[3:, 3:]))) if self.covariance is not None else float("nan")
+        )
+
+    @property
+    def rotation_std_deg(self) -> float:
+        if self.covariance is None:
+            return float("nan")
+        return float(np.degrees(np.sqrt(np.trace(self.covariance[:3, :3]))))
+
+    @property
+    def inlier_ratio(self) -> float:
+        return self.num_inliers / self.num_matches if self.num_matches else 0.0
+
+
+@dataclass(frozen=True)
+class _MapImage:
+    """The features of a map image that see a point, longest tracks first."""
+
+    descriptors: NDArray[np.uint8]
+    points: Ints
+    scales: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class _Matches:
+    """K matches of query pixels to map points."""
+
+    camera: Ints
+    """(K,) camera of the rig."""
+    pixels: Floats
+    """(K, 2)."""
+    point: Ints
+    """(K,) map point."""
+
+    def __len__(self) -> int:
+        return len(self.point)
+
+    def __getitem__(self, part: NDArray[np.bool_]) -> "_Matches":
+        return _Matches(self.camera[part], self.pixels[part], self.point[part])
+
+
+@dataclass(frozen=True)
+class _Hypothesis:
+    """A pose and the guided matches that it rests on."""
+
+    rig_from_world: Floats
+    matches: _Matches
+
+    @property
+    def world_from_rig(self) -> Floats:
+        return geometry.invert(self.rig_from_world)
+
+
+class PnpLocalizer:
+    """Localizes queries in one map. Safe to use from several threads; the map is never changed."""
+
+    def __init__(self, local_map: LocalMap, features: FeatureStore, settings: PnpSettings | None = None):
+        self.map = local_map
+        self.settings = settings or PnpSettings()
+        self._features = features
+        self._cache: OrderedDict[int, _MapImage] = OrderedDict()
+        self._lock = Lock()
+
+    def localize(
+        self,
+        cameras: Sequence[pycolmap.Camera],
+        rig_from_cams: Floats,
+        features: Sequence[LocalFeatures],
+        references: Sequence[Sequence[int]],
+    ) -> PoseEstimate:
+        """Return one pose for the cameras of a rig, or for a single camera.
+
+        Args:
+            cameras: C cameras.
+            rig_from_cams: (C, 4, 4); the identity for a single camera.
+            features: their local features.
+            references: for each camera, indices of map images to match it with, best first.
+        """
+        if not any(len(refs) for refs in references):
+            return PoseEstimate("failed: no references")
+        query = _Query(list(cameras), np.asarray(rig_from_cams, np.float64), list(features))
+        camera, keypoint, point = self._match(query, references)
+        distinct = len(np.unique(point))
+        if distinct < 4:
+            return PoseEstimate("failed: too few matches", num_matches=len(point))
+        matches = _Matches(camera, query.pixels(camera, keypoint), point)
+        hypotheses = self._hypotheses(query, matches)
+        if not hypotheses:
+            return PoseEstimate("failed: no consistent pose", num_matches=len(point))
+        return self._estimate(query, matches, hypotheses, references)
+
+    def _hypotheses(self, query: "_Query", matches: "_Matches") -> "list[_Hypothesis]":
+        """Return refined poses, best supported first.
+
+        Repeated structure (a row of like windows) gives several poses that many descriptors agree with, and
+        RANSAC may take one of them or something in between. So unless the first is clear, others are sought, with a
+        tighter limit and among the matches that the first leaves over, and the guided matches decide: only the
+        right pose puts the rest of the map where it is seen.
+        """
+        settings = self.settings
+        everything = np.ones(len(matches), bool)
+        attempts = [
+            (settings.ransac_max_error_deg, False),
+            (settings.max_error_deg, False),
+            (settings.ransac_max_error_deg, True),
+        ]
+        found: list[_Hypothesis] = []
+        for max_error_deg, leave_out in attempts:
+            rest = everything
+            for hypothesis in found if leave_out else []:
+                rest = rest & ~self._inliers(query, hypothesis.rig_from_world, matches)
+            start = self._ransac(query, matches[rest], max_error_deg)
+            if start is not None:
+                found.append(self._improve(query, start, matches))
+                share = self._inliers(query, found[0].rig_from_world, matches).mean()
+                if share > settings.clear_inlier_ratio:
+                    break
+        return sorted(found, key=lambda hypothesis: -len(hypothesis.matches))
+
+    def _inliers(self, query: "_Query", rig_from_world: Floats, matches: "_Matches") -> NDArray[np.bool_]:
+        errors = query.errors_deg(rig_from_world, matches, self.map.points)
+        return errors < self.settings.ransac_max_error_deg
+
+    def _improve(self, query: "_Query", rig_from_world: Floats, matches: "_Matches") -> "_Hypothesis":
+        """Match again around a pose and refine it, as long as that finds support."""
+        best = _Hypothesis(rig_from_world, matches[self._inliers(query, rig_from_world, matches)])
+        least = max(4, 0.5 * len(np.unique(best.matches.point)))
+        for radius in self.settings.guided_radii_deg:
+            images = self._covisible(np.unique(best.matches.point))
+            near = self._match_guided(query, best.rig_from_world, images, radius)
+            pose = self._refine(query, best.rig_from_world, near) if len(near) >= least else None
+            if pose is None:
+                break
+            near = near[query.errors_deg(pose, near, self.map.points) < self.settings.max_error_deg]
+            pose = self._refine(query, pose, near) if len(near) >= least else None
+            if pose is None:
+                break
+            best = _Hypothesis(pose, near)
+        return best
+
+    def _estimate(
+        self,
+        query: "_Query",
+        matches: "_Matches",
+        hypotheses: "list[_Hypothesis]",
+        references: Sequence[Sequence[int]],
+    ) -> PoseEstimate:
+        """Judge the best pose by the matches that were made without it, and by its rivals."""
+        settings = self.settings
+        rig_from_world, guided = hypotheses[0].rig_from_world, hypotheses[0].matches
+        inliers = matches[self._inliers(query, rig_from_world, matches)]
+        # A point matched in several ways, or several points on one keypoint, are one piece of evidence.
+        keypoints = np.column_stack([inliers.camera, inliers.pixels])
+        independent = min(len(np.unique(inliers.point)), len(np.unique(keypoints, axis=0)))
+        if independent < settings.min_inliers:
+            reason = f"failed: too few inliers ({independent} within {settings.ransac_max_error_deg} deg)"
+            return PoseEstimate(reason, num_matches=len(matches), num_inliers=independent)
+        errors = query.errors_px(rig_from_world, guided, self.map.points)
+        asked = np.unique(np.concatenate([np.asarray(refs, np.int64) for refs in references]))
+        seen = self.map.images_seeing(np.unique(inliers.point))
+        estimate = PoseEstimate(
+            status="ok",
+            world_from_rig=geometry.invert(rig_from_world),
+            covariance=query.covariance(rig_from_world, guided, self.map.points, errors),
+            num_matches=len(matches),
+            num_inliers=independent,
+            num_guided=len(guided),
+            rmse_px=float(np.sqrt(np.mean(errors**2))) if len(errors) else float("nan"),
+            rival_support=self._rival_support(hypotheses),
+            references=tuple(int(index) for index in asked[seen[asked] > 0]),
+            camera_index=guided.camera,
+            pixels=guided.pixels,
+            point_index=guided.point,
+        )
+        certain = (
+            independent >= settings.ok_inliers
+            and estimate.position_std_m <= settings.ok_position_std_m  # False where unknown
+            and estimate.rival_support <= settings.ok_rival_support
+        )
+        return estimate if certain else replace(estimate, status="low_confidence")
+
+    def _rival_support(self, hypotheses: "list[_Hypothesis]") -> float:
+        """Return the support of the best pose that is another one, relative to the best pose's."""
+        first = hypotheses[0]
+        for other in hypotheses[1:]:
+            rotation_deg, distance_m = geometry.pose_error(first.world_from_rig, other.world_from_rig)
+            if rotation_deg > 1.0 or distance_m > 0.1:
+                return len(other.matches) / max(len(first.matches), 1)
+        return 0.0
+
+    def _match(self, query: "_Query", references: Sequence[Sequence[int]]) -> tuple[Ints, Ints, Ints]:
+        """Match each camera to its references by descriptors; returns camera, keypoint, point, each (K,)."""
+        found = []
+        for camera, (features, refs) in enumerate(zip(query.features, references, strict=True)):
+            descriptors = unit_descriptors(features.descriptors[: self.settings.max_query_features])
+            for reference in refs:
+                image = self._image(int(reference))
+                scores = similarity(descriptors, unit_descriptors(image.descriptors))
+                pairs = mutual_matches(scores, self.settings.ratio)
+                found.append(
+                    np.column_stack([np.full(len(pairs), camera), pairs[:, 0], image.points[pairs[:, 1]]])
+                )
+        unique = np.unique(np.concatenate(found), axis=0)
+        return unique[:, 0], unique[:, 1], unique[:, 2]
+
+    def _ransac(self, query: "_Query", matches: _Matches, max_error_deg: float) -> Floats | None:
+        """Return rig_from_world by LO-RANSAC, or None."""
+        if len(np.unique(matches.point)) < 4:
+            return None
+        options = pycolmap.RANSACOptions()
+        options.max_error = float(np.tan(np.radians(max_error_deg)) * query.focals_px.mean())
+        options.random_seed = self.settings.seed
+        options.min_num_trials = 100
+        options.max_num_trials = self.settings.ransac_max_trials
+        options.confidence = 0.9999
+        refinement = pycolmap.AbsolutePoseRefinementOptions()
+        points = self.map.points[matches.point]
+        if len(query.cameras) == 1:
+            estimation = pycolmap.AbsolutePoseEstimationOptions()
+            estimation.ransac = options
+            answer = pycolmap.estimate_and_refine_absolute_pose(
+                matches.pixels, points, query.cameras[0], estimation, refinement
+            )
+            return None if answer is None else query.rig_from_cams[0] @ _matrix(answer["cam_from_world"])
+        answer = pycolmap.estimate_and_refine_generalized_absolute_pose(
+            matches.pixels,
+            points,
+            matches.camera.tolist(),
+            query.cams_from_rig,
+            query.cameras,
+            options,
+            refinement,
+        )
+        return None if answer is None else _matrix(answer["rig_from_world"])
+
+    def _refine(self, query: "_Query", rig_from_world: Floats, matches: _Matches) -> Floats | None:
+        """Minimise the reprojection error of all matches, robustly (Cauchy, 1 px)."""
+        options = pycolmap.AbsolutePoseRefinementOptions()
+        points, mask = self.map.points[matches.point], np.ones(len(matches), bool)
+        if len(query.cameras) == 1:
+            start = pycolmap.Rigid3d((geometry.invert(query.rig_from_cams[0]) @ rig_from_world)[:3])
+            answer = pycolmap.refine_absolute_pose(
+                start, matches.pixels, points, mask, query.cameras[0], options
+            )
+            return None if answer is None else query.rig_from_cams[0] @ _matrix(answer["cam_from_world"])
+        answer = pycolmap.refine_generalized_absolute_pose(
+            pycolmap.Rigid3d(rig_from_world[:3]),
+            matches.pixels,
+            points,
+            mask,
+            matches.camera.tolist(),
+            query.cams_from_rig,
+            query.cameras,
+            options,
+        )
+        return None if answer is None else _matrix(answer["rig_from_world"])
+
+    def _covisible(self, points: Ints) -> Ints:
+        """Return the map images that see the most of the points, in a fixed order."""
+        seen = self.map.images_seeing(points)
+        order = np.argsort(-seen, kind="stable")[: self.settings.guided_images]
+        return order[seen[order] > 0]
+
+    def _match_guided(
+        self, query: "_Query", rig_from_world: Floats, images: Ints, radius_deg: float
+    ) -> _Matches:
+        """Match the points of map images near where the pose puts them."""
+        members = [self._image(int(index)) for index in images]
+        point = np.concatenate([member.points for member in members])
+        image = np.concatenate([np.full(len(m.points), i) for m, i in zip(members, images, strict=True)])
+        descriptors = np.concatenate([member.descriptors for member in members])
+        depth = np.einsum("oj,oj->o", self.map.cams_from_world[image, 2, :3], self.map.points[point])
+        depth += self.map.cams_from_world[image, 2, 3]
+        # Size of the feature on the surface, metres: it looks that large from everywhere.
+        size = np.concatenate([member.scales for member in members]) * depth / self.map.focals_px[image]
+        found: list[tuple[Ints, Floats, Ints]] = []
+        for camera, features in enumerate(query.features):
+            radius = np.tan(np.radians(radius_deg)) * query.focals_px[camera]
+            cam_from_world = geometry.invert(query.rig_from_cams[camera]) @ rig_from_world
+            in_cam = geometry.transform(cam_from_world, self.map.points[point])
+            visible = np.flatnonzero(in_view(in_cam[None], query.bounds[camera][None])[0])
+            if not len(visible) or not len(features):
+                continue
+            projected = np.asarray(query.cameras[camera].img_from_cam(in_cam[visible]))
+            visible, projected = (
+                visible[np.isfinite(projected).all(1)],
+                projected[np.isfinite(projected).all(1)],
+            )
+            near = KDTree(projected).sparse_distance_matrix(
+                query.trees[camera], radius, output_type="ndarray"
+            )
+            order = np.lexsort((near["j"], near["i"]))
+            observed, keypoint = visible[near["i"][order]], near["j"][order]
+            expected = size[observed] * query.focals_px[camera] / in_cam[observed, 2]
+            similar = np.abs(np.log2(features.scales[keypoint] / np.maximum(expected, 1e-6))) < 1.0
+            observed, keypoint = observed[similar], keypoint[similar]
+            score = np.einsum(
+                "od,od->o",
+                unit_descriptors(descriptors[observed]),
+                unit_descriptors(features.descriptors[keypoint]),
+            )
+            order = np.argsort(-score, kind="stable")
+            order = order[score[order] > self.settings.guided_min_score]
+            candidate, keypoint = point[observed[order]], keypoint[order]
+            # Best first: the first of each keypoint and of each point, where they are the same match.
+            first_of_keypoint = np.unique(keypoint, return_index=True)[1]
+            first_of_point = np.unique(candidate, return_index=True)[1]
+            mutual = np.intersect1d(first_of_keypoint, first_of_point)
+            pixels = features.keypoints[keypoint[mutual]].astype(np.float64)
+            found.append((np.full(len(mutual), camera), pixels, candidate[mutual]))
+        if not found:
+            return _Matches(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.int64))
+        cameras, pixels_of, points = zip(*found, strict=True)
+        return _Matches(np.concatenate(cameras), np.concatenate(pixels_of), np.concatenate(points))
+
+    def _image(self, index: int) -> _MapImage:
+        """Return the features of a map image that see points; the last 256 images are kept in memory."""
+        with self._lock:
+            if index in self._cache:
+                self._cache.move_to_end(index)
+                return self._cache[index]
+        keypoint, point = self.map.observations(index)
+        order = np.argsort(-self.map.track_lengths[point], kind="stable")[: self.settings.max_map_features]
+        features = self._features[self.map.image_names[index]]
+        image = _MapImage(
+            features.descriptors[keypoint[order]], point[order], features.scales[keypoint[order]]
+        )
+        with self._lock:
+            self._cache[index] = image
+            if len(self._cache) > 256:
+                self._cache.popitem(last=False)
+        return image
+
+
+def _matrix(rigid: pycolmap.Rigid3d) -> Floats:
+    return np.vstack([rigid.matrix(), [0.0, 0.0, 0.0, 1.0]])
+
+
+class _Query:
+    """The cameras of a query device, with what the steps above ask of them."""
+
+    def __init__(self, cameras: list[pycolmap.Camera], rig_from_cams: Floats, features: list[LocalFeatures]):
+        self.cameras = cameras
+        self.rig_from_cams = rig_from_cams
+        self.features = features
+        self.cams_from_rig = [pycolmap.Rigid3d(pose[:3]) for pose in geometry.invert(rig_from_cams)]
+        self.focals_px = np.array([camera.mean_focal_length() for camera in cameras])
+        self.bounds = np.stack([view_bounds(camera) for camera in cameras])
+        self.trees = [KDTree(f.keypoints) if len(f) else KDTree(np.zeros((1, 2)) - 1e9) for f in features]
+
+    def pixels(self, camera: Ints, keypoint: Ints) -> Floats:
+        pixels = np.zeros((len(camera), 2))
+        for index, features in enumerate(self.features):
+            pixels[camera == index] = features.keypoints[keypoint[camera == index]]
+        return pixels
+
+    def errors_px(self, rig_from_world: Floats, matches: _Matches, points: Floats) -> Floats:
+        """Return the reprojection errors (K,) of matches to points (P, 3), inf behind a camera."""
+        errors = np.full(len(matches), np.inf)
+        for index in np.unique(matches.camera):
+            part = matches.camera == index
+            cam_from_world = geometry.invert(self.rig_from_cams[index]) @ rig_from_world
+            in_cam = geometry.transform(cam_from_world, points[matches.point[part]])
+            projected = np.asarray(self.cameras[index].img_from_cam(in_cam))
+            error = np.linalg.norm(projected - matches.pixels[part], axis=1)
+            errors[part] = np.where((in_cam[:, 2] > 1e-3) & np.isfinite(error), error, np.inf)
+        return errors
+
+    def errors_deg(self, rig_from_world: Floats, matches: _Matches, points: Floats) -> Floats:
+        """Return the reprojection errors (K,) as angles."""
+        errors = self.errors_px(rig_from_world, matches, points)
+        return np.degrees(np.arctan(errors / self.focals_px[matches.camera]))
+
+    def covariance(
+        self, rig_from_world: Floats, matches: _Matches, points: Floats, errors_px: Floats
+    ) -> Floats | None:
+        """Return the covariance (6, 6) of the pose, from the spread of the errors; None where it is not defined.
+
+        For world_from_rig @ Exp(d), d = rotation (radians), translation (metres) in the rig's frame, as the
+        benchmark's poses have it: the noise acts on the right.
+        """
+        if len(matches) < 4:
+            return None
+        information = np.zeros((6, 6))
+        for index in np.unique(matches.camera):
+            part = matches.camera == index
+            cam_from_rig = geometry.invert(self.rig_from_cams[index])
+            in_rig = geometry.transform(rig_from_world, points[matches.point[part]])
+            in_cam = geometry.transform(cam_from_rig, in_rig)
+            # A motion d of the rig moves a point in it by -(rotation x point) - translation.
+            x, y, z = in_rig.T
+            zero = np.zeros_like(x)
+            skew = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
+            moved = np.concatenate([skew, np.broadcast_to(-np.eye(3), skew.shape)], axis=2)
+            moved = cam_from_rig[:3, :3] @ moved
+            u, v, depth = in_cam[:, 0], in_cam[:, 1], np.maximum(in_cam[:, 2], 1e-6)
+            inverse = self.focals_px[index] / depth
+            projection = np.zeros((len(x), 2, 3))
+            projection[:, 0, 0] = projection[:, 1, 1] = inverse
+            projection[:, 0, 2], projection[:, 1, 2] = -inverse * u / depth, -inverse * v / depth
+            jacobian = projection @ moved
+            information += np.einsum("oki,okj->ij", jacobian, jacobian)
+        if np.linalg.cond(information) > 1e14:
+            return None
+        # Two coordinates a point, six parameters.
+        variance = float((errors_px**2).sum()) / max(2 * len(matches) - 6, 1)
+        return np.asarray(np.linalg.inv(information) * variance, np.float64)

@@ -1,0 +1,476 @@
+"""The map: images with known poses, and points triangulated from matches between them."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from toolkit import geometry
+from toolkit.capture import Session
+from toolkit.errors import ArtefactError, ImageError
+from toolkit.features import FeatureStore, LocalFeatures
+from toolkit.files import is_current, write_atomic, write_sidecar
+from toolkit.images import prefetch, read_image
+from toolkit.matching import match_along_epipolar_lines, unit_descriptors
+
+Floats = NDArray[np.float64]
+
+
+def rays_of(camera: pycolmap.Camera, pixels: NDArray[np.floating]) -> Floats:
+    """Return unit rays (N, 3) in the camera's frame of pixels (N, 2)."""
+    if not len(pixels):
+        return np.zeros((0, 3))
+    rays = np.asarray(camera.cam_ray_from_img(np.asarray(pixels, np.float64)))
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def select_pairs(
+    world_from_cams: Floats,
+    cameras: Sequence[pycolmap.Camera],
+    groups: NDArray[np.int64],
+    per_image: int = 20,
+    depths_m: Sequence[float] = (2.0, 4.0, 8.0, 16.0),
+) -> NDArray[np.int64]:
+    """Choose the image pairs of a map that are worth matching, from the poses alone.
+
+    A pair is good if each camera sees what the other sees, under an angle that triangulates well. The depth of the
+    scene is not known, so points are laid at several depths into each view, and the share is counted that the other
+    camera sees too, weighted by the angle between the two lines of sight.
+
+    Args:
+        world_from_cams: (N, 4, 4).
+        cameras: N cameras.
+        groups: (N,) images of one group (the cameras of one rig at one instant) are never paired: they have
+            next to no baseline.
+        per_image: partners an image.
+        depths_m: depths at which points are laid, metres.
+
+    Returns:
+        (P, 2) indices, i < j, sorted.
+    """
+    n = len(world_from_cams)
+    if n < 2:
+        return np.zeros((0, 2), np.int64)
+    cams_from_world = geometry.invert(world_from_cams)
+    centers = world_from_cams[:, :3, 3]
+    bounds = np.stack([view_bounds(camera) for camera in cameras])  # (N, 4)
+    tree = KDTree(centers)
+    pairs: set[tuple[int, int]] = set()
+    steps = np.linspace(0.1, 0.9, 5)
+    for i in range(n):
+        # Far away cameras share no view at the depths considered; 200 candidates are plenty for 20 partners.
+        _, near = tree.query(centers[i], k=min(n, 200), distance_upper_bound=2 * max(depths_m))
+        near = near[near < n]
+        near = near[(groups[near] != groups[i]) & (near != i)]
+        if not len(near):
+            continue
+        x = bounds[i, 0] + steps * (bounds[i, 1] - bounds[i, 0])
+        y = bounds[i, 2] + steps * (bounds[i, 3] - bounds[i, 2])
+        rays = np.stack([*np.meshgrid(x, y), np.ones((len(y), len(x)))], -1).reshape(-1, 3)
+        points = geometry.transform(
+            world_from_cams[i], (rays * np.asarray(depths_m)[:, None, None]).reshape(-1, 3)
+        )
+        seen = in_view(geometry.transform(cams_from_world[near], points[None]), bounds[near])
+        to_i = _unit(centers[i] - points)
+        to_j = _unit(centers[near][:, None] - points)
+        angle_deg = np.degrees(np.arccos(np.clip((to_j * to_i).sum(-1), -1, 1)))
+        # Below 4 degrees depth is poor; beyond 30 descriptors stop matching.
+        weight = np.clip(angle_deg / 4, 0.1, 1) * np.clip((60 - angle_deg) / 30, 0, 1)
+        scores = (seen * weight).mean(axis=1)
+        order = np.argsort(-scores, kind="stable")[:per_image]
+        pairs.update((min(i, int(j)), max(i, int(j))) for j in near[order[scores[order] > 0.02]])
+    return np.array(sorted(pairs), np.int64).reshape(-1, 2)
+
+
+def view_bounds(camera: pycolmap.Camera) -> Floats:
+    """Return x_min, x_max, y_min, y_max of the view at depth 1."""
+    w, h = camera.width, camera.height
+    rays = rays_of(camera, np.array([[0, h / 2], [w, h / 2], [w / 2, 0], [w / 2, h]]))
+    rays = rays / np.maximum(rays[:, 2:], 0.2)  # views wider than 157 degrees are cut there
+    return np.array([rays[0, 0], rays[1, 0], rays[2, 1], rays[3, 1]])
+
+
+def in_view(points_in_cams: Floats, bounds: Floats) -> NDArray[np.bool_]:
+    """Tell which points (J, P, 3) in the cameras' frames lie in the cameras' views (J, 4)."""
+    z = points_in_cams[..., 2]
+    x, y = points_in_cams[..., 0] / np.maximum(z, 1e-6), points_in_cams[..., 1] / np.maximum(z, 1e-6)
+    b = bounds[:, None]
+    return (z > 0.1) & (x > b[..., 0]) & (x < b[..., 1]) & (y > b[..., 2]) & (y < b[..., 3])
+
+
+def _unit(vectors: Floats) -> Floats:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+
+
+def match_pairs(
+    pairs: NDArray[np.int64],
+    features: Sequence[LocalFeatures],
+    cameras: Sequence[pycolmap.Camera],
+    world_from_cams: Floats,
+    max_error_px: float = 4.0,
+    ratio: float = 0.9,
+) -> list[NDArray[np.int64]]:
+    """Match the features of image pairs whose poses are known, along epipolar lines only.
+
+    Returns:
+        For each pair (K, 2) indices of matched features.
+    """
+    cams_from_world = geometry.invert(world_from_cams)
+    rays = [rays_of(camera, f.keypoints) for camera, f in zip(cameras, features, strict=True)]
+    descriptors = [unit_descriptors(f.descriptors) for f in features]
+    angles = [max_error_px / camera.mean_focal_length() for camera in cameras]
+    result = []
+    for i, j in pairs:
+        j_from_i = cams_from_world[j] @ world_from_cams[i]
+        result.append(
+            match_along_epipolar_lines(
+                descriptors[i], descriptors[j], rays[i], rays[j], j_from_i, angles[i], angles[j], ratio
+            )
+        )
+    return result
+
+
+@dataclass(frozen=True)
+class MapSettings:
+    """How a map is triangulated; part of every fingerprint that rests on it."""
+
+    pairs_per_image: int = 20
+    """Partners that an image is matched with."""
+    max_epipolar_error_px: float = 4.0
+    """Largest distance of a match to its epipolar line, at either side."""
+    ratio: float = 0.9
+    """Lowe's ratio, among the candidates along the epipolar line."""
+    max_reprojection_error_px: float = 4.0
+    """Observations further off are taken out of a point's track."""
+    min_triangulation_angle_deg: float = 1.5
+    """Points seen under a smaller angle are dropped: their depth is not known."""
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class LocalMap:
+    """Posed images and the points triangulated from them, as arrays.
+
+    Observations are sorted by image; observation o says that keypoint `obs_keypoint[o]` of image `obs_image[o]` sees
+    point `obs_point[o]`.
+    """
+
+    image_names: list[str]
+    """N names (`Session.image_name`)."""
+    cameras: list[pycolmap.Camera]
+    """N cameras, with distortion, as in the capture."""
+    world_from_cams: Floats
+    """(N, 4, 4)."""
+    points: Floats
+    """(P, 3) in the world, metres."""
+    colors: NDArray[np.uint8]
+    """(P, 3) RGB."""
+    obs_image: NDArray[np.int64]
+    obs_keypoint: NDArray[np.int64]
+    obs_point: NDArray[np.int64]
+
+    @cached_property
+    def index_of(self) -> dict[str, int]:
+        """Index of an image by its name."""
+        return {name: index for index, name in enumerate(self.image_names)}
+
+    @cached_property
+    def cams_from_world(self) -> Floats:
+        return geometry.invert(self.world_from_cams)
+
+    @cached_property
+    def focals_px(self) -> Floats:
+        return np.array([camera.mean_focal_length() for camera in self.cameras])
+
+    @cached_property
+    def track_lengths(self) -> NDArray[np.int64]:
+        """(P,) images that see each point."""
+        return np.bincount(self.obs_point, minlength=len(self.points))
+
+    @cached_property
+    def _image_starts(self) -> NDArray[np.int64]:
+        return np.searchsorted(self.obs_image, np.arange(len(self.image_names) + 1))
+
+    @cached_property
+    def _by_point(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        order = np.argsort(self.obs_point, kind="stable")
+        return order, np.searchsorted(self.obs_point[order], np.arange(len(self.points) + 1))
+
+    def observations(self, image: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the keypoints (n,) of an image that see a point, and the points (n,)."""
+        part = slice(self._image_starts[image], self._image_starts[image + 1])
+        return self.obs_keypoint[part], self.obs_point[part]
+
+    def images_seeing(self, points: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return how many of the given points each image sees, (N,)."""
+        order, starts = self._by_point
+        seen = np.concatenate([order[starts[p] : starts[p + 1]] for p in points] or [np.zeros(0, np.int64)])
+        return np.bincount(self.obs_image[seen], minlength=len(self.image_names))
+
+    def save(self, path: str | Path) -> None:
+        """Write the map as one `.npz` file."""
+        cameras = [
+            f"{c.model.name}, {c.width}, {c.height}, " + ", ".join(repr(float(p)) for p in c.params)
+            for c in self.cameras
+        ]
+        arrays: dict[str, Any] = {
+            "image_names": np.array(self.image_names, np.str_),
+            "cameras": np.array(cameras, np.str_),
+        }
+        for name in ("world_from_cams", "points", "colors", "obs_image", "obs_keypoint", "obs_point"):
+            arrays[name] = getattr(self, name)
+        with write_atomic(path) as temporary, open(temporary, "wb") as stream:
+            np.savez(stream, **arrays)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "LocalMap":
+        """Read a map.
+
+        Raises:
+            ArtefactError: the file is missing or torn.
+        """
+        try:
+            with np.load(path) as arrays:
+                data = {name: arrays[name] for name in arrays.files}
+            names, cameras = data.pop("image_names").tolist(), data.pop("cameras").tolist()
+            return cls(image_names=names, cameras=[_camera(text) for text in cameras], **data)
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ArtefactError(
+                f"The triangulated map {path} cannot be read ({error}). Build it with the localize stage."
+            ) from None
+
+
+def _camera(text: str) -> pycolmap.Camera:
+    model, width, height, *params = [word.strip() for word in text.split(",")]
+    return pycolmap.Camera(
+        model=model, width=int(width), height=int(height), params=[float(p) for p in params]
+    )
+
+
+def triangulate(
+    names: Sequence[str],
+    cameras: Sequence[pycolmap.Camera],
+    world_from_cams: Floats,
+    keypoints: Sequence[NDArray[np.float32]],
+    pairs: NDArray[np.int64],
+    matches: Sequence[NDArray[np.int64]],
+    settings: MapSettings | None = None,
+) -> LocalMap:
+    """Triangulate points from matches between images with known poses, which stay as they are.
+
+    COLMAP's triangulator builds the tracks; the points are then refined here, all at once: with fixed poses each
+    is a problem of its own, which a bundle adjuster does not exploit (16 s against 0.3 s for 65,000 points).
+
+    Args:
+        names, cameras, world_from_cams: N images, (N, 4, 4).
+        keypoints: for each image (n, 2), pixels.
+        pairs: (Q, 2) pairs of images.
+        matches: for each pair (K, 2) indices of keypoints.
+
+    Returns:
+        The map, its points not yet coloured.
+    """
+    settings = settings or MapSettings()
+    graph = pycolmap.CorrespondenceGraph()
+    reconstruction = pycolmap.Reconstruction()
+    for index, (name, camera, cam_from_world, xy) in enumerate(
+        zip(names, cameras, geometry.invert(world_from_cams), keypoints, strict=True), start=1
+    ):
+        camera = pycolmap.Camera(camera.todict() | {"camera_id": index})
+        reconstruction.add_camera_with_trivial_rig(camera)
+        points2D = pycolmap.Point2DList([pycolmap.Point2D(p) for p in np.asarray(xy, np.float64)])
+        image = pycolmap.Image(name=name, camera_id=index, image_id=index, points2D=points2D)
+        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(cam_from_world[:3]))
+        graph.add_image(index, len(xy))
+    for (i, j), found in zip(pairs, matches, strict=True):
+        if len(found):
+            two_view = pycolmap.TwoViewGeometry()
+            # COLMAP silently ignores matches whose configuration is not set
+            two_view.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+            two_view.inlier_matches = found.astype(np.uint32)
+            graph.add_two_view_geometry(int(i) + 1, int(j) + 1, two_view)
+    graph.finalize()
+    observed = pycolmap.ObservationManager(reconstruction, graph)
+    triangulator = pycolmap.IncrementalTriangulator(graph, reconstruction, observed)
+    options = pycolmap.IncrementalTriangulatorOptions()
+    options.random_seed = settings.seed
+    options.ignore_two_view_tracks = False
+    options.min_angle = settings.min_triangulation_angle_deg
+    for index in range(1, len(names) + 1):
+        triangulator.triangulate_image(options, index)
+    triangulator.complete_all_tracks(options)
+    triangulator.merge_all_tracks(options)
+    observed.filter_all_points3D(settings.max_reprojection_error_px, settings.min_triangulation_angle_deg)
+    tracks = sorted(reconstruction.points3D.items())
+    points = np.array([point.xyz for _, point in tracks]).reshape(-1, 3)
+    observations = np.array(
+        [
+            (element.image_id - 1, element.point2D_idx, index)
+            for index, (_, point) in enumerate(tracks)
+            for element in point.track.elements
+        ],
+        np.int64,
+    ).reshape(-1, 3)
+    observations = observations[np.lexsort((observations[:, 1], observations[:, 0]))]
+    points, observations = _refine_points(points, observations, cameras, world_from_cams, keypoints, settings)
+    return LocalMap(
+        image_names=list(names),
+        cameras=list(cameras),
+        world_from_cams=np.asarray(world_from_cams, np.float64),
+        points=points,
+        colors=np.full((len(points), 3), 128, np.uint8),
+        obs_image=observations[:, 0],
+        obs_keypoint=observations[:, 1],
+        obs_point=observations[:, 2],
+    )
+
+
+def _refine_points(
+    points: Floats,
+    observations: NDArray[np.int64],
+    cameras: Sequence[pycolmap.Camera],
+    world_from_cams: Floats,
+    keypoints: Sequence[NDArray[np.float32]],
+    settings: MapSettings,
+    iterations: int = 8,
+) -> tuple[Floats, NDArray[np.int64]]:
+    """Minimise the reprojection errors of each point under a Cauchy loss of 1 px, by Gauss-Newton on all at once.
+
+    Errors are measured on the undistorted image plane, times the focal length. Observations beyond the limit are
+    dropped, and then points that fewer than two images see.
+    """
+    if not len(points):
+        return points, observations
+    cams_from_world = geometry.invert(world_from_cams)
+    image, keypoint, _ = observations.T
+    plane = np.zeros((len(observations), 2))
+    focal = np.array([camera.mean_focal_length() for camera in cameras])[image]
+    starts = np.searchsorted(image, np.arange(len(cameras) + 1))
+    for index, camera in enumerate(cameras):
+        part = slice(starts[index], starts[index + 1])
+        rays = rays_of(camera, keypoints[index][keypoint[part]])
+        plane[part] = rays[:, :2] / np.maximum(rays[:, 2:], 1e-3)
+    rotation, translation = cams_from_world[image, :3, :3], cams_from_world[image, :3, 3]
+
+    def residuals(xyz: Floats, obs: NDArray[np.int64]) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+        in_cam = np.einsum("oij,oj->oi", rotation, xyz[obs[:, 2]]) + translation
+        z = np.maximum(in_cam[:, 2], 1e-3)
+        return (in_cam[:, :2] / z[:, None] - plane) * focal[:, None], in_cam, in_cam[:, 2] > 1e-3
+
+    count = len(points)
+    for _ in range(iterations):
+        error, in_cam, _ = residuals(points, observations)
+        z = np.maximum(in_cam[:, 2], 1e-3)
+        # d(x/z, y/z)/d(world point) = (R0 - x/z R2) / z, (R1 - y/z R2) / z
+        jacobian = (rotation[:, :2] - (in_cam[:, :2] / z[:, None])[..., None] * rotation[:, 2:3]) / z[
+            :, None, None
+        ]
+        jacobian *= focal[:, None, None]
+        weight = 1.0 / (1.0 + (error**2).sum(1))
+        hessian = np.einsum("o,oki,okj->oij", weight, jacobian, jacobian).reshape(-1, 9)
+        gradient = np.einsum("o,oki,ok->oi", weight, jacobian, error)
+        H = np.stack([np.bincount(observations[:, 2], h, count) for h in hessian.T], -1).reshape(-1, 3, 3)
+        g = np.stack([np.bincount(observations[:, 2], d, count) for d in gradient.T], -1)
+        # A little damping keeps points with a poor depth from jumping.
+        H += 1e-6 * np.trace(H, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
+        points = points - np.linalg.solve(H, g[..., None])[..., 0]
+    error, _, in_front = residuals(points, observations)
+    good = in_front & ((error**2).sum(1) < settings.max_reprojection_error_px**2)
+    kept = observations[good]
+    # Keypoints of one image at one place (two orientations) are one view.
+    views = np.unique(kept[:, [0, 2]], axis=0)[:, 1]
+    seen = np.bincount(views, minlength=count) >= 2
+    seen &= np.isfinite(points).all(axis=1)
+    new_index = np.cumsum(seen) - 1
+    kept = kept[seen[kept[:, 2]]]
+    kept[:, 2] = new_index[kept[:, 2]]
+    return points[seen], kept
+
+
+def build_map(
+    session: Session,
+    features: FeatureStore,
+    path: str | Path,
+    settings: MapSettings | None = None,
+    skip_existing: bool = True,
+    inputs: str = "",
+) -> LocalMap:
+    """Triangulate the map of a session from its poses, or load the one at `path` if it is current.
+
+    Args:
+        session: a map session.
+        features: local features of its images; images that could not be read are left out.
+        path: the `.npz` file of the map.
+        settings: how to triangulate.
+        skip_existing: reuse the file if it was made from the same features, poses and settings.
+        inputs: fingerprint of what the features and poses were made from.
+
+    Raises:
+        ArtefactError: no image has both a pose and features.
+    """
+    settings = settings or MapSettings()
+    record = {"map": asdict(settings), "inputs": inputs}
+    if skip_existing and is_current(path, record):
+        return LocalMap.load(path)
+    names = [session.image_name(row) for row in range(len(session.images))]
+    poses = session.world_from_cam()
+    rows = np.array(
+        [row for row, name in enumerate(names) if name in features and np.isfinite(poses[row]).all()],
+        np.int64,
+    )
+    if not len(rows):
+        raise ArtefactError(
+            f"Session {session.id} has no image with both a pose and local features; nothing to map."
+        )
+    sensor_ids = session.images["sensor_id"].to_numpy()
+    cameras = [session.camera(sensor_ids[row]) for row in rows]
+    devices = session.images["timestamp"].astype(str) + " " + session.device_ids
+    groups = np.unique(devices.to_numpy(str)[rows], return_inverse=True)[1]
+    found = [features[names[row]] for row in rows]
+    pairs = select_pairs(poses[rows], cameras, groups, settings.pairs_per_image)
+    matches = match_pairs(pairs, found, cameras, poses[rows], settings.max_epipolar_error_px, settings.ratio)
+    local_map = triangulate(
+        [names[row] for row in rows],
+        cameras,
+        poses[rows],
+        [f.keypoints for f in found],
+        pairs,
+        matches,
+        settings,
+    )
+    local_map = _colored(local_map, session, rows, [f.keypoints for f in found])
+    local_map.save(path)
+    write_sidecar(path, record)
+    return local_map
+
+
+def _colored(
+    local_map: LocalMap, session: Session, rows: NDArray[np.int64], keypoints: Sequence[NDArray[np.float32]]
+) -> LocalMap:
+    """Return the map with each point in the colour of its first observation."""
+    _, first = np.unique(local_map.obs_point, return_index=True)
+    colors = local_map.colors.copy()
+    images = local_map.obs_image[first]
+
+    def read(index: int) -> NDArray[np.uint8] | None:
+        try:
+            return read_image(session.image_path(int(rows[index])))
+        except ImageError:
+            return None
+
+    wanted = np.unique(images)
+    for index, pixels in zip(wanted, prefetch(read, wanted.tolist()), strict=True):
+        obs = first[images == index]
+        if pixels is not None:
+            xy = keypoints[index][local_map.obs_keypoint[obs]].astype(np.int64)
+            height, width = pixels.shape[:2]
+            colors[local_map.obs_point[obs]] = pixels[
+                np.clip(xy[:, 1], 0, height - 1), np.clip(xy[:, 0], 0, width - 1)
+            ]
+    return replace(local_map, colors=colors)

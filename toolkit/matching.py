@@ -1,0 +1,142 @@
+"""Match local features between images: mutual nearest neighbours, narrowed by whatever is known of the geometry."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from toolkit.features import DESCRIPTOR_SCALE
+
+Floats = NDArray[np.float64]
+
+
+def unit_descriptors(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return descriptors (N, 128) as float32 of length about 1, ready for dot products."""
+    return descriptors.astype(np.float32) * np.float32(1.0 / DESCRIPTOR_SCALE)
+
+
+def similarity(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the cosine similarities (N, M) of unit descriptors (N, D) and (M, D)."""
+    return a @ b.T
+
+
+def mutual_matches(
+    scores: NDArray[np.float32], ratio: float = 0.8, min_score: float = -1.0
+) -> NDArray[np.int64]:
+    """Return mutual nearest neighbours whose rows pass Lowe's ratio test.
+
+    Args:
+        scores: (N, M) cosine similarities; candidates that geometry excludes are below -1.
+        ratio: the nearest must be closer than `ratio` times the second nearest, as Euclidean distance.
+        min_score: least cosine similarity of a match.
+
+    Returns:
+        (K, 2) indices into the rows and the columns.
+    """
+    n, m = scores.shape
+    if n == 0 or m == 0:
+        return np.zeros((0, 2), np.int64)
+    best, second = _two_best(scores)
+    rows = np.arange(n)
+    top = scores[rows, best]
+    # |a - b|^2 = 2 - 2 a.b for unit vectors
+    keep = np.flatnonzero(((1.0 - top) < ratio**2 * (1.0 - second)) & (top > min_score))
+    # Only the columns that are somebody's best need to be looked at from the other side.
+    keep = keep[np.argmax(scores[:, best[keep]], axis=0) == keep]
+    return np.stack([keep, best[keep]], axis=1)
+
+
+def _two_best(scores: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Return the best column of each row, (N,), and the second best score, (N,), -1 where there is none."""
+    best = np.argmax(scores, axis=1)
+    if scores.shape[1] == 1:
+        return best, np.full(len(scores), -1.0, np.float32)
+    rows = np.arange(len(scores))
+    top = scores[rows, best]
+    scores[rows, best] = -2.0
+    second = np.maximum(scores.max(axis=1), np.float32(-1.0))
+    scores[rows, best] = top
+    return best, second
+
+
+def match_along_epipolar_lines(
+    descriptors_a: NDArray[np.float32],
+    descriptors_b: NDArray[np.float32],
+    rays_a: Floats,
+    rays_b: Floats,
+    b_from_a: Floats,
+    max_angle_a: float,
+    max_angle_b: float,
+    ratio: float = 0.9,
+    min_score: float = 0.6,
+) -> NDArray[np.int64]:
+    """Match two images whose poses are known, comparing only what can be the same point.
+
+    The planes through both camera centres turn about the baseline. Two rays can meet only if they lie in one
+    half-plane, so rays are sorted by the angle of itss and each is compared with its neighbours in that order
+    alone: some hundredths of all pairs. Works on rays, so for every central camera model.
+
+    Args:
+        descriptors_a, descriptors_b: (N, D), (M, D) unit descriptors.
+        rays_a, rays_b: (N, 3), (M, 3) unit rays in the cameras' frames.
+        b_from_a: (4, 4) relative pose, metres.
+        max_angle_a, max_angle_b: largest angle of a ray to the other's epipolar plane, radians.
+        ratio: the nearest must be closer than `ratio` times the second nearest of the candidates.
+        min_score: least cosine similarity of a match.
+
+    Returns:
+        (K, 2) indices of matched features; none where the cameras share one place.
+    """
+    baseline = np.linalg.norm(b_from_a[:3, 3])
+    if baseline < 1e-6 or not len(rays_a) or not len(rays_b):
+        return np.zeros((0, 2), np.int64)
+    axis = b_from_a[:3, 3] / baseline  # from b towards a, in b
+    turn_a, elevation_a = _about_axis(rays_a @ b_from_a[:3, :3].T, axis)
+    turn_b, elevation_b = _about_axis(rays_b, axis)
+    # The same sideways error is a larger turn close to the epipole.
+    reach_a = np.arcsin(np.minimum(max_angle_a / np.maximum(np.sin(elevation_a), 1e-9), 1.0))
+    reach_b = np.arcsin(np.minimum(max_angle_b / np.maximum(np.sin(elevation_b), 1e-9), 1.0))
+    order_a = np.argsort(turn_a, kind="stable")
+    order_b = np.argsort(turn_b, kind="stable")
+    # Turns wrap around: b is laid out three times so that every window is one slice.
+    m = len(order_b)
+    wrapped = np.concatenate([turn_b[order_b] - 2 * np.pi, turn_b[order_b], turn_b[order_b] + 2 * np.pi])
+    row_best = np.full(len(rays_a), -1, np.int64)
+    column_best = np.full(m, -1, np.int64)
+    column_score = np.full(m, -2.0, np.float32)
+    slack = max_angle_a + max_angle_b
+    for start in range(0, len(order_a), 64):
+        rows = order_a[start : start + 64]
+        low = np.searchsorted(wrapped, (turn_a[rows] - reach_a[rows]).min())
+        high = np.searchsorted(wrapped, (turn_a[rows] + reach_a[rows]).max())
+        if high - low > m:
+            low, high = m, 2 * m
+        if high <= low:
+            continue
+        columns = order_b[np.arange(low, high) % m]
+        apart = np.abs(turn_a[rows, None] - wrapped[None, low:high])
+        apart = np.minimum(apart, 2 * np.pi - apart)
+        # In their half-plane the rays meet in front of both cameras only if b's opens wider, seen from the axis.
+        allowed = (apart < np.minimum(reach_a[rows, None], reach_b[columns])) & (
+            elevation_b[columns] < elevation_a[rows, None] + slack
+        )
+        scores = np.where(allowed, descriptors_a[rows] @ descriptors_b[columns].T, np.float32(-2.0))
+        best, second = _two_best(scores)
+        top = scores[np.arange(len(rows)), best]
+        good = (top > min_score) & ((1.0 - top) < ratio**2 * (1.0 - second))
+        row_best[rows[good]] = columns[best[good]]
+        winners = np.argmax(scores, axis=0)
+        winning = scores[winners, np.arange(len(columns))]
+        better = winning > column_score[columns]
+        column_best[columns[better]] = rows[winners[better]]
+        column_score[columns[better]] = winning[better]
+    matched = np.flatnonzero(row_best >= 0)
+    matched = matched[column_best[row_best[matched]] == matched]
+    return np.stack([matched, row_best[matched]], axis=1)
+
+
+def _about_axis(rays: Floats, axis: Floats) -> tuple[Floats, Floats]:
+    """Return the angles of rays (N, 3) about a unit axis and from it, radians, each (N,)."""
+    helper = np.eye(3)[np.argmin(np.abs(axis))]
+    x = np.cross(axis, helper)
+    x /= np.linalg.norm(x)
+    y = np.cross(axis, x)
+    return np.arctan2(rays @ y, rays @ x), np.arccos(np.clip(rays @ axis, -1.0, 1.0))
