@@ -1,0 +1,268 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from toolkit.capture import Trajectory, write_session
+from toolkit.errors import ToolkitError
+from toolkit.evaluate import draw_evaluation, evaluate_scene, pose_errors, recall
+from toolkit.geometry import make_pose, pose_error
+
+CAMERA = ("camera", "PINHOLE", "640", "480", "500", "500", "320", "240")
+# Two cameras a metre to either side of the rig's origin, so that a turn of the rig moves them.
+RIG_FROM_CAM = {"left": make_pose(np.eye(3), [-1, 0, 0]), "right": make_pose(np.eye(3), [1, 0, 0])}
+
+
+def turned(degrees: float, axis: str = "z") -> np.ndarray:
+    """Return a rotation about an axis."""
+    angle = np.radians(degrees)
+    c, s = np.cos(angle), np.sin(angle)
+    rotation = {"z": [[c, -s, 0], [s, c, 0], [0, 0, 1]], "y": [[c, 0, s], [0, 1, 0], [-s, 0, c]]}[axis]
+    return np.array(rotation)
+
+
+def pose(x: float = 0, degrees: float = 0, axis: str = "z") -> np.ndarray:
+    return make_pose(turned(degrees, axis), [x, 0, 0])
+
+
+def write_capture(root: Path, ground_truth: bool = True) -> Path:
+    """Write a capture `TINY`: ios and hl maps, four ios and two hl (rig) queries, each 10 m apart."""
+    sessions = root / "TINY" / "sessions"
+    for device, sensors in (("ios", ["phone"]), ("hl", ["left", "right"])):
+        for split, count in (("map", 4), ("query", 4 if device == "ios" else 2)):
+            times = np.arange(count)
+            rig = device == "hl"
+            ids = ["rig" if rig else "phone"] * count
+            truth = Trajectory.from_poses(times, ids, np.stack([pose(10.0 * t) for t in times]))
+            given = truth if split == "map" or ground_truth else None
+            keys = pd.DataFrame({"timestamp": times, "device_id": ids})
+            write_session(
+                sessions / f"{device}_{split}",
+                [(s, s, *CAMERA) for s in sensors],
+                [("rig", s, RIG_FROM_CAM[s]) for s in sensors] if rig else None,
+                given if split == "map" else None,
+                [(int(t), s, f"{s}/{t}.jpg") for t in times for s in sensors],
+                keyframes={"pruned_subsampled": keys} if split == "query" else None,
+                ground_truth=given if split == "query" else None,
+            )
+    return sessions
+
+
+def write_poses(
+    folder: Path, pair: str, rows: list[tuple[int, str, np.ndarray | None, str]], table: bool = True
+) -> None:
+    """Write poses of a pair: rows (timestamp, device id, pose or None, status)."""
+    found = [row for row in rows if row[2] is not None]
+    trajectory = Trajectory.from_poses(
+        [r[0] for r in found], [r[1] for r in found], np.array([r[2] for r in found]).reshape(-1, 4, 4)
+    )
+    trajectory.write(folder / f"TINY_{pair}.txt")
+    if table:
+        details = pd.DataFrame(rows, columns=["timestamp", "device_id", "pose", "status"])
+        details.drop(columns="pose").assign(num_inliers=10).to_csv(folder / f"TINY_{pair}.csv", index=False)
+
+
+def write_references(folder: Path, pair: str, found: dict[tuple[int, str, str], list[np.ndarray]]) -> None:
+    """Write references of a pair: for (timestamp, device id, sensor id), world_from_cam of the map images."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lines = []
+    for (time, device, sensor), poses in found.items():
+        trs = RIG_FROM_CAM.get(sensor, np.eye(4)).tolist()
+        topk = [{"rank": k, "score": 1.0, "Tws": p.tolist()} for k, p in enumerate(poses)]
+        line = {"timestamp": str(time), "device_id": device, "sensor_id": sensor, "Trs": trs, "topk": topk}
+        lines.append(json.dumps(line))
+    (folder / f"TINY_{pair}.jsonl").write_text("\n".join(lines) + "\n")
+
+
+IOS = "map_ios_query_ios"
+
+
+def test_errors_have_known_values():
+    true = np.stack([pose(), pose(2, 30), pose(), pose()])
+    estimated = np.stack([pose(0.3), pose(2, 37), pose(degrees=180), pose(-1, 90)])
+    rotation, translation = pose_errors(estimated, true)
+    np.testing.assert_allclose(rotation, [0, 7, 180, 90], atol=1e-9)
+    np.testing.assert_allclose(translation, [0.3, 0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(pose_error(estimated, true), (rotation, translation))
+
+
+def test_missing_pose_is_infinitely_wrong_and_missing_truth_is_unknown():
+    nothing = np.full((4, 4), np.nan)
+    rotation, translation = pose_errors(np.stack([nothing, pose()]), np.stack([pose(), nothing]))
+    assert np.isinf(rotation[0])
+    assert np.isinf(translation[0])
+    assert np.isnan(rotation[1])
+    assert np.isnan(translation[1])
+
+
+def test_trajectories_are_joined_on_time_and_device():
+    keys = pd.DataFrame({"timestamp": [1, 1, 2], "device_id": ["a", "b", "a"]})
+    truth = Trajectory.from_poses([1, 1, 2], ["a", "b", "a"], np.stack([pose(), pose(5), pose(9)]))
+    estimated = Trajectory.from_poses([1, 1], ["b", "a"], np.stack([pose(5), pose(1)]))
+    np.testing.assert_allclose(pose_errors(estimated, truth, keys)[1], [1, 0, np.inf])
+    with pytest.raises(ValueError, match="keys"):
+        pose_errors(estimated, truth)
+
+
+def test_threshold_is_strict_on_both_errors():
+    rotation, translation = np.array([0.5, 1.0, 0.5, 0.5]), np.array([0.05, 0.05, 0.1, np.inf])
+    assert recall(rotation, translation, [(1, 0.1)])[0] == 0.25
+    assert recall(rotation, translation, [(1.001, 0.1001)])[0] == 0.75
+    assert np.isnan(recall(np.zeros(0), np.zeros(0))).all()
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """Sessions, poses and references: one ios query right, one without reference, one failed, one wrong."""
+    sessions = write_capture(tmp_path)
+    poses, references = tmp_path / "poses", tmp_path / "retrieval"
+    write_poses(
+        poses,
+        IOS,
+        [
+            (0, "phone", pose(0.01), "ok"),
+            (1, "phone", pose(13.0), "low_confidence"),
+            (2, "phone", None, "failed: too few inliers"),
+            (3, "phone", pose(30.2), "ok"),
+        ],
+    )
+    write_references(
+        references,
+        IOS,
+        {
+            (0, "phone", "phone"): [pose(30), pose(0, 90), pose(0)],  # a roll about the view does not matter
+            (1, "phone", "phone"): [pose(30), pose(10, 90, "y")],  # near, but looks elsewhere
+            (2, "phone", "phone"): [pose(20)],
+            (3, "phone", "phone"): [pose(31)],
+        },
+    )
+    return sessions, poses, references
+
+
+def evaluate_ios(scene, **options):
+    return evaluate_scene(*scene, options.pop("out", None), map_device="ios", query_device="ios", **options)
+
+
+def test_scene_tables(scene, tmp_path):
+    result = evaluate_ios(scene, retrieval_radius_m=5, retrieval_ks=(1, 2), out=tmp_path / "out")
+    (row,) = result.recall.to_dict("records")
+    assert row["state"] == "evaluated"
+    counts = [row[c] for c in ("queries", "localized", "ok", "low_confidence", "failed")]
+    assert counts == [4, 3, 2, 1, 1]
+    assert [row[f"recall@({t})"] for t in ("1deg,0.1m", "5deg,0.5m", "5deg,1m")] == [0.25, 0.5, 0.5]
+    assert row["median_translation_m"] == pytest.approx((0.2 + 3) / 2)
+    assert row["ok_wrong"] == 0
+    (found,) = result.retrieval.to_dict("records")
+    assert [found["recall@1"], found["recall@2"], found["in_map"]] == [0.5, 0.75, 1.0]
+    losses = result.losses.set_index("threshold")
+    reasons = ["missed", "no good reference", "no pose", "wrong pose"]
+    assert losses.loc["(1deg,0.1m)", reasons].tolist() == [3, 1, 1, 1]
+    assert losses.loc["(5deg,0.5m)", reasons].tolist() == [2, 1, 1, 0]
+    assert result.errors["loss@(1deg,0.1m)"].tolist() == ["", "no good reference", "no pose", "wrong pose"]
+    assert not result.messages
+    for name in ("recall", "errors", "retrieval", "losses"):
+        written = pd.read_csv(tmp_path / "out" / f"{name}.csv")
+        assert len(written) == len(getattr(result, name))
+    for name in ("recall", "median_errors", "error_curves", "losses", "retrieval"):
+        assert (tmp_path / "out" / f"{name}.png").stat().st_size > 1000
+
+
+def test_nothing_lost_leaves_no_figure_of_losses(scene, tmp_path):
+    evaluate_ios(scene, out=tmp_path)
+    assert (tmp_path / "losses.png").is_file()
+    write_poses(scene[1], IOS, [(t, "phone", pose(10.0 * t), "ok") for t in range(4)])
+    result = evaluate_ios(scene, out=tmp_path)
+    assert result.recall["recall@(1deg,0.1m)"].item() == 1
+    assert not (tmp_path / "losses.png").exists()
+
+
+def test_wrong_pose_called_ok_is_counted(scene):
+    write_poses(scene[1], IOS, [(t, "phone", pose(10.0 * t + (t == 3)), "ok") for t in range(4)])
+    assert evaluate_ios(scene).recall["ok_wrong"].item() == 0.25
+
+
+def test_median_is_infinite_where_most_have_no_pose(scene):
+    rows = [(0, "phone", pose(), "ok")] + [(t, "phone", None, "failed: x") for t in (1, 2, 3)]
+    write_poses(scene[1], IOS, rows)
+    result = evaluate_ios(scene)
+    assert np.isinf(result.recall["median_rotation_deg"].item())
+    assert draw_evaluation(result)
+
+
+def test_poses_of_another_tool_need_no_table(scene):
+    (scene[1] / f"TINY_{IOS}.csv").unlink()
+    (row,) = evaluate_ios(scene).recall.to_dict("records")
+    assert [row["state"], row["ok"], row["failed"]] == ["evaluated", 3, 1]
+
+
+def test_table_of_other_queries_is_named_stale(scene):
+    write_poses(scene[1], IOS, [(0, "phone", pose(), "ok")])
+    result = evaluate_ios(scene)
+    assert result.recall["state"].item().startswith("stale: 1 of 4 queries")
+    assert result.recall["recall@(1deg,0.1m)"].item() == 0.25
+    assert len(result.messages) == 1
+
+
+def test_camera_errors_follow_the_rig(tmp_path):
+    sessions, poses = write_capture(tmp_path), tmp_path / "poses"
+    rows = [(0, "rig", make_pose(turned(4, "y"), [0, 0, 0]), "ok"), (1, "rig", None, "failed: x")]
+    write_poses(poses, "map_hl_query_hl", rows)
+    options = {"map_device": "hl", "query_device": "hl"}
+    device = evaluate_scene(sessions, poses, None, None, **options)
+    camera = evaluate_scene(sessions, poses, None, None, at="camera", **options)
+    assert len(device.errors) == 2
+    assert device.errors["translation_error_m"].tolist() == [0, np.inf]
+    assert camera.errors["sensor_id"].tolist() == ["left", "right"] * 2
+    arc = 2 * np.sin(np.radians(2))  # a camera one metre from the rig's origin moves along the arc
+    np.testing.assert_allclose(camera.errors["translation_error_m"], [arc, arc, np.inf, np.inf])
+    np.testing.assert_allclose(camera.errors["rotation_error_deg"][:2], 4)
+    assert camera.recall["queries"].item() == 4
+
+
+def test_good_reference_of_any_camera_counts_for_the_rig(tmp_path):
+    sessions, poses, references = write_capture(tmp_path), tmp_path / "poses", tmp_path / "retrieval"
+    pair = "map_ios_query_hl"
+    write_poses(poses, pair, [(0, "rig", pose(), "ok"), (1, "rig", pose(10), "ok")])
+    found = {(0, "rig", "left"): [pose(30)], (0, "rig", "right"): [pose(1)], (1, "rig", "left"): [pose(30)]}
+    write_references(references, pair, found)
+    result = evaluate_scene(sessions, poses, references, None, map_device="ios", query_device="hl")
+    assert result.retrieval["recall@1"].item() == 0.5
+
+
+def test_no_ground_truth_is_said_and_skipped(tmp_path, caplog):
+    sessions = write_capture(tmp_path, ground_truth=False)
+    result = evaluate_scene(sessions, tmp_path / "poses", tmp_path / "retrieval", tmp_path / "out")
+    assert result.recall["state"].tolist() == ["no ground truth"] * 4
+    assert len(result.errors) == 0
+    assert sorted(result.messages) == [
+        "hl_query has no ground truth; it is not evaluated.",
+        "ios_query has no ground truth; it is not evaluated.",
+    ]
+    assert "ios_query has no ground truth" in caplog.text
+    assert len(pd.read_csv(tmp_path / "out" / "recall.csv")) == 4
+    assert len(pd.read_csv(tmp_path / "out" / "errors.csv")) == 0
+
+
+def test_missing_and_torn_files_are_rows_not_exceptions(scene):
+    result = evaluate_scene(*scene, None)
+    states = result.recall.set_index(["map_device", "query_device"])["state"]
+    assert states["ios", "ios"] == "evaluated"
+    assert states["hl", "ios"] == "no poses file"
+    assert states["hl", "hl"] == "no poses file"
+    (scene[1] / "TINY_map_hl_query_ios.txt").write_text("0, phone, 1, 0\n")
+    (scene[2] / f"TINY_{IOS}.jsonl").write_text('{"timestamp": "0"')
+    result = evaluate_scene(*scene, None)
+    states = result.recall.set_index(["map_device", "query_device"])["state"]
+    assert states["hl", "ios"].startswith("unreadable poses file")
+    assert result.retrieval["state"].str.startswith("unreadable retrieval file").sum() == 1
+    assert set(result.errors["loss@(1deg,0.1m)"]) == {"", "no pose", "wrong pose"}
+    assert draw_evaluation(result)
+
+
+def test_unknown_choices_are_named(scene):
+    with pytest.raises(ToolkitError, match=r"no map session of device 'spot'. Known: \['ios', 'hl'\]"):
+        evaluate_scene(*scene, None, map_device="spot")
+    with pytest.raises(ToolkitError, match="Known: device, camera"):
+        evaluate_ios(scene, at="rig")
