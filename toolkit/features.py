@@ -19,7 +19,15 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Session
 from toolkit.errors import ImageError
-from toolkit.files import files_fingerprint, is_current, write_atomic, write_sidecar
+from toolkit.files import (
+    file_fingerprint,
+    files_fingerprint,
+    fingerprint,
+    is_current,
+    sidecar_path,
+    write_atomic,
+    write_sidecar,
+)
 from toolkit.images import prefetch, read_image
 
 # RootSIFT vectors have length 1; times 512 they fill the range of a byte, as COLMAP stores them.
@@ -97,9 +105,7 @@ class SiftExtractor:
                 (width, height),
             )
         scale = np.array([width / size[0], height / size[1]])
-        order = np.argsort([-keypoint.response for keypoint in keypoints], kind="stable")[
-            : settings.max_keypoints
-        ]
+        order = np.argsort([-keypoint.response for keypoint in keypoints], kind="stable")[: settings.max_keypoints]
         keypoints, descriptors = [keypoints[index] for index in order], descriptors[order]
         xy = np.array([keypoint.pt for keypoint in keypoints])
         # OpenCV puts the centre of the top-left pixel at 0.
@@ -139,11 +145,22 @@ class FeatureStore:
             store.add_shard(path)
         return store
 
-    def add_shard(self, path: Path) -> None:
-        with h5py.File(path, "r") as shard:
-            for name in json.loads(shard.attrs["names"]):
-                self._shard_of[name] = path
-            self.failed.update(json.loads(shard.attrs["failed"]))
+    def add_shard(self, path: Path) -> bool:
+        """Take up the images of a shard; False if the file is torn."""
+        try:
+            with h5py.File(path, "r") as shard:
+                names, failed = json.loads(shard.attrs["names"]), json.loads(shard.attrs["failed"])
+        except (OSError, KeyError):
+            return False
+        self._shard_of.update(dict.fromkeys(names, path))
+        self.failed.update(failed)
+        return True
+
+    @property
+    def fingerprint(self) -> str:
+        """16 hex digits that identify the images and settings that the features were made from."""
+        shards = sorted({*self._shard_of.values()})
+        return fingerprint([[path.name, file_fingerprint(sidecar_path(path))] for path in shards])
 
     @property
     def names(self) -> list[str]:
@@ -202,17 +219,13 @@ def extract_session(
             continue
         images = files_fingerprint([session.image_path(int(row)) for row in members])
         record = {"features": asdict(settings), "images": images}
-        if skip_existing and is_current(path, record):
-            store.add_shard(path)
-        else:
+        if not (skip_existing and is_current(path, record) and store.add_shard(path)):
             todo.append((path, record, members))
     total = sum(len(members) for _, _, members in todo)
     cv2_threads = cv2.getNumThreads()
     cv2.setNumThreads(1)  # the images are the parallel dimension
     try:
-        with tqdm(
-            total=total, desc=f"features {session.id}", unit="image", disable=not progress or not total
-        ) as bar:
+        with tqdm(total=total, desc=f"features {session.id}", unit="image", disable=not progress or not total) as bar:
             for path, record, members in todo:
                 _write_shard(path, session, members, extractor, workers, bar)
                 write_sidecar(path, record)

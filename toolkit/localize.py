@@ -108,10 +108,7 @@ def localize_pairs(
                         "map_device": mapped,
                         "query_device": asked,
                         "queries": int(counts.sum()),
-                        **{
-                            status: int(counts.get(status, 0))
-                            for status in ("ok", "low_confidence", "failed")
-                        },
+                        **{status: int(counts.get(status, 0)) for status in ("ok", "low_confidence", "failed")},
                         "seconds": round(time.perf_counter() - started, 2),
                         "skipped": skipped,
                         "path": str(pair.txt),
@@ -168,9 +165,7 @@ class _Pair:
             "retrieval": file_fingerprint(self.retrieval),
             "map_session": session_fingerprint(self.capture[f"{self.map_device}_map"]),
             "query_session": session_fingerprint(self.session),
-            "keyframes": fingerprint(
-                [keyframes["timestamp"].astype(str).tolist(), keyframes["device_id"].tolist()]
-            ),
+            "keyframes": fingerprint([keyframes["timestamp"].astype(str).tolist(), keyframes["device_id"].tolist()]),
         }
 
     def references(self) -> dict[tuple[int, str], list[dict[str, Any]]]:
@@ -191,9 +186,7 @@ class _Pair:
 def session_fingerprint(session: Session) -> str:
     """Return 16 hex digits that identify the calibration, poses and image list of a session."""
     files = ["sensors.txt", "images.txt", "rigs.txt", "trajectories.txt"]
-    return fingerprint(
-        [file_fingerprint(session.path / name) for name in files if (session.path / name).exists()]
-    )
+    return fingerprint([file_fingerprint(session.path / name) for name in files if (session.path / name).exists()])
 
 
 def _devices(capture: Capture, device: str, split: str) -> list[str]:
@@ -216,12 +209,11 @@ def _open_localizer(
     skip_existing: bool,
 ) -> PnpLocalizer:
     """Build or load the triangulated map of a session."""
-    store = extract_session(session, features_dir, workers=workers, skip_existing=skip_existing)
-    inputs = fingerprint([session_fingerprint(session), asdict(FeatureSettings()), sorted(store.failed)])
+    store = extract_session(session, features_dir, workers=workers)
+    inputs = fingerprint([session_fingerprint(session), store.fingerprint])
     path = map_dir / f"{session.id}.npz"
-    return PnpLocalizer(
-        build_map(session, store, path, MapSettings(seed=settings.seed), skip_existing, inputs), store
-    )
+    local_map = build_map(session, store, path, MapSettings(seed=settings.seed), skip_existing, inputs)
+    return PnpLocalizer(local_map, store, settings)
 
 
 def _localize_pair(
@@ -241,7 +233,7 @@ def _localize_pair(
     store = None
     if localizer is not None:
         rows = np.unique(np.concatenate([*members, np.zeros(0, np.int64)]))
-        store = extract_session(session, features_dir, rows=rows, workers=workers, skip_existing=True)
+        store = extract_session(session, features_dir, rows=rows, workers=workers)
 
     def solve(index: int) -> dict[str, Any]:
         started = time.perf_counter()
@@ -352,9 +344,7 @@ def _nearest(query: _QueryDevice) -> tuple[PoseEstimate, list[str]]:
 def _row(
     key: tuple[int, str], estimate: PoseEstimate, references: list[str], method: str, started: float
 ) -> dict[str, Any]:
-    pose = (
-        None if estimate.world_from_rig is None else geometry.qt_from_pose(estimate.world_from_rig).tolist()
-    )
+    pose = None if estimate.world_from_rig is None else geometry.qt_from_pose(estimate.world_from_rig).tolist()
     covariance = None if estimate.covariance is None else estimate.covariance.ravel().tolist()
     return {
         "timestamp": key[0],
