@@ -24,6 +24,11 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
+# COLMAP's solver for rigs with baselines draws from the C library's generator, which threads share: two at once would
+# disturb each other's sequence, and equal seeds give unequal poses.
+_RIG_RANSAC = Lock()
+
+
 @dataclass(frozen=True)
 class PnpSettings:
     """How queries are localized; part of the poses' fingerprint. Angles are seen from the camera."""
@@ -88,9 +93,7 @@ class PoseEstimate:
 
     @property
     def position_std_m(self) -> float:
-        return (
-            float(np.sqrt(np.trace(self.covariance[3:, 3:]))) if self.covariance is not None else float("nan")
-        )
+        return float(np.sqrt(np.trace(self.covariance[3:, 3:]))) if self.covariance is not None else float("nan")
 
     @property
     def rotation_std_deg(self) -> float:
@@ -288,9 +291,7 @@ class PnpLocalizer:
                 image = self._image(int(reference))
                 scores = similarity(descriptors, unit_descriptors(image.descriptors))
                 pairs = mutual_matches(scores, self.settings.ratio)
-                found.append(
-                    np.column_stack([np.full(len(pairs), camera), pairs[:, 0], image.points[pairs[:, 1]]])
-                )
+                found.append(np.column_stack([np.full(len(pairs), camera), pairs[:, 0], image.points[pairs[:, 1]]]))
         unique = np.unique(np.concatenate(found), axis=0)
         return unique[:, 0], unique[:, 1], unique[:, 2]
 
@@ -313,15 +314,16 @@ class PnpLocalizer:
                 matches.pixels, points, query.cameras[0], estimation, refinement
             )
             return None if answer is None else query.rig_from_cams[0] @ _matrix(answer["cam_from_world"])
-        answer = pycolmap.estimate_and_refine_generalized_absolute_pose(
-            matches.pixels,
-            points,
-            matches.camera.tolist(),
-            query.cams_from_rig,
-            query.cameras,
-            options,
-            refinement,
-        )
+        with _RIG_RANSAC:
+            answer = pycolmap.estimate_and_refine_generalized_absolute_pose(
+                matches.pixels,
+                points,
+                matches.camera.tolist(),
+                query.cams_from_rig,
+                query.cameras,
+                options,
+                refinement,
+            )
         return None if answer is None else _matrix(answer["rig_from_world"])
 
     def _refine(self, query: "_Query", rig_from_world: Floats, matches: _Matches) -> Floats | None:
@@ -330,9 +332,7 @@ class PnpLocalizer:
         points, mask = self.map.points[matches.point], np.ones(len(matches), bool)
         if len(query.cameras) == 1:
             start = pycolmap.Rigid3d((geometry.invert(query.rig_from_cams[0]) @ rig_from_world)[:3])
-            answer = pycolmap.refine_absolute_pose(
-                start, matches.pixels, points, mask, query.cameras[0], options
-            )
+            answer = pycolmap.refine_absolute_pose(start, matches.pixels, points, mask, query.cameras[0], options)
             return None if answer is None else query.rig_from_cams[0] @ _matrix(answer["cam_from_world"])
         answer = pycolmap.refine_generalized_absolute_pose(
             pycolmap.Rigid3d(rig_from_world[:3]),
@@ -352,9 +352,7 @@ class PnpLocalizer:
         order = np.argsort(-seen, kind="stable")[: self.settings.guided_images]
         return order[seen[order] > 0]
 
-    def _match_guided(
-        self, query: "_Query", rig_from_world: Floats, images: Ints, radius_deg: float
-    ) -> _Matches:
+    def _match_guided(self, query: "_Query", rig_from_world: Floats, images: Ints, radius_deg: float) -> _Matches:
         """Match the points of map images near where the pose puts them."""
         members = [self._image(int(index)) for index in images]
         point = np.concatenate([member.points for member in members])
@@ -377,9 +375,7 @@ class PnpLocalizer:
                 visible[np.isfinite(projected).all(1)],
                 projected[np.isfinite(projected).all(1)],
             )
-            near = KDTree(projected).sparse_distance_matrix(
-                query.trees[camera], radius, output_type="ndarray"
-            )
+            near = KDTree(projected).sparse_distance_matrix(query.trees[camera], radius, output_type="ndarray")
             order = np.lexsort((near["j"], near["i"]))
             observed, keypoint = visible[near["i"][order]], near["j"][order]
             expected = size[observed] * query.focals_px[camera] / in_cam[observed, 2]
@@ -413,9 +409,7 @@ class PnpLocalizer:
         keypoint, point = self.map.observations(index)
         order = np.argsort(-self.map.track_lengths[point], kind="stable")[: self.settings.max_map_features]
         features = self._features[self.map.image_names[index]]
-        image = _MapImage(
-            features.descriptors[keypoint[order]], point[order], features.scales[keypoint[order]]
-        )
+        image = _MapImage(features.descriptors[keypoint[order]], point[order], features.scales[keypoint[order]])
         with self._lock:
             self._cache[index] = image
             if len(self._cache) > 256:
@@ -462,9 +456,7 @@ class _Query:
         errors = self.errors_px(rig_from_world, matches, points)
         return np.degrees(np.arctan(errors / self.focals_px[matches.camera]))
 
-    def covariance(
-        self, rig_from_world: Floats, matches: _Matches, points: Floats, errors_px: Floats
-    ) -> Floats | None:
+    def covariance(self, rig_from_world: Floats, matches: _Matches, points: Floats, errors_px: Floats) -> Floats | None:
         """Return the covariance (6, 6) of the pose, from the spread of the errors; None where it is not defined.
 
         For world_from_rig @ Exp(d), d = rotation (radians), translation (metres) in the rig's frame, as the
