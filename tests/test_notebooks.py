@@ -1,0 +1,105 @@
+"""The notebooks as committed: clean, in step with the stages and the manifest; and a whole run of them."""
+
+import importlib
+import inspect
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import nbformat
+import pytest
+
+from toolkit.manifest import STAGES, Manifest
+from toolkit.notebook import notebook_parameters, notebook_path
+
+# What the pipeline sets for a run, so that a manifest has it once and not in a section.
+OF_THE_RUN = {
+    *("sessions_root", "out_dir", "map_feats_root", "out_jsonl", "retrieval_dir", "features_dir", "map_dir"),
+    *("poses_dir", "device", "subsession", "map_device", "query_device", "queries", "seed", "world_up"),
+    "skip_existing",
+}
+FUNCTIONS = {
+    "embed": "toolkit.embed:embed_sessions",
+    "retrieve": "toolkit.retrieve:retrieve_pairs",
+    "localize": "toolkit.localize:localize_pairs",
+    "evaluate": "toolkit.evaluate:evaluate_scene",
+    "visualize": "toolkit.visualize_scene:visualize_scene",
+}
+
+
+def plain(value: Any) -> Any:
+    return json.loads(json.dumps(value))
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_notebooks_are_committed_clean(stage: str) -> None:
+    path = notebook_path(stage)
+    content = nbformat.read(path, as_version=4)
+    nbformat.validate(content)
+    assert content.metadata.kernelspec.name == "python3"
+    code = [cell for cell in content.cells if cell.cell_type == "code"]
+    assert not any(cell.outputs or cell.execution_count for cell in code), (
+        "clear the outputs before committing"
+    )
+    assert content.cells[0].source.startswith("# ")
+    assert content.cells[1].metadata.tags == ["parameters"]
+    assert content.cells[2].metadata.tags == ["setup"]
+    assert "notebook.finish(" in content.cells[-1].source
+    for cell in code:
+        assert len(cell.source.splitlines()) <= 18, f"{path.name}: a cell is long; functions live in toolkit/"
+        assert "sys.path" not in cell.source
+    assert [cell.id for cell in content.cells] == [
+        f"{path.name[:2]}-{i:02d}" for i in range(len(content.cells))
+    ]
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_every_parameter_has_a_comment(stage: str) -> None:
+    lines = nbformat.read(notebook_path(stage), as_version=4).cells[1].source.splitlines()
+    assert all("  # " in line for line in lines)
+
+
+@pytest.mark.parametrize("stage", FUNCTIONS)
+def test_parameters_and_defaults_are_those_of_the_stage(stage: str) -> None:
+    module, _, name = FUNCTIONS[stage].partition(":")
+    function: Callable[..., Any] = getattr(importlib.import_module(module), name)
+    signature = inspect.signature(function).parameters
+    for name, default in notebook_parameters(notebook_path(stage)).items():
+        assert name in signature
+        if default is not None and signature[name].default is not inspect.Parameter.empty:
+            assert plain(default) == plain(signature[name].default), name
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_the_manifest_has_every_parameter_once(stage: str) -> None:
+    parameters = set(notebook_parameters(notebook_path(stage)))
+    section = set(type(getattr(Manifest(name="x", captures=["x"]), stage)).model_fields)
+    assert section == parameters - OF_THE_RUN
+
+
+@pytest.mark.slow
+def test_a_capture_goes_from_files_to_a_report(small_capture: Path, tmp_path: Path) -> None:
+    manifest = tmp_path / "small.yaml"
+    manifest.write_text(f"captures: ['{small_capture}']\noutput_root: runs\n")
+    command = [sys.executable, "-m", "toolkit", "run", str(manifest)]
+    first = subprocess.run(command, capture_output=True, text=True)
+    assert first.returncode == 0, first.stdout + first.stderr
+    run = tmp_path / "runs" / "small"
+    assert (run / "report.html").is_file()
+    record = json.loads((run / "run.json").read_text())
+    assert [row["stage"] for row in record["stages"]] == list(STAGES)
+    counts = {row["stage"]: row["counts"] for row in record["stages"]}
+    assert counts["embed"]["images"] == counts["embed"]["embedded"] + counts["embed"]["unreadable"]
+    poses = sorted((run / "SMALL" / "poses").glob("*.txt"))
+    assert len(poses) == 9
+    before = {path.name: path.read_bytes() for path in poses}
+
+    again = subprocess.run(command, capture_output=True, text=True)
+    assert again.stdout.count("reused") == len(STAGES), again.stdout + again.stderr
+
+    forced = subprocess.run([*command, "--force", "--only", "localize"], capture_output=True, text=True)
+    assert forced.returncode == 0, forced.stdout + forced.stderr
+    assert {path.name: path.read_bytes() for path in poses} == before, "the same seed gives the same poses"

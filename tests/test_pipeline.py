@@ -1,0 +1,206 @@
+"""The mechanics of a run, on tiny notebooks: what is executed, reused, refused, and what a failure leaves."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import nbformat
+import pytest
+from nbformat.v4 import new_code_cell, new_notebook
+
+from toolkit import notebook, pipeline
+from toolkit.errors import ManifestError, ToolkitError
+from toolkit.pipeline import StageError
+
+KERNEL = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
+EMBED = """
+from pathlib import Path
+from toolkit import notebook
+out = Path(out_dir)
+out.mkdir(parents=True, exist_ok=True)
+(out / "log.txt").open("a").write(f"{model} {skip_existing}\\n")
+notebook.finish(images=4)
+"""
+RETRIEVE = """
+from pathlib import Path
+from toolkit.errors import CaptureError
+if topk > 50:
+    raise CaptureError("images.txt, line 3: found a dragon.")
+out = Path(out_jsonl)
+out.mkdir(parents=True, exist_ok=True)
+(out / f"P_map_{map_device}_query_{query_device}.jsonl").write_text(str(topk))
+"""
+
+
+def write_notebook(folder: Path, stage: str, parameters: str, code: str) -> None:
+    first, work = new_code_cell(parameters), new_code_cell(code)
+    first.metadata["tags"] = ["parameters"]
+    name = f"{pipeline.STAGES.index(stage) + 1:02d}_{stage}.ipynb"
+    nbformat.write(new_notebook(cells=[first, work], metadata=KERNEL), folder / name)
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a capture `P`, six tiny notebooks of which two are run, and a manifest `run.yaml`."""
+    notebooks = tmp_path / "notebooks"
+    notebooks.mkdir()
+    for stage in pipeline.STAGES:
+        write_notebook(notebooks, stage, "samples = 1\nthresholds = []", "")
+    parameters = 'sessions_root = None\nout_dir = None\nmodel = "vlad"\nskip_existing = True'
+    write_notebook(notebooks, "embed", parameters, EMBED)
+    parameters = 'out_jsonl = None\ntopk = 10\nmap_device = "all"\nquery_device = "all"'
+    write_notebook(notebooks, "retrieve", parameters, RETRIEVE)
+    monkeypatch.setattr(notebook, "NOTEBOOKS", notebooks)
+    monkeypatch.setattr(pipeline, "STAGES", ("embed", "retrieve"))
+    monkeypatch.setattr(pipeline, "_write_report", lambda run_dir: None)
+    monkeypatch.setattr(pipeline, "_code_fingerprint", lambda: "the same")
+    for session in ("ios_map", "ios_query", "hl_map", "hl_query"):
+        folder = tmp_path / "P" / "sessions" / session
+        folder.mkdir(parents=True)
+        (folder / "images.txt").write_text("# timestamp, sensor_id, image_path\n")
+    (tmp_path / "run.yaml").write_text("captures: [P]\noutput_root: runs\n")
+    return tmp_path
+
+
+@pytest.fixture
+def go(place: Path) -> Callable[..., dict[str, str]]:
+    def run(*overrides: str, **options: object) -> dict[str, str]:
+        """Run the manifest and return what became of each stage."""
+        lines: list[str] = []
+        pipeline.run(
+            place / "run.yaml", overrides=overrides, say=lambda *a, **k: lines.append(a[0]), **options
+        )
+        record = json.loads((place / "runs/run/run.json").read_text())
+        assert record["status"] == "done"
+        assert lines
+        return {row["stage"]: row["status"] for row in record["stages"]}
+
+    return run
+
+
+def test_a_stage_runs_again_only_when_something_has_changed(
+    place: Path, go: Callable[..., dict[str, str]]
+) -> None:
+    done, reused = "done", "reused"
+    assert go() == {"embed": done, "retrieve": done}
+    record = json.loads((place / "runs/run/run.json").read_text())
+    assert record["stages"][0]["counts"] == {"images": 4}
+    assert record["stages"][0]["peak_memory_mb"] > 10
+    assert record["scenes"] == ["P"]
+    assert (place / "runs/run" / record["stages"][1]["notebook"]).is_file()
+    jsonl = place / "runs/run/P/retrieval/P_map_all_query_all.jsonl"
+    assert jsonl.read_text() == "10"
+
+    assert go() == {"embed": reused, "retrieve": reused}
+    assert go("retrieve.topk=3") == {"embed": reused, "retrieve": done}
+    assert jsonl.read_text() == "3"
+    jsonl.unlink()
+    assert go("retrieve.topk=3", only="retrieve") == {"embed": reused, "retrieve": done}
+    # What is built on a stage that ran again runs again too.
+    assert go("retrieve.topk=3", force=True, only="embed") == {"embed": done, "retrieve": reused}
+    assert (place / "runs/run/P/embeddings/log.txt").read_text() == "vlad True\nvlad False\n"
+    assert go("retrieve.topk=3") == {"embed": reused, "retrieve": done}
+    (place / "P/sessions/ios_map/images.txt").write_text("# changed\n")
+    assert go("retrieve.topk=3", only="embed")["embed"] == done
+
+
+def test_some_pairs_take_an_execution_each(place: Path, go: Callable[..., dict[str, str]]) -> None:
+    assert go("pairs=[[ios, hl], [hl, ios]]", only="retrieve") == {"retrieve": "done"}
+    found = sorted(path.stem for path in (place / "runs/run/P/retrieval").iterdir())
+    assert found == ["P_map_hl_query_ios", "P_map_ios_query_hl"]
+    go("pairs=[[ios, hl], [hl, ios]]", only="retrieve")
+    record = json.loads((place / "runs/run/run.json").read_text())
+    assert [row["status"] for row in record["stages"]] == ["reused", "reused"]
+
+
+def test_a_failing_cell_stops_with_its_message_and_the_notebook(place: Path) -> None:
+    with pytest.raises(StageError) as error:
+        pipeline.run(place / "run.yaml", overrides=["retrieve.topk=99"], only="retrieve")
+    message, where = str(error.value).splitlines()
+    assert message == "images.txt, line 3: found a dragon."
+    executed = Path(where.rpartition("where: ")[2])
+    assert executed == place / "runs/run/notebooks/P_03_retrieve.ipynb"
+    assert "dragon" in executed.read_text()
+    record = json.loads((place / "runs/run/run.json").read_text())
+    assert record["status"] == "failed"
+    assert [row["status"] for row in record["stages"]] == ["failed"]
+    assert not list(executed.parent.glob(".*"))
+
+
+def test_unknown_parameters_are_refused_before_anything_runs(place: Path) -> None:
+    # The manifest knows `dtype`, but this notebook does not.
+    with pytest.raises(
+        ManifestError, match=r"embed\.dtype: 02_embed\.ipynb has no such parameter\. .*Known: model"
+    ):
+        pipeline.run(place / "run.yaml", overrides=["embed.dtype=float16"])
+    assert not (place / "runs").exists()
+    with pytest.raises(ManifestError, match="Did you mean 'topk'"):
+        pipeline.execute(place / "notebooks/03_retrieve.ipynb", place / "out.ipynb", {"top_k": 5})
+
+
+def test_a_notebook_refuses_what_papermill_injected(monkeypatch: pytest.MonkeyPatch) -> None:
+    shell = SimpleNamespace(user_ns={"In": ["", "topk = 10  # a user's cell", "# Parameters\ntop_k = 5\n"]})
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
+    with pytest.raises(
+        ManifestError, match=r"top_k: 03_retrieve\.ipynb has no such parameter\. Did you mean 'topk'"
+    ):
+        notebook.start("retrieve", sessions_root="anywhere/sessions")
+
+
+def test_parameters_must_be_literals(tmp_path: Path) -> None:
+    write_notebook(tmp_path, "embed", "a = 1\nb = a + 1", "")
+    with pytest.raises(ManifestError, match="`name = literal` lines only"):
+        notebook.notebook_parameters(tmp_path / "02_embed.ipynb")
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"only": "embedd"}, "Did you mean 'embed'"),
+        ({"overrides": ["captures=[Q]"]}, "Q"),
+        ({"overrides": ["devices=[spot]"]}, "none of the devices or pairs"),
+    ],
+)
+def test_what_cannot_run_is_refused(place: Path, options: dict[str, object], expected: str) -> None:
+    with pytest.raises(ToolkitError, match=expected):
+        pipeline.run(place / "run.yaml", **options)
+
+
+def test_the_command_line_prints_errors_without_traceback(tmp_path: Path) -> None:
+    started = time.perf_counter()
+    result = subprocess.run(
+        [sys.executable, "-m", "toolkit", "run", str(tmp_path / "no.yaml")], capture_output=True, text=True
+    )
+    assert result.returncode == 1
+    assert result.stderr.startswith("Error: ")
+    assert "no such manifest" in result.stderr
+    assert "Traceback" not in result.stderr
+    assert time.perf_counter() - started < 20
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
+def test_a_killed_run_is_taken_up_again(place: Path, go: Callable[..., dict[str, str]]) -> None:
+    slow = f"{RETRIEVE}\nimport time\ntime.sleep(0 if Path(out_jsonl, 'again').exists() else 600)"
+    parameters = 'out_jsonl = None\ntopk = 10\nmap_device = "all"\nquery_device = "all"'
+    write_notebook(place / "notebooks", "retrieve", parameters, slow)
+    script = (
+        "from pathlib import Path; from toolkit import notebook, pipeline;"
+        f"notebook.NOTEBOOKS = Path({str(place / 'notebooks')!r}); pipeline.STAGES = ('embed', 'retrieve');"
+        "pipeline._code_fingerprint = lambda: 'the same';"
+        f"pipeline.run({str(place / 'run.yaml')!r})"
+    )
+    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.DEVNULL)
+    retrieval = place / "runs/run/P/retrieval"
+    deadline = time.monotonic() + 120
+    while not retrieval.exists() and time.monotonic() < deadline and process.poll() is None:
+        time.sleep(0.1)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    (retrieval / "again").touch()
+    assert go() == {"embed": "reused", "retrieve": "done"}

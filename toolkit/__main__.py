@@ -1,0 +1,72 @@
+"""The command line: `python -m toolkit run|check|demo-data`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from toolkit.errors import ToolkitError
+
+app = typer.Typer(
+    help="Tell where photographs were taken, in a map of posed photographs.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+@app.command()
+def run(
+    manifest: Annotated[Path, typer.Argument(help="What to run, for example data_manifests/demo.yaml.")],
+    only: Annotated[str | None, typer.Option(metavar="STAGE", help="Run this stage alone.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Run stages that are up to date as well.")] = False,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Replace a setting, e.g. localize.method=nearest."),
+    ] = None,
+) -> None:
+    """Run the notebooks of a manifest, resuming what is done, and write a report."""
+    from toolkit import pipeline
+
+    try:
+        run_dir = pipeline.run(manifest, only=only, force=force, overrides=overrides or ())
+    except KeyboardInterrupt:
+        print("Interrupted. The same command goes on from here.")
+        raise typer.Exit(130) from None
+    print(f"Report: {run_dir / 'report.html'}")
+
+
+@app.command()
+def check(capture: Annotated[Path, typer.Argument(help="Capture folder, with sessions/ in it.")]) -> None:
+    """Show what a capture holds and every inconsistency, with file and line."""
+    from toolkit.check import check_capture
+
+    report = check_capture(capture)
+    print(report.text())
+    if not report.ok:
+        raise typer.Exit(1)
+
+
+@app.command()
+def demo_data(
+    out: Annotated[Path, typer.Option(help="Capture folder to write.")],
+    rooms: Annotated[int, typer.Option(min=1, help="Rooms to render.")] = 2,
+    frames: Annotated[int, typer.Option(min=2, help="Frames a room and map session.")] = 12,
+    seed: Annotated[int, typer.Option(min=0, help="Another seed, another place.")] = 0,
+) -> None:
+    """Render a capture with exact ground truth, for demos, tests and benchmarks."""
+    from toolkit.synthetic import render_capture
+
+    print(f"Capture: {render_capture(out, rooms=rooms, frames=frames, seed=seed)}")
+
+
+def main() -> None:
+    """Run the command line; an error meant for the user is one paragraph, not a traceback."""
+    try:
+        app(prog_name="python -m toolkit")
+    except ToolkitError as error:
+        raise SystemExit(f"Error: {error}") from None
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,249 @@
+"""The manifest: one YAML file that says what to run on which captures, checked before anything runs."""
+
+import difflib
+import os
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from toolkit.errors import ManifestError
+
+STAGES = ("explore", "embed", "retrieve", "localize", "evaluate", "visualize")
+DEVICES = ("ios", "hl", "spot")
+
+Device = Literal["ios", "hl", "spot"]
+Positive = Annotated[int, Field(gt=0)]
+Natural = Annotated[int, Field(ge=0)]
+PositiveNumber = Annotated[float, Field(gt=0)]
+DevicePair = Annotated[list[Device], Field(min_length=2, max_length=2)]
+Threshold = Annotated[list[PositiveNumber], Field(min_length=2, max_length=2)]
+
+
+class _Strict(BaseModel):
+    """A frozen model without coercion of strings to numbers that refuses keys it does not know."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+class _Section(_Strict):
+    """Settings of one stage. A key that is not given leaves the default of the stage's notebook in force."""
+
+    def given(self) -> dict[str, Any]:
+        """Return what the manifest says, without what it leaves to the notebook's defaults."""
+        return self.model_dump(mode="json", exclude_none=True)
+
+
+class DemoData(_Strict):
+    """A rendered capture instead of a recorded one."""
+
+    rooms: Positive = 2
+    """Rooms to render."""
+    frames: Annotated[int, Field(ge=2)] = 12
+    """Frames a room and map session; queries have half."""
+    seed: Natural = 0
+    """Another seed, another place."""
+
+
+class ExploreSettings(_Section):
+    samples: Positive | None = None
+    """Images shown of each session."""
+
+
+class EmbedSettings(_Section):
+    model: str | None = None
+    """Global descriptor; `vlad` needs no weights."""
+    batch_size: Positive | None = None
+    """Images a step."""
+    compute_device: str | None = None
+    """auto, cpu or cuda."""
+    normalize: bool | None = None
+    """Scale descriptors to unit length."""
+    dtype: Literal["float32", "float16"] | None = None
+    """Type of the numbers in the .npy files."""
+
+
+class RetrieveSettings(_Section):
+    topk: Positive | None = None
+    """References a query image."""
+    use_faiss: bool | None = None
+    """Search with FAISS, else with torch."""
+    faiss_gpu: bool | None = None
+    """FAISS on the GPU."""
+    normalize: bool | None = None
+    """Compare by cosine."""
+    compute_device: str | None = None
+    """auto, cpu or cuda."""
+
+
+class LocalizeSettings(_Section):
+    method: str | None = None
+    """`pnp`, or `nearest`: the pose of the best reference, to compare against."""
+
+
+class EvaluateSettings(_Section):
+    thresholds: list[Threshold] | None = None
+    """Recall is counted at these (degrees, metres)."""
+    retrieval_ks: list[Positive] | None = None
+    """Retrieval recall is counted at these numbers of references."""
+    retrieval_radius_m: PositiveNumber | None = None
+    """A reference this near is a good one ..."""
+    retrieval_angle_deg: PositiveNumber | None = None
+    """... when it also looks the same way to within this angle."""
+
+
+class VisualizeSettings(_Section):
+    samples: Natural | None = None
+    """Queries shown of each pair."""
+    recordings: bool | None = None
+    """Write recordings for the rerun viewer."""
+
+
+class Manifest(_Strict):
+    """What to run. Paths are relative to the manifest's folder; `~` and `$VARIABLES` are expanded."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+    """Name of the run folder; the manifest's file name when not given."""
+    description: str = ""
+    """A sentence for the report."""
+    captures: list[str] = []
+    """Capture folders, each with `sessions/` in it. The folder's name is the scene's name."""
+    demo_data: DemoData | None = None
+    """Or: a capture to render."""
+    output_root: str = "../runs"
+    """Results go to <output_root>/<name>."""
+    devices: Literal["auto"] | list[Device] = "auto"
+    """Devices to take part; auto: all that a capture has."""
+    pairs: Literal["all"] | list[DevicePair] = "all"
+    """[map device, query device] pairs; all: every map with every query session."""
+    queries: str = "keyframes_pruned_subsampled"
+    """List of keyframes to localize, from the query sessions' proc/; `all`: every device pose known."""
+    seed: Natural = 0
+    """The same seed gives the same poses."""
+    world_up: Annotated[list[float], Field(min_length=3, max_length=3)] | None = None
+    """Direction that is up in the captures' world, for the pictures."""
+    explore: ExploreSettings = ExploreSettings()
+    embed: EmbedSettings = EmbedSettings()
+    retrieve: RetrieveSettings = RetrieveSettings()
+    localize: LocalizeSettings = LocalizeSettings()
+    evaluate: EvaluateSettings = EvaluateSettings()
+    visualize: VisualizeSettings = VisualizeSettings()
+
+    @model_validator(mode="after")
+    def _one_source(self) -> "Manifest":
+        if bool(self.captures) == (self.demo_data is not None):
+            raise ValueError("give either `captures` (a list of folders) or `demo_data`, and not both")
+        return self
+
+    def stage(self, stage: str) -> _Section:
+        """Return the settings of one stage."""
+        section: _Section = getattr(self, stage)
+        return section
+
+
+def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
+    """Read and check a manifest.
+
+    Args:
+        path: YAML file.
+        overrides: `key=value` or `section.key=value`, the value in YAML; they replace what the file says.
+
+    Returns:
+        The manifest with its paths made absolute.
+
+    Raises:
+        ManifestError: naming the file, the key, what was found, and the nearest known key.
+    """
+    path = Path(path)
+    source = str(path)
+    raw = _read_yaml(path)
+    for override in overrides:
+        _apply(raw, override)
+        source = f"{path} with --set {override}" if source == str(path) else f"{source} {override}"
+    raw.setdefault("name", path.stem)
+    try:
+        manifest = Manifest.model_validate(raw)
+    except ValidationError as error:
+        raise ManifestError(_explain(error, source)) from None
+    folder = path.resolve().parent
+    update = {
+        "captures": [str(_expand(text, folder, f"{source}: captures")) for text in manifest.captures],
+        "output_root": str(_expand(manifest.output_root, folder, f"{source}: output_root")),
+    }
+    names = [Path(capture).name for capture in update["captures"]]
+    if twice := {name for name in names if names.count(name) > 1}:
+        raise ManifestError(
+            f"{source}: captures: two folders are called {sorted(twice)[0]!r}, so their results would "
+            "overwrite each other. Rename one, or use two manifests."
+        )
+    return manifest.model_copy(update=update)
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return a sentence that names the nearest of the known names, and lists them all."""
+    known = sorted(known)
+    match = difflib.get_close_matches(name.lower(), known, n=1, cutoff=0.5)
+    return (f"Did you mean {match[0]!r}? " if match else "") + f"Known: {', '.join(known)}."
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ManifestError(f"{path}: no such manifest. data_manifests/demo.yaml is an example.") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ManifestError(f"{path}: cannot be read as a text file ({error}).") from None
+    except yaml.YAMLError as error:
+        text = str(error).replace('"<unicode string>"', str(path))
+        raise ManifestError(f"{path}: not valid YAML. {text}") from None
+    if not isinstance(raw, dict):
+        raise ManifestError(f"{path}: found {type(raw).__name__}, expected `key: value` lines.")
+    return raw
+
+
+def _apply(raw: dict[str, Any], override: str) -> None:
+    key, equals, text = override.partition("=")
+    if not equals or not key.strip():
+        raise ManifestError(f"--set {override}: expected key=value, for example localize.method=nearest.")
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ManifestError(f"--set {override}: the value is not valid YAML. {error}") from None
+    *sections, last = key.strip().split(".")
+    for section in sections:
+        if not isinstance(raw.get(section), dict):
+            raw[section] = {}
+        raw = raw[section]
+    raw[last] = value
+
+
+def _explain(error: ValidationError, source: str) -> str:
+    lines = []
+    for problem in error.errors():
+        keys = [str(key) for key in problem["loc"] if not re.match(r"literal|list\[|constrained", str(key))]
+        where = ".".join(keys) or "the manifest"
+        if problem["type"] == "extra_forbidden":
+            model: Any = Manifest
+            for key in keys[:-1]:
+                model = DemoData if key == "demo_data" else model.model_fields[key].annotation
+            lines.append(f"unknown key {where!r}. {nearest(keys[-1], model.model_fields)}")
+        elif problem["type"] == "value_error":
+            lines.append(f"{problem['ctx']['error']}.")
+        elif problem["type"] == "literal_error" and isinstance(problem["input"], list):
+            continue  # the other branch of `"all" | list`, which says what is wrong in the list
+        else:
+            lines.append(f"{where}: found {problem['input']!r}. {problem['msg']}.")
+    return "\n  ".join([f"{source}:", *dict.fromkeys(lines)])
+
+
+def _expand(text: str, folder: Path, where: str) -> Path:
+    expanded = os.path.expandvars(text)
+    if unset := re.search(r"\$\{?(\w+)\}?", expanded):
+        raise ManifestError(
+            f"{where}: {text!r} uses the variable ${unset[1]}, which is not set. "
+            f"Set it (export {unset[1]}=...) or write the folder itself."
+        )
+    return Path(os.path.normpath(folder / Path(expanded).expanduser()))

@@ -1,0 +1,216 @@
+"""What the notebooks call, and what can be read from them: parameters, folders, counts.
+
+`start` resolves a notebook's folders, so that each opens and runs alone on the demo capture; `finish` tells
+the pipeline what was done.
+"""
+
+import ast
+import os
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import tqdm.auto
+import tqdm.std
+
+from toolkit.errors import ManifestError
+from toolkit.files import SceneFiles
+from toolkit.manifest import STAGES, DemoData, nearest
+
+NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
+TEXT_BARS = "TOOLKIT_TEXT_BARS"
+"""Variable of the environment that is set where no one sees widgets: progress bars are text then."""
+COUNTS_MIME = "application/vnd.visual-localization.counts+json"
+# What each stage is made from, besides the capture. A stage runs again when one of these has run again.
+UPSTREAM: dict[str, tuple[str, ...]] = {
+    "explore": (),
+    "embed": (),
+    "retrieve": ("embed",),
+    "localize": ("retrieve",),
+    "evaluate": ("retrieve", "localize"),
+    "visualize": ("retrieve", "localize"),
+}
+
+if TEXT_BARS in os.environ:
+    # Every stage takes its bar from tqdm.auto, and imports it after this module.
+    tqdm.auto.tqdm = tqdm.std.tqdm
+
+
+class Folders:
+    """The resolved folders of a notebook, as attributes; shown as a table."""
+
+    def __init__(self, folders: dict[str, Path]) -> None:
+        self._folders = folders
+
+    def __getattr__(self, name: str) -> Path:
+        folders = self.__dict__.get("_folders", {})
+        if name not in folders:
+            raise AttributeError(f"{name}: not a folder of this notebook. {nearest(name, folders)}")
+        path: Path = folders[name]
+        return path
+
+    def __repr__(self) -> str:
+        width = max(len(name) for name in self._folders)
+        return "\n".join(f"{name:<{width}}  {path}" for name, path in self._folders.items())
+
+
+def start(stage: str, sessions_root: str | None = None, **folders: str | None) -> Folders:
+    """Resolve the folders of a notebook. What is None is the demo's, made now if it is not there yet.
+
+    Args:
+        stage: name of the stage, one of `toolkit.manifest.STAGES`.
+        sessions_root: folder `sessions` of a capture; None: the demo capture, rendered when absent.
+        **folders: the notebook's other folders by the names of its parameters; None: below `runs/<scene>/` of
+            the repository. What an earlier stage should have left in such a folder is made when absent.
+
+    Raises:
+        ManifestError: papermill was given a parameter that the notebook does not have.
+    """
+    _refuse_injected(stage)
+    root = NOTEBOOKS.parent if NOTEBOOKS.is_dir() else Path.cwd()
+    if sessions_root is None:
+        from toolkit.synthetic import render_capture
+
+        sessions = render_capture(root / "data" / "demo", **DemoData().model_dump()) / "sessions"
+    else:
+        sessions = Path(sessions_root).expanduser().resolve()
+    scene = sessions.parent.name
+    files = SceneFiles(root / "runs" / scene, scene)
+    defaults = {**stage_folders(files), "out_dir": stage_outputs(files, stage)}
+    _make_upstream(
+        stage, sessions, files, {defaults[name] for name, given in folders.items() if given is None}
+    )
+    resolved = {"sessions_root": sessions}
+    for name, given in folders.items():
+        path = Path(given).expanduser().resolve() if given else defaults[name]
+        if path is not None:
+            resolved[name] = path
+    return Folders(resolved)
+
+
+def finish(**counts: Any) -> None:
+    """Show what a notebook did and hand it to the pipeline, with the peak memory of this process."""
+    import resource
+
+    from IPython.display import display
+
+    unit = 2**20 if sys.platform == "darwin" else 2**10  # bytes on macOS, kilobytes elsewhere
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+    plain = {name: value.item() if hasattr(value, "item") else value for name, value in counts.items()}
+    text = ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in plain.items())
+    content = {**plain, "peak_memory_mb": round(peak, 1)}
+    display({"text/plain": f"{text}; peak memory {peak:.0f} MB", COUNTS_MIME: content}, raw=True)
+
+
+def notebook_path(stage: str) -> Path:
+    """Return the notebook of a stage."""
+    path = NOTEBOOKS / f"{STAGES.index(stage) + 1:02d}_{stage}.ipynb"
+    if not path.is_file():
+        raise ManifestError(
+            f"{path}: no such notebook. The pipeline runs from a clone of the repository: "
+            "install it there with `pip install --editable .`."
+        )
+    return path
+
+
+def notebook_parameters(path: Path) -> dict[str, Any]:
+    """Return names and defaults of the cell tagged `parameters`.
+
+    Raises:
+        ManifestError: no such cell, or something else than plain literals in it.
+    """
+    import nbformat
+
+    for cell in nbformat.read(path, as_version=4).cells:
+        if "parameters" in cell.metadata.get("tags", []):
+            try:
+                return _literals(cell.source)
+            except (SyntaxError, ValueError) as error:
+                raise ManifestError(
+                    f"{path}: parameters are `name = literal` lines only ({error})."
+                ) from None
+    raise ManifestError(f"{path}: no cell is tagged `parameters`.")
+
+
+def check_parameters(path: Path, parameters: Iterable[str], where: str = "") -> None:
+    """Refuse parameters that the notebook `path` does not have; papermill would only warn.
+
+    Raises:
+        ManifestError: naming the parameter and the nearest known one.
+    """
+    known = notebook_parameters(path)
+    for name in parameters:
+        if name not in known:
+            raise ManifestError(f"{where}{name}: {path.name} has no such parameter. {nearest(name, known)}")
+
+
+def stage_folders(files: SceneFiles) -> dict[str, Path]:
+    """Return where the stages meet, by the names of the notebooks' parameters."""
+    return {
+        "map_feats_root": files.embeddings,
+        "out_jsonl": files.retrieval_dir,
+        "retrieval_dir": files.retrieval_dir,
+        "features_dir": files.features,
+        "map_dir": files.maps,
+        "poses_dir": files.poses_dir,
+        "evaluation_dir": files.evaluation,
+    }
+
+
+def stage_outputs(files: SceneFiles, stage: str) -> Path | None:
+    """Return the folder of a stage's results; None for one that has only its notebook to show."""
+    return {
+        "embed": files.embeddings,
+        "retrieve": files.retrieval_dir,
+        "localize": files.poses_dir,
+        "evaluate": files.evaluation,
+        "visualize": files.visualization,
+    }.get(stage)
+
+
+def _make_upstream(stage: str, sessions: Path, files: SceneFiles, wanted: set[Path | None]) -> None:
+    """Make what earlier stages should have left in the folders `wanted`, where they are empty or absent."""
+    for name in UPSTREAM[stage]:
+        folder = stage_outputs(files, name)
+        if folder is None or folder not in wanted or (folder.is_dir() and any(folder.iterdir())):
+            continue
+        _make_upstream(name, sessions, files, {stage_outputs(files, earlier) for earlier in UPSTREAM[name]})
+        print(f"{name}: not there yet, made now in {folder}")
+        _run_stage(name, sessions, files)
+
+
+def _run_stage(stage: str, sessions: Path, files: SceneFiles) -> None:
+    """Run a stage that others build on, with its defaults."""
+    if stage == "embed":
+        from toolkit.embed import embed_sessions
+
+        embed_sessions(sessions, files.embeddings)
+    elif stage == "retrieve":
+        from toolkit.retrieve import retrieve_pairs
+
+        retrieve_pairs(sessions, files.embeddings, out_jsonl=files.retrieval_dir)
+    else:
+        from toolkit.localize import localize_pairs
+
+        localize_pairs(sessions, files.retrieval_dir, files.poses_dir, files.features, files.maps)
+
+
+def _refuse_injected(stage: str) -> None:
+    """Refuse unknown parameters among those papermill has injected into the running notebook."""
+    ipython = sys.modules.get("IPython")
+    shell = ipython.get_ipython() if ipython else None
+    for source in shell.user_ns.get("In", []) if shell else []:
+        if source.startswith("# Parameters\n"):
+            check_parameters(notebook_path(stage), _literals(source))
+
+
+def _literals(source: str) -> dict[str, Any]:
+    """Return the `name = literal` lines of a cell."""
+    values = {}
+    for node in ast.parse(source).body:
+        target = node.targets[0] if isinstance(node, ast.Assign) and len(node.targets) == 1 else None
+        if not (isinstance(node, ast.Assign) and isinstance(target, ast.Name)):
+            raise ValueError(f"line {node.lineno}: {ast.unparse(node)}")
+        values[target.id] = ast.literal_eval(node.value)
+    return values

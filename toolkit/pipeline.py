@@ -1,0 +1,511 @@
+"""Run the notebooks of a manifest: in order, resumable, with a record of what was done (`run.json`).
+
+Each notebook is one stage and is executed by papermill in a kernel of its own. A stage whose settings,
+inputs, code and outputs are those of its record under `RUN/SCENE/.stages/` is not executed again; one that is
+executed still reuses what it finds finished.
+"""
+
+import hashlib
+import importlib.metadata
+import json
+import os
+import platform
+import re
+import shutil
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from toolkit import __version__, errors
+from toolkit.errors import ManifestError, ToolkitError
+from toolkit.files import SceneFiles, fingerprint, write_text
+from toolkit.manifest import STAGES, Manifest, load_manifest, nearest
+from toolkit.notebook import (
+    COUNTS_MIME,
+    TEXT_BARS,
+    UPSTREAM,
+    check_parameters,
+    notebook_parameters,
+    notebook_path,
+    stage_folders,
+    stage_outputs,
+)
+
+# Distributions whose versions may change results.
+_VERSIONS = ("numpy", "pycolmap", "faiss-cpu", "opencv-python-headless", "pandas", "torch", "rerun-sdk")
+
+Say = Callable[..., None]
+
+
+class StageError(ToolkitError):
+    """A stage stopped; the message holds the failing cell's error and the path of the executed notebook."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One execution of one notebook."""
+
+    stage: str
+    files: SceneFiles
+    parameters: dict[str, Any]
+    label: str = ""
+    """Which part of the stage, where it takes several executions; its outputs have it in their path."""
+
+    @property
+    def name(self) -> str:
+        return f"{self.files.scene} {self.label}".rstrip()
+
+    @property
+    def notebook(self) -> Path:
+        stem = f"{self.files.scene}_{notebook_path(self.stage).stem}"
+        return self.files.run / "notebooks" / f"{stem}{self.label and '_' + self.label}.ipynb"
+
+    @property
+    def record(self) -> Path:
+        return self.files.root / ".stages" / f"{self.stage}{self.label and '_' + self.label}.json"
+
+    def outputs(self) -> str:
+        """Return what identifies the files that the job has made."""
+        folder = stage_outputs(self.files, self.stage)
+        return tree_fingerprint(folder, self.label) if folder else ""
+
+    def forget(self) -> None:
+        """Remove the records of what the outputs were made from, so that the stage reuses none of them."""
+        folder = stage_outputs(self.files, self.stage)
+        if folder:
+            for path in folder.rglob("*.meta.json"):
+                if self.label in path.relative_to(folder).as_posix():
+                    path.unlink()
+
+
+def run(
+    manifest_path: str | Path,
+    only: str | None = None,
+    force: bool = False,
+    overrides: Iterable[str] = (),
+    say: Say = print,
+) -> Path:
+    """Run a manifest and return its run folder, with `run.json` and `report.html` in it.
+
+    Args:
+        manifest_path: YAML file, see `toolkit.manifest`.
+        only: run this stage alone, on what earlier stages left.
+        force: execute stages that are up to date, and let them reuse nothing of their own.
+        overrides: `key=value` or `stage.key=value`, replacing what the manifest says.
+        say: takes the progress lines; called like `print`.
+
+    Raises:
+        ManifestError: before anything runs.
+        StageError: when a notebook fails; `run.json` then says `"status": "failed"`.
+    """
+    if only is not None and only not in STAGES:
+        raise ManifestError(f"--only {only}: no such stage. {nearest(only, STAGES)}")
+    manifest = load_manifest(manifest_path, overrides)
+    for stage in STAGES:  # a wrong key stops the run before hours of work, not after
+        check_parameters(notebook_path(stage), manifest.stage(stage).given(), f"{manifest_path}: {stage}.")
+    captures = _captures(manifest)
+    run_dir = Path(manifest.output_root) / manifest.name
+    jobs = [
+        job
+        for capture in captures
+        for stage in ([only] if only else STAGES)
+        for job in _jobs(manifest, stage, capture, SceneFiles(run_dir, capture.name), force)
+    ]
+    inputs = {capture.name: tree_fingerprint(capture / "sessions") for capture in captures}
+    log = RunLog(run_dir, manifest, inputs)
+    try:
+        for i, job in enumerate(jobs, 1):
+            wanted = _inputs_of(job, inputs[job.files.scene])
+            head = f"[{i}/{len(jobs)}] {job.stage:<9} {job.name}"
+            if not force and (row := _reusable(job, wanted)):
+                say(f"{head}  reused")
+            else:
+                row = _run_job(job, wanted, force, head, log, say)
+            log.add(row)
+        log.status = "done"
+    except StageError as error:
+        log.status, log.error = "failed", str(error)
+        raise
+    except KeyboardInterrupt:
+        log.status = "interrupted"
+        raise
+    finally:
+        log.write()
+    _write_report(run_dir)
+    return run_dir
+
+
+class StatusLine:
+    """The line of a running stage; on a terminal it ends in the stage's own progress bar, which it is fed."""
+
+    def __init__(self, head: str, say: Say) -> None:
+        self.head, self.say = head, say
+        # Elsewhere, and for a caller with a `say` of its own, the line is written once.
+        self.live = say is print and sys.stdout.isatty()
+        say(f"{head} ...", end="", flush=True)
+
+    def write(self, text: str) -> None:
+        """Take what the kernel writes to stderr; the last line of it is shown."""
+        shown = [part for part in re.split(r"[\r\n]", text) if part.strip()]
+        if self.live and shown:
+            width = shutil.get_terminal_size().columns - 1
+            self.say(f"\r{f'{self.head} ... {shown[-1].strip()}'[:width]}\033[K", end="", flush=True)
+
+    def flush(self) -> None:
+        """Do nothing: every write is shown at once."""
+
+    def end(self, text: str) -> None:
+        """Replace the progress by what came of it."""
+        self.say(f"\r{self.head}  {text}\033[K" if self.live else f"  {text}")
+
+
+def execute(
+    path: Path, output: Path, parameters: dict[str, Any], progress: StatusLine | None = None
+) -> tuple[Any, float]:
+    """Execute the notebook `path` in a fresh kernel and write the executed copy to `output`.
+
+    Args:
+        path: the notebook.
+        output: where the executed copy goes, also of a notebook that failed.
+        parameters: replacing those of its parameters cell.
+        progress: shows what the kernel writes to stderr.
+
+    Returns:
+        The executed notebook, and the highest memory (MB) of this process and the kernel's together.
+
+    Raises:
+        ManifestError: a parameter that the notebook does not have.
+        StageError: a cell failed, or the kernel died; `output` shows where.
+    """
+    check_parameters(path, parameters)
+    # papermill takes seconds to import, and a run that reuses everything does not need it.
+    import papermill
+    from nbclient.exceptions import DeadKernelError
+    from papermill.exceptions import PapermillExecutionError
+    from traitlets.config import Config
+
+    output.parent.mkdir(parents=True, exist_ok=True)
+    partial = output.with_name(f".{output.stem}.partial.ipynb")
+    sockets = tempfile.TemporaryDirectory(prefix="kernel-")
+    # Sockets in the file system: other users of the machine cannot listen in. Their paths have to be short.
+    ipc = os.name == "posix" and len(sockets.name) < 80
+    memory = MemoryWatch()
+    os.environ[TEXT_BARS] = "1"
+    try:
+        notebook = papermill.execute_notebook(
+            # papermill formats paths with the parameters, so braces in them need escaping.
+            *(str(file).replace("{", "{{").replace("}", "}}") for file in (path, partial)),
+            parameters=parameters,
+            kernel_name="python3",
+            progress_bar=False,
+            stderr_file=progress,
+            # What the kernel has to say of its own shutdown is of no use to anybody.
+            extra_arguments=["--log-level=CRITICAL"],
+            cwd=str(output.parent),
+            config=Config({"KernelManager": {"transport": "ipc", "ip": f"{sockets.name}/s"}} if ipc else {}),
+        )
+    except PapermillExecutionError as error:
+        known = {name for name, kind in vars(errors).items() if isinstance(kind, type)}
+        text = error.evalue if error.ename in known else f"{error.ename}: {error.evalue}"
+        raise StageError(f"{text}\nThe executed notebook shows where: {output}") from None
+    except DeadKernelError:
+        raise StageError(
+            "The notebook's kernel died; when the system ends it, memory is the usual reason "
+            f"({memory.stop():.0f} MB were in use).\nThe executed notebook shows where: {output}"
+        ) from None
+    finally:
+        del os.environ[TEXT_BARS]
+        memory.stop()
+        sockets.cleanup()
+        if partial.exists():
+            _tidy_streams(partial)
+            partial.replace(output)
+    return notebook, memory.stop()
+
+
+def _tidy_streams(path: Path) -> None:
+    """Join the pieces of each stream of an executed notebook; keep what a terminal would show in the end."""
+    import nbformat
+
+    content = nbformat.read(path, as_version=4)
+    for cell in content.cells:
+        outputs: list[Any] = []
+        for output in cell.get("outputs", []):
+            joins = output.output_type == "stream" and outputs and outputs[-1].get("name") == output.name
+            if joins:
+                outputs[-1].text += output.text
+            else:
+                outputs.append(output)
+        for output in outputs:
+            if output.output_type == "stream":
+                lines = output.text.split("\n")
+                output.text = "\n".join(line.rstrip("\r").rpartition("\r")[2] for line in lines)
+        if "outputs" in cell:
+            cell.outputs = outputs
+    nbformat.write(content, path)
+
+
+def tree_fingerprint(folder: Path, part: str = "") -> str:
+    """Return 16 hex digits for the files below a folder: their paths, sizes and times of change.
+
+    With `part`, of those that have it in their path.
+    """
+    rows = []
+    for root, folders, names in os.walk(folder, followlinks=True):
+        folders.sort()
+        place = os.path.relpath(root, folder)
+        for name in sorted(names):
+            if part in f"{place}/{name}":
+                with suppress(FileNotFoundError):
+                    stat = os.stat(f"{root}/{name}")  # noqa: PTH116 - a Path for each is 5 times slower
+                    rows.append([place, name, stat.st_size, stat.st_mtime_ns])
+    return fingerprint(rows)
+
+
+def _captures(manifest: Manifest) -> list[Path]:
+    if manifest.demo_data is not None:
+        from toolkit.synthetic import render_capture
+
+        folder = Path(manifest.output_root).parent / "data" / manifest.name
+        return [render_capture(folder, **manifest.demo_data.model_dump())]
+    return [Path(capture) for capture in manifest.captures]
+
+
+def _jobs(manifest: Manifest, stage: str, capture: Path, files: SceneFiles, force: bool) -> Iterator[Job]:
+    """Yield the executions that a stage takes: one, unless only some devices or pairs are asked for."""
+    values: dict[str, Any] = {
+        **stage_folders(files),
+        "sessions_root": capture / "sessions",
+        "out_dir": stage_outputs(files, stage),
+        "queries": manifest.queries,
+        "seed": manifest.seed,
+        "world_up": manifest.world_up,
+    }
+    if force:
+        values["skip_existing"] = False
+    known = notebook_parameters(notebook_path(stage))
+    for label, choice in _parts(manifest, stage, capture):
+        parameters = {name: value for name, value in (values | choice).items() if name in known}
+        parameters |= manifest.stage(stage).given()
+        plain = {name: str(value) if isinstance(value, Path) else value for name, value in parameters.items()}
+        yield Job(stage, files, plain, label)
+
+
+def _parts(manifest: Manifest, stage: str, capture: Path) -> list[tuple[str, dict[str, str]]]:
+    """Return label and choice of devices for each execution of a stage."""
+    from toolkit.capture import Capture
+
+    present = Capture.open(capture).devices
+    devices = present if manifest.devices == "auto" else [d for d in present if d in manifest.devices]
+    pairs = [(m, q) for m in devices for q in devices]
+    if manifest.pairs != "all":
+        pairs = [(m, q) for m, q in manifest.pairs if m in devices and q in devices]
+    if not pairs:
+        raise ManifestError(
+            f"{capture}: none of the devices or pairs that the manifest asks for is in this capture, "
+            f"which has {', '.join(present) or 'none'}."
+        )
+    if len(pairs) == len(present) ** 2:
+        return [("", {"device": "auto", "map_device": "all", "query_device": "all"})]
+    if stage == "embed":
+        return [(f"{d}_", {"device": d}) for d in present if any(d in pair for pair in pairs)]
+    if stage in ("retrieve", "localize"):
+        return [(f"map_{m}_query_{q}", {"map_device": m, "query_device": q}) for m, q in pairs]
+    return [("", {"map_device": "all", "query_device": "all"})]
+
+
+def _inputs_of(job: Job, capture: str) -> str:
+    """Return what identifies the inputs of a job: parameters, capture, code, and the runs it builds on."""
+    # Reusing or not gives the same results.
+    parameters = {name: value for name, value in job.parameters.items() if name != "skip_existing"}
+    source = hashlib.sha256(notebook_path(job.stage).read_bytes()).hexdigest()
+    upstream = [
+        _read_json(record).get("made")
+        for stage in UPSTREAM[job.stage]
+        for record in sorted(job.record.parent.glob(f"{stage}*.json"))
+    ]
+    return fingerprint([parameters, capture, _code_fingerprint(), source, upstream])
+
+
+@cache
+def _code_fingerprint() -> str:
+    """Return what identifies the toolkit's code; a version number would not tell one commit from the next."""
+    sources = sorted(Path(__file__).parent.rglob("*.py"))
+    return fingerprint([hashlib.sha256(path.read_bytes()).hexdigest() for path in sources])
+
+
+def _reusable(job: Job, wanted: str) -> dict[str, Any] | None:
+    """Return the row of the execution that made what is there, if it would be the same now."""
+    record = _read_json(job.record)
+    if record.get("inputs") != wanted or record.get("outputs") != job.outputs() or not job.notebook.is_file():
+        return None
+    return {**record["row"], "status": "reused"}
+
+
+def _run_job(job: Job, wanted: str, force: bool, head: str, log: "RunLog", say: Say) -> dict[str, Any]:
+    """Execute a job and return its row of `run.json`."""
+    line = StatusLine(head, say)
+    row: dict[str, Any] = {"stage": job.stage, "scene": job.files.scene, "part": job.label}
+    row |= {"notebook": str(job.notebook.relative_to(job.files.run)), "parameters": job.parameters}
+    # No record while the stage runs: what it was killed in, it runs again.
+    job.record.unlink(missing_ok=True)
+    if force:
+        job.forget()
+    started = time.perf_counter()
+    try:
+        notebook, memory = execute(notebook_path(job.stage), job.notebook, job.parameters, line)
+    except BaseException as error:
+        status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+        line.end(status)
+        log.add(row | {"status": status, "seconds": round(time.perf_counter() - started, 2)})
+        raise
+    seconds = time.perf_counter() - started
+    work = _work_seconds(notebook)
+    counts = _counts(notebook)
+    memory = max(memory, counts.pop("peak_memory_mb", 0.0))
+    row |= {"status": "done", "seconds": round(seconds, 2), "startup_seconds": round(seconds - work, 2)}
+    row |= {"work_seconds": round(work, 2), "peak_memory_mb": round(memory), "counts": counts}
+    record = {"made": datetime.now(UTC).isoformat(), "inputs": wanted, "outputs": job.outputs(), "row": row}
+    write_text(job.record, json.dumps(record, indent=1) + "\n")
+    summary = ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in counts.items())
+    line.end(f"{summary}{summary and '; '}{work:.1f} s + {seconds - work:.1f} s start-up, {memory:.0f} MB")
+    return row
+
+
+def _work_seconds(notebook: Any) -> float:
+    """Return the seconds in cells after the one tagged `setup`, which imports and resolves."""
+    cells = list(notebook.cells)
+    setup = [i for i, cell in enumerate(cells) if "setup" in cell.metadata.get("tags", [])]
+    later = cells[setup[-1] + 1 :] if setup else cells
+    return sum((cell.metadata.get("papermill", {}).get("duration") or 0.0) for cell in later)
+
+
+def _counts(notebook: Any) -> dict[str, Any]:
+    """Return what the notebook handed to `toolkit.notebook.finish`."""
+    for cell in reversed(notebook.cells):
+        for output in cell.get("outputs", []):
+            if COUNTS_MIME in output.get("data", {}):
+                return dict(output["data"][COUNTS_MIME])
+    return {}
+
+
+class MemoryWatch(threading.Thread):
+    """Samples the memory of this process and its children, so that workers of a kernel count as well."""
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self._ended = threading.Event()
+        self._peak_mb = 0.0
+        self.start()
+
+    def run(self) -> None:
+        """Sample until stopped."""
+        import psutil
+
+        me = psutil.Process()
+        while not self._ended.wait(0.5):
+            total = 0
+            for process in [me, *me.children(recursive=True)]:
+                with suppress(psutil.Error):
+                    info = process.memory_full_info()
+                    # Proportional set size: pages shared between forked workers count once.
+                    total += getattr(info, "pss", info.rss)
+            self._peak_mb = max(self._peak_mb, total / 2**20)
+
+    def stop(self) -> float:
+        """End the sampling and return the highest sum seen, in MB."""
+        self._ended.set()
+        self.join()
+        return self._peak_mb
+
+
+@dataclass
+class RunLog:
+    """The content of `run.json`, written anew after every stage.
+
+    A reused stage keeps the seconds and memory of the execution that made it; `total_seconds` and
+    `work_seconds` are of what this run executed, `peak_memory_mb` is of all its stages.
+    """
+
+    run_dir: Path
+    manifest: Manifest
+    inputs: dict[str, str]
+    """Fingerprint of each scene's capture."""
+    status: str = "running"
+    error: str | None = None
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    started: float = field(default_factory=time.perf_counter)
+    created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
+
+    def add(self, row: dict[str, Any]) -> None:
+        """Add a stage that has ended."""
+        self.rows.append(row)
+        self.write()
+
+    def write(self) -> None:
+        """Write `run.json` as things stand."""
+        rows = self._all_rows()
+        work = sum(row.get("work_seconds", 0.0) for row in rows if row["status"] == "done")
+        content = {
+            "name": self.manifest.name,
+            "status": self.status,
+            "error": self.error,
+            "created": self.created,
+            "manifest": self.manifest.model_dump(mode="json", exclude_none=True),
+            "versions": _versions(),
+            "machine": _machine(),
+            "scenes": list(self.inputs),
+            "inputs": self.inputs,
+            "stages": rows,
+            "total_seconds": round(time.perf_counter() - self.started, 2),
+            "work_seconds": round(work, 2),
+            "peak_memory_mb": max((row.get("peak_memory_mb", 0) for row in rows), default=0),
+        }
+        write_text(self.run_dir / "run.json", json.dumps(content, indent=1) + "\n")
+
+    def _all_rows(self) -> list[dict[str, Any]]:
+        """Return this run's rows and, for stages that `--only` left alone, those of their records."""
+        mine = {(row["scene"], row["stage"]) for row in self.rows}
+        rows = list(self.rows)
+        for scene in self.inputs:
+            for record in sorted((self.run_dir / scene / ".stages").glob("*.json")):
+                row = _read_json(record).get("row")
+                if row and (scene, row["stage"]) not in mine:
+                    rows.append({**row, "status": "reused"})
+        scenes = list(self.inputs)
+        return sorted(rows, key=lambda row: (scenes.index(row["scene"]), STAGES.index(row["stage"])))
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _versions() -> dict[str, str]:
+    versions = {"toolkit": __version__, "python": platform.python_version()}
+    for name in _VERSIONS:
+        with suppress(importlib.metadata.PackageNotFoundError):
+            versions[name] = importlib.metadata.version(name)
+    return versions
+
+
+def _machine() -> dict[str, Any]:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {"cores": cores, "python": platform.python_version(), "platform": platform.platform()}
+
+
+def _write_report(run_dir: Path) -> None:
+    from toolkit.report import write_report
+
+    write_report(run_dir)
