@@ -33,8 +33,8 @@ lint: $(INSTALLED)  ## ruff and mypy
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m mypy
 
-bench: $(INSTALLED)  ## timings; see benchmarks/
-	$(BIN)/python -m benchmarks
+bench: $(INSTALLED)  ## timings: every script in benchmarks/; each has --help
+	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done
 
 clean:  ## remove caches and the environment; runs/ and data/ stay
 	rm -rf $(VENV) *.egg-info build dist .mypy_cache .pytest_cache .ruff_cache

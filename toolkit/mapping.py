@@ -73,9 +73,7 @@ def select_pairs(
         x = bounds[i, 0] + steps * (bounds[i, 1] - bounds[i, 0])
         y = bounds[i, 2] + steps * (bounds[i, 3] - bounds[i, 2])
         rays = np.stack([*np.meshgrid(x, y), np.ones((len(y), len(x)))], -1).reshape(-1, 3)
-        points = geometry.transform(
-            world_from_cams[i], (rays * np.asarray(depths_m)[:, None, None]).reshape(-1, 3)
-        )
+        points = geometry.transform(world_from_cams[i], (rays * np.asarray(depths_m)[:, None, None]).reshape(-1, 3))
         seen = in_view(geometry.transform(cams_from_world[near], points[None]), bounds[near])
         to_i = _unit(centers[i] - points)
         to_j = _unit(centers[near][:, None] - points)
@@ -248,9 +246,7 @@ class LocalMap:
 
 def _camera(text: str) -> pycolmap.Camera:
     model, width, height, *params = [word.strip() for word in text.split(",")]
-    return pycolmap.Camera(
-        model=model, width=int(width), height=int(height), params=[float(p) for p in params]
-    )
+    return pycolmap.Camera(model=model, width=int(width), height=int(height), params=[float(p) for p in params])
 
 
 def triangulate(
@@ -368,9 +364,7 @@ def _refine_points(
         error, in_cam, _ = residuals(points, observations)
         z = np.maximum(in_cam[:, 2], 1e-3)
         # d(x/z, y/z)/d(world point) = (R0 - x/z R2) / z, (R1 - y/z R2) / z
-        jacobian = (rotation[:, :2] - (in_cam[:, :2] / z[:, None])[..., None] * rotation[:, 2:3]) / z[
-            :, None, None
-        ]
+        jacobian = (rotation[:, :2] - (in_cam[:, :2] / z[:, None])[..., None] * rotation[:, 2:3]) / z[:, None, None]
         jacobian *= focal[:, None, None]
         weight = 1.0 / (1.0 + (error**2).sum(1))
         hessian = np.einsum("o,oki,okj->oij", weight, jacobian, jacobian).reshape(-1, 9)
@@ -425,9 +419,7 @@ def build_map(
         np.int64,
     )
     if not len(rows):
-        raise ArtefactError(
-            f"Session {session.id} has no image with both a pose and local features; nothing to map."
-        )
+        raise ArtefactError(f"Session {session.id} has no image with both a pose and local features; nothing to map.")
     sensor_ids = session.images["sensor_id"].to_numpy()
     cameras = [session.camera(sensor_ids[row]) for row in rows]
     devices = session.images["timestamp"].astype(str) + " " + session.device_ids
@@ -470,7 +462,5 @@ def _colored(
         if pixels is not None:
             xy = keypoints[index][local_map.obs_keypoint[obs]].astype(np.int64)
             height, width = pixels.shape[:2]
-            colors[local_map.obs_point[obs]] = pixels[
-                np.clip(xy[:, 1], 0, height - 1), np.clip(xy[:, 0], 0, width - 1)
-            ]
+            colors[local_map.obs_point[obs]] = pixels[np.clip(xy[:, 1], 0, height - 1), np.clip(xy[:, 0], 0, width - 1)]
     return replace(local_map, colors=colors)

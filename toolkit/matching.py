@@ -18,9 +18,7 @@ def similarity(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.flo
     return a @ b.T
 
 
-def mutual_matches(
-    scores: NDArray[np.float32], ratio: float = 0.8, min_score: float = -1.0
-) -> NDArray[np.int64]:
+def mutual_matches(scores: NDArray[np.float32], ratio: float = 0.8, min_score: float = -1.0) -> NDArray[np.int64]:
     """Return mutual nearest neighbours whose rows pass Lowe's ratio test.
 
     Args:

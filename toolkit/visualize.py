@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 import pycolmap
+from matplotlib.collections import LineCollection
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.figures import BLUE, GREEN, GREY, VERMILLION, new_figure, save_figure
@@ -279,8 +280,8 @@ def draw_localization(
         if keypoints is not None:
             measured = np.asarray(keypoints, np.float64).reshape(-1, 2)
             _dots(axis, _on(measured[~good]), s=7, c=ESTIMATED, alpha=0.5, lw=0)
-            for a, b in zip(measured[good & inside], pixels[good & inside], strict=True):
-                axis.plot(*_on(np.stack([a, b])).T, color="white", lw=0.8)
+            lines = np.stack([_on(measured[good & inside]), _on(pixels[good & inside])], axis=1)
+            axis.add_collection(LineCollection(list(lines), colors="white", linewidths=0.8))
         _dots(axis, _on(pixels[good & inside]), s=11, c=GREEN, edgecolors="white", lw=0.35)
         caption += f": {good.sum()} of {len(good)} map points agree"
     else:
