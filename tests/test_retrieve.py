@@ -135,7 +135,7 @@ def test_refused(tiny: Path, tmp_path: Path) -> None:
     sessions, embeddings = tiny / "sessions", tmp_path / "embeddings"
     with pytest.raises(ArtefactError, match=r"run the embed stage first.*--only embed"):
         retrieve_pairs(sessions, tmp_path / "nowhere")
-    with pytest.raises(ManifestError, match=r"map_device is 'spot'.*ios, hl"):
+    with pytest.raises(CaptureError, match=r"No map session of device 'spot'.*ios, hl"):
         retrieve_pairs(sessions, embeddings, "spot")
     with pytest.raises(CaptureError, match="pruned_subsampled"):
         retrieve_pairs(sessions, embeddings, queries="nope")

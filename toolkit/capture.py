@@ -641,6 +641,26 @@ class Capture:
         present = {name.rpartition("_")[0] for name in self.session_ids}
         return [device for device in DEVICES if device in present]
 
+    def devices_with(self, split: str, device: str = "all") -> list[str]:
+        """Return the devices that have a session of a split, all of them or the one asked for.
+
+        Args:
+            split: `map` or `query`.
+            device: a device key, or `all` (also `auto`).
+
+        Raises:
+            CaptureError: no device, or not this one, has such a session.
+        """
+        present = [key for key in self.devices if f"{key}_{split}" in self]
+        if device in ("all", "auto") and present:
+            return present
+        if device not in present:
+            raise CaptureError(
+                f"No {split} session of device {device!r} in {self.path}. "
+                f"Devices with one: {', '.join(present) or 'none'} (or `all`)."
+            )
+        return [device]
+
     def __getitem__(self, session_id: str) -> Session:
         if session_id not in self.session_ids:
             raise CaptureError(

@@ -17,7 +17,7 @@ from tqdm.auto import tqdm
 
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
-from toolkit.embedders import Embedder, create_embedder
+from toolkit.embedders import Embedder, create_embedder, load_embeddings
 from toolkit.errors import ArtefactError, ImageError, ManifestError
 from toolkit.features import FeatureSettings, FeatureStore, LocalFeatures, SiftExtractor, extract_session
 from toolkit.files import (
@@ -32,7 +32,6 @@ from toolkit.files import (
 from toolkit.images import default_workers, prefetch, read_image
 from toolkit.localizers.pnp import PnpLocalizer, PnpSettings, PoseEstimate
 from toolkit.mapping import LocalMap, MapSettings, build_map
-from toolkit.retrieve import load_embeddings, search
 
 log = logging.getLogger(__name__)
 
@@ -86,9 +85,9 @@ def localize_pairs(
     workers = workers or default_workers()
     table = []
     with threadpool_limits(1, "blas"):  # queries are the parallel dimension, and sums stay in one order
-        for mapped in _devices(capture, map_device, "map"):
+        for mapped in capture.devices_with("map", map_device):
             localizer: PnpLocalizer | None = None
-            for asked in _devices(capture, query_device, "query"):
+            for asked in capture.devices_with("query", query_device):
                 started = time.perf_counter()
                 pair = _Pair(capture, mapped, asked, Path(retrieval_dir), Path(out_dir), queries)
                 record = pair.record(settings, method)
@@ -187,17 +186,6 @@ def session_fingerprint(session: Session) -> str:
     """Return 16 hex digits that identify the calibration, poses and image list of a session."""
     files = ["sensors.txt", "images.txt", "rigs.txt", "trajectories.txt"]
     return fingerprint([file_fingerprint(session.path / name) for name in files if (session.path / name).exists()])
-
-
-def _devices(capture: Capture, device: str, split: str) -> list[str]:
-    present = [key for key in capture.devices if f"{key}_{split}" in capture]
-    if device in ("all", "auto"):
-        return present
-    if device not in present:
-        raise ManifestError(
-            f"No session {device}_{split} in {capture.path}. Devices with a {split} session: {', '.join(present)}."
-        )
-    return [device]
 
 
 def _open_localizer(
@@ -446,6 +434,6 @@ def localize_image(
         )
     gray = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
     features: LocalFeatures = SiftExtractor()(gray)
-    query = map.embedder.embed([features])
-    _, found = search(query, map.descriptors, topk, backend="numpy")
-    return map.localizer.localize([camera], np.eye(4)[None], [features], [map.images[found[0]].tolist()])
+    scores = map.descriptors @ map.embedder.embed([features])[0]
+    best = np.argsort(-scores, kind="stable")[:topk]
+    return map.localizer.localize([camera], np.eye(4)[None], [features], [map.images[best].tolist()])

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
+from toolkit.embedders import load_embeddings
 from toolkit.errors import ArtefactError, ManifestError, ToolkitError
 from toolkit.files import (
     file_fingerprint,
@@ -28,7 +29,6 @@ from toolkit.files import (
 log = logging.getLogger(__name__)
 
 Backend = Literal["faiss", "torch", "numpy"]
-COLUMNS = ["row_index", "device_id", "sensor_id", "timestamp", "abs_path"]
 _BLOCK_BYTES = 64 << 20
 
 
@@ -91,49 +91,6 @@ def search(
     return scores, indices
 
 
-def load_embeddings(folder: str | Path) -> tuple[NDArray[np.float32], pd.DataFrame]:
-    """Read the embeddings of a session, or of one subsession.
-
-    Args:
-        folder: `<embeddings>/<session>` or `<embeddings>/<session>/<subsession>`.
-
-    Returns:
-        (N, D) float32; a table of its rows: row_index, device_id, sensor_id, timestamp, abs_path, subsession.
-
-    Raises:
-        ArtefactError: there are none, or files do not fit together.
-    """
-    folder = Path(folder)
-    manifests = sorted(folder.rglob("manifest.csv"))
-    if not manifests:
-        raise ArtefactError(
-            f"No embeddings in {folder}: run the embed stage first (python -m toolkit run ... --only embed)."
-        )
-    matrices: list[NDArray[np.float32]] = []
-    tables = []
-    for manifest in manifests:
-        path = manifest.parent / f"{manifest.parent.name}.npy"
-        try:
-            matrix = np.load(path).astype(np.float32, copy=False)
-            table = pd.read_csv(manifest, dtype={"device_id": str, "sensor_id": str, "abs_path": str})
-        except (OSError, ValueError) as error:
-            raise ArtefactError(f"Embeddings {path} cannot be read ({error}); embed again.") from error
-        if list(table.columns) != COLUMNS or matrix.ndim != 2 or len(matrix) != len(table):
-            raise ArtefactError(
-                f"{manifest} ({len(table)} rows, {', '.join(table.columns)}) does not fit {path.name} "
-                f"{matrix.shape}; expected columns {', '.join(COLUMNS)} and one row a vector. Embed again."
-            )
-        if matrices and matrix.shape[1] != matrices[0].shape[1]:
-            raise ArtefactError(
-                f"{path} has {matrix.shape[1]} dimensions, {manifests[0].parent} {matrices[0].shape[1]}; "
-                "embed again."
-            )
-        matrices.append(matrix)
-        base = folder.parent if manifest.parent == folder else folder
-        tables.append(table.assign(subsession=manifest.parent.relative_to(base).as_posix()))
-    return np.concatenate(matrices), pd.concat(tables, ignore_index=True)
-
-
 def retrieve_pairs(
     sessions_root: str | Path,
     map_feats_root: str | Path,
@@ -174,8 +131,8 @@ def retrieve_pairs(
     if topk < 1:
         raise ManifestError(f"topk is {topk}; expected at least 1.")
     capture = Capture.from_sessions_root(sessions_root)
-    maps = _devices(capture, map_device, "map")
-    askers = _devices(capture, query_device, "query")
+    maps = capture.devices_with("map", map_device)
+    askers = capture.devices_with("query", query_device)
     embeddings = Path(map_feats_root)
     out = Path(out_jsonl) if out_jsonl is not None else embeddings.parent / "retrieval"
     if out.suffix == ".jsonl" and len(maps) * len(askers) != 1:
@@ -348,18 +305,6 @@ def _write_pair(
 def _records(table: pd.DataFrame) -> list[dict[str, Any]]:
     strings = table.assign(timestamp=table["timestamp"].astype(str)).rename(columns={"abs_path": "path"})
     return strings.to_dict("records")
-
-
-def _devices(capture: Capture, device: str, split: str) -> list[str]:
-    present = [key for key in capture.devices if f"{key}_{split}" in capture]
-    if device in ("all", "auto") and present:
-        return present
-    if device not in present:
-        raise ManifestError(
-            f"{split}_device is {device!r}; {capture.name} has {split} sessions of: "
-            f"{', '.join(present) or 'no device'} (or `all`)."
-        )
-    return [device]
 
 
 def _inputs(session: Session, embeddings: Path) -> list[Any]:

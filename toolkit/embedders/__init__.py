@@ -2,12 +2,14 @@
 
 from collections.abc import Callable, Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
-from toolkit.errors import ToolkitError
+from toolkit.errors import ArtefactError, ToolkitError
 
 
 class Embedder(Protocol):
@@ -34,6 +36,8 @@ class Embedder(Protocol):
 
 EMBEDDERS: dict[str, str] = {"vlad": "toolkit.embedders.vlad:Vlad.load"}
 """Name of an embedder -> `module:callable` that makes it, imported when it is asked for."""
+MANIFEST_COLUMNS = ["row_index", "device_id", "sensor_id", "timestamp", "abs_path"]
+"""Columns of the `manifest.csv` that names the image of each row of embeddings."""
 PLANNED = ("megaloc",)
 """Names that manifests may hold and that a later version brings."""
 PREFERENCE = ("megaloc", "vlad")
@@ -71,3 +75,46 @@ def create_embedder(name: str, **options: Any) -> Embedder:
         make = getattr(make, attribute)
     factory: Callable[..., Embedder] = make
     return factory(**options)
+
+
+def load_embeddings(folder: str | Path) -> tuple[NDArray[np.float32], pd.DataFrame]:
+    """Read the embeddings of a session, or of one subsession.
+
+    Args:
+        folder: `<embeddings>/<session>` or `<embeddings>/<session>/<subsession>`.
+
+    Returns:
+        (N, D) float32; a table of its rows: row_index, device_id, sensor_id, timestamp, abs_path, subsession.
+
+    Raises:
+        ArtefactError: there are none, or files do not fit together.
+    """
+    folder = Path(folder)
+    manifests = sorted(folder.rglob("manifest.csv"))
+    if not manifests:
+        raise ArtefactError(
+            f"No embeddings in {folder}: run the embed stage first (python -m toolkit run ... --only embed)."
+        )
+    matrices: list[NDArray[np.float32]] = []
+    tables = []
+    for manifest in manifests:
+        path = manifest.parent / f"{manifest.parent.name}.npy"
+        try:
+            matrix = np.load(path).astype(np.float32, copy=False)
+            table = pd.read_csv(manifest, dtype={"device_id": str, "sensor_id": str, "abs_path": str})
+        except (OSError, ValueError) as error:
+            raise ArtefactError(f"Embeddings {path} cannot be read ({error}); embed again.") from error
+        if list(table.columns) != MANIFEST_COLUMNS or matrix.ndim != 2 or len(matrix) != len(table):
+            raise ArtefactError(
+                f"{manifest} ({len(table)} rows, {', '.join(table.columns)}) does not fit {path.name} "
+                f"{matrix.shape}; expected columns {', '.join(MANIFEST_COLUMNS)} and one row a vector. Embed again."
+            )
+        if matrices and matrix.shape[1] != matrices[0].shape[1]:
+            raise ArtefactError(
+                f"{path} has {matrix.shape[1]} dimensions, {manifests[0].parent} {matrices[0].shape[1]}; "
+                "embed again."
+            )
+        matrices.append(matrix)
+        base = folder.parent if manifest.parent == folder else folder
+        tables.append(table.assign(subsession=manifest.parent.relative_to(base).as_posix()))
+    return np.concatenate(matrices), pd.concat(tables, ignore_index=True)
