@@ -200,7 +200,7 @@ def _open_localizer(
     store = extract_session(session, features_dir, workers=workers)
     inputs = fingerprint([session_fingerprint(session), store.fingerprint])
     path = map_dir / f"{session.id}.npz"
-    local_map = build_map(session, store, path, MapSettings(seed=settings.seed), skip_existing, inputs)
+    local_map = build_map(session, store, path, MapSettings(seed=settings.seed), skip_existing, inputs, workers)
     return PnpLocalizer(local_map, store, settings)
 
 

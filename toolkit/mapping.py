@@ -1,8 +1,8 @@
 """The map: images with known poses, and points triangulated from matches between them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +10,19 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
+from tqdm.auto import tqdm
 
 from toolkit import geometry
 from toolkit.capture import Session
 from toolkit.errors import ArtefactError, ImageError
 from toolkit.features import FeatureStore, LocalFeatures
-from toolkit.files import is_current, write_atomic, write_sidecar
+from toolkit.files import fingerprint, is_current, write_atomic, write_sidecar
 from toolkit.images import prefetch, read_image
 from toolkit.matching import match_along_epipolar_lines, unit_descriptors
 
 Floats = NDArray[np.float64]
+
+PAIRS_A_FILE = 500
 
 
 def rays_of(camera: pycolmap.Camera, pixels: NDArray[np.floating]) -> Floats:
@@ -108,30 +111,43 @@ def _unit(vectors: Floats) -> Floats:
 
 def match_pairs(
     pairs: NDArray[np.int64],
-    features: Sequence[LocalFeatures],
+    load: Callable[[int], LocalFeatures],
     cameras: Sequence[pycolmap.Camera],
     world_from_cams: Floats,
     max_error_px: float = 4.0,
     ratio: float = 0.9,
-) -> list[NDArray[np.int64]]:
+    workers: int = 1,
+) -> Iterator[NDArray[np.int64]]:
     """Match the features of image pairs whose poses are known, along epipolar lines only.
 
-    Returns:
+    Args:
+        pairs: (Q, 2) indices of images; in sorted order an image's features are read once or twice.
+        load: returns the features of an image.
+        cameras, world_from_cams: N images, (N, 4, 4).
+        max_error_px: largest distance of a match to its epipolar line, at either side.
+        ratio: Lowe's ratio, among the candidates along the line.
+        workers: threads.
+
+    Yields:
         For each pair (K, 2) indices of matched features.
     """
     cams_from_world = geometry.invert(world_from_cams)
-    rays = [rays_of(camera, f.keypoints) for camera, f in zip(cameras, features, strict=True)]
-    descriptors = [unit_descriptors(f.descriptors) for f in features]
-    angles = [max_error_px / camera.mean_focal_length() for camera in cameras]
-    result = []
-    for i, j in pairs:
+
+    @lru_cache(maxsize=128)  # 1.6 MB an image: memory does not grow with the map
+    def prepare(index: int) -> tuple[NDArray[np.float32], Floats]:
+        features = load(index)
+        return unit_descriptors(features.descriptors), rays_of(cameras[index], features.keypoints)
+
+    def match(pair: NDArray[np.int64]) -> NDArray[np.int64]:
+        i, j = int(pair[0]), int(pair[1])
+        (descriptors_i, rays_i), (descriptors_j, rays_j) = prepare(i), prepare(j)
+        angle_i, angle_j = (max_error_px / cameras[index].mean_focal_length() for index in (i, j))
         j_from_i = cams_from_world[j] @ world_from_cams[i]
-        result.append(
-            match_along_epipolar_lines(
-                descriptors[i], descriptors[j], rays[i], rays[j], j_from_i, angles[i], angles[j], ratio
-            )
+        return match_along_epipolar_lines(
+            descriptors_i, descriptors_j, rays_i, rays_j, j_from_i, angle_i, angle_j, ratio
         )
-    return result
+
+    return prefetch(match, pairs, workers)
 
 
 @dataclass(frozen=True)
@@ -394,8 +410,11 @@ def build_map(
     settings: MapSettings | None = None,
     skip_existing: bool = True,
     inputs: str = "",
+    workers: int = 1,
 ) -> LocalMap:
     """Triangulate the map of a session from its poses, or load the one at `path` if it is current.
+
+    Matches are kept beside it in `<name>.matches/`, some hundred pairs a file, so that a killed run goes on there.
 
     Args:
         session: a map session.
@@ -404,13 +423,14 @@ def build_map(
         settings: how to triangulate.
         skip_existing: reuse the file if it was made from the same features, poses and settings.
         inputs: fingerprint of what the features and poses were made from.
+        workers: threads.
 
     Raises:
         ArtefactError: no image has both a pose and features.
     """
     settings = settings or MapSettings()
-    record = {"map": asdict(settings), "inputs": inputs}
-    if skip_existing and is_current(path, record):
+    map_record = {"map": asdict(settings), "inputs": inputs}
+    if skip_existing and is_current(path, map_record):
         return LocalMap.load(path)
     names = [session.image_name(row) for row in range(len(session.images))]
     poses = session.world_from_cam()
@@ -424,22 +444,51 @@ def build_map(
     cameras = [session.camera(sensor_ids[row]) for row in rows]
     devices = session.images["timestamp"].astype(str) + " " + session.device_ids
     groups = np.unique(devices.to_numpy(str)[rows], return_inverse=True)[1]
-    found = [features[names[row]] for row in rows]
     pairs = select_pairs(poses[rows], cameras, groups, settings.pairs_per_image)
-    matches = match_pairs(pairs, found, cameras, poses[rows], settings.max_epipolar_error_px, settings.ratio)
-    local_map = triangulate(
-        [names[row] for row in rows],
-        cameras,
-        poses[rows],
-        [f.keypoints for f in found],
-        pairs,
-        matches,
-        settings,
-    )
-    local_map = _colored(local_map, session, rows, [f.keypoints for f in found])
+    matches: list[NDArray[np.int64]] = []
+    with tqdm(total=len(pairs), desc=f"match {session.id}", unit="pair") as bar:
+        for start in range(0, len(pairs), PAIRS_A_FILE):
+            part = pairs[start : start + PAIRS_A_FILE]
+            cache = Path(path).with_suffix(".matches") / f"{start // PAIRS_A_FILE:05d}.npz"
+            record = {
+                "inputs": inputs,
+                "pairs": fingerprint(part.tolist()),
+                "max_epipolar_error_px": settings.max_epipolar_error_px,
+                "ratio": settings.ratio,
+            }
+            if not (skip_existing and is_current(cache, record)):
+                found = match_pairs(
+                    part,
+                    lambda index: features[names[rows[index]]],
+                    cameras,
+                    poses[rows],
+                    settings.max_epipolar_error_px,
+                    settings.ratio,
+                    workers,
+                )
+                _save_matches(cache, found)
+                write_sidecar(cache, record)
+            matches += _load_matches(cache)
+            bar.update(len(part))
+    keypoints = [features[names[row]].keypoints for row in rows]
+    local_map = triangulate([names[row] for row in rows], cameras, poses[rows], keypoints, pairs, matches, settings)
+    local_map = _colored(local_map, session, rows, keypoints)
     local_map.save(path)
-    write_sidecar(path, record)
+    write_sidecar(path, map_record)
     return local_map
+
+
+def _save_matches(path: Path, matches: Iterable[NDArray[np.int64]]) -> None:
+    """Write the matches of many pairs, one after the other, and how many each pair has."""
+    parts = list(matches)
+    together = np.concatenate([*parts, np.zeros((0, 2), np.int64)]).astype(np.uint16)  # keypoints are thousands
+    with write_atomic(path) as temporary, open(temporary, "wb") as stream:
+        np.savez(stream, matches=together, counts=np.array([len(part) for part in parts], np.int64))
+
+
+def _load_matches(path: Path) -> list[NDArray[np.int64]]:
+    with np.load(path) as arrays:
+        return np.split(arrays["matches"].astype(np.int64), np.cumsum(arrays["counts"])[:-1])
 
 
 def _colored(
