@@ -92,6 +92,8 @@ def is_current(path: str | Path, settings: dict[str, Any]) -> bool:
         record = json.loads(sidecar_path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
+    if not isinstance(record, dict):
+        return False
     return bool(record.get("version") == __version__ and record.get("fingerprint") == fingerprint(settings))
 
 

@@ -1,10 +1,12 @@
 """The map: images with known poses, and points triangulated from matches between them."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 import pycolmap
@@ -254,7 +256,7 @@ class LocalMap:
                 data = {name: arrays[name] for name in arrays.files}
             names, cameras = data.pop("image_names").tolist(), data.pop("cameras").tolist()
             return cls(image_names=names, cameras=[_camera(text) for text in cameras], **data)
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile) as error:
             raise ArtefactError(
                 f"The triangulated map {path} cannot be read ({error}). Build it with the localize stage."
             ) from None
@@ -431,7 +433,8 @@ def build_map(
     settings = settings or MapSettings()
     map_record = {"map": asdict(settings), "inputs": inputs}
     if skip_existing and is_current(path, map_record):
-        return LocalMap.load(path)
+        with suppress(ArtefactError):  # torn behind our back: build it anew
+            return LocalMap.load(path)
     names = [session.image_name(row) for row in range(len(session.images))]
     poses = session.world_from_cam()
     rows = np.array(
@@ -456,7 +459,8 @@ def build_map(
                 "max_epipolar_error_px": settings.max_epipolar_error_px,
                 "ratio": settings.ratio,
             }
-            if not (skip_existing and is_current(cache, record)):
+            kept = _load_matches(cache) if skip_existing and is_current(cache, record) else None
+            if kept is None:
                 found = match_pairs(
                     part,
                     lambda index: features[names[rows[index]]],
@@ -466,9 +470,10 @@ def build_map(
                     settings.ratio,
                     workers,
                 )
-                _save_matches(cache, found)
+                kept = list(found)
+                _save_matches(cache, kept)
                 write_sidecar(cache, record)
-            matches += _load_matches(cache)
+            matches += kept
             bar.update(len(part))
     keypoints = [features[names[row]].keypoints for row in rows]
     local_map = triangulate([names[row] for row in rows], cameras, poses[rows], keypoints, pairs, matches, settings)
@@ -478,17 +483,20 @@ def build_map(
     return local_map
 
 
-def _save_matches(path: Path, matches: Iterable[NDArray[np.int64]]) -> None:
+def _save_matches(path: Path, parts: list[NDArray[np.int64]]) -> None:
     """Write the matches of many pairs, one after the other, and how many each pair has."""
-    parts = list(matches)
     together = np.concatenate([*parts, np.zeros((0, 2), np.int64)]).astype(np.uint16)  # keypoints are thousands
     with write_atomic(path) as temporary, open(temporary, "wb") as stream:
         np.savez(stream, matches=together, counts=np.array([len(part) for part in parts], np.int64))
 
 
-def _load_matches(path: Path) -> list[NDArray[np.int64]]:
-    with np.load(path) as arrays:
-        return np.split(arrays["matches"].astype(np.int64), np.cumsum(arrays["counts"])[:-1])
+def _load_matches(path: Path) -> list[NDArray[np.int64]] | None:
+    """Return the matches of each pair; None if the file is torn."""
+    try:
+        with np.load(path) as arrays:
+            return np.split(arrays["matches"].astype(np.int64), np.cumsum(arrays["counts"])[:-1])
+    except (OSError, EOFError, ValueError, KeyError, BadZipFile):
+        return None
 
 
 def _colored(

@@ -42,8 +42,11 @@ class PnpSettings:
     ransac_max_error_deg: float = 0.45
     """Largest reprojection error of an inlier in RANSAC."""
     ransac_max_trials: int = 20000
-    clear_inlier_ratio: float = 0.4
-    """With more inliers than this share of the matches, no other pose is looked for."""
+    clear_inlier_ratio: float = 0.56
+    """With more inliers than this share of the matches, no other pose is looked for: what is left over cannot support
+    one by more than `ok_rival_support`."""
+    contested_inlier_ratio: float = 0.4
+    """With fewer, the pose may lie between two, and is sought again under a tighter limit."""
     guided_radii_deg: tuple[float, ...] = (0.7, 0.35)
     """Search radius around a projected map point, one guided pass each."""
     guided_min_score: float = 0.75
@@ -192,23 +195,26 @@ class PnpLocalizer:
         right pose puts the rest of the map where it is seen.
         """
         settings = self.settings
-        everything = np.ones(len(matches), bool)
-        attempts = [
-            (settings.ransac_max_error_deg, False),
-            (settings.max_error_deg, False),
-            (settings.ransac_max_error_deg, True),
-        ]
-        found: list[_Hypothesis] = []
-        for max_error_deg, leave_out in attempts:
-            rest = everything
-            for hypothesis in found if leave_out else []:
-                rest = rest & ~self._inliers(query, hypothesis.rig_from_world, matches)
-            start = self._ransac(query, matches[rest], max_error_deg)
+        start = self._ransac(query, matches, settings.ransac_max_error_deg)
+        if start is None:
+            return []
+        found = [self._improve(query, start, matches)]
+        inliers = self._inliers(query, found[0].rig_from_world, matches)
+        share = float(inliers.mean())
+        if share > settings.clear_inlier_ratio:
+            return found
+        if share < settings.contested_inlier_ratio:
+            start = self._ransac(query, matches, settings.max_error_deg)
             if start is not None:
                 found.append(self._improve(query, start, matches))
-                share = self._inliers(query, found[0].rig_from_world, matches).mean()
-                if share > settings.clear_inlier_ratio:
-                    break
+                inliers |= self._inliers(query, found[1].rig_from_world, matches)
+        rest = matches[~inliers]
+        # No need to look for less than half of the support.
+        start = self._ransac(query, rest, settings.ransac_max_error_deg, least_inliers=int(inliers.sum() / 2))
+        if start is not None:
+            support = self._inliers(query, start, rest).sum()
+            if share < settings.contested_inlier_ratio or support >= inliers.sum() / 2:
+                found.append(self._improve(query, start, matches))
         return sorted(found, key=lambda hypothesis: -len(hypothesis.matches))
 
     def _inliers(self, query: "_Query", rig_from_world: Floats, matches: "_Matches") -> NDArray[np.bool_]:
@@ -295,16 +301,20 @@ class PnpLocalizer:
         unique = np.unique(np.concatenate(found), axis=0)
         return unique[:, 0], unique[:, 1], unique[:, 2]
 
-    def _ransac(self, query: "_Query", matches: _Matches, max_error_deg: float) -> Floats | None:
-        """Return rig_from_world by LO-RANSAC, or None."""
+    def _ransac(
+        self, query: "_Query", matches: _Matches, max_error_deg: float, least_inliers: int = 0
+    ) -> Floats | None:
+        """Return rig_from_world by LO-RANSAC, or None; a pose with fewer than `least_inliers` may be missed."""
         if len(np.unique(matches.point)) < 4:
             return None
         options = pycolmap.RANSACOptions()
         options.max_error = float(np.tan(np.radians(max_error_deg)) * query.focals_px.mean())
         options.random_seed = self.settings.seed
         options.min_num_trials = 100
-        options.max_num_trials = self.settings.ransac_max_trials
         options.confidence = 0.9999
+        ratio = np.clip(least_inliers / len(matches), 1e-3, 0.99)
+        trials = np.log(1 - options.confidence) / np.log1p(-(ratio**3))  # to draw three inliers once
+        options.max_num_trials = int(np.clip(trials, options.min_num_trials, self.settings.ransac_max_trials))
         refinement = pycolmap.AbsolutePoseRefinementOptions()
         points = self.map.points[matches.point]
         if len(query.cameras) == 1:

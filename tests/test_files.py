@@ -1,0 +1,179 @@
+"""Artefacts: whole or absent, and reused only if made from the same things."""
+
+import json
+import os
+import stat
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from toolkit import files
+
+
+def test_a_failing_writer_leaves_the_old_file_and_no_litter(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "poses.txt"
+    files.write_text(path, "old")
+
+    def fail() -> None:
+        with files.write_atomic(path) as temporary:
+            temporary.write_text("half of the n")
+            assert path.read_text() == "old"
+            raise RuntimeError("disk")
+
+    with pytest.raises(RuntimeError, match="disk"):
+        fail()
+    assert path.read_text() == "old"
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_a_failing_first_writer_leaves_nothing(tmp_path: Path) -> None:
+    def fail() -> None:
+        with files.write_atomic(tmp_path / "map.npz") as temporary:
+            temporary.write_bytes(b"PK")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fail()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_killed_writer_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text("old")
+    script = (
+        "import os, sys; from toolkit.files import write_atomic\n"
+        "with write_atomic(sys.argv[1]) as t:\n    t.write_text('new'); os.kill(os.getpid(), 9)"
+    )
+    repository = Path(files.__file__).parents[1]
+    assert subprocess.run([sys.executable, "-c", script, str(path)], cwd=repository, check=False).returncode == -9
+    assert path.read_text() == "old"
+
+
+def test_the_temporary_name_keeps_the_suffix_and_is_hidden(tmp_path: Path) -> None:
+    # numpy, cv2 and matplotlib choose the format by the suffix; readers skip hidden files.
+    with files.write_atomic(tmp_path / "a.npy") as temporary:
+        assert temporary.suffix == ".npy"
+        assert temporary.name.startswith(".")
+        assert temporary.parent == tmp_path
+        np.save(temporary, np.arange(3))
+    assert np.load(tmp_path / "a.npy").tolist() == [0, 1, 2]
+
+
+@pytest.fixture
+def umask() -> Iterator[None]:
+    old = os.umask(0o027)
+    yield
+    os.umask(old)
+
+
+@pytest.mark.usefixtures("umask")
+def test_permissions_follow_the_umask(tmp_path: Path) -> None:
+    files.write_text(tmp_path / "a", "x")
+    assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == 0o640
+    assert os.umask(0o027) == 0o027  # and the umask is as it was
+
+
+def test_fingerprint_is_stable() -> None:
+    a = {"x": 1, "y": [1.5, None, "é"], "z": {"p": Path("a/b"), "q": True}}
+    b = {"z": {"q": True, "p": Path("a/b")}, "y": [1.5, None, "é"], "x": 1}
+    assert files.fingerprint(a) == files.fingerprint(b)
+    assert len(files.fingerprint(a)) == 16
+    int(files.fingerprint(a), 16)
+    assert files.fingerprint({"n": np.int64(3), "f": np.float64(0.1)}) == files.fingerprint({"n": 3, "f": 0.1})
+    # It is the same in every process: it must not rest on hash() or on addresses.
+    script = "from toolkit.files import fingerprint; print(fingerprint({'b': [1, 'x'], 'a': None}))"
+    out = subprocess.run([sys.executable, "-c", script], cwd=Path(files.__file__).parents[1], capture_output=True)
+    assert out.stdout.decode().strip() == files.fingerprint({"a": None, "b": [1, "x"]})
+
+
+@pytest.mark.parametrize(
+    "other", [{"a": 2}, {"a": "1"}, {"a": 1.5}, {"a": None}, {"b": 1}, {"a": 1, "b": 1}, {"a": [1]}, {}]
+)
+def test_fingerprint_tells_different_values_apart(other: dict) -> None:
+    assert files.fingerprint(other) != files.fingerprint({"a": 1})
+
+
+def test_fingerprint_respects_the_order_of_lists_and_refuses_objects() -> None:
+    assert files.fingerprint([1, 2]) != files.fingerprint([2, 1])
+    with pytest.raises(TypeError, match="Settings must be JSON"):
+        files.fingerprint({"a": object()})
+
+
+def test_file_fingerprint_is_of_the_bytes(tmp_path: Path) -> None:
+    a, b = tmp_path / "a", tmp_path / "b"
+    a.write_bytes(b"x" * 3_000_000)
+    b.write_bytes(b"x" * 3_000_000)
+    os.utime(b, (1, 1))
+    assert files.file_fingerprint(a) == files.file_fingerprint(b)
+    b.write_bytes(b"x" * 2_999_999 + b"y")
+    assert files.file_fingerprint(a) != files.file_fingerprint(b)
+
+
+def test_files_fingerprint_sees_a_change_a_removal_and_a_swap(tmp_path: Path) -> None:
+    a, b = tmp_path / "a", tmp_path / "b"
+    a.write_text("1")
+    b.write_text("22")
+    first = files.files_fingerprint([a, b])
+    assert files.files_fingerprint([a, b]) == first
+    assert files.files_fingerprint([b, a]) != first
+    os.utime(a, ns=(1, 1))
+    changed = files.files_fingerprint([a, b])
+    assert changed != first
+    b.unlink()
+    assert files.files_fingerprint([a, b]) not in (first, changed)
+
+
+def test_current_only_with_the_same_settings(tmp_path: Path) -> None:
+    path, settings = tmp_path / "map.npz", {"seed": 0, "radii": [0.7, 0.35], "inputs": "abc"}
+    assert not files.is_current(path, settings)
+    path.write_text("x")
+    assert not files.is_current(path, settings)  # no record
+    files.write_sidecar(path, settings)
+    assert files.sidecar_path(path) == tmp_path / "map.npz.meta.json"
+    assert files.is_current(path, settings)
+    assert files.is_current(path, dict(reversed(settings.items())))
+    assert not files.is_current(path, settings | {"seed": 1})
+    assert not files.is_current(path, settings | {"more": None})
+    path.unlink()
+    assert not files.is_current(path, settings)  # a record without its artefact
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"{",
+        b"\xff\xfe\x00",
+        b"{}",
+        *(b"null", b"[]", b'"text"', b"3"),
+    ],
+)
+def test_a_garbage_record_is_not_current(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "a.npy"
+    path.write_text("x")
+    files.sidecar_path(path).write_bytes(content)
+    assert files.is_current(path, {"a": 1}) is False
+
+
+def test_a_record_of_another_version_is_not_current(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    path.write_text("x")
+    files.write_sidecar(path, {"a": 1})
+    record = json.loads(files.sidecar_path(path).read_text())
+    assert record["settings"] == {"a": 1}
+    files.sidecar_path(path).write_text(json.dumps(record | {"version": "0.0.0"}))
+    assert not files.is_current(path, {"a": 1})
+
+
+def test_paths_of_a_scene_are_the_contract() -> None:
+    scene = files.SceneFiles(Path("runs/demo"), "HYDRO")
+    root = Path("runs/demo/HYDRO")
+    assert scene.embeddings == root / "embeddings"
+    assert scene.retrieval("ios", "hl") == root / "retrieval" / "HYDRO_map_ios_query_hl.jsonl"
+    assert scene.poses_txt("spot", "ios") == root / "poses" / "HYDRO_map_spot_query_ios.txt"
+    assert scene.poses_csv("spot", "ios") == root / "poses" / "HYDRO_map_spot_query_ios.csv"
+    assert (scene.evaluation, scene.visualization) == (root / "evaluation", root / "visualization")

@@ -1,0 +1,426 @@
+"""The localize stage from files to files, on a rendered capture: poses, rows, resuming, and single pictures."""
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from toolkit import geometry
+from toolkit.capture import Capture, Trajectory
+from toolkit.embed import embed_sessions
+from toolkit.errors import ArtefactError, CaptureError, ImageError, ManifestError, ToolkitError
+from toolkit.files import SceneFiles, sidecar_path
+from toolkit.images import read_image
+from toolkit.localize import COLUMNS, Map, localize_image, localize_pairs
+from toolkit.localizers.pnp import PnpLocalizer, PoseEstimate
+from toolkit.retrieve import retrieve_pairs
+
+LIST = "keyframes_original"
+DEVICES = ("ios", "hl", "spot")
+
+
+def run_stage(capture: Path, files: SceneFiles, **more: object) -> pd.DataFrame:
+    """Localize in the phone's map, one thread where nothing else is said."""
+    options = {"map_device": "ios", "queries": LIST, "workers": 1} | more
+    folders = (files.retrieval_dir, files.poses_dir, files.features, files.maps)
+    return localize_pairs(capture / "sessions", *folders, **options)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def finished(small_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[SceneFiles, pd.DataFrame]:
+    """A run that has localized all devices in the phone's map, and its table; do not write to it."""
+    files = SceneFiles(tmp_path_factory.mktemp("run"), small_capture.name)
+    sessions = small_capture / "sessions"
+    embed_sessions(sessions, files.embeddings, features_dir=files.features)
+    retrieve_pairs(sessions, files.embeddings, map_device="ios", out_jsonl=files.retrieval_dir, queries=LIST)
+    return files, run_stage(small_capture, files)
+
+
+@pytest.fixture
+def run(finished: tuple[SceneFiles, pd.DataFrame], tmp_path: Path) -> SceneFiles:
+    """A copy of the run without its poses, to work in."""
+    files = SceneFiles(tmp_path / "run", finished[0].scene)
+    shutil.copytree(finished[0].root, files.root)
+    shutil.rmtree(files.poses_dir)
+    return files
+
+
+@pytest.fixture
+def capture(small_capture: Path, tmp_path: Path) -> Path:
+    """A copy of the capture, to damage."""
+    return Path(shutil.copytree(small_capture, tmp_path / "data" / small_capture.name))
+
+
+def rows_of(files: SceneFiles, query: str, mapped: str = "ios") -> pd.DataFrame:
+    return pd.read_csv(files.poses_csv(mapped, query))
+
+
+def without_times(files: SceneFiles, query: str) -> str:
+    return rows_of(files, query).drop(columns="seconds").to_csv()
+
+
+# ------------------------------------------------------------------------------------------------ the answer
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_poses_are_right(small_capture: Path, finished: tuple[SceneFiles, pd.DataFrame], device: str) -> None:
+    files, _ = finished
+    session = Capture.open(small_capture)[f"{device}_query"]
+    estimated = Trajectory.read(files.poses_txt("ios", device))
+    true = session.ground_truth.lookup(estimated.timestamps, estimated.device_ids)
+    rotation_deg, distance_m = geometry.pose_error(estimated.world_from_device, true)
+    assert len(estimated) == len(session.keyframes(LIST))
+    assert ((rotation_deg < 1) & (distance_m < 0.1)).mean() > 0.6
+    assert np.median(distance_m) < 0.02
+    # Device ids are those of the files: the rig's where there is one, else the camera's.
+    assert list(estimated.device_ids) == session.keyframes(LIST)["device_id"].tolist()
+    assert estimated.covariances.shape == (len(estimated), 6, 6)
+    assert (np.linalg.eigvalsh(estimated.covariances) > 0).all()
+
+
+def test_counts_balance(small_capture: Path, finished: tuple[SceneFiles, pd.DataFrame]) -> None:
+    files, table = finished
+    assert table[["map_device", "query_device"]].to_numpy().tolist() == [["ios", d] for d in DEVICES]
+    np.testing.assert_array_equal(table["ok"] + table["low_confidence"] + table["failed"], table["queries"])
+    for row in table.itertuples():
+        keyframes = Capture.open(small_capture)[f"{row.query_device}_query"].keyframes(LIST)
+        found = rows_of(files, row.query_device)
+        assert list(found.columns) == COLUMNS
+        assert row.queries == len(found) == len(keyframes)
+        assert found["timestamp"].tolist() == keyframes["timestamp"].tolist()  # a row each, in the list's order
+        assert found["device_id"].tolist() == keyframes["device_id"].tolist()
+        assert Path(row.path) == files.poses_txt("ios", row.query_device)
+        assert len(Trajectory.read(row.path)) == row.ok + row.low_confidence
+        assert not row.skipped
+
+
+def test_rows_say_how_a_pose_came_about(finished: tuple[SceneFiles, pd.DataFrame]) -> None:
+    found = rows_of(finished[0], "hl")
+    ok = found[found["status"] == "ok"]
+    assert len(ok)
+    assert (ok["method"] == "pnp").all()
+    assert (ok["num_inliers"] <= ok["num_matches"]).all()
+    np.testing.assert_allclose(ok["inlier_ratio"], ok["num_inliers"] / ok["num_matches"], atol=1e-4)
+    assert ok[["rmse_px", "position_std_m", "rotation_std_deg", "seconds"]].gt(0).all(axis=None)
+    listed = {name for names in ok["references"] for name in names.split(";")}
+    retrieved = set()
+    for line in finished[0].retrieval("ios", "hl").read_text().splitlines():
+        retrieved |= {entry["path"].split("/sessions/")[1] for entry in json.loads(line)["topk"]}
+    assert listed
+    assert listed <= retrieved
+
+
+def test_a_finished_run_leaves_no_partial_files(finished: tuple[SceneFiles, pd.DataFrame]) -> None:
+    names = {path.name for path in finished[0].poses_dir.iterdir()}
+    stems = [finished[0].poses_txt("ios", device).stem for device in DEVICES]
+    assert names == {stem + end for stem in stems for end in (".txt", ".csv", ".txt.meta.json")}
+
+
+def test_nearest_is_the_pose_of_the_best_reference_and_labelled(small_capture: Path, run: SceneFiles) -> None:
+    table = run_stage(small_capture, run, method="nearest", query_device="hl")
+    found = rows_of(run, "hl")
+    assert (found["method"] == "nearest").all()
+    assert (found["status"] == "low_confidence").all()  # never `ok`: nothing has confirmed it
+    assert table["low_confidence"].tolist() == [len(found)]
+    session = Capture.open(small_capture)["hl_query"]
+    best: dict[int, dict] = {}
+    for line in run.retrieval("ios", "hl").read_text().splitlines():
+        row = json.loads(line)
+        entry = row["topk"][0] | {"Trs": row["Trs"]}
+        best[int(row["timestamp"])] = max(best.get(int(row["timestamp"]), entry), entry, key=lambda e: e["score"])
+    estimated = Trajectory.read(run.poses_txt("ios", "hl"))
+    assert estimated.covariances is None
+    assert len(estimated) == len(session.keyframes(LIST))
+    for timestamp, pose, names in zip(
+        estimated.timestamps, estimated.world_from_device, found["references"], strict=True
+    ):
+        entry = best[int(timestamp)]
+        # The camera stands where the reference stood; the device's pose follows from its place in the rig.
+        np.testing.assert_allclose(pose @ np.array(entry["Trs"]), entry["Tws"], atol=1e-9)
+        assert entry["path"].endswith(names)
+
+
+# ------------------------------------------------------------------------------------------ wrong questions
+
+
+@pytest.mark.parametrize(
+    ("wrong", "error", "message"),
+    [
+        ({"method": "magic"}, ManifestError, r"Unknown method 'magic'. Known: pnp, nearest"),
+        ({"map_device": "drone"}, ToolkitError, r"drone.*ios, hl, spot"),
+        ({"query_device": "drone"}, ToolkitError, r"drone.*ios, hl, spot"),
+        ({"queries": "keyframes_best"}, CaptureError, "original"),
+        ({"map_device": "hl"}, ArtefactError, r"query ios: .*SMALL_map_hl_query_ios\.jsonl is missing.*retrieve"),
+    ],
+)
+def test_wrong_questions_are_refused(
+    small_capture: Path, run: SceneFiles, wrong: dict, error: type[ToolkitError], message: str
+) -> None:
+    with pytest.raises(error, match=re.compile(message, re.DOTALL)):
+        run_stage(small_capture, run, **wrong)
+    assert not run.poses_dir.exists() or not list(run.poses_dir.glob("*.txt"))
+
+
+@pytest.mark.parametrize("line", ["{", '{"timestamp": "1"}', '{"timestamp": "x", "sensor_id": "a", "topk": []}', "[]"])
+def test_a_garbled_retrieval_names_the_line(small_capture: Path, run: SceneFiles, line: str) -> None:
+    path = run.retrieval("ios", "ios")
+    path.write_text(path.read_text() + line + "\n")
+    with pytest.raises(ArtefactError, match=r"SMALL_map_ios_query_ios\.jsonl, line 4: not a retrieval row"):
+        run_stage(small_capture, run, query_device="ios")
+
+
+# -------------------------------------------------------------------------------------------- what is broken
+
+
+def test_an_unreadable_photograph_is_a_row_and_the_others_go_on(
+    capture: Path, run: SceneFiles, finished: tuple[SceneFiles, pd.DataFrame]
+) -> None:
+    session = Capture.open(capture)["ios_query"]
+    session.image_path(1).write_bytes(b"\xff\xd8 torn")
+    table = run_stage(capture, run, query_device="ios")
+    found, before = rows_of(run, "ios"), rows_of(finished[0], "ios")
+    bad = found["timestamp"] == session.images["timestamp"].iloc[1]
+    assert bad.sum() == 1
+    assert found["status"][bad].iloc[0].startswith("failed: no readable image (Image cannot be decoded")
+    assert found["status"][~bad].tolist() == before["status"][~bad].tolist()
+    assert table["failed"].tolist() == [1]
+    poses = dict(zip(before["timestamp"], Trajectory.read(finished[0].poses_txt("ios", "ios")).qt, strict=True))
+    estimated = Trajectory.read(run.poses_txt("ios", "ios"))
+    assert set(estimated.timestamps) == set(found["timestamp"][~bad])
+    for timestamp, qt in zip(estimated.timestamps, estimated.qt, strict=True):
+        np.testing.assert_array_equal(qt, poses[timestamp])
+
+
+def test_a_rig_goes_on_with_the_cameras_that_it_has(capture: Path, run: SceneFiles) -> None:
+    session = Capture.open(capture)["spot_query"]
+    keyframe = session.keyframes(LIST).iloc[:1]
+    rows = session.rows_of_keyframes(keyframe)[0]
+    session.image_path(int(rows[0])).unlink()
+    run_stage(capture, run, query_device="spot")
+    assert rows_of(run, "spot")["status"].iloc[0] in ("ok", "low_confidence")
+    estimated = Trajectory.read(run.poses_txt("ios", "spot"))
+    true = session.ground_truth.lookup(estimated.timestamps[:1], estimated.device_ids[:1])
+    assert geometry.pose_error(estimated.world_from_device[:1], true)[1] < 0.1
+
+
+def test_a_keyframe_without_photographs_is_a_row(capture: Path, run: SceneFiles) -> None:
+    path = capture / "sessions" / "ios_query" / "proc" / f"{LIST}.txt"
+    path.write_text(path.read_text() + "123456789, nobody/cam\n")
+    table = run_stage(capture, run, query_device="ios")
+    last = rows_of(run, "ios").iloc[-1]
+    assert (last["timestamp"], last["device_id"]) == (123456789, "nobody/cam")
+    assert last["status"] == "failed: no images of this device at this time"
+    assert table[["queries", "failed"]].to_numpy().tolist() == [[4, 1]]
+    assert 123456789 not in Trajectory.read(run.poses_txt("ios", "ios")).timestamps
+
+
+def test_an_image_that_was_not_retrieved_for_is_a_row(small_capture: Path, run: SceneFiles) -> None:
+    path = run.retrieval("ios", "ios")
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
+    run_stage(small_capture, run, query_device="ios")
+    assert rows_of(run, "ios")["status"].tolist()[-1] == "failed: no references"
+
+
+def test_an_exception_in_one_query_does_not_end_the_run(
+    small_capture: Path, run: SceneFiles, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = spy(monkeypatch, fail_at=1, error=ZeroDivisionError("by chance"))
+    run_stage(small_capture, run, query_device="ios")
+    status = rows_of(run, "ios")["status"]
+    assert len(calls) == 3
+    assert (status == "failed: ZeroDivisionError: by chance").sum() == 1
+    assert (status == "ok").sum() == 2
+
+
+# -------------------------------------------------------------------------------------- reuse, resume, order
+
+
+def spy(monkeypatch: pytest.MonkeyPatch, fail_at: int | None = None, error: BaseException | None = None) -> list[int]:
+    """Count the queries that are localized from now on; fail at one of them."""
+    calls: list[int] = []
+    work: Callable[..., PoseEstimate] = PnpLocalizer.localize
+
+    def counted(self: PnpLocalizer, *args: object) -> PoseEstimate:
+        calls.append(len(calls))
+        if error is not None and calls[-1] == fail_at:
+            raise error
+        return work(self, *args)
+
+    monkeypatch.setattr(PnpLocalizer, "localize", counted)
+    return calls
+
+
+@pytest.mark.parametrize("device", ["ios", "spot"])
+def test_a_killed_run_goes_on_where_it_was(
+    small_capture: Path,
+    run: SceneFiles,
+    finished: tuple[SceneFiles, pd.DataFrame],
+    device: str,
+) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        spy(patch, fail_at=2, error=KeyboardInterrupt())
+        with pytest.raises(KeyboardInterrupt):
+            run_stage(small_capture, run, query_device=device)
+    assert not run.poses_txt("ios", device).exists()
+    with pytest.MonkeyPatch.context() as patch:
+        calls = spy(patch)
+        table = run_stage(small_capture, run, query_device=device)
+    assert len(calls) == table["queries"].iloc[0] - 2
+    assert run.poses_txt("ios", device).read_bytes() == finished[0].poses_txt("ios", device).read_bytes()
+    assert without_times(run, device) == without_times(finished[0], device)
+
+
+@pytest.mark.parametrize("tail", [b'{"timestamp": 17145', b"\0" * 50, b"\n", b'"'])
+def test_a_torn_progress_file_costs_at_most_its_last_line(
+    small_capture: Path,
+    run: SceneFiles,
+    finished: tuple[SceneFiles, pd.DataFrame],
+    monkeypatch: pytest.MonkeyPatch,
+    tail: bytes,
+) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        spy(patch, fail_at=2, error=KeyboardInterrupt())
+        with pytest.raises(KeyboardInterrupt):
+            run_stage(small_capture, run, query_device="ios")
+    (progress,) = run.poses_dir.glob(".*.partial.jsonl")
+    with open(progress, "ab") as stream:
+        stream.write(tail)
+    calls = spy(monkeypatch)
+    run_stage(small_capture, run, query_device="ios")
+    assert len(calls) <= 1
+    assert run.poses_txt("ios", "ios").read_bytes() == finished[0].poses_txt("ios", "ios").read_bytes()
+
+
+def test_progress_of_another_question_is_not_taken_over(small_capture: Path, run: SceneFiles) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        spy(patch, fail_at=2, error=KeyboardInterrupt())
+        with pytest.raises(KeyboardInterrupt):
+            run_stage(small_capture, run, query_device="ios", seed=5)
+    with pytest.MonkeyPatch.context() as patch:
+        calls = spy(patch)
+        run_stage(small_capture, run, query_device="ios")
+    assert len(calls) == 3
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_equal_seeds_give_equal_files(
+    small_capture: Path, run: SceneFiles, finished: tuple[SceneFiles, pd.DataFrame], workers: int
+) -> None:
+    shutil.rmtree(run.maps)  # the map too is made anew
+    run_stage(small_capture, run, workers=workers)
+    for device in DEVICES:
+        assert run.poses_txt("ios", device).read_bytes() == finished[0].poses_txt("ios", device).read_bytes()
+        assert without_times(run, device) == without_times(finished[0], device)
+
+
+def test_a_finished_pair_is_reused_until_something_changes(
+    small_capture: Path, run: SceneFiles, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_stage(small_capture, run, query_device="ios")
+    stamp = run.poses_txt("ios", "ios").stat().st_mtime_ns
+    calls = spy(monkeypatch)
+
+    def again(**more: object) -> bool:
+        calls.clear()
+        table = run_stage(small_capture, run, query_device="ios", **more)
+        assert table["queries"].tolist() == [3]
+        assert table["ok"].iloc[0] + table["low_confidence"].iloc[0] == 3
+        return bool(table["skipped"].iloc[0])
+
+    assert again()
+    assert again(workers=2)  # the answer does not depend on it
+    assert calls == []
+    assert run.poses_txt("ios", "ios").stat().st_mtime_ns == stamp
+    assert not again(skip_existing=False)
+    assert len(calls) == 3
+    assert not again(method="nearest")
+    assert not again()  # the poses that lay there were the baseline's
+    assert (rows_of(run, "ios")["method"] == "pnp").all()
+    run.poses_csv("ios", "ios").unlink()
+    assert not again()
+    sidecar_path(run.poses_txt("ios", "ios")).unlink()
+    assert not again()
+    path = run.retrieval("ios", "ios")
+    path.write_text(path.read_text() + path.read_text().splitlines(keepends=True)[-1])
+    assert not again()
+    assert again()
+
+
+@pytest.mark.parametrize("file", ["images.txt", "sensors.txt", "trajectories.txt"])
+def test_changed_files_of_the_map_make_the_poses_anew(capture: Path, run: SceneFiles, file: str) -> None:
+    """A map session whose last photograph is gone, or whose files were touched up, is another map."""
+    run_stage(capture, run, query_device="ios")
+    assert run_stage(capture, run, query_device="ios")["skipped"].all()
+    path = capture / "sessions" / "ios_map" / file
+    path.write_text(path.read_text() + "# corrected\n")
+    assert not run_stage(capture, run, query_device="ios")["skipped"].any()
+
+
+# ---------------------------------------------------------------------------------------- a single picture
+
+
+@pytest.fixture(scope="module")
+def opened(finished: tuple[SceneFiles, pd.DataFrame]) -> Map:
+    return Map.open(finished[0].run, finished[0].scene, "ios")
+
+
+def snapshot(folder: Path) -> dict[str, tuple[int, int]]:
+    return {
+        str(path): (path.stat().st_size, path.stat().st_mtime_ns)
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def test_a_single_picture_gets_the_pipelines_pose_and_changes_nothing(
+    small_capture: Path, finished: tuple[SceneFiles, pd.DataFrame], opened: Map
+) -> None:
+    session = Capture.open(small_capture)["ios_query"]
+    before = snapshot(finished[0].run)
+    estimated = Trajectory.read(finished[0].poses_txt("ios", "ios"))
+    for row in range(len(session.images)):
+        image = session.images.iloc[row]
+        expected = estimated.lookup([image["timestamp"]], [image["sensor_id"]])[0]
+        answer = localize_image(opened, session.image_path(row), session.camera(image["sensor_id"]))
+        assert answer.status in ("ok", "low_confidence")
+        np.testing.assert_allclose(answer.world_from_rig, expected, atol=1e-9)
+    assert snapshot(finished[0].run) == before
+
+
+def test_a_picture_may_be_pixels(small_capture: Path, opened: Map) -> None:
+    session = Capture.open(small_capture)["ios_query"]
+    path, camera = session.image_path(0), session.camera(session.images["sensor_id"].iloc[0])
+    from_file = localize_image(opened, str(path), camera)
+    gray = localize_image(opened, read_image(path, gray=True), camera)
+    np.testing.assert_allclose(gray.world_from_rig, from_file.world_from_rig, atol=1e-9)
+    colour = localize_image(opened, read_image(path), camera)
+    rotation_deg, distance_m = geometry.pose_error(colour.world_from_rig, from_file.world_from_rig)
+    assert rotation_deg < 0.1
+    assert distance_m < 0.01
+
+
+def test_a_picture_of_nothing_has_no_pose(small_capture: Path, opened: Map) -> None:
+    session = Capture.open(small_capture)["ios_query"]
+    camera = session.camera(session.images["sensor_id"].iloc[0])
+    answer = localize_image(opened, np.zeros((camera.height, camera.width), np.uint8), camera)
+    assert answer.status.startswith("failed: ")
+    assert answer.world_from_rig is None
+
+
+def test_a_picture_of_another_size_than_its_camera_is_refused(small_capture: Path, opened: Map) -> None:
+    session = Capture.open(small_capture)["ios_query"]
+    camera = session.camera(session.images["sensor_id"].iloc[0])
+    with pytest.raises(ImageError, match=f"10 x 20 pixels, its camera {camera.width} x {camera.height}"):
+        localize_image(opened, np.zeros((20, 10), np.uint8), camera)
+    with pytest.raises(ImageError, match="not found"):
+        localize_image(opened, "nowhere.jpg", camera)
+
+
+def test_the_map_of_an_unfinished_run(finished: tuple[SceneFiles, pd.DataFrame]) -> None:
+    with pytest.raises(ArtefactError, match="hl_map"):
+        Map.open(finished[0].run, finished[0].scene, "hl")
