@@ -34,7 +34,7 @@ lint: $(INSTALLED)  ## ruff and mypy
 	$(BIN)/python -m mypy
 
 bench: $(INSTALLED)  ## timings: every script in benchmarks/; each has --help
-	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done
+	$(BIN)/python -m benchmarks all
 
 clean:  ## remove caches and the environment; runs/ and data/ stay
 	rm -rf $(VENV) *.egg-info build dist .mypy_cache .pytest_cache .ruff_cache

@@ -75,7 +75,8 @@ def localize_pairs(
         One row a pair: map_device, query_device, queries, ok, low_confidence, failed, seconds, skipped, path.
 
     Raises:
-        ManifestError: unknown method, device or list.
+        ManifestError: unknown method.
+        CaptureError: unknown device or list.
         ArtefactError: the retrieval of a pair is missing.
     """
     if method not in METHODS:

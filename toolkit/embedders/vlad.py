@@ -14,6 +14,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from toolkit.errors import ArtefactError, ToolkitError
 from toolkit.features import DESCRIPTOR_SCALE, LocalFeatures
@@ -66,6 +67,7 @@ class Vlad:
     def settings(self) -> dict[str, Any]:
         return {"name": self.name, **asdict(self._settings), "vocabulary": self._fingerprint}
 
+    @threadpool_limits.wrap(limits=1, user_api="blas")  # small products: two threads take three times as long
     def embed(self, inputs: Sequence[LocalFeatures]) -> Floats:
         """Return the global descriptors (B, dim) of images; rows of zeros where an image has no features.
 
@@ -74,6 +76,7 @@ class Vlad:
         return self._aggregate(inputs) @ self.projection
 
     @classmethod
+    @threadpool_limits.wrap(limits=1, user_api="blas")
     def learn(
         cls,
         features: Callable[[], Iterable[LocalFeatures]],

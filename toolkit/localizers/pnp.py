@@ -51,6 +51,10 @@ class PnpSettings:
     """Search radius around a projected map point, one guided pass each."""
     guided_min_score: float = 0.75
     """Least cosine similarity of a match in the guided passes."""
+    max_ransac_matches: int = 2500
+    """Matches that RANSAC sees at most, a random choice: the guided passes find the rest again."""
+    max_guided_matches: int = 1000
+    """Guided matches of a camera at most, the most alike."""
     guided_images: int = 12
     """Covisible map images whose points are projected."""
     max_error_deg: float = 0.17
@@ -307,6 +311,12 @@ class PnpLocalizer:
         """Return rig_from_world by LO-RANSAC, or None; a pose with fewer than `least_inliers` may be missed."""
         if len(np.unique(matches.point)) < 4:
             return None
+        if len(matches) > self.settings.max_ransac_matches:
+            chosen = np.random.default_rng(self.settings.seed).permutation(len(matches))
+            kept = np.zeros(len(matches), bool)
+            kept[chosen[: self.settings.max_ransac_matches]] = True
+            least_inliers = least_inliers * self.settings.max_ransac_matches // len(matches)
+            matches = matches[kept]
         options = pycolmap.RANSACOptions()
         options.max_error = float(np.tan(np.radians(max_error_deg)) * query.focals_px.mean())
         options.random_seed = self.settings.seed
@@ -402,7 +412,7 @@ class PnpLocalizer:
             # Best first: the first of each keypoint and of each point, where they are the same match.
             first_of_keypoint = np.unique(keypoint, return_index=True)[1]
             first_of_point = np.unique(candidate, return_index=True)[1]
-            mutual = np.intersect1d(first_of_keypoint, first_of_point)
+            mutual = np.intersect1d(first_of_keypoint, first_of_point)[: self.settings.max_guided_matches]
             pixels = features.keypoints[keypoint[mutual]].astype(np.float64)
             found.append((np.full(len(mutual), camera), pixels, candidate[mutual]))
         if not found:
