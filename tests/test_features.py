@@ -375,3 +375,15 @@ def test_the_same_features_from_a_copy_of_the_capture_elsewhere(session: Session
     os.sync()
     again = extract(Session.open(moved / "sessions" / "ios_map"), tmp_path / "features2")
     assert again.fingerprint == extract(session, tmp_path / "features").fingerprint
+
+
+def test_image_of_another_size_than_its_camera_is_listed(small_capture: Path, tmp_path: Path) -> None:
+    shutil.copytree(small_capture / "sessions" / "ios_query", tmp_path / "ios_query")
+    session = Session.open(tmp_path / "ios_query")
+    image = cv2.imread(str(session.image_path(0)))
+    cv2.imwrite(str(session.image_path(0)), image[::2, ::2])
+    store = extract_session(session, tmp_path / "features", SETTINGS, rows=np.array([0, 1]), progress=False)
+    name = session.image_name(0)
+    assert name not in store
+    assert session.image_name(1) in store
+    assert "sensors.txt says" in store.failed[name]

@@ -213,12 +213,13 @@ def extract_session(
     cameras = np.flatnonzero(session.images["sensor_id"].map(is_camera).to_numpy(bool))
     wanted = cameras if rows is None else np.intersect1d(cameras, rows)
     shards = list(_shards(session, cameras))
+    calibration = file_fingerprint(session.path / "sensors.txt")
     todo: list[tuple[Path, dict[str, Any], NDArray[np.int64]]] = []
     for path, members in ((folder / name, members) for name, members in shards):
         if not np.isin(members, wanted).any():
             continue
         images = files_fingerprint([session.image_path(int(row)) for row in members])
-        record = {"features": asdict(settings), "images": images}
+        record = {"features": asdict(settings), "images": images, "sensors": calibration}
         if not (skip_existing and is_current(path, record) and store.add_shard(path)):
             todo.append((path, record, members))
     total = sum(len(members) for _, _, members in todo)
@@ -249,10 +250,18 @@ def _write_shard(
 ) -> None:
     def extract(row: int) -> LocalFeatures | str:
         try:
-            return extractor(read_image(session.image_path(row), gray=True))
+            image = read_image(session.image_path(row), gray=True)
         except ImageError as error:
             return str(error)
+        camera = session.camera(sensors[row])
+        if image.shape != (camera.height, camera.width):
+            return (
+                f"Image of {image.shape[1]} x {image.shape[0]} pixels, but sensors.txt says {camera.width} x "
+                f"{camera.height} for {sensors[row]}: {session.image_path(row)}"
+            )
+        return extractor(image)
 
+    sensors = session.images["sensor_id"].to_numpy()
     names: list[str] = []
     failed: dict[str, str] = {}
     with write_atomic(path) as temporary, h5py.File(temporary, "w") as shard:

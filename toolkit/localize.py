@@ -28,6 +28,7 @@ from toolkit.files import (
     pair_name,
     write_atomic,
     write_sidecar,
+    write_text,
 )
 from toolkit.images import default_workers, prefetch, read_image
 from toolkit.localizers.pnp import PnpLocalizer, PnpSettings, PoseEstimate
@@ -237,11 +238,9 @@ def _localize_pair(
     progress = pair.out_dir / f".{pair.name}.partial.jsonl"
     done = _read_progress(progress, record) if skip_existing else {}
     todo = [index for index, key in enumerate(keys) if key not in done]
-    progress.parent.mkdir(parents=True, exist_ok=True)
-    with open(progress, "w", encoding="utf-8") as stream:
-        stream.write(json.dumps({"record": fingerprint(record)}) + "\n")
-        stream.writelines(json.dumps(row) + "\n" for row in done.values())
-        stream.flush()
+    finished = [{"record": fingerprint(record)}, *done.values()]
+    write_text(progress, "".join(json.dumps(line) + "\n" for line in finished))
+    with open(progress, "a", encoding="utf-8") as stream:
         label = f"localize {pair.query_device} in {pair.map_device}"
         for row in tqdm(prefetch(solve, todo, workers), total=len(todo), desc=label, unit="query"):
             stream.write(json.dumps(row) + "\n")
