@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from toolkit import tables
-from toolkit.capture import Capture, Session, Trajectory, read_depth, write_depth, write_session
+from toolkit.capture import Capture, Session, Trajectory, parse_camera, read_depth, write_depth, write_session
 from toolkit.errors import CaptureError
 
 CAPTURES = Path(__file__).parents[1].parent / "shared" / "data" / "captures"
@@ -436,3 +436,8 @@ def test_real_captures_open(name: str) -> None:
         if session.split == "query":
             assert session.keyframe_lists == ["original", "pruned", "pruned_subsampled"]
             assert all(len(rows) for rows in session.rows_of_keyframes(session.keyframes()))
+
+
+def test_a_focal_length_of_zero_is_refused() -> None:
+    with pytest.raises(ValueError, match="focal length that is not positive"):
+        parse_camera("camera", "PINHOLE, 640, 480, 0, 500, 320, 240")

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from toolkit.capture import Trajectory, write_session
+from toolkit.capture import Session, Trajectory, write_session
 from toolkit.embed import embed_sessions
 from toolkit.errors import ManifestError, ToolkitError
 from toolkit.retrieve import load_embeddings
@@ -157,3 +157,33 @@ def test_no_map_no_vocabulary(tiny: Path, tmp_path: Path) -> None:
         embed_sessions(tiny / "sessions", tmp_path / "e")
     with pytest.raises(ToolkitError, match="use model `vlad`"):
         embed_sessions(tiny / "sessions", tmp_path / "e", model="megaloc")
+
+
+def test_a_subsession_that_is_gone_leaves_no_embeddings(tiny: Path, tmp_path: Path) -> None:
+    out = tmp_path / "e"
+    embed_sessions(tiny / "sessions", out, device="ios")
+    former = out / "ios_map" / "gone"
+    shutil.copytree(out / "ios_map" / "ios_a", former)
+    (former / "ios_a.npy").rename(former / "gone.npy")
+    embed_sessions(tiny / "sessions", out, device="ios")
+    assert len(load_embeddings(out / "ios_map")[0]) == 6
+
+
+def test_corrected_intrinsics_are_followed(tiny: Path, tmp_path: Path) -> None:
+    sensors = tiny / "sessions" / "ios_map" / "sensors.txt"
+    right = sensors.read_text()
+    width = str(Session.open(tiny / "sessions" / "ios_map").camera("ios_a/cam").width)
+    sensors.write_text(right.replace(f", {width},", f", {int(width) + 2},"))
+    wrong = embed_sessions(tiny / "sessions", tmp_path / "e", device="ios", model="vlad", skip_existing=True)
+    assert wrong.iloc[0]["embedded"] < 6
+    sensors.write_text(right)
+    assert embed_sessions(tiny / "sessions", tmp_path / "e", device="ios").iloc[0]["embedded"] == 6
+
+
+def test_a_torn_matrix_is_made_anew(tiny: Path, tmp_path: Path) -> None:
+    embed_sessions(tiny / "sessions", tmp_path / "e", device="ios")
+    path = tmp_path / "e" / "ios_map" / "ios_a" / "ios_a.npy"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:100])
+    embed_sessions(tiny / "sessions", tmp_path / "e", device="ios")
+    assert path.read_bytes() == whole

@@ -266,3 +266,10 @@ def test_unknown_choices_are_named(scene):
         evaluate_scene(*scene, None, map_device="spot")
     with pytest.raises(ToolkitError, match="Known: device, camera"):
         evaluate_ios(scene, at="rig")
+
+
+def test_only_the_pairs_asked_for_are_evaluated(scene):
+    everything = evaluate_scene(*scene, None).recall
+    wanted = everything[["map_device", "query_device"]].iloc[:1].to_numpy().tolist()
+    some = evaluate_scene(*scene, None, pairs=wanted).recall
+    assert some[["map_device", "query_device"]].to_numpy().tolist() == wanted

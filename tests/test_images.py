@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from toolkit.errors import ImageError
-from toolkit.images import default_workers, prefetch, read_image
+from toolkit.images import default_workers, prefetch, read_for_display, read_image
 
 
 @pytest.fixture
@@ -140,3 +140,11 @@ def test_prefetch_raises_at_the_turn_of_the_item() -> None:
         got.extend(prefetch(fails_at_three, range(50), workers=2, ahead=4))
     assert got == [0, 1, 2]
     assert threading.active_count() < 20  # and the pool is gone
+
+
+def test_a_picture_of_an_unreadable_image_is_a_placeholder(tmp_path: Path) -> None:
+    (tmp_path / "empty.jpg").write_bytes(b"")
+    for name in ("empty.jpg", "missing.jpg"):
+        shown = read_for_display(tmp_path / name)
+        assert shown.ndim == 3
+        assert shown.std() > 0, "it says so"

@@ -19,7 +19,7 @@ from toolkit.notebook import notebook_parameters, notebook_path
 OF_THE_RUN = {
     *("sessions_root", "out_dir", "map_feats_root", "out_jsonl", "retrieval_dir", "features_dir", "map_dir"),
     *("poses_dir", "device", "subsession", "map_device", "query_device", "queries", "seed", "world_up"),
-    "skip_existing",
+    *("skip_existing", "pairs"),
 }
 FUNCTIONS = {
     "embed": "toolkit.embed:embed_sessions",

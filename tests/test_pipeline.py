@@ -204,3 +204,11 @@ def test_a_killed_run_is_taken_up_again(place: Path, go: Callable[..., dict[str,
     process.wait()
     (retrieval / "again").touch()
     assert go() == {"embed": "reused", "retrieve": "done"}
+
+
+def test_output_that_cannot_be_written_is_said(small_capture: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    manifest = tmp_path / "m.yaml"
+    manifest.write_text(f"captures: [{small_capture}]\noutput_root: {tmp_path / 'file' / 'runs'}\n")
+    with pytest.raises(ManifestError, match="cannot be made"):
+        pipeline.run(manifest)

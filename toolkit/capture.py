@@ -25,7 +25,7 @@ import pyarrow.compute as pc
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.errors import CaptureError
-from toolkit.files import write_atomic
+from toolkit.files import files_fingerprint, write_atomic
 from toolkit.geometry import pose_from_qt, qt_from_pose
 from toolkit.tables import (
     ID,
@@ -276,6 +276,11 @@ class Session:
     def depths(self) -> pd.DataFrame | None:
         """Table [timestamp, sensor_id, path] of depths.txt, or None."""
         return self._records("depths.txt", "depth_path") if (self.path / "depths.txt").exists() else None
+
+    @cached_property
+    def files_fingerprint(self) -> str:
+        """16 hex digits that identify the image files as they were when first asked."""
+        return files_fingerprint([self.image_path(row) for row in range(len(self.images))])
 
     @cached_property
     def _depth_index(self) -> KeyIndex | None:
@@ -559,7 +564,10 @@ def parse_camera(sensor_type: str, params: str) -> "pycolmap.Camera":
     width, height = numbers[:2]
     if width < 1 or height < 1 or width % 1 or height % 1:
         raise ValueError(f"found image size {width:g} x {height:g}, expected positive whole numbers.")
-    return pycolmap.Camera(model=model, width=int(width), height=int(height), params=numbers[2:])
+    camera = pycolmap.Camera(model=model, width=int(width), height=int(height), params=numbers[2:])
+    if any(camera.params[index] <= 0 for index in camera.focal_length_idxs()):
+        raise ValueError(f"found a focal length that is not positive in {params!r}, expected pixels.")
+    return camera
 
 
 def _frame(table: TextTable, names: Sequence[str]) -> pd.DataFrame:

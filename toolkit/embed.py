@@ -17,7 +17,15 @@ from toolkit.capture import Capture, Session
 from toolkit.embedders import Embedder, create_embedder, resolve_name
 from toolkit.errors import ImageError, ManifestError, ToolkitError
 from toolkit.features import FeatureSettings, LocalFeatures, extract_session
-from toolkit.files import files_fingerprint, fingerprint, is_current, write_atomic, write_sidecar
+from toolkit.files import (
+    file_fingerprint,
+    files_fingerprint,
+    fingerprint,
+    is_current,
+    sidecar_path,
+    write_atomic,
+    write_sidecar,
+)
 from toolkit.images import prefetch, read_image
 
 log = logging.getLogger(__name__)
@@ -82,6 +90,8 @@ def embed_sessions(
         )
     else:
         embedder = create_embedder(name, device=compute_device)
+    if subsession == "all":
+        _remove_former(out_dir, jobs)
     table = []
     for session, part, rows in jobs:
         started = time.perf_counter()
@@ -91,6 +101,7 @@ def embed_sessions(
             "embedder": embedder.settings,
             "features": asdict(FeatureSettings()) if embedder.inputs == "features" else None,
             "images": _images_fingerprint(session, rows),
+            "sensors": file_fingerprint(session.path / "sensors.txt"),
             "normalize": normalize,
             "dtype": dtype,
         }
@@ -153,6 +164,18 @@ def _jobs(capture: Capture, device: str, subsession: str) -> list[tuple[Session,
             f"No images of subsession {subsession!r} in {', '.join(names)}; known: {', '.join(known)}."
         )
     return jobs
+
+
+def _remove_former(out_dir: Path, jobs: list[tuple[Session, str, NDArray[np.intp]]]) -> None:
+    """Remove the embeddings of subsessions that the capture no longer has: whoever reads a session reads all."""
+    for session in {session.id: session for session, _, _ in jobs}.values():
+        parts = {out_dir / session.id / part for job_session, part, _ in jobs if job_session is session}
+        for manifest in sorted((out_dir / session.id).rglob("manifest.csv")):
+            if manifest.parent not in parts:
+                log.warning("%s: no such subsession any more, removed", manifest.parent)
+                stem = manifest.parent / f"{manifest.parent.name}.npy"
+                for path in (manifest, stem, sidecar_path(stem), manifest.parent / "failed.csv"):
+                    path.unlink(missing_ok=True)
 
 
 def _vocabulary(

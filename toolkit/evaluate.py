@@ -128,6 +128,7 @@ def evaluate_scene(
     retrieval_radius_m: float = 8.0,
     retrieval_angle_deg: float = 45.0,
     at: str = "device",
+    pairs: Sequence[Sequence[str]] | None = None,
 ) -> Evaluation:
     """Evaluate the poses of all pairs of a scene and write tables and figures.
 
@@ -147,6 +148,7 @@ def evaluate_scene(
             direction does not count: a rolled camera sees the same things.
         at: `device` has one error a query device; `camera` one a camera image of it, as the benchmark's own
             code evaluates rigs.
+        pairs: only these [map device, query device]; None: all.
 
     Raises:
         ToolkitError: an unknown device or `at`, or no pair to evaluate.
@@ -163,6 +165,8 @@ def evaluate_scene(
         session = capture[f"{query}_query"]
         keys, truth = _queries_with_truth(session, queries, messages)
         for map_ in map_devices:
+            if pairs is not None and [map_, query] not in [list(asked) for asked in pairs]:
+                continue
             pair = {"map_device": map_, "query_device": query}
             name = pair_name(capture.name, map_, query)
             if not len(keys):

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture import Capture, Session
 from toolkit.figures import DEVICE_COLOURS, GREEN, GREY, ORANGE, VERMILLION, new_figure
-from toolkit.images import read_image
+from toolkit.images import read_for_display
 from toolkit.visualize import ground_axes, places_of, world_up
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def draw_samples(capture: Capture, count: int = 4) -> "Figure":
         session = capture[name]
         chosen = np.linspace(0, len(session.images) - 1, count).round().astype(int)
         for axis, row in zip(line, chosen, strict=True):
-            axis.imshow(read_image(session.image_path(row)), interpolation="antialiased")
+            axis.imshow(read_for_display(session.image_path(row)), interpolation="antialiased")
             axis.set_xticks([])
             axis.set_yticks([])
         line[0].set_ylabel(name)
@@ -131,7 +131,7 @@ def draw_references(
         for axis in line:
             axis.set_axis_off()
         for axis, (side, entry, title) in zip(line, shown, strict=False):
-            axis.imshow(read_image(files[side][int(entry["timestamp"]), entry["sensor_id"]]))
+            axis.imshow(read_for_display(files[side][int(entry["timestamp"]), entry["sensor_id"]]))
             axis.set_title(title, fontsize=8)
     return figure
 

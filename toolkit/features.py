@@ -269,7 +269,7 @@ def _write_shard(
             name = session.image_name(int(row))
             if isinstance(features, str):
                 failed[name] = features
-            else:
+            elif name not in shard:  # a line of images.txt may be there twice
                 names.append(name)
                 group = shard.create_group(name)
                 group["keypoints"] = features.keypoints

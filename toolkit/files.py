@@ -80,12 +80,13 @@ def write_sidecar(path: str | Path, settings: dict[str, Any]) -> None:
 
     Call it after the artefact stands: an artefact without a matching record is made again.
     """
-    record = {"version": __version__, "fingerprint": fingerprint(settings), "settings": settings}
+    size = Path(path).stat().st_size
+    record = {"version": __version__, "fingerprint": fingerprint(settings), "bytes": size, "settings": settings}
     write_text(sidecar_path(path), json.dumps(record, indent=1, default=_jsonable) + "\n")
 
 
 def is_current(path: str | Path, settings: dict[str, Any]) -> bool:
-    """Tell whether the artefact `path` exists and was made by this version from exactly these settings."""
+    """Tell whether the artefact `path` is whole and was made by this version from exactly these settings."""
     if not Path(path).exists():
         return False
     try:
@@ -94,7 +95,8 @@ def is_current(path: str | Path, settings: dict[str, Any]) -> bool:
         return False
     if not isinstance(record, dict):
         return False
-    return bool(record.get("version") == __version__ and record.get("fingerprint") == fingerprint(settings))
+    current = {"version": __version__, "fingerprint": fingerprint(settings), "bytes": Path(path).stat().st_size}
+    return all(record.get(key) == value for key, value in current.items())
 
 
 def _jsonable(value: Any) -> Any:

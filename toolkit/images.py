@@ -39,6 +39,16 @@ def read_image(path: str | Path, gray: bool = False) -> NDArray[np.uint8]:
     return np.asarray(image if gray else image[:, :, ::-1], np.uint8)
 
 
+def read_for_display(path: str | Path) -> NDArray[np.uint8]:
+    """Return an image, (H, W, 3) RGB, or a grey one that says so where it cannot be read: pictures go on."""
+    try:
+        return read_image(path)
+    except ImageError:
+        blank = np.full((240, 320, 3), 200, np.uint8)
+        cv2.putText(blank, "unreadable", (60, 130), cv2.FONT_HERSHEY_SIMPLEX, 1.1, (90, 90, 90), 2)
+        return blank
+
+
 def default_workers() -> int:
     """Return the number of threads to use where nobody asks for one: the cores at hand, at most 8."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -166,6 +166,7 @@ class _Pair:
             "retrieval": file_fingerprint(self.retrieval),
             "map_session": session_fingerprint(self.capture[f"{self.map_device}_map"]),
             "query_session": session_fingerprint(self.session),
+            "images": [self.capture[f"{self.map_device}_map"].files_fingerprint, self.session.files_fingerprint],
             "keyframes": fingerprint([keyframes["timestamp"].astype(str).tolist(), keyframes["device_id"].tolist()]),
         }
 

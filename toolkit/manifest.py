@@ -80,7 +80,7 @@ class RetrieveSettings(_Section):
 
 
 class LocalizeSettings(_Section):
-    method: str | None = None
+    method: Literal["pnp", "nearest"] | None = None
     """`pnp`, or `nearest`: the pose of the best reference, to compare against."""
 
 

@@ -113,6 +113,10 @@ def run(
         check_parameters(notebook_path(stage), manifest.stage(stage).given(), f"{manifest_path}: {stage}.")
     captures = _captures(manifest)
     run_dir = Path(manifest.output_root) / manifest.name
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ManifestError(f"output_root: {run_dir} cannot be made ({error.strerror}). Choose another.") from None
     jobs = [
         job
         for capture in captures
@@ -299,7 +303,7 @@ def _jobs(manifest: Manifest, stage: str, capture: Path, files: SceneFiles, forc
         yield Job(stage, files, plain, label)
 
 
-def _parts(manifest: Manifest, stage: str, capture: Path) -> list[tuple[str, dict[str, str]]]:
+def _parts(manifest: Manifest, stage: str, capture: Path) -> list[tuple[str, dict[str, Any]]]:
     """Return label and choice of devices for each execution of a stage."""
     from toolkit.capture import Capture
 
@@ -307,7 +311,8 @@ def _parts(manifest: Manifest, stage: str, capture: Path) -> list[tuple[str, dic
     devices = present if manifest.devices == "auto" else [d for d in present if d in manifest.devices]
     pairs = [(m, q) for m in devices for q in devices]
     if manifest.pairs != "all":
-        pairs = [(m, q) for m, q in manifest.pairs if m in devices and q in devices]
+        wanted = dict.fromkeys((m, q) for m, q in manifest.pairs)
+        pairs = [(m, q) for m, q in wanted if m in devices and q in devices]
     if not pairs:
         raise ManifestError(
             f"{capture}: none of the devices or pairs that the manifest asks for is in this capture, "
@@ -319,7 +324,7 @@ def _parts(manifest: Manifest, stage: str, capture: Path) -> list[tuple[str, dic
         return [(f"{d}_", {"device": d}) for d in present if any(d in pair for pair in pairs)]
     if stage in ("retrieve", "localize"):
         return [(f"map_{m}_query_{q}", {"map_device": m, "query_device": q}) for m, q in pairs]
-    return [("", {"map_device": "all", "query_device": "all"})]
+    return [("", {"map_device": "all", "query_device": "all", "pairs": [list(pair) for pair in pairs]})]
 
 
 def _inputs_of(job: Job, capture: str) -> str:

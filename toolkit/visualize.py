@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from toolkit.figures import BLUE, GREEN, GREY, VERMILLION, new_figure, save_figure
 from toolkit.files import write_atomic
 from toolkit.geometry import invert, pose_error, rotation_to_quaternion, transform
-from toolkit.images import read_image
+from toolkit.images import read_for_display
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -612,7 +612,7 @@ def _small_jpeg(source: Path | Image, size: int) -> tuple[Any, float]:
     """Return a picture reduced to `size` pixels on its longer side, as JPEG, and its scale."""
     import rerun as rr
 
-    image = read_image(source) if isinstance(source, str | Path) else source
+    image = read_for_display(source) if isinstance(source, str | Path) else source
     scale = min(1.0, size / max(image.shape[:2]))
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else image
     bgr = np.ascontiguousarray(small[..., ::-1]) if small.ndim == 3 else small

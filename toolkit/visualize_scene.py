@@ -1,6 +1,7 @@
 """The visualize stage: recordings and still pictures of a scene, from the files that other stages left."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from toolkit.capture import Capture, Session, Trajectory
 from toolkit.errors import ArtefactError
 from toolkit.features import FeatureStore, extract_session
 from toolkit.files import pair_name
-from toolkit.images import read_image
+from toolkit.images import read_for_display
 from toolkit.localizers.pnp import PnpLocalizer, PoseEstimate
 from toolkit.mapping import LocalMap
 from toolkit.visualize import Queries, Views, draw_localization, draw_scene_png, record_scene
@@ -70,6 +71,7 @@ def visualize_scene(
     samples: int = 2,
     recordings: bool = True,
     world_up: ArrayLike | None = None,
+    pairs: Sequence[Sequence[str]] | None = None,
 ) -> pd.DataFrame:
     """Draw every pair of a scene, and record every map with its queries.
 
@@ -86,6 +88,7 @@ def visualize_scene(
         samples: queries shown of each pair, from the least to the best supported.
         recordings: whether to write recordings.
         world_up: direction (3,) that is up; None: estimated from the cameras.
+        pairs: only these [map device, query device]; None: all.
 
     Returns:
         One row a pair: map_device, query_device, queries, localized, seconds, still, recording.
@@ -97,7 +100,7 @@ def visualize_scene(
     maps = [d for d in capture.devices if f"{d}_map" in capture and map_device in ("all", d)]
     askers = [d for d in capture.devices if f"{d}_query" in capture and query_device in ("all", d)]
     found: dict[tuple[str, str], _Results] = {}
-    for pair in [(m, q) for m in maps for q in askers]:
+    for pair in [(m, q) for m in maps for q in askers if pairs is None or [m, q] in [list(p) for p in pairs]]:
         stem = Path(poses_dir) / pair_name(capture.name, *pair)
         if stem.with_name(f"{stem.name}.txt").is_file():
             found[pair] = _load_results(stem, capture[f"{pair[1]}_query"])
@@ -108,12 +111,12 @@ def visualize_scene(
     table = []
     with tqdm(total=len(found), desc="visualize", unit="pair") as bar:
         for m in dict.fromkeys(m for m, _ in found):
-            pairs = {q: results for (of_map, q), results in found.items() if of_map == m}
+            of_map = {q: results for (mapped, q), results in found.items() if mapped == m}
             shown = _open_map(capture[f"{m}_map"], Path(features_dir), Path(map_dir))
             recording = out / f"{capture.name}_map_{m}.rrd"
             if recordings:
-                _record(recording, shown, pairs, world_up)
-            for q, results in pairs.items():
+                _record(recording, shown, of_map, world_up)
+            for q, results in of_map.items():
                 started = time.perf_counter()
                 name = pair_name(capture.name, m, q)
                 draw_scene_png(
@@ -201,11 +204,11 @@ def _draw_samples(stem: Path, shown: _Map, results: _Results, features_dir: Path
         mine, row = estimate.camera_index == camera, images[camera : camera + 1]
         truth = results.session.world_from_cam(row, ground_truth=True)[0]
         draw_localization(
-            read_image(results.session.image_path(int(row[0]))),
+            read_for_display(results.session.image_path(int(row[0]))),
             results.session.camera(str(results.session.images["sensor_id"].iloc[int(row[0])])),
             results.world_from_rig[k] @ results.session.rig_from_cam(row)[0],
             shown.localizer.map.points[estimate.point_index[mine]] if shown.localizer else (),
-            [(read_image(files[name]), f"reference {n}") for n, name in enumerate(references, start=1)],
+            [(read_for_display(files[name]), f"reference {n}") for n, name in enumerate(references, start=1)],
             stem.with_name(f"{stem.name}_{number}.png"),
             title=f"{results.session.device} query in the {shown.session.device} map: {query['status']}",
             keypoints=estimate.pixels[mine],
