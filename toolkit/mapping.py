@@ -156,7 +156,7 @@ def match_pairs(
 class MapSettings:
     """How a map is triangulated; part of every fingerprint that rests on it."""
 
-    pairs_per_image: int = 20
+    pairs_per_image: int = 14
     """Partners that an image is matched with."""
     max_epipolar_error_px: float = 4.0
     """Largest distance of a match to its epipolar line, at either side."""
