@@ -278,6 +278,13 @@ class Session:
         return self._records("depths.txt", "depth_path") if (self.path / "depths.txt").exists() else None
 
     @cached_property
+    def camera_rows(self) -> Ints:
+        """Rows of `images` that were taken by cameras, in file order."""
+        sensors = self.images["sensor_id"]
+        cameras = {sensor: self.is_camera(sensor) for sensor in sensors.unique()}
+        return np.flatnonzero(sensors.map(cameras).to_numpy(bool))
+
+    @cached_property
     def files_fingerprint(self) -> str:
         """16 hex digits that identify the image files as they were when first asked."""
         return files_fingerprint([self.image_path(row) for row in range(len(self.images))])

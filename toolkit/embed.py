@@ -134,13 +134,6 @@ def embed_sessions(
     return pd.DataFrame(table)
 
 
-def camera_rows(session: Session) -> NDArray[np.intp]:
-    """Return the rows of `session.images` that were taken by cameras, in file order."""
-    sensors = session.images["sensor_id"]
-    cameras = {sensor: session.is_camera(sensor) for sensor in sensors.unique()}
-    return np.flatnonzero(sensors.map(cameras).to_numpy(bool))
-
-
 def _jobs(capture: Capture, device: str, subsession: str) -> list[tuple[Session, str, NDArray[np.intp]]]:
     """Return the subsessions to embed: session, subsession, image rows."""
     if device not in ("auto", "all", *capture.devices):
@@ -151,7 +144,7 @@ def _jobs(capture: Capture, device: str, subsession: str) -> list[tuple[Session,
     names = [f"{key}_{split}" for key in devices for split in ("map", "query")]
     jobs, known = [], []
     for session in (capture[name] for name in names if name in capture):
-        rows = camera_rows(session)
+        rows = session.camera_rows
         parts = session.subsession_of(rows)
         # Images outside every listed subsession are embedded too, under the session's name.
         parts = np.where(parts == "", session.id, parts)
@@ -190,7 +183,7 @@ def _vocabulary(
             f"{capture.path}/sessions has no <device>_map session; `vlad` learns its vocabulary from the map."
         )
     settings = VladSettings() if dim is None else VladSettings(dim=dim)
-    every = [(session.id, int(row)) for session in maps for row in camera_rows(session)]
+    every = [(session.id, int(row)) for session in maps for row in session.camera_rows]
     picked = np.linspace(0, len(every) - 1, min(len(every), VOCABULARY_IMAGES)).astype(int).tolist()
     chosen: dict[str, list[int]] = {}
     for name, row in (every[index] for index in picked):

@@ -209,8 +209,7 @@ def extract_session(
     folder = Path(out) / session.id
     store = FeatureStore(folder)
     extractor = SiftExtractor(settings)
-    is_camera = {sensor: session.is_camera(sensor) for sensor in session.images["sensor_id"].unique()}
-    cameras = np.flatnonzero(session.images["sensor_id"].map(is_camera).to_numpy(bool))
+    cameras = session.camera_rows
     wanted = cameras if rows is None else np.intersect1d(cameras, rows)
     shards = list(_shards(session, cameras))
     calibration = file_fingerprint(session.path / "sensors.txt")

@@ -391,10 +391,8 @@ class PnpLocalizer:
             if not len(visible) or not len(features):
                 continue
             projected = np.asarray(query.cameras[camera].img_from_cam(in_cam[visible]))
-            visible, projected = (
-                visible[np.isfinite(projected).all(1)],
-                projected[np.isfinite(projected).all(1)],
-            )
+            finite = np.isfinite(projected).all(axis=1)
+            visible, projected = visible[finite], projected[finite]
             near = KDTree(projected).sparse_distance_matrix(query.trees[camera], radius, output_type="ndarray")
             order = np.lexsort((near["j"], near["i"]))
             observed, keypoint = visible[near["i"][order]], near["j"][order]
