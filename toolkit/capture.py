@@ -280,9 +280,10 @@ class Session:
     @cached_property
     def camera_rows(self) -> Ints:
         """Rows of `images` that were taken by cameras, in file order."""
-        sensors = self.images["sensor_id"]
-        cameras = {sensor: self.is_camera(sensor) for sensor in sensors.unique()}
-        return np.flatnonzero(sensors.map(cameras).to_numpy(bool))
+        codes = codes_of(as_strings(self.images["sensor_id"]), as_strings(self.sensors["sensor_id"]))
+        if (codes < 0).any():
+            self._sensor_row(str(self.images["sensor_id"].iloc[int(np.argmax(codes < 0))]))
+        return np.flatnonzero((self.sensors["sensor_type"] == "camera").to_numpy(bool)[codes])
 
     @cached_property
     def files_fingerprint(self) -> str:
