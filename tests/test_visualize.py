@@ -4,6 +4,7 @@ import pytest
 from PIL import Image
 
 from toolkit.geometry import make_pose
+from toolkit.upright import up_of_cameras
 from toolkit.visualize import (
     Queries,
     Views,
@@ -13,7 +14,6 @@ from toolkit.visualize import (
     places_of,
     project,
     record_scene,
-    world_up,
 )
 
 CAMERA = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=[50, 50, 32, 24])
@@ -41,13 +41,13 @@ def test_up_is_found_in_level_pitched_and_rolled_cameras(up_axis, roll_deg):
     poses = np.concatenate(
         [looking(headings, up_axis, pitch_deg=10), looking(headings, up_axis, roll_deg, pitch_deg=10)]
     )
-    up = world_up(np.concatenate([poses, np.full((1, 4, 4), np.nan)]))
+    up = up_of_cameras(np.concatenate([poses, np.full((1, 4, 4), np.nan)]))
     assert up @ np.eye(3)[up_axis] > np.cos(np.radians(1))
 
 
 def test_up_of_cameras_that_all_look_one_way_and_of_none():
-    assert world_up(looking([90] * 5))[2] > 0.99
-    assert world_up(np.zeros((0, 4, 4))).tolist() == [0, 0, 1]
+    assert up_of_cameras(looking([90] * 5))[2] > 0.99
+    assert up_of_cameras(np.zeros((0, 4, 4))).tolist() == [0, 0, 1]
 
 
 def test_ground_axes_are_seen_from_above():

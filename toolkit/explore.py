@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from toolkit.capture import Capture, Session
 from toolkit.figures import DEVICE_COLOURS, GREEN, GREY, ORANGE, VERMILLION, new_figure
 from toolkit.images import read_for_display
-from toolkit.visualize import ground_axes, places_of, world_up
+from toolkit.upright import up_of_cameras
+from toolkit.visualize import ground_axes, places_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -60,7 +61,7 @@ def draw_top_view(capture: Capture, up: ArrayLike | None = None) -> "Figure":
     """
     poses = {name: _poses(capture[name]) for name in capture}
     everything = np.concatenate(list(poses.values()))
-    axes, labels = ground_axes(world_up(everything) if up is None else up)
+    axes, labels = ground_axes(up_of_cameras(everything) if up is None else up)
     seen = {name: of_session[:, :3, 3] @ axes.T for name, of_session in poses.items()}
     place = places_of(np.concatenate(list(seen.values())))
     sessions = np.repeat(list(seen), [len(centers) for centers in seen.values()])

@@ -15,6 +15,7 @@ from toolkit.figures import BLUE, GREEN, GREY, VERMILLION, new_figure, save_figu
 from toolkit.files import write_atomic
 from toolkit.geometry import invert, pose_error, rotation_to_quaternion, transform
 from toolkit.images import read_for_display
+from toolkit.upright import up_of_cameras
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -55,44 +56,6 @@ class Queries:
 
 
 # Directions and places
-
-
-def world_up(world_from_cams: ArrayLike) -> Array:
-    """Return the direction, (3,) unit, that is up in the world of cameras (N, 4, 4).
-
-    Photographers hold cameras level: up is the direction that the most image axes agree on, where the image's
-    top counts most and its sides (a camera turned by 90 degrees) nearly as much. Of two directions that do as
-    well, the one in which the cameras spread least wins, since people walk on the ground.
-
-    Without any pose the answer is z.
-    """
-    poses = _finite(world_from_cams)
-    if not len(poses):
-        return np.array([0.0, 0.0, 1.0])
-    top, right = -poses[:, :3, 1], poses[:, :3, 0]
-    axes = np.stack([top, right, -right, -top], axis=1)
-    weights = np.array([1.0, 0.95, 0.95, 0.5])
-    centres = poses[:, :3, 3] - poses[:, :3, 3].mean(0)
-    spread = centres.T @ centres / max(float((centres**2).sum()), 1e-12)
-
-    def agreement(up: Array) -> Array:
-        return weights * np.clip(axes @ up, 0, None) ** 8
-
-    candidates = axes[:: max(1, len(axes) // 100), :3].reshape(-1, 3)
-    scores = [agreement(c).max(1).sum() * (1.3 - 0.3 * c @ spread @ c) for c in candidates]
-    up = candidates[int(np.argmax(scores))]
-    for _ in range(5):
-        agreed = agreement(up)
-        best = np.take_along_axis(axes, agreed.argmax(1)[:, None, None], 1)[:, 0]
-        mean = (agreed.max(1)[:, None] * best).sum(0)
-        mean /= np.linalg.norm(mean)
-        # Cameras that all look up a little tilt the mean. What lies across both the view and the image's
-        # upright stays level then, and decides as far as the cameras look in different directions.
-        level = np.cross(best, poses[:, :3, 2]) * np.sqrt(agreed.max(1))[:, None]
-        scatter = level.T @ level / agreed.max(1).sum()
-        up = np.linalg.solve(scatter + 0.01 * np.eye(3), 0.01 * mean)
-        up /= np.linalg.norm(up)
-    return up
 
 
 def ground_axes(up: ArrayLike) -> tuple[Array, list[str]]:
@@ -170,7 +133,7 @@ def draw_scene_png(
     map_poses = _finite(map_poses)
     estimated = np.asarray(queries_est, np.float64).reshape(-1, 4, 4)
     true = np.full_like(estimated, np.nan) if queries_true is None else np.asarray(queries_true, np.float64)
-    axes, labels = ground_axes(world_up(map_poses) if up is None else up)
+    axes, labels = ground_axes(up_of_cameras(map_poses) if up is None else up)
     xyz = np.asarray(points, np.float64).reshape(-1, 3)
     step = len(xyz) // max_points + 1
     cloud, shades = xyz[::step] @ axes.T, None if colors is None else colors[::step]
@@ -458,7 +421,7 @@ def record_scene(
     import rerun as rr
 
     poses = _finite(map_views.world_from_cam)
-    up = np.asarray(world_up(poses) if up is None else up, np.float64)
+    up = np.asarray(up_of_cameras(poses) if up is None else up, np.float64)
     size = _camera_size(poses)
     pictured = [device for device, results in queries.items() if results.views is not None]
     with write_atomic(out) as temporary:
