@@ -19,3 +19,7 @@ class ArtefactError(ToolkitError):
 
 class ImageError(ToolkitError):
     """An image file is missing or cannot be decoded."""
+
+
+class WeightsError(ToolkitError):
+    """Weights are missing, cannot be fetched, are damaged, or are those of another network."""

@@ -1,0 +1,1 @@
+"""The networks. Each loads the official checkpoint, key for key, and computes the official numbers."""
