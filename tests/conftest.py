@@ -25,3 +25,21 @@ def captures_root() -> Path:
     if not root.is_dir():
         pytest.skip(f"needs the real captures: no folder {root}; set CAPTURES")
     return root
+
+
+@pytest.fixture(scope="session")
+def golden_root() -> Path:
+    """Folder of the official networks' numbers: $GOLDEN, or beside the clone; skips where absent."""
+    root = Path(os.environ.get("GOLDEN", REPOSITORY.parent / "shared" / "golden"))
+    if not root.is_dir():
+        pytest.skip(f"needs the golden files: no folder {root}; set GOLDEN")
+    return root
+
+
+@pytest.fixture
+def no_hub(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """No weights on this machine, and no network to get some."""
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)

@@ -1,0 +1,140 @@
+"""Where networks run and in which precision, and what happens when a batch does not fit the memory there."""
+
+import logging
+import re
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from toolkit.errors import ManifestError, ToolkitError
+
+if TYPE_CHECKING:
+    import torch
+
+log = logging.getLogger(__name__)
+
+PRECISIONS = ("auto", "float32", "bfloat16", "float16")
+
+
+def check_device_name(name: str) -> None:
+    """Refuse what is no name of a device, without loading torch.
+
+    Raises:
+        ManifestError: not `auto`, `cpu`, `cuda`, `cuda:<i>` or `mps`.
+    """
+    if not re.fullmatch(r"auto|cpu|mps|cuda(:\d+)?", name):
+        raise ManifestError(f"compute_device is {name!r}; expected auto, cpu, cuda, cuda:<number> or mps.")
+
+
+def resolve_device(name: str = "auto") -> "torch.device":
+    """Return the device that `auto`, `cpu`, `cuda`, `cuda:<i>` or `mps` stands for.
+
+    `auto`: the first GPU, else Apple's, else the CPU.
+
+    Raises:
+        ManifestError: none of these names.
+        ToolkitError: torch does not see such a device here.
+    """
+    import torch
+
+    check_device_name(name)
+    gpus, apple = torch.cuda.device_count(), torch.backends.mps.is_available()
+    if name == "auto":
+        name = "cuda" if gpus else "mps" if apple else "cpu"
+    kind, _, number = name.partition(":")
+    if kind == "cuda" and int(number or 0) >= gpus:
+        seen = f"{gpus} GPU{'s' if gpus > 1 else ''}, cuda:0 to cuda:{gpus - 1}" if gpus else "no GPU"
+        raise ToolkitError(f"compute_device is {name}, but torch sees {seen}. Set compute_device: auto or cpu.")
+    if kind == "mps" and not apple:
+        raise ToolkitError("compute_device is mps, but torch sees no Apple GPU. Set compute_device: auto or cpu.")
+    return torch.device(name)
+
+
+def resolve_precision(name: str, device: "torch.device") -> "torch.dtype":
+    """Return the type that a network computes in.
+
+    `auto`: bfloat16 where the device multiplies it natively (GPUs since Ampere; CPUs with AMX or AVX512-BF16),
+    float16 on older GPUs, else float32.
+
+    Raises:
+        ManifestError: none of `PRECISIONS`.
+    """
+    import torch
+
+    if name not in PRECISIONS:
+        raise ManifestError(f"dtype_compute is {name!r}; expected one of {', '.join(PRECISIONS)}.")
+    if name != "auto":
+        return {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}[name]
+    if device.type == "cuda":
+        native = torch.cuda.get_device_capability(device) >= (8, 0)
+        return torch.bfloat16 if native else torch.float16
+    if device.type == "cpu" and cpu_multiplies_bfloat16():
+        return torch.bfloat16
+    return torch.float32
+
+
+def cpu_multiplies_bfloat16() -> bool:
+    """Tell whether this CPU has instructions for products of bfloat16 matrices: AMX or AVX512-BF16.
+
+    Others only emulate them, some ten times slower than float32.
+    """
+    import torch
+
+    capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
+    # A torch before 2.8 has no list; it knows of AMX.
+    amx = getattr(torch.cpu, "_is_amx_tile_supported", bool)()
+    return bool(amx or capabilities.get("amx_bf16") or capabilities.get("avx512_bf16"))
+
+
+class Fitting:
+    """Runs a function on batches, in smaller parts once one did not fit the memory of the device."""
+
+    def __init__(self, run: "Callable[[torch.Tensor], torch.Tensor]", what: str) -> None:
+        """
+        Args:
+            run: maps (B, ...) to (B, ...), each row of the result by the same row of the input alone.
+            what: what the rows are, in the plural, for messages.
+        """
+        self._run = run
+        self._what = what
+        self._most: int | None = None
+
+    def __call__(self, batch: "torch.Tensor") -> "torch.Tensor":
+        """Return `run(batch)`; halves the batch as often as needed, says so, and remembers what fits.
+
+        Raises:
+            ToolkitError: not even one row fits.
+        """
+        import torch
+
+        parts = []
+        start = 0
+        while start < len(batch):
+            count = min(self._most or len(batch), len(batch) - start)
+            try:
+                parts.append(self._run(batch[start : start + count]))
+                start += count
+                continue
+            except (torch.OutOfMemoryError, RuntimeError) as error:
+                if not _is_out_of_memory(error):
+                    raise
+                reason = str(error).strip().split("\n")[0]
+            # Outside the handler: the traceback holds what the failed attempt had allocated.
+            if count == 1:
+                raise ToolkitError(
+                    f"The memory of {batch.device} does not hold the network with one of the {self._what} "
+                    f"({reason}). Use a smaller image_size, dtype_compute: bfloat16, or compute_device: cpu."
+                )
+            self._most = count // 2
+            log.warning("%d %s do not fit the memory of %s, going on with %d at a time",
+                        count, self._what, batch.device, self._most)  # fmt: skip
+            if batch.device.type == "cuda":
+                torch.cuda.empty_cache()
+        return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    import torch
+
+    # Only CUDA has a type of its own for it.
+    text = str(error)
+    return isinstance(error, torch.OutOfMemoryError) or "out of memory" in text or "can't allocate memory" in text

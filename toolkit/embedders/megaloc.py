@@ -1,0 +1,108 @@
+"""MegaLoc as an embedder: photographs as they come, resized, in batches, on any device."""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
+
+from toolkit.compute import Fitting, resolve_device, resolve_precision
+from toolkit.errors import ManifestError
+from toolkit.models.megaloc import IMAGENET_MEAN, IMAGENET_STD, PATCH, MegaLoc
+from toolkit.models.weights import MEGALOC, resolve_weights
+
+
+class MegaLocEmbedder:
+    """Global descriptors by MegaLoc, (8448,) unit vectors."""
+
+    name = "megaloc"
+    inputs: Literal["images"] = "images"
+    upright = True
+
+    def __init__(
+        self,
+        checkpoint: str | Path | Mapping[str, Tensor] | MegaLoc | None = None,
+        device: str = "auto",
+        dtype_compute: str = "auto",
+        image_size: int = 322,
+    ) -> None:
+        """
+        Args:
+            checkpoint: the official file, its tensors by name, or a network; None: from the hub's cache, else
+                downloaded there.
+            device: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
+            dtype_compute: `float32`, `bfloat16`, `float16`; `auto`: what is fast on the device.
+            image_size: images are squeezed to a square of so many pixels a side, a multiple of 14.
+
+        Raises:
+            WeightsError: no weights, or other ones.
+            ManifestError, ToolkitError: see `toolkit.compute`.
+        """
+        if image_size < 9 * PATCH or image_size % PATCH:
+            raise ManifestError(
+                f"image_size is {image_size}; expected a multiple of {PATCH}, at least {9 * PATCH} (322 is usual)."
+            )
+        self._size = image_size
+        self._device = resolve_device(device)
+        self._dtype = resolve_precision(dtype_compute, self._device)
+        if checkpoint is None or isinstance(checkpoint, str | Path):
+            checkpoint = resolve_weights(MEGALOC, checkpoint)
+        model = checkpoint if isinstance(checkpoint, MegaLoc) else MegaLoc.from_checkpoint(checkpoint)
+        self._weights = _digest(model)
+        self.dim = model.dim
+        self._model = model.to(self._device, self._dtype).eval()
+        self._mean = torch.tensor(IMAGENET_MEAN, device=self._device).view(1, 3, 1, 1)
+        self._std = torch.tensor(IMAGENET_STD, device=self._device).view(1, 3, 1, 1)
+        self._fitting = Fitting(self._forward, "images")
+
+    @cached_property
+    def settings(self) -> dict[str, Any]:
+        precision = str(self._dtype).removeprefix("torch.")
+        return {
+            "name": self.name, "weights": self._weights, "image_size": self._size, "dtype_compute": precision
+        }  # fmt: skip
+
+    def prepare(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return an image (H, W, 3) or (H, W), uint8 RGB or grey, as the network takes it, (S, S, 3).
+
+        Raises:
+            ValueError: another shape or type.
+        """
+        image = np.asarray(image)
+        if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)) or not image.size:
+            raise ValueError(f"an image is {image.dtype} {image.shape}; expected uint8 (H, W, 3) RGB or (H, W).")
+        if image.ndim == 2:
+            image = np.repeat(image[:, :, None], 3, axis=2)
+        if image.shape[:2] == (self._size, self._size):
+            return image
+        # Pillow's bilinear filter is antialiased: the one that the official code resizes photographs with.
+        square = (self._size, self._size)
+        return np.asarray(Image.fromarray(np.ascontiguousarray(image)).resize(square, Image.Resampling.BILINEAR))
+
+    def embed(self, inputs: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
+        """Return unit vectors (B, 8448) of images (H, W, 3), uint8 RGB, of any sizes."""
+        if not len(inputs):
+            return np.zeros((0, self.dim), np.float32)
+        batch = torch.from_numpy(np.stack([self.prepare(image) for image in inputs]))
+        with torch.inference_mode():
+            return self._fitting(batch.to(self._device)).float().cpu().numpy()
+
+    def _forward(self, images: Tensor) -> Tensor:
+        normalised = (images.permute(0, 3, 1, 2).float() / 255 - self._mean) / self._std
+        descriptors: Tensor = self._model(normalised)
+        return descriptors
+
+
+def _digest(model: MegaLoc) -> str:
+    """Return 16 hex digits that identify the weights by their values."""
+    digest = hashlib.sha256()
+    for name, tensor in model.state_dict().items():
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().contiguous().flatten().view(torch.uint8).numpy())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,198 @@
+"""MegaLoc (Berton and Masone, 2025): a global descriptor of a photograph for place recognition.
+
+A DINOv2 ViT-B/14 and an optimal-transport aggregation of its patches (SALAD, Izquierdo and Civera, CVPR 2024).
+The official network is MIT-licensed, at github.com/gmberton/MegaLoc.
+"""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from toolkit.models.vit import Block, PatchEmbed
+from toolkit.models.weights import load_checkpoint
+
+PATCH = 14
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+_SINKHORN_STEPS = 3
+
+
+class Dinov2(nn.Module):
+    """DINOv2 ViT (Oquab et al., 2023) without registers."""
+
+    def __init__(self, dim: int = 768, depth: int = 12, num_heads: int = 12, grid: int = 37) -> None:
+        super().__init__()
+        self.grid = grid
+        self.patch_embed = PatchEmbed(dim, PATCH)
+        self.cls_token = nn.Parameter(torch.empty(1, 1, dim))
+        self.pos_embed = nn.Parameter(torch.empty(1, grid * grid + 1, dim))
+        self.blocks = nn.ModuleList([Block(dim, num_heads) for _ in range(depth)])
+        self.norm = nn.LayerNorm(dim, eps=1e-6)
+
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the patches (B, N, C), row by row, and the class token (B, C) of images (B, 3, H, W)."""
+        rows, columns = images.shape[2] // PATCH, images.shape[3] // PATCH
+        position = self._position(rows, columns)
+        patches = self.patch_embed(images.to(self.patch_embed.proj.weight.dtype))
+        cls_token = (self.cls_token + position[:, :1]).to(patches.dtype).expand(len(images), -1, -1)
+        x = torch.cat([cls_token, patches + position[:, 1:].to(patches.dtype)], dim=1)
+        for block in self.blocks:
+            x = block(x)
+        x = self.norm(x)
+        return x[:, 1:], x[:, 0]
+
+    def _position(self, rows: int, columns: int) -> Tensor:
+        """Return the position embedding of class token and patches, (1, 1 + rows * columns, C).
+
+        Trained for grid x grid patches; for others interpolated as in training, by a factor with an offset of
+        0.1 that the weights have learnt to expect.
+        """
+        if rows == columns == self.grid:
+            return self.pos_embed
+        trained = self.pos_embed[:, 1:].float().reshape(1, self.grid, self.grid, -1).permute(0, 3, 1, 2)
+        factor = ((rows + 0.1) / self.grid, (columns + 0.1) / self.grid)
+        patches = F.interpolate(trained, scale_factor=factor, mode="bicubic", antialias=False)
+        return torch.cat([self.pos_embed[:, :1].float(), patches.flatten(2).transpose(1, 2)], dim=1)
+
+
+class PatchMlp(nn.Sequential):
+    """Two layers on each patch, (B, N, C) -> (B, N, out), under the names of 1 x 1 convolutions."""
+
+    def __init__(self, dim: int, hidden: int, out: int) -> None:
+        # No. 1 is a dropout of training.
+        super().__init__(nn.Conv2d(dim, hidden, 1), nn.Identity(), nn.ReLU(), nn.Conv2d(hidden, out, 1))
+
+    def forward(self, patches: Tensor) -> Tensor:
+        first: Any = self[0]
+        last: Any = self[3]
+        # As products with a matrix they need no rows and columns of patches.
+        hidden = F.relu(F.linear(patches, first.weight.flatten(1), first.bias))
+        return F.linear(hidden, last.weight.flatten(1), last.bias)
+
+
+class Salad(nn.Module):
+    """Aggregation: patches are assigned to clusters by optimal transport, and their features summed in each."""
+
+    def __init__(self, dim: int, clusters: int, cluster_dim: int, token_dim: int, hidden: int) -> None:
+        super().__init__()
+        self.token_features = nn.Sequential(nn.Linear(dim, hidden), nn.ReLU(), nn.Linear(hidden, token_dim))
+        self.cluster_features = PatchMlp(dim, hidden, cluster_dim)
+        self.score = PatchMlp(dim, hidden, clusters)
+        self.dust_bin = nn.Parameter(torch.empty(()))
+
+    def forward(self, patches: Tensor, cls_token: Tensor) -> Tensor:
+        """Return unit vectors (B, token_dim + cluster_dim * clusters) of patches (B, N, C), class tokens (B, C)."""
+        features = self.cluster_features(patches)
+        share = transport(self.score(patches).transpose(1, 2).float(), self.dust_bin)
+        clusters = features.float().transpose(1, 2) @ share.transpose(1, 2)  # (B, cluster_dim, clusters)
+        token = F.normalize(self.token_features(cls_token).float(), dim=-1)
+        return F.normalize(torch.cat([token, F.normalize(clusters, dim=1).flatten(1)], dim=-1), dim=-1)
+
+
+def transport(scores: Tensor, dust_bin: Tensor) -> Tensor:
+    """Return how much of each patch goes to each cluster, (B, M, N), for scores (B, M, N), N > M.
+
+    Sinkhorn's iteration on logarithms (Cuturi, NeurIPS 2013): each of the M clusters shall receive one patch and
+    a bin for what fits none, one more row with the score `dust_bin`, the other N - M.
+    """
+    B, M, N = scores.shape
+    scores = torch.cat([scores, dust_bin.to(scores.dtype).expand(B, 1, N)], dim=1)
+    log_received = scores.new_zeros(M + 1)
+    log_received[M] = math.log(N - M)
+    log_given = 0.0
+    # The common factor 1 / (N + M) of both margins cancels: it is left out from the start.
+    columns = scores.new_zeros(B, 1, N)
+    for _ in range(_SINKHORN_STEPS):
+        rows = log_received[:, None] - torch.logsumexp(scores + columns, dim=2, keepdim=True)
+        columns = log_given - torch.logsumexp(scores + rows, dim=1, keepdim=True)
+    return torch.exp(scores + rows + columns)[:, :M]
+
+
+class Aggregator(nn.Module):
+    """From patches and class token to the descriptor before its last normalisation."""
+
+    def __init__(self, dim: int, clusters: int, cluster_dim: int, token_dim: int, hidden: int, out: int) -> None:
+        super().__init__()
+        self.agg = Salad(dim, clusters, cluster_dim, token_dim, hidden)
+        self.linear = nn.Linear(token_dim + clusters * cluster_dim, out)
+
+    def forward(self, patches: Tensor, cls_token: Tensor) -> Tensor:
+        """Return (B, out) of patches (B, N, C) and class tokens (B, C)."""
+        return self.linear(self.agg(patches, cls_token).to(self.linear.weight.dtype))
+
+
+class MegaLoc(nn.Module):
+    """The network: photographs in, unit vectors out. The defaults are the official sizes."""
+
+    def __init__(
+        self,
+        dim: int = 768,
+        depth: int = 12,
+        num_heads: int = 12,
+        grid: int = 37,
+        clusters: int = 64,
+        cluster_dim: int = 256,
+        token_dim: int = 256,
+        hidden: int = 512,
+        out: int = 8448,
+    ) -> None:
+        """
+        Args:
+            dim, depth, num_heads: of the transformer.
+            grid: rows and columns of patches that the position embedding was trained for.
+            clusters, cluster_dim, token_dim, hidden: of the aggregation.
+            out: length of the descriptor.
+        """
+        super().__init__()
+        self.clusters = clusters
+        self.backbone = Dinov2(dim, depth, num_heads, grid)
+        self.aggregator = Aggregator(dim, clusters, cluster_dim, token_dim, hidden, out)
+
+    @property
+    def dim(self) -> int:
+        """Length of the descriptor."""
+        return self.aggregator.linear.out_features
+
+    @classmethod
+    def from_checkpoint(cls, checkpoint: str | Path | Mapping[str, Tensor]) -> "MegaLoc":
+        """Return the network with official weights, float32, on the CPU, ready to use.
+
+        Args:
+            checkpoint: the official `model.safetensors`, or its tensors by name (shared, not copied).
+
+        Raises:
+            WeightsError: not such a file, or other weights; names missing, unexpected and mis-shaped keys.
+        """
+        with torch.device("meta"):
+            model = cls()
+        load_checkpoint(model, checkpoint, "MegaLoc")
+        return model
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Return descriptors (B, 8448) float32, of length 1.
+
+        Args:
+            images: (B, 3, H, W), RGB in [0, 1] minus `IMAGENET_MEAN`, over `IMAGENET_STD`. Sides that are no
+                multiple of 14 are resized to the nearest.
+
+        Raises:
+            ValueError: another shape, or too small: the aggregation needs more patches of 14 x 14 than clusters.
+        """
+        if images.ndim != 4 or images.shape[1] != 3:
+            raise ValueError(f"images have shape {tuple(images.shape)}; expected (B, 3, H, W).")
+        height, width = (round(side / PATCH) for side in images.shape[2:])  # half to even, as the official code
+        if height * width <= self.clusters:
+            raise ValueError(
+                f"images of {images.shape[3]} x {images.shape[2]} pixels give {height * width} patches of "
+                f"{PATCH} x {PATCH}; expected more than {self.clusters}. Enlarge them."
+            )
+        size = [height * PATCH, width * PATCH]
+        if list(images.shape[2:]) != size:
+            images = F.interpolate(images.float(), size, mode="bilinear", align_corners=False, antialias=True)
+        descriptors: Tensor = F.normalize(self.aggregator(*self.backbone(images)).float(), dim=-1)
+        return descriptors
