@@ -1,5 +1,6 @@
 """The embed stage: what it writes, that counts balance, what it reuses."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -7,11 +8,18 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
+from test_megaloc import tiny_megaloc
 
 from toolkit.capture import Session, Trajectory, write_session
 from toolkit.embed import embed_sessions
-from toolkit.errors import ManifestError, ToolkitError
-from toolkit.retrieve import load_embeddings
+from toolkit.embedders import load_embeddings
+from toolkit.embedders.megaloc import MegaLocEmbedder
+from toolkit.errors import ManifestError, ToolkitError, WeightsError
+from toolkit.geometry import invert, qt_from_pose
+from toolkit.images import read_image
+from toolkit.models.megaloc import MegaLoc
+from toolkit.retrieve import retrieve_pairs
+from toolkit.upright import turned_from_cam
 
 HL_RIG = "hl_a/rig"
 
@@ -142,7 +150,7 @@ def test_a_changed_query_or_map_image(tiny: Path, tmp_path: Path) -> None:
         ({"subsession": "nope"}, "ios_a"),
         ({"dtype": "int8"}, "float16"),
         ({"batch_size": 0}, "at least 1"),
-        ({"compute_device": "tpu"}, "auto, cpu or cuda"),
+        ({"compute_device": "tpu"}, "auto, cpu, cuda"),
     ],
 )
 def test_refused_parameters(tiny: Path, tmp_path: Path, parameters: dict[str, object], message: str) -> None:
@@ -155,8 +163,130 @@ def test_no_map_no_vocabulary(tiny: Path, tmp_path: Path) -> None:
         shutil.rmtree(tiny / "sessions" / f"{device}_map")
     with pytest.raises(ToolkitError, match="_map session"):
         embed_sessions(tiny / "sessions", tmp_path / "e")
-    with pytest.raises(ToolkitError, match="use model `vlad`"):
-        embed_sessions(tiny / "sessions", tmp_path / "e", model="megaloc")
+
+
+@pytest.fixture
+def megaloc(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, object]:
+    """Parameters of the stage that make it use a tiny MegaLoc with random weights."""
+    monkeypatch.setattr(MegaLoc, "from_checkpoint", lambda _: tiny_megaloc())
+    path = tmp_path / "weights.safetensors"
+    path.write_bytes(b"stands for weights")
+    options: dict[str, object] = {"model": "megaloc", "checkpoint": str(path), "image_size": 126}
+    return options | {"compute_device": "cpu", "dtype_compute": "float32", "batch_size": 4}
+
+
+def test_a_learned_embedder(tiny: Path, tmp_path: Path, megaloc: dict[str, object]) -> None:
+    (tiny / "sessions/hl_map/raw_data/hl_a/images/left/1010.png").write_bytes(b"not an image")
+    out = tmp_path / "run" / "e"
+    table = embed_sessions(tiny / "sessions", out, **megaloc)  # type: ignore[arg-type]
+    assert table[["session", "embedded", "unreadable"]].to_numpy().tolist() == [
+        ["ios_map", 6, 0], ["ios_query", 3, 0], ["hl_map", 11, 1], ["hl_query", 6, 0],
+    ]  # fmt: skip
+    assert not (tmp_path / "run" / "features").exists(), "it needs no local features"
+    matrix, manifest = load_embeddings(out / "hl_map")
+    embedder = MegaLocEmbedder(tiny_megaloc(), device="cpu", dtype_compute="float32", image_size=126)
+    for row in (0, 4, 10):
+        image = read_image(tiny.parent / manifest["abs_path"][row])
+        np.testing.assert_allclose(matrix[row], embedder.embed([image])[0], atol=1e-6)
+    assert pd.read_csv(out / "hl_map/hl_a/failed.csv")["timestamp"].tolist() == [1010]
+    assert embed_sessions(tiny / "sessions", out, **megaloc)["skipped"].all()  # type: ignore[arg-type]
+    other = megaloc | {"image_size": 140}
+    assert not embed_sessions(tiny / "sessions", out, **other)["skipped"].any()  # type: ignore[arg-type]
+
+
+def test_half_precision_on_disk(tiny: Path, tmp_path: Path, megaloc: dict[str, object]) -> None:
+    matrices = []
+    for dtype in ("float32", "float16"):
+        out = tmp_path / dtype
+        embed_sessions(tiny / "sessions", out, device="ios", dtype=dtype, **megaloc)  # type: ignore[arg-type]
+        matrices.append(np.load(out / "ios_map/ios_a/ios_a.npy"))
+    assert [matrix.dtype for matrix in matrices] == [np.float32, np.float16]
+    np.testing.assert_allclose(matrices[0], matrices[1], atol=1e-3)
+
+
+def test_a_killed_run_goes_on_within_a_subsession(
+    tiny: Path, tmp_path: Path, megaloc: dict[str, object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tiny / "sessions/hl_map/raw_data/hl_a/images/left/1000.png").unlink()
+    go = {"device": "hl", **megaloc}
+    embed_sessions(tiny / "sessions", tmp_path / "whole", **go)  # type: ignore[arg-type]
+    embed, seen = MegaLocEmbedder.embed, []
+
+    def dies_at_the_third_batch(self: MegaLocEmbedder, inputs: list[np.ndarray]) -> np.ndarray:
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+        seen.append(len(inputs))
+        return embed(self, inputs)
+
+    monkeypatch.setattr(MegaLocEmbedder, "embed", dies_at_the_third_batch)
+    with pytest.raises(KeyboardInterrupt):
+        embed_sessions(tiny / "sessions", tmp_path / "e", **go)  # type: ignore[arg-type]
+    assert not (tmp_path / "e/hl_map/hl_a/hl_a.npy").exists()
+
+    def counts(self: MegaLocEmbedder, inputs: list[np.ndarray]) -> np.ndarray:
+        seen.append(len(inputs))
+        return embed(self, inputs)
+
+    monkeypatch.setattr(MegaLocEmbedder, "embed", counts)
+    table = embed_sessions(tiny / "sessions", tmp_path / "e", **go)  # type: ignore[arg-type]
+    assert seen == [4, 4, 3, 4, 2], "11 images of the map, of which 8 were done, and 6 of the query"
+    assert table["unreadable"].tolist() == [1, 0]
+    for path in (tmp_path / "whole").rglob("*.*"):
+        twin = tmp_path / "e" / path.relative_to(tmp_path / "whole")
+        assert path.is_dir() or twin.read_bytes() == path.read_bytes(), path
+    assert not list((tmp_path / "e").rglob("*.partial*"))
+
+
+@pytest.mark.usefixtures("no_hub")
+def test_no_weights_no_work(tiny: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for options in ({}, {"checkpoint": str(tmp_path / "none.safetensors")}):
+        with pytest.raises(WeightsError, match=r"model\.safetensors(.|\n)*`embed\.model: vlad`"):
+            embed_sessions(tiny / "sessions", tmp_path / "run" / "e", model="megaloc", **options)  # type: ignore[arg-type]
+    assert not (tmp_path / "run").exists()
+    table = embed_sessions(tiny / "sessions", tmp_path / "run" / "e", device="ios", model="auto")
+    assert set(table["model"]) == {"vlad"}
+    assert "model auto: vlad" in caplog.text
+
+
+def test_auto_takes_the_learned_one_where_it_can(tiny: Path, tmp_path: Path, megaloc: dict[str, object]) -> None:
+    table = embed_sessions(tiny / "sessions", tmp_path / "e", **megaloc | {"model": "auto"})  # type: ignore[arg-type]
+    assert set(table["model"]) == {"megaloc"}
+
+
+def roll_camera(capture: Path, sensor: str, k: int) -> None:
+    """Mount a camera of the headset differently: its images are stored after k counter-clockwise quarter turns."""
+    for split in ("map", "query"):
+        session = capture / "sessions" / f"hl_{split}"
+        for path in (session / "raw_data" / "hl_a" / "images" / sensor).iterdir():
+            cv2.imwrite(str(path), np.rot90(cv2.imread(str(path)), k))
+        turned = invert(turned_from_cam(k))
+        numbers = ", ".join(map(str, qt_from_pose(turned)))
+        lines = (session / "rigs.txt").read_text().splitlines()
+        edited = [f"{HL_RIG}, hl_a/{sensor}, {numbers}" if f"hl_a/{sensor}," in line else line for line in lines]
+        (session / "rigs.txt").write_text("\n".join(edited) + "\n")
+
+
+@pytest.mark.parametrize("k", [1, 2, 3])
+def test_a_rolled_camera_is_described_as_an_upright_one(
+    tiny: Path, tmp_path: Path, megaloc: dict[str, object], k: int
+) -> None:
+    """The world's up is -y here: the cameras of the walls have the axes of the world."""
+    rolled = write_tiny_capture(tmp_path / "ROLLED" / "TINY")
+    roll_camera(rolled, "right", k)
+    tables, matrices, retrieved = [], {}, {}
+    for name, capture, upright in (("as they are", tiny, None), ("turned", rolled, None), ("not", rolled, False)):
+        out = tmp_path / name / "e"
+        options = megaloc | {"upright": upright, "world_up": [0, -1, 0]}
+        tables.append(embed_sessions(capture / "sessions", out, **options))  # type: ignore[arg-type]
+        matrices[name] = np.load(out / "hl_query/hl_a/hl_a.npy")
+        retrieve_pairs(capture / "sessions", out, "ios", "hl", topk=3)
+        retrieved[name] = (tmp_path / name / "retrieval/TINY_map_ios_query_hl.jsonl").read_text()
+    assert [table.set_index("session").loc["hl_query", "turned"] for table in tables] == [0, 3, 0]
+    np.testing.assert_array_equal(matrices["turned"], matrices["as they are"])
+    assert np.abs(matrices["not"] - matrices["as they are"]).max() > 1e-3
+    lines = {name: [json.loads(line) for line in text.splitlines()] for name, text in retrieved.items()}
+    ranked = {name: [query["topk"] for query in queries] for name, queries in lines.items()}
+    assert ranked["turned"] == ranked["as they are"]
 
 
 def test_a_subsession_that_is_gone_leaves_no_embeddings(tiny: Path, tmp_path: Path) -> None:

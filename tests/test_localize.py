@@ -3,8 +3,9 @@
 import json
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -14,6 +15,7 @@ from toolkit import geometry
 from toolkit.capture import Capture, Trajectory
 from toolkit.embed import embed_sessions
 from toolkit.errors import ArtefactError, CaptureError, ImageError, ManifestError, ToolkitError
+from toolkit.features import extract_session
 from toolkit.files import SceneFiles, sidecar_path
 from toolkit.images import read_image
 from toolkit.localize import COLUMNS, Map, localize_image, localize_pairs
@@ -424,3 +426,37 @@ def test_a_picture_of_another_size_than_its_camera_is_refused(small_capture: Pat
 def test_the_map_of_an_unfinished_run(finished: tuple[SceneFiles, pd.DataFrame]) -> None:
     with pytest.raises(ArtefactError, match="hl_map"):
         Map.open(finished[0].run, finished[0].scene, "hl")
+
+
+class Learned:
+    """An embedder of images that always points at the same descriptor."""
+
+    name, upright = "learned", True
+    inputs: Literal["images"] = "images"
+
+    def __init__(self, vector: np.ndarray) -> None:
+        self.vector = vector
+        self.dim = len(vector)
+        self.seen: list[tuple[int, ...]] = []
+
+    def embed(self, inputs: Sequence[np.ndarray]) -> np.ndarray:
+        self.seen += [image.shape for image in inputs]
+        return np.repeat(self.vector[None], len(inputs), axis=0)
+
+
+def test_a_map_with_the_embedder_it_was_made_with(
+    small_capture: Path, finished: tuple[SceneFiles, pd.DataFrame]
+) -> None:
+    files = finished[0]
+    with pytest.raises(ArtefactError, match="but `learned` makes 7"):
+        Map.open(files.run, files.scene, "ios", embedder=Learned(np.zeros(7, np.float32)))
+    session = Capture.open(small_capture)["ios_query"]
+    path, camera = session.image_path(0), session.camera(session.images["sensor_id"].iloc[0])
+    vlad = Map.open(files.run, files.scene, "ios")
+    store = extract_session(session, files.features)
+    learned = Learned(vlad.embedder.embed([store[session.image_name(0)]])[0])
+    opened = Map.open(files.run, files.scene, "ios", embedder=learned)
+    expected = localize_image(vlad, path, camera)
+    answer = localize_image(opened, path, camera)
+    np.testing.assert_allclose(answer.world_from_rig, expected.world_from_rig, atol=1e-9)
+    assert learned.seen == [(camera.height, camera.width, 3)], "it is given colours"

@@ -98,3 +98,13 @@ def test_the_manifests_of_the_repository_are_valid(path: Path, monkeypatch: pyte
 def test_there_is_a_section_for_each_stage() -> None:
     assert set(STAGES) <= set(Manifest.model_fields)
     assert yaml.safe_load((REPOSITORY / "data_manifests" / "demo.yaml").read_text())["demo_data"]
+
+
+def test_the_checkpoint_is_found_from_the_manifest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WEIGHTS", "/models")
+    for text, expected in {
+        "w/m.safetensors": str(tmp_path / "w/m.safetensors"),
+        "$WEIGHTS/m.safetensors": "/models/m.safetensors",
+    }.items():
+        path = write(tmp_path, f"captures: [a]\nembed: {{checkpoint: {text}}}")
+        assert load_manifest(path).embed.checkpoint == expected

@@ -15,7 +15,7 @@ import pytest
 from nbformat.v4 import new_code_cell, new_notebook
 
 from toolkit import notebook, pipeline
-from toolkit.errors import ManifestError, ToolkitError
+from toolkit.errors import ManifestError, ToolkitError, WeightsError
 from toolkit.pipeline import StageError
 
 KERNEL = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
@@ -212,3 +212,19 @@ def test_output_that_cannot_be_written_is_said(small_capture: Path, tmp_path: Pa
     manifest.write_text(f"captures: [{small_capture}]\noutput_root: {tmp_path / 'file' / 'runs'}\n")
     with pytest.raises(ManifestError, match="cannot be made"):
         pipeline.run(manifest)
+
+
+@pytest.mark.usefixtures("no_hub")
+def test_without_weights_nothing_is_run(place: Path, go: Callable[..., dict[str, str]]) -> None:
+    with pytest.raises(WeightsError, match=r"`embed\.model: vlad`"):
+        go("embed.model=megaloc")
+    assert not (place / "runs/run/run.json").exists()
+    assert go("embed.model=auto") == {"embed": "done", "retrieve": "done"}
+    assert (place / "runs/run/P/embeddings/log.txt").read_text() == "vlad True\n"
+    # What is up to date needs no weights any more.
+    assert go("embed.model=megaloc", only="retrieve")["retrieve"] == "reused"
+
+
+def test_an_unknown_embedder_is_refused_at_once(go: Callable[..., dict[str, str]]) -> None:
+    with pytest.raises(ManifestError, match=r"Unknown embedder 'megalok'.*megaloc"):
+        go("embed.model=megalok")

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from toolkit.embedders import EMBEDDERS, create_embedder, resolve_name
+from toolkit.embedders import create_embedder, resolve_name
 from toolkit.embedders.vlad import Vlad, VladSettings
-from toolkit.errors import ArtefactError, ToolkitError
+from toolkit.errors import ArtefactError, ManifestError, ToolkitError, WeightsError
 from toolkit.features import LocalFeatures
 
 SETTINGS = VladSettings(words=16, local_dim=16, min_features=20, sample_descriptors=3000)
@@ -127,11 +127,15 @@ def test_a_file_that_is_no_vocabulary(tmp_path: Path) -> None:
         Vlad.load(tmp_path / "torn.npz")
 
 
-def test_names(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("no_hub")
+def test_names(tmp_path: Path) -> None:
     assert resolve_name("auto") == "vlad"
-    with pytest.raises(ToolkitError, match=r"not installed in this version.*`vlad`"):
+    with pytest.raises(WeightsError, match=r"MegaLoc: no weights.*\n.*\n.*`embed\.model: vlad`"):
         create_embedder("megaloc")
-    with pytest.raises(ToolkitError, match=r"Unknown embedder 'vald'.*vlad"):
+    with pytest.raises(ManifestError, match=r"Unknown embedder 'vald'.*vlad"):
         create_embedder("vald")
-    monkeypatch.setitem(EMBEDDERS, "megaloc", "builtins:dict")
-    assert resolve_name("auto") == "megaloc"
+    with pytest.raises(WeightsError, match=r"no weights file .*none\.safetensors"):
+        resolve_name("auto", tmp_path / "none.safetensors")
+    weights = tmp_path / "weights.safetensors"
+    weights.write_bytes(b"some")
+    assert resolve_name("auto", weights) == "megaloc"

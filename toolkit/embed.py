@@ -2,9 +2,8 @@
 
 import logging
 import time
-from collections.abc import Iterable, Iterator
-from dataclasses import asdict
-from itertools import islice
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
+from toolkit.compute import check_device_name
 from toolkit.embedders import Embedder, create_embedder, resolve_name
 from toolkit.errors import ImageError, ManifestError, ToolkitError
 from toolkit.features import FeatureSettings, LocalFeatures, extract_session
@@ -26,7 +26,9 @@ from toolkit.files import (
     write_atomic,
     write_sidecar,
 )
-from toolkit.images import prefetch, read_image
+from toolkit.images import default_workers, prefetch, read_image
+from toolkit.matrix import MatrixWriter
+from toolkit.upright import Turns, quarter_turns, turn_image
 
 log = logging.getLogger(__name__)
 
@@ -45,6 +47,11 @@ def embed_sessions(
     skip_existing: bool = True,
     dtype: str = "float32",
     model: str = "vlad",
+    checkpoint: str | None = None,
+    image_size: int = 322,
+    dtype_compute: str = "auto",
+    upright: bool | None = None,
+    world_up: Sequence[float] | None = None,
     features_dir: str | Path | None = None,
     dim: int | None = None,
     seed: int = 0,
@@ -52,6 +59,7 @@ def embed_sessions(
     """Write `<out_dir>/<session>/<subsession>/<subsession>.npy` (N, D) and its `manifest.csv`.
 
     Images that cannot be read are left out of both, and listed with the reason in `failed.csv` beside them.
+    Memory does not grow with the number of images, and a killed run goes on within a subsession.
 
     Args:
         sessions_root: `<capture>/sessions`.
@@ -59,42 +67,55 @@ def embed_sessions(
         device: `ios`, `hl`, `spot`, or `auto`: all that the capture has.
         subsession: one subsession's name, or `all`.
         batch_size: images a batch.
-        compute_device: `auto`, `cpu`, `cuda`: where a network runs. `vlad` runs on the CPU.
+        compute_device: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`: where a network runs. `vlad` runs on the CPU.
         normalize: L2-normalise the rows.
         skip_existing: reuse subsessions made from the same images and settings.
         dtype: `float32` or `float16`, of the files.
-        model: an embedder's name, or `auto`.
+        model: an embedder's name; `auto`: `megaloc` if its weights are on this machine, else `vlad`.
+        checkpoint: file with the weights of a learned model; None: the hub's cache, else a download.
+        image_size: side of the square that a learned model sees, a multiple of 14 for `megaloc`.
+        dtype_compute: `float32`, `bfloat16`, `float16`, or `auto`: what is fast where the network runs.
+        upright: turn images so that gravity points down; None: for learned models. `vlad` does not need it.
+        world_up: the direction (3,) that is up in the map's world; None: estimated from its cameras.
         features_dir: folder of the local features that stages share; `<out_dir>/../features` where None.
         dim: most dimensions of `vlad`; its default where None.
         seed: of the vocabulary.
 
     Returns:
-        One row a subsession: session, subsession, images, embedded, unreadable, seconds, skipped, model, dim.
+        One row a subsession: session, subsession, images, embedded, unreadable, turned, seconds, skipped, model,
+        dim.
+
+    Raises:
+        ManifestError: a parameter is not valid.
+        WeightsError: a learned model has no weights, or other ones; before any work.
     """
     if dtype not in ("float32", "float16"):
         raise ManifestError(f"dtype is {dtype!r}; expected float32 or float16.")
     if batch_size < 1:
         raise ManifestError(f"batch_size is {batch_size}; expected at least 1.")
-    if compute_device.split(":")[0] not in ("auto", "cpu", "cuda"):
-        raise ManifestError(f"compute_device is {compute_device!r}; expected auto, cpu or cuda.")
+    check_device_name(compute_device)
     out_dir = Path(out_dir)
     features_dir = Path(features_dir) if features_dir is not None else out_dir.parent / "features"
     capture = Capture.from_sessions_root(sessions_root)
     jobs = _jobs(capture, device, subsession)
-    name = resolve_name(model)
+    name = resolve_name(model, checkpoint)
     if model == "auto":
-        log.info("model auto: %s", name)
+        log.warning("model auto: %s", name)
     if name == "vlad":
         embedder = create_embedder(
             name, vocabulary=_vocabulary(capture, out_dir, features_dir, dim, seed, skip_existing)
         )
     else:
-        embedder = create_embedder(name, device=compute_device)
+        embedder = create_embedder(
+            name, checkpoint=checkpoint, device=compute_device, dtype_compute=dtype_compute, image_size=image_size
+        )
+    turns = _turns(capture, embedder, upright, world_up)
     if subsession == "all":
         _remove_former(out_dir, jobs)
     table = []
     for session, part, rows in jobs:
         started = time.perf_counter()
+        job = _Job(session, part, rows, np.zeros(len(rows), np.int64) if turns is None else turns.of(session, rows))
         folder = out_dir / session.id / part
         matrix_path = folder / f"{Path(part).name}.npy"
         record = {
@@ -102,6 +123,7 @@ def embed_sessions(
             "features": asdict(FeatureSettings()) if embedder.inputs == "features" else None,
             "images": _images_fingerprint(session, rows),
             "sensors": file_fingerprint(session.path / "sensors.txt"),
+            "turns": fingerprint(job.turns.tolist()) if job.turns.any() else None,
             "normalize": normalize,
             "dtype": dtype,
         }
@@ -109,11 +131,13 @@ def embed_sessions(
         if skipped:
             embedded = len(np.load(matrix_path, mmap_mode="r"))
         else:
-            matrix, failed = _embed_rows(embedder, session, part, rows, batch_size, features_dir)
-            if normalize:
-                matrix /= np.maximum(np.linalg.norm(matrix, axis=1, keepdims=True), 1e-12)
-            embedded = len(matrix)
-            _write(matrix_path, matrix.astype(dtype), _manifest(capture, session, rows, failed), failed)
+            # The same images in batches of another size are the same up to rounding.
+            identity = {**record, "batch_size": batch_size}
+            with MatrixWriter(matrix_path, embedder.dim, dtype, identity, resume=skip_existing) as writer:
+                failed = _embed_job(embedder, job, writer, batch_size, normalize, features_dir)
+                embedded = writer.count
+                _write_tables(folder, _manifest(capture, session, rows, failed), failed)
+                writer.finish()
             write_sidecar(matrix_path, record)
             if failed:
                 log.warning("%s/%s: %d of %d images cannot be read, see %s",
@@ -125,6 +149,7 @@ def embed_sessions(
                 "images": len(rows),
                 "embedded": embedded,
                 "unreadable": len(rows) - embedded,
+                "turned": int(np.count_nonzero(job.turns)),
                 "seconds": round(time.perf_counter() - started, 3),
                 "skipped": skipped,
                 "model": name,
@@ -132,6 +157,25 @@ def embed_sessions(
             }
         )
     return pd.DataFrame(table)
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One subsession: its images, and how each is turned for the embedder."""
+
+    session: Session
+    part: str
+    rows: NDArray[np.intp]
+    turns: NDArray[np.int64]
+
+
+def _turns(
+    capture: Capture, embedder: Embedder, upright: bool | None, world_up: Sequence[float] | None
+) -> Turns | None:
+    """Return how images are turned upright, or None where they are taken as they are."""
+    if embedder.inputs == "features" or not (embedder.upright if upright is None else upright):
+        return None
+    return quarter_turns([capture[name] for name in capture if capture[name].split == "map"], world_up)
 
 
 def _jobs(capture: Capture, device: str, subsession: str) -> list[tuple[Session, str, NDArray[np.intp]]]:
@@ -214,52 +258,73 @@ def _vocabulary(
     return path
 
 
-def _embed_rows(
-    embedder: Embedder,
-    session: Session,
-    part: str,
-    rows: NDArray[np.intp],
-    batch_size: int,
-    features_dir: Path,
-) -> tuple[NDArray[np.float32], dict[int, str]]:
-    """Return the vectors of the readable images, in order, and why the others (by row) have none."""
+def _embed_job(
+    embedder: Embedder, job: _Job, writer: MatrixWriter, batch_size: int, normalize: bool, features_dir: Path
+) -> dict[int, str]:
+    """Write the vectors of the readable images, in order; returns why the others (by row) have none."""
     failed: dict[int, str] = {}
+    done = 0
+    for note in writer.notes:  # what a killed run had done
+        done = note["done"]
+        failed |= dict(note["failed"])
+    source = _features if embedder.inputs == "features" else _images
+    inputs = source(embedder, job, done, batch_size, features_dir)
+    label = f"embed {job.session.id}/{job.part}"
+    with tqdm(total=len(job.rows), initial=done, desc=label, unit="image") as bar:
+        for batch, unreadable in _batches(inputs, batch_size):
+            vectors = embedder.embed(batch)
+            if normalize:
+                vectors = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+            failed |= unreadable
+            done += len(batch) + len(unreadable)
+            writer.append(vectors, {"done": done, "failed": list(unreadable.items())})
+            bar.update(len(batch) + len(unreadable))
+    return failed
 
-    def from_features() -> Iterator[Any]:
-        store = extract_session(session, features_dir, rows=rows)
-        for row in rows.tolist():
-            name = session.image_name(row)
-            if name in store:
-                yield store[name]
-            else:
-                failed[row] = store.failed.get(name, "no local features were extracted")
 
-    def read(row: int) -> NDArray[np.uint8] | tuple[int, str]:
+def _features(
+    embedder: Embedder, job: _Job, done: int, batch_size: int, features_dir: Path
+) -> Iterator[tuple[int, LocalFeatures | str]]:
+    """Yield row and local features of the images after the first `done`, or why there are none."""
+    store = extract_session(job.session, features_dir, rows=job.rows)
+    for row in job.rows[done:].tolist():
+        name = job.session.image_name(row)
+        yield row, store[name] if name in store else store.failed.get(name, "no local features were extracted")
+
+
+def _images(
+    embedder: Embedder, job: _Job, done: int, batch_size: int, features_dir: Path
+) -> Iterator[tuple[int, NDArray[np.uint8] | str]]:
+    """Yield row and prepared image of the images after the first `done`, or why it cannot be read."""
+
+    def read(item: tuple[int, int]) -> tuple[int, NDArray[np.uint8] | str]:
+        row, turns = item
         try:
-            return read_image(session.image_path(row))
+            image = read_image(job.session.image_path(row))
         except ImageError as error:
             return row, str(error)
+        return row, embedder.prepare(turn_image(image, turns))
 
-    def from_images() -> Iterator[Any]:
-        for image in prefetch(read, rows.tolist(), ahead=batch_size):
-            if isinstance(image, tuple):
-                failed[image[0]] = image[1]
-            else:
-                yield image
-
-    inputs = from_features() if embedder.inputs == "features" else from_images()
-    blocks = [np.zeros((0, embedder.dim), np.float32)]
-    with tqdm(total=len(rows), desc=f"embed {session.id}/{part}", unit="image") as bar:
-        for batch in _batches(inputs, batch_size):
-            blocks.append(embedder.embed(batch))
-            bar.update(len(batch))
-    return np.concatenate(blocks), failed
+    items = zip(job.rows[done:].tolist(), job.turns[done:].tolist(), strict=True)
+    return prefetch(read, items, workers=default_workers(), ahead=2 * batch_size)
 
 
-def _batches(items: Iterable[Any], size: int) -> Iterator[list[Any]]:
-    iterator = iter(items)
-    while batch := list(islice(iterator, size)):
-        yield batch
+def _batches(
+    items: Iterable[tuple[int, Any | str]], size: int
+) -> Iterator[tuple[list[Any], dict[int, str]]]:
+    """Yield up to `size` inputs, and the reasons (by row) of those that are none, in order."""
+    batch: list[Any] = []
+    unreadable: dict[int, str] = {}
+    for row, item in items:
+        if isinstance(item, str):
+            unreadable[row] = item
+        else:
+            batch.append(item)
+        if len(batch) == size:
+            yield batch, unreadable
+            batch, unreadable = [], {}
+    if batch or unreadable:
+        yield batch, unreadable
 
 
 def _images_fingerprint(session: Session, rows: NDArray[np.intp]) -> str:
@@ -286,16 +351,13 @@ def _manifest(
     return manifest
 
 
-def _write(path: Path, matrix: NDArray[Any], manifest: pd.DataFrame, failed: dict[int, str]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    missing = path.parent / "failed.csv"
+def _write_tables(folder: Path, manifest: pd.DataFrame, failed: dict[int, str]) -> None:
+    missing = folder / "failed.csv"
     if failed:
         with write_atomic(missing) as temporary:
             manifest[manifest["reason"] != ""].to_csv(temporary, index=False)
     else:
         missing.unlink(missing_ok=True)
     embedded = manifest[manifest["reason"] == ""].drop(columns="reason").reset_index(drop=True)
-    with write_atomic(path.parent / "manifest.csv") as temporary:
+    with write_atomic(folder / "manifest.csv") as temporary:
         embedded.to_csv(temporary, index_label="row_index")
-    with write_atomic(path) as temporary, open(temporary, "wb") as stream:
-        np.save(stream, matrix)

@@ -384,16 +384,17 @@ class Map:
     """(N,) their indices in `local_map`."""
 
     @classmethod
-    def open(cls, run: str | Path, scene: str, device: str) -> "Map":
+    def open(cls, run: str | Path, scene: str, device: str, embedder: Embedder | None = None) -> "Map":
         """Open the map of a finished run.
 
         Args:
             run: the run folder, `<output_root>/<manifest name>`.
             scene: the capture's name.
             device: `ios`, `hl`, `spot`.
+            embedder: the one that the run was embedded with; None: `vlad`.
 
         Raises:
-            ArtefactError: the run has no such map yet.
+            ArtefactError: the run has no such map yet, or was embedded by another embedder.
         """
         files = SceneFiles(Path(run), scene)
         session = f"{device}_map"
@@ -402,7 +403,13 @@ class Map:
         names = [path.split("/sessions/", 1)[-1] for path in table["abs_path"]]
         indices = np.array([local_map.index_of.get(name, -1) for name in names], np.int64)
         localizer = PnpLocalizer(local_map, FeatureStore.open(files.features / session))
-        embedder = create_embedder("vlad", vocabulary=files.embeddings / "vlad.npz")
+        if embedder is None:
+            embedder = create_embedder("vlad", vocabulary=files.embeddings / "vlad.npz")
+        if embedder.dim != vectors.shape[1]:
+            raise ArtefactError(
+                f"{files.embeddings / session}: descriptors of length {vectors.shape[1]}, but `{embedder.name}` makes "
+                f"{embedder.dim}. Give the embedder that this run was made with: Map.open(..., embedder=...)."
+            )
         return cls(local_map, localizer, embedder, vectors[indices >= 0], indices[indices >= 0])
 
 
@@ -416,7 +423,7 @@ def localize_image(
 
     Args:
         map: an open map.
-        image: a file, or pixels (H, W) or (H, W, 3) RGB uint8.
+        image: a file, or pixels (H, W) or (H, W, 3) RGB uint8; upright, if the map's embedder is a learned one.
         camera: its intrinsics, with the size of the picture.
         topk: references to match with.
 
@@ -426,15 +433,18 @@ def localize_image(
     Raises:
         ImageError: the file cannot be read, or its size is not the camera's.
     """
+    learned = map.embedder.inputs == "images"
     if isinstance(image, (str, Path)):
-        image = read_image(image, gray=True)
+        gray = read_image(image, gray=True)  # as the map's images were read
+        image = read_image(image) if learned else gray
+    else:
+        gray = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
     if (camera.width, camera.height) != (image.shape[1], image.shape[0]):
         raise ImageError(
             f"The image is {image.shape[1]} x {image.shape[0]} pixels, its camera {camera.width} x {camera.height}. "
             "Give the intrinsics of the image as it is stored."
         )
-    gray = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
     features: LocalFeatures = SiftExtractor()(gray)
-    scores = map.descriptors @ map.embedder.embed([features])[0]
+    scores = map.descriptors @ map.embedder.embed([image if learned else features])[0]
     best = np.argsort(-scores, kind="stable")[:topk]
     return map.localizer.localize([camera], np.eye(4)[None], [features], [map.images[best].tolist()])

@@ -55,11 +55,19 @@ class ExploreSettings(_Section):
 
 class EmbedSettings(_Section):
     model: str | None = None
-    """Global descriptor; `vlad` needs no weights."""
+    """Global descriptor: vlad, megaloc, or auto: megaloc if its weights are there. `vlad` needs no weights."""
+    checkpoint: str | None = None
+    """File with the weights of a learned model; without it the hub's cache, else a download."""
     batch_size: Positive | None = None
     """Images a step."""
+    image_size: Positive | None = None
+    """Side of the square that a learned model sees, a multiple of 14."""
     compute_device: str | None = None
-    """auto, cpu or cuda."""
+    """auto, cpu, cuda, cuda:<number> or mps."""
+    dtype_compute: Literal["auto", "float32", "bfloat16", "float16"] | None = None
+    """Precision of a learned model; auto: what is fast on the device."""
+    upright: bool | None = None
+    """Turn images so that gravity points down; without it: for learned models."""
     normalize: bool | None = None
     """Scale descriptors to unit length."""
     dtype: Literal["float32", "float16"] | None = None
@@ -76,7 +84,7 @@ class RetrieveSettings(_Section):
     normalize: bool | None = None
     """Compare by cosine."""
     compute_device: str | None = None
-    """auto, cpu or cuda."""
+    """auto, cpu, cuda, cuda:<number> or mps."""
 
 
 class LocalizeSettings(_Section):
@@ -124,7 +132,7 @@ class Manifest(_Strict):
     seed: Natural = 0
     """The same seed gives the same poses."""
     world_up: Annotated[list[float], Field(min_length=3, max_length=3)] | None = None
-    """Direction that is up in the captures' world, for the pictures."""
+    """Direction that is up in the captures' world; estimated from the map's cameras where it is needed."""
     explore: ExploreSettings = ExploreSettings()
     embed: EmbedSettings = EmbedSettings()
     retrieve: RetrieveSettings = RetrieveSettings()
@@ -169,10 +177,13 @@ def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
     except ValidationError as error:
         raise ManifestError(_explain(error, source)) from None
     folder = path.resolve().parent
-    update = {
+    update: dict[str, Any] = {
         "captures": [str(_expand(text, folder, f"{source}: captures")) for text in manifest.captures],
         "output_root": str(_expand(manifest.output_root, folder, f"{source}: output_root")),
     }
+    if manifest.embed.checkpoint is not None:
+        weights = _expand(manifest.embed.checkpoint, folder, f"{source}: embed.checkpoint")
+        update["embed"] = manifest.embed.model_copy(update={"checkpoint": str(weights)})
     names = [Path(capture).name for capture in update["captures"]]
     if twice := {name for name in names if names.count(name) > 1}:
         raise ManifestError(

@@ -26,7 +26,7 @@ from typing import Any
 
 from toolkit import __version__, errors
 from toolkit.errors import ManifestError, ToolkitError
-from toolkit.files import SceneFiles, fingerprint, write_text
+from toolkit.files import SceneFiles, files_fingerprint, fingerprint, write_text
 from toolkit.manifest import STAGES, Manifest, load_manifest, nearest
 from toolkit.notebook import (
     COUNTS_MIME,
@@ -40,7 +40,7 @@ from toolkit.notebook import (
 )
 
 # Distributions whose versions may change results.
-_VERSIONS = ("numpy", "pycolmap", "faiss-cpu", "opencv-python-headless", "pandas", "torch", "rerun-sdk")
+_VERSIONS = ("numpy", "pycolmap", "faiss-cpu", "opencv-python-headless", "pandas", "pillow", "torch", "rerun-sdk")
 
 Say = Callable[..., None]
 
@@ -111,6 +111,7 @@ def run(
     manifest = load_manifest(manifest_path, overrides)
     for stage in STAGES:  # a wrong key stops the run before hours of work, not after
         check_parameters(notebook_path(stage), manifest.stage(stage).given(), f"{manifest_path}: {stage}.")
+    manifest = _name_embedder(manifest, say)
     captures = _captures(manifest)
     run_dir = Path(manifest.output_root) / manifest.name
     try:
@@ -124,6 +125,9 @@ def run(
         for job in _jobs(manifest, stage, capture, SceneFiles(run_dir, capture.name), force)
     ]
     inputs = {capture.name: tree_fingerprint(capture / "sessions") for capture in captures}
+    embedding = [job for job in jobs if job.stage == "embed"]
+    if any(force or not _reusable(job, _inputs_of(job, inputs[job.files.scene])) for job in embedding):
+        _require_weights(manifest)
     log = RunLog(run_dir, manifest, inputs)
     try:
         for i, job in enumerate(jobs, 1):
@@ -274,6 +278,27 @@ def tree_fingerprint(folder: Path, part: str = "") -> str:
     return fingerprint(rows)
 
 
+def _name_embedder(manifest: Manifest, say: Say) -> Manifest:
+    """Return the manifest with the embedder that `auto` stands for; refuses an unknown one."""
+    from toolkit.embedders import resolve_name
+
+    settings = manifest.embed
+    if settings.model is None:
+        return manifest
+    name = resolve_name(settings.model, settings.checkpoint)
+    if name != settings.model:
+        say(f"embed.model {settings.model}: {name}")
+    return manifest.model_copy(update={"embed": settings.model_copy(update={"model": name})})
+
+
+def _require_weights(manifest: Manifest) -> None:
+    """Find or download the weights that the run needs, before hours of work and where its progress is seen."""
+    from toolkit.embedders import require_weights
+
+    if manifest.embed.model is not None:
+        require_weights(manifest.embed.model, manifest.embed.checkpoint)
+
+
 def _captures(manifest: Manifest) -> list[Path]:
     if manifest.demo_data is not None:
         from toolkit.synthetic import render_capture
@@ -337,7 +362,8 @@ def _inputs_of(job: Job, capture: str) -> str:
         for stage in UPSTREAM[job.stage]
         for record in sorted(job.record.parent.glob(f"{stage}*.json"))
     ]
-    return fingerprint([parameters, capture, _code_fingerprint(), source, upstream])
+    weights = files_fingerprint([Path(parameters["checkpoint"])]) if parameters.get("checkpoint") else None
+    return fingerprint([parameters, weights, capture, _code_fingerprint(), source, upstream])
 
 
 @cache

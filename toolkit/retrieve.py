@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
+from toolkit.compute import resolve_device
 from toolkit.embedders import load_embeddings
 from toolkit.errors import ArtefactError, ManifestError, ToolkitError
 from toolkit.files import (
@@ -50,7 +51,7 @@ def search(
         database: (N, D).
         k: how many; at most N are returned.
         backend: `faiss`, `torch` or `numpy`.
-        compute_device: where torch computes: `auto`, `cpu`, `cuda`.
+        compute_device: where torch computes: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
         faiss_gpu: let faiss compute on the GPU (needs a faiss built for it).
 
     Returns:
@@ -116,7 +117,7 @@ def retrieve_pairs(
         use_faiss: search with faiss, else with torch; the result is the same.
         faiss_gpu: search with a faiss built for GPUs.
         normalize: L2-normalise before the search, so that scores are cosines.
-        compute_device: where torch computes: `auto`, `cpu`, `cuda`.
+        compute_device: where torch computes: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
         queries: the keyframe list that says which devices are asked for, or `all`.
         skip_existing: reuse files made from the same embeddings, poses and settings.
 
@@ -398,13 +399,10 @@ def _torch_blocks(
 ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int64]]]:
     import torch
 
-    if compute_device == "auto":
-        compute_device = "cuda" if torch.cuda.is_available() else "cpu"
-    if compute_device.startswith("cuda") and not torch.cuda.is_available():
-        raise ToolkitError("compute_device is cuda, but torch sees no GPU. Set compute_device: auto or cpu.")
-    queries = torch.from_numpy(query).to(compute_device)
+    device = resolve_device(compute_device)
+    queries = torch.from_numpy(query).to(device)
     step = max(1, _BLOCK_BYTES // (4 * len(query)))
     for start in range(0, len(database), step):
-        scores = queries @ torch.from_numpy(database[start : start + step]).to(compute_device).T
+        scores = queries @ torch.from_numpy(database[start : start + step]).to(device).T
         values, chosen = scores.topk(min(width, scores.shape[1]), dim=1)
         yield values.cpu().numpy(), chosen.cpu().numpy() + start

@@ -9,7 +9,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from toolkit.errors import ArtefactError, ToolkitError
+from toolkit.errors import ArtefactError, ManifestError
+from toolkit.models.weights import MEGALOC, find_weights, resolve_weights
 
 
 class Embedder(Protocol):
@@ -18,6 +19,8 @@ class Embedder(Protocol):
     name: str
     inputs: Literal["images", "features"]
     """What `embed` takes: images (H, W, 3) uint8 RGB, or `toolkit.features.LocalFeatures`."""
+    upright: bool
+    """Whether it was learnt from upright photographs, so that images are better turned upright for it."""
 
     @property
     def dim(self) -> int:
@@ -29,37 +32,53 @@ class Embedder(Protocol):
         """What the vectors depend on besides the images; part of their fingerprint."""
         ...
 
+    def prepare(self, item: Any) -> Any:
+        """Return an input in the form that is quickest to embed; for threads, while others are embedded."""
+        ...
+
     def embed(self, inputs: Sequence[Any]) -> NDArray[np.float32]:
         """Return (B, D) float32; an image without any structure may have a zero vector."""
         ...
 
 
-EMBEDDERS: dict[str, str] = {"vlad": "toolkit.embedders.vlad:Vlad.load"}
+EMBEDDERS: dict[str, str] = {
+    "megaloc": "toolkit.embedders.megaloc:MegaLocEmbedder",
+    "vlad": "toolkit.embedders.vlad:Vlad.load",
+}
 """Name of an embedder -> `module:callable` that makes it, imported when it is asked for."""
+WEIGHTS = {"megaloc": MEGALOC}
+"""The weights of those that need some."""
+PREFERENCE = ("megaloc", "vlad")
+"""What `auto` takes: the first that needs no weights or has them."""
 MANIFEST_COLUMNS = ["row_index", "device_id", "sensor_id", "timestamp", "abs_path"]
 """Columns of the `manifest.csv` that names the image of each row of embeddings."""
-PLANNED = ("megaloc",)
-"""Names that manifests may hold and that a later version brings."""
-PREFERENCE = ("megaloc", "vlad")
-"""What `auto` takes: the first that is there."""
 
 
-def resolve_name(name: str) -> str:
-    """Return the embedder that `name` stands for: itself, or for `auto` the best that is there.
+def resolve_name(name: str, checkpoint: str | Path | None = None) -> str:
+    """Return the embedder that `name` stands for: itself, or for `auto` the best whose weights are there.
 
     Raises:
-        ToolkitError: it is not in this version, or not known at all.
+        ManifestError: it is not known.
+        WeightsError: `checkpoint` is given and is not there.
     """
     if name == "auto":
-        return next(candidate for candidate in PREFERENCE if candidate in EMBEDDERS)
-    if name in EMBEDDERS:
-        return name
-    known = ", ".join([*sorted(EMBEDDERS), "auto"])
-    if name in PLANNED:
-        raise ToolkitError(
-            f"Embedder {name!r} is not installed in this version; use model `vlad`. Known: {known}."
+        return next(
+            candidate
+            for candidate in PREFERENCE
+            if candidate not in WEIGHTS or find_weights(WEIGHTS[candidate], checkpoint)
         )
-    raise ToolkitError(f"Unknown embedder {name!r}. Known: {known}.")
+    if name not in EMBEDDERS:
+        raise ManifestError(f"Unknown embedder {name!r}. Known: {', '.join([*sorted(EMBEDDERS), 'auto'])}.")
+    return name
+
+
+def require_weights(name: str, checkpoint: str | Path | None = None) -> Path | None:
+    """Return the file with the weights of an embedder, None for one without; download it if need be.
+
+    Raises:
+        WeightsError: there are none to be had; says what to do.
+    """
+    return resolve_weights(WEIGHTS[name], checkpoint) if name in WEIGHTS else None
 
 
 def create_embedder(name: str, **options: Any) -> Embedder:
@@ -67,9 +86,12 @@ def create_embedder(name: str, **options: Any) -> Embedder:
 
     Args:
         name: a key of `EMBEDDERS`, or `auto`.
-        options: the embedder's own, e.g. `vocabulary=<file>` of `vlad`.
+        options: the embedder's own: `vocabulary=<file>` of `vlad`; `checkpoint`, `device`, `dtype_compute` and
+            `image_size` of `megaloc`.
     """
-    module, _, path = EMBEDDERS[resolve_name(name)].partition(":")
+    checkpoint = options.get("checkpoint")
+    place = checkpoint if isinstance(checkpoint, str | Path) else None
+    module, _, path = EMBEDDERS[resolve_name(name, place)].partition(":")
     make: Any = import_module(module)
     for attribute in path.split("."):
         make = getattr(make, attribute)

@@ -52,6 +52,7 @@ class Vlad:
 
     name = "vlad"
     inputs: Literal["features"] = "features"
+    upright = False
 
     def __init__(self, settings: VladSettings, arrays: dict[str, Floats], fingerprint: str = ""):
         self._settings = settings
@@ -66,6 +67,10 @@ class Vlad:
     @property
     def settings(self) -> dict[str, Any]:
         return {"name": self.name, **asdict(self._settings), "vocabulary": self._fingerprint}
+
+    def prepare(self, item: LocalFeatures) -> LocalFeatures:
+        """Return the features as they are."""
+        return item
 
     @threadpool_limits.wrap(limits=1, user_api="blas")  # small products: two threads take three times as long
     def embed(self, inputs: Sequence[LocalFeatures]) -> Floats:
