@@ -14,7 +14,8 @@ from torch import Tensor
 
 from toolkit.compute import Fitting, resolve_device, resolve_precision
 from toolkit.errors import ManifestError
-from toolkit.models.megaloc import IMAGENET_MEAN, IMAGENET_STD, PATCH, MegaLoc
+from toolkit.models.megaloc import PATCH, MegaLoc
+from toolkit.models.vit import IMAGENET_MEAN, IMAGENET_STD
 from toolkit.models.weights import MEGALOC, resolve_weights
 
 

@@ -17,8 +17,6 @@ from toolkit.models.vit import Block, PatchEmbed
 from toolkit.models.weights import load_checkpoint
 
 PATCH = 14
-IMAGENET_MEAN = (0.485, 0.456, 0.406)
-IMAGENET_STD = (0.229, 0.224, 0.225)
 _SINKHORN_STEPS = 3
 
 
@@ -177,7 +175,7 @@ class MegaLoc(nn.Module):
         """Return descriptors (B, 8448) float32, of length 1.
 
         Args:
-            images: (B, 3, H, W), RGB in [0, 1] minus `IMAGENET_MEAN`, over `IMAGENET_STD`. Sides that are no
+            images: (B, 3, H, W), RGB in [0, 1] minus `vit.IMAGENET_MEAN`, over `vit.IMAGENET_STD`. Sides that are no
                 multiple of 14 are resized to the nearest.
 
         Raises:

@@ -1,36 +1,76 @@
 """The parts of a vision transformer (Dosovitskiy et al., ICLR 2021) in the form and with the key names of DINOv2.
 
-Modules may stand in another type than their input's numbers: `LayerNorm` weights and the layer scales fit any.
+Modules may stand in another type than their input's numbers: `LayerNorm` weights and the layer scales fit any, and a
+block computes in the type of its matrices (`set_matrix_type`) what it adds to its input in the input's type.
 """
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+Rope = tuple[Tensor, Tensor]
+"""Cosines and signed sines of a rotary position embedding, each (N, 1, C / heads): see `rotate_`."""
+
+
+def rotate_(x: Tensor, rope: Rope) -> Tensor:
+    """Turn each pair of channels of queries or keys (B, N, heads, D) by an angle of its own, in place.
+
+    Rotary position embedding (Su et al., RoFormer, 2021) in two dimensions: of the four quarters of D, the first
+    two hold pairs (first, second) for y, the last two for x. The sines come with the sign of the pair's other half.
+    """
+    cosine, sine = rope
+    first_y, second_y, first_x, second_x = x.chunk(4, dim=-1)
+    swapped = torch.cat([second_y, first_y, second_x, first_x], dim=-1)
+    return x.mul_(cosine).addcmul_(swapped, sine)
+
 
 class Attention(nn.Module):
     """Self-attention of all tokens of a sequence, (B, N, C) -> (B, N, C)."""
 
-    def __init__(self, dim: int, num_heads: int) -> None:
+    def __init__(self, dim: int, num_heads: int, qk_norm_eps: float | None = None) -> None:
+        """
+        Args:
+            dim, num_heads: C, and into how many parts it is cut.
+            qk_norm_eps: where given, queries and keys of each head go through a LayerNorm with this epsilon.
+        """
         super().__init__()
         self.num_heads = num_heads
         self.qkv = nn.Linear(dim, 3 * dim)
+        self.has_qk_norm = qk_norm_eps is not None
+        if qk_norm_eps is not None:
+            self.q_norm = nn.LayerNorm(dim // num_heads, eps=qk_norm_eps)
+            self.k_norm = nn.LayerNorm(dim // num_heads, eps=qk_norm_eps)
         self.proj = nn.Linear(dim, dim)
 
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, x: Tensor, rope: Rope | None = None, every: int = 1) -> Tensor:
+        """Return what tokens 0, every, 2 * every, ... gather from all tokens, (B, ceil(N / every), C)."""
         B, N, C = x.shape
-        q, k, v = self.qkv(x).view(B, N, 3, self.num_heads, C // self.num_heads).permute(2, 0, 3, 1, 4)
+        heads = (self.num_heads, C // self.num_heads)
+        if every == 1:
+            q, k, v = self.qkv(x).view(B, N, 3, *heads).unbind(2)
+        else:
+            weight, bias = self.qkv.weight, self.qkv.bias
+            q = F.linear(x[:, ::every], weight[:C], bias[:C]).unflatten(-1, heads)
+            k, v = F.linear(x, weight[C:], bias[C:]).view(B, N, 2, *heads).unbind(2)
+        if self.has_qk_norm:
+            q, k = self.q_norm(q.float()), self.k_norm(k.float())
+        if rope is not None:
+            q, k = rotate_(q, (rope[0][::every], rope[1][::every])), rotate_(k, rope)
+        q, k, v = (part.to(v.dtype).transpose(1, 2) for part in (q, k, v))
         x = F.scaled_dot_product_attention(q, k, v)
-        return self.proj(x.transpose(1, 2).reshape(B, N, C))
+        return self.proj(x.transpose(1, 2).reshape(B, -1, C))
 
 
 class Mlp(nn.Module):
     """Two linear layers with an exact (not tanh) GELU between them."""
 
-    def __init__(self, dim: int, hidden: int) -> None:
+    def __init__(self, dim: int, hidden: int, out: int | None = None) -> None:
         super().__init__()
         self.fc1 = nn.Linear(dim, hidden)
-        self.fc2 = nn.Linear(hidden, dim)
+        self.fc2 = nn.Linear(hidden, dim if out is None else out)
 
     def forward(self, x: Tensor) -> Tensor:
         return self.fc2(torch.ops.aten.gelu_(self.fc1(x)))  # in place: the hidden layer is the largest array
@@ -51,18 +91,26 @@ class LayerScale(nn.Module):
 class Block(nn.Module):
     """A transformer block: attention and MLP, each on the normalised stream and added to it, scaled."""
 
-    def __init__(self, dim: int, num_heads: int, eps: float = 1e-6) -> None:
+    def __init__(self, dim: int, num_heads: int, eps: float = 1e-6, qk_norm_eps: float | None = None) -> None:
         super().__init__()
         self.norm1 = nn.LayerNorm(dim, eps=eps)
-        self.attn = Attention(dim, num_heads)
+        self.attn = Attention(dim, num_heads, qk_norm_eps)
         self.ls1 = LayerScale(dim)
         self.norm2 = nn.LayerNorm(dim, eps=eps)
         self.mlp = Mlp(dim, 4 * dim)
         self.ls2 = LayerScale(dim)
 
-    def forward(self, x: Tensor) -> Tensor:
-        x = self.ls1(x, self.attn(self.norm1(x)))
-        return self.ls2(x, self.mlp(self.norm2(x)))
+    def forward(self, x: Tensor, rope: Rope | None = None, every: int = 1) -> Tensor:
+        """Return the tokens (B, N, C) one block further.
+
+        Args:
+            x: (B, N, C).
+            rope: position of each token, for queries and keys.
+            every: return only tokens 0, every, 2 * every, ...; what is read of the others alone is computed.
+        """
+        matrix_type = self.attn.qkv.weight.dtype
+        x = self.ls1(x[:, ::every], self.attn(self.norm1(x).to(matrix_type), rope, every))
+        return self.ls2(x, self.mlp(self.norm2(x).to(matrix_type)))
 
 
 class PatchEmbed(nn.Module):
@@ -74,3 +122,13 @@ class PatchEmbed(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         return self.proj(images).flatten(2).transpose(1, 2)
+
+
+def set_matrix_type(module: nn.Module, dtype: torch.dtype) -> None:
+    """Convert the linear layers of a module, and these alone, to a type that its blocks then compute in.
+
+    Norms, layer scales, learnt tokens and the stream of tokens keep theirs: float32 sums of bfloat16 products.
+    """
+    for part in module.modules():
+        if isinstance(part, nn.Linear):
+            part.to(dtype)

@@ -144,7 +144,12 @@ def read_state_dict(path: str | Path) -> "dict[str, Tensor]":
     return _tensors(_read_safetensors(path, where) if kind == "safetensors" else _read_pickle(path, where), where)
 
 
-def load_checkpoint(module: "nn.Module", checkpoint: "str | Path | Mapping[str, Tensor]", name: str = "") -> None:
+def load_checkpoint(
+    module: "nn.Module",
+    checkpoint: "str | Path | Mapping[str, Tensor]",
+    name: str = "",
+    ignore: tuple[str, ...] = (),
+) -> None:
     """Put a checkpoint's tensors into a module, ready for inference: no gradients, in eval mode.
 
     Tensors become the module's own without a copy where type and layout allow, so that one built under
@@ -155,6 +160,7 @@ def load_checkpoint(module: "nn.Module", checkpoint: "str | Path | Mapping[str, 
         module: has the checkpoint's parameters and buffers, each with its shape and type.
         checkpoint: a file (see `read_state_dict`), or tensors by name.
         name: of the network, for messages.
+        ignore: how keys begin that the checkpoint may have and the module does without.
 
     Raises:
         WeightsError: not a checkpoint, or one of another network; names the missing, unexpected, mis-shaped and
@@ -164,6 +170,7 @@ def load_checkpoint(module: "nn.Module", checkpoint: "str | Path | Mapping[str, 
         where, state = "the given dict", _tensors(checkpoint, "the given dict")
     else:
         where, state = str(checkpoint), read_state_dict(checkpoint)
+    state = {key: value for key, value in state.items() if not key.startswith(ignore)}
     expected: dict[str, Tensor] = module.state_dict()
     common = [key for key in expected if key in state]
     missing = [key for key in expected if key not in state]

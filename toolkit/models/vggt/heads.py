@@ -1,0 +1,192 @@
+"""VGGT's heads: cameras, and what each pixel has (depth or a point, each with a confidence)."""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from toolkit.models.vggt.aggregator import PATCH, SPECIAL, LayerTokens
+from toolkit.models.vit import Block, Mlp
+
+_EPS = 1e-5
+_CAMERA_STEPS = 4
+_POSE = 9
+
+
+class CameraHead(nn.Module):
+    """Cameras from the camera tokens, in steps: each adds a correction to the pose encoding before."""
+
+    def __init__(self, dim: int, depth: int, num_heads: int) -> None:
+        super().__init__()
+        self.token_norm = nn.LayerNorm(dim, eps=_EPS)
+        self.empty_pose_tokens = nn.Parameter(torch.empty(1, 1, _POSE))
+        self.embed_pose = nn.Linear(_POSE, dim)
+        self.poseLN_modulation = nn.Sequential(nn.SiLU(), nn.Linear(dim, 3 * dim))
+        self.trunk = nn.ModuleList([Block(dim, num_heads, _EPS) for _ in range(depth)])
+        self.trunk_norm = nn.LayerNorm(dim, eps=_EPS)
+        self.pose_branch = Mlp(dim, dim // 2, _POSE)
+
+    def forward(self, tokens: LayerTokens) -> list[Tensor]:
+        """Return the pose encoding (B, S, 9) after each step, for the tokens of the last layer.
+
+        The tokens enter each step anew, shifted, scaled and gated by the encoding so far (Peebles and Xie, ICCV
+        2023). What is returned has no field of view below 0; the next step gets the raw one.
+        """
+        within, among = tokens
+        camera = self.token_norm(torch.cat([within[:, :, 0], among[:, :, 0]], dim=-1).float())
+        normed = F.layer_norm(camera, camera.shape[-1:], eps=1e-6)
+        encoding: Tensor | None = None
+        returned = []
+        for _ in range(_CAMERA_STEPS):
+            before = self.empty_pose_tokens if encoding is None else encoding
+            shift, scale, gate = self.poseLN_modulation(self.embed_pose(before)).chunk(3, dim=-1)
+            x = camera + gate * (normed * (1 + scale) + shift)
+            for block in self.trunk:
+                x = block(x)
+            correction = self.pose_branch(self.trunk_norm(x))
+            encoding = correction if encoding is None else encoding + correction
+            returned.append(torch.cat([encoding[..., :7], F.relu(encoding[..., 7:])], dim=-1))
+        return returned
+
+
+class ResidualUnit(nn.Module):
+    """Two 3 x 3 convolutions added to the *rectified* input: in the official code its ReLU overwrites the input."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(channels, channels, 3, padding=1)
+        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = F.relu(x)
+        return self.conv2(F.relu(self.conv1(x))).add_(x)
+
+
+class Fusion(nn.Module):
+    """Add a finer map to a coarser one, and enlarge the sum."""
+
+    def __init__(self, channels: int, has_residual: bool) -> None:
+        super().__init__()
+        self.out_conv = nn.Conv2d(channels, channels, 1)
+        if has_residual:
+            self.resConfUnit1 = ResidualUnit(channels)
+        self.resConfUnit2 = ResidualUnit(channels)
+
+    def forward(self, coarse: Tensor, fine: Tensor | None, size: Sequence[int]) -> Tensor:
+        """Return (N, C, *size) of maps (N, C, h, w)."""
+        if fine is not None:
+            coarse = self.resConfUnit1(fine).add_(coarse)
+        # A 1 x 1 convolution and an interpolation may be exchanged: the small map is the cheaper one to convolve.
+        return _resize(self.out_conv(self.resConfUnit2(coarse)), size)
+
+
+class Scratch(nn.Module):
+    """What fuses the maps of the four layers (its name in the checkpoint)."""
+
+    def __init__(self, channels: Sequence[int], features: int, out: int) -> None:
+        super().__init__()
+        self.layer1_rn = nn.Conv2d(channels[0], features, 3, padding=1, bias=False)
+        self.layer2_rn = nn.Conv2d(channels[1], features, 3, padding=1, bias=False)
+        self.layer3_rn = nn.Conv2d(channels[2], features, 3, padding=1, bias=False)
+        self.layer4_rn = nn.Conv2d(channels[3], features, 3, padding=1, bias=False)
+        self.refinenet1 = Fusion(features, has_residual=True)
+        self.refinenet2 = Fusion(features, has_residual=True)
+        self.refinenet3 = Fusion(features, has_residual=True)
+        self.refinenet4 = Fusion(features, has_residual=False)
+        self.output_conv1 = nn.Conv2d(features, features // 2, 3, padding=1)
+        self.output_conv2 = nn.Sequential(
+            nn.Conv2d(features // 2, 32, 3, padding=1), nn.ReLU(inplace=True), nn.Conv2d(32, out, 1)
+        )
+
+    def forward(self, maps: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
+        """Return (N, out, H, W), size = (H, W), of maps from fine to coarse, (N, channels[level], h, w)."""
+        fine1, fine2, fine3 = self.layer1_rn(maps[0]), self.layer2_rn(maps[1]), self.layer3_rn(maps[2])
+        x = self.refinenet4(self.layer4_rn(maps[3]), None, fine3.shape[2:])
+        x = self.refinenet3(x, fine3, fine2.shape[2:])
+        x = self.refinenet2(x, fine2, fine1.shape[2:])
+        x = self.refinenet1(x, fine1, [2 * side for side in fine1.shape[2:]])
+        x = _resize(self.output_conv1(x), size)
+        return self.output_conv2(add_position(x, size[1] / size[0]))
+
+
+class DenseHead(nn.Module):
+    """Dense Prediction Transformer (Ranftl et al., ICCV 2021): maps of four layers, fused from coarse to fine."""
+
+    def __init__(self, dim: int, out: int, channels: Sequence[int], features: int) -> None:
+        """
+        Args:
+            dim: of the tokens of both blocks of a layer together.
+            out: channels of the result, the confidence among them.
+            channels: of the maps of the four layers.
+            features: channels of the fused maps.
+        """
+        super().__init__()
+        self.out = out
+        self.norm = nn.LayerNorm(dim, eps=_EPS)
+        self.projects = nn.ModuleList([nn.Conv2d(dim, channel, 1) for channel in channels])
+        self.resize_layers = nn.ModuleList(
+            [
+                nn.ConvTranspose2d(channels[0], channels[0], 4, stride=4),
+                nn.ConvTranspose2d(channels[1], channels[1], 2, stride=2),
+                nn.Identity(),
+                nn.Conv2d(channels[3], channels[3], 3, stride=2, padding=1),
+            ]
+        )
+        self.scratch = Scratch(channels, features, out)
+
+    def forward(self, layers: Sequence[LayerTokens], size: tuple[int, int]) -> Tensor:
+        """Return (N, out, H, W) before activation, size = (H, W), for tokens (N, T, C) of the four layers."""
+        grid = (size[0] // PATCH, size[1] // PATCH)
+        maps = []
+        for (within, among), project, resize in zip(layers, self.projects, self.resize_layers, strict=True):
+            tokens = self.norm(torch.cat([within[:, SPECIAL:], among[:, SPECIAL:]], dim=-1).float())
+            x = project(tokens.transpose(1, 2).unflatten(2, grid))
+            maps.append(resize(add_position(x, size[1] / size[0])))
+        output: Tensor = self.scratch(maps, size)
+        return output
+
+
+def dense_output(
+    head: DenseHead, layers: Mapping[int, LayerTokens], read: Sequence[int], size: tuple[int, int], frames: int
+) -> tuple[Tensor, Tensor]:
+    """Return the values (B, S, H, W, out - 1) before activation, and the confidence (B, S, H, W), above 1.
+
+    Args:
+        head: which head.
+        layers: tokens (B, S, T, C) by layer.
+        read: the four layers that the head reads.
+        size: (H, W) of the images.
+        frames: how many to compute at a time: the maps of one take many times the memory of its tokens.
+    """
+    B, S = layers[read[0]][0].shape[:2]
+    flat = [(layers[layer][0].flatten(0, 1), layers[layer][1].flatten(0, 1)) for layer in read]
+    result = torch.empty(B * S, *size, head.out, device=flat[0][0].device)
+    for start in range(0, B * S, frames):
+        part = slice(start, start + frames)
+        result[part] = head([(within[part], among[part]) for within, among in flat], size).permute(0, 2, 3, 1)
+    result = result.unflatten(0, (B, S))
+    return result[..., :-1], 1 + result[..., -1].exp()
+
+
+def add_position(x: Tensor, aspect: float, factor: float = 0.1) -> Tensor:
+    """Add sines and cosines of each pixel's place to maps (N, C, h, w), in place: of x in C / 2 channels, then of y.
+
+    Places are those on the image plane of a half diagonal of 1, for width / height = `aspect`.
+    """
+    _, C, height, width = x.shape
+    diagonal = (1 + aspect**2) ** 0.5
+    frequencies = 1.0 / 100.0 ** (torch.arange(C // 4, dtype=torch.float64, device=x.device) / (C / 4))
+    for channels, span, count, axis in (
+        (slice(0, C // 2), aspect / diagonal, width, 1),
+        (slice(C // 2, C), 1 / diagonal, height, 2),
+    ):
+        last = span * (count - 1) / count
+        angles = frequencies[:, None] * torch.linspace(-last, last, count, device=x.device)
+        waves = torch.cat([angles.sin(), angles.cos()]).float() * factor
+        x[:, channels].add_(waves.unsqueeze(axis))
+    return x
+
+
+def _resize(x: Tensor, size: Sequence[int]) -> Tensor:
+    return F.interpolate(x, list(size), mode="bilinear", align_corners=True)
