@@ -5,7 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-SCRIPTS = {name: Path(__file__).with_name(f"{name}.py") for name in ("capture", "embed", "localize")}
+SCRIPTS = {name: Path(__file__).with_name(f"{name}.py") for name in ("capture", "embed", "localize", "alignment")}
 
 
 def main() -> int:
