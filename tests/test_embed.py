@@ -14,7 +14,7 @@ from toolkit.capture import Session, Trajectory, write_session
 from toolkit.embed import embed_sessions
 from toolkit.embedders import load_embeddings
 from toolkit.embedders.megaloc import MegaLocEmbedder
-from toolkit.errors import ManifestError, ToolkitError, WeightsError
+from toolkit.errors import ArtefactError, ManifestError, ToolkitError, WeightsError
 from toolkit.geometry import invert, qt_from_pose
 from toolkit.images import read_image
 from toolkit.models.megaloc import MegaLoc
@@ -297,6 +297,16 @@ def test_a_subsession_that_is_gone_leaves_no_embeddings(tiny: Path, tmp_path: Pa
     (former / "ios_a.npy").rename(former / "gone.npy")
     embed_sessions(tiny / "sessions", out, device="ios")
     assert len(load_embeddings(out / "ios_map")[0]) == 6
+
+
+def test_a_session_that_lost_its_images_leaves_no_embeddings(tiny: Path, tmp_path: Path) -> None:
+    out = tmp_path / "e"
+    embed_sessions(tiny / "sessions", out, device="ios")
+    images = tiny / "sessions" / "ios_query" / "images.txt"
+    images.write_text(images.read_text().splitlines(keepends=True)[0])
+    assert set(embed_sessions(tiny / "sessions", out, device="ios")["session"]) == {"ios_map"}
+    with pytest.raises(ArtefactError, match="No embeddings"):
+        load_embeddings(out / "ios_query")
 
 
 def test_corrected_intrinsics_are_followed(tiny: Path, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from toolkit.errors import ArtefactError
 from toolkit.matrix import MatrixWriter
 
 RECORD = {"model": "x"}
@@ -88,3 +89,16 @@ def test_rows_of_another_length(tmp_path: Path) -> None:
     writer = MatrixWriter(tmp_path / "m.npy", 4, "float32", RECORD)
     with writer, pytest.raises(ValueError, match=r"\(2, 3\); expected \(B, 4\)"):
         writer.append(rows(0, 2))
+
+
+def test_two_writers_do_not_mix(tmp_path: Path) -> None:
+    path = tmp_path / "m.npy"
+    with MatrixWriter(path, 3, "float32", RECORD) as first:
+        first.append(rows(0, 2))
+        for record in (RECORD, {"model": "y"}):
+            with pytest.raises(ArtefactError, match=r"m\.npy is being written by another process"):
+                MatrixWriter(path, 3, "float32", record)
+        first.append(rows(2, 4))
+        first.finish()
+    np.testing.assert_array_equal(np.load(path), rows(0, 4))
+    assert write(path, [(0, 1)]).count == 1, "the lock is gone"

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from PIL import Image
 
 from toolkit.embedders import create_embedder
 from toolkit.embedders.megaloc import MegaLocEmbedder
-from toolkit.errors import ManifestError, WeightsError
+from toolkit.errors import ManifestError, ToolkitError, WeightsError
 from toolkit.models.megaloc import MegaLoc, transport
 
 
@@ -125,6 +126,8 @@ def test_the_trained_grid_is_taken_as_it_is(tiny: MegaLoc) -> None:
 def test_images_that_cannot_be_described(tiny: MegaLoc, shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=r"expected \(B, 3, H, W\)|more than 6"):
         tiny(torch.zeros(shape))
+    with pytest.raises(ValueError, match="uint8"):
+        tiny(torch.zeros(1, 3, 126, 126, dtype=torch.uint8))
 
 
 def test_transport_shares_each_patch_out() -> None:
@@ -185,8 +188,8 @@ def test_the_embedder_takes_any_photographs(tiny: MegaLoc) -> None:
             embedder.embed([wrong])
 
 
-@pytest.mark.parametrize("size", [100, 112, 0, -14, 323])
-def test_image_sizes_that_are_refused(size: int) -> None:
+@pytest.mark.parametrize("size", [100, 112, 0, -14, 323, 322.0])
+def test_image_sizes_that_are_refused(size: Any) -> None:
     with pytest.raises(ManifestError, match="multiple of 14, at least 126"):
         MegaLocEmbedder(tiny_megaloc(), device="cpu", image_size=size)
 
@@ -211,3 +214,18 @@ def test_half_precision_points_the_same_way() -> None:
         rough = embedder.embed(images)
         assert rough.dtype == np.float32
         assert (exact * rough).sum(axis=1).min() > 0.99
+
+
+def test_a_network_that_is_given_stays_as_it_is(tiny: MegaLoc) -> None:
+    exact = MegaLocEmbedder(tiny, device="cpu", dtype_compute="float32", image_size=126)
+    before = exact.embed([noise(126, 126)])
+    rough = MegaLocEmbedder(tiny, device="cpu", dtype_compute="bfloat16", image_size=126)
+    assert rough.settings["weights"] == exact.settings["weights"]
+    np.testing.assert_array_equal(exact.embed([noise(126, 126)]), before)
+    assert tiny.backbone.cls_token.dtype == torch.float32
+
+
+def test_descriptors_that_are_no_numbers_are_not_written(tiny: MegaLoc) -> None:
+    tiny.aggregator.linear.bias[3] = torch.nan
+    with pytest.raises(ToolkitError, match=r"not finite.*NaN.*bfloat16"):
+        MegaLocEmbedder(tiny, device="cpu", image_size=126).embed([noise(126, 126)])

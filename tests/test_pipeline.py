@@ -228,3 +228,26 @@ def test_without_weights_nothing_is_run(place: Path, go: Callable[..., dict[str,
 def test_an_unknown_embedder_is_refused_at_once(go: Callable[..., dict[str, str]]) -> None:
     with pytest.raises(ManifestError, match=r"Unknown embedder 'megalok'.*megaloc"):
         go("embed.model=megalok")
+
+
+@pytest.mark.usefixtures("no_hub")
+def test_missing_weights_are_told_before_a_capture_is_rendered(
+    place: Path, go: Callable[..., dict[str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipeline, "_captures", lambda manifest: pytest.fail("rendered"))
+    with pytest.raises(WeightsError):
+        go("embed.model=megaloc")
+
+
+def test_other_weights_in_the_same_place_are_noticed(place: Path, go: Callable[..., dict[str, str]]) -> None:
+    parameters = 'sessions_root = None\nout_dir = None\nmodel = "vlad"\ncheckpoint = None\nskip_existing = True'
+    write_notebook(place, "embed", parameters, EMBED)
+    (place / "01_embed.ipynb").replace(place / "notebooks" / "02_embed.ipynb")
+    weights = place / "weights" / "model.safetensors"
+    weights.parent.mkdir()
+    weights.write_bytes(b"some")
+    options = ("embed.model=megaloc", f"embed.checkpoint={weights.parent}")
+    assert go(*options)["embed"] == "done"
+    assert go(*options)["embed"] == "reused"
+    weights.write_bytes(b"other")
+    assert go(*options)["embed"] == "done"

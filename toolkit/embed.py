@@ -111,7 +111,7 @@ def embed_sessions(
         )
     turns = _turns(capture, embedder, upright, world_up)
     if subsession == "all":
-        _remove_former(out_dir, jobs)
+        _remove_former(out_dir, _session_names(capture, device), jobs)
     table = []
     for session, part, rows in jobs:
         started = time.perf_counter()
@@ -178,16 +178,21 @@ def _turns(
     return quarter_turns([capture[name] for name in capture if capture[name].split == "map"], world_up)
 
 
+def _session_names(capture: Capture, device: str) -> list[str]:
+    devices = capture.devices if device in ("auto", "all") else [device]
+    names = [f"{key}_{split}" for key in devices for split in ("map", "query")]
+    return [name for name in names if name in capture]
+
+
 def _jobs(capture: Capture, device: str, subsession: str) -> list[tuple[Session, str, NDArray[np.intp]]]:
     """Return the subsessions to embed: session, subsession, image rows."""
     if device not in ("auto", "all", *capture.devices):
         raise ManifestError(
             f"device is {device!r}; {capture.name} has {', '.join(capture.devices)} (or `auto`)."
         )
-    devices = capture.devices if device in ("auto", "all") else [device]
-    names = [f"{key}_{split}" for key in devices for split in ("map", "query")]
+    names = _session_names(capture, device)
     jobs, known = [], []
-    for session in (capture[name] for name in names if name in capture):
+    for session in (capture[name] for name in names):
         rows = session.camera_rows
         parts = session.subsession_of(rows)
         # Images outside every listed subsession are embedded too, under the session's name.
@@ -203,11 +208,13 @@ def _jobs(capture: Capture, device: str, subsession: str) -> list[tuple[Session,
     return jobs
 
 
-def _remove_former(out_dir: Path, jobs: list[tuple[Session, str, NDArray[np.intp]]]) -> None:
-    """Remove the embeddings of subsessions that the capture no longer has: whoever reads a session reads all."""
-    for session in {session.id: session for session, _, _ in jobs}.values():
-        parts = {out_dir / session.id / part for job_session, part, _ in jobs if job_session is session}
-        for manifest in sorted((out_dir / session.id).rglob("manifest.csv")):
+def _remove_former(
+    out_dir: Path, names: list[str], jobs: list[tuple[Session, str, NDArray[np.intp]]]
+) -> None:
+    """Remove the embeddings of subsessions that these sessions no longer have: whoever reads a session reads all."""
+    parts = {out_dir / session.id / part for session, part, _ in jobs}
+    for name in names:
+        for manifest in sorted((out_dir / name).rglob("manifest.csv")):
             if manifest.parent not in parts:
                 log.warning("%s: no such subsession any more, removed", manifest.parent)
                 stem = manifest.parent / f"{manifest.parent.name}.npy"

@@ -1,6 +1,7 @@
 """The manifest: one YAML file that says what to run on which captures, checked before anything runs."""
 
 import difflib
+import math
 import os
 import re
 from collections.abc import Iterable
@@ -8,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from toolkit.errors import ManifestError
 
@@ -19,6 +20,7 @@ Device = Literal["ios", "hl", "spot"]
 Positive = Annotated[int, Field(gt=0)]
 Natural = Annotated[int, Field(ge=0)]
 PositiveNumber = Annotated[float, Field(gt=0)]
+ComputeDevice = Annotated[str, Field(pattern=r"^(auto|cpu|mps|cuda(:\d+)?)$")]
 DevicePair = Annotated[list[Device], Field(min_length=2, max_length=2)]
 Threshold = Annotated[list[PositiveNumber], Field(min_length=2, max_length=2)]
 
@@ -60,9 +62,9 @@ class EmbedSettings(_Section):
     """File with the weights of a learned model; without it the hub's cache, else a download."""
     batch_size: Positive | None = None
     """Images a step."""
-    image_size: Positive | None = None
+    image_size: Annotated[int, Field(ge=126, multiple_of=14)] | None = None
     """Side of the square that a learned model sees, a multiple of 14."""
-    compute_device: str | None = None
+    compute_device: ComputeDevice | None = None
     """auto, cpu, cuda, cuda:<number> or mps."""
     dtype_compute: Literal["auto", "float32", "bfloat16", "float16"] | None = None
     """Precision of a learned model; auto: what is fast on the device."""
@@ -83,7 +85,7 @@ class RetrieveSettings(_Section):
     """FAISS on the GPU."""
     normalize: bool | None = None
     """Compare by cosine."""
-    compute_device: str | None = None
+    compute_device: ComputeDevice | None = None
     """auto, cpu, cuda, cuda:<number> or mps."""
 
 
@@ -139,6 +141,13 @@ class Manifest(_Strict):
     localize: LocalizeSettings = LocalizeSettings()
     evaluate: EvaluateSettings = EvaluateSettings()
     visualize: VisualizeSettings = VisualizeSettings()
+
+    @field_validator("world_up")
+    @classmethod
+    def _a_direction(cls, world_up: list[float] | None) -> list[float] | None:
+        if world_up is not None and not 1e-9 < math.hypot(*world_up) < math.inf:
+            raise ValueError(f"world_up is {world_up}; expected three finite numbers that are not all zero")
+        return world_up
 
     @model_validator(mode="after")
     def _one_source(self) -> "Manifest":

@@ -2,6 +2,7 @@
 
 import json
 import os
+import sys
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -9,7 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
+from toolkit.errors import ArtefactError
 from toolkit.files import fingerprint
+
+if sys.platform != "win32":
+    import fcntl
 
 
 class MatrixWriter:
@@ -27,6 +32,9 @@ class MatrixWriter:
             dtype: of the numbers on disk.
             record: what the matrix is made from; rows that were made from something else are dropped.
             resume: go on with what a killed writer left.
+
+        Raises:
+            ArtefactError: another process is writing the same matrix.
         """
         self.path = Path(path)
         self._dim, self._dtype = dim, np.dtype(dtype)
@@ -38,6 +46,7 @@ class MatrixWriter:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         # The header keeps room for any number of rows, so its length does not depend on it.
         self._rows = open(self._rows_path, "r+b" if self._rows_path.exists() else "w+b")  # noqa: SIM115
+        self._lock()
         self._write_header()
         start = self._rows.tell()
         kept = self._read_lines(start) if resume else []
@@ -66,9 +75,11 @@ class MatrixWriter:
         """Put the matrix in its place."""
         self._rows.seek(0)
         self._write_header()
-        self.close()
-        self._rows_path.replace(self.path)
+        self._rows.flush()
+        # Before the lock goes with the open file: who comes next shall find no rows of this one.
         self._lines_path.unlink(missing_ok=True)
+        self._rows_path.replace(self.path)
+        self.close()
 
     def close(self) -> None:
         """Close the files and keep what was written for the next writer."""
@@ -82,6 +93,17 @@ class MatrixWriter:
         self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.close()
+
+    def _lock(self) -> None:
+        if sys.platform == "win32":
+            return
+        try:
+            fcntl.flock(self._rows, fcntl.LOCK_EX | fcntl.LOCK_NB)  # ends with the process, however it ends
+        except BlockingIOError:
+            self._rows.close()
+            raise ArtefactError(
+                f"{self.path} is being written by another process. Wait for that run to end, or stop it."
+            ) from None
 
     def _write_header(self) -> None:
         description = {"descr": self._dtype.str, "fortran_order": False, "shape": (self.count, self._dim)}

@@ -112,8 +112,11 @@ def run(
     for stage in STAGES:  # a wrong key stops the run before hours of work, not after
         check_parameters(notebook_path(stage), manifest.stage(stage).given(), f"{manifest_path}: {stage}.")
     manifest = _name_embedder(manifest, say)
-    captures = _captures(manifest)
     run_dir = Path(manifest.output_root) / manifest.name
+    embeds = only in (None, "embed")
+    if embeds and not any(run_dir.glob("*/.stages/embed*.json")):
+        _require_weights(manifest)
+    captures = _captures(manifest)
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -362,8 +365,16 @@ def _inputs_of(job: Job, capture: str) -> str:
         for stage in UPSTREAM[job.stage]
         for record in sorted(job.record.parent.glob(f"{stage}*.json"))
     ]
-    weights = files_fingerprint([Path(parameters["checkpoint"])]) if parameters.get("checkpoint") else None
-    return fingerprint([parameters, weights, capture, _code_fingerprint(), source, upstream])
+    return fingerprint([parameters, _weights_of(job), capture, _code_fingerprint(), source, upstream])
+
+
+def _weights_of(job: Job) -> str | None:
+    """Return what identifies the file with the weights that a job uses, None if it uses none or has none yet."""
+    from toolkit.embedders import WEIGHTS, find_weights
+
+    source = WEIGHTS.get(job.parameters.get("model", "")) if job.stage == "embed" else None
+    path = find_weights(source, job.parameters.get("checkpoint")) if source else None
+    return files_fingerprint([path.resolve()]) if path else None
 
 
 @cache

@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -13,7 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from toolkit.compute import Fitting, resolve_device, resolve_precision
-from toolkit.errors import ManifestError
+from toolkit.errors import ManifestError, ToolkitError
 from toolkit.models.megaloc import PATCH, MegaLoc
 from toolkit.models.vit import IMAGENET_MEAN, IMAGENET_STD
 from toolkit.models.weights import MEGALOC, resolve_weights
@@ -45,7 +46,7 @@ class MegaLocEmbedder:
             WeightsError: no weights, or other ones.
             ManifestError, ToolkitError: see `toolkit.compute`.
         """
-        if image_size < 9 * PATCH or image_size % PATCH:
+        if not isinstance(image_size, int) or image_size < 9 * PATCH or image_size % PATCH:
             raise ManifestError(
                 f"image_size is {image_size}; expected a multiple of {PATCH}, at least {9 * PATCH} (322 is usual)."
             )
@@ -54,7 +55,8 @@ class MegaLocEmbedder:
         self._dtype = resolve_precision(dtype_compute, self._device)
         if checkpoint is None or isinstance(checkpoint, str | Path):
             checkpoint = resolve_weights(MEGALOC, checkpoint)
-        model = checkpoint if isinstance(checkpoint, MegaLoc) else MegaLoc.from_checkpoint(checkpoint)
+        # A network that is given stays the caller's, with its type and device.
+        model = deepcopy(checkpoint) if isinstance(checkpoint, MegaLoc) else MegaLoc.from_checkpoint(checkpoint)
         self._weights = _digest(model)
         self.dim = model.dim
         self._model = model.to(self._device, self._dtype).eval()
@@ -87,12 +89,22 @@ class MegaLocEmbedder:
         return np.asarray(Image.fromarray(np.ascontiguousarray(image)).resize(square, Image.Resampling.BILINEAR))
 
     def embed(self, inputs: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
-        """Return unit vectors (B, 8448) of images (H, W, 3), uint8 RGB, of any sizes."""
+        """Return unit vectors (B, 8448) of images (H, W, 3), uint8 RGB, of any sizes.
+
+        Raises:
+            ToolkitError: a vector is not finite.
+        """
         if not len(inputs):
             return np.zeros((0, self.dim), np.float32)
         batch = torch.from_numpy(np.stack([self.prepare(image) for image in inputs]))
         with torch.inference_mode():
-            return self._fitting(batch.to(self._device)).float().cpu().numpy()
+            vectors = self._fitting(batch.to(self._device)).float().cpu().numpy()
+        if not np.isfinite(vectors).all():
+            raise ToolkitError(
+                "MegaLoc gave a descriptor that is not finite. Its weights may hold NaN: compare the file with the "
+                "official one. With dtype_compute: float16, numbers may have been too large: use bfloat16 or float32."
+            )
+        return vectors
 
     def _forward(self, images: Tensor) -> Tensor:
         normalised = (images.permute(0, 3, 1, 2).float() / 255 - self._mean) / self._std

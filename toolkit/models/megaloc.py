@@ -181,8 +181,10 @@ class MegaLoc(nn.Module):
         Raises:
             ValueError: another shape, or too small: the aggregation needs more patches of 14 x 14 than clusters.
         """
-        if images.ndim != 4 or images.shape[1] != 3:
-            raise ValueError(f"images have shape {tuple(images.shape)}; expected (B, 3, H, W).")
+        if images.ndim != 4 or images.shape[1] != 3 or not images.is_floating_point():
+            raise ValueError(
+                f"images are {images.dtype} {tuple(images.shape)}; expected (B, 3, H, W), ImageNet-normalised."
+            )
         height, width = (round(side / PATCH) for side in images.shape[2:])  # half to even, as the official code
         if height * width <= self.clusters:
             raise ValueError(

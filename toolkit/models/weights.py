@@ -74,7 +74,8 @@ def find_weights(source: WeightsSource, checkpoint: str | Path | None = None) ->
             )
         return path
     cached = huggingface_hub.try_to_load_from_cache(source.repo_id, source.filename)
-    return Path(cached) if isinstance(cached, str) else None
+    # An empty file is what a full disk leaves of a download.
+    return Path(cached) if isinstance(cached, str) and Path(cached).stat().st_size else None
 
 
 def resolve_weights(source: WeightsSource, checkpoint: str | Path | None = None) -> Path:
