@@ -3,6 +3,7 @@
 import json
 import logging
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -31,16 +32,23 @@ from toolkit.files import (
     write_text,
 )
 from toolkit.images import default_workers, prefetch, read_image
+from toolkit.localizers.hybrid import HybridLocalizer
 from toolkit.localizers.pnp import PnpLocalizer, PnpSettings, PoseEstimate
+from toolkit.localizers.prediction import Predictor, View, create_predictor
+from toolkit.localizers.vggt import VggtAnswer, VggtLocalizer, VggtQuery, VggtSettings
 from toolkit.mapping import LocalMap, MapSettings, build_map
 
 log = logging.getLogger(__name__)
 
-METHODS = ("pnp", "nearest")
+METHODS = ("pnp", "nearest", "vggt", "hybrid")
+PREDICTING = ("vggt", "hybrid")
+"""Methods that need a predictor."""
 COLUMNS = [
     "timestamp", "device_id", "status", "method", "num_inliers", "num_matches", "inlier_ratio", "num_guided",
     "rmse_px", "rival_support", "position_std_m", "rotation_std_deg", "references", "seconds",
 ]  # fmt: skip
+PREDICTION_COLUMNS = ["scale_std", "rejected", "reason"]
+"""Further columns of the methods that predict."""
 
 
 def localize_pairs(
@@ -56,6 +64,13 @@ def localize_pairs(
     skip_existing: bool = True,
     workers: int = 0,
     seed: int = 0,
+    predictor: str = "vggt",
+    checkpoint: str | Path | None = None,
+    num_references: int = 5,
+    candidates: int | None = None,
+    compute_device: str = "auto",
+    dtype_compute: str = "auto",
+    batch_size: int = 4,
 ) -> pd.DataFrame:
     """Write, for every pair of devices, the poses of the queries (`.txt`) and how they came about (`.csv`).
 
@@ -66,42 +81,60 @@ def localize_pairs(
         features_dir: folder of local features, shared with the embed stage.
         map_dir: folder of the triangulated maps, `<device>_map.npz`.
         map_device, query_device: `ios`, `hl`, `spot`, or `all` that the capture has.
-        method: `pnp`, or the baseline `nearest`: the pose of the best reference, marked so in the table.
+        method: `pnp`; the baseline `nearest`: the pose of the best reference, marked so in the table; `vggt`: the
+            pose of a network that is shown the query and references, aligned to the map; or `hybrid`: the better
+            supported of `pnp` and that, each helped by the other.
         queries: the keyframe list that says which devices are asked for, or `all`.
         skip_existing: reuse what was made from the same inputs and settings, and go on where a run was killed.
         workers: threads; 0 takes the number of cores, at most 8.
         seed: of RANSAC. Equal seeds give equal files, whatever the number of threads.
+        predictor: of `vggt` and `hybrid`: the network `vggt`, or `simulated`, which looks up true poses: for tests
+            and for trying things out; every row then says so.
+        checkpoint: file with the network's weights; None: the hub's cache, else a download.
+        num_references: map images that the network is shown with each query image.
+        candidates: retrieved images to choose them from, the best so many; None: all.
+        compute_device: where the network runs: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
+        dtype_compute: of the network: `auto`, `float32`, `bfloat16`, `float16`.
+        batch_size: query devices that the network is given at once. Rows do not depend on it.
 
     Returns:
         One row a pair: map_device, query_device, queries, ok, low_confidence, failed, seconds, skipped, path.
 
     Raises:
-        ManifestError: unknown method.
+        ManifestError: unknown method or predictor, or a number that is not positive.
+        WeightsError: the network has no weights, before any work is done.
         CaptureError: unknown device or list.
         ArtefactError: the retrieval of a pair is missing.
     """
     if method not in METHODS:
         raise ManifestError(f"Unknown method {method!r}. Known: {', '.join(METHODS)}.")
+    for name, value in (("num_references", num_references), ("candidates", candidates), ("batch_size", batch_size)):
+        if value is not None and value < 1:
+            raise ManifestError(f"{name} is {value}; expected 1 or more.")
     capture = Capture.from_sessions_root(sessions_root)
     settings = PnpSettings(seed=seed)
     workers = workers or default_workers()
+    guide: _Guide | None = None
+    if method in PREDICTING:
+        network = open_predictor(capture, predictor, map_dir, checkpoint, compute_device, dtype_compute, seed)
+        guide = _Guide(network, VggtSettings(num_references, candidates), batch_size)
     table = []
     with threadpool_limits(1, "blas"):  # queries are the parallel dimension, and sums stay in one order
         for mapped in capture.devices_with("map", map_device):
-            localizer: PnpLocalizer | None = None
+            solver: _Solver | None = None
             for asked in capture.devices_with("query", query_device):
                 started = time.perf_counter()
                 pair = _Pair(capture, mapped, asked, Path(retrieval_dir), Path(out_dir), queries)
-                record = pair.record(settings, method)
+                record = pair.record(settings, method) | ({} if guide is None else guide.record())
                 skipped = skip_existing and is_current(pair.txt, record) and pair.csv.exists()
                 if not skipped:
-                    if method == "pnp" and localizer is None:
+                    if solver is None:
                         session = capture[f"{mapped}_map"]
-                        localizer = _open_localizer(
-                            session, Path(features_dir), Path(map_dir), settings, workers, skip_existing
+                        solver = _open_solver(
+                            session, Path(features_dir), Path(map_dir), settings, method, guide, workers, skip_existing
                         )
-                    rows = _localize_pair(pair, localizer, Path(features_dir), record, workers, skip_existing)
-                    _write_poses(pair, rows)
+                    rows = _localize_pair(pair, solver, Path(features_dir), record, workers, skip_existing)
+                    _write_poses(pair, rows, COLUMNS if guide is None else [*COLUMNS, *PREDICTION_COLUMNS])
                     write_sidecar(pair.txt, record)
                 counts = pd.read_csv(pair.csv)["status"].str.split(":").str[0].value_counts()
                 table.append(
@@ -116,6 +149,62 @@ def localize_pairs(
                     }
                 )
     return pd.DataFrame(table)
+
+
+def open_predictor(
+    capture: Capture,
+    name: str,
+    map_dir: str | Path,
+    checkpoint: str | Path | None = None,
+    compute_device: str = "auto",
+    dtype_compute: str = "auto",
+    seed: int = 0,
+) -> Predictor:
+    """Return a predictor for the images of a capture; warn of one that looks up the answers.
+
+    Args and errors: as for `localize_pairs`.
+    """
+    predictor = create_predictor(
+        name,
+        sessions=[capture[session] for session in capture.session_ids] if name == "simulated" else (),
+        map_dir=map_dir,
+        checkpoint=checkpoint,
+        compute_device=compute_device,
+        dtype_compute=dtype_compute,
+        seed=seed,
+    )
+    if predictor.simulated:
+        log.warning("predictor: %s looks up the true poses of the queries. What comes out is no result.", name)
+    return predictor
+
+
+@dataclass(frozen=True)
+class _Guide:
+    """What predicts, and how it is asked."""
+
+    predictor: Predictor
+    settings: VggtSettings
+    batch_size: int
+
+    def record(self) -> dict[str, Any]:
+        """Return what poses depend on, besides what those of `pnp` do."""
+        return {"predictor": {"name": self.predictor.name} | self.predictor.settings, "vggt": asdict(self.settings)}
+
+
+@dataclass(frozen=True)
+class _Solver:
+    """The localizers of one map that a method asks; without any, the method is `nearest`."""
+
+    pnp: PnpLocalizer | None = None
+    vggt: VggtLocalizer | None = None
+    method: str = "nearest"
+    batch_size: int = 1
+
+    @property
+    def label(self) -> str:
+        """What the column `method` begins with."""
+        simulated = self.vggt is not None and self.vggt.predictor.simulated
+        return f"{self.method}:simulated/" if simulated else ""
 
 
 @dataclass(frozen=True)
@@ -191,25 +280,33 @@ def session_fingerprint(session: Session) -> str:
     return fingerprint([file_fingerprint(session.path / name) for name in files if (session.path / name).exists()])
 
 
-def _open_localizer(
+def _open_solver(
     session: Session,
     features_dir: Path,
     map_dir: Path,
     settings: PnpSettings,
+    method: str,
+    guide: _Guide | None,
     workers: int,
     skip_existing: bool,
-) -> PnpLocalizer:
-    """Build or load the triangulated map of a session."""
+) -> _Solver:
+    """Return the localizers of a map session; its triangulated map is built or loaded where they need it."""
+    if method == "nearest":
+        return _Solver()
     store = extract_session(session, features_dir, workers=workers)
     inputs = fingerprint([session_fingerprint(session), store.fingerprint])
     path = map_dir / f"{session.id}.npz"
     local_map = build_map(session, store, path, MapSettings(seed=settings.seed), skip_existing, inputs, workers)
-    return PnpLocalizer(local_map, store, settings)
+    pnp = PnpLocalizer(local_map, store, settings)
+    if guide is None:
+        return _Solver(pnp, method=method)
+    vggt = VggtLocalizer(local_map, session, guide.predictor, guide.settings)
+    return _Solver(pnp if method == "hybrid" else None, vggt, method, guide.batch_size)
 
 
 def _localize_pair(
     pair: _Pair,
-    localizer: PnpLocalizer | None,
+    solver: _Solver,
     features_dir: Path,
     record: dict[str, Any],
     workers: int,
@@ -222,19 +319,40 @@ def _localize_pair(
     members = session.rows_of_keyframes(keyframes)
     references = pair.references()
     store = None
-    if localizer is not None:
+    if solver.pnp is not None:
         rows = np.unique(np.concatenate([*members, np.zeros(0, np.int64)]))
         store = extract_session(session, features_dir, rows=rows, workers=workers)
 
-    def solve(index: int) -> dict[str, Any]:
-        started = time.perf_counter()
-        query = _read_query(session, members[index], references)
+    def solve(task: tuple[int, _QueryDevice, PoseEstimate | None, float]) -> dict[str, Any]:
+        index, query, predicted, seconds = task
+        started = time.perf_counter() - seconds
         estimate, names = PoseEstimate("failed: no images of this device at this time"), list[str]()
-        if query.names and localizer is not None and store is not None:
-            estimate, names = _pnp(query, localizer, store)
+        if query.names and solver.pnp is not None and store is not None:
+            estimate, names = _pnp(query, solver.pnp, store, predicted)
+        elif query.names and predicted is not None and solver.vggt is not None:
+            estimate, names = predicted, _names(solver.vggt.map, predicted.references)
         elif query.names:
             estimate, names = _nearest(query)
-        return _row(keys[index], estimate, names, "nearest" if localizer is None else "pnp", started)
+        found_by = solver.method if estimate.world_from_rig is None else estimate.found_by
+        row = _row(keys[index], estimate, names, f"{solver.label}{found_by}", started)
+        if solver.vggt is not None:
+            row["scale_std"], row["reason"] = round(estimate.scale_std, 6), estimate.reason
+            row["rejected"] = ";".join(_names(solver.vggt.map, estimate.rejected))
+        return row
+
+    def tasks(indices: Sequence[int]) -> Iterator[tuple[int, _QueryDevice, PoseEstimate | None, float]]:
+        """Yield the queries, and what a network says of them, which is asked for some at a time."""
+        for start in range(0, len(indices), solver.batch_size):
+            part = indices[start : start + solver.batch_size]
+            asked = [_read_query(session, members[index], references) for index in part]
+            if solver.vggt is None:
+                yield from ((index, query, None, 0.0) for index, query in zip(part, asked, strict=True))
+                continue
+            started = time.perf_counter()
+            answers = solver.vggt.localize([_vggt_query(session, query, solver.vggt.map) for query in asked])
+            seconds = (time.perf_counter() - started) / len(part)
+            for index, query, answer in zip(part, asked, answers, strict=True):
+                yield index, query, answer.estimate, seconds
 
     progress = pair.out_dir / f".{pair.name}.partial.jsonl"
     done = _read_progress(progress, record) if skip_existing else {}
@@ -243,7 +361,7 @@ def _localize_pair(
     write_text(progress, "".join(json.dumps(line) + "\n" for line in finished))
     with open(progress, "a", encoding="utf-8") as stream:
         label = f"localize {pair.query_device} in {pair.map_device}"
-        for row in tqdm(prefetch(solve, todo, workers), total=len(todo), desc=label, unit="query"):
+        for row in tqdm(prefetch(solve, tasks(todo), workers), total=len(todo), desc=label, unit="query"):
             stream.write(json.dumps(row) + "\n")
             stream.flush()
             done[row["timestamp"], row["device_id"]] = row
@@ -296,7 +414,32 @@ def _reference_name(reference: dict[str, Any]) -> str:
     return str(reference["path"]).split("/sessions/", 1)[-1]
 
 
-def _pnp(query: _QueryDevice, localizer: PnpLocalizer, store: FeatureStore) -> tuple[PoseEstimate, list[str]]:
+def _vggt_query(session: Session, query: _QueryDevice, local_map: LocalMap) -> VggtQuery:
+    """Return the query as a network is asked it."""
+    index_of = local_map.index_of
+    known = [
+        [(index_of[name], float(row["score"])) for row in rows if (name := _reference_name(row)) in index_of]
+        for rows in query.references
+    ]
+    return VggtQuery(
+        views=[
+            View(name, session.path.parent / name, camera, known=False)
+            for name, camera in zip(query.names, query.cameras, strict=True)
+        ],
+        rig_from_cams=query.rig_from_cams,
+        references=[np.array([index for index, _ in rows], np.int64) for rows in known],
+        scores=[np.array([score for _, score in rows], np.float64) for rows in known],
+    )
+
+
+def _names(local_map: LocalMap, images: Sequence[int]) -> list[str]:
+    return [local_map.image_names[index] for index in images]
+
+
+def _pnp(
+    query: _QueryDevice, localizer: PnpLocalizer, store: FeatureStore, predicted: PoseEstimate | None = None
+) -> tuple[PoseEstimate, list[str]]:
+    """Localize by matching; with what a network says of the query, by both."""
     usable = [index for index, name in enumerate(query.names) if name in store]
     if not usable:
         reasons = "; ".join(store.failed.get(name, "no features") for name in query.names)
@@ -306,17 +449,18 @@ def _pnp(query: _QueryDevice, localizer: PnpLocalizer, store: FeatureStore) -> t
         [index_of[name] for name in map(_reference_name, query.references[index]) if name in index_of]
         for index in usable
     ]
+    cameras, rig_from_cams = [query.cameras[index] for index in usable], query.rig_from_cams[usable]
+    features = [store[query.names[index]] for index in usable]
     try:
-        estimate = localizer.localize(
-            [query.cameras[index] for index in usable],
-            query.rig_from_cams[usable],
-            [store[query.names[index]] for index in usable],
-            references,
-        )
+        if predicted is None:
+            estimate = localizer.localize(cameras, rig_from_cams, features, references)
+        else:
+            hybrid = HybridLocalizer(localizer)
+            estimate = hybrid.localize(cameras, rig_from_cams, features, references, predicted)
     except Exception as error:  # one bad query never ends a run
         log.exception("localizing %s", query.names[0])
         return PoseEstimate(f"failed: {type(error).__name__}: {error}"), []
-    return estimate, [localizer.map.image_names[index] for index in estimate.references]
+    return estimate, _names(localizer.map, estimate.references)
 
 
 def _nearest(query: _QueryDevice) -> tuple[PoseEstimate, list[str]]:
@@ -327,7 +471,7 @@ def _nearest(query: _QueryDevice) -> tuple[PoseEstimate, list[str]]:
     index = max(best)[1]
     reference = query.references[index][0]
     world_from_rig = np.array(reference["Tws"], np.float64) @ geometry.invert(query.rig_from_cams[index])
-    return PoseEstimate("low_confidence", world_from_rig), [_reference_name(reference)]
+    return PoseEstimate("low_confidence", world_from_rig, found_by="nearest"), [_reference_name(reference)]
 
 
 def _row(
@@ -355,10 +499,10 @@ def _row(
     }
 
 
-def _write_poses(pair: _Pair, rows: list[dict[str, Any]]) -> None:
+def _write_poses(pair: _Pair, rows: list[dict[str, Any]], columns: list[str]) -> None:
     """Write both files of a pair, the poses last: they stand for a finished pair."""
     with write_atomic(pair.csv) as temporary:
-        pd.DataFrame(rows, columns=[*COLUMNS]).to_csv(temporary, index=False)
+        pd.DataFrame(rows, columns=columns).to_csv(temporary, index=False)
     posed = [row for row in rows if row["qt"] is not None]
     covariances = [row["covariance"] for row in posed]
     trajectory = Trajectory(
@@ -369,6 +513,45 @@ def _write_poses(pair: _Pair, rows: list[dict[str, Any]]) -> None:
     )
     trajectory.write(pair.txt)
     (pair.out_dir / f".{pair.name}.partial.jsonl").unlink(missing_ok=True)
+
+
+def explain_query(
+    sessions_root: str | Path,
+    retrieval_dir: str | Path,
+    map_dir: str | Path,
+    map_device: str,
+    query_device: str,
+    queries: str = "keyframes_pruned_subsampled",
+    index: int = 0,
+    predictor: str = "vggt",
+    checkpoint: str | Path | None = None,
+    num_references: int = 5,
+    candidates: int | None = None,
+    compute_device: str = "auto",
+    dtype_compute: str = "auto",
+    seed: int = 0,
+) -> tuple[VggtLocalizer, VggtQuery, VggtAnswer]:
+    """Ask the predictor about one query of a finished run again, and return all that it said.
+
+    Args:
+        index: of the query in the keyframe list. The other arguments are those of `localize_pairs`.
+
+    Returns:
+        What `toolkit.visualize_prediction.draw_prediction` takes.
+
+    Raises:
+        ArtefactError: the retrieval or the triangulated map is missing.
+    """
+    capture = Capture.from_sessions_root(sessions_root)
+    pair = _Pair(capture, map_device, query_device, Path(retrieval_dir), Path(retrieval_dir), queries)
+    local_map = LocalMap.load(Path(map_dir) / f"{map_device}_map.npz")
+    network = open_predictor(capture, predictor, map_dir, checkpoint, compute_device, dtype_compute, seed)
+    localizer = VggtLocalizer(
+        local_map, capture[f"{map_device}_map"], network, VggtSettings(num_references, candidates)
+    )
+    rows = pair.session.rows_of_keyframes(pair.session.keyframes(queries).iloc[[index]])[0]
+    query = _vggt_query(pair.session, _read_query(pair.session, rows, pair.references()), local_map)
+    return localizer, query, localizer.localize([query])[0]
 
 
 @dataclass(frozen=True)

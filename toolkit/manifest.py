@@ -90,8 +90,22 @@ class RetrieveSettings(_Section):
 
 
 class LocalizeSettings(_Section):
-    method: Literal["pnp", "nearest"] | None = None
-    """`pnp`, or `nearest`: the pose of the best reference, to compare against."""
+    method: Literal["pnp", "nearest", "vggt", "hybrid"] | None = None
+    """`pnp`; `nearest`: the pose of the best reference, to compare against; `vggt`: a network's; `hybrid`: both."""
+    predictor: Literal["vggt", "simulated"] | None = None
+    """What `vggt` and `hybrid` ask; `simulated` looks up true poses, for trying things out."""
+    checkpoint: str | None = None
+    """File with the network's weights; without it the hub's cache, else a download."""
+    num_references: Positive | None = None
+    """Map images that the network is shown with each query image ..."""
+    candidates: Positive | None = None
+    """... chosen from so many of the best retrieved; without it, from all."""
+    compute_device: str | None = None
+    """auto, cpu, cuda, cuda:<number> or mps."""
+    dtype_compute: Literal["auto", "float32", "bfloat16", "float16"] | None = None
+    """Precision of the network; auto: what is fast on the device."""
+    batch_size: Positive | None = None
+    """Query devices that the network is given at once."""
 
 
 class EvaluateSettings(_Section):
@@ -190,9 +204,11 @@ def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
         "captures": [str(_expand(text, folder, f"{source}: captures")) for text in manifest.captures],
         "output_root": str(_expand(manifest.output_root, folder, f"{source}: output_root")),
     }
-    if manifest.embed.checkpoint is not None:
-        weights = _expand(manifest.embed.checkpoint, folder, f"{source}: embed.checkpoint")
-        update["embed"] = manifest.embed.model_copy(update={"checkpoint": str(weights)})
+    for stage in ("embed", "localize"):
+        section = getattr(manifest, stage)
+        if section.checkpoint is not None:
+            weights = _expand(section.checkpoint, folder, f"{source}: {stage}.checkpoint")
+            update[stage] = section.model_copy(update={"checkpoint": str(weights)})
     names = [Path(capture).name for capture in update["captures"]]
     if twice := {name for name in names if names.count(name) > 1}:
         raise ManifestError(

@@ -229,6 +229,11 @@ class LocalMap:
         seen = np.concatenate([order[starts[p] : starts[p + 1]] for p in points] or [np.zeros(0, np.int64)])
         return np.bincount(self.obs_image[seen], minlength=len(self.image_names))
 
+    def shared_points(self, images: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return how many points each two of n images both see, (n, n)."""
+        seen = [np.unique(self.observations(int(image))[1]) for image in images]
+        return np.array([[len(np.intersect1d(a, b, assume_unique=True)) for b in seen] for a in seen], np.int64)
+
     def save(self, path: str | Path) -> None:
         """Write the map as one `.npz` file."""
         cameras = [

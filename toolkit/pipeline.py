@@ -300,6 +300,10 @@ def _require_weights(manifest: Manifest) -> None:
 
     if manifest.embed.model is not None:
         require_weights(manifest.embed.model, manifest.embed.checkpoint)
+    if manifest.localize.method in ("vggt", "hybrid") and manifest.localize.predictor in (None, "vggt"):
+        from toolkit.localizers import network
+
+        network.require_weights(manifest.localize.checkpoint)
 
 
 def _captures(manifest: Manifest) -> list[Path]:

@@ -226,7 +226,7 @@ def _matches(
 ) -> PoseEstimate:
     """Match a query with its first references again: files of poses do not keep which points agreed."""
     names = [session.image_name(int(row)) for row in images]
-    if method != "pnp" or shown.localizer is None or store is None or any(n not in store for n in names):
+    if "pnp" not in method or shown.localizer is None or store is None or any(n not in store for n in names):
         return PoseEstimate("failed: not matched")
     index_of = shown.localizer.map.index_of
     known = [index_of[name] for name in references if name in index_of]

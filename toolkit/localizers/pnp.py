@@ -28,6 +28,8 @@ Ints = NDArray[np.int64]
 # disturb each other's sequence, and equal seeds give unequal poses.
 _RIG_RANSAC = Lock()
 
+CONFIRMED = (5.0, 0.5)  # degrees, metres: further apart, two answers contradict each other
+
 
 @dataclass(frozen=True)
 class PnpSettings:
@@ -97,6 +99,14 @@ class PoseEstimate:
     """(num_guided, 2)."""
     point_index: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     """(num_guided,) map point."""
+    found_by: str = "pnp"
+    """What the pose rests on: `pnp`, `pnp+vggt` (found from a prior), `vggt` (a prediction), `nearest`."""
+    scale_std: float = float("nan")
+    """Relative standard deviation of a prediction's scale; inf if unknown, NaN without a prediction."""
+    rejected: tuple[int, ...] = ()
+    """References whose predicted places contradict the others'."""
+    reason: str = ""
+    """Of a prediction: what was left out or is unknown."""
 
     @property
     def position_std_m(self) -> float:
@@ -152,6 +162,18 @@ class _Hypothesis:
         return geometry.invert(self.rig_from_world)
 
 
+@dataclass(frozen=True)
+class Prior:
+    """A pose to look for, from elsewhere than matches."""
+
+    world_from_rig: Floats
+    """(4, 4)"""
+    images: Ints
+    """Map images that see what the query sees."""
+    radius_deg: float
+    """How far from where the pose puts a map point its feature may be."""
+
+
 class PnpLocalizer:
     """Localizes queries in one map. Safe to use from several threads; the map is never changed."""
 
@@ -168,6 +190,7 @@ class PnpLocalizer:
         rig_from_cams: Floats,
         features: Sequence[LocalFeatures],
         references: Sequence[Sequence[int]],
+        priors: Sequence[Prior] = (),
     ) -> PoseEstimate:
         """Return one pose for the cameras of a rig, or for a single camera.
 
@@ -176,19 +199,65 @@ class PnpLocalizer:
             rig_from_cams: (C, 4, 4); the identity for a single camera.
             features: their local features.
             references: for each camera, indices of map images to match it with, best first.
+            priors: poses that are hypotheses too. One wins if clearly more guided matches support it; one that
+                confirms an `ok` pose changes nothing.
         """
         if not any(len(refs) for refs in references):
             return PoseEstimate("failed: no references")
         query = _Query(list(cameras), np.asarray(rig_from_cams, np.float64), list(features))
         camera, keypoint, point = self._match(query, references)
-        distinct = len(np.unique(point))
-        if distinct < 4:
-            return PoseEstimate("failed: too few matches", num_matches=len(point))
         matches = _Matches(camera, query.pixels(camera, keypoint), point)
-        hypotheses = self._hypotheses(query, matches)
-        if not hypotheses:
-            return PoseEstimate("failed: no consistent pose", num_matches=len(point))
-        return self._estimate(query, matches, hypotheses, references)
+        distinct = len(np.unique(point))
+        hypotheses = self._hypotheses(query, matches) if distinct >= 4 else []
+        if distinct < 4:
+            found = PoseEstimate("failed: too few matches", num_matches=len(point))
+        elif not hypotheses:
+            found = PoseEstimate("failed: no consistent pose", num_matches=len(point))
+        else:
+            found = self._estimate(query, matches, hypotheses, references)
+        for prior in priors:
+            found = self._compare(query, matches, hypotheses, found, references, prior)
+        return found
+
+    def _compare(
+        self,
+        query: "_Query",
+        matches: "_Matches",
+        hypotheses: "list[_Hypothesis]",
+        found: PoseEstimate,
+        references: Sequence[Sequence[int]],
+        prior: Prior,
+    ) -> PoseEstimate:
+        """Return the estimate that was found without a prior, or the one found with it if it is better supported."""
+        if found.status == "ok" and agree(found.world_from_rig, prior.world_from_rig):
+            return found  # each confirms the other
+        near = self._match_guided(
+            query, geometry.invert(prior.world_from_rig), self._seeing_the_same(prior.images), prior.radius_deg
+        )
+        start = self._ransac(query, near, self.settings.ransac_max_error_deg) if len(near) else None
+        if start is None:
+            return found
+        hypothesis = self._improve(query, start, near)
+        same = bool(hypotheses) and not _differ(hypotheses[0], hypothesis)
+        support = len(hypotheses[0].matches) if hypotheses else 0
+        mine = len(hypothesis.matches)
+        clearly_more = support <= self.settings.ok_rival_support * mine  # a tie is no reason to change
+        if (mine >= support and found.status != "ok") if same else clearly_more:
+            # Judged by the matches about the prior, which is as independent of the pose as descriptors alone are.
+            estimate = self._estimate(query, near, [hypothesis, *hypotheses], [prior.images.tolist()])
+            known = found.world_from_rig is not None
+            if estimate.world_from_rig is not None and (not same or not known or estimate.status == "ok"):
+                return replace(estimate, found_by="pnp+vggt")
+            return found
+        if same or found.world_from_rig is None:
+            return found
+        rivals = sorted([*hypotheses, hypothesis], key=lambda one: -len(one.matches))
+        return self._estimate(query, matches, rivals, references)
+
+    def _seeing_the_same(self, images: Ints) -> Ints:
+        """Return the map images that see the most of what the given ones see."""
+        points = [self.map.observations(int(image))[1] for image in images]
+        return self._covisible(np.unique(np.concatenate([np.zeros(0, np.int64), *points])))
 
     def _hypotheses(self, query: "_Query", matches: "_Matches") -> "list[_Hypothesis]":
         """Return refined poses, best supported first.
@@ -287,8 +356,7 @@ class PnpLocalizer:
         """Return the support of the best pose that is another one, relative to the best pose's."""
         first = hypotheses[0]
         for other in hypotheses[1:]:
-            rotation_deg, distance_m = geometry.pose_error(first.world_from_rig, other.world_from_rig)
-            if rotation_deg > 1.0 or distance_m > 0.1:
+            if _differ(first, other):
                 return len(other.matches) / max(len(first.matches), 1)
         return 0.0
 
@@ -433,6 +501,20 @@ class PnpLocalizer:
             if len(self._cache) > 256:
                 self._cache.popitem(last=False)
         return image
+
+
+def agree(world_from_rig: Floats | None, other: Floats | None) -> bool:
+    """Tell whether two poses are near enough that one confirms the other."""
+    if world_from_rig is None or other is None:
+        return False
+    rotation_deg, distance_m = geometry.pose_error(world_from_rig, other)
+    return bool(rotation_deg <= CONFIRMED[0] and distance_m <= CONFIRMED[1])
+
+
+def _differ(one: _Hypothesis, other: _Hypothesis) -> bool:
+    """Tell whether two hypotheses are clearly different poses."""
+    rotation_deg, distance_m = geometry.pose_error(one.world_from_rig, other.world_from_rig)
+    return bool(rotation_deg > 1.0 or distance_m > 0.1)
 
 
 def _matrix(rigid: pycolmap.Rigid3d) -> Floats:

@@ -49,6 +49,22 @@ MEGALOC = WeightsSource(
     licence="MIT",
     alternative="set `embed.model: vlad`, which needs none",
 )
+VGGT_1B = WeightsSource(
+    model="VGGT-1B",
+    repo_id="facebook/VGGT-1B",
+    filename="model.pt",
+    licence="non-commercial, as the code's README says of the original checkpoint",
+    alternative="set `localize.method: pnp`, which needs none",
+    setting="localize.checkpoint",
+)
+VGGT_1B_COMMERCIAL = WeightsSource(
+    model="VGGT-1B-Commercial",
+    repo_id="facebook/VGGT-1B-Commercial",
+    filename="model.pt",
+    licence="VGGT License of July 29, 2025: commercial use allowed, not military; access by form",
+    alternative="set `localize.method: pnp`, which needs none",
+    setting="localize.checkpoint",
+)
 
 
 def find_weights(source: WeightsSource, checkpoint: str | Path | None = None) -> Path | None:
