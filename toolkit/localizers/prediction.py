@@ -1,0 +1,135 @@
+"""What a network says about a few views, and the interface between networks and localizers."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import pycolmap
+from numpy.typing import ArrayLike, NDArray
+
+from toolkit.capture import Session
+from toolkit.errors import ManifestError
+
+Floats = NDArray[np.float64]
+
+PREDICTORS = ("vggt", "simulated")
+"""Names that `create_predictor` takes. `simulated` is taken only where it is asked for by name."""
+LOW_CONFIDENCE = 0.2
+"""Share of a view's depths, the least confident, that are not used."""
+
+
+@dataclass(frozen=True)
+class View:
+    """One photograph that a network is shown."""
+
+    name: str
+    """`<session>/raw_data/<path>`, as `Session.image_name` gives it."""
+    path: Path
+    camera: pycolmap.Camera
+    known: bool
+    """Whether it is a map image: others will ask for it again, so that its encoding is worth keeping."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Cameras and depth of the S views of one group, in a frame and a unit of its own, `model`."""
+
+    model_from_cams: Floats
+    """(S, 4, 4)."""
+    depth: NDArray[np.float32] | None = None
+    """(S, h, w) along the optical axis, in units of the model; NaN where unknown."""
+    depth_conf: NDArray[np.float32] | None = None
+    """(S, h, w), larger is surer."""
+    map_from_image: Floats | None = None
+    """(S, 4) scale_x, scale_y, offset_x, offset_y of each view, from pixels of the photograph to those of the depth
+    map; the centre of the top-left pixel is (0.5, 0.5) in both."""
+    simulated: bool = False
+
+    def depth_at(self, view: int, xy: ArrayLike) -> Floats:
+        """Return the depth (N,), in units of the model, at pixels (N, 2) of the photograph.
+
+        Between pixels it is interpolated. NaN outside of the map, where one of the four neighbours is unknown or not
+        positive, and where the nearest is among the least confident of the view (`LOW_CONFIDENCE`).
+        """
+        pixels = np.asarray(xy, np.float64).reshape(-1, 2)
+        if self.depth is None or self.map_from_image is None:
+            return np.full(len(pixels), np.nan)
+        depth = np.where(self.depth[view] > 0, self.depth[view], np.nan).astype(np.float64)
+        size = np.array(depth.shape[::-1])
+        at = pixels * self.map_from_image[view, :2] + self.map_from_image[view, 2:]
+        inside = np.asarray((np.isfinite(at) & (at >= 0) & (at <= size)).all(axis=1))
+        at = np.clip(np.where(inside[:, None], at, 0.0) - 0.5, 0, size - 1)
+        low = np.minimum(at.astype(np.int64), np.maximum(size - 2, 0))
+        high = np.minimum(low + 1, size - 1)
+        (x, y), (x0, y0), (x1, y1) = (at - low).T, low.T, high.T
+        upper = depth[y0, x0] * (1 - x) + depth[y0, x1] * x
+        lower = depth[y1, x0] * (1 - x) + depth[y1, x1] * x
+        found = np.where(inside, upper * (1 - y) + lower * y, np.nan)
+        if self.depth_conf is not None:
+            confidence = self.depth_conf[view]
+            column, row = np.rint(at).astype(np.int64).T
+            found[confidence[row, column] < np.nanquantile(confidence, LOW_CONFIDENCE)] = np.nan
+        return found
+
+
+class Predictor(Protocol):
+    """What the localizers need of a network, or of what stands in for one."""
+
+    name: str
+    simulated: bool
+    """Whether it looks up the answers; what it takes part in is no result, and is labelled."""
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the predictions depend on besides the views; part of the poses' fingerprint."""
+        ...
+
+    def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
+        """Return a prediction for each group of views; groups do not influence each other."""
+        ...
+
+
+def check_predictor_name(name: str) -> None:
+    """Refuse what is no name of a predictor.
+
+    Raises:
+        ManifestError: none of `PREDICTORS`.
+    """
+    if name not in PREDICTORS:
+        raise ManifestError(f"Unknown predictor {name!r}. Known: {', '.join(PREDICTORS)}.")
+
+
+def create_predictor(
+    name: str,
+    *,
+    sessions: Sequence[Session] = (),
+    map_dir: str | Path | None = None,
+    checkpoint: str | Path | None = None,
+    compute_device: str = "auto",
+    dtype_compute: str = "auto",
+    seed: int = 0,
+) -> Predictor:
+    """Return a ready predictor.
+
+    Args:
+        name: `vggt`, or `simulated`, which looks up true poses and is for tests and for trying things out.
+        sessions: of `simulated`: where the true poses are.
+        map_dir: of `simulated`: folder of the triangulated maps, for depth.
+        checkpoint: of `vggt`: file with the weights; None: the hub's cache, else a download.
+        compute_device, dtype_compute: of `vggt`, as `toolkit.compute` takes them.
+        seed: of `simulated`.
+
+    Raises:
+        ManifestError: unknown name, device or precision.
+        WeightsError: `vggt` and no weights to be had; says what to do.
+    """
+    check_predictor_name(name)
+    if name == "simulated":
+        from toolkit.localizers.simulated import SimulatedPredictor
+
+        return SimulatedPredictor(sessions, map_dir, seed=seed)
+    from toolkit.localizers.network import NetworkPredictor
+
+    return NetworkPredictor(checkpoint, compute_device, dtype_compute)

@@ -1,0 +1,177 @@
+"""A stand-in for a network, for tests and for trying things out without weights: it looks up the true cameras.
+
+Poses come from the capture's ground truth and depth from triangulated map points; both are put under a random
+similarity, with noise. What it takes part in says nothing about any network, and is labelled `simulated` everywhere.
+"""
+
+import hashlib
+import json
+from collections import OrderedDict
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from toolkit import geometry
+from toolkit.capture import Session
+from toolkit.errors import CaptureError
+from toolkit.localizers.prediction import Prediction, View
+from toolkit.mapping import LocalMap, in_view, view_bounds
+
+Floats = NDArray[np.float64]
+
+_GRID = 96  # pixels of the longer side of a depth map
+_NEAREST = 5  # points whose depth a pixel has; some triangulated points are wrong
+_KEPT = 256  # depth maps of map images kept in memory
+
+
+class SimulatedPredictor:
+    """Ground truth under a random similarity for each group, with noise.
+
+    A group's prediction depends on the seed and the names in the group alone: not on their order, on other groups, or
+    on threads. Depth is, at each pixel of a small map, the median of those of the triangulated points seen nearest.
+    """
+
+    name = "simulated"
+    simulated = True
+
+    def __init__(
+        self,
+        sessions: Sequence[Session],
+        map_dir: str | Path | None = None,
+        *,
+        rotation_noise_deg: float = 1.0,
+        position_noise_m: float = 0.03,
+        depth_noise: float = 0.05,
+        wrong_references: float = 0.0,
+        seed: int = 0,
+    ) -> None:
+        """
+        Args:
+            sessions: those that the views are of, with ground truth.
+            map_dir: folder of triangulated maps, `<session>.npz`; None, or none of a session: no depth.
+            rotation_noise_deg: standard deviation of a camera's rotation, as an angle.
+            position_noise_m: standard deviation of a camera's place, as a length.
+            depth_noise: relative standard deviation of each pixel's depth.
+            wrong_references: share of the map images that are put anywhere, looking anywhere.
+            seed: of all of it.
+        """
+        self._sessions = {session.id: session for session in sessions}
+        self._map_dir = None if map_dir is None else Path(map_dir)
+        self._noise = {
+            "rotation_noise_deg": rotation_noise_deg,
+            "position_noise_m": position_noise_m,
+            "depth_noise": depth_noise,
+            "wrong_references": wrong_references,
+            "seed": seed,
+        }
+        self._maps: dict[str, LocalMap | None] = {}
+        self._depths: OrderedDict[str, Floats] = OrderedDict()
+        self._lock = Lock()
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The noise and the seed."""
+        return dict(self._noise)
+
+    @cached_property
+    def _truth(self) -> dict[str, Floats]:
+        return {
+            session.image_name(row): pose
+            for session in self._sessions.values()
+            for row, pose in enumerate(session.world_from_cam(ground_truth=True))
+        }
+
+    def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
+        """Return a prediction for each group of views.
+
+        Raises:
+            CaptureError: the true pose of a view is not known.
+        """
+        return [self._predict(list(group)) for group in groups]
+
+    def _random(self, *key: Any) -> np.random.Generator:
+        text = json.dumps([self._noise["seed"], *key])
+        return np.random.default_rng(int.from_bytes(hashlib.sha256(text.encode()).digest()[:16]))
+
+    def _predict(self, group: list[View]) -> Prediction:
+        names = sorted(view.name for view in group)
+        for view in group:
+            if view.name not in self._truth or not np.isfinite(self._truth[view.name]).all():
+                raise CaptureError(
+                    f"The simulated predictor has no true pose of {view.name}: it works only where "
+                    "proc/alignment_trajectories.txt or trajectories.txt has one. Use another predictor or method."
+                )
+        true = np.stack([self._truth[view.name] for view in group])
+        noisy = np.stack([self._noisy(pose, names, view, true) for pose, view in zip(true, group, strict=True)])
+        rng = self._random(names)
+        turn, scale = Rotation.random(random_state=rng).as_matrix(), float(np.exp(rng.uniform(-2, 2)))
+        shift = rng.normal(size=3) * 3
+        model = geometry.make_pose(turn @ noisy[:, :3, :3], scale * noisy[:, :3, 3] @ turn.T + shift)
+        sizes = np.array([[view.camera.width, view.camera.height] for view in group], np.float64)
+        grid = np.maximum(np.rint(sizes * _GRID / sizes.max()), 1).astype(np.int64).max(axis=0)
+        map_from_image = np.zeros((len(group), 4))
+        map_from_image[:, :2] = grid / sizes
+        depth = np.stack([self._depth(view, group, names, grid) * scale for view in group]).astype(np.float32)
+        return Prediction(
+            model, None if np.isnan(depth).all() else depth, map_from_image=map_from_image, simulated=True
+        )
+
+    def _noisy(self, world_from_cam: Floats, names: list[str], view: View, group: Floats) -> Floats:
+        rng = self._random(names, view.name)
+        turn = Rotation.from_rotvec(rng.normal(size=3) * np.radians(self._noise["rotation_noise_deg"]) / np.sqrt(3))
+        moved = rng.normal(size=3) * self._noise["position_noise_m"] / np.sqrt(3)
+        if view.known and rng.random() < self._noise["wrong_references"]:
+            turn = Rotation.random(random_state=rng)
+            moved = rng.normal(size=3) * max(2.0, float(np.ptp(group[:, :3, 3], axis=0).max()))
+        return geometry.make_pose(world_from_cam[:3, :3] @ turn.as_matrix(), world_from_cam[:3, 3] + moved)
+
+    def _depth(self, view: View, group: list[View], names: list[str], grid: NDArray[np.int64]) -> Floats:
+        key = f"{view.name} {grid}"
+        with self._lock:
+            kept = self._depths.get(key) if view.known else None
+        if kept is None:
+            points = self._points(view) if view.known else np.concatenate([self._points(v) for v in group])
+            kept = _nearest_depth(points, view, self._truth[view.name], grid)
+            with self._lock:
+                if view.known:  # the depth of others depends on the group
+                    self._depths[key] = kept
+                if len(self._depths) > _KEPT:
+                    self._depths.popitem(last=False)
+        return kept * (1 + self._noise["depth_noise"] * self._random(names, view.name, "depth").normal(size=kept.shape))
+
+    def _points(self, view: View) -> Floats:
+        """Return the map points (P, 3) that a map image sees; none of another image."""
+        found = self._map(view.name.split("/", 1)[0]) if view.known else None
+        if found is None or view.name not in found.index_of:
+            return np.zeros((0, 3))
+        return found.points[np.unique(found.observations(found.index_of[view.name])[1])]
+
+    def _map(self, session: str) -> LocalMap | None:
+        with self._lock:
+            if session not in self._maps:
+                path = None if self._map_dir is None else self._map_dir / f"{session}.npz"
+                self._maps[session] = LocalMap.load(path) if path is not None and path.exists() else None
+            return self._maps[session]
+
+
+def _nearest_depth(points: Floats, view: View, world_from_cam: Floats, grid: NDArray[np.int64]) -> Floats:
+    """Return depth in metres, (h, w), the median of the points nearest to each pixel of a grid; NaN without points."""
+    in_cam = geometry.transform(geometry.invert(world_from_cam), points)
+    in_cam = in_cam[in_view(in_cam[None], view_bounds(view.camera)[None])[0]] if len(in_cam) else in_cam
+    if not len(in_cam):
+        return np.full(grid[::-1], np.nan)
+    pixels = np.asarray(view.camera.img_from_cam(in_cam)) * grid / [view.camera.width, view.camera.height]
+    kept = np.isfinite(pixels).all(axis=1)
+    x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in grid))
+    if not kept.any():
+        return np.full(x.shape, np.nan)
+    count = min(_NEAREST, int(kept.sum()))
+    _, nearest = KDTree(pixels[kept]).query(np.stack([x, y], -1).reshape(-1, 2), k=np.arange(1, count + 1))
+    return np.asarray(np.median(in_cam[kept, 2][nearest], axis=1)).reshape(x.shape)

@@ -1,0 +1,272 @@
+"""Localize by what a feed-forward network says of a query and its references, aligned to the map. No matching."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from toolkit import geometry
+from toolkit.alignment import Alignment, align_to_map, is_trustworthy, query_pose, robust_mean_pose
+from toolkit.capture import Session, read_depth
+from toolkit.errors import CaptureError
+from toolkit.localizers.pnp import PoseEstimate
+from toolkit.localizers.prediction import Prediction, Predictor, View
+from toolkit.localizers.references import select_references
+from toolkit.mapping import LocalMap, rays_of
+
+log = logging.getLogger(__name__)
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class VggtSettings:
+    """How references are chosen and used; part of the poses' fingerprint."""
+
+    num_references: int = 5
+    """References shown to the network with each query image."""
+    candidates: int | None = None
+    """Retrieved images to choose them from, the best so many; None: all."""
+    depth_points: int = 200
+    """Map points of a reference at most whose depth is compared, those of the longest tracks."""
+    least_points: int = 20
+    """With fewer, the capture's depth map of the reference is asked, where there is one."""
+
+
+@dataclass(frozen=True)
+class VggtQuery:
+    """The C images of one query device at one instant, and what was retrieved for each."""
+
+    views: list[View]
+    rig_from_cams: Floats
+    """(C, 4, 4); the identity for a single camera."""
+    references: list[Ints]
+    """For each image the indices of map images."""
+    scores: list[Floats]
+    """Their similarities, higher is better."""
+
+
+@dataclass(frozen=True)
+class CameraAnswer:
+    """What came out for one image of a query."""
+
+    references: Ints
+    """(k,) map images chosen, in order of choice."""
+    prediction: Prediction | None = None
+    """Of the query, first, and the references."""
+    alignment: Alignment | None = None
+    world_from_cam: Floats | None = None
+    """(4, 4), None without a known rotation; where the scale is unknown, at the place of the first consistent
+    reference."""
+    covariance: Floats | None = None
+    """(6, 6), in the convention of `PoseEstimate`."""
+    reason: str = ""
+    """What was left out or is unknown; without a pose, why there is none."""
+
+
+@dataclass(frozen=True)
+class VggtAnswer:
+    """The estimate for a query device, and how it came about."""
+
+    estimate: PoseEstimate
+    cameras: tuple[CameraAnswer, ...] = ()
+
+
+class VggtLocalizer:
+    """Localizes queries in one map by a predictor's cameras."""
+
+    def __init__(
+        self, local_map: LocalMap, session: Session, predictor: Predictor, settings: VggtSettings | None = None
+    ):
+        """
+        Args:
+            local_map: the map of the session.
+            session: where the map's images and depth maps are.
+        """
+        self.map = local_map
+        self.predictor = predictor
+        self.settings = settings or VggtSettings()
+        self._session = session
+        self._rows = {session.image_name(row): row for row in range(len(session.images))}
+
+    def localize(self, queries: Sequence[VggtQuery]) -> list[VggtAnswer]:
+        """Return an answer for each query; all go to the predictor in one call.
+
+        Nothing that goes wrong with one query is raised or touches another: its answer says `failed: <reason>`.
+        """
+        chosen = [[self._choose(*found) for found in zip(q.references, q.scores, strict=True)] for q in queries]
+        groups = {
+            (number, camera): [query.views[camera], *(self.view(int(index)) for index in references)]
+            for number, query in enumerate(queries)
+            for camera, references in enumerate(chosen[number])
+            if len(references)
+        }
+        predictions = dict(zip(groups, self._predict(list(groups.values())), strict=True))
+        answers = []
+        for number, query in enumerate(queries):
+            cameras = tuple(
+                self._camera_answer(references, predictions.get((number, camera), "no references"))
+                for camera, references in enumerate(chosen[number])
+            )
+            answers.append(VggtAnswer(_combine(query, cameras), cameras))
+        return answers
+
+    def view(self, index: int) -> View:
+        """Return a map image as a network is shown it."""
+        name = self.map.image_names[index]
+        return View(name, self._session.path.parent / name, self.map.cameras[index], known=True)
+
+    def _choose(self, references: Ints, scores: Floats) -> Ints:
+        """Return the references of one query image to use."""
+        near = np.asarray(references, np.int64)[: self.settings.candidates]
+        if not len(near):
+            return near
+        points = np.concatenate([self.map.observations(int(index))[1] for index in near])
+        images = np.repeat(near, [len(self.map.observations(int(index))[1]) for index in near])
+        depth = np.einsum("oj,oj->o", self.map.cams_from_world[images, 2, :3], self.map.points[points])
+        depth += self.map.cams_from_world[images, 2, 3]
+        chosen = select_references(
+            scores[: len(near)],
+            self.map.world_from_cams[near],
+            self.settings.num_references,
+            [self.map.cameras[int(index)] for index in near],
+            self.map.shared_points(near),
+            **({"depth_m": float(np.median(depth))} if len(depth) else {}),
+        )
+        return near[chosen]
+
+    def _predict(self, groups: list[list[View]]) -> list[Prediction | str]:
+        """Return predictions, or why there is none."""
+        try:
+            return [*self.predictor.predict(groups)] if groups else []
+        except Exception as error:  # one bad query never ends a run
+            if len(groups) > 1:
+                return [found for group in groups for found in self._predict([group])]
+            log.exception("predicting %s", groups[0][0].name)
+            return [f"{type(error).__name__}: {error}"]
+
+    def _camera_answer(self, references: Ints, prediction: Prediction | str) -> CameraAnswer:
+        if isinstance(prediction, str):
+            return CameraAnswer(references, reason=prediction)
+        try:
+            return self._align(references, prediction)
+        except Exception as error:  # a prediction may be anything
+            log.exception("aligning a prediction")
+            return CameraAnswer(references, prediction, reason=f"{type(error).__name__}: {error}")
+
+    def _align(self, references: Ints, prediction: Prediction) -> CameraAnswer:
+        model = np.asarray(prediction.model_from_cams, np.float64)
+        if not np.isfinite(model[0]).all():
+            return CameraAnswer(references, prediction, reason="the predicted camera is not finite")
+        ratios = [self._depth_ratios(int(index), prediction, view) for view, index in enumerate(references, start=1)]
+        world = self.map.world_from_cams[references]
+        alignment = align_to_map(model[1:], world, depth_ratios=ratios if any(len(r) for r in ratios) else None)
+        if not np.isfinite(alignment.rotation_std_deg):
+            reason = alignment.reason or "the rotation is unknown"
+            return CameraAnswer(references, prediction, alignment, reason=reason)
+        pose, covariance = query_pose(alignment, model[0])
+        if not alignment.scale_known:
+            # Whatever scale was taken, the query may be put anywhere along a line; near a reference is a better guess.
+            pose[:3, 3] = world[int(np.argmax(alignment.inliers)), :3, 3]
+        return CameraAnswer(references, prediction, alignment, pose, covariance, alignment.reason)
+
+    def _depth_ratios(self, image: int, prediction: Prediction, view: int) -> Floats:
+        """Return metric over predicted depth (R,) at points that a map image sees."""
+        points = self._points(image)
+        in_cam = geometry.transform(self.map.cams_from_world[image], points)
+        in_cam = in_cam[in_cam[:, 2] > 0.1]
+        pixels = np.asarray(self.map.cameras[image].img_from_cam(in_cam), np.float64).reshape(-1, 2)
+        ratios = in_cam[:, 2] / prediction.depth_at(view, pixels)
+        return np.asarray(ratios[np.isfinite(ratios)], np.float64)
+
+    def _points(self, image: int) -> Floats:
+        """Return points (P, 3) in the world that a map image sees: triangulated, else of its depth map."""
+        points = np.unique(self.map.observations(image)[1])
+        if len(points) >= self.settings.least_points:
+            order = np.argsort(-self.map.track_lengths[points], kind="stable")[: self.settings.depth_points]
+            return self.map.points[points[order]]
+        row = self._rows[self.map.image_names[image]]
+        found = self._session.images.iloc[row]
+        path = self._session.depth_path(int(found["timestamp"]), str(found["sensor_id"]))
+        try:
+            depth = read_depth(path) if path is not None else np.zeros((0, 0), np.float32)
+        except CaptureError as error:
+            log.warning("%s: left out", error)
+            depth = np.zeros((0, 0), np.float32)
+        y, x = np.nonzero(depth)
+        part = np.linspace(0, len(x) - 1, min(len(x), self.settings.depth_points)).astype(np.int64)
+        if not len(part):
+            return self.map.points[points]
+        x, y, camera = x[part], y[part], self.map.cameras[image]
+        # A depth map may be smaller than the photograph of the same sensor.
+        scale = np.array([camera.width / depth.shape[1], camera.height / depth.shape[0]])
+        rays = rays_of(camera, (np.column_stack([x, y]) + 0.5) * scale)
+        in_cam = rays / rays[:, 2:] * depth[y, x, None]
+        return geometry.transform(self.map.world_from_cams[image], in_cam)
+
+
+def _combine(query: VggtQuery, cameras: tuple[CameraAnswer, ...]) -> PoseEstimate:
+    """Return one pose of the device from those of its cameras."""
+    count = sum(len(answer.references) for answer in cameras if answer.prediction is not None)
+    reasons = "; ".join(dict.fromkeys(answer.reason for answer in cameras if answer.reason))
+    posed = [index for index, answer in enumerate(cameras) if answer.world_from_cam is not None]
+    if not posed:
+        return PoseEstimate(f"failed: {reasons}", num_matches=count, found_by="vggt")
+    known = [index for index in posed if np.isfinite(_covariance(cameras[index])).all()]
+    if known:
+        poses = np.stack([_pose(cameras[index]) for index in known]) @ geometry.invert(query.rig_from_cams[known])
+        covariances = np.stack([
+            _moved(_covariance(cameras[index]), query.rig_from_cams[index]) for index in known
+        ])  # fmt: skip
+        mean = robust_mean_pose(poses, covariances=covariances)
+        pose, covariance = mean.world_from_cam, mean.covariance
+        kept = [index for index, inside in zip(known, mean.inliers, strict=True) if inside]
+        reasons = "; ".join(part for part in (reasons, mean.reason) if part)
+        agreed = np.isfinite(covariance).all() and 2 * len(kept) > len(known)
+        sure = agreed and any(is_trustworthy(_alignment(cameras[index]), covariance) for index in kept)
+    else:
+        kept = [min(posed, key=lambda index: _alignment(cameras[index]).rotation_std_deg)]
+        rig_from_cam = query.rig_from_cams[kept[0]]
+        pose, sure = _pose(cameras[kept[0]]) @ geometry.invert(rig_from_cam), False
+        turn, covariance = rig_from_cam[:3, :3], np.diag(np.full(6, np.inf))
+        covariance[:3, :3] = turn @ _covariance(cameras[kept[0]])[:3, :3] @ turn.T
+    consistent = [int(i) for c in kept for i in cameras[c].references[_alignment(cameras[c]).inliers]]
+    asked = [int(i) for answer in cameras if answer.prediction is not None for i in answer.references]
+    return PoseEstimate(
+        status="ok" if sure else "low_confidence",
+        world_from_rig=pose,
+        covariance=covariance,
+        num_matches=count,
+        num_inliers=len(consistent),
+        references=tuple(dict.fromkeys(consistent)),
+        found_by="vggt",
+        scale_std=min(_alignment(cameras[index]).scale_std for index in kept),
+        rejected=tuple(index for index in dict.fromkeys(asked) if index not in consistent),
+        reason=reasons,
+    )
+
+
+def _alignment(answer: CameraAnswer) -> Alignment:
+    assert answer.alignment is not None
+    return answer.alignment
+
+
+def _pose(answer: CameraAnswer) -> Floats:
+    assert answer.world_from_cam is not None
+    return answer.world_from_cam
+
+
+def _covariance(answer: CameraAnswer) -> Floats:
+    assert answer.covariance is not None
+    return answer.covariance
+
+
+def _moved(covariance: Floats, rig_from_cam: Floats) -> Floats:
+    """Return the covariance (6, 6) of a rig's pose from that of a camera on it: the adjoint carries it over."""
+    R, (x, y, z) = rig_from_cam[:3, :3], rig_from_cam[:3, 3]
+    adjoint = np.kron(np.eye(2), R)
+    adjoint[3:, :3] = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ R
+    return np.asarray(adjoint @ covariance @ adjoint.T)
