@@ -25,9 +25,12 @@ from pathlib import Path
 from typing import Any
 
 from toolkit import __version__, errors
+from toolkit.embedders import WEIGHTS as EMBEDDER_WEIGHTS
+from toolkit.embedders import resolve_name
 from toolkit.errors import ManifestError, ToolkitError
 from toolkit.files import SceneFiles, files_fingerprint, fingerprint, write_text
 from toolkit.manifest import STAGES, Manifest, load_manifest, nearest
+from toolkit.models.weights import VGGT, WeightsSource, find_any, resolve_any
 from toolkit.notebook import (
     COUNTS_MIME,
     TEXT_BARS,
@@ -113,9 +116,10 @@ def run(
         check_parameters(notebook_path(stage), manifest.stage(stage).given(), f"{manifest_path}: {stage}.")
     manifest = _name_embedder(manifest, say)
     run_dir = Path(manifest.output_root) / manifest.name
-    embeds = only in (None, "embed")
-    if embeds and not any(run_dir.glob("*/.stages/embed*.json")):
-        _require_weights(manifest)
+    stages = [only] if only else [*STAGES]
+    for stage in stages:
+        if not any(run_dir.glob(f"*/.stages/{stage}*.json")):
+            _require_weights(manifest, stage)
     captures = _captures(manifest)
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
@@ -124,13 +128,13 @@ def run(
     jobs = [
         job
         for capture in captures
-        for stage in ([only] if only else STAGES)
+        for stage in stages
         for job in _jobs(manifest, stage, capture, SceneFiles(run_dir, capture.name), force)
     ]
     inputs = {capture.name: tree_fingerprint(capture / "sessions") for capture in captures}
-    embedding = [job for job in jobs if job.stage == "embed"]
-    if any(force or not _reusable(job, _inputs_of(job, inputs[job.files.scene])) for job in embedding):
-        _require_weights(manifest)
+    for job in jobs:
+        if force or not _reusable(job, _inputs_of(job, inputs[job.files.scene])):
+            _require_weights(manifest, job.stage)
     log = RunLog(run_dir, manifest, inputs)
     try:
         for i, job in enumerate(jobs, 1):
@@ -283,8 +287,6 @@ def tree_fingerprint(folder: Path, part: str = "") -> str:
 
 def _name_embedder(manifest: Manifest, say: Say) -> Manifest:
     """Return the manifest with the embedder that `auto` stands for; refuses an unknown one."""
-    from toolkit.embedders import resolve_name
-
     settings = manifest.embed
     if settings.model is None:
         return manifest
@@ -294,16 +296,20 @@ def _name_embedder(manifest: Manifest, say: Say) -> Manifest:
     return manifest.model_copy(update={"embed": settings.model_copy(update={"model": name})})
 
 
-def _require_weights(manifest: Manifest) -> None:
-    """Find or download the weights that the run needs, before hours of work and where its progress is seen."""
-    from toolkit.embedders import require_weights
+def _require_weights(manifest: Manifest, stage: str) -> None:
+    """Find or download the weights that a stage needs, before hours of work and where its progress is seen."""
+    parameters = manifest.stage(stage).given()
+    if sources := _weights_needed(stage, parameters):
+        resolve_any(sources, parameters.get("checkpoint"))
 
-    if manifest.embed.model is not None:
-        require_weights(manifest.embed.model, manifest.embed.checkpoint)
-    if manifest.localize.method in ("vggt", "hybrid") and manifest.localize.predictor in (None, "vggt"):
-        from toolkit.localizers import network
 
-        network.require_weights(manifest.localize.checkpoint)
+def _weights_needed(stage: str, parameters: dict[str, Any]) -> tuple[WeightsSource, ...]:
+    """Return the weights, any of which will do, of the network that a stage runs with these parameters, if it does."""
+    if stage == "embed" and parameters.get("model") in EMBEDDER_WEIGHTS:
+        return (EMBEDDER_WEIGHTS[parameters["model"]],)
+    if stage == "localize" and parameters.get("method") in ("vggt", "hybrid"):
+        return VGGT if parameters.get("predictor", "vggt") == "vggt" else ()
+    return ()
 
 
 def _captures(manifest: Manifest) -> list[Path]:
@@ -374,10 +380,8 @@ def _inputs_of(job: Job, capture: str) -> str:
 
 def _weights_of(job: Job) -> str | None:
     """Return what identifies the file with the weights that a job uses, None if it uses none or has none yet."""
-    from toolkit.embedders import WEIGHTS, find_weights
-
-    source = WEIGHTS.get(job.parameters.get("model", "")) if job.stage == "embed" else None
-    path = find_weights(source, job.parameters.get("checkpoint")) if source else None
+    sources = _weights_needed(job.stage, job.parameters)
+    path = find_any(sources, job.parameters.get("checkpoint")) if sources else None
     return files_fingerprint([path.resolve()]) if path else None
 
 

@@ -10,7 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from toolkit.errors import ArtefactError, ManifestError
-from toolkit.models.weights import MEGALOC, find_weights, resolve_weights
+from toolkit.models.weights import MEGALOC, find_weights
 
 
 class Embedder(Protocol):
@@ -70,15 +70,6 @@ def resolve_name(name: str, checkpoint: str | Path | None = None) -> str:
     if name not in EMBEDDERS:
         raise ManifestError(f"Unknown embedder {name!r}. Known: {', '.join([*sorted(EMBEDDERS), 'auto'])}.")
     return name
-
-
-def require_weights(name: str, checkpoint: str | Path | None = None) -> Path | None:
-    """Return the file with the weights of an embedder, None for one without; download it if need be.
-
-    Raises:
-        WeightsError: there are none to be had; says what to do.
-    """
-    return resolve_weights(WEIGHTS[name], checkpoint) if name in WEIGHTS else None
 
 
 def create_embedder(name: str, **options: Any) -> Embedder:

@@ -8,17 +8,7 @@ from toolkit.compute import PRECISIONS, check_device_name
 from toolkit.errors import ManifestError
 from toolkit.files import files_fingerprint
 from toolkit.localizers.prediction import Prediction, View
-from toolkit.models.weights import VGGT_1B, VGGT_1B_COMMERCIAL, find_weights, resolve_weights
-
-
-def require_weights(checkpoint: str | Path | None = None) -> Path:
-    """Return the file with the weights: the one given, one in the hub's cache, or else a download.
-
-    Raises:
-        WeightsError: there are none to be had; says what to do.
-    """
-    cached = None if checkpoint is not None else find_weights(VGGT_1B) or find_weights(VGGT_1B_COMMERCIAL)
-    return cached or resolve_weights(VGGT_1B, checkpoint)
+from toolkit.models.weights import VGGT, resolve_any
 
 
 class NetworkPredictor:
@@ -32,7 +22,7 @@ class NetworkPredictor:
     ) -> None:
         """
         Args:
-            checkpoint: see `require_weights`.
+            checkpoint: file with the weights; None: the hub's cache, else a download.
             compute_device, dtype_compute: as `toolkit.compute` takes them.
 
         Raises:
@@ -42,7 +32,7 @@ class NetworkPredictor:
         check_device_name(compute_device)
         if dtype_compute not in PRECISIONS:
             raise ManifestError(f"dtype_compute is {dtype_compute!r}; expected one of {', '.join(PRECISIONS)}.")
-        self.checkpoint = require_weights(checkpoint)
+        self.checkpoint = resolve_any(VGGT, checkpoint)
         self.compute_device, self.dtype_compute = compute_device, dtype_compute
 
     @property

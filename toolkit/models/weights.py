@@ -5,7 +5,7 @@ import json
 import os
 import pickle
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -65,6 +65,8 @@ VGGT_1B_COMMERCIAL = WeightsSource(
     alternative="set `localize.method: pnp`, which needs none",
     setting="localize.checkpoint",
 )
+VGGT = (VGGT_1B, VGGT_1B_COMMERCIAL)
+"""Of one architecture: what is on the machine is taken."""
 
 
 def find_weights(source: WeightsSource, checkpoint: str | Path | None = None) -> Path | None:
@@ -128,6 +130,22 @@ def resolve_weights(source: WeightsSource, checkpoint: str | Path | None = None)
                 source, f"wrong checksum, found SHA-256 {found_sum}, expected {expected}; the file was deleted"
             )
     return path
+
+
+def find_any(sources: Sequence[WeightsSource], checkpoint: str | Path | None = None) -> Path | None:
+    """Return the first file that is on this machine of weights that will all do, else None; see `find_weights`."""
+    if checkpoint is not None:
+        return find_weights(sources[0], checkpoint)
+    return next((path for source in sources if (path := find_weights(source))), None)
+
+
+def resolve_any(sources: Sequence[WeightsSource], checkpoint: str | Path | None = None) -> Path:
+    """Return the first file that is on this machine of weights that will all do, else download the first of them.
+
+    Raises:
+        WeightsError: see `resolve_weights`.
+    """
+    return find_any(sources, checkpoint) or resolve_weights(sources[0], checkpoint)
 
 
 def read_state_dict(path: str | Path) -> "dict[str, Tensor]":
