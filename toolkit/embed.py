@@ -28,7 +28,7 @@ from toolkit.files import (
 )
 from toolkit.images import default_workers, prefetch, read_image
 from toolkit.matrix import MatrixWriter
-from toolkit.upright import Turns, quarter_turns, turn_image
+from toolkit.upright import Turns, turn_image, upright_turns
 
 log = logging.getLogger(__name__)
 
@@ -175,7 +175,7 @@ def _turns(
     """Return how images are turned upright, or None where they are taken as they are."""
     if embedder.inputs == "features" or not (embedder.upright if upright is None else upright):
         return None
-    return quarter_turns([capture[name] for name in capture if capture[name].split == "map"], world_up)
+    return upright_turns(capture, world_up)
 
 
 def _session_names(capture: Capture, device: str) -> list[str]:

@@ -37,6 +37,7 @@ from toolkit.localizers.pnp import PnpLocalizer, PnpSettings, PoseEstimate
 from toolkit.localizers.prediction import Predictor, View, create_predictor
 from toolkit.localizers.vggt import VggtAnswer, VggtLocalizer, VggtQuery, VggtSettings
 from toolkit.mapping import LocalMap, MapSettings, build_map
+from toolkit.upright import Turns, upright_turns
 
 log = logging.getLogger(__name__)
 
@@ -71,6 +72,8 @@ def localize_pairs(
     compute_device: str = "auto",
     dtype_compute: str = "auto",
     batch_size: int = 4,
+    upright: bool = True,
+    world_up: Sequence[float] | None = None,
 ) -> pd.DataFrame:
     """Write, for every pair of devices, the poses of the queries (`.txt`) and how they came about (`.csv`).
 
@@ -96,6 +99,8 @@ def localize_pairs(
         compute_device: where the network runs: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
         dtype_compute: of the network: `auto`, `float32`, `bfloat16`, `float16`.
         batch_size: query devices that the network is given at once. Rows do not depend on it.
+        upright: show the network images turned so that gravity points down.
+        world_up: the direction (3,) that is up in the map's world; None: estimated from its cameras.
 
     Returns:
         One row a pair: map_device, query_device, queries, ok, low_confidence, failed, seconds, skipped, path.
@@ -117,7 +122,8 @@ def localize_pairs(
     guide: _Guide | None = None
     if method in PREDICTING:
         network = open_predictor(capture, predictor, map_dir, checkpoint, compute_device, dtype_compute, seed)
-        guide = _Guide(network, VggtSettings(num_references, candidates), batch_size)
+        turns = upright_turns(capture, world_up) if upright else None
+        guide = _Guide(network, VggtSettings(num_references, candidates), batch_size, turns)
     table = []
     with threadpool_limits(1, "blas"):  # queries are the parallel dimension, and sums stay in one order
         for mapped in capture.devices_with("map", map_device):
@@ -185,10 +191,13 @@ class _Guide:
     predictor: Predictor
     settings: VggtSettings
     batch_size: int
+    turns: Turns | None
 
     def record(self) -> dict[str, Any]:
         """Return what poses depend on, besides what those of `pnp` do."""
-        return {"predictor": {"name": self.predictor.name} | self.predictor.settings, "vggt": asdict(self.settings)}
+        predictor = {"name": self.predictor.name} | self.predictor.settings
+        turns = None if self.turns is None else self.turns.record()
+        return {"predictor": predictor, "vggt": asdict(self.settings), "turns": turns}
 
 
 @dataclass(frozen=True)
@@ -199,6 +208,7 @@ class _Solver:
     vggt: VggtLocalizer | None = None
     method: str = "nearest"
     batch_size: int = 1
+    turns: Turns | None = None
 
     @property
     def label(self) -> str:
@@ -300,8 +310,8 @@ def _open_solver(
     pnp = PnpLocalizer(local_map, store, settings)
     if guide is None:
         return _Solver(pnp, method=method)
-    vggt = VggtLocalizer(local_map, session, guide.predictor, guide.settings)
-    return _Solver(pnp if method == "hybrid" else None, vggt, method, guide.batch_size)
+    vggt = VggtLocalizer(local_map, session, guide.predictor, guide.settings, guide.turns)
+    return _Solver(pnp if method == "hybrid" else None, vggt, method, guide.batch_size, guide.turns)
 
 
 def _localize_pair(
@@ -344,7 +354,7 @@ def _localize_pair(
         """Yield the queries, and what a network says of them, which is asked for some at a time."""
         for start in range(0, len(indices), solver.batch_size):
             part = indices[start : start + solver.batch_size]
-            asked = [_read_query(session, members[index], references) for index in part]
+            asked = [_read_query(session, members[index], references, solver.turns) for index in part]
             if solver.vggt is None:
                 yield from ((index, query, None, 0.0) for index, query in zip(part, asked, strict=True))
                 continue
@@ -394,10 +404,14 @@ class _QueryDevice:
     cameras: list[pycolmap.Camera]
     rig_from_cams: NDArray[np.float64]
     references: list[list[dict[str, Any]]]
+    turns: list[int]
 
 
 def _read_query(
-    session: Session, rows: NDArray[np.int64], references: dict[tuple[int, str], list[dict[str, Any]]]
+    session: Session,
+    rows: NDArray[np.int64],
+    references: dict[tuple[int, str], list[dict[str, Any]]],
+    turns: Turns | None = None,
 ) -> _QueryDevice:
     images = session.images.iloc[rows]
     keys = list(zip(images["timestamp"].tolist(), images["sensor_id"].tolist(), strict=True))
@@ -406,6 +420,7 @@ def _read_query(
         cameras=[session.camera(sensor) for _, sensor in keys],
         rig_from_cams=session.rig_from_cam(rows),
         references=[references.get(key, []) for key in keys],
+        turns=[0] * len(rows) if turns is None else turns.of(session, rows).tolist(),
     )
 
 
@@ -423,8 +438,8 @@ def _vggt_query(session: Session, query: _QueryDevice, local_map: LocalMap) -> V
     ]
     return VggtQuery(
         views=[
-            View(name, session.path.parent / name, camera, known=False)
-            for name, camera in zip(query.names, query.cameras, strict=True)
+            View(name, session.path.parent / name, camera, known=False, turns=turns)
+            for name, camera, turns in zip(query.names, query.cameras, query.turns, strict=True)
         ],
         rig_from_cams=query.rig_from_cams,
         references=[np.array([index for index, _ in rows], np.int64) for rows in known],
@@ -529,6 +544,8 @@ def explain_query(
     candidates: int | None = None,
     compute_device: str = "auto",
     dtype_compute: str = "auto",
+    upright: bool = True,
+    world_up: Sequence[float] | None = None,
     seed: int = 0,
 ) -> tuple[VggtLocalizer, VggtQuery, VggtAnswer]:
     """Ask the predictor about one query of a finished run again, and return all that it said.
@@ -546,11 +563,11 @@ def explain_query(
     pair = _Pair(capture, map_device, query_device, Path(retrieval_dir), Path(retrieval_dir), queries)
     local_map = LocalMap.load(Path(map_dir) / f"{map_device}_map.npz")
     network = open_predictor(capture, predictor, map_dir, checkpoint, compute_device, dtype_compute, seed)
-    localizer = VggtLocalizer(
-        local_map, capture[f"{map_device}_map"], network, VggtSettings(num_references, candidates)
-    )
+    turns = upright_turns(capture, world_up) if upright else None
+    settings = VggtSettings(num_references, candidates)
+    localizer = VggtLocalizer(local_map, capture[f"{map_device}_map"], network, settings, turns)
     rows = pair.session.rows_of_keyframes(pair.session.keyframes(queries).iloc[[index]])[0]
-    query = _vggt_query(pair.session, _read_query(pair.session, rows, pair.references()), local_map)
+    query = _vggt_query(pair.session, _read_query(pair.session, rows, pair.references(), turns), local_map)
     return localizer, query, localizer.localize([query])[0]
 
 

@@ -100,12 +100,14 @@ class LocalizeSettings(_Section):
     """Map images that the network is shown with each query image ..."""
     candidates: Positive | None = None
     """... chosen from so many of the best retrieved; without it, from all."""
-    compute_device: str | None = None
+    compute_device: ComputeDevice | None = None
     """auto, cpu, cuda, cuda:<number> or mps."""
     dtype_compute: Literal["auto", "float32", "bfloat16", "float16"] | None = None
     """Precision of the network; auto: what is fast on the device."""
     batch_size: Positive | None = None
     """Query devices that the network is given at once."""
+    upright: bool | None = None
+    """Show the network images turned so that gravity points down."""
 
 
 class EvaluateSettings(_Section):

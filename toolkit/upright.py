@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from toolkit.capture import Rows, Session
+from toolkit.capture import Capture, Rows, Session
 from toolkit.errors import CaptureError, ManifestError, ToolkitError
 from toolkit.geometry import Array
 
@@ -481,6 +481,11 @@ def quarter_turns(maps: Sequence[Session], world_up: WorldUp | ArrayLike | None 
         kind: _decide(_Learnt.collect(keys[kind], k, weights, up_in_cam), share) for kind, share in SHARES.items()
     }
     return Turns(up, tables)
+
+
+def upright_turns(capture: Capture, world_up: ArrayLike | None = None) -> Turns:
+    """Return the turns learnt from all map sessions of a capture; see `quarter_turns`."""
+    return quarter_turns([capture[name] for name in capture if capture[name].split == "map"], world_up)
 
 
 def _votes_of(up_in_cam: Array) -> tuple[Ints, Array]:

@@ -30,6 +30,9 @@ class View:
     camera: pycolmap.Camera
     known: bool
     """Whether it is a map image: others will ask for it again, so that its encoding is worth keeping."""
+    turns: int = 0
+    """Counter-clockwise quarter turns that bring gravity down, see `toolkit.upright`. A network is shown the image
+    turned; what comes back is of the image as it is stored."""
 
 
 @dataclass(frozen=True)
@@ -38,10 +41,10 @@ class Prediction:
 
     model_from_cams: Floats
     """(S, 4, 4)."""
-    depth: NDArray[np.float32] | None = None
-    """(S, h, w) along the optical axis, in units of the model; NaN where unknown."""
-    depth_conf: NDArray[np.float32] | None = None
-    """(S, h, w), larger is surer."""
+    depth: Sequence[NDArray[np.float32]] | NDArray[np.float32] | None = None
+    """S arrays (h, w) along the optical axis, in units of the model; NaN where unknown."""
+    depth_conf: Sequence[NDArray[np.float32]] | NDArray[np.float32] | None = None
+    """S arrays (h, w), larger is surer."""
     map_from_image: Floats | None = None
     """(S, 4) scale_x, scale_y, offset_x, offset_y of each view, from pixels of the photograph to those of the depth
     map; the centre of the top-left pixel is (0.5, 0.5) in both."""

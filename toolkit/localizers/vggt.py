@@ -15,6 +15,7 @@ from toolkit.localizers.pnp import PoseEstimate
 from toolkit.localizers.prediction import Prediction, Predictor, View
 from toolkit.localizers.references import select_references
 from toolkit.mapping import LocalMap, rays_of
+from toolkit.upright import Turns
 
 log = logging.getLogger(__name__)
 
@@ -79,18 +80,25 @@ class VggtLocalizer:
     """Localizes queries in one map by a predictor's cameras."""
 
     def __init__(
-        self, local_map: LocalMap, session: Session, predictor: Predictor, settings: VggtSettings | None = None
+        self,
+        local_map: LocalMap,
+        session: Session,
+        predictor: Predictor,
+        settings: VggtSettings | None = None,
+        turns: Turns | None = None,
     ):
         """
         Args:
             local_map: the map of the session.
             session: where the map's images and depth maps are.
+            turns: what makes images upright; None: they are shown as they are.
         """
         self.map = local_map
         self.predictor = predictor
         self.settings = settings or VggtSettings()
         self._session = session
         self._rows = {session.image_name(row): row for row in range(len(session.images))}
+        self._turns = np.zeros(len(session.images), np.int64) if turns is None else turns.of(session)
 
     def localize(self, queries: Sequence[VggtQuery]) -> list[VggtAnswer]:
         """Return an answer for each query; all go to the predictor in one call.
@@ -117,7 +125,8 @@ class VggtLocalizer:
     def view(self, index: int) -> View:
         """Return a map image as a network is shown it."""
         name = self.map.image_names[index]
-        return View(name, self._session.path.parent / name, self.map.cameras[index], known=True)
+        turns = int(self._turns[self._rows[name]])
+        return View(name, self._session.path.parent / name, self.map.cameras[index], known=True, turns=turns)
 
     def _choose(self, references: Ints, scores: Floats) -> Ints:
         """Return the references of one query image to use."""
