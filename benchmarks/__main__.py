@@ -5,7 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-SCRIPTS = {name: Path(__file__).with_name(f"{name}.py") for name in ("capture", "embed", "localize", "alignment")}
+NAMES = ("capture", "embed", "vggt", "alignment", "localize")
+SCRIPTS = {name: Path(__file__).with_name(f"{name}.py") for name in NAMES}
 
 
 def main() -> int:

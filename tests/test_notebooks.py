@@ -49,7 +49,8 @@ def test_notebooks_are_committed_clean(stage: str) -> None:
     assert content.cells[2].metadata.tags == ["setup"]
     assert "notebook.finish(" in content.cells[-1].source
     for cell in code:
-        assert len(cell.source.splitlines()) <= 18, f"{path.name}: a cell is long; functions live in toolkit/"
+        listing = cell.metadata.get("tags") == ["parameters"]  # a line each
+        assert listing or len(cell.source.splitlines()) <= 18, f"{path.name}: a cell is long; put it in toolkit/"
         assert "sys.path" not in cell.source
     assert [cell.id for cell in content.cells] == [
         f"{path.name[:2]}-{i:02d}" for i in range(len(content.cells))

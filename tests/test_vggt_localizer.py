@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pandas as pd
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from toolkit import geometry
 from toolkit import localize as localize_stage
 from toolkit.capture import Capture, Session, Trajectory
-from toolkit.errors import CaptureError, ManifestError, WeightsError
+from toolkit.errors import CaptureError, ImageError, ManifestError, WeightsError
 from toolkit.features import extract_session
 from toolkit.files import SceneFiles
 from toolkit.localize import COLUMNS, PREDICTION_COLUMNS, localize_pairs
@@ -657,3 +658,24 @@ def test_a_prediction_is_drawn_and_labelled(world: World, tmp_path: Path) -> Non
     assert figure.get_suptitle().startswith("SIMULATED, no result")
     failed = VggtAnswer(PoseEstimate("failed: no references"), ())
     assert "failed: no references" in draw_prediction(localizer, queries[0], failed).get_suptitle()
+
+
+class Refuses:
+    """A predictor that cannot predict."""
+
+    name, simulated = "vggt", False
+    settings: ClassVar[dict[str, str]] = {}
+
+    def __init__(self, error: Exception) -> None:
+        self.error = error
+
+    def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
+        raise self.error
+
+
+def test_wrong_weights_end_the_run_and_a_bad_image_does_not(world: World) -> None:
+    queries, _ = world.queries("ios")
+    with pytest.raises(WeightsError, match="of another network"):
+        world.localizer(Refuses(WeightsError("of another network"))).localize(queries)
+    answers = world.localizer(Refuses(ImageError("torn.jpg"))).localize(queries)
+    assert {answer.estimate.status for answer in answers} == {"failed: ImageError: torn.jpg"}

@@ -1,45 +1,462 @@
 """VGGT as a predictor: the adapter between `toolkit.models.vggt` and the localizers."""
 
-from collections.abc import Sequence
+import logging
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from toolkit.compute import PRECISIONS, check_device_name
-from toolkit.errors import ManifestError
+import numpy as np
+from numpy.typing import NDArray
+
+from toolkit.compute import PRECISIONS, Fitting, check_device_name, resolve_device, resolve_precision
+from toolkit.errors import ImageError, ManifestError, ToolkitError
 from toolkit.files import files_fingerprint
+from toolkit.geometry import invert, make_pose
+from toolkit.images import default_workers, prefetch, read_image
 from toolkit.localizers.prediction import Prediction, View
-from toolkit.models.weights import VGGT, resolve_any
+from toolkit.models.weights import VGGT as WEIGHTS
+from toolkit.models.weights import resolve_any
+from toolkit.upright import turn_image, turn_points, turned_from_cam
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+log = logging.getLogger(__name__)
+
+CACHE_BYTES = 2 << 30
+"""Of encodings of map images that are kept: 500 of them at 518 x 392 in float32, twice as many in bfloat16."""
+_SIDE = 518
+_PATCH = 14
+# A CPU is kept busy by one group; more of them at once take memory and no less time.
+_GROUPS_AT_A_TIME = {"cpu": 1}
+_GROUPS_AT_A_TIME_ELSEWHERE = 8
+_IMAGES_AT_A_TIME = 8
+# Part of the free memory to plan with: the rest is for what else runs, and for what the estimate leaves out.
+_MEMORY_SHARE = 0.8
+_LEAST_VIEWS = 2
+
+# Bytes that VGGT holds at most, measured in float32: for each number of the tokens (views x tokens x channels) during
+# a block and, with depth, kept of four layers; for each pixel of a frame in the depth head, and apart from pixels.
+_TRUNK_BYTES = 42
+_KEPT_BYTES = 32
+_DENSE_BYTES_PER_PIXEL = 1500
+_DENSE_BYTES = 32 << 20
+_DENSE_FRAMES = 8
+_RESULT_BYTES_PER_PIXEL = 24
+
+
+def estimate_bytes(
+    groups: int, views: int, size: tuple[int, int], channels: int = 1024, depth: bool = True, on_cpu: bool = True
+) -> int:
+    """Return the memory that VGGT needs, beside its weights, for so many groups of views at once.
+
+    Args:
+        groups, views: how many groups, of how many views each.
+        size: (H, W) of the network's images.
+        channels: of a token.
+        depth: whether the depth head runs.
+        on_cpu: where the depth head takes one frame at a time, elsewhere 8.
+    """
+    height, width = size
+    frames = groups * views
+    numbers = frames * (5 + (height // _PATCH) * (width // _PATCH)) * channels
+    trunk = _TRUNK_BYTES * numbers
+    if not depth:
+        return trunk
+    dense = _DENSE_BYTES_PER_PIXEL * height * width * (1 if on_cpu else min(frames, _DENSE_FRAMES)) + _DENSE_BYTES
+    return _KEPT_BYTES * numbers + max(trunk, dense) + _RESULT_BYTES_PER_PIXEL * frames * height * width
+
+
+def free_bytes(device: "torch.device") -> int:
+    """Return the memory of a device that nobody uses; of Apple's, that of the machine."""
+    import psutil
+    import torch
+
+    if device.type == "cuda":
+        # What torch has reserved and not handed out is as good as free.
+        reserved = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+        return int(torch.cuda.mem_get_info(device)[0]) + reserved
+    return int(psutil.virtual_memory().available)
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """A view, and how it lies in the network's image."""
+
+    view: View
+    mode: str
+    """Of `load_images`."""
+    size: tuple[int, int]
+    """(H, W) of the network's images of its group."""
+
+    @property
+    def key(self) -> tuple[Path, tuple[int, int], int]:
+        """Of its encoding: in images of one size a photograph lies in one way."""
+        return self.view.path, self.size, self.view.turns
+
+    @property
+    def map_from_image(self) -> NDArray[np.float64]:
+        """(4,), see `Prediction`: from the photograph as it is stored to the network's image turned back to it."""
+        camera, (height, width) = self.view.camera, self.size
+        corners = np.array([[0, 0], [camera.width, camera.height]], np.float64)
+        turned = turn_points(corners, camera.width, camera.height, self.view.turns)
+        shown = turned * self._resized / _shown_size(self.view) + self.offset
+        first, last = turn_points(shown, width, height, -self.view.turns)
+        scale = (last - first) / corners[1]
+        return np.concatenate([scale, first])
+
+    def turned_back(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return numbers (H, W) of the network's image in the orientation of the photograph as it is stored."""
+        return turn_image(values, -self.view.turns)
+
+    @property
+    def offset(self) -> NDArray[np.float64]:
+        """(2,): of x and of y, pixels of the network's image."""
+        return np.asarray((np.array(self.size[::-1]) - self._resized) // 2)
+
+    @property
+    def _resized(self) -> NDArray[np.float64]:
+        return np.array(_resized(*_shown_size(self.view)), np.float64)
+
+    @property
+    def outside(self) -> NDArray[np.bool_]:
+        """(H, W): pixels of the network's image that the photograph does not cover."""
+        (left, top), (width, height) = self.offset.astype(int), self._resized.astype(int)
+        outside = np.ones(self.size, bool)
+        outside[top : top + height, left : left + width] = False
+        return outside
+
+
+def _shown_size(view: View) -> tuple[int, int]:
+    """Return the width and height of a photograph after its turns."""
+    size = (view.camera.width, view.camera.height)
+    return size[::-1] if view.turns % 2 else size
+
+
+def _resized(width: int, height: int) -> tuple[int, int]:
+    """Return the width and height to which the loader resizes a photograph that it does not cut."""
+    if width >= height:
+        return _SIDE, round(height * (_SIDE / width) / _PATCH) * _PATCH
+    return round(width * (_SIDE / height) / _PATCH) * _PATCH, _SIDE
+
+
+def _place(group: Sequence[View]) -> list[_Placed]:
+    """Return how the views of a group lie in images of one size, of which nothing is cut.
+
+    "crop" would cut a portrait photograph of a phone to its middle 75 % (3:4) or 56 % (9:16); "pad" keeps all of it,
+    in an image of the same 518 x 518. Of a landscape photograph "crop" cuts nothing, and without white bars it has a
+    quarter to two fifths fewer tokens.
+    """
+    sizes = [_shown_size(view) for view in group]
+    portrait = any(height > width for width, height in sizes)
+    heights = [_resized(*size)[1] for size in sizes]
+    height = _SIDE if portrait else max(heights, default=0)
+    return [_Placed(view, "pad" if portrait else "crop", (height, _SIDE)) for view in group]
+
+
+class TokenCache:
+    """Encodings of map images, those that were not asked for the longest forgotten first. Not thread-safe."""
+
+    def __init__(self, max_bytes: int) -> None:
+        self.max_bytes = max_bytes
+        self.bytes = 0
+        self._kept: OrderedDict[Any, Tensor] = OrderedDict()
+
+    def __contains__(self, key: Any) -> bool:
+        return key in self._kept
+
+    def get(self, key: Any) -> "Tensor | None":
+        """Return what is kept under a key, or None."""
+        if key in self._kept:
+            self._kept.move_to_end(key)
+        return self._kept.get(key)
+
+    def put(self, key: Any, tokens: "Tensor") -> None:
+        """Keep an encoding, and forget others until there is room; one larger than all the room is not kept."""
+        if key in self._kept or tokens.nbytes > self.max_bytes:
+            return
+        self._kept[key] = tokens
+        self.bytes += tokens.nbytes
+        while self.bytes > self.max_bytes:
+            self.bytes -= self._kept.popitem(last=False)[1].nbytes
 
 
 class NetworkPredictor:
-    """Runs VGGT. The weights are looked for at once, and loaded when the first prediction is asked for."""
+    """Runs VGGT. The weights are looked for at once, and loaded when the first prediction is asked for.
+
+    Photographs go in whole, see `_place`. The encoding of map images, a fifth of the work, is kept.
+    """
 
     name = "vggt"
     simulated = False
 
     def __init__(
-        self, checkpoint: str | Path | None = None, compute_device: str = "auto", dtype_compute: str = "auto"
+        self,
+        checkpoint: str | Path | None = None,
+        compute_device: str = "auto",
+        dtype_compute: str = "auto",
+        *,
+        needs_depth: bool = True,
+        batch_size: int | None = None,
+        cache_bytes: int = CACHE_BYTES,
     ) -> None:
         """
         Args:
             checkpoint: file with the weights; None: the hub's cache, else a download.
-            compute_device, dtype_compute: as `toolkit.compute` takes them.
+            compute_device, dtype_compute: as `toolkit.compute` takes them, without float16: the trunk's numbers may
+                be larger than it can hold. `auto` is float32 where it would be that. The heads are always float32.
+            needs_depth: whether to predict depth too, for a fifth more time.
+            batch_size: groups at a time, at most; None: what is usual for the device.
+            cache_bytes: memory for the encodings of map images.
 
         Raises:
             ManifestError: no such device or precision.
             WeightsError: no weights.
         """
         check_device_name(compute_device)
-        if dtype_compute not in PRECISIONS:
-            raise ManifestError(f"dtype_compute is {dtype_compute!r}; expected one of {', '.join(PRECISIONS)}.")
-        self.checkpoint = resolve_any(VGGT, checkpoint)
+        expected = [name for name in PRECISIONS if name != "float16"]
+        if dtype_compute not in expected:
+            raise ManifestError(f"dtype_compute is {dtype_compute!r}; VGGT expects one of {', '.join(expected)}.")
+        self.checkpoint = resolve_any(WEIGHTS, checkpoint)
         self.compute_device, self.dtype_compute = compute_device, dtype_compute
+        self.needs_depth = needs_depth
+        self._batch_size = batch_size
+        self._cache = TokenCache(cache_bytes)
+        self._fitting: dict[tuple[int, tuple[int, int]], Fitting] = {}
+        self._most_views: dict[tuple[int, int], int] = {}
 
-    @property
+    @cached_property
     def settings(self) -> dict[str, Any]:
         """What the predictions depend on besides the views. A device changes rounding only, a type more."""
-        return {"weights": files_fingerprint([self.checkpoint]), "dtype_compute": self.dtype_compute}
+        weights = files_fingerprint([self.checkpoint])
+        precision = str(self._dtype).removeprefix("torch.")
+        return {"name": self.name, "weights": weights, "dtype_compute": precision, "depth": self.needs_depth}
+
+    @cached_property
+    def _device(self) -> "torch.device":
+        return resolve_device(self.compute_device)
+
+    @cached_property
+    def _dtype(self) -> "torch.dtype":
+        import torch
+
+        dtype = resolve_precision(self.dtype_compute, self._device)
+        return torch.float32 if dtype == torch.float16 else dtype
+
+    @cached_property
+    def _heads(self) -> tuple[str, ...]:
+        return ("camera", "depth") if self.needs_depth else ("camera",)
+
+    @cached_property
+    def _model(self) -> Any:
+        from toolkit.models.vggt import VGGT
+
+        model = VGGT.from_checkpoint(self.checkpoint, heads=self._heads, compute_dtype=self._dtype)
+        return model.to(self._device)
 
     def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
-        """Return a prediction for each group of views."""
-        raise NotImplementedError("the network is not part of this version; set `localize.method: pnp`")
+        """Return a prediction for each group of views, in order: the query first, then its references.
+
+        Each has as many views as its group. Those that the network was not shown have NaN in `model_from_cams` and
+        `depth`, and 0 in `depth_conf`; why is logged:
+
+        - A view whose file is missing, cannot be decoded or is not of its camera's size. Where it is the query, its
+          whole group is NaN, without depth.
+        - The last references of a group that does not fit the memory.
+
+        Nothing else is raised for a group, and what one group holds does not change the others. Groups of equally many
+        views and equal image size run together, as many as fit the memory.
+
+        Raises:
+            WeightsError: at the first call, the file is not of VGGT.
+            ToolkitError: there is no such device; or the memory does not hold a query and one reference.
+        """
+        placed = [_place(group) for group in groups]
+        results = [_nothing(len(group)) for group in groups]
+        alike: dict[tuple[int, tuple[int, int]], list[int]] = {}
+        for number, group in enumerate(placed):
+            if group:
+                alike.setdefault((len(group), group[0].size), []).append(number)
+        for (views, size), numbers in alike.items():
+            batch, views = self._plan(len(numbers), views, size)
+            batches = [numbers[start : start + batch] for start in range(0, len(numbers), batch)]
+            shown = {number: placed[number][:views] for number in numbers}
+            for part, found in zip(batches, self._encoded([[shown[n] for n in b] for b in batches]), strict=True):
+                for number, prediction in self._run(part, [placed[n] for n in part], found).items():
+                    results[number] = prediction
+        return results
+
+    def _plan(self, count: int, views: int, size: tuple[int, int]) -> tuple[int, int]:
+        """Return how many groups to run at a time, and how many views of each, by the memory that is free."""
+        channels = self._model.aggregator.camera_token.shape[-1]
+        on_cpu = self._device.type == "cpu"
+        estimate = partial(estimate_bytes, size=size, channels=channels, depth=self.needs_depth, on_cpu=on_cpu)
+        free = int(_MEMORY_SHARE * free_bytes(self._device))
+        batch = self._batch_size or _GROUPS_AT_A_TIME.get(self._device.type, _GROUPS_AT_A_TIME_ELSEWHERE)
+        batch = min(batch, count)
+        while batch > 1 and estimate(batch, views) > free:
+            batch -= 1
+        fitting = views
+        while fitting > _LEAST_VIEWS and estimate(batch, fitting) > free:
+            fitting -= 1
+        if fitting < views:
+            log.warning("%d views of %d x %d need %.1f GB of memory, %s has %.1f GB to spare: the first %d go on",
+                        views, *size[::-1], estimate(1, views) / 1e9, self._device, free / 1e9, fitting)  # fmt: skip
+        return batch, fitting
+
+    def _encoded(self, batches: Sequence[Sequence[Sequence[_Placed]]]) -> "Iterator[list[list[Tensor | None]]]":
+        """Yield the tokens (P, C) of each view of each group of each batch; None for one that cannot be read.
+
+        Photographs are decoded in other threads meanwhile, those whose encoding is kept not at all.
+        """
+        decoded = prefetch(_read, self._to_read(batches), workers=default_workers(), ahead=_IMAGES_AT_A_TIME)
+        for batch in batches:
+            found: dict[Any, Tensor] = {}
+            waiting: dict[Any, tuple[_Placed, Tensor]] = {}
+            for placed in (placed for group in batch for placed in group):
+                image = next(decoded)
+                kept = self._cache.get(placed.key)
+                if kept is not None:
+                    found[placed.key] = kept
+                if kept is not None or placed.key in waiting:
+                    continue
+                # Known when its turn to be read came, and forgotten since.
+                image = _read(placed) if image is None else image
+                if isinstance(image, ImageError):
+                    log.warning("%s: left out. %s", placed.view.name, image)
+                elif image is not None:
+                    waiting[placed.key] = (placed, image)
+            found.update(self._encode(list(waiting.values())))
+            yield [[found.get(placed.key) for placed in group] for group in batch]
+
+    def _to_read(self, batches: Sequence[Sequence[Sequence[_Placed]]]) -> Iterator[_Placed | None]:
+        """Yield each view, or None for a map image whose encoding is kept, or will be by then."""
+        asked = set()
+        for placed in (placed for batch in batches for group in batch for placed in group):
+            yield None if placed.key in self._cache or placed.key in asked else placed
+            if placed.view.known:
+                asked.add(placed.key)
+
+    def _encode(self, images: "Sequence[tuple[_Placed, Tensor]]") -> "dict[Any, Tensor]":
+        """Return tokens (P, C), on the CPU, of images (3, H, W) of one size, by key; keep those of map images."""
+        import torch
+
+        # Measured: float16 changes depth by 1.2e-4 of its size, a trunk in bfloat16 by 4e-3 whatever is kept.
+        dtype = torch.float32 if self._dtype == torch.float32 else torch.float16
+        fitting = Fitting(self._model.encode, "images")
+        found = {}
+        for start in range(0, len(images), _IMAGES_AT_A_TIME):
+            part = images[start : start + _IMAGES_AT_A_TIME]
+            batch = torch.stack([image for _, image in part]).to(self._device)
+            for (placed, _), tokens in zip(part, fitting(batch).to("cpu", dtype), strict=True):
+                # A copy: a part of the batch would hold all of it in memory.
+                found[placed.key] = tokens.clone()
+                if placed.view.known:
+                    self._cache.put(placed.key, found[placed.key])
+        return found
+
+    def _run(
+        self, numbers: Sequence[int], groups: Sequence[list[_Placed]], tokens: "Sequence[list[Tensor | None]]"
+    ) -> dict[int, Prediction]:
+        """Return the predictions of a batch by number of the group; none for a group without its query."""
+        import torch
+
+        alike: dict[int, list[tuple[int, list[_Placed], list[int], Tensor]]] = {}
+        for number, group, found in zip(numbers, groups, tokens, strict=True):
+            seen = [index for index, one in enumerate(found) if one is not None]
+            if seen[:1] == [0]:
+                stacked = torch.stack([one for one in found if one is not None])
+                alike.setdefault(len(seen), []).append((number, group, seen, stacked))
+        results = {}
+        for rows in alike.values():
+            output = self._forward(torch.stack([stacked for *_, stacked in rows]), rows[0][1][0].size).numpy()
+            for (number, group, seen, _), values in zip(rows, output, strict=True):
+                results[number] = self._prediction(group, seen[: len(values)], values)
+        return results
+
+    def _forward(self, tokens: "Tensor", size: tuple[int, int]) -> "Tensor":
+        """Return (B, S, 9 + numbers of the depth head), on the CPU, of tokens (B, S, P, C); fewer views if need be."""
+        import torch
+
+        while True:
+            views = min(tokens.shape[1], self._most_views.get(size, tokens.shape[1]))
+            run = self._fitting.setdefault((views, size), Fitting(self._network(size), f"groups of {views} views"))
+            try:
+                with torch.inference_mode():
+                    return run(tokens[:, :views].to(self._device))
+            except ToolkitError as error:
+                if views <= _LEAST_VIEWS:
+                    raise ToolkitError(
+                        f"The memory of {self._device} does not hold VGGT with {views} views of {size[1]} x {size[0]} "
+                        "pixels. Use dtype_compute: bfloat16, or compute_device: cpu."
+                    ) from error
+            self._most_views[size] = max(_LEAST_VIEWS, views // 2)
+            log.warning("going on with the first %d views of each group", self._most_views[size])
+
+    def _network(self, size: tuple[int, int]) -> "Callable[[Tensor], Tensor]":
+        """Return the network as a function of tokens (B, S, P, C), for images (H, W)."""
+        import torch
+
+        def run(tokens: "Tensor") -> "Tensor":
+            images = torch.empty(*tokens.shape[:2], 3, *size, device="meta")
+            output = self._model(images, self._heads, tokens.float())
+            flat = [output["pose_enc"]]
+            if self.needs_depth:
+                flat += [output["depth"].flatten(2), output["depth_conf"].flatten(2)]
+            return torch.cat(flat, dim=-1).cpu()
+
+        return run
+
+    def _prediction(self, group: list[_Placed], seen: Sequence[int], numbers: NDArray[np.float32]) -> Prediction:
+        """Return the prediction of a group, of numbers (seen views, 9 + numbers of the depth head)."""
+        from toolkit.models.vggt import cameras_from_pose_encoding
+
+        poses = np.full((len(group), 4, 4), np.nan)
+        size = group[0].size
+        for index, encoding in zip(seen, numbers[:, :9].astype(np.float64), strict=True):
+            if np.isfinite(encoding).all() and encoding[3:7].any():
+                cam_from_model, _ = cameras_from_pose_encoding(encoding, size)
+                model_from_turned = invert(make_pose(cam_from_model[:, :3], cam_from_model[:, 3]))
+                poses[index] = model_from_turned @ turned_from_cam(group[index].view.turns)
+        map_from_image = np.stack([placed.map_from_image for placed in group])
+        if not self.needs_depth:
+            return Prediction(poses, map_from_image=map_from_image)
+        depth = [placed.turned_back(np.full(size, np.nan, np.float32)) for placed in group]
+        confidence = [placed.turned_back(np.zeros(size, np.float32)) for placed in group]
+        maps = numbers[:, 9:].reshape(len(seen), 2, *size)
+        for index, (of_depth, of_confidence) in zip(seen, maps, strict=True):
+            placed, outside = group[index], group[index].outside
+            depth[index] = placed.turned_back(np.where(outside, np.float32(np.nan), of_depth))
+            confidence[index] = placed.turned_back(np.where(outside, np.float32(np.nan), of_confidence))
+        return Prediction(poses, depth, confidence, map_from_image)
+
+
+def _nothing(views: int) -> Prediction:
+    return Prediction(np.full((views, 4, 4), np.nan))
+
+
+def _read(placed: _Placed | None) -> "Tensor | ImageError | None":
+    """Return the image (3, H, W) for the network, or why it cannot be had; nothing of nothing."""
+    if placed is None:
+        return None
+    import torch.nn.functional as F
+
+    from toolkit.models.vggt import load_images
+
+    try:
+        path, turns = placed.view.path, placed.view.turns
+        loaded = load_images([turn_image(read_image(path), turns) if turns else path], placed.mode)
+    except ImageError as error:
+        return error
+    found, expected = tuple(loaded.sizes[0].tolist()), _shown_size(placed.view)
+    if found != expected:
+        return ImageError(
+            f"Image of {found[0]} x {found[1]} pixels, upright: {placed.view.path}; its camera has {expected[0]} x "
+            f"{expected[1]}. Correct the size in `sensors.txt`, or the image."
+        )
+    missing = placed.size[0] - loaded.images.shape[2]
+    return F.pad(loaded.images[0], (0, 0, missing // 2, missing - missing // 2), value=1.0)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from toolkit import geometry
 from toolkit.alignment import Alignment, align_to_map, is_trustworthy, query_pose, robust_mean_pose
 from toolkit.capture import Session, read_depth
-from toolkit.errors import CaptureError
+from toolkit.errors import CaptureError, ImageError, ToolkitError
 from toolkit.localizers.pnp import PoseEstimate
 from toolkit.localizers.prediction import Prediction, Predictor, View
 from toolkit.localizers.references import select_references
@@ -104,6 +104,9 @@ class VggtLocalizer:
         """Return an answer for each query; all go to the predictor in one call.
 
         Nothing that goes wrong with one query is raised or touches another: its answer says `failed: <reason>`.
+
+        Raises:
+            ToolkitError: what no other query would do better with: no such device, other weights, too little memory.
         """
         chosen = [[self._choose(*found) for found in zip(q.references, q.scores, strict=True)] for q in queries]
         groups = {
@@ -152,6 +155,8 @@ class VggtLocalizer:
         try:
             return [*self.predictor.predict(groups)] if groups else []
         except Exception as error:  # one bad query never ends a run
+            if isinstance(error, ToolkitError) and not isinstance(error, ImageError):
+                raise
             if len(groups) > 1:
                 return [found for group in groups for found in self._predict([group])]
             log.exception("predicting %s", groups[0][0].name)
