@@ -353,7 +353,9 @@ def test_a_query_that_cannot_be_read_fails_alone(
         assert found[number].model_from_cams.shape == (3, 4, 4)
         assert np.isnan(found[number].model_from_cams).all()
         assert found[number].depth is None
-    assert f"Image not found: {groups[1][0].path}" in caplog.text
+    assert found[1].reason == f"Image not found: {groups[1][0].path}"
+    assert found[0].reason == ""
+    assert found[1].reason in caplog.text
     assert "Image of 370 x 160 pixels" in caplog.text
     assert "its camera has 370 x 80" in caplog.text
 

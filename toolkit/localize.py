@@ -210,11 +210,11 @@ class _Solver:
     batch_size: int = 1
     turns: Turns | None = None
 
-    @property
-    def label(self) -> str:
-        """What the column `method` begins with."""
-        simulated = self.vggt is not None and self.vggt.predictor.simulated
-        return f"{self.method}:simulated/" if simulated else ""
+    def label(self, found_by: str) -> str:
+        """Return what the column `method` says of a pose that was found by some method, or of none."""
+        if self.vggt is not None and self.vggt.predictor.simulated:
+            return f"{self.method}:simulated" + (f"/{found_by}" if found_by else "")
+        return found_by or self.method
 
 
 @dataclass(frozen=True)
@@ -343,8 +343,8 @@ def _localize_pair(
             estimate, names = predicted, _names(solver.vggt.map, predicted.references)
         elif query.names:
             estimate, names = _nearest(query)
-        found_by = solver.method if estimate.world_from_rig is None else estimate.found_by
-        row = _row(keys[index], estimate, names, f"{solver.label}{found_by}", started)
+        found_by = "" if estimate.world_from_rig is None else estimate.found_by
+        row = _row(keys[index], estimate, names, solver.label(found_by), started)
         if solver.vggt is not None:
             row["scale_std"], row["reason"] = round(estimate.scale_std, 6), estimate.reason
             row["rejected"] = ";".join(_names(solver.vggt.map, estimate.rejected))

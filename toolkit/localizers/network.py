@@ -265,7 +265,7 @@ class NetworkPredictor:
         `depth`, and 0 in `depth_conf`; why is logged:
 
         - A view whose file is missing, cannot be decoded or is not of its camera's size. Where it is the query, its
-          whole group is NaN, without depth.
+          whole group is NaN, without depth, with the reason.
         - The last references of a group that does not fit the memory.
 
         Nothing else is raised for a group, and what one group holds does not change the others. Groups of equally many
@@ -308,14 +308,14 @@ class NetworkPredictor:
                         views, *size[::-1], estimate(1, views) / 1e9, self._device, free / 1e9, fitting)  # fmt: skip
         return batch, fitting
 
-    def _encoded(self, batches: Sequence[Sequence[Sequence[_Placed]]]) -> "Iterator[list[list[Tensor | None]]]":
-        """Yield the tokens (P, C) of each view of each group of each batch; None for one that cannot be read.
+    def _encoded(self, batches: Sequence[Sequence[Sequence[_Placed]]]) -> "Iterator[list[list[Tensor | str]]]":
+        """Yield the tokens (P, C) of each view of each group of each batch, or why it cannot be read.
 
         Photographs are decoded in other threads meanwhile, those whose encoding is kept not at all.
         """
         decoded = prefetch(_read, self._to_read(batches), workers=default_workers(), ahead=_IMAGES_AT_A_TIME)
         for batch in batches:
-            found: dict[Any, Tensor] = {}
+            found: dict[Any, Tensor | str] = {}
             waiting: dict[Any, tuple[_Placed, Tensor]] = {}
             for placed in (placed for group in batch for placed in group):
                 image = next(decoded)
@@ -328,10 +328,11 @@ class NetworkPredictor:
                 image = _read(placed) if image is None else image
                 if isinstance(image, ImageError):
                     log.warning("%s: left out. %s", placed.view.name, image)
+                    found[placed.key] = str(image)
                 elif image is not None:
                     waiting[placed.key] = (placed, image)
             found.update(self._encode(list(waiting.values())))
-            yield [[found.get(placed.key) for placed in group] for group in batch]
+            yield [[found[placed.key] for placed in group] for group in batch]
 
     def _to_read(self, batches: Sequence[Sequence[Sequence[_Placed]]]) -> Iterator[_Placed | None]:
         """Yield each view, or None for a map image whose encoding is kept, or will be by then."""
@@ -360,18 +361,20 @@ class NetworkPredictor:
         return found
 
     def _run(
-        self, numbers: Sequence[int], groups: Sequence[list[_Placed]], tokens: "Sequence[list[Tensor | None]]"
+        self, numbers: Sequence[int], groups: Sequence[list[_Placed]], tokens: "Sequence[list[Tensor | str]]"
     ) -> dict[int, Prediction]:
-        """Return the predictions of a batch by number of the group; none for a group without its query."""
+        """Return the predictions of a batch by number of the group."""
         import torch
 
         alike: dict[int, list[tuple[int, list[_Placed], list[int], Tensor]]] = {}
-        for number, group, found in zip(numbers, groups, tokens, strict=True):
-            seen = [index for index, one in enumerate(found) if one is not None]
-            if seen[:1] == [0]:
-                stacked = torch.stack([one for one in found if one is not None])
-                alike.setdefault(len(seen), []).append((number, group, seen, stacked))
         results = {}
+        for number, group, found in zip(numbers, groups, tokens, strict=True):
+            seen = [index for index, one in enumerate(found) if not isinstance(one, str)]
+            if isinstance(found[0], str):
+                results[number] = _nothing(len(group), found[0])
+            else:
+                stacked = torch.stack([one for one in found if not isinstance(one, str)])
+                alike.setdefault(len(seen), []).append((number, group, seen, stacked))
         for rows in alike.values():
             output = self._forward(torch.stack([stacked for *_, stacked in rows]), rows[0][1][0].size).numpy()
             for (number, group, seen, _), values in zip(rows, output, strict=True):
@@ -435,8 +438,8 @@ class NetworkPredictor:
         return Prediction(poses, depth, confidence, map_from_image)
 
 
-def _nothing(views: int) -> Prediction:
-    return Prediction(np.full((views, 4, 4), np.nan))
+def _nothing(views: int, reason: str = "") -> Prediction:
+    return Prediction(np.full((views, 4, 4), np.nan), reason=reason)
 
 
 def _read(placed: _Placed | None) -> "Tensor | ImageError | None":
@@ -454,9 +457,10 @@ def _read(placed: _Placed | None) -> "Tensor | ImageError | None":
         return error
     found, expected = tuple(loaded.sizes[0].tolist()), _shown_size(placed.view)
     if found != expected:
+        turned = " when upright" if turns else ""
         return ImageError(
-            f"Image of {found[0]} x {found[1]} pixels, upright: {placed.view.path}; its camera has {expected[0]} x "
-            f"{expected[1]}. Correct the size in `sensors.txt`, or the image."
+            f"Image of {found[0]} x {found[1]} pixels{turned}: {placed.view.path}; its camera has "
+            f"{expected[0]} x {expected[1]}. Correct the size in `sensors.txt`, or the image."
         )
     missing = placed.size[0] - loaded.images.shape[2]
     return F.pad(loaded.images[0], (0, 0, missing // 2, missing - missing // 2), value=1.0)

@@ -49,6 +49,8 @@ class Prediction:
     """(S, 4) scale_x, scale_y, offset_x, offset_y of each view, from pixels of the photograph to those of the depth
     map; the centre of the top-left pixel is (0.5, 0.5) in both."""
     simulated: bool = False
+    reason: str = ""
+    """Why there are no cameras, where that is known."""
 
     def depth_at(self, view: int, xy: ArrayLike) -> Floats:
         """Return the depth (N,), in units of the model, at pixels (N, 2) of the photograph.

@@ -174,7 +174,8 @@ class VggtLocalizer:
     def _align(self, references: Ints, prediction: Prediction) -> CameraAnswer:
         model = np.asarray(prediction.model_from_cams, np.float64)
         if not np.isfinite(model[0]).all():
-            return CameraAnswer(references, prediction, reason="the predicted camera is not finite")
+            reason = prediction.reason or "the predicted camera is not finite"
+            return CameraAnswer(references, prediction, reason=reason)
         ratios = [self._depth_ratios(int(index), prediction, view) for view, index in enumerate(references, start=1)]
         world = self.map.world_from_cams[references]
         alignment = align_to_map(model[1:], world, depth_ratios=ratios if any(len(r) for r in ratios) else None)
