@@ -19,13 +19,12 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from common import add_out, check_out, in_own_process, limit_cores, markdown_table, write_out
 from megaloc_worker import clocks, load_official, peak_allocated_mb, peak_mb, read
 from numpy.typing import NDArray
 
@@ -78,12 +77,6 @@ class Measurement:
     def decode_share(self) -> float:
         """Part of the CPU seconds that decoding takes."""
         return self.decode / self.cpu
-
-
-def in_own_process(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Return what a function returns in a fresh process, so that memory and warm caches are its own."""
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        return pool.submit(function, *arguments).result()
 
 
 def describe_machine(threads: int, device: str) -> dict[str, Any]:
@@ -409,7 +402,7 @@ def markdown(document: dict[str, Any], ours: list[Measurement], official: Measur
         f"{document['batch_size']}, {document['weights']}, on {machine['device']}, {document['threads']} threads, "
         f"torch {machine['torch']}:",
         "",
-        _table(header, rows),
+        markdown_table(header, rows),
         "",
         f"- `dtype_compute: auto` is {machine['auto']} here; the CPU ({machine['cpu']}) {native}.",
     ]
@@ -455,28 +448,12 @@ def markdown(document: dict[str, Any], ours: list[Measurement], official: Measur
             f"takes {1000 * document['gpu'][0]['decode']:.1f} ms an image in one thread; its share is of a plain "
             "loop of one decoder and the network.",
             "",
-            _table(header, rows),
+            markdown_table(header, rows),
         ]
     else:
         reason = f"this was run on {machine['device']}" if machine["gpu"] else "torch sees none here"
         text.append(f"- No GPU was measured: {reason}.")
     return "\n".join(text) + "\n"
-
-
-def _table(header: list[str], rows: list[list[str]]) -> str:
-    widths = [max(len(row[column]) for row in [header, *rows]) for column in range(len(header))]
-    lines = [header, ["-" * width for width in widths], *rows]
-    return "\n".join("| " + " | ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) + " |" for row in lines)
-
-
-def limit_cores(threads: int) -> None:
-    """Keep this process and its children to so many cores, and say so to their libraries."""
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:threads])
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[name] = str(threads)
-    os.environ["TQDM_DISABLE"] = "1"
-    os.environ["KINETO_LOG_LEVEL"] = "99"  # torch's profiler announces itself
 
 
 def main() -> None:
@@ -494,11 +471,9 @@ def main() -> None:
     parser.add_argument("--device", default="auto", help="compute_device (default: %(default)s)")
     parser.add_argument("--memory", action="store_true", help="also peak memory of embedding 200 and 2,000 images")
     parser.add_argument("--repeat", type=int, default=1, help="runs in turn; the fastest of each counts")
-    parser.add_argument("--out", type=Path, action="append", default=[], help="write FILE.md or FILE.json; repeatable")
+    add_out(parser)
     options = parser.parse_args()
-    for path in options.out:
-        if path.suffix not in (".md", ".json"):
-            parser.error(f"--out {path}: expected a name that ends in .md or .json.")
+    check_out(parser, options.out)
     if min(options.images, options.threads, options.batch_size, options.repeat) < 1:
         parser.error("--images, --threads, --batch-size and --repeat are at least 1.")
     if options.image_size < MEMORY_IMAGE_SIZE or options.image_size % 14:
@@ -516,9 +491,7 @@ def main() -> None:
     except ToolkitError as error:
         sys.exit(str(error))
     print(text)
-    for path in options.out:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text if path.suffix == ".md" else json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    write_out(options.out, text, document)
 
 
 def benchmark(options: argparse.Namespace, checkout: str) -> tuple[str, dict[str, Any]]:

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from common import add_out, check_out, limit_cores, markdown_table, write_out
 from numpy.typing import NDArray
 
 HLOC_WORKER = Path(__file__).with_name("hloc_worker.py")
@@ -288,7 +289,7 @@ def markdown(capture: str, threads: int, ours: Measurement, theirs: Measurement 
     everything = [part for parts in STAGES.values() for part in parts if part != "imports"]
     rows = [line(stage, parts) for stage, parts in STAGES.items()]
     rows.insert(-1, line("**total**", everything))
-    text = [f"{capture}, {threads} cores:", "", _table(header, rows), ""]
+    text = [f"{capture}, {threads} cores:", "", markdown_table(header, rows), ""]
     for name, tool in zip(names, tools, strict=True):
         facts = [f"{value} {key}" for key, value in tool.counts.items()]
         facts.append(f"peak memory {tool.peak_mb:.0f} MB")
@@ -308,23 +309,8 @@ def markdown(capture: str, threads: int, ours: Measurement, theirs: Measurement 
                 cells += [f"{result['median_rotation_deg']:.3f}", f"{result['median_translation_cm']:.2f}"]
                 cells += [f"{100 * result['recall_1deg_0.1m']:.1f}"]
             rows.append(cells)
-        text += ["", "Median errors and recall:", "", _table(header, rows)]
+        text += ["", "Median errors and recall:", "", markdown_table(header, rows)]
     return "\n".join(text) + "\n"
-
-
-def _table(header: list[str], rows: list[list[str]]) -> str:
-    widths = [max(len(row[column]) for row in [header, *rows]) for column in range(len(header))]
-    lines = [header, ["-" * width for width in widths], *rows]
-    return "\n".join("| " + " | ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) + " |" for row in lines)
-
-
-def limit_cores(threads: int) -> None:
-    """Keep this process and its children to so many cores, and say so to their libraries."""
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:threads])
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[name] = str(threads)
-    os.environ["TQDM_DISABLE"] = "1"
 
 
 def main() -> None:
@@ -336,11 +322,9 @@ def main() -> None:
     parser.add_argument("--hloc-python", default=sys.executable, help="interpreter with hloc's needs (default: this)")
     parser.add_argument("--hloc-map-pairs", type=int, default=20, help="partners of a map image (default: %(default)s)")
     parser.add_argument("--repeat", type=int, default=1, help="runs in turn; the fastest of each tool counts")
-    parser.add_argument("--out", type=Path, action="append", default=[], help="write FILE.md or FILE.json; repeatable")
+    add_out(parser)
     options = parser.parse_args()
-    for path in options.out:
-        if path.suffix not in (".md", ".json"):
-            parser.error(f"--out {path}: expected a name that ends in .md or .json.")
+    check_out(parser, options.out)
     limit_cores(options.threads)
     from toolkit.capture import Capture
     from toolkit.errors import ToolkitError
@@ -371,17 +355,12 @@ def main() -> None:
     best = min(ours, key=lambda measured: measured.total)
     other = min(theirs, key=lambda measured: measured.total) if theirs else None
     text = markdown(sessions_root.parent.name, options.threads, best, other)
+    results = {"toolkit": vars(best) | {"total": best.total}}
+    if other:
+        results["hloc"] = vars(other) | {"total": other.total}
+    document = {"capture": sessions_root.parent.name, "queries": options.queries, "threads": options.threads}
     print(text)
-    for path in options.out:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.suffix == ".md":
-            path.write_text(text, encoding="utf-8")
-        else:
-            results = {"toolkit": vars(best) | {"total": best.total}}
-            if other:
-                results["hloc"] = vars(other) | {"total": other.total}
-            document = {"capture": sessions_root.parent.name, "queries": options.queries, "threads": options.threads}
-            path.write_text(json.dumps(document | results, indent=1) + "\n", encoding="utf-8")
+    write_out(options.out, text, document | results)
 
 
 if __name__ == "__main__":

@@ -44,6 +44,11 @@ def peak_allocated_mb(run: Callable[[], Any]) -> float:
     run()
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU], profile_memory=True) as profile:
         run()
+    return peak_bytes(profile) / 1e6
+
+
+def peak_bytes(profile: Any) -> int:
+    """Return the most bytes that torch held on the CPU at once in a profile, above what was there before."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "trace.json"
         profile.export_chrome_trace(str(path))
@@ -53,7 +58,7 @@ def peak_allocated_mb(run: Callable[[], Any]) -> float:
     for event in sorted(changes, key=lambda event: (event["ts"], event["args"]["Ev Idx"])):
         held += event["args"]["Bytes"]
         peak = max(peak, held)
-    return peak / 1e6
+    return peak
 
 
 def import_official(checkout: str) -> Any:

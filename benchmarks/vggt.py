@@ -16,23 +16,16 @@ import os
 import subprocess
 import sys
 import tempfile
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from embed import describe_machine, limit_cores
+from common import add_out, check_out, in_own_process, limit_cores, markdown_table, write_out
+from embed import describe_machine
 from vggt_worker import measure
 
 WORKER = Path(__file__).with_name("vggt_worker.py")
 GPU_VIEWS = (6, 11)
 GPU_BATCHES = (1, 8)
-
-
-def in_own_process(function: Any, *arguments: Any) -> Any:
-    """Return what a function returns in a fresh process, so that memory and warm caches are its own."""
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        return pool.submit(function, *arguments).result()
 
 
 def write_images(path: Path, batch: int, views: int, size: tuple[int, int]) -> None:
@@ -150,11 +143,11 @@ def table(rows: list[dict[str, Any]]) -> str:
         "pose_enc: largest difference": ("largest_difference", "{:.1e}"),
         "relative": ("relative_difference", "{:.1e}"),
     }
-    lines = [["", *columns], ["---"] * (1 + len(columns))]
+    lines = []
     for row in rows:
         shown = [form.format(row[key]) if key in row else "–" for key, form in columns.values()]
         lines.append([f"{row['name']}, {row['precision']}", *shown])
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return markdown_table(["", *columns], lines)
 
 
 def benchmark(options: argparse.Namespace, checkout: str) -> tuple[str, dict[str, Any]]:
@@ -210,11 +203,9 @@ def main() -> None:
     parser.add_argument("--precision", action="append", choices=("auto", "float32", "bfloat16"), help=precision_help)
     parser.add_argument("--device", default="auto", help="compute_device (default: %(default)s)")
     parser.add_argument("--repeat", type=int, default=1, help="runs; the fastest counts")
-    parser.add_argument("--out", type=Path, action="append", default=[], help="write FILE.md or FILE.json; repeatable")
+    add_out(parser)
     options = parser.parse_args()
-    for path in options.out:
-        if path.suffix not in (".md", ".json"):
-            parser.error(f"--out {path}: expected a name that ends in .md or .json.")
+    check_out(parser, options.out)
     if min(options.threads, options.repeat) < 1 or (options.views is not None and options.views < 2):
         parser.error("--threads and --repeat are at least 1, --views at least 2.")
     if options.checkpoint and not (options.checkpoint.is_file() and options.checkpoint.suffix == ".safetensors"):
@@ -230,9 +221,7 @@ def main() -> None:
     except ToolkitError as error:
         sys.exit(str(error))
     print(text)
-    for path in options.out:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text if path.suffix == ".md" else json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    write_out(options.out, text, document)
 
 
 if __name__ == "__main__":

@@ -11,14 +11,13 @@ import gc
 import json
 import os
 import sys
-import tempfile
 import types
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from megaloc_worker import clocks
+from megaloc_worker import clocks, peak_bytes
 
 
 def measure(run: Callable[[], Any], device: str) -> tuple[Any, dict[str, float]]:
@@ -44,21 +43,8 @@ def measure(run: Callable[[], Any], device: str) -> tuple[Any, dict[str, float]]
             wall, cpu = clocks()
             result = run()
             ended = clocks()
-        peak = _peak_bytes(profile)
+        peak = peak_bytes(profile)
     return result, {"seconds": ended[0] - wall, "cpu": ended[1] - cpu, "peak_mb": peak / 1e6}
-
-
-def _peak_bytes(profile: Any) -> int:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "trace.json"
-        profile.export_chrome_trace(str(path))
-        events = json.loads(path.read_text())["traceEvents"]
-    changes = [event for event in events if event["name"] == "[memory]" and event["args"]["Device Type"] == 0]
-    held = peak = 0
-    for event in sorted(changes, key=lambda event: (event["ts"], event["args"]["Ev Idx"])):
-        held += event["args"]["Bytes"]
-        peak = max(peak, held)
-    return peak
 
 
 def import_official(checkout: str) -> Any:
