@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+DEVICE_NAME = r"auto|cpu|mps|cuda(:\d+)?"
+"""Pattern of the names of devices."""
 PRECISIONS = ("auto", "float32", "bfloat16", "float16")
 
 
@@ -21,7 +23,7 @@ def check_device_name(name: str) -> None:
     Raises:
         ManifestError: not `auto`, `cpu`, `cuda`, `cuda:<i>` or `mps`.
     """
-    if not re.fullmatch(r"auto|cpu|mps|cuda(:\d+)?", name):
+    if not re.fullmatch(DEVICE_NAME, name):
         raise ManifestError(f"compute_device is {name!r}; expected auto, cpu, cuda, cuda:<number> or mps.")
 
 
@@ -114,7 +116,7 @@ class Fitting:
                 parts.append(self._run(batch[start : start + count]))
                 start += count
                 continue
-            except (torch.OutOfMemoryError, RuntimeError) as error:
+            except RuntimeError as error:
                 if not _is_out_of_memory(error):
                     raise
                 reason = str(error).strip().split("\n")[0]

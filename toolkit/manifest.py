@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from toolkit.compute import DEVICE_NAME
 from toolkit.errors import ManifestError
 
 STAGES = ("explore", "embed", "retrieve", "localize", "evaluate", "visualize")
@@ -20,7 +21,7 @@ Device = Literal["ios", "hl", "spot"]
 Positive = Annotated[int, Field(gt=0)]
 Natural = Annotated[int, Field(ge=0)]
 PositiveNumber = Annotated[float, Field(gt=0)]
-ComputeDevice = Annotated[str, Field(pattern=r"^(auto|cpu|mps|cuda(:\d+)?)$")]
+ComputeDevice = Annotated[str, Field(pattern=f"^({DEVICE_NAME})$")]
 DevicePair = Annotated[list[Device], Field(min_length=2, max_length=2)]
 Threshold = Annotated[list[PositiveNumber], Field(min_length=2, max_length=2)]
 

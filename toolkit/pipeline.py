@@ -119,7 +119,7 @@ def run(
     stages = [only] if only else [*STAGES]
     for stage in stages:
         if not any(run_dir.glob(f"*/.stages/{stage}*.json")):
-            _require_weights(manifest, stage)
+            _require_weights(stage, manifest.stage(stage).given())
     captures = _captures(manifest)
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
@@ -133,8 +133,11 @@ def run(
     ]
     inputs = {capture.name: tree_fingerprint(capture / "sessions") for capture in captures}
     for job in jobs:
-        if force or not _reusable(job, _inputs_of(job, inputs[job.files.scene])):
-            _require_weights(manifest, job.stage)
+        # Asked first: to tell whether a job is reusable, all files of its outputs are looked at.
+        if _weights_needed(job.stage, job.parameters) and (
+            force or not _reusable(job, _inputs_of(job, inputs[job.files.scene]))
+        ):
+            _require_weights(job.stage, job.parameters)
     log = RunLog(run_dir, manifest, inputs)
     try:
         for i, job in enumerate(jobs, 1):
@@ -296,9 +299,8 @@ def _name_embedder(manifest: Manifest, say: Say) -> Manifest:
     return manifest.model_copy(update={"embed": settings.model_copy(update={"model": name})})
 
 
-def _require_weights(manifest: Manifest, stage: str) -> None:
+def _require_weights(stage: str, parameters: dict[str, Any]) -> None:
     """Find or download the weights that a stage needs, before hours of work and where its progress is seen."""
-    parameters = manifest.stage(stage).given()
     if sources := _weights_needed(stage, parameters):
         resolve_any(sources, parameters.get("checkpoint"))
 

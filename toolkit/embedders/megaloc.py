@@ -3,7 +3,6 @@
 import hashlib
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -64,7 +63,7 @@ class MegaLocEmbedder:
         self._std = torch.tensor(IMAGENET_STD, device=self._device).view(1, 3, 1, 1)
         self._fitting = Fitting(self._forward, "images")
 
-    @cached_property
+    @property
     def settings(self) -> dict[str, Any]:
         precision = str(self._dtype).removeprefix("torch.")
         return {
