@@ -139,9 +139,9 @@ def _shown_size(view: View) -> tuple[int, int]:
 
 def _resized(width: int, height: int) -> tuple[int, int]:
     """Return the width and height to which the loader resizes a photograph that it does not cut."""
-    if width >= height:
-        return _SIDE, round(height * (_SIDE / width) / _PATCH) * _PATCH
-    return round(width * (_SIDE / height) / _PATCH) * _PATCH, _SIDE
+    from toolkit.models.vggt.preprocess import resized_size
+
+    return resized_size(width, height, "pad")  # of a landscape photograph "crop" makes the same
 
 
 def _place(group: Sequence[View]) -> list[_Placed]:

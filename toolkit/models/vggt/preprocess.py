@@ -79,6 +79,15 @@ class Views:
         return self.sample(index, values, np.stack([x, y], axis=-1))
 
 
+def resized_size(width: int, height: int, mode: str) -> tuple[int, int]:
+    """Return the width and height to which `load_images` resizes an image, before it cuts or fills."""
+    longest = width if mode == "crop" else max(width, height)
+    # In the order of the official code: where a quotient is near a half, another one rounds otherwise.
+    new_width = SIDE if longest == width else round(width * (SIDE / height) / PATCH) * PATCH
+    new_height = SIDE if longest != width else round(height * (SIDE / width) / PATCH) * PATCH
+    return new_width, new_height
+
+
 def load_images(sources: Sequence[Source], mode: str = "crop") -> Views:
     """Return images as the official loader makes them.
 
@@ -103,10 +112,7 @@ def load_images(sources: Sequence[Source], mode: str = "crop") -> Views:
     for position, source in enumerate(sources):
         image = _open(source)
         width, height = image.size
-        longest = width if mode == "crop" else max(width, height)
-        # In the order of the official code: where a quotient is near a half, another one rounds otherwise.
-        new_width = SIDE if longest == width else round(width * (SIDE / height) / PATCH) * PATCH
-        new_height = SIDE if longest != width else round(height * (SIDE / width) / PATCH) * PATCH
+        new_width, new_height = resized_size(width, height, mode)
         if not min(new_width, new_height):
             where = source if isinstance(source, str | Path) else f"no. {position}"
             raise ImageError(
