@@ -17,15 +17,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import add_out, check_out, limit_cores, markdown_table, write_out
+from common import add_out, check_out, in_own_process, limit_cores, markdown_table, write_out
 from numpy.typing import NDArray
 
 HLOC_WORKER = Path(__file__).with_name("hloc_worker.py")
@@ -132,8 +130,7 @@ def measure_toolkit(sessions_root: Path, run: Path, queries: str, threads: int) 
     from toolkit.files import SceneFiles
 
     before = os.getloadavg()[0]
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        fields = pool.submit(run_toolkit, sessions_root, run, queries, threads).result()
+    fields = in_own_process(run_toolkit, sessions_root, run, queries, threads)
     measured = Measurement(**fields, load=[before, os.getloadavg()[0]])
     measured.pairs = accuracy(sessions_root, SceneFiles(run, sessions_root.parent.name).poses_dir, queries)
     return measured
