@@ -8,13 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from toolkit import geometry
-from toolkit.alignment import Alignment, align_to_map, is_trustworthy, query_pose, robust_mean_pose
+from toolkit.alignment import Alignment, align_to_map, is_trustworthy, query_pose
 from toolkit.capture import Session, read_depth
 from toolkit.errors import CaptureError, ImageError, ToolkitError
 from toolkit.localizers.pnp import PoseEstimate
 from toolkit.localizers.prediction import Prediction, Predictor, View
 from toolkit.localizers.references import select_references
 from toolkit.mapping import LocalMap, rays_of
+from toolkit.pose_mean import robust_mean_pose
 from toolkit.upright import Turns
 
 log = logging.getLogger(__name__)
