@@ -301,6 +301,14 @@ class Session:
         (row,) = self._depth_index.find(np.array([timestamp], np.int64), [sensor_id])
         return None if row < 0 else self.path / RAW_DATA / self.depths["path"].iloc[row]
 
+    @cached_property
+    def depths_fingerprint(self) -> str:
+        """16 hex digits that identify the list of depth maps and their files as they were when first asked."""
+        if self.depths is None:
+            return ""
+        root = self.path / RAW_DATA
+        return files_fingerprint([self.path / "depths.txt", *(root / path for path in self.depths["path"])])
+
     # Sensors
 
     @cached_property
@@ -316,6 +324,10 @@ class Session:
                 "Add it there, or correct the id where it is used."
             )
         return row
+
+    def has_sensor(self, sensor_id: str) -> bool:
+        """Tell whether sensors.txt has a sensor."""
+        return sensor_id in self._sensor_rows
 
     def is_camera(self, sensor_id: str) -> bool:
         """Tell whether a sensor takes photographs (type `camera`; a `depth` camera does not)."""
@@ -518,6 +530,24 @@ class Session:
             world_from_rig[in_rig] = world_from_rig[in_rig] @ pose_from_qt(self._rig_qt[rigs[known][in_rig]])
             world_from_cam[part][known] = world_from_rig
         return world_from_cam
+
+    def poses_of_sensor(self, sensor_id: str) -> tuple[Ints, Floats]:
+        """Return when a sensor has a pose, (n,) microseconds ascending, and world_from_sensor then, (n, 4, 4).
+
+        Of `trajectory`: the poses of the sensor itself and of all rigs that hold it.
+        """
+        if self.trajectory is None:
+            return np.zeros(0, np.int64), np.zeros((0, 4, 4))
+        devices, qt = [sensor_id], np.zeros((0, 7))
+        if self.rigs is not None:
+            held = np.flatnonzero(self.rigs["sensor_id"] == sensor_id)
+            devices, qt = [*self.rigs["rig_id"].iloc[held], sensor_id], self._rig_qt[held]
+        codes = codes_of(self.trajectory._ids, as_strings(devices))
+        rows = np.flatnonzero(codes >= 0)
+        rows = rows[np.argsort(self.trajectory.timestamps[rows], kind="stable")]
+        poses, in_rig = pose_from_qt(self.trajectory.qt[rows]), codes[rows] < len(qt)
+        poses[in_rig] = poses[in_rig] @ pose_from_qt(qt[codes[rows][in_rig]])
+        return self.trajectory.timestamps[rows], poses
 
     @cached_property
     def _image_index(self) -> tuple[KeyIndex, Ints]:

@@ -131,7 +131,7 @@ def localize_pairs(
             for asked in capture.devices_with("query", query_device):
                 started = time.perf_counter()
                 pair = _Pair(capture, mapped, asked, Path(retrieval_dir), Path(out_dir), queries)
-                record = pair.record(settings, method) | ({} if guide is None else guide.record())
+                record = pair.record(settings, method) | ({} if guide is None else guide.record(pair.capture[f"{mapped}_map"]))
                 skipped = skip_existing and is_current(pair.txt, record) and pair.csv.exists()
                 if not skipped:
                     if solver is None:
@@ -193,11 +193,12 @@ class _Guide:
     batch_size: int
     turns: Turns | None
 
-    def record(self) -> dict[str, Any]:
-        """Return what poses depend on, besides what those of `pnp` do."""
+    def record(self, mapped: Session) -> dict[str, Any]:
+        """Return what poses in the map of a session depend on, besides what those of `pnp` do."""
         predictor = {"name": self.predictor.name} | self.predictor.settings
         turns = None if self.turns is None else self.turns.record()
-        return {"predictor": predictor, "vggt": asdict(self.settings), "turns": turns}
+        vggt = asdict(self.settings)
+        return {"predictor": predictor, "vggt": vggt, "turns": turns, "depths": mapped.depths_fingerprint}
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 
 from toolkit import geometry
 from toolkit.alignment import Alignment, align_to_map, is_trustworthy, query_pose
-from toolkit.capture import Session, read_depth
-from toolkit.errors import CaptureError, ImageError, ToolkitError
+from toolkit.capture import Session
+from toolkit.depths import DepthMaps, SeenDepth, lifted
+from toolkit.errors import ImageError, ToolkitError
 from toolkit.localizers.pnp import PoseEstimate
 from toolkit.localizers.prediction import Prediction, Predictor, View
 from toolkit.localizers.references import select_references
-from toolkit.mapping import LocalMap, rays_of
+from toolkit.mapping import LocalMap
 from toolkit.pose_mean import robust_mean_pose
 from toolkit.upright import Turns
 
@@ -98,6 +99,7 @@ class VggtLocalizer:
         self.predictor = predictor
         self.settings = settings or VggtSettings()
         self._session = session
+        self._depths = DepthMaps(session)
         self._rows = {session.image_name(row): row for row in range(len(session.images))}
         self._turns = np.zeros(len(session.images), np.int64) if turns is None else turns.of(session)
 
@@ -199,29 +201,21 @@ class VggtLocalizer:
         return np.asarray(ratios[np.isfinite(ratios)], np.float64)
 
     def _points(self, image: int) -> Floats:
-        """Return points (P, 3) in the world that a map image sees: triangulated, else of its depth map."""
+        """Return points (P, 3) in the world that a map image sees: triangulated, else of the capture's depth maps."""
         points = np.unique(self.map.observations(image)[1])
         if len(points) >= self.settings.least_points:
             order = np.argsort(-self.map.track_lengths[points], kind="stable")[: self.settings.depth_points]
             return self.map.points[points[order]]
-        row = self._rows[self.map.image_names[image]]
-        found = self._session.images.iloc[row]
-        path = self._session.depth_path(int(found["timestamp"]), str(found["sensor_id"]))
-        try:
-            depth = read_depth(path) if path is not None else np.zeros((0, 0), np.float32)
-        except CaptureError as error:
-            log.warning("%s: left out", error)
-            depth = np.zeros((0, 0), np.float32)
-        y, x = np.nonzero(depth)
-        part = np.linspace(0, len(x) - 1, min(len(x), self.settings.depth_points)).astype(np.int64)
+        seen = self.seen_depth(image)
+        part = np.linspace(0, len(seen) - 1, min(len(seen), self.settings.depth_points)).astype(np.int64)
         if not len(part):
             return self.map.points[points]
-        x, y, camera = x[part], y[part], self.map.cameras[image]
-        # A depth map may be smaller than the photograph of the same sensor.
-        scale = np.array([camera.width / depth.shape[1], camera.height / depth.shape[0]])
-        rays = rays_of(camera, (np.column_stack([x, y]) + 0.5) * scale)
-        in_cam = rays / rays[:, 2:] * depth[y, x, None]
+        in_cam = lifted(self.map.cameras[image], seen.pixels[part], seen.depth_m[part])
         return geometry.transform(self.map.world_from_cams[image], in_cam)
+
+    def seen_depth(self, image: int) -> SeenDepth:
+        """Return what the capture's depth maps say of a map image."""
+        return self._depths.of(self._rows[self.map.image_names[image]])
 
 
 def _combine(query: VggtQuery, cameras: tuple[CameraAnswer, ...]) -> PoseEstimate:
