@@ -561,10 +561,10 @@ def test_without_a_usable_prediction_the_hybrid_is_pnp(world: World, pnp: PnpLoc
     asked = asked_of(world, device, 0)
     expected = pnp.localize(*asked)
     assert expected.status == "ok"
-    assert same(HybridLocalizer(pnp).localize(*asked, PoseEstimate("failed: no references")), expected)
+    assert same(HybridLocalizer(pnp).localize(*asked, VggtAnswer(PoseEstimate("failed: no references"))), expected)
     unknown = np.diag([1e-4] * 3 + [np.inf] * 3)
     far = PoseEstimate("low_confidence", np.eye(4), unknown, found_by="vggt")
-    assert same(HybridLocalizer(pnp).localize(*asked, far), expected)
+    assert same(HybridLocalizer(pnp).localize(*asked, VggtAnswer(far)), expected)
 
 
 @pytest.mark.parametrize("device", ["ios", "spot"])
@@ -574,7 +574,7 @@ def test_a_wrong_prediction_does_no_harm(world: World, pnp: PnpLocalizer, device
     wrong = expected.world_from_rig @ geometry.make_pose(np.eye(3), [1.0, 0.5, 0.0])
     covariance = np.diag([1e-4] * 3 + [1e-3] * 3)
     prediction = PoseEstimate("ok", wrong, covariance, references=tuple(asked[3][0][:4]), found_by="vggt")
-    found = HybridLocalizer(pnp).localize(*asked, prediction)
+    found = HybridLocalizer(pnp).localize(*asked, VggtAnswer(prediction))
     assert same(found, expected)
 
 
@@ -591,11 +591,11 @@ def test_a_prediction_finds_what_descriptors_alone_do_not(world: World, pnp: Pnp
     """Descriptors too alike to be matched in all of an image are matched about the predicted pose."""
     cameras, rig_from_cams, features, references = asked_of(world, "ios", 0)
     true = world.queries("ios")[1][0]
-    strict = PnpLocalizer(world.map, pnp._features, PnpSettings(ratio=0.0))
+    strict = PnpLocalizer(world.map, pnp.features, PnpSettings(ratio=0.0))
     alone = strict.localize(cameras, rig_from_cams, features, references)
     assert alone.status.startswith("failed")
     found = HybridLocalizer(strict).localize(
-        cameras, rig_from_cams, features, references, prediction_near(true, references[0][:4])
+        cameras, rig_from_cams, features, references, VggtAnswer(prediction_near(true, references[0][:4]))
     )
     assert found.found_by == "pnp+vggt"
     assert found.status == "ok"
@@ -612,7 +612,7 @@ def test_where_nothing_matches_the_prediction_is_the_answer(world: World, pnp: P
     ]
     true = world.queries("ios")[1][0]
     prediction = prediction_near(true, references[0][:4])
-    found = HybridLocalizer(pnp).localize(cameras, rig_from_cams, blind, references, prediction)
+    found = HybridLocalizer(pnp).localize(cameras, rig_from_cams, blind, references, VggtAnswer(prediction))
     assert found.found_by == "vggt"
     assert found.status == "ok"
     np.testing.assert_array_equal(found.world_from_rig, prediction.world_from_rig)

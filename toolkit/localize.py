@@ -33,6 +33,7 @@ from toolkit.files import (
 )
 from toolkit.images import default_workers, prefetch, read_image
 from toolkit.localizers.hybrid import HybridLocalizer
+from toolkit.localizers.lifting import DepthLifter
 from toolkit.localizers.pnp import PnpLocalizer, PnpSettings, PoseEstimate
 from toolkit.localizers.prediction import Predictor, View, create_predictor
 from toolkit.localizers.vggt import VggtAnswer, VggtLocalizer, VggtQuery, VggtSettings
@@ -131,7 +132,9 @@ def localize_pairs(
             for asked in capture.devices_with("query", query_device):
                 started = time.perf_counter()
                 pair = _Pair(capture, mapped, asked, Path(retrieval_dir), Path(out_dir), queries)
-                record = pair.record(settings, method) | ({} if guide is None else guide.record(pair.capture[f"{mapped}_map"]))
+                record = pair.record(settings, method)
+                if guide is not None:
+                    record |= guide.record(capture[f"{mapped}_map"])
                 skipped = skip_existing and is_current(pair.txt, record) and pair.csv.exists()
                 if not skipped:
                     if solver is None:
@@ -210,6 +213,10 @@ class _Solver:
     method: str = "nearest"
     batch_size: int = 1
     turns: Turns | None = None
+
+    @property
+    def lifter(self) -> DepthLifter | None:
+        return None if self.pnp is None or self.vggt is None else DepthLifter(self.pnp, self.vggt)
 
     def label(self, found_by: str) -> str:
         """Return what the column `method` says of a pose that was found by some method, or of none."""
@@ -334,14 +341,14 @@ def _localize_pair(
         rows = np.unique(np.concatenate([*members, np.zeros(0, np.int64)]))
         store = extract_session(session, features_dir, rows=rows, workers=workers)
 
-    def solve(task: tuple[int, _QueryDevice, PoseEstimate | None, float]) -> dict[str, Any]:
-        index, query, predicted, seconds = task
+    def solve(task: tuple[int, _QueryDevice, VggtAnswer | None, float]) -> dict[str, Any]:
+        index, query, answer, seconds = task
         started = time.perf_counter() - seconds
         estimate, names = PoseEstimate("failed: no images of this device at this time"), list[str]()
         if query.names and solver.pnp is not None and store is not None:
-            estimate, names = _pnp(query, solver.pnp, store, predicted)
-        elif query.names and predicted is not None and solver.vggt is not None:
-            estimate, names = predicted, _names(solver.vggt.map, predicted.references)
+            estimate, names = _pnp(query, solver, store, answer)
+        elif query.names and answer is not None and solver.vggt is not None:
+            estimate, names = answer.estimate, _names(solver.vggt.map, answer.estimate.references)
         elif query.names:
             estimate, names = _nearest(query)
         found_by = "" if estimate.world_from_rig is None else estimate.found_by
@@ -351,7 +358,7 @@ def _localize_pair(
             row["rejected"] = ";".join(_names(solver.vggt.map, estimate.rejected))
         return row
 
-    def tasks(indices: Sequence[int]) -> Iterator[tuple[int, _QueryDevice, PoseEstimate | None, float]]:
+    def tasks(indices: Sequence[int]) -> Iterator[tuple[int, _QueryDevice, VggtAnswer | None, float]]:
         """Yield the queries, and what a network says of them, which is asked for some at a time."""
         for start in range(0, len(indices), solver.batch_size):
             part = indices[start : start + solver.batch_size]
@@ -363,7 +370,7 @@ def _localize_pair(
             answers = solver.vggt.localize([_vggt_query(session, query, solver.vggt.map) for query in asked])
             seconds = (time.perf_counter() - started) / len(part)
             for index, query, answer in zip(part, asked, answers, strict=True):
-                yield index, query, answer.estimate, seconds
+                yield index, query, answer, seconds
 
     progress = pair.out_dir / f".{pair.name}.partial.jsonl"
     done = _read_progress(progress, record) if skip_existing else {}
@@ -453,13 +460,15 @@ def _names(local_map: LocalMap, images: Sequence[int]) -> list[str]:
 
 
 def _pnp(
-    query: _QueryDevice, localizer: PnpLocalizer, store: FeatureStore, predicted: PoseEstimate | None = None
+    query: _QueryDevice, solver: _Solver, store: FeatureStore, answer: VggtAnswer | None = None
 ) -> tuple[PoseEstimate, list[str]]:
     """Localize by matching; with what a network says of the query, by both."""
     usable = [index for index, name in enumerate(query.names) if name in store]
     if not usable:
         reasons = "; ".join(store.failed.get(name, "no features") for name in query.names)
         return PoseEstimate(f"failed: no readable image ({reasons})"), []
+    localizer = solver.pnp
+    assert localizer is not None
     index_of = localizer.map.index_of
     references = [
         [index_of[name] for name in map(_reference_name, query.references[index]) if name in index_of]
@@ -468,11 +477,11 @@ def _pnp(
     cameras, rig_from_cams = [query.cameras[index] for index in usable], query.rig_from_cams[usable]
     features = [store[query.names[index]] for index in usable]
     try:
-        if predicted is None:
+        if answer is None:
             estimate = localizer.localize(cameras, rig_from_cams, features, references)
         else:
-            hybrid = HybridLocalizer(localizer)
-            estimate = hybrid.localize(cameras, rig_from_cams, features, references, predicted)
+            hybrid = HybridLocalizer(localizer, solver.lifter)
+            estimate = hybrid.localize(cameras, rig_from_cams, features, references, answer)
     except Exception as error:  # one bad query never ends a run
         log.exception("localizing %s", query.names[0])
         return PoseEstimate(f"failed: {type(error).__name__}: {error}"), []

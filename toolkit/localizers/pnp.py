@@ -6,7 +6,7 @@ which finds several times as many and makes the pose more precise.
 """
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from threading import Lock
 
@@ -98,9 +98,10 @@ class PoseEstimate:
     pixels: Floats = field(default_factory=lambda: np.zeros((0, 2)))
     """(num_guided, 2)."""
     point_index: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    """(num_guided,) map point."""
+    """(num_guided,) map point; -1: a place that was lifted by depth."""
     found_by: str = "pnp"
-    """What the pose rests on: `pnp`, `pnp+vggt` (found from a prior), `vggt` (a prediction), `nearest`."""
+    """What the pose rests on: `pnp`, `pnp+vggt` (found from a prior), `lifted` (map features lifted by a capture's
+    depth maps), `lifted+vggt` (by predicted depth, too), `vggt` (a prediction), `nearest`."""
     scale_std: float = float("nan")
     """Relative standard deviation of a prediction's scale; inf if unknown, NaN without a prediction."""
     rejected: tuple[int, ...] = ()
@@ -180,7 +181,7 @@ class PnpLocalizer:
     def __init__(self, local_map: LocalMap, features: FeatureStore, settings: PnpSettings | None = None):
         self.map = local_map
         self.settings = settings or PnpSettings()
-        self._features = features
+        self.features = features
         self._cache: OrderedDict[int, _MapImage] = OrderedDict()
         self._lock = Lock()
 
@@ -334,7 +335,7 @@ class PnpLocalizer:
         estimate = PoseEstimate(
             status="ok",
             world_from_rig=geometry.invert(rig_from_world),
-            covariance=query.covariance(rig_from_world, guided, self.map.points, errors),
+            covariance=self._covariance(query, rig_from_world, guided, errors),
             num_matches=len(matches),
             num_inliers=independent,
             num_guided=len(guided),
@@ -351,6 +352,12 @@ class PnpLocalizer:
             and estimate.rival_support <= settings.ok_rival_support
         )
         return estimate if certain else replace(estimate, status="low_confidence")
+
+    def _covariance(
+        self, query: "_Query", rig_from_world: Floats, matches: "_Matches", errors_px: Floats
+    ) -> Floats | None:
+        """Return the covariance (6, 6) of a pose; the map's points count as exact."""
+        return query.covariance(rig_from_world, matches, self.map.points, errors_px)
 
     def _rival_support(self, hypotheses: "list[_Hypothesis]") -> float:
         """Return the support of the best pose that is another one, relative to the best pose's."""
@@ -442,6 +449,9 @@ class PnpLocalizer:
 
     def _match_guided(self, query: "_Query", rig_from_world: Floats, images: Ints, radius_deg: float) -> _Matches:
         """Match the points of map images near where the pose puts them."""
+        nothing = _Matches(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.int64))
+        if not len(images):
+            return nothing
         members = [self._image(int(index)) for index in images]
         point = np.concatenate([member.points for member in members])
         image = np.concatenate([np.full(len(m.points), i) for m, i in zip(members, images, strict=True)])
@@ -482,7 +492,7 @@ class PnpLocalizer:
             pixels = features.keypoints[keypoint[mutual]].astype(np.float64)
             found.append((np.full(len(mutual), camera), pixels, candidate[mutual]))
         if not found:
-            return _Matches(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.int64))
+            return nothing
         cameras, pixels_of, points = zip(*found, strict=True)
         return _Matches(np.concatenate(cameras), np.concatenate(pixels_of), np.concatenate(points))
 
@@ -494,7 +504,7 @@ class PnpLocalizer:
                 return self._cache[index]
         keypoint, point = self.map.observations(index)
         order = np.argsort(-self.map.track_lengths[point], kind="stable")[: self.settings.max_map_features]
-        features = self._features[self.map.image_names[index]]
+        features = self.features[self.map.image_names[index]]
         image = _MapImage(features.descriptors[keypoint[order]], point[order], features.scales[keypoint[order]])
         with self._lock:
             self._cache[index] = image
@@ -565,6 +575,21 @@ class _Query:
         if len(matches) < 4:
             return None
         information = np.zeros((6, 6))
+        for _, jacobian, _ in self.jacobians(rig_from_world, matches, points):
+            information += np.einsum("oki,okj->ij", jacobian, jacobian)
+        if np.linalg.cond(information) > 1e14:
+            return None
+        # Two coordinates a point, six parameters.
+        variance = float((errors_px**2).sum()) / max(2 * len(matches) - 6, 1)
+        return np.asarray(np.linalg.inv(information) * variance, np.float64)
+
+    def jacobians(
+        self, rig_from_world: Floats, matches: _Matches, points: Floats
+    ) -> Iterator[tuple[NDArray[np.bool_], Floats, Floats]]:
+        """Yield, for each camera, which matches (K,) are its k, and how their projections move, in pixels.
+
+        With a motion d of the rig as in `covariance`: (k, 2, 6); with a motion of the point in the world: (k, 2, 3).
+        """
         for index in np.unique(matches.camera):
             part = matches.camera == index
             cam_from_rig = geometry.invert(self.rig_from_cams[index])
@@ -581,10 +606,4 @@ class _Query:
             projection = np.zeros((len(x), 2, 3))
             projection[:, 0, 0] = projection[:, 1, 1] = inverse
             projection[:, 0, 2], projection[:, 1, 2] = -inverse * u / depth, -inverse * v / depth
-            jacobian = projection @ moved
-            information += np.einsum("oki,okj->ij", jacobian, jacobian)
-        if np.linalg.cond(information) > 1e14:
-            return None
-        # Two coordinates a point, six parameters.
-        variance = float((errors_px**2).sum()) / max(2 * len(matches) - 6, 1)
-        return np.asarray(np.linalg.inv(information) * variance, np.float64)
+            yield part, projection @ moved, projection @ (cam_from_rig[:3, :3] @ rig_from_world[:3, :3])

@@ -1,7 +1,8 @@
 """A stand-in for a network, for tests and for trying things out without weights: it looks up the true cameras.
 
-Poses come from the capture's ground truth and depth from triangulated map points; both are put under a random
-similarity, with noise. What it takes part in says nothing about any network, and is labelled `simulated` everywhere.
+Poses come from the capture's ground truth and depth from triangulated map points, else from the capture's depth maps;
+both are put under a random similarity, with noise. What it takes part in says nothing about any network, and is
+labelled `simulated` everywhere.
 """
 
 import hashlib
@@ -20,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from toolkit import geometry
 from toolkit.capture import Session
+from toolkit.depths import DepthMaps, lifted
 from toolkit.errors import CaptureError
 from toolkit.localizers.prediction import Prediction, View
 from toolkit.mapping import LocalMap, in_view, view_bounds
@@ -28,6 +30,7 @@ Floats = NDArray[np.float64]
 
 _GRID = 96  # pixels of the longer side of a depth map
 _NEAREST = 5  # points whose depth a pixel has; some triangulated points are wrong
+_FEW_POINTS = 20  # with fewer, a map image's depth maps are asked
 _KEPT = 256  # depth maps of map images kept in memory
 
 
@@ -35,7 +38,8 @@ class SimulatedPredictor:
     """Ground truth under a random similarity for each group, with noise.
 
     A group's prediction depends on the seed and the names in the group alone: not on their order, on other groups, or
-    on threads. Depth is, at each pixel of a small map, the median of those of the triangulated points seen nearest.
+    on threads. Depth is, at each pixel of a small map, the median of those of the triangulated points seen nearest, or
+    of points of the capture's depth maps where there are few.
     """
 
     name = "simulated"
@@ -79,6 +83,10 @@ class SimulatedPredictor:
     def settings(self) -> dict[str, Any]:
         """The noise and the seed."""
         return dict(self._noise)
+
+    @cached_property
+    def _rows(self) -> dict[str, int]:
+        return {s.image_name(row): row for s in self._sessions.values() for row in range(len(s.images))}
 
     @cached_property
     def _truth(self) -> dict[str, Floats]:
@@ -147,11 +155,22 @@ class SimulatedPredictor:
         return kept * (1 + self._noise["depth_noise"] * self._random(names, view.name, "depth").normal(size=kept.shape))
 
     def _points(self, view: View) -> Floats:
-        """Return the map points (P, 3) that a map image sees; none of another image."""
-        found = self._map(view.name.split("/", 1)[0]) if view.known else None
+        """Return points (P, 3) that a map image sees, of the map, else of its depth maps; none of another image."""
+        session = view.name.split("/", 1)[0]
+        found = self._map(session) if view.known else None
         if found is None or view.name not in found.index_of:
             return np.zeros((0, 3))
-        return found.points[np.unique(found.observations(found.index_of[view.name])[1])]
+        points = found.points[np.unique(found.observations(found.index_of[view.name])[1])]
+        if len(points) >= _FEW_POINTS:
+            return points
+        seen = self._depth_maps[session].of(self._rows[view.name])
+        if not len(seen):
+            return points
+        return geometry.transform(self._truth[view.name], lifted(view.camera, seen.pixels, seen.depth_m))
+
+    @cached_property
+    def _depth_maps(self) -> dict[str, DepthMaps]:
+        return {key: DepthMaps(session) for key, session in self._sessions.items()}
 
     def _map(self, session: str) -> LocalMap | None:
         with self._lock:

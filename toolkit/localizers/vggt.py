@@ -68,6 +68,8 @@ class CameraAnswer:
     """(6, 6), in the convention of `PoseEstimate`."""
     reason: str = ""
     """What was left out or is unknown; without a pose, why there is none."""
+    depth_ratios: tuple[Floats, ...] = ()
+    """For each reference, metric over predicted depth at points that the map knows."""
 
 
 @dataclass(frozen=True)
@@ -184,12 +186,12 @@ class VggtLocalizer:
         alignment = align_to_map(model[1:], world, depth_ratios=ratios if any(len(r) for r in ratios) else None)
         if not np.isfinite(alignment.rotation_std_deg):
             reason = alignment.reason or "the rotation is unknown"
-            return CameraAnswer(references, prediction, alignment, reason=reason)
+            return CameraAnswer(references, prediction, alignment, reason=reason, depth_ratios=tuple(ratios))
         pose, covariance = query_pose(alignment, model[0])
         if not alignment.scale_known:
             # Whatever scale was taken, the query may be put anywhere along a line; near a reference is a better guess.
             pose[:3, 3] = world[int(np.argmax(alignment.inliers)), :3, 3]
-        return CameraAnswer(references, prediction, alignment, pose, covariance, alignment.reason)
+        return CameraAnswer(references, prediction, alignment, pose, covariance, alignment.reason, tuple(ratios))
 
     def _depth_ratios(self, image: int, prediction: Prediction, view: int) -> Floats:
         """Return metric over predicted depth (R,) at points that a map image sees."""

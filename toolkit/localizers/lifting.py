@@ -1,0 +1,240 @@
+"""Localize by map features whose place is not triangulated but lifted by depth, where triangulated ones do not suffice.
+
+Depth comes from the capture's depth maps, else from the network that was shown the map image. What is wrong with the
+depth of an image as a whole scales its points about its camera, which no reprojection error tells if all matches are
+of that image: the query then moves towards the image or away from it. So that scale is an unknown of the covariance.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from toolkit import geometry
+from toolkit.alignment import DEPTH_NOISE
+from toolkit.depths import lifted
+from toolkit.features import LocalFeatures
+from toolkit.localizers.pnp import PnpLocalizer, PoseEstimate, Prior, _Matches, _Query
+from toolkit.localizers.vggt import CameraAnswer, VggtAnswer, VggtLocalizer
+from toolkit.mapping import LocalMap
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+DEPTH_MAP_STD = 0.01  # relative, of what is common to the depth of a depth map
+LEAST_LIFTED = 20  # features of a map image that its depth maps reach; with fewer, predicted depth is asked
+LEAST_RATIOS = 10  # depth ratios from which on an image's predicted depth has a scale of its own
+MOST_RATIOS = 10  # that count as independent: the errors of a network's depth extend over parts of an image
+MAX_RATIO_SPREAD = 0.25  # relative spread of an image's ratios; beyond, its predicted depth is wrong
+CONTRADICTION = 3.0  # standard deviations by axis between a pose and the predicted camera
+
+
+@dataclass(frozen=True)
+class Depth:
+    """Depth of features of one map image."""
+
+    depth_m: Floats
+    """(n,) NaN where unknown."""
+    scale_std: float
+    """Relative standard deviation of what is common to them."""
+    predicted: bool = False
+    measured: bool = True
+    """Whether the scale was compared with known points of the image itself."""
+
+
+@dataclass(frozen=True)
+class LiftedMap:
+    """Part of a map, with points lifted by depth beside the triangulated ones."""
+
+    local_map: LocalMap
+    """The same images; points that the lifted images see."""
+    triangulated: Ints
+    """(T,) index of the first T points in the whole map."""
+    image: Ints
+    """(P,) the map image that a point was lifted from; -1: triangulated."""
+    depths: dict[int, Depth]
+    """Of the images lifted."""
+
+
+class DepthLifter:
+    """Lifts the features of one map's images, and localizes with them. Safe to use from several threads."""
+
+    def __init__(self, pnp: PnpLocalizer, vggt: VggtLocalizer) -> None:
+        self._pnp, self._vggt = pnp, vggt
+
+    def localize(
+        self,
+        cameras: Sequence[pycolmap.Camera],
+        rig_from_cams: Floats,
+        features: Sequence[LocalFeatures],
+        references: Sequence[Sequence[int]],
+        answer: VggtAnswer,
+        priors: Sequence[Prior] = (),
+    ) -> PoseEstimate | None:
+        """Return a pose by triangulated and lifted places of the references' features; None where none can be lifted.
+
+        It is `ok` by the rules of `PnpLocalizer`, its covariance with the unknown scale of each image's depth; and, if
+        it rests on predicted depth that nothing measured, only if the predicted camera of the query agrees.
+
+        Args:
+            cameras, rig_from_cams, features, references, priors: as for `PnpLocalizer.localize`.
+            answer: what `VggtLocalizer` says of the query.
+        """
+        images = list(dict.fromkeys(int(image) for part in references for image in part))
+        made = self.lift(images, answer)
+        if made is None:
+            return None
+        localizer = _LiftedLocalizer(made, self._pnp)
+        found = localizer.localize(cameras, rig_from_cams, features, references, priors)
+        source = made.image[found.point_index]
+        used = [made.depths[int(image)] for image in np.unique(source[source >= 0])]
+        whole = np.concatenate([made.triangulated, np.full(len(made.image) - len(made.triangulated), -1)])
+        label = "lifted+vggt" if any(depth.predicted for depth in used) else "lifted"
+        found = replace(found, found_by=label, point_index=whole[found.point_index])
+        guessed = any(not depth.measured for depth in used)
+        if found.status == "ok" and guessed and not _consistent(found, answer.estimate):
+            why = "the predicted camera contradicts the pose that its depth gives"
+            return replace(found, status="low_confidence", reason=why)
+        return found
+
+    def lift(self, images: Sequence[int], answer: VggtAnswer) -> LiftedMap | None:
+        """Return the part of the map that images see, with points for their features that have none."""
+        local_map = self._pnp.map
+        predictions = _predictions(answer)
+        points, obs, source, depths = [], [], [], {}
+        for image in images:
+            xy = self._pnp.features[local_map.image_names[image]].keypoints.astype(np.float64)
+            free = np.setdiff1d(np.arange(len(xy)), local_map.observations(image)[0])
+            depth = self._depth(image, xy[free], predictions.get(image))
+            if depth is None:
+                continue
+            known = np.flatnonzero(np.isfinite(depth.depth_m))
+            in_cam = lifted(local_map.cameras[image], xy[free[known]], depth.depth_m[known])
+            known = known[np.isfinite(in_cam).all(axis=1)]
+            if not len(known):
+                continue
+            in_cam = lifted(local_map.cameras[image], xy[free[known]], depth.depth_m[known])
+            points.append(geometry.transform(local_map.world_from_cams[image], in_cam))
+            obs.append(np.column_stack([np.full(len(known), image), free[known]]))
+            source.append(np.full(len(known), image))
+            depths[image] = depth
+        if not points:
+            return None
+        seen = [local_map.observations(image)[1] for image in images]
+        triangulated = np.unique(np.concatenate(seen))
+        there = np.flatnonzero(np.isin(local_map.obs_point, triangulated))
+        place = np.searchsorted(triangulated, local_map.obs_point[there])
+        new = np.column_stack([np.concatenate(obs), len(triangulated) + np.arange(sum(map(len, points)))])
+        old = np.column_stack([local_map.obs_image[there], local_map.obs_keypoint[there], place])
+        rows = np.concatenate([old, new])
+        rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
+        together = np.concatenate([local_map.points[triangulated], *points])
+        part = LocalMap(
+            image_names=local_map.image_names,
+            cameras=local_map.cameras,
+            world_from_cams=local_map.world_from_cams,
+            points=together,
+            colors=np.full((len(together), 3), 128, np.uint8),
+            obs_image=rows[:, 0],
+            obs_keypoint=rows[:, 1],
+            obs_point=rows[:, 2],
+        )
+        image_of = np.concatenate([np.full(len(triangulated), -1), *source])
+        return LiftedMap(part, triangulated, image_of, depths)
+
+    def _depth(self, image: int, xy: Floats, predicted: tuple[CameraAnswer, int] | None) -> Depth | None:
+        """Return the depth at pixels of a map image: of the capture's depth maps, else predicted."""
+        seen = self._vggt.seen_depth(image)
+        depth_m = seen.at(xy)
+        if np.isfinite(depth_m).sum() >= LEAST_LIFTED:
+            return Depth(depth_m, DEPTH_MAP_STD)
+        if predicted is None:
+            return None
+        answer, view = predicted
+        assert answer.prediction is not None
+        assert answer.alignment is not None
+        ratios = answer.depth_ratios[view - 1]
+        ratios = np.log(ratios[ratios > 0])
+        if len(ratios) >= LEAST_RATIOS:
+            middle = float(np.median(ratios))
+            spread = 1.4826 * float(np.median(np.abs(ratios - middle)))  # that of a Gaussian with this median
+            if spread > MAX_RATIO_SPREAD:
+                return None
+            scale, std, measured = np.exp(middle), spread / np.sqrt(min(len(ratios), MOST_RATIOS)), True
+        elif answer.alignment.scale_known:
+            # The depth need not have the scale of the cameras quite.
+            scale, measured = answer.alignment.world_from_model.scale, False
+            std = float(np.hypot(answer.alignment.scale_std, DEPTH_NOISE))
+        else:
+            return None
+        return Depth(scale * answer.prediction.depth_at(view, xy), max(std, DEPTH_MAP_STD), True, measured)
+
+
+class _LiftedLocalizer(PnpLocalizer):
+    """Localizes in a lifted map; the common scale of each image's depth is unknown within its standard deviation."""
+
+    def __init__(self, made: LiftedMap, pnp: PnpLocalizer) -> None:
+        super().__init__(made.local_map, pnp.features, pnp.settings)
+        self._made = made
+
+    def _covariance(
+        self, query: _Query, rig_from_world: Floats, matches: _Matches, errors_px: Floats
+    ) -> Floats | None:
+        made = self._made
+        source = made.image[matches.point]
+        images = np.unique(source[source >= 0])
+        if len(matches) < 4 or not len(images):
+            return super()._covariance(query, rig_from_world, matches, errors_px)
+        size = 6 + len(images)
+        information = np.zeros((size, size))
+        for part, of_pose, of_point in query.jacobians(rig_from_world, matches, made.local_map.points):
+            row = np.zeros((int(part.sum()), 2, size))
+            row[:, :, :6] = of_pose
+            for number, image in enumerate(images):
+                mine = source[part] == image
+                # A change s of the scale moves a point by s times its place relative to the image's camera.
+                arm = made.local_map.points[matches.point[part][mine]] - made.local_map.world_from_cams[image, :3, 3]
+                row[mine, :, 6 + number] = np.einsum("okj,oj->ok", of_point[mine], arm)
+            information += np.einsum("oki,okj->ij", row, row)
+        information /= float((errors_px**2).sum()) / max(2 * len(matches) - 6, 1)
+        information[6:, 6:] += np.linalg.inv(_scale_covariance([made.depths[int(image)] for image in images]))
+        # Rotations, places and scales are of like size; what is not determined shows here.
+        if not np.isfinite(information).all() or np.linalg.cond(information) > 1e14:
+            return None
+        return np.asarray(np.linalg.inv(information)[:6, :6], np.float64)
+
+
+def _scale_covariance(depths: Sequence[Depth]) -> Floats:
+    """Return what is known of the relative errors of scale of several images' depth, (J, J).
+
+    Those of predicted depths that nothing measured have the alignment's scale in common; a half of their variance is
+    each one's own.
+    """
+    stds = np.array([depth.scale_std for depth in depths])
+    common = stds * np.array([not depth.measured for depth in depths]) / np.sqrt(2)
+    return np.diag(stds**2 - common**2) + np.outer(common, common)
+
+
+def _predictions(answer: VggtAnswer) -> dict[int, tuple[CameraAnswer, int]]:
+    """Return for each consistent reference what was predicted of it, and its place in the prediction."""
+    found: dict[int, tuple[CameraAnswer, int]] = {}
+    for camera in answer.cameras:
+        if camera.prediction is None or camera.alignment is None or camera.world_from_cam is None:
+            continue
+        for view, image in enumerate(camera.references, start=1):
+            if camera.alignment.inliers[view - 1]:
+                found.setdefault(int(image), (camera, view))
+    return found
+
+
+def _consistent(found: PoseEstimate, predicted: PoseEstimate) -> bool:
+    """Tell whether a pose and a predicted one agree, as far as both are known."""
+    poses, covariances = (found.world_from_rig, predicted.world_from_rig), (found.covariance, predicted.covariance)
+    if poses[0] is None or poses[1] is None or covariances[0] is None or covariances[1] is None:
+        return False
+    spread = np.sqrt(np.diagonal(covariances[0] + covariances[1]).reshape(2, 3).sum(axis=1))
+    rotation_deg, distance_m = geometry.pose_error(poses[0], poses[1])
+    limits = CONTRADICTION / np.sqrt(3) * spread  # of lengths, that are of three axes
+    return bool(np.isfinite(spread).all() and np.radians(rotation_deg) <= limits[0] and distance_m <= limits[1])
