@@ -53,6 +53,59 @@ PREDICTION_COLUMNS = ["scale_std", "rejected", "reason"]
 """Further columns of the methods that predict."""
 
 
+@dataclass(frozen=True)
+class PredictorSettings:
+    """What predicts cameras, and what it is shown; the arguments of `localize_pairs` of the same names."""
+
+    predictor: str = "vggt"
+    checkpoint: str | Path | None = None
+    num_references: int = 5
+    candidates: int | None = None
+    compute_device: str = "auto"
+    dtype_compute: str = "auto"
+    batch_size: int = 4
+    upright: bool = True
+    world_up: Sequence[float] | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("num_references", "candidates", "batch_size"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ManifestError(f"{name} is {value}; expected 1 or more.")
+
+    @property
+    def references(self) -> VggtSettings:
+        """How references are chosen and used."""
+        return VggtSettings(self.num_references, self.candidates)
+
+    def open(self, capture: Capture, map_dir: str | Path) -> Predictor:
+        """Return the predictor for the images of a capture; warn of one that looks up the answers.
+
+        Raises:
+            ManifestError: unknown predictor, device or precision.
+            WeightsError: no weights; says what to do.
+        """
+        predictor = create_predictor(
+            self.predictor,
+            sessions=[capture[key] for key in capture.session_ids] if self.predictor == "simulated" else (),
+            map_dir=map_dir,
+            checkpoint=self.checkpoint,
+            compute_device=self.compute_device,
+            dtype_compute=self.dtype_compute,
+            seed=self.seed,
+        )
+        if predictor.simulated:
+            log.warning(
+                "predictor: %s looks up the true poses of the queries. What comes out is no result.", self.predictor
+            )
+        return predictor
+
+    def turns(self, capture: Capture) -> Turns | None:
+        """Return what makes the images of a capture upright, None where they are shown as they are."""
+        return upright_turns(capture, self.world_up) if self.upright else None
+
+
 def localize_pairs(
     sessions_root: str | Path,
     retrieval_dir: str | Path,
@@ -114,17 +167,16 @@ def localize_pairs(
     """
     if method not in METHODS:
         raise ManifestError(f"Unknown method {method!r}. Known: {', '.join(METHODS)}.")
-    for name, value in (("num_references", num_references), ("candidates", candidates), ("batch_size", batch_size)):
-        if value is not None and value < 1:
-            raise ManifestError(f"{name} is {value}; expected 1 or more.")
+    prediction = PredictorSettings(
+        predictor, checkpoint, num_references, candidates, compute_device, dtype_compute, batch_size, upright,
+        world_up, seed,
+    )  # fmt: skip
     capture = Capture.from_sessions_root(sessions_root)
     settings = PnpSettings(seed=seed)
     workers = workers or default_workers()
     guide: _Guide | None = None
     if method in PREDICTING:
-        network = open_predictor(capture, predictor, map_dir, checkpoint, compute_device, dtype_compute, seed)
-        turns = upright_turns(capture, world_up) if upright else None
-        guide = _Guide(network, VggtSettings(num_references, candidates), batch_size, turns)
+        guide = _Guide(prediction.open(capture, map_dir), prediction, prediction.turns(capture))
     table = []
     with threadpool_limits(1, "blas"):  # queries are the parallel dimension, and sums stay in one order
         for mapped in capture.devices_with("map", map_device):
@@ -160,47 +212,19 @@ def localize_pairs(
     return pd.DataFrame(table)
 
 
-def open_predictor(
-    capture: Capture,
-    name: str,
-    map_dir: str | Path,
-    checkpoint: str | Path | None = None,
-    compute_device: str = "auto",
-    dtype_compute: str = "auto",
-    seed: int = 0,
-) -> Predictor:
-    """Return a predictor for the images of a capture; warn of one that looks up the answers.
-
-    Args and errors: as for `localize_pairs`.
-    """
-    predictor = create_predictor(
-        name,
-        sessions=[capture[session] for session in capture.session_ids] if name == "simulated" else (),
-        map_dir=map_dir,
-        checkpoint=checkpoint,
-        compute_device=compute_device,
-        dtype_compute=dtype_compute,
-        seed=seed,
-    )
-    if predictor.simulated:
-        log.warning("predictor: %s looks up the true poses of the queries. What comes out is no result.", name)
-    return predictor
-
-
 @dataclass(frozen=True)
 class _Guide:
     """What predicts, and how it is asked."""
 
     predictor: Predictor
-    settings: VggtSettings
-    batch_size: int
+    settings: PredictorSettings
     turns: Turns | None
 
     def record(self, mapped: Session) -> dict[str, Any]:
         """Return what poses in the map of a session depend on, besides what those of `pnp` do."""
         predictor = {"name": self.predictor.name} | self.predictor.settings
         turns = None if self.turns is None else self.turns.record()
-        vggt = asdict(self.settings)
+        vggt = asdict(self.settings.references)
         return {"predictor": predictor, "vggt": vggt, "turns": turns, "depths": mapped.depths_fingerprint}
 
 
@@ -318,8 +342,8 @@ def _open_solver(
     pnp = PnpLocalizer(local_map, store, settings)
     if guide is None:
         return _Solver(pnp, method=method)
-    vggt = VggtLocalizer(local_map, session, guide.predictor, guide.settings, guide.turns)
-    return _Solver(pnp if method == "hybrid" else None, vggt, method, guide.batch_size, guide.turns)
+    vggt = VggtLocalizer(local_map, session, guide.predictor, guide.settings.references, guide.turns)
+    return _Solver(pnp if method == "hybrid" else None, vggt, method, guide.settings.batch_size, guide.turns)
 
 
 def _localize_pair(
@@ -546,21 +570,14 @@ def explain_query(
     map_dir: str | Path,
     map_device: str,
     query_device: str,
+    settings: PredictorSettings | None = None,
     queries: str = "keyframes_pruned_subsampled",
     index: int = 0,
-    predictor: str = "vggt",
-    checkpoint: str | Path | None = None,
-    num_references: int = 5,
-    candidates: int | None = None,
-    compute_device: str = "auto",
-    dtype_compute: str = "auto",
-    upright: bool = True,
-    world_up: Sequence[float] | None = None,
-    seed: int = 0,
 ) -> tuple[VggtLocalizer, VggtQuery, VggtAnswer]:
     """Ask the predictor about one query of a finished run again, and return all that it said.
 
     Args:
+        settings: with which the run was made.
         index: of the query in the keyframe list. The other arguments are those of `localize_pairs`.
 
     Returns:
@@ -572,10 +589,9 @@ def explain_query(
     capture = Capture.from_sessions_root(sessions_root)
     pair = _Pair(capture, map_device, query_device, Path(retrieval_dir), Path(retrieval_dir), queries)
     local_map = LocalMap.load(Path(map_dir) / f"{map_device}_map.npz")
-    network = open_predictor(capture, predictor, map_dir, checkpoint, compute_device, dtype_compute, seed)
-    turns = upright_turns(capture, world_up) if upright else None
-    settings = VggtSettings(num_references, candidates)
-    localizer = VggtLocalizer(local_map, capture[f"{map_device}_map"], network, settings, turns)
+    settings = settings or PredictorSettings()
+    network, turns = settings.open(capture, map_dir), settings.turns(capture)
+    localizer = VggtLocalizer(local_map, capture[f"{map_device}_map"], network, settings.references, turns)
     rows = pair.session.rows_of_keyframes(pair.session.keyframes(queries).iloc[[index]])[0]
     query = _vggt_query(pair.session, _read_query(pair.session, rows, pair.references(), turns), local_map)
     return localizer, query, localizer.localize([query])[0]
