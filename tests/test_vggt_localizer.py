@@ -646,7 +646,7 @@ def test_the_hybrid_run_is_as_good_as_pnp(run: SceneFiles, small_capture: Path) 
             counts = [int(((r[0] < limits[0]) & (r[1] < limits[1])).sum()) for r in right]
             assert counts[1] >= counts[0]
         rows = pd.read_csv(run.poses_csv("ios", device))
-        assert rows["method"].str.fullmatch(r"hybrid:simulated/(pnp|pnp\+vggt|vggt)").all()
+        assert rows["method"].str.fullmatch(r"hybrid:simulated/((pnp|lifted)(\+vggt)?|vggt)").all()
 
 
 def test_a_prediction_is_drawn_and_labelled(world: World, tmp_path: Path) -> None:
