@@ -119,7 +119,13 @@ def test_some_pairs_take_an_execution_each(place: Path, go: Callable[..., dict[s
     assert [row["status"] for row in record["stages"]] == ["reused", "reused"]
 
 
-def test_a_failing_cell_stops_with_its_message_and_the_notebook(place: Path) -> None:
+def test_a_failing_cell_stops_with_its_message_and_the_notebook(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reports: list[str] = []
+    monkeypatch.setattr(
+        pipeline, "_write_report", lambda run: reports.append(json.loads((run / "run.json").read_text())["status"])
+    )
     with pytest.raises(StageError) as error:
         pipeline.run(place / "run.yaml", overrides=["retrieve.topk=99"], only="retrieve")
     message, where = str(error.value).splitlines()
@@ -130,6 +136,7 @@ def test_a_failing_cell_stops_with_its_message_and_the_notebook(place: Path) -> 
     record = json.loads((place / "runs/run/run.json").read_text())
     assert record["status"] == "failed"
     assert [row["status"] for row in record["stages"]] == ["failed"]
+    assert reports == ["failed"], "the report of an earlier run would say that all is well"
     assert not list(executed.parent.glob(".*"))
 
 

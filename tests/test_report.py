@@ -1,7 +1,10 @@
 import base64
 import io
+import itertools
 import json
 import re
+from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 import pandas as pd
@@ -64,16 +67,34 @@ def full(tmp_path):
     retrieval.assign(**{"recall@1": 0.77, "recall@10": 1.0, "in_map": 1.0}).to_csv(
         files.evaluation / "retrieval.csv", index=False
     )
-    write_png(files.evaluation / "error_curves.png")
+    errors = recall[["map_device", "query_device"]].iloc[[0, 1, 2]].assign(
+        timestamp=[11, 12, 13], device_id=["007", "hetlf", "cam"], num_inliers=[30, 9, 70],
+        status=["ok", "failed: too few matches", "low_confidence"],
+        rotation_error_deg=[0.02, np.inf, 2.5], translation_error_m=[0.004, np.inf, 3.0],
+    )  # fmt: skip
+    errors["loss@(1deg,0.1m)"] = ["", "no pose", "wrong pose"]
+    errors["loss@(5deg,0.5m)"] = ["", "no pose", "wrong pose"]
+    errors.to_csv(files.evaluation / "errors.csv", index=False)
+    files.poses_dir.mkdir()
+    for pair, status in (("ios_query_ios", "ok"), ("hl_query_ios", "failed: too few inliers (3 within <1> deg)")):
+        table = errors.iloc[:2].assign(status=["low_confidence", status])
+        table.to_csv(files.poses_dir / f"{files.scene}_map_{pair}.csv", index=False)
+        (files.poses_dir / f"{files.scene}_map_{pair}.txt").write_text("# timestamp, device_id, ...\n")
+    write_png(files.evaluation / "error_curves.png", size=(200, 90))
     write_png(files.visualization / "scene_ios.png", caption='from "above" <x>')
     write_png(files.visualization / "localization_1.png", size=(2400, 600), caption="a sample", noise=True)
+    write_png(files.visualization / "worst_2.png", caption="second worst")
+    write_png(files.visualization / "worst_10.png", caption="tenth worst")
     (files.visualization / "scene_ios.rrd").write_bytes(b"RRF2")
     stage = {"scene": files.scene, "status": "done", "seconds": 130.0, "work_seconds": 100.0}
-    stage |= {"peak_memory_mb": 900, "counts": {"images_embedded": 12}}
+    stage |= {"peak_memory_mb": 900, "counts": {"images_embedded": 12}, "parameters": {"model": "<vlad>"}}
+    stage["notebook"] = "notebooks/PLACE_02_embed.ipynb"
+    (files.run / "notebooks").mkdir()
+    (files.run / stage["notebook"]).write_text("{}")
     return write_run(
         files.run, name="a <script>alert(1)</script>", status="done", created="2026-01-02T03:04:05+00:00",
         manifest={"description": "R&D", "seed": 0}, versions={"numpy": "2"}, machine={"cores": 2},
-        scenes=[files.scene], stages=[{"stage": "embed", **stage}, {"stage": "retrieve"}],
+        inputs={files.scene: "0123456789abcdef"}, code="fedcba9876543210", scenes=[files.scene], stages=[{"stage": "embed", **stage}, {"stage": "retrieve"}],
         total_seconds=150.0, work_seconds=120.0, peak_memory_mb=1234,
     )  # fmt: skip
 
@@ -84,15 +105,49 @@ def test_full_run(full):
     for expected in (
         "2026-01-02 03:04:05 UTC", "2 min 30 s", "1.23 GB", "45 % mean recall at 1°, 0.1 m", "5 % called ok",
         "Recall at 5°, 0.5 m [%]", "0.031", "1.23", "∞", "no poses file", "In the first 10 [%]", "77",
-        "8 m of the query", "12 images embedded", "embed", "numpy 2", "rerun PLACE",
+        "8 m of the query", "12 images embedded", "embed", "numpy 2", "scene_ios.rrd",
+        "4 queries asked in 2 pairs of devices: 1 ok, 2 low confidence, 1 failed.",
+        "Weakest pair at 1°, 0.1 m: ios queries in the ios map, 10 %.", "2.50°, 3.00 m median error",
+        "0123456789abcdef", "fedcba9876543210", "model", "too few inliers 1 ios in hl map 1",
     ):  # fmt: skip
         assert expected in text, expected
-    assert page.count("<img") == 3
+    assert page.count("<img") == 5
+
+
+def test_the_worst_queries_come_first_and_say_why(full):
+    page = write_report(full).read_text()
+    text = text_of(page)
+    order = ["hl in ios map hetlf 12 failed: too few matches 9 ∞ ∞ no pose (beyond 5°, 0.5 m)",
+             "spot in ios map cam 13 low confidence 70 2.50 3.00 m wrong pose (beyond 5°, 0.5 m)",
+             "ios in ios map 007 11 ok 30 0.020 0.40 cm within every threshold"]  # fmt: skip
+    places = [text.index(row) for row in order]
+    assert places == sorted(places)
+    assert page.index('alt="second worst"') < page.index('alt="tenth worst"') < page.index('alt="a sample"')
+
+
+def test_links_are_relative_and_lead_to_files(full):
+    links = re.findall(r'href="([^"#]*)"', write_report(full).read_text())
+    assert len(links) == len(re.findall("<a href", write_report(full).read_text())) - 4
+    for link in links:
+        assert ":" not in link
+        assert (full / unquote(link)).is_file(), link
+    ends = {Path(unquote(link)).suffix for link in links}
+    assert ends == {".png", ".rrd", ".csv", ".txt", ".ipynb", ".json"}
+
+
+def test_headings_do_not_skip_levels_and_tables_have_captions(full):
+    page = write_report(full).read_text()
+    levels = [int(level) for level in re.findall(r"<h(\d)", page)]
+    assert levels[0] == 1
+    assert all(later <= earlier + 1 for earlier, later in itertools.pairwise(levels))
+    assert page.count("<table") == page.count("<caption>") > 8
+    assert not re.search(r'<img(?![^>]*alt="[^"])', page)
 
 
 def test_page_needs_nothing_else_and_no_script(full):
     page = write_report(full).read_text()
-    assert not re.search(r'(src|href)="(?!data:)', page)
+    assert not re.search(r'src="(?!data:)', page)
+    assert not re.search(r"<link|@import|url\(", page)
     assert "http" not in re.sub(r'src="data:[^"]*"', "", page)
     assert "<script" not in page
 
@@ -126,6 +181,43 @@ def test_minimal_and_failed_run(tmp_path):
     text = text_of(write_report(run).read_text())
     assert "This run stopped before its end. NameError: &lt;x&gt;" in text
     assert "S Not evaluated." in text
+
+
+def test_a_stopped_run_names_the_stage(tmp_path):
+    row = {"scene": "S", "stage": "localize", "status": "failed", "seconds": 1.0}
+    run = write_run(tmp_path / "b", status="failed", error="out of luck", stages=[row])
+    assert "Stage localize of S: failed." in text_of(write_report(run).read_text())
+    row["status"] = "interrupted"
+    run = write_run(tmp_path / "c", status="interrupted", stages=[row])
+    assert "stopped before its end. Stage localize of S: interrupted." in text_of(write_report(run).read_text())
+
+
+def test_every_scene_has_room_for_pictures(full, monkeypatch):
+    second = SceneFiles(full, "OTHER")
+    write_png(second.visualization / "map.png", caption="the other map")
+    content = json.loads((full / "run.json").read_text())
+    write_run(full, **{**content, "scenes": [*content["scenes"], "OTHER"]})
+    monkeypatch.setattr(report, "PICTURE_BUDGET", 4000)
+    page = write_report(full).read_text()
+    assert "localization_1.png" in page[page.index("Not embedded") :]
+    assert '<img src="data:image/png' in page[page.index("<h2>OTHER") :]
+
+
+def test_unreadable_tables_are_named_and_the_rest_is_shown(full):
+    (next(full.rglob("errors.csv"))).write_text('a,b\n"1,2\n3,4,5\n')
+    (next(full.rglob("*_map_ios_query_ios.csv"))).write_bytes(b"\xff\xfe\x00\xd8")
+    text = text_of(write_report(full).read_text())
+    assert "errors.csv cannot be read" in text
+    assert "_map_ios_query_ios.csv cannot be read" in text
+    assert "Recall at 5°, 0.5 m [%]" in text
+
+
+def test_without_ground_truth_the_least_supported_are_listed(full):
+    for path in full.rglob("evaluation/*.csv"):
+        path.unlink()
+    text = text_of(write_report(full).read_text())
+    assert "The 4 least supported; there is no ground truth" in text
+    assert text.index("failed: too few inliers (3") < text.index("low confidence 30")
 
 
 def test_scene_without_ground_truth(tmp_path):

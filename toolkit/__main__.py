@@ -1,4 +1,4 @@
-"""The command line: `python -m toolkit run|check|demo-data`."""
+"""The command line: `python -m toolkit run|report|check|demo-data`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -34,6 +34,14 @@ def run(
         print("Interrupted. The same command goes on from here.")
         raise typer.Exit(130) from None
     print(f"Report: {run_dir / 'report.html'}")
+
+
+@app.command()
+def report(run_dir: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, for example runs/demo.")]) -> None:
+    """Write the report of a run anew, from what lies in its folder."""
+    from toolkit.report import write_report
+
+    print(f"Report: {write_report(run_dir)}")
 
 
 @app.command()

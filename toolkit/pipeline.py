@@ -157,7 +157,8 @@ def run(
         raise
     finally:
         log.write()
-    _write_report(run_dir)
+        # Also of a run that stopped: the page of an earlier one would say that all is well.
+        _write_report(run_dir)
     return run_dir
 
 
@@ -514,6 +515,7 @@ class RunLog:
             "manifest": self.manifest.model_dump(mode="json", exclude_none=True),
             "versions": _versions(),
             "machine": _machine(),
+            "code": _code_fingerprint(),
             "scenes": list(self.inputs),
             "inputs": self.inputs,
             "stages": rows,

@@ -4,24 +4,35 @@ import base64
 import io
 import json
 import math
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
+import numpy as np
 import pandas as pd
 
 from toolkit.errors import ArtefactError
 from toolkit.files import SceneFiles, sidecar_path, write_text
 
-# All pictures together, before base64 makes them a third larger: the page stays below 15 MB.
-PICTURE_BUDGET = 10_000_000
+# All pictures of a page together, before base64 makes them a third larger: the page stays below 10 MB.
+PICTURE_BUDGET = 7_000_000
 MAX_WIDTH = 1600
-# Figures that say more than the page's own tables.
+WORST, MOST_REASONS = 10, 12
+"""Rows listed of a scene: the worst queries, and the reasons of queries without a pose."""
+# Figures that say more than the page's own tables: a heading, and how to read it.
 EVALUATION_FIGURES = {
-    "error_curves": "Share of queries with an error below x. A curve ends where queries have no pose; "
-    "dotted lines are the thresholds of the tables.",
-    "losses": "What the misses at each threshold come from. No good reference: retrieval found no map image "
-    "near the true camera; no pose: too few matches agreed; wrong pose: beyond the threshold.",
+    "error_curves": (
+        "Error curves",
+        "Share of queries [%] with an error below x, in metres (top) and degrees (bottom). A curve ends where queries "
+        "have no pose; dotted lines are the thresholds of the tables.",
+    ),
+    "losses": (
+        "Where accuracy was lost",
+        "What the misses at each threshold come from, in % of the queries. No good reference: retrieval found no map "
+        "image near the true camera; no pose: too few matches agreed; wrong pose: beyond the threshold.",
+    ),
 }
 REASONS = ("no good reference", "no pose", "wrong pose")
 
@@ -32,26 +43,30 @@ class Picture:
 
     data: str
     """data: URL, or empty where the page has no room left."""
+    title: str
     caption: str
     path: str
     """Relative to the run folder."""
+    wide: bool = False
+    """Too wide to be read when it is scaled to a phone."""
 
 
 @dataclass
 class Cell:
-    """A cell of a table: its text and, where it is shaded, how much (0 white to 1 dark)."""
+    """A cell of a table."""
 
     text: str
     shade: float | None = None
+    """How dark the cell is, 0 to 1, where a number is shown by colour as well."""
+    bar: float | None = None
+    """Length of a bar below the text, 0 to 1."""
+    link: str = ""
+    """Relative to the run folder."""
 
     @property
-    def style(self) -> str:
-        """CSS of the shading: white to blue, with text that can be read on it."""
-        if self.shade is None:
-            return ""
-        share = min(max(self.shade, 0.0), 1.0)
-        red, green, blue = (round(255 + share * (dark - 255)) for dark in (20, 98, 160))
-        return f"background:rgb({red},{green},{blue});color:{'#fff' if share > 0.55 else '#111'}"
+    def percent(self) -> int:
+        """The shade in percent."""
+        return round(100 * min(max(self.shade or 0.0, 0.0), 1.0))
 
 
 @dataclass
@@ -67,6 +82,7 @@ class Matrix:
 class Table:
     """A plain table."""
 
+    caption: str
     columns: list[str]
     rows: list[list[Cell]]
 
@@ -76,27 +92,36 @@ class Scene:
     """What the page shows of one scene."""
 
     name: str
+    fingerprint: str = ""
+    verdict: list[str] = field(default_factory=list)
     headlines: list[tuple[str, str]] = field(default_factory=list)
     recall: list[Matrix] = field(default_factory=list)
     medians: list[Matrix] = field(default_factory=list)
     pairs: Table | None = None
     losses: Table | None = None
     missed: int = 0
+    failures: Table | None = None
+    worst: Table | None = None
+    worst_pictures: list[Picture] = field(default_factory=list)
     retrieval: list[Matrix] = field(default_factory=list)
     retrieval_note: str = ""
     messages: list[str] = field(default_factory=list)
     figures: list[Picture] = field(default_factory=list)
     maps: list[Picture] = field(default_factory=list)
     samples: list[Picture] = field(default_factory=list)
-    recordings: list[str] = field(default_factory=list)
+    recordings: list[Cell] = field(default_factory=list)
+    files: Table | None = None
+    others: list[Cell] = field(default_factory=list)
+    """Files that are of no single pair."""
 
 
 def write_report(run_dir: str | Path) -> Path:
     """Write `report.html` of a run from `run.json`, tables and pictures in its folder, and return its path.
 
-    Pictures are embedded, so that the one file can be mailed; what is missing is left out. In the folder
-    `visualization`, pictures named `localization*` are shown as samples, others as maps; a caption is the
-    PNG's `Description` or `Title`.
+    Pictures are embedded, so that the one file can be mailed; links to poses, notebooks and recordings are relative
+    and work beside them. What is missing is left out, what cannot be read is named. In the folder `visualization`,
+    pictures named `worst*` are shown with the worst queries, `localization*` as samples, others as maps; a title is
+    the PNG's `Title` or `Description`.
 
     Raises:
         ArtefactError: there is no `run.json`, or it is torn.
@@ -105,8 +130,12 @@ def write_report(run_dir: str | Path) -> Path:
 
     run_dir = Path(run_dir)
     run = _read_run(run_dir / "run.json")
-    album = _Album(run_dir)
-    scenes = [_scene(SceneFiles(run_dir, str(name)), album) for name in run["scenes"]]
+    left_out: list[str] = []
+    scenes = []
+    for name in map(str, run["scenes"]):
+        # A share for each scene: the last one is worth its pictures, too.
+        album = _Album(run_dir, PICTURE_BUDGET // len(run["scenes"]), left_out)
+        scenes.append(_scene(SceneFiles(run_dir, name), str(run["inputs"].get(name, "")), album))
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -117,10 +146,12 @@ def write_report(run_dir: str | Path) -> Path:
     page = environment.get_template("report.html.j2").render(
         run=run,
         scenes=scenes,
-        stages=_stages(run),
+        stages=_stages(run, run_dir),
+        stopped=[row for row in run["stages"] if row.get("status") in ("failed", "interrupted")],
         summary=_summary(run),
-        manifest=json.dumps(run["manifest"], indent=2, ensure_ascii=False),
-        left_out=album.left_out,
+        manifest=_json(run["manifest"]),
+        parameters=[(_stage_name(row), _json(row["parameters"])) for row in run["stages"] if row.get("parameters")],
+        left_out=left_out,
     )
     write_text(run_dir / "report.html", page)
     return run_dir / "report.html"
@@ -138,12 +169,19 @@ def _read_run(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ArtefactError(f"{path}: expected a JSON object, found a {type(content).__name__}.")
     empty = {"name": path.parent.name, "created": "", "status": "", "error": None, "total_seconds": None}
-    lists: dict[str, Any] = {"manifest": {}, "versions": {}, "machine": {}, "scenes": [], "stages": []}
-    run = {**empty, "peak_memory_mb": None, "work_seconds": None, **lists, **content}
+    lists: dict[str, Any] = {"manifest": {}, "versions": {}, "machine": {}, "inputs": {}, "scenes": [], "stages": []}
+    run = {**empty, "peak_memory_mb": None, "work_seconds": None, "code": "", **lists, **content}
     run["scenes"] = run["scenes"] or list(
         dict.fromkeys(row["scene"] for row in run["stages"] if row.get("scene"))
     )
     return run
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, indent=2, ensure_ascii=False)
+
+
+# The run: time, memory, machine
 
 
 def _summary(run: dict[str, Any]) -> list[tuple[str, str]]:
@@ -160,70 +198,113 @@ def _summary(run: dict[str, Any]) -> list[tuple[str, str]]:
     return [*parts, ("machine", machine)] if machine else parts
 
 
-def _stages(run: dict[str, Any]) -> Table:
+def _stage_name(row: dict[str, Any]) -> str:
+    return " ".join(str(part) for part in (row.get("scene"), row.get("stage"), row.get("part")) if part)
+
+
+def _stages(run: dict[str, Any], run_dir: Path) -> Table:
     rows = []
     longest = max((float(row.get("seconds") or 0) for row in run["stages"]), default=0.0)
+    largest = max((float(row.get("peak_memory_mb") or 0) for row in run["stages"]), default=0.0)
     for row in run["stages"]:
         seconds, work = row.get("seconds"), row.get("work_seconds", row.get("kernel_seconds"))
         counts = ", ".join(
             f"{value} {key.replace('_', ' ')}" for key, value in (row.get("counts") or {}).items()
         )
         memory = row.get("peak_memory_mb")
+        notebook = run_dir / str(row.get("notebook") or "")
         name = " ".join(str(part) for part in (row.get("stage", ""), row.get("part")) if part)
-        shade = 0.4 * float(seconds) / longest if seconds and longest else None
-        texts = [str(row.get("scene") or ""), name, str(row.get("status", ""))]
-        times = [
-            Cell(_seconds(seconds), shade),
+        rows.append([
+            Cell(str(row.get("scene") or "")),
+            Cell(name, link=_link(run_dir, notebook) if notebook.is_file() else ""),
+            Cell(str(row.get("status", ""))),
+            Cell(_seconds(seconds), bar=float(seconds) / longest if seconds and longest else None),
             Cell(_seconds(work)),
-            Cell(f"{memory:.0f} MB" if memory else "–"),
-        ]
-        rows.append([*map(Cell, texts), *times, Cell(counts)])
-    return Table(["scene", "stage", "status", "time", "of it work", "peak memory", "counts"], rows)
+            Cell(f"{memory:.0f} MB" if memory else "–", bar=float(memory) / largest if memory else None),
+            Cell(counts),
+        ])  # fmt: skip
+    caption = "Time and peak memory of every stage; a name leads to its executed notebook"
+    return Table(caption, ["scene", "stage", "status", "time", "of it work", "peak memory", "counts"], rows)
 
 
-def _scene(files: SceneFiles, album: "_Album") -> Scene:
-    scene = Scene(files.scene)
-    recall = _read_table(files.evaluation / "recall.csv")
+# A scene
+
+
+def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> Scene:
+    scene = Scene(files.scene, fingerprint)
+    tables = {
+        name: _read_table(files.evaluation / f"{name}.csv", scene.messages)
+        for name in ("recall", "errors", "losses", "retrieval")
+    }
+    recall, errors, losses = tables["recall"], tables["errors"], tables["losses"]
     thresholds = [column for column in recall.columns if column.startswith("recall@")]
+    statuses = _read_statuses(files, scene.messages)
+    _verdict(scene, recall, errors, statuses, thresholds)
     if thresholds:
-        done = recall.dropna(subset=thresholds)
         for column in thresholds:
-            name = _threshold(column.removeprefix("recall@"))
-            scene.headlines.append((f"{_percent(done[column].mean())} %", f"mean recall at {name}"))
-            scene.recall.append(_matrix(recall, column, f"Recall at {name} [%]", _percent, lambda v: 0.9 * v))
+            title = f"Recall at {_threshold(column)} [%]"
+            scene.recall.append(_matrix(recall, column, title, _percent, lambda v: 0.9 * v))
         for column, title, factor in (
             ("median_rotation_deg", "Median rotation error [°]", 1.0),
             ("median_translation_m", "Median translation error [cm]", 100.0),
         ):
-            scene.medians.append(_matrix(recall, column, title, lambda v, f=factor: _error(v * f)))
-        if "ok_wrong" in done:
-            scene.headlines.append(
-                (f"{_percent(_weighted(done, 'ok_wrong'))} %", "called ok, but beyond 5°, 0.5 m")
-            )
+            scene.medians.append(_matrix(recall, column, title, lambda v, f=factor: _number(v * f)))
     if len(recall):
         scene.pairs = _pairs(recall, thresholds)
-        scene.messages = _messages(files.evaluation / "recall.csv")
-    losses = _read_table(files.evaluation / "losses.csv")
+        scene.messages += _messages(files.evaluation / "recall.csv")
     scene.losses, scene.missed = _losses(losses), int(losses.get("missed", pd.Series(dtype=float)).sum())
-    scene.retrieval, scene.retrieval_note = _retrieval(_read_table(files.evaluation / "retrieval.csv"))
-    for name, caption in EVALUATION_FIGURES.items():
-        if (path := files.evaluation / f"{name}.png").is_file():
-            scene.figures.append(album.picture(path, caption))
-    stills = sorted(files.visualization.glob("*.png"))
+    scene.failures = _failures(statuses)
+    scene.worst = _worst(errors if len(errors) else statuses, thresholds)
+    scene.retrieval, scene.retrieval_note = _retrieval(tables["retrieval"])
+    stills = sorted(files.visualization.glob("*.png"), key=_natural)
+    worst = [path for path in stills if path.name.startswith("worst")]
     samples = [path for path in stills if path.name.startswith("localization")]
-    scene.maps = [album.picture(path) for path in stills if path not in samples]
+    # What fails to be understood without a picture comes first, while there is room.
+    scene.worst_pictures = [album.picture(path) for path in worst]
+    for name, (title, caption) in EVALUATION_FIGURES.items():
+        if (path := files.evaluation / f"{name}.png").is_file():
+            scene.figures.append(album.picture(path, title, caption))
+    scene.maps = [album.picture(path) for path in stills if path not in worst and path not in samples]
     scene.samples = [album.picture(path) for path in samples]
-    scene.recordings = [
-        str(path.relative_to(files.run)) for path in sorted(files.visualization.glob("*.rrd"))
+    recordings = sorted(files.visualization.glob("*.rrd"))
+    scene.recordings = [Cell(path.name, link=_link(files.run, path)) for path in recordings]
+    scene.files = _files(files)
+    scene.others = [
+        Cell(path.name, link=_link(files.run, path)) for path in sorted(files.evaluation.glob("*.csv"))
     ]
     return scene
 
 
-def _read_table(path: Path) -> pd.DataFrame:
+def _read_table(path: Path, messages: list[str]) -> pd.DataFrame:
+    """Return a table, empty where there is none; what cannot be read is said in `messages`."""
     try:
-        return pd.read_csv(path)
+        return pd.read_csv(path, dtype={"device_id": str})
     except (FileNotFoundError, pd.errors.EmptyDataError):
-        return pd.DataFrame()
+        pass
+    except (OSError, ValueError) as error:
+        messages.append(f"{path.name} cannot be read ({error}). Run its stage again.")
+    return pd.DataFrame()
+
+
+def _read_statuses(files: SceneFiles, messages: list[str]) -> pd.DataFrame:
+    """Return status and inliers of every query of every pair, also of those without ground truth."""
+    tables = []
+    for (map_device, query_device), stem in _pairs_of(files).items():
+        table = _read_table(stem.with_name(f"{stem.name}.csv"), messages)
+        if "status" in table:
+            table = table.reindex(columns=["timestamp", "device_id", "status", "num_inliers"])
+            tables.append(table.assign(map_device=map_device, query_device=query_device))
+    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
+
+
+def _pairs_of(files: SceneFiles) -> dict[tuple[str, str], Path]:
+    """Return the path, without suffix, of the results of each pair that has any."""
+    pairs = {}
+    for path in sorted([*files.poses_dir.glob("*.csv"), *files.poses_dir.glob("*.txt")]):
+        found = re.fullmatch(f"{re.escape(files.scene)}_map_(.+)_query_(.+)", path.stem)
+        if found:
+            pairs[found[1], found[2]] = path.with_suffix("")
+    return pairs
 
 
 def _messages(table: Path) -> list[str]:
@@ -232,6 +313,38 @@ def _messages(table: Path) -> list[str]:
     except (OSError, ValueError, KeyError):
         return []
     return list(settings.get("messages", []))
+
+
+def _verdict(
+    scene: Scene, recall: pd.DataFrame, errors: pd.DataFrame, statuses: pd.DataFrame, thresholds: list[str]
+) -> None:
+    """Say in a few sentences and numbers how good the answers are."""
+    if len(statuses):
+        pairs = len(statuses[["map_device", "query_device"]].drop_duplicates())
+        failed = int(statuses["status"].str.startswith("failed").sum())
+        low = int((statuses["status"] == "low_confidence").sum())
+        ok = len(statuses) - failed - low
+        counts = f"{ok} ok, {low} low confidence, {failed} failed"
+        scene.verdict.append(f"{len(statuses)} queries asked in {_plural(pairs, 'pair')} of devices: {counts}.")
+    done = recall.dropna(subset=thresholds) if thresholds else recall.iloc[:0]
+    if not len(done):
+        return
+    for column in thresholds:
+        scene.headlines.append((f"{_percent(done[column].mean())} %", f"mean recall at {_threshold(column)}"))
+    if len(errors):
+        medians = errors[["rotation_error_deg", "translation_error_m"]].median()
+        text = f"{_number(medians.iloc[0])}°, {_length(medians.iloc[1])}"
+        scene.headlines.append((text, "median error of all queries"))
+    strict = thresholds[0]
+    weakest = done.loc[done[strict].idxmin()]
+    if weakest[strict] == done[strict].max():
+        scene.verdict.append(f"Every pair has {_percent(weakest[strict])} % at {_threshold(strict)}.")
+    else:
+        pair = f"{weakest['query_device']} queries in the {weakest['map_device']} map"
+        scene.verdict.append(f"Weakest pair at {_threshold(strict)}: {pair}, {_percent(weakest[strict])} %.")
+    if "ok_wrong" in done:
+        wrong = float((done["ok_wrong"] * done["queries"]).sum() / done["queries"].sum())
+        scene.headlines.append((f"{_percent(wrong)} %", "called ok, but beyond 5°, 0.5 m"))
 
 
 def _matrix(
@@ -249,10 +362,10 @@ def _matrix(
 def _pairs(recall: pd.DataFrame, thresholds: list[str]) -> Table:
     counts = [c for c in ("queries", "localized", "ok", "low_confidence", "failed") if c in recall]
     columns = ["map", "query", *(c.replace("_", " ") for c in counts)]
-    columns += [f"recall {_threshold(c.removeprefix('recall@'))}" for c in thresholds]
+    columns += [f"recall {_threshold(c)}" for c in thresholds]
     titles = {
-        "median_rotation_deg": "median °",
-        "median_translation_m": "median cm",
+        "median_rotation_deg": "median [°]",
+        "median_translation_m": "median [cm]",
         "ok_wrong": "ok but wrong",
     }
     errors = [c for c in titles if c in recall]
@@ -264,11 +377,11 @@ def _pairs(recall: pd.DataFrame, thresholds: list[str]) -> Table:
         cells += [Cell("–" if pd.isna(row[c]) else f"{row[c]:.0f}") for c in counts]
         cells += [_share(row[c]) for c in thresholds]
         cells += [
-            Cell(_error(row[c] * factors[c])) if c in factors else Cell(_share(row[c]).text) for c in errors
+            Cell(_number(row[c] * factors[c])) if c in factors else Cell(_share(row[c]).text) for c in errors
         ]
         state = str(row.get("state", "evaluated"))
         rows.append([*cells, Cell("" if state == "evaluated" else state)])
-    return Table([*columns, "note"], rows)
+    return Table("Counts of queries, recall and median errors of every pair", [*columns, "note"], rows)
 
 
 def _losses(losses: pd.DataFrame) -> Table | None:
@@ -285,7 +398,67 @@ def _losses(losses: pd.DataFrame) -> Table | None:
             label = _threshold(str(threshold)) if name == parts[0][0] else ""
             cells = [Cell(label), Cell(name), Cell(f"{queries:.0f}"), Cell(f"{part['missed'].sum():.0f}")]
             rows.append(cells + [Cell(f"{_percent(share)} %", 1.2 * share) for share in shares])
-    return Table(["threshold", "map", "queries", "missed", *REASONS], rows)
+    caption = "Queries missed at each threshold, and the share of all queries that each reason costs"
+    return Table(caption, ["threshold", "map", "queries", "missed", *REASONS], rows)
+
+
+def _failures(statuses: pd.DataFrame) -> Table | None:
+    """Count the reasons of queries without a pose."""
+    if not len(statuses):
+        return None
+    failed = statuses[statuses["status"].str.startswith("failed")]
+    if not len(failed):
+        return None
+    # Numbers in brackets differ from query to query; the reason is the same.
+    reasons = failed["status"].str.removeprefix("failed").str.replace(r" \(.*", "", regex=True).str.lstrip(": ")
+    groups = sorted(failed.groupby(reasons.rename("reason")), key=lambda item: (-len(item[1]), item[0]))
+    rows = []
+    for reason, group in groups[:MOST_REASONS]:
+        pairs = group.groupby(["query_device", "map_device"]).size().sort_values(ascending=False)
+        where = ", ".join(f"{q} in {m} map {count}" for (q, m), count in pairs.items())
+        rows.append([Cell(str(reason)), Cell(str(len(group))), Cell(where)])
+    if rest := sum(len(group) for _, group in groups[MOST_REASONS:]):
+        rows.append([Cell("other reasons"), Cell(str(rest)), Cell("")])
+    return Table("Queries without a pose, by reason", ["reason", "queries", "where"], rows)
+
+
+def _worst(queries: pd.DataFrame, thresholds: list[str]) -> Table | None:
+    """List the queries farthest from the truth or, where it is not known, with the least support."""
+    if not len(queries):
+        return None
+    known = "rotation_error_deg" in queries
+    if known:
+        degrees, metres = _parse_threshold(thresholds[0]) if thresholds else (1.0, 0.1)
+        rotation, translation = queries["rotation_error_deg"] / degrees, queries["translation_error_m"] / metres
+        off = np.maximum(rotation, translation)
+        caption = f"The {min(WORST, len(queries))} worst, by the larger of rotation error / {degrees:g}° and "
+        caption += f"translation error / {metres:g} m"
+    else:
+        status = queries["status"]
+        off = 2 * status.str.startswith("failed").astype(int) + (status == "low_confidence").astype(int)
+        caption = f"The {min(WORST, len(queries))} least supported; there is no ground truth to compare with"
+    table = queries.assign(off=off).sort_values(["off", "num_inliers"], ascending=[False, True], kind="stable")
+    columns = ["query", "device", "timestamp [µs]", "status", "inliers"]
+    rows = []
+    for row in table.head(WORST).to_dict("records"):
+        inliers = "–" if pd.isna(row["num_inliers"]) else f"{row['num_inliers']:.0f}"
+        texts = [f"{row['query_device']} in {row['map_device']} map", str(row["device_id"])]
+        texts += [str(row["timestamp"]), str(row["status"]).replace("_", " "), inliers]
+        if known:
+            rotation_deg, translation_m = row["rotation_error_deg"], row["translation_error_m"]
+            texts += [_number(rotation_deg), _length(translation_m), _why(row)]
+        rows.append([Cell(text) for text in texts])
+    return Table(caption, columns + (["off by [°]", "off by", "why"] if known else []), rows)
+
+
+def _why(row: dict[str, Any]) -> str:
+    """Return what a query was lost by, at the widest threshold that it misses."""
+    losses = {name: reason for name, reason in row.items() if name.startswith("loss@")}
+    missed = {name: reason for name, reason in losses.items() if isinstance(reason, str) and reason}
+    if not missed:
+        return "within every threshold" if losses else ""
+    widest = list(missed)[-1]
+    return f"{missed[widest]} (beyond {_threshold(widest)})"
 
 
 def _retrieval(retrieval: pd.DataFrame) -> tuple[list[Matrix], str]:
@@ -301,8 +474,37 @@ def _retrieval(retrieval: pd.DataFrame) -> tuple[list[Matrix], str]:
     return matrices, f"{note}to within {angle_deg:g}°."
 
 
-def _weighted(table: pd.DataFrame, column: str) -> float:
-    return float((table[column] * table["queries"]).sum() / table["queries"].sum())
+def _files(files: SceneFiles) -> Table | None:
+    """Link what a pair has left."""
+    rows = []
+    for (map_device, query_device), stem in _pairs_of(files).items():
+        paths = {
+            "poses": stem.with_name(f"{stem.name}.txt"),
+            "statuses": stem.with_name(f"{stem.name}.csv"),
+            "references": files.retrieval(map_device, query_device),
+        }
+        rows.append([Cell(map_device), Cell(query_device)])
+        for name, path in paths.items():
+            rows[-1].append(Cell(name, link=_link(files.run, path)) if path.is_file() else Cell("–"))
+    caption = "Files of each pair: poses (device to world), a status row for each query, references of each image"
+    return Table(caption, ["map", "query", "poses", "statuses", "references"], rows) if rows else None
+
+
+# Text
+
+
+def _link(run_dir: Path, path: Path) -> str:
+    """Return the URL of a file, relative to the page."""
+    return quote(path.relative_to(run_dir).as_posix())
+
+
+def _natural(path: Path) -> list[Any]:
+    """Sort key that puts 10 after 9."""
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
+
+
+def _plural(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def _share(share: float) -> Cell:
@@ -313,10 +515,14 @@ def _percent(share: float) -> str:
     return "–" if math.isnan(share) else f"{100 * share:.1f}".removesuffix(".0")
 
 
-def _error(value: float) -> str:
+def _number(value: float) -> str:
     if not math.isfinite(value):
         return "∞" if math.isinf(value) else "–"
     return f"{value:.3f}" if value < 0.1 else f"{value:.2f}" if value < 10 else f"{value:.0f}"
+
+
+def _length(metres: float) -> str:
+    return f"{_number(100 * metres)} cm" if metres < 1 else f"{_number(metres)} m" if metres < math.inf else "∞"
 
 
 def _seconds(seconds: float | None) -> str:
@@ -327,30 +533,35 @@ def _seconds(seconds: float | None) -> str:
     return f"{int(seconds) // 60} min {int(seconds) % 60} s"
 
 
+def _parse_threshold(name: str) -> tuple[float, float]:
+    """Return degrees and metres of a column such as `recall@(5deg,0.5m)`."""
+    degrees, _, metres = name.rpartition("@")[2].strip("()").partition(",")
+    return float(degrees.removesuffix("deg")), float(metres.removesuffix("m"))
+
+
 def _threshold(name: str) -> str:
-    degrees, _, metres = name.strip("()").partition(",")
-    return f"{degrees.removesuffix('deg')}°, {metres.removesuffix('m')} m"
+    degrees, metres = _parse_threshold(name)
+    return f"{degrees:g}°, {metres:g} m"
 
 
 class _Album:
-    """Turns picture files into data URLs until the page has no room left."""
+    """Turns picture files into data URLs until there is no room left."""
 
-    def __init__(self, run_dir: Path) -> None:
+    def __init__(self, run_dir: Path, room: int, left_out: list[str]) -> None:
         self.run_dir = run_dir
-        self.left_out: list[str] = []
-        self._room = PICTURE_BUDGET
+        self.left_out = left_out
+        self._room = room
 
-    def picture(self, path: Path, caption: str = "") -> Picture:
-        """Return a picture for the page; the caption is the file's own where none is given."""
+    def picture(self, path: Path, title: str = "", caption: str = "") -> Picture:
+        """Return a picture for the page; the title is the file's own where none is given."""
         from PIL import Image
 
-        name = str(path.relative_to(self.run_dir))
+        name, link = str(path.relative_to(self.run_dir)), _link(self.run_dir, path)
         try:
             with Image.open(path) as image:
                 info = getattr(image, "text", {})
-                caption = (
-                    caption or info.get("Description") or info.get("Title") or path.stem.replace("_", " ")
-                )
+                title = title or info.get("Title") or info.get("Description") or path.stem.replace("_", " ")
+                wide = image.width > 1.5 * image.height
                 data, kind = path.read_bytes(), "png"
                 if image.width > MAX_WIDTH or len(data) > 150_000:
                     small = image.convert("RGB")
@@ -360,10 +571,10 @@ class _Album:
                     # Plots are often smaller as they are.
                     if stream.tell() < len(data):
                         data, kind = stream.getvalue(), "jpeg"
-        except OSError as error:
-            return Picture("", f"{name} cannot be read: {error}", name)
+        except (OSError, ValueError, SyntaxError) as error:  # the latter two: how Pillow calls some torn PNGs
+            return Picture("", f"{name} cannot be read: {error}", "", link)
         if len(data) > self._room:
             self.left_out.append(name)
-            return Picture("", caption, name)
+            return Picture("", title, caption, link)
         self._room -= len(data)
-        return Picture(f"data:image/{kind};base64,{base64.b64encode(data).decode()}", caption, name)
+        return Picture(f"data:image/{kind};base64,{base64.b64encode(data).decode()}", title, caption, link, wide)
