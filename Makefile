@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo run test test-slow lab lint bench clean
+.PHONY: help demo run test test-slow test-browser browser-setup docs-images lab lint bench clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */  make \1|/' | column -t -s '|'
@@ -25,6 +25,23 @@ test: $(INSTALLED)  ## the default tests, about a minute or two
 
 test-slow: $(INSTALLED)  ## whole runs, and accuracy on real captures where they are present
 	$(BIN)/python -m pytest -m slow
+
+# Chromium is Debian's, as Playwright's own comes from a host that many networks refuse; elsewhere, set CHROMIUM.
+browser-setup: $(INSTALLED)  ## install what the browser tests need: Chromium (apt, with sudo if not root) and Playwright (pip)
+	@set -e; if $(BIN)/python -c 'import sys; from docs import chromium; sys.exit(not chromium.find_chromium())'; then :; \
+	elif ! command -v apt-get > /dev/null; then \
+	  echo "Chromium is not installed, and here is no apt-get: install Chromium or Chrome, and name it: CHROMIUM=/path/to/it"; exit 1; \
+	elif [ "$$(id -u)" != 0 ] && ! command -v sudo > /dev/null; then \
+	  echo "Chromium is not installed. Ask root for: apt-get install chromium fonts-dejavu-core"; exit 1; \
+	else as_root=$$([ "$$(id -u)" = 0 ] || echo sudo); $$as_root apt-get update -qq; \
+	  DEBIAN_FRONTEND=noninteractive $$as_root apt-get install -qq -y --no-install-recommends chromium fonts-dejavu-core; fi
+	$(BIN)/python -m pip install $(PIP_ARGS) --quiet --constraint constraints.txt --editable '.[dev,browser]'
+
+test-browser: $(INSTALLED)  ## the report and the notebooks' viewer in a real browser; first: make browser-setup
+	$(BIN)/python -m pytest -m browser -rs
+
+docs-images: $(INSTALLED)  ## draw the README's pictures anew from a demo run; first: make browser-setup
+	$(BIN)/python -m docs.make_images
 
 lab: $(INSTALLED)  ## JupyterLab on the notebooks
 	$(BIN)/python -m jupyterlab --notebook-dir notebooks

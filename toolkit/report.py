@@ -255,7 +255,7 @@ def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> Scene:
     scene.losses, scene.missed = _losses(losses), int(losses.get("missed", pd.Series(dtype=float)).sum())
     scene.failures = _failures(statuses)
     scene.worst = _worst(errors if len(errors) else statuses, thresholds)
-    scene.retrieval, scene.retrieval_note = _retrieval(tables["retrieval"])
+    scene.retrieval, scene.retrieval_note = _retrieval(tables["retrieval"], scene.headlines)
     stills = sorted(files.visualization.glob("*.png"), key=_natural)
     worst = [path for path in stills if path.name.startswith("worst")]
     samples = [path for path in stills if path.name.startswith("localization")]
@@ -333,8 +333,8 @@ def _verdict(
         scene.headlines.append((f"{_percent(done[column].mean())} %", f"mean recall at {_threshold(column)}"))
     if len(errors):
         medians = errors[["rotation_error_deg", "translation_error_m"]].median()
-        text = f"{_number(medians.iloc[0])}°, {_length(medians.iloc[1])}"
-        scene.headlines.append((text, "median error of all queries"))
+        text = f"median error of all queries, and {_number(medians.iloc[0])}°"
+        scene.headlines.append((_length(medians.iloc[1]), text))
     strict = thresholds[0]
     weakest = done.loc[done[strict].idxmin()]
     if weakest[strict] == done[strict].max():
@@ -438,17 +438,18 @@ def _worst(queries: pd.DataFrame, thresholds: list[str]) -> Table | None:
         off = 2 * status.str.startswith("failed").astype(int) + (status == "low_confidence").astype(int)
         caption = f"The {min(WORST, len(queries))} least supported; there is no ground truth to compare with"
     table = queries.assign(off=off).sort_values(["off", "num_inliers"], ascending=[False, True], kind="stable")
-    columns = ["query", "device", "timestamp [µs]", "status", "inliers"]
+    columns = ["query", *(["off by", "why"] if known else []), "status", "inliers", "device", "timestamp [µs]"]
     rows = []
     for row in table.head(WORST).to_dict("records"):
         inliers = "–" if pd.isna(row["num_inliers"]) else f"{row['num_inliers']:.0f}"
-        texts = [f"{row['query_device']} in {row['map_device']} map", str(row["device_id"])]
-        texts += [str(row["timestamp"]), str(row["status"]).replace("_", " "), inliers]
+        texts = [f"{row['query_device']} in {row['map_device']} map"]
         if known:
             rotation_deg, translation_m = row["rotation_error_deg"], row["translation_error_m"]
-            texts += [_number(rotation_deg), _length(translation_m), _why(row)]
+            located = math.isfinite(rotation_deg)
+            texts += [f"{_number(rotation_deg)}°, {_length(translation_m)}" if located else "no pose", _why(row)]
+        texts += [str(row["status"]).replace("_", " "), inliers, str(row["device_id"]), str(row["timestamp"])]
         rows.append([Cell(text) for text in texts])
-    return Table(caption, columns + (["off by [°]", "off by", "why"] if known else []), rows)
+    return Table(caption, columns, rows)
 
 
 def _why(row: dict[str, Any]) -> str:
@@ -458,10 +459,10 @@ def _why(row: dict[str, Any]) -> str:
     if not missed:
         return "within every threshold" if losses else ""
     widest = list(missed)[-1]
-    return f"{missed[widest]} (beyond {_threshold(widest)})"
+    return f"{missed[widest]} at {_threshold(widest)}"
 
 
-def _retrieval(retrieval: pd.DataFrame) -> tuple[list[Matrix], str]:
+def _retrieval(retrieval: pd.DataFrame, headlines: list[tuple[str, str]]) -> tuple[list[Matrix], str]:
     ks = [column for column in retrieval.columns if column.startswith("recall@")]
     known = retrieval.dropna(subset=ks) if ks else retrieval.iloc[:0]
     if not len(known):
@@ -469,6 +470,8 @@ def _retrieval(retrieval: pd.DataFrame) -> tuple[list[Matrix], str]:
     titles = {k: f"In the first {k.removeprefix('recall@')} [%]" for k in ks}
     titles["in_map"] = "Anywhere in the map [%]"
     matrices = [_matrix(retrieval, c, titles[c], _percent, lambda v: 0.9 * v) for c in titles if c in known]
+    first = ks[-1].removeprefix("recall@")
+    headlines.append((f"{_percent(known[ks[-1]].mean())} %", f"have a good reference in the first {first}"))
     radius_m, angle_deg = known["radius_m"].iloc[0], known["angle_deg"].iloc[0]
     note = f"A good reference stands within {radius_m:g} m of the query's true camera and looks the same way "
     return matrices, f"{note}to within {angle_deg:g}°."
@@ -541,7 +544,7 @@ def _parse_threshold(name: str) -> tuple[float, float]:
 
 def _threshold(name: str) -> str:
     degrees, metres = _parse_threshold(name)
-    return f"{degrees:g}°, {metres:g} m"
+    return f"{degrees:g}°, {metres:g}\N{NO-BREAK SPACE}m"
 
 
 class _Album:
@@ -561,7 +564,7 @@ class _Album:
             with Image.open(path) as image:
                 info = getattr(image, "text", {})
                 title = title or info.get("Title") or info.get("Description") or path.stem.replace("_", " ")
-                wide = image.width > 1.5 * image.height
+                wide = image.width > 1.8 * image.height
                 data, kind = path.read_bytes(), "png"
                 if image.width > MAX_WIDTH or len(data) > 150_000:
                     small = image.convert("RGB")

@@ -1,0 +1,77 @@
+"""Draw the README's pictures anew: `make docs-images`, after `make browser-setup`.
+
+They come from a run of the demo, made first where it is not there yet, as a person sees it: the report in a browser,
+the viewer in JupyterLab.
+"""
+
+import io
+import sys
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from docs import chromium
+from toolkit import pipeline
+from toolkit.files import write_atomic
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+ROOT = Path(__file__).resolve().parents[1]
+IMAGES = ROOT / "docs" / "images"
+LARGEST = 300_000
+"""Bytes of a picture at most: a README is read over slow lines, too."""
+
+
+def main() -> None:
+    """Make every picture."""
+    if reason := chromium.why_missing():
+        sys.exit(f"make docs-images {reason}.")
+    run = pipeline.run(ROOT / "data_manifests" / "demo.yaml")
+    capture = run.parent.parent / "data" / run.name
+    with chromium.open_browser() as browser:
+        save(report(browser, run), IMAGES / "report.png")
+        save(viewer(browser, run, capture / "sessions"), IMAGES / "inline.png")
+
+
+def report(browser: "Browser", run: Path) -> bytes:
+    """Return what a person sees of the report first."""
+    page = browser.new_page(viewport={"width": 1000, "height": 1000})
+    page.goto((run / "report.html").as_uri())
+    return page.screenshot()
+
+
+def viewer(browser: "Browser", run: Path, sessions_root: Path) -> bytes:
+    """Return the notebook 06_visualize in JupyterLab, scrolled to its viewer."""
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        name = chromium.copy_notebook("visualize", run, sessions_root, folder / "notebooks")
+        (folder / "state").mkdir()
+        with chromium.serve_lab(folder / "notebooks", folder / "state") as url:
+            page = browser.new_page(viewport={"width": 1300, "height": 900})
+            if errors := chromium.run_notebook(page, url.format(name)):
+                sys.exit(f"{name}: {errors[0]}")
+            canvas = chromium.find_viewer(page)
+            chromium.wait_for_scene(canvas)
+            picture: bytes = page.screenshot()
+            page.close()
+            return picture
+
+
+def save(png: bytes, path: Path) -> None:
+    """Write a picture with as many colours of a palette as fit in `LARGEST` bytes."""
+    from PIL import Image
+
+    image = Image.open(io.BytesIO(png)).convert("RGB")
+    for count in (256, 128, 64, 32):
+        stream = io.BytesIO()
+        image.quantize(count, dither=Image.Dither.NONE).save(stream, "PNG", optimize=True)
+        if stream.tell() <= LARGEST:
+            break
+    with write_atomic(path) as temporary:
+        temporary.write_bytes(stream.getvalue())
+    print(f"{path.relative_to(ROOT)}: {image.width} x {image.height}, {stream.tell() // 1000} kB")
+
+
+if __name__ == "__main__":
+    main()
