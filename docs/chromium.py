@@ -30,6 +30,11 @@ FLAGS = (
     *("--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update"),
     *("--disable-sync", "--disable-dev-shm-usage"),
 )
+LAB_SETTINGS = {
+    "apputils-extension/notification": {"fetchNews": "false", "checkForUpdates": False},
+    # Cells out of sight keep their outputs, and with them the viewer.
+    "notebook-extension/tracker": {"windowingMode": "none"},
+}
 LOCAL = ("127.0.0.1", "localhost", "[::1]", "::1", "")
 
 
@@ -119,9 +124,10 @@ def serve_lab(folder: Path, state: Path) -> Iterator[str]:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     token = secrets.token_hex(16)
-    notifications = state / "settings" / "@jupyterlab" / "apputils-extension" / "notification.jupyterlab-settings"
-    notifications.parent.mkdir(parents=True)
-    notifications.write_text(json.dumps({"fetchNews": "false", "checkForUpdates": False}))
+    for name, settings in LAB_SETTINGS.items():
+        path = state / "settings" / "@jupyterlab" / f"{name}.jupyterlab-settings"
+        path.parent.mkdir(parents=True)
+        path.write_text(json.dumps(settings))
     environment = {
         **os.environ,
         "JUPYTER_CONFIG_DIR": str(state / "config"),
@@ -211,7 +217,7 @@ def find_viewer(page: "Page", seconds: float = 120) -> "Locator":
     """Wait for the rerun viewer in a notebook's outputs, scroll to it, and return its canvas."""
     canvas = page.locator(".jp-OutputArea-output canvas").first
     canvas.wait_for(timeout=1000 * seconds)
-    canvas.scroll_into_view_if_needed()
+    canvas.evaluate("element => element.scrollIntoView({block: 'center'})")
     return canvas
 
 
@@ -222,7 +228,9 @@ def wait_for_scene(canvas: "Locator", seconds: float = 120) -> bytes:
     """
     deadline = time.monotonic() + seconds
     while True:
-        png = canvas.screenshot()
+        # Of the page: of an element, Playwright waits for two frames alike in time, and software draws them slowly.
+        box = canvas.bounding_box()
+        png = canvas.page.screenshot(clip=box, timeout=1000 * seconds)  # type: ignore[arg-type]
         if is_scene(png) or time.monotonic() > deadline:
             return png
         time.sleep(1)

@@ -29,15 +29,31 @@ def main() -> None:
         sys.exit(f"make docs-images {reason}.")
     run = pipeline.run(ROOT / "data_manifests" / "demo.yaml")
     capture = run.parent.parent / "data" / run.name
+    save(result(run), IMAGES / "result.png")
     with chromium.open_browser() as browser:
         save(report(browser, run), IMAGES / "report.png")
         save(viewer(browser, run, capture / "sessions"), IMAGES / "inline.png")
 
 
+def result(run: Path) -> bytes:
+    """Return a query of the phone in the headset's map, above all of them seen from above."""
+    from PIL import Image
+
+    folder, pair = run / run.name / "visualization", f"{run.name}_map_hl_query_ios"
+    stills = [Image.open(folder / f"localization_{pair}_1.png"), Image.open(folder / f"{pair}.png")]
+    stills = [still.convert("RGB").resize((1087, 1087 * still.height // still.width)) for still in stills]
+    page = Image.new("RGB", (1087, sum(still.height for still in stills)))
+    for still, top in zip(stills, (0, stills[0].height), strict=True):
+        page.paste(still, (0, top))
+    stream = io.BytesIO()
+    page.save(stream, "PNG")
+    return stream.getvalue()
+
+
 def report(browser: "Browser", run: Path) -> bytes:
-    """Return what a person sees of the report first."""
-    page = browser.new_page(viewport={"width": 1000, "height": 1000})
-    page.goto((run / "report.html").as_uri())
+    """Return the numbers of the report, without its head: how long the demo takes depends on the machine."""
+    page = browser.new_page(viewport={"width": 1000, "height": 1150})
+    page.goto((run / "report.html").as_uri() + "#scene-1")
     return page.screenshot()
 
 

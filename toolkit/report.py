@@ -333,7 +333,7 @@ def _verdict(
         scene.headlines.append((f"{_percent(done[column].mean())} %", f"mean recall at {_threshold(column)}"))
     if len(errors):
         medians = errors[["rotation_error_deg", "translation_error_m"]].median()
-        text = f"median error of all queries, and {_number(medians.iloc[0])}°"
+        text = f"median error of position; {_number(medians.iloc[0])}° of rotation"
         scene.headlines.append((_length(medians.iloc[1]), text))
     strict = thresholds[0]
     weakest = done.loc[done[strict].idxmin()]
