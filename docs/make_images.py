@@ -40,7 +40,7 @@ def result(run: Path) -> bytes:
     from PIL import Image
 
     folder, pair = run / run.name / "visualization", f"{run.name}_map_hl_query_ios"
-    stills = [Image.open(folder / f"localization_{pair}_1.png"), Image.open(folder / f"{pair}.png")]
+    stills = [Image.open(folder / f"localization_{pair}_2.png"), Image.open(folder / f"{pair}.png")]
     stills = [still.convert("RGB").resize((1087, 1087 * still.height // still.width)) for still in stills]
     page = Image.new("RGB", (1087, sum(still.height for still in stills)))
     for still, top in zip(stills, (0, stills[0].height), strict=True):

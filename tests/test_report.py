@@ -108,7 +108,8 @@ def test_full_run(full):
         "Recall at 5°, 0.5 m [%]", "0.031", "1.23", "∞", "no poses file", "In the first 10 [%]", "77",
         "8 m of the query", "12 images embedded", "embed", "numpy 2", "scene_ios.rrd",
         "4 queries asked in 2 pairs of devices: 1 ok, 2 low confidence, 1 failed.",
-        "Weakest pair at 1°, 0.1 m: ios queries in the ios map, 10 %.", "3.00 m median error of position; 2.50° of rotation",
+        "Weakest pair at 1°, 0.1 m: ios queries in the ios map, 10 %.",
+        "3.00 m median error of position; 2.50° of rotation",
         "100 % have a good reference in the first 10",
         "0123456789abcdef", "fedcba9876543210", "model", "too few inliers 1 ios in hl map 1",
     ):  # fmt: skip

@@ -28,5 +28,5 @@ def finished_run(browser: "Browser", small_capture: Path, tmp_path_factory: pyte
     folder = tmp_path_factory.mktemp("run")
     manifest = folder / "small.yaml"
     manifest.write_text(f"description: a small run\ncaptures: ['{small_capture}']\n")
-    pairs = ["pairs=[[ios, ios], [ios, hl], [hl, ios]]", "visualize.samples=1"]
-    return pipeline.run(manifest, overrides=[f"output_root={folder}", *pairs], say=lambda *a, **k: None)
+    overrides = [f"output_root={folder}", "visualize.samples=1"]
+    return pipeline.run(manifest, overrides=overrides, say=lambda *a, **k: None)
