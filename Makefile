@@ -30,12 +30,13 @@ test-slow: $(INSTALLED)  ## whole runs, and accuracy on real captures where they
 browser-setup: $(INSTALLED)  ## install what the browser tests need: Chromium (apt, with sudo if not root) and Playwright (pip)
 	@set -e; if $(BIN)/python -c 'import sys; from docs import chromium; sys.exit(not chromium.find_chromium())'; then :; \
 	elif ! command -v apt-get > /dev/null; then \
-	  echo "Chromium is not installed, and here is no apt-get: install Chromium or Chrome, and name it: CHROMIUM=/path/to/it"; exit 1; \
+	  echo "Chromium is not installed, and there is no apt-get: install it or Chrome, and set CHROMIUM=/path/to/it"; exit 1; \
 	elif [ "$$(id -u)" != 0 ] && ! command -v sudo > /dev/null; then \
 	  echo "Chromium is not installed. Ask root for: apt-get install chromium fonts-dejavu-core"; exit 1; \
 	else as_root=$$([ "$$(id -u)" = 0 ] || echo sudo); $$as_root apt-get update -qq; \
 	  DEBIAN_FRONTEND=noninteractive $$as_root apt-get install -qq -y --no-install-recommends chromium fonts-dejavu-core; fi
 	$(BIN)/python -m pip install $(PIP_ARGS) --quiet --constraint constraints.txt --editable '.[dev,browser]'
+	@$(BIN)/python -c 'import sys; from docs import chromium; sys.exit(chromium.why_missing() or None)'
 
 test-browser: $(INSTALLED)  ## the report and the notebooks' viewer in a real browser; first: make browser-setup
 	$(BIN)/python -m pytest -m browser -rs

@@ -485,12 +485,13 @@ def _files(files: SceneFiles) -> Table | None:
             "poses": stem.with_name(f"{stem.name}.txt"),
             "statuses": stem.with_name(f"{stem.name}.csv"),
             "references": files.retrieval(map_device, query_device),
+            "recording": files.visualization / f"{stem.name}.rrd",
         }
         rows.append([Cell(map_device), Cell(query_device)])
         for name, path in paths.items():
             rows[-1].append(Cell(name, link=_link(files.run, path)) if path.is_file() else Cell("–"))
     caption = "Files of each pair: poses (device to world), a status row for each query, references of each image"
-    return Table(caption, ["map", "query", "poses", "statuses", "references"], rows) if rows else None
+    return Table(caption, ["map", "query", "poses", "statuses", "references", "recording"], rows) if rows else None
 
 
 # Text
