@@ -69,7 +69,7 @@ def viewer(browser: "Browser", run: Path, sessions_root: Path) -> bytes:
                 sys.exit(f"{name}: {errors[0]}")
             canvas = chromium.find_viewer(page)
             chromium.wait_for_scene(canvas)
-            picture: bytes = page.screenshot()
+            picture: bytes = page.screenshot(timeout=120_000)
             page.close()
             return picture
 
