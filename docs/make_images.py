@@ -64,11 +64,13 @@ def viewer(browser: "Browser", run: Path, sessions_root: Path) -> bytes:
         name = chromium.copy_notebook("visualize", run, sessions_root, folder / "notebooks")
         (folder / "state").mkdir()
         with chromium.serve_lab(folder / "notebooks", folder / "state") as url:
-            page = browser.new_page(viewport={"width": 1300, "height": 900})
+            page = browser.new_page(viewport={"width": 1300, "height": 760})
             if errors := chromium.run_notebook(page, url.format(name)):
                 sys.exit(f"{name}: {errors[0]}")
             canvas = chromium.find_viewer(page)
             chromium.wait_for_scene(canvas)
+            # What stands above and below names folders of this machine.
+            canvas.evaluate("element => element.scrollIntoView({block: 'start'})")
             picture: bytes = page.screenshot(timeout=120_000)
             page.close()
             return picture
