@@ -1,11 +1,11 @@
-"""The command line: `python -m toolkit run|report|check|demo-data`."""
+"""The command line: `python -m toolkit run|check|submit|demo-data`."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from toolkit.errors import ToolkitError
+from toolkit.errors import ManifestError, ToolkitError
 
 app = typer.Typer(
     help="Tell where photographs were taken, in a map of posed photographs.",
@@ -53,6 +53,39 @@ def check(capture: Annotated[Path, typer.Argument(help="Capture folder, with ses
     print(report.text())
     if not report.ok:
         raise typer.Exit(1)
+
+
+@app.command()
+def submit(
+    runs: Annotated[list[Path], typer.Argument(help="Run folders; scenes may be spread over several.")],
+    description: Annotated[
+        str, typer.Option(metavar="TEXT|FILE", help="What this is: method, thresholds, link to the code.")
+    ] = "",
+    out: Annotated[Path | None, typer.Option(help="Zip file; else RUN/submission.zip.")] = None,
+    failed: Annotated[
+        str,
+        typer.Option(
+            metavar="nearest|leave-out",
+            help="What stands for a query without a pose. `nearest`: the pose of its best retrieved reference. It is "
+            "the default because recall counts a query without a pose as a miss, so that a rough pose can only gain, "
+            "and because every query asked is then answered. The description says how many, and submission.csv "
+            "which. `leave-out`: nothing; then the zip holds only what was localized.",
+        ),
+    ] = "nearest",
+    queries: Annotated[str | None, typer.Option(help="Keyframe list to answer; else the challenge's.")] = None,
+    scene: Annotated[list[str] | None, typer.Option(help="Only this scene; repeat for more.")] = None,
+    capture: Annotated[list[Path] | None, typer.Option(help="Capture folder, if it has moved since the run.")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would be in the zip, write nothing.")] = False,
+) -> None:
+    """Check the poses of runs and write the zip file that the challenge takes; missing pairs are listed."""
+    from toolkit.submission import collect
+
+    if not description.strip() and not dry_run:
+        raise ManifestError("--description is missing: a text, or a file. The challenge wants to know what was done.")
+    submission = collect(runs, description, out, failed, queries, scene or (), capture or ())
+    print(submission.text())
+    if not dry_run:
+        print(f"Submission: {submission.write()}")
 
 
 @app.command()
