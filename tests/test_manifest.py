@@ -48,7 +48,7 @@ def test_overrides_are_yaml_and_win(tmp_path: Path) -> None:
         ("captures: [a]\nretrieve: {topk: ten}", "retrieve.topk: found 'ten'"),
         ("captures: [a]\nretrieve: {topk: 0}", "retrieve.topk: found 0. Input should be greater than 0"),
         ("captures: [a]\nseed: 1.5", "seed: found 1.5"),
-        ("captures: [a]\npairs: [[ios, tango]]", "pairs.0.1: found 'tango'"),
+        ("captures: [a]\npairs: [[ios, tango]]", "pairs: found 'tango'. Known: hl, ios, spot."),
         ("captures: [a]\npairs: [[ios]]", "pairs.0: found ['ios']"),
         ("captures: [a]\ndevices: ios", "devices: found 'ios'"),
         ("captures: [a]\nname: ../up", "name: found '../up'"),

@@ -1,8 +1,8 @@
 """The CroCoDL/LaMAR capture format: read and write it. `toolkit.check` looks for inconsistencies.
 
-    CAPTURE/sessions/<device>_<map|query>/
+    CAPTURE/sessions/<device>_<map|query>/          (LaMAR: map, query_phone, query_hololens; see toolkit.devices)
         sensors.txt  rigs.txt  images.txt  depths.txt  trajectories.txt  raw_data/
-        proc/subsessions.txt  proc/keyframes_*.txt  proc/alignment_trajectories.txt
+        proc/subsessions.txt  proc/keyframes_*.txt  proc/alignment_trajectories.txt      (LaMAR: queries.txt)
 
 Directions, said once: `trajectories.txt` and `alignment_trajectories.txt` hold world_from_device,
 `rigs.txt` holds rig_from_sensor. Lengths are metres, timestamps int64 microseconds, quaternions qw qx qy qz.
@@ -24,6 +24,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import ArrayLike, NDArray
 
+from toolkit.devices import SPLITS, in_order, session_id, session_of
 from toolkit.errors import CaptureError
 from toolkit.files import files_fingerprint, write_atomic
 from toolkit.geometry import pose_from_qt, qt_from_pose
@@ -52,7 +53,6 @@ if TYPE_CHECKING:
 Strings = NDArray[np.object_]
 Rows = ArrayLike | slice | None
 
-DEVICES = ("ios", "hl", "spot")
 RAW_DATA = "raw_data"
 DEPTH_SCALE = 1000.0  # depth maps are 16-bit PNGs in millimetres
 CAMERA_TYPES = ("camera", "depth")  # both have intrinsics; only the first takes photographs
@@ -191,7 +191,9 @@ class Session:
     """One folder of a capture: the recordings of one device, for the map or as queries.
 
     Attributes:
-        path, id: the folder and its name, `<device>_<map|query>`.
+        path: the folder.
+        device, split: a key of `toolkit.devices`, and `map` or `query`; from the folder's name.
+        id: `<device>_<split>`, the name of all that is made of the session.
         images: table [timestamp, sensor_id, path], in the order of images.txt; path is relative to raw_data/.
         sensors: table [sensor_id, name, sensor_type, params], params as written.
         rigs: table [rig_id, sensor_id], or None.
@@ -202,7 +204,8 @@ class Session:
     def __init__(self, path: str | Path, strict: bool = True) -> None:
         """Read a session; with strict=False leave malformed lines out and keep what was read in `tables`."""
         self.path = Path(path)
-        self.id = self.path.name
+        self.device, self.split = session_of(self.path.name)
+        self.id = session_id(self.path.name)
         self.tables: dict[str, TextTable] = {}
         self._strict = strict
         if not self.path.is_dir():
@@ -252,16 +255,6 @@ class Session:
     def _trajectory(self, file: str) -> Trajectory | None:
         return Trajectory.from_table(self._read(file)) if (self.path / file).exists() else None
 
-    @property
-    def device(self) -> str:
-        """`ios`, `hl` or `spot`: the session id up to the last underscore."""
-        return self.id.rpartition("_")[0]
-
-    @property
-    def split(self) -> str:
-        """`map` or `query`: the session id after the last underscore."""
-        return self.id.rpartition("_")[2]
-
     # Files
 
     def image_path(self, row: int) -> Path:
@@ -270,7 +263,7 @@ class Session:
 
     def image_name(self, row: int) -> str:
         """Return the name of an image in the whole capture: its path relative to sessions/."""
-        return f"{self.id}/{RAW_DATA}/{self.images['path'].iloc[row]}"
+        return f"{self.path.name}/{RAW_DATA}/{self.images['path'].iloc[row]}"
 
     @cached_property
     def depths(self) -> pd.DataFrame | None:
@@ -383,11 +376,16 @@ class Session:
         return found
 
     @property
+    def keyframe_files(self) -> dict[str, str]:
+        """The lists, by name: proc/keyframes_<name>.txt, and `queries` of LaMAR; relative to the session's folder."""
+        found = sorted(path.name for path in (self.path / "proc").glob("keyframes_*.txt"))
+        files = {name.removesuffix(".txt").removeprefix("keyframes_"): f"proc/{name}" for name in found}
+        return files | ({"queries": "queries.txt"} if (self.path / "queries.txt").exists() else {})
+
+    @property
     def keyframe_lists(self) -> list[str]:
-        """Names of the lists in proc/keyframes_<name>.txt."""
-        return sorted(
-            path.stem.removeprefix("keyframes_") for path in (self.path / "proc").glob("keyframes_*.txt")
-        )
+        """Names of the lists."""
+        return list(self.keyframe_files)
 
     def keyframes(self, name: str = "keyframes_pruned_subsampled") -> pd.DataFrame:
         """Return a keyframe list, table [timestamp, device_id].
@@ -405,12 +403,13 @@ class Session:
             keys = _keys_frame(_times(self.images), self._devices[0])
             return keys.drop_duplicates(ignore_index=True)
         short = name.removesuffix(".txt").removeprefix("keyframes_")
-        if short not in self.keyframe_lists:
+        files = self.keyframe_files
+        if short not in files:
             raise CaptureError(
                 f"Session {self.id} has no keyframe list {name!r}; available: "
-                f"{', '.join([*self.keyframe_lists, 'all'])} (from {self.path / 'proc'}/keyframes_*.txt)."
+                f"{', '.join([*files, 'all'])} (from {self.path / 'proc'}/keyframes_*.txt)."
             )
-        return _frame(self._read(f"proc/keyframes_{short}.txt"), ["timestamp", "device_id"])
+        return _frame(self._read(files[short]), ["timestamp", "device_id"])
 
     # Devices and poses
 
@@ -649,7 +648,12 @@ class Capture:
                 f"{self.path} is not a capture: it has no folder `sessions`. Expected "
                 f"{self.path.name}/sessions/<device>_<map|query>/images.txt."
             )
-        self.session_ids = sorted(folder.name for folder in self._root.iterdir() if _is_session(folder))
+        self._folders: dict[str, Path] = {}
+        for folder in sorted(folder for folder in self._root.iterdir() if _is_session(folder)):
+            name = session_id(folder.name)
+            if name not in self._folders or folder.name == name:
+                self._folders[name] = folder
+        self.session_ids = sorted(self._folders)
         if not self.session_ids:
             raise CaptureError(
                 f"{self._root} holds no session: no folder in it has a sensors.txt or images.txt. "
@@ -684,8 +688,8 @@ class Capture:
     @property
     def devices(self) -> list[str]:
         """The device keys that have a session."""
-        present = {name.rpartition("_")[0] for name in self.session_ids}
-        return [device for device in DEVICES if device in present]
+        found = (session_of(folder.name) for folder in self._folders.values())
+        return in_order(device for device, split in found if split in SPLITS)
 
     def devices_with(self, split: str, device: str = "all") -> list[str]:
         """Return the devices that have a session of a split, all of them or the one asked for.
@@ -707,13 +711,17 @@ class Capture:
             )
         return [device]
 
+    def folder(self, session_id: str) -> Path:
+        """Return the folder of a session."""
+        return self._folders[session_id]
+
     def __getitem__(self, session_id: str) -> Session:
         if session_id not in self.session_ids:
             raise CaptureError(
                 f"Capture {self.path} has no session {session_id!r}; known: {', '.join(self.session_ids)}."
             )
         if session_id not in self._sessions:
-            self._sessions[session_id] = Session.open(self._root / session_id)
+            self._sessions[session_id] = Session.open(self._folders[session_id])
         return self._sessions[session_id]
 
     def __contains__(self, session_id: object) -> bool:

@@ -13,16 +13,18 @@ from numpy.typing import NDArray
 
 from toolkit.capture import (
     CAMERA_TYPES,
-    DEVICES,
     RAW_DATA,
     Capture,
     Session,
     Trajectory,
     parse_camera,
 )
+from toolkit.devices import OTHER_SESSIONS, SPLITS, kinds
 from toolkit.tables import POSE_NAMES, KeyIndex, TextTable
 
 ERROR, WARNING = "error", "warning"
+UNUSED = {"wifi": "wifi.txt", "bluetooth": "bt.txt", "point clouds": "pointclouds.txt"}
+"""Files of the format that nothing here reads; sensors of these kinds are passed over."""
 UNIT_TOLERANCE = 1e-3  # longer or shorter quaternions were not meant to be rotations, or lost digits
 Mask = NDArray[np.bool_]
 
@@ -89,7 +91,7 @@ def check_capture(path: str | Path) -> CheckReport:
     capture = Capture.open(path)
     report = CheckReport(capture.path)
     for session_id in capture.session_ids:
-        checker = _SessionCheck(capture.path / "sessions" / session_id)
+        checker = _SessionCheck(capture.folder(session_id))
         checker.run()
         report.tables[session_id] = checker.summary()
         report.problems += checker.problems
@@ -120,9 +122,13 @@ class _SessionCheck:
 
     def run(self) -> None:
         session = self.session
-        if session.device not in DEVICES or session.split not in ("map", "query"):
-            known = ", ".join(DEVICES)
-            self._add("", 0, f"found session name {session.id!r}, expected <{known}>_<map or query>", WARNING)
+        known = [kind.key for kind in kinds()]
+        if session.split not in SPLITS:
+            expected = f"<{', '.join(known)}>_<map or query>"
+            self._add("", 0, f"found session name {session.path.name!r}, expected {expected}", WARNING)
+        elif session.device not in [*known, *(device for device, _ in OTHER_SESSIONS.values())]:
+            message = f"device {session.device!r} is none of {', '.join(known)}; it takes part. Meant? Else rename it"
+            self._add("", 0, message, WARNING)
         subsessions, _ = session.subsessions, session.depths
         self._check_sensors()
         self._check_records("images.txt", "image_path")
@@ -257,7 +263,7 @@ class _SessionCheck:
         self._add_rows("images.txt", poses < 0, message, "timestamp", "sensor_id", severity=WARNING)
 
     def _check_keyframes(self, name: str) -> None:
-        session, file = self.session, f"proc/keyframes_{name}.txt"
+        session, file = self.session, self.session.keyframe_files[name]
         keys = session.keyframes(name)
         devices = session.tables[file].columns["device_id"]
         known = _is_in(devices, self.rig_ids) | _is_in(devices, self.sensor_ids)
@@ -338,9 +344,12 @@ class _SessionCheck:
             ", ".join(shown) + (", ..." if len(session.subsessions) > 6 else ""),
         )
         for name in session.keyframe_lists:
-            table = session.tables[f"proc/keyframes_{name}.txt"]
+            table = session.tables[session.keyframe_files[name]]
             devices = len(pc.unique(table.columns["device_id"]))
             add(f"keyframes {name}", len(table), f"{_count(devices, 'device')}")
+        for what, file in UNUSED.items():
+            if (session.path / file).exists():
+                add(what, None, f"{file} is there and is not used")
         return pd.DataFrame(rows, columns=["what", "count", "details"])
 
     def _camera_models(self) -> str:

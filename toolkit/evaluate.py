@@ -12,8 +12,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from toolkit.capture import Capture, Session, Trajectory
+from toolkit.devices import colour_of, in_order
 from toolkit.errors import CaptureError, ToolkitError
-from toolkit.figures import DEVICE_COLOURS, ORANGE, SKY, VERMILLION, new_figure, save_figure
+from toolkit.figures import ORANGE, SKY, VERMILLION, new_figure, save_figure
 from toolkit.files import pair_name, write_atomic, write_sidecar
 from toolkit.geometry import pose_error
 
@@ -359,10 +360,8 @@ def _table(rows: list[dict[str, Any]], leading: list[str]) -> pd.DataFrame:
 def _leading(frame: pd.DataFrame, leading: list[str]) -> pd.DataFrame:
     """Return the table with these columns first; rows sorted so that the pairs of one map stand together."""
     frame = frame.reindex(columns=[*leading, *(c for c in frame.columns if c not in leading)])
-    order = {device: rank for rank, device in enumerate(DEVICE_COLOURS)}
-    return frame.sort_values(
-        ["map_device"], kind="stable", key=lambda s: s.map(order).fillna(len(order))
-    ).reset_index(drop=True)
+    order = {device: rank for rank, device in enumerate(in_order(frame["map_device"]))}
+    return frame.sort_values(["map_device"], kind="stable", key=lambda s: s.map(order)).reset_index(drop=True)
 
 
 # Retrieval
@@ -486,7 +485,7 @@ def draw_matrices(
         limits: range of the colours after the factor; None: of the values.
     """
     figure = new_figure(3.1 * len(columns) + 0.4, 3.35)
-    maps, queries = (_in_order(table[c]) for c in ("map_device", "query_device"))
+    maps, queries = (in_order(table[c]) for c in ("map_device", "query_device"))
     axes = figure.subplots(1, len(columns), squeeze=False)[0]
     for axis, (column, name, factor, unit) in zip(axes, columns, strict=True):
         values = np.full((len(maps), len(queries)), np.nan)
@@ -522,7 +521,7 @@ def draw_error_curves(errors: pd.DataFrame, thresholds: Sequence[Threshold] = TH
 
     A curve ends at the share of queries that have a pose. Dotted lines are the recall thresholds.
     """
-    queries, maps = _in_order(errors["query_device"]), _in_order(errors["map_device"])
+    queries, maps = in_order(errors["query_device"]), in_order(errors["map_device"])
     figure = new_figure(3.6 * len(queries) + 0.8, 6.0)
     axes = figure.subplots(2, len(queries), squeeze=False, sharey=True, sharex="row")
     quantities = [
@@ -542,7 +541,7 @@ def draw_error_curves(errors: pd.DataFrame, thresholds: Sequence[Threshold] = TH
                 found = np.sort(values[np.isfinite(values)].to_numpy(float).clip(1e-4))
                 share = 100 * np.arange(len(found) + 1) / len(values)
                 axis.step([low / 2, *found, high * 2], [*share, share[-1]], where="post", lw=1.8,
-                          color=DEVICE_COLOURS.get(map_, "black"), label=f"{map_} map")  # fmt: skip
+                          color=colour_of(map_), label=f"{map_} map")  # fmt: skip
             for mark in marks:
                 axis.axvline(mark, color="0.45", lw=0.9, ls=":")
             axis.set_xscale("log")
@@ -587,12 +586,6 @@ def draw_losses(losses: pd.DataFrame) -> "Figure":
     figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
     figure.suptitle("Where accuracy was lost", fontsize=11, fontweight="bold")
     return figure
-
-
-def _in_order(devices: pd.Series) -> list[str]:
-    present = list(dict.fromkeys(devices))
-    known = [device for device in DEVICE_COLOURS if device in present]
-    return known + [device for device in present if device not in known]
 
 
 def _short(value: float, unit: str) -> str:

@@ -10,7 +10,8 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture import Capture, Session
-from toolkit.figures import DEVICE_COLOURS, GREEN, GREY, ORANGE, VERMILLION, new_figure
+from toolkit.devices import colour_of
+from toolkit.figures import GREEN, ORANGE, VERMILLION, new_figure
 from toolkit.images import read_for_display
 from toolkit.upright import up_of_cameras
 from toolkit.visualize import ground_axes, places_of
@@ -71,7 +72,7 @@ def draw_top_view(capture: Capture, up: ArrayLike | None = None) -> "Figure":
     for number, plot in enumerate(figure.subplots(1, count, squeeze=False)[0]):
         for name in seen:
             x, y = together[(place == number) & (sessions == name)].T
-            split, colour = capture[name].split, DEVICE_COLOURS.get(capture[name].device, GREY)
+            split, colour = capture[name].split, colour_of(capture[name].device)
             marker, size = ("o", 14) if split == "map" else ("x", 36)
             plot.scatter(x, y, s=size, c=colour, marker=marker, label=name, alpha=0.8)
         plot.set_xlabel(labels[0])
@@ -94,7 +95,7 @@ def draw_similarity(embeddings: str | Path, limit: int = 300) -> "Figure":
     queries = [folder for folder in sessions if folder.name.endswith("_query")] or sessions
     maps = [folder for folder in sessions if folder.name.endswith("_map")] or sessions
     query = queries[0]
-    others = [folder for folder in maps if folder.name.split("_")[0] != query.name.split("_")[0]]
+    others = [folder for folder in maps if folder.name.rpartition("_")[0] != query.name.rpartition("_")[0]]
     map_ = (others or maps)[0]
     figure = new_figure(8, 4.5)
     plot = figure.subplots()

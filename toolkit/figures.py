@@ -11,7 +11,6 @@ if TYPE_CHECKING:
 # Okabe and Ito's colours, which people with any colour vision tell apart.
 BLUE, VERMILLION, GREEN = "#0072B2", "#D55E00", "#009E73"
 ORANGE, SKY, GREY = "#E69F00", "#56B4E9", "#5A5A5A"
-DEVICE_COLOURS = {"ios": BLUE, "hl": VERMILLION, "spot": GREEN}
 
 
 def new_figure(width: float, height: float) -> "Figure":

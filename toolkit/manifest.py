@@ -12,17 +12,16 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from toolkit.compute import DEVICE_NAME
+from toolkit.devices import TABLE
 from toolkit.errors import ManifestError
 
 STAGES = ("explore", "embed", "retrieve", "localize", "evaluate", "visualize")
-DEVICES = ("ios", "hl", "spot")
 
-Device = Literal["ios", "hl", "spot"]
 Positive = Annotated[int, Field(gt=0)]
 Natural = Annotated[int, Field(ge=0)]
 PositiveNumber = Annotated[float, Field(gt=0)]
 ComputeDevice = Annotated[str, Field(pattern=f"^({DEVICE_NAME})$")]
-DevicePair = Annotated[list[Device], Field(min_length=2, max_length=2)]
+DevicePair = Annotated[list[str], Field(min_length=2, max_length=2)]
 Threshold = Annotated[list[PositiveNumber], Field(min_length=2, max_length=2)]
 
 
@@ -49,6 +48,19 @@ class DemoData(_Strict):
     """Frames a room and map session; queries have half."""
     seed: Natural = 0
     """Another seed, another place."""
+
+
+class ExtraDevice(_Strict):
+    """A further kind of device, or what is different about a known one."""
+
+    key: Annotated[str, Field(pattern=r"^[a-z0-9-]+$")]
+    """Its sessions are `<key>_map` and `<key>_query`."""
+    label: str | None = None
+    """For people."""
+    colour: Annotated[str, Field(pattern=r"^#[0-9a-fA-F]{6}$")] | None = None
+    """In figures, as #rrggbb."""
+    sessions: dict[Literal["map", "query"], str] | None = None
+    """Or: what the folders of its sessions are called, e.g. {query: query_drone}."""
 
 
 class ExploreSettings(_Section):
@@ -142,7 +154,9 @@ class Manifest(_Strict):
     """Or: a capture to render."""
     output_root: str = "../runs"
     """Results go to <output_root>/<name>."""
-    devices: Literal["auto"] | list[Device] = "auto"
+    extra_devices: list[ExtraDevice] = []
+    """Kinds of devices besides ios, hl and spot."""
+    devices: Literal["auto"] | list[str] = "auto"
     """Devices to take part; auto: all that a capture has."""
     pairs: Literal["all"] | list[DevicePair] = "all"
     """[map device, query device] pairs; all: every map with every query session."""
@@ -172,10 +186,25 @@ class Manifest(_Strict):
             raise ValueError("give either `captures` (a list of folders) or `demo_data`, and not both")
         return self
 
+    @model_validator(mode="after")
+    def _known_devices(self) -> "Manifest":
+        known = [kind.key for kind in TABLE] + [device.key for device in self.extra_devices]
+        devices = [] if self.devices == "auto" else self.devices
+        pairs = [] if self.pairs == "all" else [key for pair in self.pairs for key in pair]
+        for name, keys in (("devices", devices), ("pairs", pairs)):
+            for key in keys:
+                if key not in known:
+                    raise ValueError(f"{name}: found {key!r}. {nearest(key, known)} `extra_devices` adds others")
+        return self
+
     def stage(self, stage: str) -> _Section:
         """Return the settings of one stage."""
         section: _Section = getattr(self, stage)
         return section
+
+
+# Models that a field's annotation names only as a part.
+_MODELS = {"demo_data": DemoData, "extra_devices": ExtraDevice}
 
 
 def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
@@ -267,7 +296,8 @@ def _explain(error: ValidationError, source: str) -> str:
         if problem["type"] == "extra_forbidden":
             model: Any = Manifest
             for key in keys[:-1]:
-                model = DemoData if key == "demo_data" else model.model_fields[key].annotation
+                if not key.isdigit():  # an item of a list is what the list is of
+                    model = _MODELS.get(key) or model.model_fields[key].annotation
             lines.append(f"unknown key {where!r}. {nearest(keys[-1], model.model_fields)}")
         elif problem["type"] == "value_error":
             lines.append(f"{problem['ctx']['error']}.")

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from toolkit import __version__, errors
+from toolkit.devices import extra_devices, table_record
 from toolkit.embedders import WEIGHTS as EMBEDDER_WEIGHTS
 from toolkit.embedders import resolve_name
 from toolkit.errors import ManifestError, ToolkitError
@@ -112,6 +113,11 @@ def run(
     if only is not None and only not in STAGES:
         raise ManifestError(f"--only {only}: no such stage. {nearest(only, STAGES)}")
     manifest = load_manifest(manifest_path, overrides)
+    with extra_devices([device.model_dump(exclude_none=True) for device in manifest.extra_devices]):
+        return _run(manifest, manifest_path, only, force, say)
+
+
+def _run(manifest: Manifest, manifest_path: str | Path, only: str | None, force: bool, say: Say) -> Path:
     for stage in STAGES:  # a wrong key stops the run before hours of work, not after
         check_parameters(notebook_path(stage), manifest.stage(stage).given(), f"{manifest_path}: {stage}.")
     manifest = _name_embedder(manifest, say)
@@ -378,7 +384,7 @@ def _inputs_of(job: Job, capture: str) -> str:
         for stage in UPSTREAM[job.stage]
         for record in sorted(job.record.parent.glob(f"{stage}*.json"))
     ]
-    return fingerprint([parameters, _weights_of(job), capture, _code_fingerprint(), source, upstream])
+    return fingerprint([parameters, table_record(), _weights_of(job), capture, _code_fingerprint(), source, upstream])
 
 
 def _weights_of(job: Job) -> str | None:

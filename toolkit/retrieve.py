@@ -200,7 +200,7 @@ class _Images:
 def _load(session: Session, embeddings: Path) -> _Images:
     folder = embeddings / session.id
     vectors, table = load_embeddings(folder)
-    names = table["abs_path"].str.split(f"/sessions/{session.id}/raw_data/", n=1, regex=False).str[-1]
+    names = table["abs_path"].str.split(f"/sessions/{session.path.name}/raw_data/", n=1, regex=False).str[-1]
     rows = pd.Index(session.images["path"]).get_indexer(names)
     if (rows < 0).any():
         raise ArtefactError(

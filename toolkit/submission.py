@@ -55,6 +55,14 @@ class Challenge:
 _PAIR_FILE = "{scene}_map_{map}_query_{query}.txt"
 CHALLENGES = (
     Challenge(
+        "LaMAR",
+        {"CAB": "CAB", "HGE": "HGE", "LIN": "LIN"},
+        (("mixed", "ios"), ("mixed", "hl")),
+        "{scene}_query_{query}.txt",
+        "queries",
+        {"ios": "phone", "hl": "hololens"},
+    ),
+    Challenge(
         "CroCoDL",
         {"HYDRO": "HYDRO", "SUCCULENT": "SUCCU"},
         tuple((m, q) for m in ("ios", "hl", "spot") for q in ("ios", "hl", "spot")),

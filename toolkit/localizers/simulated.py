@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from toolkit import geometry
 from toolkit.capture import Session
 from toolkit.depths import DepthMaps, lifted
+from toolkit.devices import session_id
 from toolkit.errors import CaptureError
 from toolkit.localizers.prediction import Prediction, View
 from toolkit.mapping import LocalMap, in_view, view_bounds
@@ -175,7 +176,7 @@ class SimulatedPredictor:
     def _map(self, session: str) -> LocalMap | None:
         with self._lock:
             if session not in self._maps:
-                path = None if self._map_dir is None else self._map_dir / f"{session}.npz"
+                path = None if self._map_dir is None else self._map_dir / f"{session_id(session)}.npz"
                 self._maps[session] = LocalMap.load(path) if path is not None and path.exists() else None
             return self._maps[session]
 
