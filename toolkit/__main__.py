@@ -1,4 +1,4 @@
-"""The command line: `python -m toolkit run|check|submit|demo-data`."""
+"""The command line: `python -m toolkit run|check|submit|import|export|demo-data`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -13,6 +13,17 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+
+
+import_app = typer.Typer(help="Make a session of your own images.", no_args_is_help=True)
+export_app = typer.Typer(help="Write what other tools read.", no_args_is_help=True)
+app.add_typer(import_app, name="import")
+app.add_typer(export_app, name="export")
+
+Device = Annotated[str, typer.Option(help="The kind of device: ios, hl, spot or another name.")]
+Placing = Annotated[str, typer.Option("--images", metavar="link|copy", help="Link the images, or copy them.")]
+Run = Annotated[Path, typer.Argument(help="Run folder.")]
+Scene = Annotated[str, typer.Argument(help="Name of the capture.")]
 
 
 @app.command()
@@ -99,6 +110,78 @@ def demo_data(
     from toolkit.synthetic import render_capture
 
     print(f"Capture: {render_capture(out, rooms=rooms, frames=frames, seed=seed)}")
+
+
+@import_app.command("colmap")
+def import_colmap(
+    model: Annotated[Path, typer.Argument(help="Folder with cameras, images, points3D as .bin or .txt.")],
+    images: Annotated[Path, typer.Argument(help="Folder that the model's image names are relative to.")],
+    capture: Annotated[Path, typer.Argument(help="Capture folder; the session is sessions/<device>_<split>.")],
+    device: Device = "ios",
+    split: Annotated[str, typer.Option(metavar="map|query", help="Poses of queries become ground truth.")] = "map",
+    placing: Placing = "link",
+) -> None:
+    """Make a session of a COLMAP model: cameras, poses, rigs."""
+    from toolkit import interchange
+
+    print(interchange.import_colmap(model, images, capture, device, split, placing).text())
+
+
+@import_app.command("images")
+def import_images(
+    images: Annotated[Path, typer.Argument(help="Folder of JPEG and PNG files.")],
+    capture: Annotated[Path, typer.Argument(help="Capture folder; the session is sessions/<device>_<split>.")],
+    device: Device = "ios",
+    split: Annotated[str, typer.Option(metavar="map|query", help="A map needs a table with poses.")] = "query",
+    table: Annotated[
+        Path | None,
+        typer.Option(
+            help="CSV with a header: image; qw,qx,qy,qz,tx,ty,tz for poses; camera_id, or model,width,height,params."
+        ),
+    ] = None,
+    poses_are: Annotated[
+        str, typer.Option(metavar="world_from_cam|cam_from_world", help="Direction of the table's poses.")
+    ] = "world_from_cam",
+    camera: Annotated[
+        str | None, typer.Option(metavar="'MODEL, W, H, ...'", help="Intrinsics of all images; else guessed from EXIF.")
+    ] = None,
+    cameras: Annotated[Path | None, typer.Option(help="COLMAP's cameras.txt.")] = None,
+    placing: Placing = "link",
+) -> None:
+    """Make a session of a folder of images: a map with poses, or queries."""
+    from toolkit import interchange
+
+    report = interchange.import_images(images, capture, device, split, table, poses_are, camera, cameras, placing)
+    print(report.text())
+
+
+@export_app.command("colmap")
+def export_colmap(
+    run: Run,
+    scene: Scene,
+    device: Annotated[str, typer.Argument(help="Whose map, e.g. ios.")],
+    out: Annotated[Path, typer.Argument(help="New folder for the model.")],
+    capture: Annotated[Path | None, typer.Option(help="Capture folder, if it has moved since the run.")] = None,
+) -> None:
+    """Write the triangulated map of a run as a COLMAP model."""
+    from toolkit import export
+
+    print(f"{out}: {export.export_colmap(run, scene, device, out, capture).summary()}")
+
+
+@export_app.command("pairs")
+def export_pairs(
+    run: Run,
+    scene: Scene,
+    map_device: Annotated[str, typer.Argument(help="Map device.")],
+    query_device: Annotated[str, typer.Argument(help="Query device.")],
+    out: Annotated[Path, typer.Argument(help="Text file.")],
+    topk: Annotated[int | None, typer.Option(min=1, help="References a query; else all.")] = None,
+) -> None:
+    """Write the retrieval of a pair as hloc reads it: `query reference` a line."""
+    from toolkit import export
+
+    print(f"{out}: {export.export_pairs(run, scene, map_device, query_device, out, topk)} pairs")
 
 
 def main() -> None:

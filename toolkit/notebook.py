@@ -68,13 +68,7 @@ def start(stage: str, sessions_root: str | None = None, **folders: str | None) -
         ManifestError: papermill was given a parameter that the notebook does not have.
     """
     _refuse_injected(stage)
-    root = NOTEBOOKS.parent if NOTEBOOKS.is_dir() else Path.cwd()
-    if sessions_root is None:
-        from toolkit.synthetic import render_capture
-
-        sessions = render_capture(root / "data" / "demo", **DemoData().model_dump()) / "sessions"
-    else:
-        sessions = Path(sessions_root).expanduser().resolve()
+    sessions, root = sessions_or_demo(sessions_root), _root()
     scene = sessions.parent.name
     files = SceneFiles(root / "runs" / scene, scene)
     defaults = {**stage_folders(files), "out_dir": stage_outputs(files, stage)}
@@ -87,6 +81,24 @@ def start(stage: str, sessions_root: str | None = None, **folders: str | None) -
         if path is not None:
             resolved[name] = path
     return Folders(resolved)
+
+
+def sessions_or_demo(sessions_root: str | None) -> Path:
+    """Return a folder `sessions`; None: that of the demo capture, rendered when absent."""
+    if sessions_root is not None:
+        return Path(sessions_root).expanduser().resolve()
+    from toolkit.synthetic import render_capture
+
+    return render_capture(_root() / "data" / "demo", **DemoData().model_dump()) / "sessions"
+
+
+def own_folder(folder: str | None, scene: str) -> Path:
+    """Return a folder for a capture of one's own images; None: `data/<scene>` of the repository."""
+    return _root() / "data" / scene if folder is None else Path(folder).expanduser().resolve()
+
+
+def _root() -> Path:
+    return NOTEBOOKS.parent if NOTEBOOKS.is_dir() else Path.cwd()
 
 
 def finish(**counts: Any) -> None:

@@ -202,7 +202,7 @@ def collect(
         raise ManifestError(f"{', '.join(map(str, folders))}: no poses in it. Run the manifest first.")
     found = [challenge for challenge in CHALLENGES if present & set(challenge.scenes)]
     challenge = found[0] if found else None
-    places = _Captures(folders, captures)
+    places = Captures(folders, captures)
     submission = Submission(
         _description(description), [], {}, failed, Path(out) if out else folders[0] / "submission.zip"
     )
@@ -221,14 +221,14 @@ def collect(
     return submission
 
 
-def _rules_of(scene: str, captures: "_Captures") -> Challenge:
+def _rules_of(scene: str, captures: "Captures") -> Challenge:
     """Return what is expected of a scene that is in no challenge: every pair that its capture has."""
     capture = captures[scene]
     maps, queries = capture.devices_with("map"), capture.devices_with("query")
     return Challenge("", {}, tuple((m, q) for m in maps for q in queries), _PAIR_FILE)
 
 
-class _Captures:
+class Captures:
     """The capture of each scene: a folder that was given, else where the runs found it. Each is opened once."""
 
     def __init__(self, runs: Iterable[Path], given: Iterable[str | Path]) -> None:
@@ -271,7 +271,7 @@ def _description(text: str) -> str:
 
 
 def _fill_entry(
-    entry: Entry, runs: Sequence[Path], captures: _Captures, queries: str, failed: str, sources: dict[str, str]
+    entry: Entry, runs: Sequence[Path], captures: Captures, queries: str, failed: str, sources: dict[str, str]
 ) -> None:
     """Read the poses of a pair, and set what is written of it."""
     pair = (entry.map_device, entry.query_device)

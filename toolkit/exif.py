@@ -1,0 +1,82 @@
+"""What a photograph's file says of itself: its size as stored, when it was taken, and a guess of its intrinsics."""
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import PIL.Image
+import pycolmap
+
+from toolkit.errors import ImageError
+
+# Tags that are read, and the millimetres in a unit of FocalPlaneResolutionUnit.
+ORIENTATION, _EXIF, _TIME, _SUBSECOND = 0x0112, 0x8769, 0x9003, 0x9291
+_FOCAL_MM, _FOCAL_35MM, _WIDTH = 0x920A, 0xA405, 0xA002
+_PLANE_X, _PLANE_UNIT = 0xA20E, 0xA210
+_UNIT_MM = {0.0: 25.4, 2.0: 25.4, 3.0: 10.0, 4.0: 1.0}  # inches where it is not said
+_FILM_DIAGONAL_MM = float(np.hypot(36, 24))
+
+
+def read_header(path: Path) -> tuple[tuple[int, int], dict[int, Any]]:
+    """Return width and height as stored, and the EXIF tags by number.
+
+    Raises:
+        ImageError: no such file, or no image.
+    """
+    if not path.is_file():
+        raise ImageError("no such file")
+    try:
+        with PIL.Image.open(path) as image:
+            exif = image.getexif()
+            return image.size, {**exif, **exif.get_ifd(_EXIF)}
+    except (OSError, SyntaxError, ValueError) as error:
+        raise ImageError(f"cannot be read as an image ({error})") from None
+
+
+def time_taken(exif: Mapping[int, Any]) -> int | None:
+    """Return microseconds since 1970 of the camera's clock, whose time zone is not known."""
+    try:
+        taken = datetime.strptime(str(exif[_TIME]), "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
+    except (KeyError, ValueError):
+        return None
+    digits = str(exif.get(_SUBSECOND, "")).strip()
+    return int(taken.timestamp()) * 10**6 + (int(f"{digits:0<6}"[:6]) if digits.isdecimal() else 0)
+
+
+def read_number(exif: Mapping[int, Any], tag: int) -> float:
+    """Return the number of a tag; 0 where there is none."""
+    try:
+        number = float(exif.get(tag, 0))
+    except (TypeError, ValueError, ZeroDivisionError):
+        return 0.0
+    return number if np.isfinite(number) else 0.0
+
+
+def exif_camera(path: Path) -> tuple[pycolmap.Camera, str]:
+    """Guess the intrinsics of an image from its EXIF tags: no distortion, the middle of the image in its centre.
+
+    FocalLengthIn35mmFilm is taken at the diagonal of 36 mm x 24 mm film, as CIPA DC-008 has it; else FocalLength with
+    FocalPlaneXResolution, scaled where the image was resized since.
+
+    Returns:
+        A SIMPLE_PINHOLE camera, and a sentence that says what it rests on.
+
+    Raises:
+        ImageError: the image cannot be read, or has no focal length in EXIF.
+    """
+    (width, height), exif = read_header(path)
+    focal_mm, film_mm = read_number(exif, _FOCAL_MM), read_number(exif, _FOCAL_35MM)
+    plane_x, unit_mm = read_number(exif, _PLANE_X), _UNIT_MM.get(read_number(exif, _PLANE_UNIT))
+    if film_mm > 0:
+        focal_px, how = film_mm * np.hypot(width, height) / _FILM_DIAGONAL_MM, "FocalLengthIn35mmFilm"
+    elif focal_mm > 0 and plane_x > 0 and unit_mm:
+        stored = read_number(exif, _WIDTH)
+        focal_px = focal_mm * plane_x / unit_mm * (width / stored if stored > 0 else 1.0)
+        how = "FocalLength and FocalPlaneXResolution"
+    else:
+        raise ImageError("no focal length in EXIF: give the camera, or cameras.txt")
+    params = [float(focal_px), width / 2, height / 2]
+    camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
+    return camera, f"a guess from EXIF ({how}), without distortion"
