@@ -2,13 +2,15 @@
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from toolkit import devices
+from toolkit import devices, pipeline
 from toolkit.capture import Capture, Trajectory, write_session
 from toolkit.check import check_capture
 from toolkit.embed import embed_sessions
@@ -132,6 +134,20 @@ def test_a_manifest_adds_a_kind(tmp_path: Path) -> None:
     path.write_text("captures: [a]\nextra_devices: [{key: drone, lable: Drone}]\n")
     with pytest.raises(ManifestError, match=r"extra_devices\.0\.lable'\. Did you mean 'label'"):
         load_manifest(path)
+
+
+def test_a_run_hands_its_kinds_to_its_notebooks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+
+    def started(*_: object) -> Path:
+        command = "from toolkit.devices import kinds; print(*[kind.key for kind in kinds()])"
+        seen.append(subprocess.run([sys.executable, "-c", command], capture_output=True, text=True).stdout.split())
+        return tmp_path
+
+    monkeypatch.setattr(pipeline, "_run", started)
+    (tmp_path / "m.yaml").write_text("captures: [a]\nextra_devices: [{key: drone}]\n")
+    pipeline.run(tmp_path / "m.yaml")
+    assert seen == [["ios", "hl", "spot", "drone"]]
 
 
 def test_a_fourth_kind_goes_from_images_to_recall(small_capture: Path, tmp_path: Path) -> None:

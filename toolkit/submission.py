@@ -265,7 +265,7 @@ def _description(text: str) -> str:
             text = path.read_text(encoding="utf-8")
         except UnicodeDecodeError as error:
             raise ManifestError(f"{path}: the description is not UTF-8 text ({error}).") from None
-    elif path.suffix == ".txt":
+    elif path.suffix == ".txt" and len(text.split()) == 1:
         raise ManifestError(f"{path}: no such file. Give an existing file, or the description itself.")
     return text.rstrip() + "\n" if text.strip() else ""
 
