@@ -157,7 +157,7 @@ class SimulatedPredictor:
 
     def _points(self, view: View) -> Floats:
         """Return points (P, 3) that a map image sees, of the map, else of its depth maps; none of another image."""
-        session = view.name.split("/", 1)[0]
+        session = session_id(view.name.split("/", 1)[0])
         found = self._map(session) if view.known else None
         if found is None or view.name not in found.index_of:
             return np.zeros((0, 3))
@@ -176,7 +176,7 @@ class SimulatedPredictor:
     def _map(self, session: str) -> LocalMap | None:
         with self._lock:
             if session not in self._maps:
-                path = None if self._map_dir is None else self._map_dir / f"{session_id(session)}.npz"
+                path = None if self._map_dir is None else self._map_dir / f"{session}.npz"
                 self._maps[session] = LocalMap.load(path) if path is not None and path.exists() else None
             return self._maps[session]
 
