@@ -1,4 +1,4 @@
-"""The command line: `python -m toolkit run|check|submit|import|export|demo-data`."""
+"""The command line: `python -m toolkit run|report|check|submit|import|export|demo-data`."""
 
 from pathlib import Path
 from typing import Annotated
