@@ -6,9 +6,7 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import huggingface_hub
@@ -18,6 +16,7 @@ from huggingface_hub import constants
 from safetensors.torch import save, save_file
 from torch import nn
 
+from tests.fake_hub import FakeHub, serving, use_hub
 from toolkit.errors import ToolkitError
 from toolkit.models.weights import (
     MEGALOC,
@@ -28,96 +27,15 @@ from toolkit.models.weights import (
     resolve_weights,
 )
 
-COMMIT = "0123456789abcdef0123456789abcdef01234567"
 BODY = save({"weight": torch.arange(50_000, dtype=torch.float32)})
-
-
-class FakeHub(ThreadingHTTPServer):
-    """Serves one file as the hub does, or fails as told."""
-
-    def __init__(self) -> None:
-        super().__init__(("127.0.0.1", 0), _Handler)
-        self.healthy()
-
-    def healthy(self) -> None:
-        self.requests: list[tuple[str, str | None]] = []  # method, Range
-        self.status = 200
-        self.error_code = ""
-        self.body = BODY
-        self.etag = hashlib.sha256(BODY).hexdigest()
-        self.cuts: list[int] = []  # bytes at which the next connections break off
-        self.commit = COMMIT
-
-    @property
-    def url(self) -> str:
-        return f"http://127.0.0.1:{self.server_address[1]}"
-
-
-class _Handler(BaseHTTPRequestHandler):
-    server: FakeHub
-
-    def do_HEAD(self) -> None:
-        self._answer(b"")
-
-    def do_GET(self) -> None:
-        self._answer(self.server.body)
-
-    def _answer(self, body: bytes) -> None:
-        hub = self.server
-        asked = self.headers.get("Range")
-        hub.requests.append((self.command, asked))
-        is_file = self.path == f"/{MEGALOC.repo_id}/resolve/main/{MEGALOC.filename}"
-        status = hub.status if is_file else 404
-        if status != 200:
-            self.send_response(status)
-            self.send_header("Content-Length", "0")
-            if hub.error_code:
-                self.send_header("X-Error-Code", hub.error_code)
-            self.end_headers()
-            return
-        start = int(asked.removeprefix("bytes=").split("-")[0]) if asked else 0
-        self.send_response(206 if asked else 200)
-        if asked:
-            self.send_header("Content-Range", f"bytes {start}-{len(hub.body) - 1}/{len(hub.body)}")
-        self.send_header("Content-Length", str(len(hub.body) - start))
-        if hub.commit:
-            self.send_header("X-Repo-Commit", hub.commit)
-        self.send_header("X-Linked-Etag", f'"{hub.etag}"')
-        self.send_header("X-Linked-Size", str(len(hub.body)))
-        self.send_header("ETag", f'"{hub.etag}"')
-        self.send_header("Accept-Ranges", "bytes")
-        self.end_headers()
-        end = hub.cuts.pop(0) if body and hub.cuts else len(body)
-        self.wfile.write(body[start:end])
-        self.close_connection = True
-
-    def log_message(self, *args: Any) -> None:
-        pass
 
 
 @pytest.fixture
 def hub(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[FakeHub]:
     """A hub on this machine in place of the real one, with an empty cache."""
-    with FakeHub() as server:
-        thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True)
-        thread.start()
-        _use_hub(monkeypatch, server.url, tmp_path)
+    with serving(FakeHub(f"/{MEGALOC.repo_id}/resolve/main/{MEGALOC.filename}", BODY)) as server:
+        use_hub(monkeypatch, server.url, tmp_path)
         yield server
-        server.shutdown()
-        thread.join()
-
-
-def _use_hub(monkeypatch: pytest.MonkeyPatch, url: str, tmp_path: Path) -> None:
-    # The library reads its environment when it is imported, so its constants are set here.
-    monkeypatch.setattr(constants, "ENDPOINT", url)
-    monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", url + "/{repo_id}/resolve/{revision}/{filename}")
-    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(constants, "HF_TOKEN_PATH", str(tmp_path / "no-token"))
-    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
-    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
-    monkeypatch.delenv("HF_TOKEN", raising=False)
-    monkeypatch.setattr("time.sleep", lambda seconds: None)  # between the library's attempts
-    huggingface_hub.close_session()
 
 
 def failure() -> str:
@@ -178,7 +96,7 @@ def test_something_that_is_no_hub_answers(hub: FakeHub) -> None:
 
 def test_no_network(hub: FakeHub, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     with monkeypatch.context() as patch:
-        _use_hub(patch, "http://127.0.0.1:9", tmp_path)  # the port for discarding: nobody listens
+        use_hub(patch, "http://127.0.0.1:9", tmp_path)  # the port for discarding: nobody listens
         message = failure()
         assert "http://127.0.0.1:9" in message
         assert "ConnectError" in message

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from toolkit.errors import WeightsError
+from toolkit.hub import failure_reason
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -119,7 +120,7 @@ def resolve_weights(source: WeightsSource, checkpoint: str | Path | None = None)
         metadata = huggingface_hub.get_hf_file_metadata(huggingface_hub.hf_hub_url(source.repo_id, source.filename))
         path = Path(huggingface_hub.hf_hub_download(source.repo_id, source.filename, tqdm_class=_progress_bar()))
     except Exception as error:  # of the library, of the HTTP client, which differs with its version, and of the disk
-        raise _not_downloaded(source, _reason(error)) from error
+        raise _not_downloaded(source, failure_reason(error)) from error
     expected = metadata.etag or ""
     if re.fullmatch("[0-9a-f]{64}", expected):  # files under version control have a shorter one, of git
         with open(path, "rb") as stream:
@@ -262,32 +263,6 @@ def _not_downloaded(source: WeightsSource, reason: str) -> WeightsError:
         f"{folder / 'snapshots' / revision / source.filename}, where it is found without.\n"
         f"Or {source.alternative}."
     )
-
-
-def _reason(error: Exception) -> str:
-    """Return in a few words why the hub gave no file."""
-    from huggingface_hub import constants, errors
-
-    sign_in = f"accept the licence on the model's page and set HF_TOKEN (HTTP {_status(error)})"
-    if isinstance(error, errors.OfflineModeIsEnabled):
-        return "HF_HUB_OFFLINE is set"
-    if isinstance(error, errors.EntryNotFoundError) and _status(error) is not None:
-        return f"{constants.ENDPOINT} has the repository, but no such file in it (HTTP {_status(error)})"
-    if isinstance(error, errors.GatedRepoError):
-        return f"access is restricted: {sign_in}"
-    if isinstance(error, errors.RepositoryNotFoundError):
-        return f"{constants.ENDPOINT} has no such repository, or not for everyone: then {sign_in}"
-    if _status(error) in (401, 403):
-        return f"access is refused: {sign_in}"
-    if _status(error) is not None:
-        return f"{constants.ENDPOINT} answered HTTP {_status(error)}"
-    text = str(error).strip().split("\n")[0].rstrip(".")
-    return f"from {constants.ENDPOINT}, {type(error).__name__}" + (f": {text}" if text else "")
-
-
-def _status(error: Exception) -> int | None:
-    """Return the HTTP status that an error of the hub's library stands for."""
-    return getattr(getattr(error, "response", None), "status_code", None)
 
 
 def _remove(path: Path) -> None:

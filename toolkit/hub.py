@@ -1,0 +1,27 @@
+"""What went wrong with the Hugging Face hub, in words."""
+
+
+def failure_reason(error: Exception, page: str = "the model's page") -> str:
+    """Return in a few words why the hub did not give something; `page` is where its terms are accepted."""
+    from huggingface_hub import constants, errors
+
+    sign_in = f"accept the licence on {page} and set HF_TOKEN (HTTP {status_of(error)})"
+    if isinstance(error, errors.OfflineModeIsEnabled):
+        return "HF_HUB_OFFLINE is set"
+    if isinstance(error, errors.EntryNotFoundError) and status_of(error) is not None:
+        return f"{constants.ENDPOINT} has the repository, but no such file in it (HTTP {status_of(error)})"
+    if isinstance(error, errors.GatedRepoError):
+        return f"access is restricted: {sign_in}"
+    if isinstance(error, errors.RepositoryNotFoundError):
+        return f"{constants.ENDPOINT} has no such repository, or not for everyone: then {sign_in}"
+    if status_of(error) in (401, 403):
+        return f"access is refused: {sign_in}"
+    if status_of(error) is not None:
+        return f"{constants.ENDPOINT} answered HTTP {status_of(error)}"
+    text = str(error).strip().split("\n")[0].rstrip(".")
+    return f"from {constants.ENDPOINT}, {type(error).__name__}" + (f": {text}" if text else "")
+
+
+def status_of(error: Exception) -> int | None:
+    """Return the HTTP status that an error of the hub's library stands for."""
+    return getattr(getattr(error, "response", None), "status_code", None)
