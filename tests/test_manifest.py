@@ -30,6 +30,92 @@ def test_paths_are_relative_to_the_manifest_and_expanded(
     assert manifest.name == "mine"
 
 
+def write_files(folder: Path, **texts: str) -> Path:
+    """Write `mine.yaml` and others, `__` in a name standing for `/`; return the former."""
+    for name, text in texts.items():
+        path = folder / f"{name.replace('__', '/')}.yaml"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+    return folder / "mine.yaml"
+
+
+def test_what_is_inherited_is_merged_and_lists_are_replaced(tmp_path: Path) -> None:
+    path = write_files(
+        tmp_path,
+        mine="inherits: base.yaml\nretrieve: {topk: 3}\nevaluate: {thresholds: [[1, 0.1]]}",
+        base="inherits: root.yaml\ncaptures: [a]\nretrieve: {topk: 5, use_faiss: true}\nseed: 2",
+        root="captures: [x, y]\nseed: 1\nembed: {model: vlad}\nevaluate: {thresholds: [[1, 1], [2, 2]]}\nname: kept",
+    )
+    manifest = load_manifest(path, ["retrieve.use_faiss=false"])
+    assert manifest.captures == [str(tmp_path / "a")]
+    assert manifest.seed == 2
+    assert manifest.name == "kept"
+    assert manifest.embed.given() == {"model": "vlad"}
+    assert manifest.retrieve.given() == {"topk": 3, "use_faiss": False}
+    assert manifest.evaluate.given() == {"thresholds": [[1.0, 0.1]]}
+
+
+def test_of_several_bases_the_later_wins(tmp_path: Path) -> None:
+    path = write_files(
+        tmp_path,
+        mine="inherits: [a.yaml, b.yaml]",
+        a="inherits: root.yaml\nseed: 1\nretrieve: {topk: 5}\ncaptures: [a]",
+        b="inherits: root.yaml\nseed: 2\ncaptures: [b]",
+        root="description: shared by both",
+    )
+    manifest = load_manifest(path)
+    assert (manifest.seed, manifest.retrieve.topk, manifest.description) == (2, 5, "shared by both")
+    assert manifest.captures == [str(tmp_path / "b")]
+    assert manifest.name == "mine"
+
+
+def test_inherited_paths_count_from_the_file_that_has_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/home/me")
+    monkeypatch.setenv("DATA", "/data")
+    monkeypatch.setenv("HERE", "near")
+    path = write_files(
+        tmp_path,
+        mine="inherits: bases/base.yaml\nembed: {checkpoint: mine.pt}",
+        bases__base="captures: [here, $DATA/a, ~/b, $HERE/c]\noutput_root: out\nlocalize: {checkpoint: its.pt}",
+    )
+    manifest = load_manifest(path)
+    bases = tmp_path / "bases"
+    assert manifest.captures == [str(bases / "here"), "/data/a", "/home/me/b", str(bases / "near/c")]
+    assert manifest.output_root == str(bases / "out")
+    assert manifest.localize.checkpoint == str(bases / "its.pt")
+    assert manifest.embed.checkpoint == str(tmp_path / "mine.pt")
+    path = write_files(tmp_path, mine="inherits: bases/base.yaml\ncaptures: [a]", bases__base="captures: [$UNSET/a]")
+    assert load_manifest(path).captures == [str(tmp_path / "a")], "what is replaced need not be known"
+    path = write_files(tmp_path, mine="inherits: bases/base.yaml")
+    with pytest.raises(ManifestError, match=r"mine\.yaml: captures: '\$UNSET/a' uses the variable \$UNSET"):
+        load_manifest(path)
+
+
+def test_a_wrong_base_is_named_with_its_heir(tmp_path: Path) -> None:
+    def message(**texts: str) -> str:
+        with pytest.raises(ManifestError) as error:
+            load_manifest(write_files(tmp_path, **texts))
+        return str(error.value)
+
+    base, mine = str(tmp_path / "base.yaml"), str(tmp_path / "mine.yaml")
+    text = message(mine="inherits: base.yaml\nseeds: 3", base="captures: [a]\nretrieve: {topK: 5}\nseed: x")
+    assert text.startswith(f"{mine}:")
+    assert "unknown key 'retrieve.topK'. Did you mean 'topk'?" in text
+    assert text.count(f"(in {base}, which it inherits)") == 2
+    (line,) = (line for line in text.splitlines() if "'seeds'" in line)
+    assert base not in line
+    text = message(mine="inherits: base.yaml", base="captures: a: b")
+    assert f"{base}: not valid YAML" in text
+    text = message(mine="inherits: none.yaml")
+    assert text == f"{mine}: inherits {tmp_path / 'none.yaml'}, and there is no such file. Correct `inherits`."
+    text = message(mine="inherits: base.yaml", base="inherits: mine.yaml")
+    assert text.startswith(f"{mine} inherits {base} inherits {mine}: a manifest cannot inherit from itself")
+    text = message(mine="inherits: mine.yaml")
+    assert text.startswith(f"{mine} inherits {mine}: a manifest cannot inherit from itself")
+    text = message(mine="inherits: {a: b}")
+    assert "inherits: found {'a': 'b'}, expected a file name or a list of them" in text
+
+
 def test_overrides_are_yaml_and_win(tmp_path: Path) -> None:
     path = write(tmp_path, "captures: [a]\nretrieve: {topk: 20}\n")
     manifest = load_manifest(path, ["retrieve.topk=5", "seed=3", "evaluate.thresholds=[[1, 0.1]]"])
@@ -62,6 +148,23 @@ def test_overrides_are_yaml_and_win(tmp_path: Path) -> None:
         ("captures: [a]\nembed: {image_size: 100}", "embed.image_size"),
         ("captures: [a]\nembed: {image_size: 300}", "multiple of 14"),
         ("captures: [a]\nembed: {compute_device: gpu}", "embed.compute_device"),
+        ("captures: [a]\ndataset: {page: p, licence: l, sessions: [ios_map], sources: {a: {hub: x}}}", "a.hub: found"),
+        (
+            "captures: [a]\ndataset: {page: p, licence: l, sessions: [ios_map], sources: {a: {hubs: o/n}}}",
+            "unknown key 'dataset.sources.a.hubs'. Did you mean 'hub'?",
+        ),
+        (
+            "captures: [a]\ndataset: {page: p, licence: l, sessions: [ios_map], sources: {a: {}}}",
+            "either `hub` (owner/name) or `urls`",
+        ),
+        ("captures: [a]\ndataset: {page: p, licence: l, sessions: [tango_map], sources: {}}", "found 'tango_map'"),
+        ("captures: [a]\ndataset: {page: p, licence: l, sessions: [], sources: {}}", "dataset.sessions is empty"),
+        ("captures: [a]\ndataset: {page: p, licence: l, sessions: 3, sources: {}}", "dataset.sessions: found 3"),
+        ("captures: [a]\ndataset: {page: p, sessions: [ios_map], sources: {}}", "dataset.licence: not given"),
+        (
+            "captures: [a]\ndataset: {page: p, licence: l, sessions: {ios_map: map}, sources: {a: {hub: o/n}}}",
+            "works with archives (`urls`) only",
+        ),
         ("- a", "expected `key: value` lines"),
         ("", "expected `key: value` lines"),
     ],
@@ -98,6 +201,23 @@ def test_a_missing_manifest_is_named(tmp_path: Path) -> None:
 def test_the_manifests_of_the_repository_are_valid(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CAPTURES", "/data")
     assert load_manifest(path).name == path.stem
+
+
+def test_public_captures_have_a_source_and_sessions(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CAPTURES", "/data")
+    scenes = {}
+    for path in MANIFESTS:
+        manifest = load_manifest(path)
+        if manifest.dataset:
+            names = [Path(capture).name for capture in manifest.captures]
+            assert list(manifest.dataset.sources) == names
+            scenes |= {name: " ".join(manifest.dataset.session_names) for name in names}
+            assert manifest.dataset.licence
+            assert manifest.dataset.citation
+    crocodl = ("HYDRO", "SUCCULENT", "ARCHE_GRANDE", "DESIGN", "ARCHE_D2", "ARCHE_B3", "ARCHE_B5")
+    every = "ios_map ios_query hl_map hl_query spot_map spot_query"
+    lamar = dict.fromkeys(("CAB", "HGE", "LIN"), "hl_map ios_map hl_query ios_query")
+    assert scenes == dict.fromkeys(crocodl, every) | lamar
 
 
 def test_there_is_a_section_for_each_stage() -> None:

@@ -4,9 +4,9 @@ import difflib
 import math
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
@@ -141,6 +141,60 @@ class VisualizeSettings(_Section):
     """Write recordings for the rerun viewer."""
 
 
+class Source(_Strict):
+    """Where the data of one capture are: a dataset on the Hugging Face hub, or archives anywhere."""
+
+    hub: Annotated[str, Field(pattern=r"^[\w.-]+/[\w.-]+$")] | None = None
+    """Dataset on the hub, `owner/name`."""
+    revision: str = "main"
+    """Branch, tag or commit of it."""
+    urls: list[Annotated[str, Field(pattern=r"^https?://[^/]+/.+")]] = []
+    """Or: addresses of zip archives."""
+    sha256: dict[str, Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]] = {}
+    """Checksums of archives by file name; the hub knows those of its files."""
+
+    @model_validator(mode="after")
+    def _one_place(self) -> "Source":
+        if (self.hub is None) == (not self.urls):
+            raise ValueError("a source has either `hub` (owner/name) or `urls` (a list), and not both")
+        return self
+
+
+class DatasetSettings(_Strict):
+    """Where the captures of this manifest can be had; `python -m toolkit download` reads it."""
+
+    page: str
+    """Where to read about the data, ask for access and accept terms."""
+    licence: str
+    """Licence of the data."""
+    citation: str = ""
+    """What to cite."""
+    into: Literal["", "sessions"] = ""
+    """Folder of the capture that the root of a hub dataset is."""
+    sessions: list[str] | dict[str, str]
+    """Sessions to fetch; or, where an archive names them otherwise, {name here: name there}."""
+    include: list[str] = []
+    """Further files to fetch: patterns such as `registration/*` of paths in the capture; * also matches /."""
+    sources: dict[str, Source]
+    """For each capture's folder name, where its data are."""
+
+    @property
+    def session_names(self) -> dict[str, str]:
+        """The name in the source of each session to fetch."""
+        return self.sessions if isinstance(self.sessions, dict) else {name: name for name in self.sessions}
+
+    @model_validator(mode="after")
+    def _renames_archives_only(self) -> "DatasetSettings":
+        if not self.sessions:
+            raise ValueError("dataset.sessions is empty; expected names such as ios_map")
+        for name in self.session_names:
+            if not re.fullmatch(f"({'|'.join(DEVICES)})_(map|query)", name):
+                raise ValueError(f"dataset.sessions: found {name!r}, expected <{', '.join(DEVICES)}>_<map or query>")
+        if isinstance(self.sessions, dict) and any(source.hub for source in self.sources.values()):
+            raise ValueError("dataset.sessions gives new names, which works with archives (`urls`) only")
+        return self
+
+
 class Manifest(_Strict):
     """What to run. Paths are relative to the manifest's folder; `~` and `$VARIABLES` are expanded."""
 
@@ -152,6 +206,8 @@ class Manifest(_Strict):
     """Capture folders, each with `sessions/` in it. The folder's name is the scene's name."""
     demo_data: DemoData | None = None
     """Or: a capture to render."""
+    dataset: DatasetSettings | None = None
+    """Where to get the captures from, if they can be downloaded."""
     output_root: str = "../runs"
     """Results go to <output_root>/<name>."""
     extra_devices: list[ExtraDevice] = []
@@ -210,6 +266,9 @@ _MODELS = {"demo_data": DemoData, "extra_devices": ExtraDevice}
 def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
     """Read and check a manifest.
 
+    `inherits: FILE` (or a list of files, relative to the manifest) takes over what those files say: sections are
+    merged key by key, lists and values replaced, and each path counts from the folder of the file that has it.
+
     Args:
         path: YAML file.
         overrides: `key=value` or `section.key=value`, the value in YAML; they replace what the file says.
@@ -218,11 +277,15 @@ def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
         The manifest with its paths made absolute.
 
     Raises:
-        ManifestError: naming the file, the key, what was found, and the nearest known key.
+        ManifestError: naming the file, the key, what was found, and the nearest known key; also the file that an
+            inherited key is from.
     """
     path = Path(path)
     source = str(path)
-    raw = _read_yaml(path)
+    chain = _read_chain(path, ())
+    raw: dict[str, Any] = {}
+    for _, content in chain:
+        raw = _merge(raw, content)
     for override in overrides:
         _apply(raw, override)
         source = f"{path} with --set {override}" if source == str(path) else f"{source} {override}"
@@ -230,7 +293,7 @@ def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
     try:
         manifest = Manifest.model_validate(raw)
     except ValidationError as error:
-        raise ManifestError(_explain(error, source)) from None
+        raise ManifestError(_explain(error, source, path, chain)) from None
     folder = path.resolve().parent
     update: dict[str, Any] = {
         "captures": [str(_expand(text, folder, f"{source}: captures")) for text in manifest.captures],
@@ -257,10 +320,60 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return (f"Did you mean {match[0]!r}? " if match else "") + f"Known: {', '.join(known)}."
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
+Chain = list[tuple[Path, dict[str, Any]]]
+"""The files that make up a manifest, each with what it says itself; a later one wins."""
+
+
+def _read_chain(path: Path, heirs: tuple[Path, ...]) -> Chain:
+    if path.resolve() in [heir.resolve() for heir in heirs]:
+        circle = " inherits ".join(map(str, (*heirs, path)))
+        raise ManifestError(f"{circle}: a manifest cannot inherit from itself. Take one of these `inherits` out.")
+    raw = _read_yaml(path, heirs[-1] if heirs else None)
+    bases = raw.pop("inherits", [])
+    bases = [bases] if isinstance(bases, str) else bases
+    if not (isinstance(bases, list) and all(isinstance(base, str) for base in bases)):
+        raise ManifestError(f"{path}: inherits: found {bases!r}, expected a file name or a list of them.")
+    chain: Chain = []
+    for base in bases:
+        file = _expand(base, path.parent, f"{path}: inherits")
+        chain += _read_chain(file, (*heirs, path))
+    if heirs:
+        _anchor(raw, path.resolve().parent)
+    return [*chain, (path, raw)]
+
+
+def _merge(base: Mapping[str, Any], content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `base` with what `content` says: mappings are merged, anything else is replaced."""
+    merged = dict(base)
+    for key, value in content.items():
+        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
+        merged[key] = _merge(merged[key], value) if both else value
+    return merged
+
+
+def _anchor(raw: dict[str, Any], folder: Path) -> None:
+    """Make the paths of a base absolute: they count from its own folder, not from its heir's."""
+
+    def anchor(text: Any) -> Any:
+        if not isinstance(text, str) or text.startswith("~") or "$" in os.path.expandvars(text):
+            return text  # expanded, or refused, at the end: an heir may replace it
+        return os.path.normpath(folder / os.path.expandvars(text))
+
+    if isinstance(raw.get("captures"), list):
+        raw["captures"] = [anchor(text) for text in raw["captures"]]
+    if "output_root" in raw:
+        raw["output_root"] = anchor(raw["output_root"])
+    for stage in ("embed", "localize"):
+        if isinstance(raw.get(stage), dict) and "checkpoint" in raw[stage]:
+            raw[stage]["checkpoint"] = anchor(raw[stage]["checkpoint"])
+
+
+def _read_yaml(path: Path, heir: Path | None = None) -> dict[str, Any]:
     try:
         raw = yaml.safe_load(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
+        if heir:
+            raise ManifestError(f"{heir}: inherits {path}, and there is no such file. Correct `inherits`.") from None
         raise ManifestError(f"{path}: no such manifest. data_manifests/demo.yaml is an example.") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ManifestError(f"{path}: cannot be read as a text file ({error}).") from None
@@ -288,24 +401,55 @@ def _apply(raw: dict[str, Any], override: str) -> None:
     raw[last] = value
 
 
-def _explain(error: ValidationError, source: str) -> str:
+def _explain(error: ValidationError, source: str, path: Path, chain: Chain) -> str:
     lines = []
     for problem in error.errors():
-        keys = [str(key) for key in problem["loc"] if not re.match(r"literal|list\[|constrained", str(key))]
+        keys = [str(key) for key in problem["loc"] if not re.match(r"literal|list\[|dict\[|constrained", str(key))]
         where = ".".join(keys) or "the manifest"
         if problem["type"] == "extra_forbidden":
-            model: Any = Manifest
-            for key in keys[:-1]:
-                if not key.isdigit():  # an item of a list is what the list is of
-                    model = _MODELS.get(key) or model.model_fields[key].annotation
-            lines.append(f"unknown key {where!r}. {nearest(keys[-1], model.model_fields)}")
+            known = _model_at(keys[:-1]).model_fields
+            line = f"unknown key {where!r}. {nearest(keys[-1], known)}"
         elif problem["type"] == "value_error":
-            lines.append(f"{problem['ctx']['error']}.")
+            line = f"{problem['ctx']['error']}."
         elif problem["type"] == "literal_error" and isinstance(problem["input"], list):
             continue  # the other branch of `"all" | list`, which says what is wrong in the list
+        elif problem["type"] in ("list_type", "dict_type") and isinstance(problem["input"], list | dict):
+            continue  # likewise, of `list | dict`
+        elif problem["type"] == "missing":
+            line = f"{where}: not given. {problem['msg']}."
         else:
-            lines.append(f"{where}: found {problem['input']!r}. {problem['msg']}.")
+            line = f"{where}: found {problem['input']!r}. {problem['msg']}."
+        giver = next((file for file, content in reversed(chain) if _has(content, keys)), path)
+        lines.append(line if giver == path else f"{line} (in {giver}, which it inherits)")
     return "\n  ".join([f"{source}:", *dict.fromkeys(lines)])
+
+
+def _has(content: Any, keys: list[str]) -> bool:
+    """Tell whether a file itself says something under these keys."""
+    for key in keys:
+        if isinstance(content, list):
+            return True
+        if not isinstance(content, dict) or key not in content:
+            return False
+        content = content[key]
+    return True
+
+
+def _model_at(keys: list[str]) -> type[BaseModel]:
+    """Return the model of the section under these keys."""
+    model: Any = Manifest
+    for key in keys:
+        if key not in model.model_fields:
+            continue  # a name in a mapping of sections
+        kinds: list[Any] = [model.model_fields[key].annotation]
+        while kinds:  # the section in `Section | None` and `dict[str, Section]`
+            kind = kinds.pop()
+            if isinstance(kind, type) and issubclass(kind, BaseModel):
+                model = kind
+                break
+            kinds += get_args(kind)
+    section: type[BaseModel] = model
+    return section
 
 
 def _expand(text: str, folder: Path, where: str) -> Path:
