@@ -180,6 +180,19 @@ def test_all_problems_are_listed_not_the_first_alone(capture: Path) -> None:
     assert sum("hl_query" in line and "unknown sensor" in line for line in lines) == 8, "4 images, 4 rig rows"
 
 
+def test_a_long_list_of_problems_can_be_cut(capture: Path) -> None:
+    append(capture, "hl_map/images.txt", "".join(f"30, s/a, s/a/none{i}.jpg\n" for i in range(9)))
+    report = check_capture(capture)
+    count = len(report.problems)
+    assert count > 5
+    lines = report.text(most=2).splitlines()
+    assert str(report.problems[1]) in lines
+    assert str(report.problems[2]) not in lines
+    assert f"... and {count - 2} more: python -m toolkit check {capture}" in lines
+    assert "more:" not in report.text()
+    assert "more:" not in report.text(most=count)
+
+
 def test_warnings_alone_leave_it_ok(capture: Path) -> None:
     append(capture, "hl_map/trajectories.txt", f"30, s/rig_10, {QT}\n")
     report = check_capture(capture)

@@ -1,4 +1,4 @@
-"""The command line: `python -m toolkit run|report|check|submit|import|export|demo-data`."""
+"""The command line: `python -m toolkit run|report|check|download|submit|import|export|demo-data`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -97,6 +97,31 @@ def submit(
     print(submission.text())
     if not dry_run:
         print(f"Submission: {submission.write()}")
+
+
+@app.command()
+def download(
+    manifest: Annotated[Path, typer.Argument(help="A manifest with `dataset`: data_manifests/crocodl-hydro.yaml.")],
+    sessions: Annotated[
+        str, typer.Option(metavar="NAME,...", help="Only these of the manifest's sessions, e.g. ios_map,hl_query.")
+    ] = "",
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="List files and sizes; fetch nothing.")] = False,
+    keep_archives: Annotated[bool, typer.Option("--keep-archives", help="Keep what was unpacked.")] = False,
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Replace a setting, as for `run`.")
+    ] = None,
+) -> None:
+    """Fetch the captures of a manifest, unpack and check them; goes on where it was stopped."""
+    from toolkit.download import download
+
+    names = [name.strip() for name in sessions.split(",") if name.strip()]
+    try:
+        reports = download(manifest, names, keep_archives, dry_run, overrides or ())
+    except KeyboardInterrupt:
+        print("Interrupted. The same command goes on from here.")
+        raise typer.Exit(130) from None
+    if not all(report.ok for report in reports):
+        raise typer.Exit(1)
 
 
 @app.command()

@@ -65,8 +65,8 @@ class CheckReport:
     def errors(self) -> list[Problem]:
         return [problem for problem in self.problems if problem.severity == ERROR]
 
-    def text(self) -> str:
-        """Return the report as text: a table a session, then the problems, one a line."""
+    def text(self, most: int | None = None) -> str:
+        """Return the report as text: a table a session, then the problems, one a line, or so many of them."""
         parts = [f"Capture {self.path}"]
         for session, table in self.tables.items():
             widths = [max(map(len, table[name])) for name in ("what", "count")]
@@ -76,7 +76,10 @@ class CheckReport:
             ]
             parts.append("\n".join([session, *rows]))
         if self.problems:
-            parts.append("\n".join(map(str, self.problems)))
+            lines = [str(problem) for problem in self.problems[:most]]
+            if len(self.problems) > len(lines):
+                lines.append(f"... and {len(self.problems) - len(lines)} more: python -m toolkit check {self.path}")
+            parts.append("\n".join(lines))
         warnings = len(self.problems) - len(self.errors)
         parts.append(f"{_count(len(self.errors), 'error')}, {_count(warnings, 'warning')}.")
         return "\n\n".join(parts)

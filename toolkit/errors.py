@@ -23,3 +23,7 @@ class ImageError(ToolkitError):
 
 class WeightsError(ToolkitError):
     """Weights are missing, cannot be fetched, are damaged, or are those of another network."""
+
+
+class DownloadError(ToolkitError):
+    """A capture, or a file of it, cannot be listed, fetched, unpacked or put in its place."""

@@ -187,9 +187,10 @@ class DatasetSettings(_Strict):
     def _renames_archives_only(self) -> "DatasetSettings":
         if not self.sessions:
             raise ValueError("dataset.sessions is empty; expected names such as ios_map")
+        keys = [kind.key for kind in TABLE]
         for name in self.session_names:
-            if not re.fullmatch(f"({'|'.join(DEVICES)})_(map|query)", name):
-                raise ValueError(f"dataset.sessions: found {name!r}, expected <{', '.join(DEVICES)}>_<map or query>")
+            if not re.fullmatch(f"({'|'.join(keys)})_(map|query)", name):
+                raise ValueError(f"dataset.sessions: found {name!r}, expected <{', '.join(keys)}>_<map or query>")
         if isinstance(self.sessions, dict) and any(source.hub for source in self.sources.values()):
             raise ValueError("dataset.sessions gives new names, which works with archives (`urls`) only")
         return self
@@ -257,10 +258,6 @@ class Manifest(_Strict):
         """Return the settings of one stage."""
         section: _Section = getattr(self, stage)
         return section
-
-
-# Models that a field's annotation names only as a part.
-_MODELS = {"demo_data": DemoData, "extra_devices": ExtraDevice}
 
 
 def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:

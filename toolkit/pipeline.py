@@ -26,6 +26,7 @@ from typing import Any
 
 from toolkit import __version__, errors
 from toolkit.devices import extra_devices, table_record
+from toolkit.download import is_unfinished
 from toolkit.embedders import WEIGHTS as EMBEDDER_WEIGHTS
 from toolkit.embedders import resolve_name
 from toolkit.errors import ManifestError, ToolkitError
@@ -118,6 +119,7 @@ def run(
 
 
 def _run(manifest: Manifest, manifest_path: str | Path, only: str | None, force: bool, say: Say) -> Path:
+    _require_downloads(manifest, manifest_path)
     for stage in STAGES:  # a wrong key stops the run before hours of work, not after
         check_parameters(notebook_path(stage), manifest.stage(stage).given(), f"{manifest_path}: {stage}.")
     manifest = _name_embedder(manifest, say)
@@ -328,6 +330,19 @@ def _captures(manifest: Manifest) -> list[Path]:
         folder = Path(manifest.output_root).parent / "data" / manifest.name
         return [render_capture(folder, **manifest.demo_data.model_dump())]
     return [Path(capture) for capture in manifest.captures]
+
+
+def _require_downloads(manifest: Manifest, manifest_path: str | Path) -> None:
+    """Refuse to run on captures that can be downloaded and are not there, or not yet whole."""
+    fetch = f"python -m toolkit download {manifest_path}"
+    for capture in map(Path, manifest.captures):
+        if is_unfinished(capture):
+            raise ManifestError(f"{capture}: its download has not ended. Go on with it first: {fetch}")
+        if manifest.dataset and capture.name in manifest.dataset.sources and not (capture / "sessions").is_dir():
+            raise ManifestError(
+                f"{capture}: no such capture. Download it first: {fetch}\n"
+                "Or, where you have it already, name its folder in `captures`."
+            )
 
 
 def _jobs(manifest: Manifest, stage: str, capture: Path, files: SceneFiles, force: bool) -> Iterator[Job]:
