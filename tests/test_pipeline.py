@@ -16,8 +16,11 @@ from nbformat.v4 import new_code_cell, new_notebook
 
 from toolkit import notebook, pipeline
 from toolkit.errors import ManifestError, ToolkitError, WeightsError
+from toolkit.files import SceneFiles
+from toolkit.manifest import STAGES, load_manifest
 from toolkit.pipeline import StageError
 
+DEFAULT = ("explore", "embed", "retrieve", "localize", "evaluate", "visualize")
 KERNEL = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
 EMBED = """
 from pathlib import Path
@@ -41,16 +44,16 @@ out.mkdir(parents=True, exist_ok=True)
 def write_notebook(folder: Path, stage: str, parameters: str, code: str) -> None:
     first, work = new_code_cell(parameters), new_code_cell(code)
     first.metadata["tags"] = ["parameters"]
-    name = f"{pipeline.STAGES.index(stage) + 1:02d}_{stage}.ipynb"
-    nbformat.write(new_notebook(cells=[first, work], metadata=KERNEL), folder / name)
+    number = {"rerank": "03b"}.get(stage) or f"{DEFAULT.index(stage) + 1:02d}"
+    nbformat.write(new_notebook(cells=[first, work], metadata=KERNEL), folder / f"{number}_{stage}.ipynb")
 
 
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a capture `P`, six tiny notebooks of which two are run, and a manifest `run.yaml`."""
+    """A folder with a capture `P`, tiny notebooks of which two are run, and a manifest `run.yaml`."""
     notebooks = tmp_path / "notebooks"
     notebooks.mkdir()
-    for stage in pipeline.STAGES:
+    for stage in STAGES:
         write_notebook(notebooks, stage, "samples = 1\nthresholds = []", "")
     parameters = 'sessions_root = None\nout_dir = None\nmodel = "vlad"\nskip_existing = True'
     write_notebook(notebooks, "embed", parameters, EMBED)
@@ -117,6 +120,45 @@ def test_some_pairs_take_an_execution_each(place: Path, go: Callable[..., dict[s
     go("pairs=[[ios, hl], [hl, ios]]", only="retrieve")
     record = json.loads((place / "runs/run/run.json").read_text())
     assert [row["status"] for row in record["stages"]] == ["reused", "reused"]
+
+
+def test_reranking_is_switched_on_by_its_section(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pipeline, "STAGES", STAGES)
+    parameters = "retrieval_dir = None\nreranked_dir = None\ntopn = 30\ntopk = 10"
+    for stage in ("rerank", "localize", "evaluate"):
+        write_notebook(place / "notebooks", stage, parameters, "")
+
+    def asked(*overrides: str) -> dict[str, dict[str, object]]:
+        manifest = load_manifest(place / "run.yaml", overrides)
+        files = SceneFiles(place / "runs" / "run", "P")
+        return {
+            stage: job.parameters
+            for stage in manifest.stages
+            for job in pipeline._jobs(manifest, stage, place / "P", files, force=False)
+        }
+
+    off = asked()
+    assert "rerank" not in off
+    assert off["localize"]["retrieval_dir"].endswith("/retrieval")
+    assert "reranked_dir" not in off["evaluate"]
+    for switch in ("rerank=true", "rerank=null", "rerank={}"):
+        on = asked(switch)
+        assert list(on) == list(STAGES)
+        assert on["retrieve"]["topk"] == 30  # what is verified has to be retrieved
+        assert on["rerank"]["retrieval_dir"].endswith("/retrieval")
+        assert on["localize"]["retrieval_dir"].endswith("/reranked")
+        assert on["evaluate"]["retrieval_dir"].endswith("/retrieval")
+        assert on["evaluate"]["reranked_dir"].endswith("/reranked")
+    assert asked("rerank=false") == off
+    more = asked("rerank.topn=50")
+    assert (more["retrieve"]["topk"], more["rerank"]["topn"]) == (50, 50)
+    assert asked("rerank=true", "retrieve.topk=40")["retrieve"]["topk"] == 40
+    with pytest.raises(ManifestError, match=r"rerank\.topn is 50, but retrieve\.topk finds only 40"):
+        asked("rerank.topn=50", "retrieve.topk=40")
+    with pytest.raises(ManifestError, match=r"unknown key 'rerank\.top_n'\. Did you mean 'topn'"):
+        asked("rerank.top_n=50")
+    with pytest.raises(ManifestError, match="no section `rerank`"):
+        pipeline.run(place / "run.yaml", only="rerank")
 
 
 def test_a_failing_cell_stops_with_its_message_and_the_notebook(
@@ -248,8 +290,7 @@ def test_missing_weights_are_told_before_a_capture_is_rendered(
 
 def test_other_weights_in_the_same_place_are_noticed(place: Path, go: Callable[..., dict[str, str]]) -> None:
     parameters = 'sessions_root = None\nout_dir = None\nmodel = "vlad"\ncheckpoint = None\nskip_existing = True'
-    write_notebook(place, "embed", parameters, EMBED)
-    (place / "01_embed.ipynb").replace(place / "notebooks" / "02_embed.ipynb")
+    write_notebook(place / "notebooks", "embed", parameters, EMBED)
     weights = place / "weights" / "model.safetensors"
     weights.parent.mkdir()
     weights.write_bytes(b"some")

@@ -2,7 +2,8 @@
 
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,13 +14,16 @@ from numpy.typing import NDArray
 
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.devices import colour_of, in_order
-from toolkit.errors import CaptureError, ToolkitError
+from toolkit.errors import ArtefactError, CaptureError, ToolkitError
 from toolkit.figures import ORANGE, SKY, VERMILLION, new_figure, save_figure
 from toolkit.files import pair_name, write_atomic, write_sidecar
-from toolkit.geometry import pose_error
+from toolkit.geometry import invert, pose_error, transform
 
 if TYPE_CHECKING:
+    import pycolmap
     from matplotlib.figure import Figure
+
+    from toolkit.mapping import LocalMap
 
 logger = logging.getLogger(__name__)
 
@@ -33,6 +37,9 @@ WRONG: Threshold = (5, 0.5)
 FIGURES = ("recall", "median_errors", "error_curves", "losses", "retrieval")
 ERROR_COLUMNS = ["map_device", "query_device", "timestamp", "device_id", "status", "num_inliers",
                  "rotation_error_deg", "translation_error_m"]  # fmt: skip
+
+# A first reference overlaps with the query if the query sees at least this share of the map points that it sees.
+LEAST_OVERLAP = 0.1
 
 NO_REFERENCE, NO_POSE, WRONG_POSE = REASONS = ("no good reference", "no pose", "wrong pose")
 
@@ -111,6 +118,8 @@ class Evaluation:
     """One row a pair: share of queries with a good reference among the first K, and in the map at all."""
     losses: pd.DataFrame
     """One row a pair and threshold: queries missed, by reason."""
+    overlap: pd.DataFrame
+    """One row a pair: query images, and the share of them whose first reference overlaps with them in view."""
     thresholds: tuple[Threshold, ...] = THRESHOLDS
     messages: list[str] = field(default_factory=list)
     """What was not evaluated, and why; empty where all was."""
@@ -130,6 +139,8 @@ def evaluate_scene(
     retrieval_angle_deg: float = 45.0,
     at: str = "device",
     pairs: Sequence[Sequence[str]] | None = None,
+    reranked_dir: str | Path | None = None,
+    map_dir: str | Path | None = None,
 ) -> Evaluation:
     """Evaluate the poses of all pairs of a scene and write tables and figures.
 
@@ -139,7 +150,7 @@ def evaluate_scene(
         sessions_root: folder `sessions/` of the capture.
         poses_dir: folder of `SCENE_map_<M>_query_<Q>.txt`, and `.csv` where there is one.
         retrieval_dir: folder of `SCENE_map_<M>_query_<Q>.jsonl`; None skips retrieval recall.
-        out_dir: where `{recall,errors,retrieval,losses}.csv` and the figures go; None: nowhere.
+        out_dir: where `{recall,errors,retrieval,losses,overlap}.csv` and the figures go; None: nowhere.
         map_device: `all` or one device key; likewise `query_device`.
         queries: the keyframe list that is asked; all of it is the denominator.
         thresholds: pairs (degrees, metres).
@@ -150,6 +161,9 @@ def evaluate_scene(
         at: `device` has one error a query device; `camera` one a camera image of it, as the benchmark's own
             code evaluates rigs.
         pairs: only these [map device, query device]; None: all.
+        reranked_dir: folder of the reranked references, if queries were localized with those: retrieval recall is
+            then theirs, and overlap is shown before and after.
+        map_dir: folder of the triangulated maps, which say what a reference sees.
 
     Raises:
         ToolkitError: an unknown device or `at`, or no pair to evaluate.
@@ -176,7 +190,7 @@ def evaluate_scene(
                 continue
             good = None
             if retrieval_dir is not None:
-                path = Path(retrieval_dir) / f"{name}.jsonl"
+                path = Path(retrieval_dir if reranked_dir is None else reranked_dir) / f"{name}.jsonl"
                 limits = (retrieval_radius_m, retrieval_angle_deg)
                 row, good = _retrieval_recall(path, keys, truth, capture[f"{map_}_map"], retrieval_ks, limits)
                 rows["retrieval"].append({**pair, **row})
@@ -194,6 +208,8 @@ def evaluate_scene(
             errors.append(frame.assign(**pair))
             rows["recall"].append({**pair, "state": state, **_summary(frame, pairs_of_thresholds)})
             rows["losses"] += [{**pair, "state": state, **row} for row in _losses(frame, pairs_of_thresholds)]
+    references = {"retrieved": retrieval_dir, "reranked": reranked_dir}
+    known = {name: folder for name, folder in references.items() if folder is not None}
     evaluation = Evaluation(
         _table(rows["recall"], ["map_device", "query_device", "state", "queries"]),
         _leading(pd.concat(errors), ["map_device", "query_device"])
@@ -201,6 +217,7 @@ def evaluate_scene(
         else pd.DataFrame(columns=ERROR_COLUMNS),
         _table(rows["retrieval"], ["map_device", "query_device", "state"]),
         _table(rows["losses"], ["map_device", "query_device", "state", "threshold", *REASONS]),
+        overlap_table(sessions_root, known, map_dir, map_device, query_device, pairs),
         pairs_of_thresholds,
         list(dict.fromkeys(messages)),
     )
@@ -219,7 +236,7 @@ def evaluate_scene(
 def write_evaluation(evaluation: Evaluation, out_dir: str | Path, settings: dict[str, Any]) -> None:
     """Write the tables as CSV, the figures as PNG, and beside recall.csv how they were made."""
     out = Path(out_dir)
-    for name in ("recall", "errors", "retrieval", "losses"):
+    for name in ("recall", "errors", "retrieval", "losses", "overlap"):
         with write_atomic(out / f"{name}.csv") as temporary:
             getattr(evaluation, name).to_csv(temporary, index=False)
     figures = draw_evaluation(evaluation)
@@ -429,6 +446,122 @@ def _near_any(cameras: Array, map_cameras: Array, limits: tuple[float, float]) -
         for row, hits in zip(known, tree.query_ball_point(cameras[known, :3, 3], limits[0]), strict=True):
             near[row] = _is_near(map_cameras[hits], cameras[row], limits).any()
     return near
+
+
+# Overlap
+
+
+def overlap_in_view(points: Array, reference: Array, world_from_cam: Array, camera: "pycolmap.Camera") -> float:
+    """Return the share, 0 to 1, of the points that a reference sees which lie in the view of another camera.
+
+    The overlap of two images by sparse points, as M. Dusmanu et al., "D2-Net", CVPR 2019, choose training pairs. A
+    point that the camera would look at from behind (over 90 degrees from the reference's line of sight) is not seen.
+
+    Args:
+        points: (P, 3) triangulated points that the reference observes, world, metres.
+        reference: (3,) its centre.
+        world_from_cam: (4, 4) the other camera's pose.
+        camera: its intrinsics.
+    """
+    from toolkit.mapping import in_view, view_bounds
+
+    if not len(points):
+        return 0.0
+    in_cam = transform(invert(world_from_cam), points)
+    same_side = np.sum((points - reference) * (points - world_from_cam[:3, 3]), axis=1) > 0
+    seen = in_view(in_cam[None], view_bounds(camera)[None])[0] & same_side
+    return float(seen.mean())
+
+
+def overlap_table(
+    sessions_root: str | Path,
+    references: Mapping[str, str | Path],
+    map_dir: str | Path | None,
+    map_device: str = "all",
+    query_device: str = "all",
+    pairs: Sequence[Sequence[str]] | None = None,
+) -> pd.DataFrame:
+    """Return for each pair the share of query images whose first reference overlaps with them in view, by true poses.
+
+    A reference overlaps with a query image if at least `LEAST_OVERLAP` of the triangulated map points that it observes
+    lie in the image's view (`overlap_in_view`); where no map is triangulated yet, of points laid at 2, 4, 8 and 16 m
+    into the reference's view.
+
+    Args:
+        sessions_root: folder `sessions/` of the capture.
+        references: folders of references (`SCENE_map_<M>_query_<Q>.jsonl`) by the names of their columns.
+        map_dir: folder of the triangulated maps.
+        map_device: `all` or one device key; likewise `query_device`.
+        pairs: only these [map device, query device]; None: all.
+
+    Returns:
+        One row a pair: map_device, query_device, state, images (with references and a true pose), points (`map` or
+        `view`), and for each name `<name>` (share) and `<name>_mean` (mean overlap).
+    """
+    capture = Capture.from_sessions_root(sessions_root)
+    rows = []
+    for map_ in _devices(capture, "map", map_device):
+        scene = _MapView.open(capture[f"{map_}_map"], None if map_dir is None else Path(map_dir))
+        for query in _devices(capture, "query", query_device):
+            if pairs is None or [map_, query] in [list(asked) for asked in pairs]:
+                session, name = capture[f"{query}_query"], pair_name(capture.name, map_, query)
+                row: dict[str, Any] = {"map_device": map_, "query_device": query, "state": "evaluated"}
+                for column, folder in references.items():
+                    row |= _overlap(Path(folder) / f"{name}.jsonl", column, session, scene)
+                rows.append(row)
+    return _table(rows, ["map_device", "query_device", "state", "images", "points"])
+
+
+def _overlap(path: Path, name: str, session: Session, scene: "_MapView") -> dict[str, Any]:
+    """Return what a file of references adds to a row of the overlap table."""
+    if session.ground_truth is None:
+        return {"state": "no ground truth"}
+    try:
+        lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+        times, devices = [int(line["timestamp"]) for line in lines], [line["device_id"] for line in lines]
+        cameras = session.ground_truth.lookup(times, devices) @ np.array([x["Trs"] for x in lines]).reshape(-1, 4, 4)
+        shares = []
+        for line, camera in zip(lines, cameras, strict=True):
+            if np.isfinite(camera).all():
+                seen = scene.seen_by(line["topk"][0]) if line["topk"] else np.zeros((0, 3))
+                centre = np.array(line["topk"][0]["Tws"])[:3, 3] if line["topk"] else np.zeros(3)
+                shares.append(overlap_in_view(seen, centre, camera, session.camera(line["sensor_id"])))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        return {"state": f"{path.name} of the {name} cannot be read ({type(error).__name__})"}
+    row: dict[str, Any] = {"images": len(shares), "points": "view" if scene.local_map is None else "map"}
+    if shares:
+        row |= {name: float(np.mean(np.array(shares) >= LEAST_OVERLAP)), f"{name}_mean": float(np.mean(shares))}
+    return row
+
+
+@dataclass(frozen=True)
+class _MapView:
+    """What the images of a map see."""
+
+    session: Session
+    local_map: "LocalMap | None"
+
+    @classmethod
+    def open(cls, session: Session, map_dir: Path | None) -> "_MapView":
+        from toolkit.mapping import LocalMap
+
+        with suppress(ArtefactError):
+            return cls(session, None if map_dir is None else LocalMap.load(map_dir / f"{session.id}.npz"))
+        return cls(session, None)
+
+    def seen_by(self, reference: dict[str, Any]) -> Array:
+        """Return the points (P, 3) that a reference sees, world, metres."""
+        if self.local_map is not None:
+            image = self.local_map.index_of.get(str(reference["path"]).split("/sessions/", 1)[-1])
+            found = [] if image is None else self.local_map.observations(image)[1]
+            return self.local_map.points[np.unique(np.asarray(found, np.int64))]
+        from toolkit.mapping import view_bounds
+
+        left, right, top, bottom = view_bounds(self.session.camera(reference["sensor_id"]))
+        x, y = np.meshgrid(np.linspace(left, right, 9), np.linspace(top, bottom, 9))
+        rays = np.stack([x, y, np.ones_like(x)], -1).reshape(1, -1, 3)
+        points = (rays * np.array([2.0, 4.0, 8.0, 16.0])[:, None, None]).reshape(-1, 3)
+        return transform(np.array(reference["Tws"], float), points)
 
 
 # Figures

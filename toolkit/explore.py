@@ -118,24 +118,59 @@ def draw_references(
         samples: queries shown, evenly spread.
         references: references shown of each.
     """
+    lines = _queries_of(jsonl)
+    chosen = np.unique(np.linspace(0, len(lines) - 1, min(samples, len(lines))).round().astype(int))
+    return _draw_rows(sessions_root, jsonl, [[lines[row]] for row in chosen], references)
+
+
+def draw_reranked(
+    sessions_root: str | Path, jsonl: str | Path, retrieved: str | Path, samples: int = 4, references: int = 3
+) -> "Figure":
+    """Return a figure of query images, each with its first references by retrieval and, to their right, reranked.
+
+    Queries that another reference leads now come first.
+
+    Args:
+        sessions_root: folder `sessions` of the capture.
+        jsonl: the reranked references of a pair, `<scene>_map_<M>_query_<Q>.jsonl`.
+        retrieved: those of the retrieval stage.
+        samples: queries shown.
+        references: references shown of each, before and after.
+    """
+    before, after = _queries_of(retrieved), _queries_of(jsonl)
+    moved = [-row["topk"][0]["retrieval_rank"] if row["topk"] else 0 for row in after]
+    chosen = np.argsort(moved, kind="stable")[:samples]
+    return _draw_rows(sessions_root, jsonl, [[before[row], after[row]] for row in chosen], references)
+
+
+def _draw_rows(
+    sessions_root: str | Path, jsonl: str | Path, rows: list[list[dict[str, Any]]], references: int
+) -> "Figure":
+    """Draw a line a query: its image, then its first references as each of its rows has them."""
     capture = Capture.from_sessions_root(sessions_root)
     map_device, _, query_device = Path(jsonl).stem.rpartition("_map_")[2].partition("_query_")
     sides = {"map": capture[f"{map_device}_map"], "query": capture[f"{query_device}_query"]}
     files = {side: _image_paths(session) for side, session in sides.items()}
-    lines = Path(jsonl).read_text(encoding="utf-8").splitlines()
-    chosen = np.unique(np.linspace(0, len(lines) - 1, min(samples, len(lines))).round().astype(int))
-    figure = new_figure(2.2 * (references + 1), 1.9 * len(chosen))
-    axes = figure.subplots(len(chosen), references + 1, squeeze=False)
-    for line, row in zip(axes, chosen, strict=True):
-        query = json.loads(lines[row])
-        shown = [("query", query, f"query {query_device}")]
-        shown += [("map", hit, f"{map_device} {hit['score']:.2f}") for hit in query["topk"][:references]]
+    width = 1 + references * max((len(row) for row in rows), default=1)
+    figure = new_figure(2.2 * width, 1.9 * len(rows))
+    axes = figure.subplots(len(rows), width, squeeze=False)
+    for line, row in zip(axes, rows, strict=True):
         for axis in line:
             axis.set_axis_off()
-        for axis, (side, entry, title) in zip(line, shown, strict=False):
+        shown = [(line[0], "query", row[0], f"query {query_device}")]
+        for part, query in enumerate(row):
+            for axis, hit in zip(line[1 + part * references :], query["topk"][:references], strict=False):
+                verified = "retrieval_rank" in hit
+                title = f"{hit['score']} inliers, was {hit['retrieval_rank']}" if verified else f"{hit['score']:.2f}"
+                shown.append((axis, "map", hit, f"{map_device} {title}"))
+        for axis, side, entry, title in shown:
             axis.imshow(read_for_display(files[side][int(entry["timestamp"]), entry["sensor_id"]]))
             axis.set_title(title, fontsize=8)
     return figure
+
+
+def _queries_of(jsonl: str | Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in Path(jsonl).read_text(encoding="utf-8").splitlines()]
 
 
 def draw_statuses(paths: Iterable[str | Path]) -> "Figure":

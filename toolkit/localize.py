@@ -26,10 +26,10 @@ from toolkit.files import (
     file_fingerprint,
     fingerprint,
     is_current,
+    open_progress,
     pair_name,
     write_atomic,
     write_sidecar,
-    write_text,
 )
 from toolkit.images import default_workers, prefetch, read_image
 from toolkit.localizers.hybrid import HybridLocalizer
@@ -397,35 +397,14 @@ def _localize_pair(
                 yield index, query, answer, seconds
 
     progress = pair.out_dir / f".{pair.name}.partial.jsonl"
-    done = _read_progress(progress, record) if skip_existing else {}
-    todo = [index for index, key in enumerate(keys) if key not in done]
-    finished = [{"record": fingerprint(record)}, *done.values()]
-    write_text(progress, "".join(json.dumps(line) + "\n" for line in finished))
-    with open(progress, "a", encoding="utf-8") as stream:
+    with open_progress(progress, record, keep=skip_existing) as finished:
+        done = {(row["timestamp"], row["device_id"]): row for row in finished.rows}
+        todo = [index for index, key in enumerate(keys) if key not in done]
         label = f"localize {pair.query_device} in {pair.map_device}"
         for row in tqdm(prefetch(solve, tasks(todo), workers), total=len(todo), desc=label, unit="query"):
-            stream.write(json.dumps(row) + "\n")
-            stream.flush()
+            finished.add(row)
             done[row["timestamp"], row["device_id"]] = row
     return [done[key] for key in keys]
-
-
-def _read_progress(path: Path, record: dict[str, Any]) -> dict[tuple[int, str], dict[str, Any]]:
-    """Return the rows that a killed run finished, if it was asked the same."""
-    if not path.exists():
-        return {}
-    done: dict[tuple[int, str], dict[str, Any]] = {}
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines()):
-        try:
-            row = json.loads(line)
-        except ValueError:
-            break  # the line that was being written
-        if number == 0:
-            if row != {"record": fingerprint(record)}:
-                return {}
-        else:
-            done[row["timestamp"], row["device_id"]] = row
-    return done
 
 
 @dataclass(frozen=True)

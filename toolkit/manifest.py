@@ -15,7 +15,9 @@ from toolkit.compute import DEVICE_NAME
 from toolkit.devices import TABLE
 from toolkit.errors import ManifestError
 
-STAGES = ("explore", "embed", "retrieve", "localize", "evaluate", "visualize")
+STAGES = ("explore", "embed", "retrieve", "rerank", "localize", "evaluate", "visualize")
+OPTIONAL = ("rerank",)
+"""Stages that run only where the manifest has their section."""
 
 Positive = Annotated[int, Field(gt=0)]
 Natural = Annotated[int, Field(ge=0)]
@@ -100,6 +102,15 @@ class RetrieveSettings(_Section):
     """Compare by cosine."""
     compute_device: ComputeDevice | None = None
     """auto, cpu, cuda, cuda:<number> or mps."""
+
+
+class RerankSettings(_Section):
+    topn: Positive | None = None
+    """Retrieved images whose matches are verified; retrieval finds so many, if `retrieve.topk` does not say."""
+    topk: Positive | None = None
+    """References kept of them."""
+    ratio: PositiveNumber | None = None
+    """Lowe's ratio of the matches."""
 
 
 class LocalizeSettings(_Section):
@@ -226,6 +237,8 @@ class Manifest(_Strict):
     explore: ExploreSettings = ExploreSettings()
     embed: EmbedSettings = EmbedSettings()
     retrieve: RetrieveSettings = RetrieveSettings()
+    rerank: RerankSettings | None = None
+    """Optional: the stage runs if the section is there, also without a key in it, or is `true`."""
     localize: LocalizeSettings = LocalizeSettings()
     evaluate: EvaluateSettings = EvaluateSettings()
     visualize: VisualizeSettings = VisualizeSettings()
@@ -236,6 +249,21 @@ class Manifest(_Strict):
         if world_up is not None and not 1e-9 < math.hypot(*world_up) < math.inf:
             raise ValueError(f"world_up is {world_up}; expected three finite numbers that are not all zero")
         return world_up
+
+    @field_validator("rerank", mode="before")
+    @classmethod
+    def _a_switch(cls, rerank: Any) -> Any:
+        """Take `rerank:` and `rerank: true` as a section without keys, and `false` as none."""
+        return {} if rerank is None or rerank is True else None if rerank is False else rerank
+
+    @model_validator(mode="after")
+    def _enough_references(self) -> "Manifest":
+        wanted, found = self.rerank and self.rerank.topn, self.retrieve.topk
+        if wanted and found and wanted > found:
+            raise ValueError(
+                f"rerank.topn is {wanted}, but retrieve.topk finds only {found}: raise it, or leave it out"
+            )
+        return self
 
     @model_validator(mode="after")
     def _one_source(self) -> "Manifest":
@@ -255,9 +283,14 @@ class Manifest(_Strict):
         return self
 
     def stage(self, stage: str) -> _Section:
-        """Return the settings of one stage."""
-        section: _Section = getattr(self, stage)
-        return section
+        """Return the settings of one stage, also of one that is off."""
+        section: _Section | None = getattr(self, stage)
+        return RerankSettings() if section is None else section
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The stages that run, in order."""
+        return tuple(stage for stage in STAGES if getattr(self, stage) is not None)
 
 
 def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:

@@ -16,7 +16,7 @@ import tqdm.std
 
 from toolkit.errors import ManifestError
 from toolkit.files import SceneFiles
-from toolkit.manifest import STAGES, DemoData, nearest
+from toolkit.manifest import OPTIONAL, DemoData, nearest
 
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
 TEXT_BARS = "TOOLKIT_TEXT_BARS"
@@ -27,8 +27,9 @@ UPSTREAM: dict[str, tuple[str, ...]] = {
     "explore": (),
     "embed": (),
     "retrieve": ("embed",),
-    "localize": ("retrieve",),
-    "evaluate": ("retrieve", "localize"),
+    "rerank": ("retrieve",),
+    "localize": ("retrieve", "rerank"),
+    "evaluate": ("retrieve", "rerank", "localize"),
     "visualize": ("retrieve", "localize"),
 }
 
@@ -116,11 +117,11 @@ def finish(**counts: Any) -> None:
 
 
 def notebook_path(stage: str) -> Path:
-    """Return the notebook of a stage."""
-    path = NOTEBOOKS / f"{STAGES.index(stage) + 1:02d}_{stage}.ipynb"
-    if not path.is_file():
+    """Return the notebook of a stage, `<number>_<stage>.ipynb`."""
+    path = next(iter(sorted(NOTEBOOKS.glob(f"[0-9]*_{stage}.ipynb"))), None)
+    if path is None:
         raise ManifestError(
-            f"{path}: no such notebook. The pipeline runs from a clone of the repository: "
+            f"{NOTEBOOKS}: no notebook of the stage {stage}. The pipeline runs from a clone of the repository: "
             "install it there with `pip install --editable .`."
         )
     return path
@@ -175,6 +176,7 @@ def stage_outputs(files: SceneFiles, stage: str) -> Path | None:
     return {
         "embed": files.embeddings,
         "retrieve": files.retrieval_dir,
+        "rerank": files.reranked_dir,
         "localize": files.poses_dir,
         "evaluate": files.evaluation,
         "visualize": files.visualization,
@@ -185,7 +187,7 @@ def _make_upstream(stage: str, sessions: Path, files: SceneFiles, wanted: set[Pa
     """Make what earlier stages should have left in the folders `wanted`, where they are empty or absent."""
     for name in UPSTREAM[stage]:
         folder = stage_outputs(files, name)
-        if folder is None or folder not in wanted or (folder.is_dir() and any(folder.iterdir())):
+        if folder is None or name in OPTIONAL or folder not in wanted or (folder.is_dir() and any(folder.iterdir())):
             continue
         _make_upstream(name, sessions, files, {stage_outputs(files, earlier) for earlier in UPSTREAM[name]})
         print(f"{name}: not there yet, made now in {folder}")

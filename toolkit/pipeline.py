@@ -114,6 +114,8 @@ def run(
     if only is not None and only not in STAGES:
         raise ManifestError(f"--only {only}: no such stage. {nearest(only, STAGES)}")
     manifest = load_manifest(manifest_path, overrides)
+    if only is not None and only not in manifest.stages:
+        raise ManifestError(f"--only {only}: {manifest_path} has no section `{only}`, so the stage is off.")
     with extra_devices([device.model_dump(exclude_none=True) for device in manifest.extra_devices]):
         return _run(manifest, manifest_path, only, force, say)
 
@@ -124,7 +126,7 @@ def _run(manifest: Manifest, manifest_path: str | Path, only: str | None, force:
         check_parameters(notebook_path(stage), manifest.stage(stage).given(), f"{manifest_path}: {stage}.")
     manifest = _name_embedder(manifest, say)
     run_dir = Path(manifest.output_root) / manifest.name
-    stages = [only] if only else [*STAGES]
+    stages = [only] if only else [stage for stage in STAGES if stage in manifest.stages]
     for stage in stages:
         if not any(run_dir.glob(f"*/.stages/{stage}*.json")):
             _require_weights(stage, manifest.stage(stage).given())
@@ -355,6 +357,8 @@ def _jobs(manifest: Manifest, stage: str, capture: Path, files: SceneFiles, forc
         "seed": manifest.seed,
         "world_up": manifest.world_up,
     }
+    if manifest.rerank is not None:
+        values |= _with_reranking(manifest, stage, files)
     if force:
         values["skip_existing"] = False
     known = notebook_parameters(notebook_path(stage))
@@ -363,6 +367,16 @@ def _jobs(manifest: Manifest, stage: str, capture: Path, files: SceneFiles, forc
         parameters |= manifest.stage(stage).given()
         plain = {name: str(value) if isinstance(value, Path) else value for name, value in parameters.items()}
         yield Job(stage, files, plain, label)
+
+
+def _with_reranking(manifest: Manifest, stage: str, files: SceneFiles) -> dict[str, Any]:
+    """Return what the rerank stage changes for another: how many images are retrieved, and which are localized with."""
+    if stage == "retrieve":
+        settings = notebook_parameters(notebook_path("rerank")) | manifest.stage("rerank").given()
+        return {"topk": settings["topn"]}
+    if stage == "localize":
+        return {"retrieval_dir": files.reranked_dir}
+    return {"reranked_dir": files.reranked_dir} if stage == "evaluate" else {}
 
 
 def _parts(manifest: Manifest, stage: str, capture: Path) -> list[tuple[str, dict[str, Any]]]:
@@ -384,7 +398,7 @@ def _parts(manifest: Manifest, stage: str, capture: Path) -> list[tuple[str, dic
         return [("", {"device": "auto", "map_device": "all", "query_device": "all"})]
     if stage == "embed":
         return [(f"{d}_", {"device": d}) for d in present if any(d in pair for pair in pairs)]
-    if stage in ("retrieve", "localize"):
+    if stage in ("retrieve", "rerank", "localize"):
         return [(f"map_{m}_query_{q}", {"map_device": m, "query_device": q}) for m, q in pairs]
     return [("", {"map_device": "all", "query_device": "all", "pairs": [list(pair) for pair in pairs]})]
 
@@ -553,7 +567,7 @@ class RunLog:
         for scene in self.inputs:
             for record in sorted((self.run_dir / scene / ".stages").glob("*.json")):
                 row = _read_json(record).get("row")
-                if row and (scene, row["stage"]) not in mine:
+                if row and row["stage"] in self.manifest.stages and (scene, row["stage"]) not in mine:
                     rows.append({**row, "status": "reused"})
         scenes = list(self.inputs)
         return sorted(rows, key=lambda row: (scenes.index(row["scene"]), STAGES.index(row["stage"])))

@@ -1,0 +1,289 @@
+"""Reranking: inliers of known geometry, what chance gives, and the stage from files to files."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+
+from toolkit import rerank
+from toolkit.capture import Capture
+from toolkit.embed import embed_sessions
+from toolkit.errors import ArtefactError, ManifestError
+from toolkit.evaluate import overlap_in_view, overlap_table
+from toolkit.features import LocalFeatures
+from toolkit.files import SceneFiles, sidecar_path
+from toolkit.geometry import invert, make_pose, transform
+from toolkit.rerank import VerifySettings, count_inliers, is_meaningful, rerank_pairs
+from toolkit.retrieve import retrieve_pairs
+
+WIDE = pycolmap.Camera(model="PINHOLE", width=960, height=720, params=[700, 700, 480, 360])
+BENT = pycolmap.Camera(model="OPENCV", width=640, height=480, params=[430, 428, 319, 242, -0.25, 0.04, 0, 0])
+LIST = "keyframes_original"
+
+
+def turned(degrees: float, centre: tuple[float, float, float]) -> np.ndarray:
+    """Return world_from_cam, turned about the vertical."""
+    a = np.radians(degrees)
+    rotation = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+    return make_pose(rotation, np.array(centre))
+
+
+def two_views(count: int, right: int, seed: int = 0, centre: tuple[float, float, float] = (1.2, 0.1, 0.3)) -> Any:
+    """Return matched pixels of two cameras, the first `right` of which see the same points, and scores that say so."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([-1.5, -1.2, 4], [1.5, 1.2, 9], (count, 3))
+    pixels_a = np.asarray(WIDE.img_from_cam(points))
+    pixels_b = np.asarray(BENT.img_from_cam(transform(invert(turned(-8, centre)), points)))
+    pixels_b[right:] = rng.uniform(0, [640, 480], (count - right, 2))
+    scores = np.where(np.arange(count) < right, 0.9, 0.7) + rng.uniform(0, 0.1, count)
+    return pixels_a + rng.normal(0, 0.3, (count, 2)), pixels_b + rng.normal(0, 0.3, (count, 2)), scores
+
+
+# ------------------------------------------------------------------------------------------------ inliers
+
+
+@pytest.mark.parametrize("right", [40, 80, 200])
+def test_matches_of_one_scene_are_inliers(right: int) -> None:
+    pixels_a, pixels_b, scores = two_views(200, right)
+    found = count_inliers(WIDE, pixels_a, BENT, pixels_b, scores, VerifySettings())
+    assert 0.85 * right <= found <= right + 0.1 * (200 - right)
+
+
+def test_distortion_is_taken_into_account() -> None:
+    pixels_a, pixels_b, scores = two_views(200, 200)
+    ideal = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=BENT.params[:4])
+    settings = VerifySettings(max_error_deg=0.08)
+    true = count_inliers(WIDE, pixels_a, BENT, pixels_b, scores, settings)
+    assert true > 1.3 * count_inliers(WIDE, pixels_a, ideal, pixels_b, scores, settings)
+
+
+def test_a_camera_that_only_turned_still_agrees() -> None:
+    pixels_a, pixels_b, scores = two_views(150, 150, centre=(0, 0, 0))
+    assert count_inliers(WIDE, pixels_a, BENT, pixels_b, scores, VerifySettings()) > 120
+
+
+@pytest.mark.parametrize("count", [6, 12, 30, 100, 300, 800])
+def test_random_matches_count_nothing(count: int) -> None:
+    for seed in range(5):
+        pixels_a, pixels_b, scores = two_views(count, 0, seed)
+        assert count_inliers(WIDE, pixels_a, BENT, pixels_b, scores, VerifySettings(seed=seed), tests=30) == 0
+
+
+def test_what_shares_a_keypoint_counts_once() -> None:
+    pixels_a, pixels_b, scores = two_views(60, 60)
+    once = count_inliers(WIDE, pixels_a, BENT, pixels_b, scores, VerifySettings())
+    tripled = [np.repeat(values, 3, axis=0) for values in (pixels_a, pixels_b, scores)]
+    assert count_inliers(WIDE, tripled[0], BENT, tripled[1], tripled[2], VerifySettings()) <= once + 2
+
+
+def test_degenerate_matches_count_nothing_or_little() -> None:
+    none = np.zeros((0, 2))
+    assert count_inliers(WIDE, none, BENT, none, np.zeros(0), VerifySettings()) == 0
+    pixels_a, pixels_b, scores = two_views(5, 5)
+    assert count_inliers(WIDE, pixels_a, BENT, pixels_b, scores, VerifySettings()) == 0
+    one_place = np.full((50, 2), 100.0)
+    assert count_inliers(WIDE, one_place, BENT, one_place, np.ones(50), VerifySettings()) == 0
+
+
+def test_meaning_grows_with_inliers_and_shrinks_with_matches_and_tests() -> None:
+    assert not is_meaningful(5, 5, 1e-9)  # any five agree
+    assert is_meaningful(20, 30, 0.02)
+    assert not is_meaningful(20, 400, 0.02)
+    least = [next(k for k in range(6, 100) if is_meaningful(k, 100, 0.02, tests)) for tests in (1, 30, 1000)]
+    assert least == sorted(least)
+    assert least[0] < least[2]
+    assert not is_meaningful(50, 50, 1.0)
+
+
+# ------------------------------------------------------------------------------------------------ overlap
+
+
+def test_overlap_is_the_share_of_points_in_view() -> None:
+    points = np.array([[x, 0.0, 5.0] for x in np.linspace(-3, 3, 61)])
+    seen = np.abs(points[:, 0]) < 5 * 480 / 700
+    here = turned(0, (0, 0, 0))
+    assert overlap_in_view(points, np.zeros(3), here, WIDE) == pytest.approx(seen.mean())
+    assert overlap_in_view(points, np.zeros(3), turned(180, (0, 0, 0)), WIDE) == 0  # looks away
+    assert overlap_in_view(points, np.zeros(3), turned(180, (0, 0, 10)), WIDE) == 0  # from behind
+    assert overlap_in_view(points[:0], np.zeros(3), here, WIDE) == 0
+
+
+# ------------------------------------------------------------------------------------------------ files to files
+
+
+@pytest.fixture(scope="module")
+def finished(small_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> SceneFiles:
+    """A retrieval in the phone's map in reversed order, reranked; do not write to it."""
+    files = SceneFiles(tmp_path_factory.mktemp("run"), small_capture.name)
+    sessions = small_capture / "sessions"
+    embed_sessions(sessions, files.embeddings, features_dir=files.features)
+    retrieve_pairs(sessions, files.embeddings, "ios", "hl", files.retrieval_dir, topk=6, queries=LIST)
+    path = files.retrieval("ios", "hl")
+    rows = rerank.read_references(path)
+    for row in rows:  # the best come last, so that there is something to put right
+        row["topk"] = [
+            hit | {"rank": rank, "score": 1 - 0.1 * rank} for rank, hit in enumerate(row["topk"][::-1], start=1)
+        ]
+    write(path, rows)
+    run(small_capture, files)
+    return files
+
+
+@pytest.fixture
+def files(finished: SceneFiles, tmp_path: Path) -> SceneFiles:
+    """A copy of the run, to work in."""
+    copy = SceneFiles(tmp_path / "run", finished.scene)
+    shutil.copytree(finished.root, copy.root)
+    return copy
+
+
+def run(capture: Path, files: SceneFiles, **more: Any) -> Any:
+    options = {"map_device": "ios", "query_device": "hl", "topn": 6, "topk": 4, "workers": 1} | more
+    return rerank_pairs(capture / "sessions", files.retrieval_dir, files.features, files.reranked_dir, **options)
+
+
+def write(path: Path, rows: list[dict[str, Any]]) -> None:
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+
+
+def reranked(files: SceneFiles) -> Path:
+    return files.reranked_dir / files.retrieval("ios", "hl").name
+
+
+def test_the_right_references_come_first(small_capture: Path, finished: SceneFiles) -> None:
+    folders = {"retrieved": finished.retrieval_dir, "reranked": finished.reranked_dir}
+    row = overlap_table(small_capture / "sessions", folders, None, "ios", "hl").iloc[0]
+    assert row["state"] == "evaluated"
+    assert row["images"] == len(rerank.read_references(reranked(finished)))
+    assert row["reranked_mean"] > row["retrieved_mean"]
+    assert row["reranked"] >= row["retrieved"]
+
+
+def test_rows_are_those_of_retrieval_with_both_scores(finished: SceneFiles) -> None:
+    before = rerank.read_references(finished.retrieval("ios", "hl"))
+    after = rerank.read_references(reranked(finished))
+    assert len(before) == len(after) > 0
+    for old, new in zip(before, after, strict=True):
+        assert {key: new[key] for key in old if key != "topk"} == {key: old[key] for key in old if key != "topk"}
+        assert [hit["rank"] for hit in new["topk"]] == [1, 2, 3, 4]
+        order = [(-hit["score"], hit["retrieval_rank"]) for hit in new["topk"]]
+        assert order == sorted(order)
+        for hit in new["topk"]:
+            source = old["topk"][hit["retrieval_rank"] - 1]
+            assert hit["retrieval_score"] == source["score"]
+            assert {key: hit[key] for key in source if key not in ("rank", "score")} == {
+                key: source[key] for key in source if key not in ("rank", "score")
+            }
+            assert 0 <= hit["score"] <= hit["num_matches"]
+    assert any(row["topk"][0]["retrieval_rank"] > 1 for row in after)
+
+
+def test_bytes_do_not_depend_on_threads(small_capture: Path, files: SceneFiles) -> None:
+    before = reranked(files).read_bytes()
+    table = run(small_capture, files, skip_existing=False, workers=3)
+    assert reranked(files).read_bytes() == before
+    assert table["queries"].tolist() == (table["confirmed"] + table["kept"]).tolist()
+    assert table["changed"].item() > 0
+
+
+def test_what_is_current_is_reused_and_a_killed_run_goes_on(
+    small_capture: Path, files: SceneFiles, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = reranked(files).read_bytes()
+    assert run(small_capture, files)["skipped"].tolist() == [True]
+    asked: list[int] = []
+    verify = rerank.Verifier.verify
+
+    def count(self: Any, *arguments: Any) -> Any:
+        asked.append(1)
+        if len(asked) == 3:
+            raise KeyboardInterrupt
+        return verify(self, *arguments)
+
+    monkeypatch.setattr(rerank.Verifier, "verify", count)
+    sidecar_path(reranked(files)).unlink()
+    with pytest.raises(KeyboardInterrupt):
+        run(small_capture, files)
+    queries = len(before.splitlines())
+    again = len(asked)
+    run(small_capture, files)
+    assert len(asked) - again < queries  # some were finished before
+    assert reranked(files).read_bytes() == before
+    assert not list(files.reranked_dir.glob(".*"))
+    assert run(small_capture, files, topk=2)["skipped"].tolist() == [False]
+    assert all(len(row["topk"]) == 2 for row in rerank.read_references(reranked(files)))
+
+
+def test_a_query_that_fails_keeps_the_order_of_retrieval(
+    small_capture: Path, files: SceneFiles, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = rerank.read_references(files.retrieval("ios", "hl"))
+    rows[0]["topk"] = []
+    write(files.retrieval("ios", "hl"), rows)
+
+    class Broken:
+        def __init__(self, ratio: float):
+            pass
+
+        def match(self, pairs: Any) -> Any:
+            raise RuntimeError("no such luck")
+
+    monkeypatch.setattr(rerank, "MutualMatcher", Broken)
+    table = run(small_capture, files)
+    found = rerank.read_references(reranked(files))
+    assert table["kept"].item() == table["queries"].item() == len(rows)
+    assert "no reference" in found[0]["reason"]
+    for old, new in zip(rows[1:], found[1:], strict=True):
+        assert new["reason"] == "RuntimeError: no such luck"
+        assert [hit["path"] for hit in new["topk"]] == [hit["path"] for hit in old["topk"][:4]]
+        assert all(hit["score"] == 0 for hit in new["topk"])
+
+
+def test_an_image_without_features_is_named(small_capture: Path, files: SceneFiles, tmp_path: Path) -> None:
+    capture = Path(shutil.copytree(small_capture, tmp_path / "data" / small_capture.name))
+    session = Capture.open(capture)["hl_query"]
+    row = rerank.read_references(files.retrieval("ios", "hl"))[0]
+    (session.path.parent / rerank._name(row)).write_bytes(b"no image")
+    run(capture, files)
+    found = rerank.read_references(reranked(files))
+    assert "cannot be decoded" in found[0]["reason"]
+    assert found[1]["reason"] == ""
+
+
+def test_wrong_settings_and_files_are_refused(small_capture: Path, files: SceneFiles) -> None:
+    with pytest.raises(ManifestError, match="1 <= topk <= topn"):
+        run(small_capture, files, topk=7)
+    path = files.retrieval("ios", "hl")
+    path.write_text(path.read_text() + "{}\n")
+    with pytest.raises(ArtefactError, match=r"line \d+: not a retrieval row"):
+        run(small_capture, files)
+    path.write_text(path.read_text().splitlines()[0].replace("ios_map/raw_data/", "ios_map/raw_data/x") + "\n")
+    with pytest.raises(ArtefactError, match="of another capture"):
+        run(small_capture, files)
+    path.unlink()
+    with pytest.raises(ArtefactError, match="Run the retrieve stage first"):
+        run(small_capture, files)
+
+
+def test_map_images_in_memory_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rerank, "MAP_IMAGES_KEPT", 2)
+    features = LocalFeatures(
+        np.zeros((9, 2), np.float32), np.ones(9, np.float32), np.zeros((9, 128), np.uint8), (640, 480)
+    )
+    read: list[str] = []
+
+    class Store:
+        def __getitem__(self, name: str) -> LocalFeatures:
+            read.append(name)
+            return features
+
+    verifier = rerank.Verifier(VerifySettings(max_features=4), rerank.MutualMatcher(0.8))
+    for name in "abab":
+        assert len(verifier._features(name, Store())) == 4  # type: ignore[arg-type]
+    assert read == ["a", "b"]
+    verifier._features("c", Store())  # type: ignore[arg-type]
+    assert len(verifier._kept) == 2
