@@ -39,6 +39,7 @@ RIVAL_SUPPORT = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 POSITION_STD_M = (0.02, 0.05, 0.1, 0.2, 0.5)
 DEGRADATIONS = ("none", "dark", "blurred", "hidden")
 REFERENCES = ("right", "one right", "wrong")
+DEVICES = ("ios", "hl", "spot")
 
 Image = NDArray[np.uint8]
 
@@ -106,8 +107,10 @@ def localize_session(session: "Session", localizer: "PnpLocalizer", seed: int) -
                 yield row | {"position_std_m": found.position_std_m}
 
 
-def measure(folder: Path, seed: int, rooms: int, frames: int, workers: int) -> Iterator[list[dict[str, Any]]]:
-    """Render a capture and yield the rows of each map."""
+def measure(
+    folder: Path, seed: int, rooms: int, frames: int, workers: int, done: set[str]
+) -> Iterator[list[dict[str, Any]]]:
+    """Render a capture and yield the rows of each map, but of those of the devices that are done."""
     from toolkit.capture import Capture
     from toolkit.features import extract_session
     from toolkit.localizers.pnp import PnpLocalizer
@@ -115,7 +118,7 @@ def measure(folder: Path, seed: int, rooms: int, frames: int, workers: int) -> I
     from toolkit.synthetic import render_capture
 
     capture = Capture.open(render_capture(folder / f"SEED{seed}", rooms, frames, seed, progress=False))
-    for device in capture.devices:
+    for device in [device for device in capture.devices if device not in done]:
         session = capture[f"{device}_map"]
         store = extract_session(session, folder / f"features{seed}", workers=workers)
         local_map = build_map(session, store, folder / f"{device}{seed}.npz", workers=workers)
@@ -186,7 +189,7 @@ def main() -> None:
     parser.add_argument("--rooms", type=int, default=2, help="rooms of each (default: %(default)s)")
     parser.add_argument("--frames", type=int, default=6, help="map frames a room and device (default: %(default)s)")
     parser.add_argument("--threads", type=int, default=2, help="cores (default: %(default)s)")
-    parser.add_argument("--rows", type=Path, help="CSV that rows are added to; those of seeds in it are not made again")
+    parser.add_argument("--rows", type=Path, help="CSV that rows are added to; maps in it are not made again")
     add_out(parser)
     options = parser.parse_args()
     check_out(parser, options.out)
@@ -194,10 +197,11 @@ def main() -> None:
     kept = options.rows is not None and options.rows.is_file()
     rows = pd.read_csv(options.rows) if kept else pd.DataFrame()
     for seed in options.seeds:
-        if len(rows) and (rows["seed"] == seed).any():
+        done = set(rows.loc[rows["seed"] == seed, "map"]) if len(rows) else set()
+        if len(done) == len(DEVICES):
             continue
         with tempfile.TemporaryDirectory() as folder:
-            for part in measure(Path(folder), seed, options.rooms, options.frames, options.threads):
+            for part in measure(Path(folder), seed, options.rooms, options.frames, options.threads, done):
                 rows = pd.concat([rows, pd.DataFrame(part)], ignore_index=True)
                 if options.rows is not None:
                     rows.to_csv(options.rows, index=False)
