@@ -503,7 +503,7 @@ def overlap_table(
     for map_ in _devices(capture, "map", map_device):
         scene = _MapView.open(capture[f"{map_}_map"], None if map_dir is None else Path(map_dir))
         for query in _devices(capture, "query", query_device):
-            if pairs is None or [map_, query] in [list(asked) for asked in pairs]:
+            if references and (pairs is None or [map_, query] in [list(asked) for asked in pairs]):
                 session, name = capture[f"{query}_query"], pair_name(capture.name, map_, query)
                 row: dict[str, Any] = {"map_device": map_, "query_device": query, "state": "evaluated"}
                 for column, folder in references.items():
