@@ -27,7 +27,7 @@ FUNCTIONS = {
     "rerank": "toolkit.rerank:rerank_pairs",
     "localize": "toolkit.localize:localize_pairs",
     "evaluate": "toolkit.evaluate:evaluate_scene",
-    "visualize": "toolkit.visualize_scene:visualize_scene",
+    "visualize": "toolkit.visualize:visualize_scene",
 }
 
 

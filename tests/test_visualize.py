@@ -3,18 +3,11 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from toolkit.geometry import make_pose
+from toolkit.geometry import make_pose, project
+from toolkit.recordings import Queries, Views, record_scene
+from toolkit.stills import draw_localization, draw_scene_png
+from toolkit.top_view import ground_axes, places_of
 from toolkit.upright import up_of_cameras
-from toolkit.visualize import (
-    Queries,
-    Views,
-    draw_localization,
-    draw_scene_png,
-    ground_axes,
-    places_of,
-    project,
-    record_scene,
-)
 
 CAMERA = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=[50, 50, 32, 24])
 

@@ -13,8 +13,8 @@ from toolkit.capture import Capture, Session
 from toolkit.devices import colour_of
 from toolkit.figures import GREEN, ORANGE, VERMILLION, new_figure
 from toolkit.images import read_for_display
+from toolkit.top_view import ground_axes, places_of
 from toolkit.upright import up_of_cameras
-from toolkit.visualize import ground_axes, places_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

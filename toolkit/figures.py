@@ -11,6 +11,8 @@ if TYPE_CHECKING:
 # Okabe and Ito's colours, which people with any colour vision tell apart.
 BLUE, VERMILLION, GREEN = "#0072B2", "#D55E00", "#009E73"
 ORANGE, SKY, GREY = "#E69F00", "#56B4E9", "#5A5A5A"
+# One meaning a colour, in pictures and recordings alike.
+ESTIMATED, TRUE, MAP = VERMILLION, BLUE, GREY
 
 
 def new_figure(width: float, height: float) -> "Figure":

@@ -3,8 +3,13 @@
 All functions are batched over leading dimensions.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    import pycolmap
 
 Array = NDArray[np.float64]
 
@@ -116,3 +121,13 @@ def pose_error(world_from_estimated: ArrayLike, world_from_true: ArrayLike) -> t
     estimated_from_true = invert(world_from_estimated) @ np.asarray(world_from_true, np.float64)
     distance_m = np.linalg.norm(estimated_from_true[..., :3, 3], axis=-1)
     return rotation_angle_deg(estimated_from_true[..., :3, :3]), distance_m
+
+
+def project(points: Array, camera: "pycolmap.Camera", world_from_cam: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the pixels (n, 2) of world points (n, 3), and which are in front of the camera (others NaN)."""
+    in_cam = transform(invert(world_from_cam), points)
+    front = in_cam[:, 2] > 1e-3
+    pixels = np.full((len(points), 2), np.nan)
+    if front.any():
+        pixels[front] = camera.img_from_cam(in_cam[front])
+    return pixels, front & np.isfinite(pixels).all(1)

@@ -1,606 +1,236 @@
-"""Show where queries are: rerun recordings to walk around in, and still pictures that need no viewer."""
+"""The visualize stage: recordings and still pictures of a scene, from the files that other stages left."""
 
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import cv2
 import numpy as np
-import pycolmap
-from matplotlib.collections import LineCollection
+import pandas as pd
 from numpy.typing import ArrayLike, NDArray
+from tqdm.auto import tqdm
 
-from toolkit.figures import BLUE, GREEN, GREY, VERMILLION, new_figure, save_figure
-from toolkit.files import write_atomic
-from toolkit.geometry import invert, pose_error, rotation_to_quaternion, transform
+from toolkit.capture import Capture, Session, Trajectory
+from toolkit.errors import ArtefactError
+from toolkit.features import FeatureStore, extract_session
+from toolkit.files import pair_name
 from toolkit.images import read_for_display
-from toolkit.upright import up_of_cameras
-
-if TYPE_CHECKING:
-    import rerun as rr
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from toolkit.localizers.pnp import PnpLocalizer, PoseEstimate
+from toolkit.mapping import LocalMap
+from toolkit.recordings import Queries, Views, record_scene
+from toolkit.stills import draw_localization, draw_scene_png
 
 Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
-# One meaning a colour, in pictures and recordings alike.
-ESTIMATED, TRUE, MAP = VERMILLION, BLUE, GREY
-
-
-@dataclass(frozen=True)
-class Views:
-    """Posed photographs, to be drawn as cameras."""
-
-    world_from_cam: Array
-    """(N, 4, 4); NaN for a photograph without a pose."""
-    cameras: Sequence[pycolmap.Camera]
-    images: Sequence[Path | Image]
-    """Files, or (H, W, 3) uint8 RGB."""
-    names: Sequence[str]
+REFERENCES = 4
+"""References shown of a query, and matched with it again for the picture."""
 
 
-@dataclass(frozen=True)
-class Queries:
-    """Results of the queries of one device."""
+@dataclass
+class _Map:
+    """A map session, and what was triangulated from it; the localizer is None where there is no such map."""
 
-    estimated: Array
-    """world_from_cam, (Q, 4, 4); NaN where there is no pose."""
-    true: Array | None = None
-    """The same, true; None where there is no ground truth."""
-    names: Sequence[str] = ()
-    status: Sequence[str] = ()
-    views: Views | None = None
-    """A photograph a query, at its estimated pose."""
+    session: Session
+    localizer: PnpLocalizer | None
 
-
-# Directions and places
+    def cloud(self) -> tuple[Array, NDArray[np.uint8] | None]:
+        """Return the points that at least three images see, (P, 3), and their colours; the rest is noisy."""
+        if self.localizer is None:
+            return np.zeros((0, 3)), None
+        sure = self.localizer.map.track_lengths >= 3
+        return self.localizer.map.points[sure], self.localizer.map.colors[sure]
 
 
-def ground_axes(up: ArrayLike) -> tuple[Array, list[str]]:
-    """Return the right and the upward axis of a map seen from above, (2, 3), and their labels.
+@dataclass
+class _Results:
+    """The queries of a pair, a row each; the first image of a device stands for it."""
 
-    They are world axes where the world stands upright, so the picture's numbers are coordinates.
-    """
-    up = np.asarray(up, np.float64) / np.linalg.norm(up)
-    axis = int(np.argmax(np.abs(up)))
-    first = np.eye(3)[0 if axis != 0 else 1]
-    right = first - up * (first @ up)
-    right /= np.linalg.norm(right)
-    axes = np.stack([right, np.cross(up, right)])
-    labels = []
-    for row in axes:
-        k = int(np.argmax(np.abs(row)))
-        sign = "−" if row[k] < 0 else ""
-        labels.append(f"{sign}{'xyz'[k]} [m]" if abs(row[k]) > 0.99 else "along the ground [m]")
-    return axes, labels
+    session: Session
+    table: pd.DataFrame
+    """The pair's csv, of the queries that have an image."""
+    rows: list[NDArray[np.int64]]
+    """Rows of the session's images of each query."""
+    world_from_rig: Array
+    """(Q, 4, 4), NaN where there is no pose."""
+    true: Array | None
+    """world_from_cam of the first images, (Q, 4, 4); None where the session has no ground truth."""
 
-
-def places_of(positions: Array, gap_ratio: float = 5.0, share: float = 0.12) -> NDArray[np.int64]:
-    """Return the number of the place, (N,) counted from 0 in order of appearance, of positions (N, 2 or 3).
-
-    Places are apart by more than `share` of the whole extent and by more than `gap_ratio` times the usual
-    step between neighbours.
-    """
-    from scipy.cluster.hierarchy import fcluster, linkage
-    from scipy.spatial import cKDTree
-
-    if len(positions) < 2:
-        return np.zeros(len(positions), np.int64)
-    extent = float(np.linalg.norm(np.ptp(positions, axis=0)))
-    # Positions on one spot (the cameras of a rig) say nothing about steps; a thousand spots are plenty.
-    spots = np.unique(np.round(positions / max(extent / 400, 1e-9)), axis=0) * max(extent / 400, 1e-9)
-    spots = spots[:: len(spots) // 1500 + 1]
-    if len(spots) < 2:
-        return np.zeros(len(positions), np.int64)
-    tree = linkage(spots, "single")
-    gap = max(gap_ratio * float(np.median(tree[:, 2])), share * extent)
-    labels = fcluster(tree, gap, "distance")[cKDTree(spots).query(positions)[1]]
-    _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
-    return np.argsort(np.argsort(first))[inverse]
+    @property
+    def estimated(self) -> Array:
+        return self.world_from_rig @ self.session.rig_from_cam(np.array([rows[0] for rows in self.rows], int))
 
 
-# Still pictures
+def visualize_scene(
+    sessions_root: str | Path,
+    poses_dir: str | Path,
+    features_dir: str | Path,
+    map_dir: str | Path,
+    out_dir: str | Path,
+    map_device: str = "all",
+    query_device: str = "all",
+    samples: int = 2,
+    recordings: bool = True,
+    world_up: ArrayLike | None = None,
+    pairs: Sequence[Sequence[str]] | None = None,
+) -> pd.DataFrame:
+    """Draw every pair of a scene, and record every map with its queries.
 
-
-def draw_scene_png(
-    points: ArrayLike,
-    colors: NDArray[np.uint8] | None,
-    map_poses: ArrayLike,
-    queries_est: ArrayLike,
-    queries_true: ArrayLike | None,
-    out: str | Path | None = None,
-    up: ArrayLike | None = None,
-    title: str = "",
-    max_places: int = 6,
-    max_points: int = 60_000,
-) -> "Figure":
-    """Draw the map from above with estimated and true queries, one panel a place; return the figure.
+    Writes `<pair>.png`, the map from above; `localization_<pair>_<k>.png`, a query beside its references; and
+    for each map `<scene>_map_<M>.rrd`, a recording for the rerun viewer.
 
     Args:
-        points: (P, 3), metres.
-        colors: (P, 3) RGB, or None.
-        map_poses: world_from_cam (N, 4, 4) of the map; NaN rows are passed over.
-        queries_est: world_from_cam (Q, 4, 4) of the queries, NaN where there is no pose.
-        queries_true: the same, true; None where there is no ground truth.
-        out: PNG to write; None: no file.
-        up: direction (3,) that is up; None: estimated from the map's cameras.
-        title: of the figure.
-        max_places: panels at most; the places with the most map images.
-        max_points: points drawn at most in all, a regular choice.
+        sessions_root: folder `sessions` of the capture.
+        poses_dir: folder of the poses, `<pair>.txt` and `<pair>.csv`.
+        features_dir: folder of local features.
+        map_dir: folder of the triangulated maps; a device without one is drawn without points.
+        out_dir: where pictures and recordings go.
+        map_device: `all` or one device key; likewise `query_device`.
+        samples: queries shown of each pair, from the least to the best supported.
+        recordings: whether to write recordings.
+        world_up: direction (3,) that is up; None: estimated from the cameras.
+        pairs: only these [map device, query device]; None: all.
+
+    Returns:
+        One row a pair: map_device, query_device, queries, localized, seconds, still, recording.
+
+    Raises:
+        ArtefactError: there are no poses at all.
     """
-    map_poses = _finite(map_poses)
-    estimated = np.asarray(queries_est, np.float64).reshape(-1, 4, 4)
-    true = np.full_like(estimated, np.nan) if queries_true is None else np.asarray(queries_true, np.float64)
-    axes, labels = ground_axes(up_of_cameras(map_poses) if up is None else up)
-    xyz = np.asarray(points, np.float64).reshape(-1, 3)
-    step = len(xyz) // max_points + 1
-    cloud, shades = xyz[::step] @ axes.T, None if colors is None else colors[::step]
-    cameras, seen = map_poses[:, :3, 3] @ axes.T, estimated[:, :3, 3] @ axes.T
-    known = true[:, :3, 3] @ axes.T
-
-    place = places_of(cameras)
-    anchors = np.where(np.isfinite(known), known, seen)
-    query_place = _nearest(anchors, cameras, place)
-    point_place = _nearest(cloud, cameras, place)
-    counts = np.bincount(place, minlength=1)
-    shown = np.sort(np.argsort(-counts, kind="stable")[:max_places])
-    windows = [
-        _window(cloud[point_place == p], cameras[place == p], anchors[query_place == p]) for p in shown
-    ]
-
-    columns = min(len(shown), 3)
-    rows = -(-len(shown) // columns)
-    shape = max(0.5, min(1.4, float(np.mean([np.ptp(w[1]) / np.ptp(w[0]) for w in windows]))))
-    width = 8.0 if columns == 1 else 4.6
-    figure = new_figure(width * columns, width * shape * rows + 1.2)
-    panels = np.ravel(figure.subplots(rows, columns, squeeze=False))
-    for axis in panels[len(shown) :]:
-        axis.set_visible(False)
-    for axis, p, window in zip(panels, shown, windows, strict=False):
-        near, mine = point_place == p, query_place == p
-        tint = "#9A9A9A" if shades is None else _muted(shades[near])
-        _dots(axis, cloud[near], s=1.2, c=tint, lw=0, rasterized=True)
-        _draw_heading(axis, cameras[place == p], map_poses[place == p], axes, MAP, window, "map cameras")
-        _draw_queries(axis, seen[mine], known[mine], estimated[mine], true[mine], axes, window)
-        axis.set(xlim=window[0], ylim=window[1], aspect="equal", xlabel=labels[0])
-        axis.spines[["top", "right"]].set_visible(False)
-        axis.grid(alpha=0.2)
-        located = np.isfinite(seen[mine]).all(1)
-        name = f"place {int(p) + 1}: " if len(counts) > 1 else ""
-        outside = _outside(seen[mine], window)
-        far = f", {outside} estimated outside the picture" if outside else ""
-        axis.set_title(f"{name}{located.sum()} of {mine.sum()} queries have a pose{far}", fontsize=9)
-        if len(shown) < len(counts) and axis is panels[len(shown) - 1]:
-            axis.annotate(f"{len(counts) - len(shown)} smaller places not shown", (1, -0.2), fontsize=8,
-                          xycoords="axes fraction", ha="right")  # fmt: skip
-    for row in range(rows):
-        panels[row * columns].set_ylabel(labels[1])
-    handles: dict[str, Any] = {}
-    for axis in panels:
-        handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5, frameon=False,
-                  fontsize=9)  # fmt: skip
-    figure.suptitle(title or "Queries in the map, seen from above", fontsize=11, fontweight="bold")
-    if out is not None:
-        save_figure(figure, out, title or "Queries in the map, seen from above")
-    return figure
-
-
-def draw_localization(
-    query_image: Image,
-    camera: pycolmap.Camera,
-    world_from_cam_est: ArrayLike | None,
-    points_world: ArrayLike,
-    references: Sequence[tuple[Image, str]],
-    out: str | Path | None = None,
-    title: str = "",
-    keypoints: ArrayLike | None = None,
-    inliers: NDArray[np.bool_] | None = None,
-    world_from_cam_true: ArrayLike | None = None,
-    max_references: int = 4,
-) -> "Figure":
-    """Draw one query beside its references, with map points reprojected by its pose; return the figure.
-
-    Green dots are inliers' map points as the pose projects them, a white line leads from each to where it was
-    measured; orange dots are measurements that do not agree.
-
-    Args:
-        query_image: (H, W, 3) or (H, W).
-        camera: its intrinsics.
-        world_from_cam_est: (4, 4); None or NaN where it was not localized.
-        points_world: (n, 3) map points that were matched.
-        references: pictures and captions, best first.
-        out: PNG to write; None: no file.
-        title: of the figure; the errors are added to it where the true pose is given.
-        keypoints: (n, 2) pixels of the query that were matched to the points; an inlier's distance to its
-            reprojection is drawn.
-        inliers: (n,) of the points; None: all.
-        world_from_cam_true: (4, 4) for the errors; None where it is not known.
-        max_references: drawn at most.
-    """
-    points = np.asarray(points_world, np.float64).reshape(-1, 3)
-    good = np.ones(len(points), bool) if inliers is None else np.asarray(inliers, bool)
-    pose = None if world_from_cam_est is None else np.asarray(world_from_cam_est, np.float64)
-    located = pose is not None and bool(np.isfinite(pose).all())
-    shown = list(references[:max_references])
-    height, width = query_image.shape[:2]
-    # The query is as high as two rows of references, so that its points can be seen.
-    rows = 2 if len(shown) > 1 else 1
-    columns = -(-len(shown) // rows)
-    ratio = width / height
-    shapes = [image.shape[1] / image.shape[0] for image, _ in shown]
-    small = max(shapes) if shapes else 1.0
-    figure = new_figure(4.4 * ratio + columns * small * 4.4 / rows + 0.6, 5.3)
-    grid = figure.add_gridspec(rows, 1 + columns, width_ratios=[ratio, *[small / rows] * columns])
-    axis = figure.add_subplot(grid[:, 0])
-    axis.imshow(query_image, cmap="gray", vmin=0, vmax=255)
-    caption = "query"
-    if located:
-        pixels, visible = project(points, camera, np.asarray(pose))
-        inside = visible & (pixels >= 0).all(1) & (pixels < [width, height]).all(1)
-        if keypoints is not None:
-            measured = np.asarray(keypoints, np.float64).reshape(-1, 2)
-            _dots(axis, _on(measured[~good]), s=7, c=ESTIMATED, alpha=0.5, lw=0)
-            lines = np.stack([_on(measured[good & inside]), _on(pixels[good & inside])], axis=1)
-            axis.add_collection(LineCollection(list(lines), colors="white", linewidths=0.8))
-        _dots(axis, _on(pixels[good & inside]), s=11, c=GREEN, edgecolors="white", lw=0.35)
-        caption += f": {good.sum()} of {len(good)} map points agree"
-    else:
-        if keypoints is not None:
-            _dots(axis, _on(np.asarray(keypoints, np.float64)), s=7, c=ESTIMATED, lw=0)
-        caption += ": not localized"
-    axis.set_title(caption, fontsize=9)
-    _frame(axis, GREEN if located else ESTIMATED, width, height)
-    for k, (image, text) in enumerate(shown):
-        panel = figure.add_subplot(grid[k // columns, 1 + k % columns])
-        panel.imshow(image, cmap="gray", vmin=0, vmax=255)
-        panel.set_title(text, fontsize=8)
-        _frame(panel, "0.6", image.shape[1], image.shape[0])
-    if located and world_from_cam_true is not None and np.isfinite(world_from_cam_true).all():
-        rotation, metres = pose_error(np.asarray(pose), world_from_cam_true)
-        title = f"{title}{' · ' if title else ''}off by {float(rotation):.2g}°, {_length(float(metres))}"
-    figure.suptitle(title, fontsize=11, fontweight="bold")
-    if out is not None:
-        save_figure(figure, out, title)
-    return figure
-
-
-def project(points: Array, camera: pycolmap.Camera, world_from_cam: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the pixels (n, 2) of world points (n, 3), and which are in front of the camera (others NaN)."""
-    in_cam = transform(invert(world_from_cam), points)
-    front = in_cam[:, 2] > 1e-3
-    pixels = np.full((len(points), 2), np.nan)
-    if front.any():
-        pixels[front] = camera.img_from_cam(in_cam[front])
-    return pixels, front & np.isfinite(pixels).all(1)
-
-
-def _on(pixels: Array) -> Array:
-    """Return pixels as imshow counts them: it has the centre of the top-left pixel at (0, 0)."""
-    return pixels - 0.5
-
-
-def _frame(axis: "Axes", colour: str, width: int, height: int) -> None:
-    axis.set(xticks=[], yticks=[], xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
-    axis.spines[:].set(color=colour, linewidth=1.5)
-
-
-def _length(metres: float) -> str:
-    return f"{100 * metres:.2g} cm" if metres < 0.995 else f"{metres:.3g} m"
-
-
-def _known(poses: Array) -> NDArray[np.bool_]:
-    return np.asarray(np.isfinite(poses).all((1, 2)), bool)
-
-
-def _finite(poses: ArrayLike) -> Array:
-    poses = np.asarray(poses, np.float64).reshape(-1, 4, 4)
-    return poses[_known(poses)]
-
-
-def _dots(axis: "Axes", xy: Array, **style: Any) -> None:
-    axis.scatter(xy[:, 0], xy[:, 1], **style)
-
-
-def _nearest(positions: Array, cameras: Array, place: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the place of the nearest camera; -1 where the position is not known."""
-    from scipy.spatial import cKDTree
-
-    found = np.full(len(positions), -1, np.int64)
-    known = np.isfinite(positions).all(1)
-    if known.any() and len(cameras):
-        found[known] = place[cKDTree(cameras).query(positions[known])[1]]
-    return found
-
-
-def _window(cloud: Array, cameras: Array, queries: Array) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return x and y limits that hold the cameras and queries, and all but the farthest of the points."""
-    parts = [cameras, queries[np.isfinite(queries).all(1)]]
-    if len(cloud):
-        parts.append(np.percentile(cloud, [3, 97], axis=0))
-    held = np.concatenate(parts) if sum(map(len, parts)) else np.zeros((1, 2))
-    low, high = held.min(0), held.max(0)
-    half = (high - low) / 2 * 1.08 + 0.5
-    # A street is long and thin; a panel should not be.
-    half = np.maximum(half, half.max() / 2.2)
-    middle = (low + high) / 2
-    (x0, y0), (x1, y1) = middle - half, middle + half
-    return (float(x0), float(x1)), (float(y0), float(y1))
-
-
-def _outside(positions: Array, window: tuple[tuple[float, float], tuple[float, float]]) -> int:
-    known = positions[np.isfinite(positions).all(1)]
-    low, high = np.array(window).T
-    return int(((known < low) | (known > high)).any(1).sum())
-
-
-def _muted(colors: NDArray[np.uint8]) -> Array:
-    """Return colours for thin points on white: bright ones would not be seen."""
-    rgb = colors.astype(np.float64) / 255
-    return np.clip(rgb * 0.75 + 0.2, 0, 0.75)
-
-
-def _draw_heading(
-    axis: "Axes",
-    positions: Array,
-    poses: Array,
-    axes: Array,
-    colour: str,
-    window: tuple[tuple[float, float], tuple[float, float]],
-    label: str,
-) -> None:
-    """Draw cameras as dots with a line in the direction they look."""
-    if not len(positions):
-        return
-    length = 0.035 * max(np.ptp(window[0]), np.ptp(window[1]))
-    heads = positions + length * poses[:, :3, 2] @ axes.T
-    lines = np.full((3 * len(positions), 2), np.nan)
-    lines[0::3], lines[1::3] = positions, heads
-    axis.plot(*lines.T, color=colour, lw=1.0, alpha=0.7)
-    _dots(axis, positions, s=9, color=colour, lw=0, zorder=3, label=label)
-
-
-def _draw_queries(
-    axis: "Axes",
-    seen: Array,
-    known: Array,
-    estimated: Array,
-    true: Array,
-    axes: Array,
-    window: tuple[tuple[float, float], tuple[float, float]],
-) -> None:
-    has_estimate, has_truth = np.isfinite(seen).all(1), np.isfinite(known).all(1)
-    both = has_estimate & has_truth
-    lines = np.full((3 * both.sum(), 2), np.nan)
-    lines[0::3], lines[1::3] = seen[both], known[both]
-    axis.plot(*lines.T, color=ESTIMATED, lw=1.2, alpha=0.9, zorder=4, label="error" if both.any() else None)
-    found = has_truth & has_estimate
-    _dots(axis, known[found], s=52, facecolors="none", edgecolors=TRUE, lw=1.4, zorder=5,
-                 label="query, true" if found.any() else None)  # fmt: skip
-    lost = has_truth & ~has_estimate
-    _dots(axis, known[lost], s=42, marker="x", color=TRUE, lw=1.6, zorder=5,
-                 label="query without a pose" if lost.any() else None)  # fmt: skip
-    _draw_heading(
-        axis, seen[has_estimate], estimated[has_estimate], axes, ESTIMATED, window, "query, estimated"
-    )
-
-
-# Recordings
-
-
-def record_scene(
-    out: str | Path,
-    map_views: Views,
-    points: ArrayLike,
-    colors: NDArray[np.uint8] | None,
-    queries: Mapping[str, Queries],
-    up: ArrayLike | None = None,
-    max_images: int = 60,
-    image_size: int = 480,
-    name: str = "scene",
-) -> Path:
-    """Write a rerun recording (.rrd) of a map and of queries in it, and return its path.
-
-    Entities: `world/map/{points,trajectory,cameras/<k>}` and, for each device,
-    `world/queries/<device>/{estimated,true,error,view}`; `view` and `query/<device>` (its image)
-    change along the timeline `query`: one steps through the queries. Open it with `rerun FILE`.
-
-    Args:
-        out: file to write.
-        map_views: all map images; at most `max_images`, a regular choice, are drawn with their picture.
-        points: (P, 3), metres.
-        colors: (P, 3) RGB or None.
-        queries: results by device.
-        up: direction (3,) that is up; None: estimated from the map's cameras.
-        max_images: pictures at most of the map, and of each device's queries.
-        image_size: longer side of the pictures, pixels.
-        name: of the recording.
-    """
-    import rerun as rr
-
-    poses = _finite(map_views.world_from_cam)
-    up = np.asarray(up_of_cameras(poses) if up is None else up, np.float64)
-    size = _camera_size(poses)
-    pictured = [device for device, results in queries.items() if results.views is not None]
-    with write_atomic(out) as temporary:
-        # A fixed id: opened again after another run, it replaces the old one in the viewer.
-        stream = rr.RecordingStream("visual-localization", recording_id=name)
-        # Before the first entity: batches are handed to the file as they fill.
-        stream.save(temporary, default_blueprint=_blueprint(pictured, poses, up))
-        stream.send_recording_name(name)
-        stream.log("world", _view_coordinates(up), static=True)
-        stream.log(
-            "world/map/points",
-            rr.Points3D(points, colors=colors, radii=rr.Radius.ui_points(1.5)),
-            static=True,
+    capture, out = Capture.from_sessions_root(sessions_root), Path(out_dir)
+    maps = [d for d in capture.devices if f"{d}_map" in capture and map_device in ("all", d)]
+    askers = [d for d in capture.devices if f"{d}_query" in capture and query_device in ("all", d)]
+    found: dict[tuple[str, str], _Results] = {}
+    for pair in [(m, q) for m in maps for q in askers if pairs is None or [m, q] in [list(p) for p in pairs]]:
+        stem = Path(poses_dir) / pair_name(capture.name, *pair)
+        if stem.with_name(f"{stem.name}.txt").is_file():
+            found[pair] = _load_results(stem, capture[f"{pair[1]}_query"])
+    if not found:
+        raise ArtefactError(
+            f"{poses_dir}: no poses of {capture.name} for the devices asked for. Localize them first."
         )
-        _log_trajectory(stream, map_views)
-        for k in _choice(len(map_views.images), max_images):
-            entity = f"world/map/cameras/{k}"
-            _log_view(stream, entity, map_views, int(k), image_size, size, MAP, static=True)
-        for device, results in queries.items():
-            _log_queries(stream, device, results, max_images, image_size, size)
-        stream.flush()
-        stream.disconnect()
-    return Path(out)
+    table = []
+    with tqdm(total=len(found), desc="visualize", unit="pair") as bar:
+        for m in dict.fromkeys(m for m, _ in found):
+            of_map = {q: results for (mapped, q), results in found.items() if mapped == m}
+            shown = _open_map(capture[f"{m}_map"], Path(features_dir), Path(map_dir))
+            recording = out / f"{capture.name}_map_{m}.rrd"
+            if recordings:
+                _record(recording, shown, of_map, world_up)
+            for q, results in of_map.items():
+                started = time.perf_counter()
+                name = pair_name(capture.name, m, q)
+                draw_scene_png(
+                    *shown.cloud(),
+                    shown.session.world_from_cam(),
+                    results.estimated,
+                    results.true,
+                    out / f"{name}.png",
+                    up=world_up,
+                    title=f"{q} queries in the {m} map, seen from above",
+                )
+                _draw_samples(out / f"localization_{name}", shown, results, Path(features_dir), samples)
+                row: dict[str, Any] = {"map_device": m, "query_device": q, "queries": len(results.table)}
+                row["localized"] = int(np.isfinite(results.world_from_rig).all((1, 2)).sum())
+                row["seconds"] = round(time.perf_counter() - started, 3)
+                row |= {"still": str(out / f"{name}.png"), "recording": str(recording) if recordings else ""}
+                table.append(row)
+                bar.update()
+    return pd.DataFrame(table)
 
 
-def _blueprint(devices: list[str], poses: Array, up: Array) -> Any:
-    """Return the layout of the viewer: from behind and above the place with the most cameras, at rest."""
-    import rerun.blueprint as rrb
+def _load_results(stem: Path, session: Session) -> _Results:
+    """Read the poses of a pair."""
+    keys = {"timestamp": np.int64, "device_id": str}
+    try:
+        table = pd.read_csv(stem.with_name(f"{stem.name}.csv"), dtype=keys)
+    except (OSError, ValueError) as error:
+        raise ArtefactError(f"{stem}.csv cannot be read ({error}). Localize again.") from None
+    rows = session.rows_of_keyframes(table)
+    have = np.array([len(part) > 0 for part in rows], bool)
+    table, rows = table[have].reset_index(drop=True), [part for part in rows if len(part)]
+    times, devices = table["timestamp"].to_numpy(), table["device_id"].to_numpy(str)
+    poses = Trajectory.read(stem.with_name(f"{stem.name}.txt")).lookup(times, devices)
+    first = np.array([part[0] for part in rows], int)
+    true = None if session.ground_truth is None else session.world_from_cam(first, ground_truth=True)
+    return _Results(session, table, rows, poses, true)
 
-    eye = None
-    if len(poses):
-        place = places_of(poses[:, :3, 3])
-        here = poses[place == np.bincount(place).argmax()]
-        centre, view = here[:, :3, 3].mean(0), here[:, :3, 2].mean(0)
-        view -= up * (view @ up)
-        reach = max(3.0, float(np.linalg.norm(np.ptp(here[:, :3, 3], axis=0))))
-        target = centre + 0.3 * reach * view
-        eye = rrb.EyeControls3D(
-            position=target - reach * view + 0.7 * reach * up, look_target=target, eye_up=up
+
+def _open_map(session: Session, features_dir: Path, map_dir: Path) -> _Map:
+    path = map_dir / f"{session.id}.npz"
+    if not path.is_file():
+        return _Map(session, None)
+    store = extract_session(session, features_dir, progress=False)
+    return _Map(session, PnpLocalizer(LocalMap.load(path), store))
+
+
+def _record(path: Path, shown: _Map, pairs: dict[str, _Results], world_up: ArrayLike | None) -> None:
+    everything = np.arange(len(shown.session.images))
+    poses = shown.session.world_from_cam()
+    posed = everything[np.isfinite(poses).all((1, 2))]
+    queries = {}
+    for device, results in pairs.items():
+        first = np.array([rows[0] for rows in results.rows], int)
+        names = [results.session.image_name(int(row)) for row in first]
+        views = _views(results.session, first, results.estimated)
+        status = results.table["status"].tolist()
+        queries[device] = Queries(results.estimated, results.true, names, status, views)
+    views = _views(shown.session, posed, poses[posed])
+    record_scene(path, views, *shown.cloud(), queries, up=world_up, name=path.stem)
+
+
+def _views(session: Session, rows: NDArray[np.int64], world_from_cam: Array) -> Views:
+    cameras = [session.camera(str(sensor)) for sensor in session.images["sensor_id"].iloc[rows]]
+    names = [session.image_name(int(row)) for row in rows]
+    return Views(world_from_cam, cameras, [session.image_path(int(row)) for row in rows], names)
+
+
+def _draw_samples(stem: Path, shown: _Map, results: _Results, features_dir: Path, samples: int) -> None:
+    """Draw queries beside their references, from the least to the best supported."""
+    order = np.argsort(results.table["num_inliers"].fillna(0).to_numpy(), kind="stable")
+    chosen = order[np.unique(np.linspace(0, len(order) - 1, min(samples, len(order))).round().astype(int))]
+    rows = np.concatenate([results.rows[k] for k in chosen] or [np.zeros(0, np.int64)])
+    store = extract_session(results.session, features_dir, rows=rows, progress=False) if len(rows) else None
+    files = {
+        shown.session.image_name(k): shown.session.image_path(k) for k in range(len(shown.session.images))
+    }
+    for number, k in enumerate(chosen, start=1):
+        query, images = results.table.iloc[k], results.rows[k]
+        text = query["references"] if isinstance(query["references"], str) else ""
+        references = [name for name in text.split(";") if name in files][:REFERENCES]
+        estimate = _matches(shown, results.session, images, store, references, str(query["method"]))
+        # Of a rig, the camera that contributes most is shown.
+        shares = np.bincount(estimate.camera_index, minlength=len(images))
+        camera = int(np.argmax(shares))
+        mine, row = estimate.camera_index == camera, images[camera : camera + 1]
+        truth = results.session.world_from_cam(row, ground_truth=True)[0]
+        draw_localization(
+            read_for_display(results.session.image_path(int(row[0]))),
+            results.session.camera(str(results.session.images["sensor_id"].iloc[int(row[0])])),
+            results.world_from_rig[k] @ results.session.rig_from_cam(row)[0],
+            shown.localizer.map.points[estimate.point_index[mine]] if shown.localizer else (),
+            [(read_for_display(files[name]), f"reference {n}") for n, name in enumerate(references, start=1)],
+            stem.with_name(f"{stem.name}_{number}.png"),
+            title=f"{results.session.device} query in the {shown.session.device} map: {query['status']}",
+            keypoints=estimate.pixels[mine],
+            world_from_cam_true=truth if np.isfinite(truth).all() else None,
         )
-    scene = rrb.Spatial3DView(origin="world", name="map and queries", eye_controls=eye)
-    time = rrb.TimePanel(state="collapsed", timeline="query", play_state="paused")
-    if not devices:
-        return rrb.Blueprint(scene, time, collapse_panels=True)
-    images = rrb.Vertical(*[rrb.Spatial2DView(origin=f"query/{d}", name=f"{d} query") for d in devices])
-    return rrb.Blueprint(rrb.Horizontal(scene, images, column_shares=[3, 1]), time, collapse_panels=True)
 
 
-def _view_coordinates(up: Array) -> Any:
-    import rerun as rr
-
-    axis = int(np.argmax(np.abs(up)))
-    return getattr(rr.ViewCoordinates, f"RIGHT_HAND_{'XYZ'[axis]}_{'UP' if up[axis] > 0 else 'DOWN'}")
-
-
-def _log_trajectory(stream: "rr.RecordingStream", views: Views) -> None:
-    """Log one line a folder of images, in order of names: recordings joined would draw paths nobody went."""
-    import rerun as rr
-
-    finite = np.isfinite(views.world_from_cam).all((1, 2))
-    centres = views.world_from_cam[:, :3, 3]
-    tracks: dict[str, list[Array]] = {}
-    for k in sorted(np.flatnonzero(finite).tolist(), key=lambda k: views.names[k]):
-        tracks.setdefault(str(views.names[k]).rpartition("/")[0], []).append(centres[k])
-    strips = [np.array(track) for track in tracks.values()]
-    stream.log("world/map/trajectory", rr.LineStrips3D(strips, colors=_rgb(MAP)), static=True)
-
-
-def _log_queries(
-    stream: "rr.RecordingStream", device: str, results: Queries, max_images: int, image_size: int, size: float
-) -> None:
-    import rerun as rr
-
-    root = f"world/queries/{device}"
-    estimated = np.asarray(results.estimated, np.float64)
-    found = _known(estimated)
-    labels = list(results.names) or [str(k) for k in range(len(estimated))]
-
-    def log_points(entity: str, poses: Array, rows: NDArray[np.bool_], colour: str) -> None:
-        names = [labels[k] for k in np.flatnonzero(rows)]
-        dots = rr.Points3D(
-            poses[rows, :3, 3],
-            colors=_rgb(colour),
-            radii=rr.Radius.ui_points(4),
-            labels=names,
-            show_labels=False,
-        )
-        stream.log(f"{root}/{entity}", dots, static=True)
-
-    log_points("estimated", estimated, found, ESTIMATED)
-    if results.true is not None:
-        true = np.asarray(results.true, np.float64)
-        known = _known(true)
-        log_points("true", true, known, TRUE)
-        both = found & known
-        lines = np.stack([estimated[both, :3, 3], true[both, :3, 3]], axis=1)
-        stream.log(f"{root}/error", rr.LineStrips3D(list(lines), colors=_rgb(ESTIMATED)), static=True)
-    if results.views is None:
-        return
-    for k in _choice(len(estimated), max_images):
-        stream.set_time("query", sequence=int(k))
-        text = f"{labels[k]}: {results.status[k]}" if len(results.status) else labels[k]
-        stream.log(f"query/{device}/text", rr.TextLog(text))
-        image = _small_jpeg(results.views.images[k], image_size)[0]
-        stream.log(f"query/{device}", image)
-        if not found[k]:
-            stream.log(f"{root}/view", rr.Clear(recursive=True))  # or the last one's camera would stay
-        _log_view(
-            stream, f"{root}/view", results.views, int(k), image_size, 2 * size, ESTIMATED, static=False
-        )
-    stream.reset_time()
-
-
-def _log_view(
-    stream: "rr.RecordingStream",
-    entity: str,
-    views: Views,
-    k: int,
-    image_size: int,
-    size: float,
-    colour: str,
-    static: bool,
-) -> None:
-    """Log a posed photograph; nothing where it has no pose."""
-    import rerun as rr
-
-    pose = np.asarray(views.world_from_cam[k], np.float64)
-    if not np.isfinite(pose).all():
-        return
-    image, scale = _small_jpeg(views.images[k], image_size)
-    camera = views.cameras[k]
-    w, x, y, z = rotation_to_quaternion(pose[:3, :3])
-    stream.log(
-        entity,
-        rr.Transform3D(translation=pose[:3, 3], quaternion=rr.Quaternion(xyzw=[x, y, z, w])),
-        static=static,
-    )
-    # Rerun draws pinholes; distortion is left out, which at this size does not show.
-    pinhole = rr.Pinhole(
-        image_from_camera=np.diag([scale, scale, 1.0]) @ camera.calibration_matrix(),
-        resolution=[round(camera.width * scale), round(camera.height * scale)],
-        camera_xyz=rr.ViewCoordinates.RDF,
-        image_plane_distance=size,
-        color=_rgb(colour),
-    )
-    stream.log(entity, pinhole, static=static)
-    stream.log(f"{entity}/image", image, static=static)
-
-
-def _small_jpeg(source: Path | Image, size: int) -> tuple[Any, float]:
-    """Return a picture reduced to `size` pixels on its longer side, as JPEG, and its scale."""
-    import rerun as rr
-
-    image = read_for_display(source) if isinstance(source, str | Path) else source
-    scale = min(1.0, size / max(image.shape[:2]))
-    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else image
-    bgr = np.ascontiguousarray(small[..., ::-1]) if small.ndim == 3 else small
-    _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 80])
-    return rr.EncodedImage(contents=data.tobytes(), media_type="image/jpeg"), scale
-
-
-def _camera_size(poses: Array) -> float:
-    """Return how deep to draw a camera, metres: about half the usual step between neighbours."""
-    from scipy.spatial import cKDTree
-
-    spots = np.unique(np.round(poses[:, :3, 3], 2), axis=0)
-    if len(spots) < 2:
-        return 0.3
-    return float(np.clip(np.median(cKDTree(spots).query(spots, k=2)[0][:, 1]) / 2, 0.05, 1.0))
-
-
-def _choice(count: int, limit: int) -> NDArray[np.int64]:
-    """Return at most `limit` of `count` indices, evenly spread."""
-    return (
-        np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(np.int64))
-        if count
-        else np.zeros(0, int)
-    )
-
-
-def _rgb(colour: str) -> list[int]:
-    return [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
+def _matches(
+    shown: _Map,
+    session: Session,
+    images: NDArray[np.int64],
+    store: FeatureStore | None,
+    references: list[str],
+    method: str,
+) -> PoseEstimate:
+    """Match a query with its first references again: files of poses do not keep which points agreed."""
+    names = [session.image_name(int(row)) for row in images]
+    if "pnp" not in method or shown.localizer is None or store is None or any(n not in store for n in names):
+        return PoseEstimate("failed: not matched")
+    index_of = shown.localizer.map.index_of
+    known = [index_of[name] for name in references if name in index_of]
+    cameras = [session.camera(str(sensor)) for sensor in session.images["sensor_id"].iloc[images]]
+    features = [store[name] for name in names]
+    return shown.localizer.localize(cameras, session.rig_from_cam(images), features, [known] * len(images))

@@ -11,8 +11,8 @@ from toolkit.figures import BLUE, GREEN, GREY, VERMILLION, new_figure, save_figu
 from toolkit.images import read_for_display
 from toolkit.localizers.prediction import View
 from toolkit.localizers.vggt import CameraAnswer, VggtAnswer, VggtLocalizer, VggtQuery
+from toolkit.top_view import ground_axes
 from toolkit.upright import up_of_cameras
-from toolkit.visualize import ground_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -1,0 +1,49 @@
+"""Seeing a map from above: which way is right and up in the picture, and which places lie apart."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def ground_axes(up: ArrayLike) -> tuple[Array, list[str]]:
+    """Return the right and the upward axis of a map seen from above, (2, 3), and their labels.
+
+    They are world axes where the world stands upright, so the picture's numbers are coordinates.
+    """
+    up = np.asarray(up, np.float64) / np.linalg.norm(up)
+    axis = int(np.argmax(np.abs(up)))
+    first = np.eye(3)[0 if axis != 0 else 1]
+    right = first - up * (first @ up)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(up, right)])
+    labels = []
+    for row in axes:
+        k = int(np.argmax(np.abs(row)))
+        sign = "−" if row[k] < 0 else ""
+        labels.append(f"{sign}{'xyz'[k]} [m]" if abs(row[k]) > 0.99 else "along the ground [m]")
+    return axes, labels
+
+
+def places_of(positions: Array, gap_ratio: float = 5.0, share: float = 0.12) -> NDArray[np.int64]:
+    """Return the number of the place, (N,) counted from 0 in order of appearance, of positions (N, 2 or 3).
+
+    Places are apart by more than `share` of the whole extent and by more than `gap_ratio` times the usual
+    step between neighbours.
+    """
+    from scipy.cluster.hierarchy import fcluster, linkage
+    from scipy.spatial import cKDTree
+
+    if len(positions) < 2:
+        return np.zeros(len(positions), np.int64)
+    extent = float(np.linalg.norm(np.ptp(positions, axis=0)))
+    # Positions on one spot (the cameras of a rig) say nothing about steps; a thousand spots are plenty.
+    spots = np.unique(np.round(positions / max(extent / 400, 1e-9)), axis=0) * max(extent / 400, 1e-9)
+    spots = spots[:: len(spots) // 1500 + 1]
+    if len(spots) < 2:
+        return np.zeros(len(positions), np.int64)
+    tree = linkage(spots, "single")
+    gap = max(gap_ratio * float(np.median(tree[:, 2])), share * extent)
+    labels = fcluster(tree, gap, "distance")[cKDTree(spots).query(positions)[1]]
+    _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[inverse]
