@@ -485,6 +485,20 @@ class Session:
             rig_rows[todo[found >= 0]] = named[found[found >= 0]]
         return rig_rows
 
+    def devices_of(self, timestamps: ArrayLike, sensor_ids: Any) -> tuple[Strings, Floats]:
+        """Return the posed device of sensors of any type at given times, (n,), and device_from_sensor (n, 4, 4).
+
+        The device is the rig at that time, else the sensor itself, with the identity.
+        """
+        sensors = as_strings(sensor_ids)
+        rig_rows = self._find_rigs(np.asarray(timestamps, np.int64), sensors)
+        devices, poses = sensors.to_numpy(zero_copy_only=False).copy(), np.tile(np.eye(4), (len(rig_rows), 1, 1))
+        if self.rigs is not None and np.any(rig_rows >= 0):
+            held = rig_rows >= 0
+            devices[held] = self.rigs["rig_id"].to_numpy()[rig_rows[held]]
+            poses[held] = pose_from_qt(self._rig_qt[rig_rows[held]])
+        return devices, poses
+
     def _posed_keys(self) -> Iterator[tuple[Ints, pa.Array]]:
         if self.trajectory is not None:
             yield self.trajectory.timestamps, self.trajectory._ids

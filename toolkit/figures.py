@@ -1,31 +1,103 @@
-"""What the figures of all stages share: colours, a figure without global state, and files with a caption."""
+"""What the figures of all stages share: one style, colours, a figure without global state, files with a caption."""
 
+import io
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from toolkit.files import write_atomic
 
 if TYPE_CHECKING:
+    from matplotlib.colors import Colormap, LogNorm
     from matplotlib.figure import Figure
 
+P = ParamSpec("P")
+R = TypeVar("R")
+
+STYLE = Path(__file__).with_name("figures.mplstyle")
 # Okabe and Ito's colours, which people with any colour vision tell apart.
 BLUE, VERMILLION, GREEN = "#0072B2", "#D55E00", "#009E73"
 ORANGE, SKY, GREY = "#E69F00", "#56B4E9", "#5A5A5A"
 # One meaning a colour, in pictures and recordings alike.
 ESTIMATED, TRUE, MAP = VERMILLION, BLUE, GREY
+ERROR_RANGE_M = (0.01, 1.0)
+"""Errors of position that the colours of errors tell apart, on a logarithmic scale."""
+
+
+def styled(draw: Callable[P, R]) -> Callable[P, R]:
+    """Make a function draw in the style of all figures, without changing the style of anyone else's."""
+
+    @wraps(draw)
+    def in_style(*args: P.args, **kwargs: P.kwargs) -> R:
+        import matplotlib as mpl
+
+        with mpl.rc_context(fname=STYLE):
+            return draw(*args, **kwargs)
+
+    return in_style
 
 
 def new_figure(width: float, height: float) -> "Figure":
     """Return an empty figure of a size in inches, laid out so that labels do not collide."""
     from matplotlib.figure import Figure  # not pyplot: no state, and nothing is shown twice in a notebook
 
-    return Figure(figsize=(width, height), layout="constrained", facecolor="white")
+    return Figure(figsize=(width, height), layout="constrained")
 
 
+@styled
 def save_figure(figure: "Figure", path: str | Path, caption: str = "") -> Path:
     """Write a figure as PNG, the caption kept in the file where the report finds it, and return the path."""
     # Software would name the version of matplotlib: the same data shall give the same bytes.
     metadata = {"Software": None, "Description": caption}
     with write_atomic(path) as temporary:
-        figure.savefig(temporary, dpi=110, bbox_inches="tight", pad_inches=0.1, metadata=metadata)
+        figure.savefig(temporary, metadata=metadata)
     return Path(path)
+
+
+def error_scale() -> "tuple[Colormap, LogNorm]":
+    """Return the colours of errors of position: perceptually uniform, without ends that vanish on white or black."""
+    import matplotlib as mpl
+    from matplotlib.colors import ListedColormap, LogNorm
+
+    colours = mpl.colormaps["plasma"](np.linspace(0.25, 0.85, 256))
+    return ListedColormap(colours), LogNorm(*ERROR_RANGE_M, clip=True)
+
+
+def error_colours(errors_m: ArrayLike) -> NDArray[np.uint8]:
+    """Return the colours (N, 3) RGB of errors (N,), metres; what is not known, NaN, is sky blue."""
+    errors = np.asarray(errors_m, np.float64)
+    colours, scale = error_scale()
+    known = np.isfinite(errors)
+    rgb = np.tile(np.array([0x56, 0xB4, 0xE9], np.uint8), (len(errors), 1))
+    if known.any():
+        rgb[known] = colours(scale(np.maximum(errors[known], ERROR_RANGE_M[0])), bytes=True)[:, :3]
+    return rgb
+
+
+def error_bar(figure: "Figure", axis: Any, **where: Any) -> None:
+    """Draw the legend of errors' colours beside an axis of a figure."""
+    from matplotlib.cm import ScalarMappable
+
+    colours, scale = error_scale()
+    bar = figure.colorbar(ScalarMappable(scale, colours), ax=axis, extend="both", **where)
+    bar.set_label("error of position [m]")
+    bar.set_ticks([0.01, 0.1, 1.0], labels=["0.01", "0.1", "1"])
+
+
+@styled
+def draw_error_legend() -> bytes:
+    """Return the legend of errors' colours, PNG."""
+    from matplotlib.cm import ScalarMappable
+
+    colours, scale = error_scale()
+    figure = new_figure(1.3, 2.4)
+    bar = figure.colorbar(ScalarMappable(scale, colours), cax=figure.subplots(), extend="both")
+    bar.set_label("error of position [m]")
+    bar.set_ticks([0.01, 0.1, 1.0], labels=["0.01", "0.1", "1"])
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", metadata={"Software": None})
+    return stream.getvalue()

@@ -1,6 +1,7 @@
 """Still pictures of queries in a map, which need no viewer."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,8 +10,20 @@ import pycolmap
 from matplotlib.collections import LineCollection
 from numpy.typing import ArrayLike, NDArray
 
-from toolkit.figures import ESTIMATED, GREEN, MAP, TRUE, new_figure, save_figure
+from toolkit.figures import (
+    ESTIMATED,
+    GREEN,
+    MAP,
+    TRUE,
+    error_bar,
+    error_colours,
+    new_figure,
+    save_figure,
+    styled,
+)
 from toolkit.geometry import pose_error, project
+from toolkit.images import read_for_display
+from toolkit.localization_view import ShownImage
 from toolkit.top_view import ground_axes, places_of
 from toolkit.upright import up_of_cameras
 
@@ -22,6 +35,22 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 
+@dataclass(frozen=True)
+class WorstQuery:
+    """A query of the sheet of the worst."""
+
+    pair: str
+    reason: str
+    """Status and counts of matches."""
+    image: ShownImage
+    reference: ShownImage | None
+    """The best one; None where there is none."""
+    rotation_deg: float = np.nan
+    translation_m: float = np.nan
+    """Its errors; NaN without a pose, or where the truth is not known."""
+
+
+@styled
 def draw_scene_png(
     points: ArrayLike,
     colors: NDArray[np.uint8] | None,
@@ -33,6 +62,8 @@ def draw_scene_png(
     title: str = "",
     max_places: int = 6,
     max_points: int = 60_000,
+    map_tracks: Sequence[Array] = (),
+    query_tracks: Sequence[Array] = (),
 ) -> "Figure":
     """Draw the map from above with estimated and true queries, one panel a place; return the figure.
 
@@ -47,6 +78,8 @@ def draw_scene_png(
         title: of the figure.
         max_places: panels at most; the places with the most map images.
         max_points: points drawn at most in all, a regular choice.
+        map_tracks: ways of the map's devices, (n, 3) each, drawn as lines.
+        query_tracks: true ways of the query devices.
     """
     map_poses = _finite(map_poses)
     estimated = np.asarray(queries_est, np.float64).reshape(-1, 4, 4)
@@ -64,9 +97,7 @@ def draw_scene_png(
     point_place = _nearest(cloud, cameras, place)
     counts = np.bincount(place, minlength=1)
     shown = np.sort(np.argsort(-counts, kind="stable")[:max_places])
-    windows = [
-        _window(cloud[point_place == p], cameras[place == p], anchors[query_place == p]) for p in shown
-    ]
+    windows = [_window(cloud[point_place == p], cameras[place == p], anchors[query_place == p]) for p in shown]
 
     columns = min(len(shown), 3)
     rows = -(-len(shown) // columns)
@@ -80,6 +111,10 @@ def draw_scene_png(
         near, mine = point_place == p, query_place == p
         tint = "#9A9A9A" if shades is None else _muted(shades[near])
         _dots(axis, cloud[near], s=1.2, c=tint, lw=0, rasterized=True)
+        for tracks, colour, label in ((map_tracks, MAP, "way of the map's devices"), (query_tracks, TRUE, "true way")):
+            for number, track in enumerate(tracks):
+                axis.plot(*(np.asarray(track).reshape(-1, 3) @ axes.T).T, color=colour, lw=0.7, alpha=0.5, zorder=2,
+                          label=None if number else label)  # fmt: skip
         _draw_heading(axis, cameras[place == p], map_poses[place == p], axes, MAP, window, "map cameras")
         _draw_queries(axis, seen[mine], known[mine], estimated[mine], true[mine], axes, window)
         axis.set(xlim=window[0], ylim=window[1], aspect="equal", xlabel=labels[0])
@@ -95,17 +130,20 @@ def draw_scene_png(
                           xycoords="axes fraction", ha="right")  # fmt: skip
     for row in range(rows):
         panels[row * columns].set_ylabel(labels[1])
+    if (np.isfinite(seen).all(1) & np.isfinite(known).all(1)).any():
+        error_bar(figure, list(panels[: len(shown)]), shrink=0.8)
     handles: dict[str, Any] = {}
     for axis in panels:
         handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5, frameon=False,
                   fontsize=9)  # fmt: skip
-    figure.suptitle(title or "Queries in the map, seen from above", fontsize=11, fontweight="bold")
+    figure.suptitle(title or "Queries in the map, seen from above")
     if out is not None:
         save_figure(figure, out, title or "Queries in the map, seen from above")
     return figure
 
 
+@styled
 def draw_localization(
     query_image: Image,
     camera: pycolmap.Camera,
@@ -179,10 +217,66 @@ def draw_localization(
     if located and world_from_cam_true is not None and np.isfinite(world_from_cam_true).all():
         rotation, metres = pose_error(np.asarray(pose), world_from_cam_true)
         title = f"{title}{' · ' if title else ''}off by {float(rotation):.2g}°, {_length(float(metres))}"
-    figure.suptitle(title, fontsize=11, fontweight="bold")
+    figure.suptitle(title)
     if out is not None:
         save_figure(figure, out, title)
     return figure
+
+
+@styled
+def draw_worst(
+    queries: Sequence[WorstQuery], out: str | Path | None = None, title: str = "The worst queries"
+) -> "Figure":
+    """Draw the worst queries, each beside its best reference with their common matches joined; return the figure.
+
+    Args:
+        queries: the worst first.
+        out: PNG to write; None: no file.
+        title: of the figure.
+    """
+    columns = 2 if len(queries) > 1 else 1
+    rows = max(1, -(-len(queries) // columns))
+    figure = new_figure(6.0 * columns, 2.75 * rows + 0.5)
+    panels = np.ravel(figure.subplots(rows, columns, squeeze=False))
+    for axis in panels:
+        axis.set_axis_off()
+    if not len(queries):
+        panels[0].text(0.5, 0.5, "no queries", ha="center")
+    for rank, (axis, query) in enumerate(zip(panels, queries, strict=False), start=1):
+        _draw_side_by_side(axis, query)
+        off = f"off by {query.rotation_deg:.2g}°, {_length(query.translation_m)}; " if (
+            np.isfinite(query.translation_m)) else ""  # fmt: skip
+        axis.set_title(f"{rank}. {query.pair}: {off}{query.reason}", fontsize=8, loc="left", wrap=True)
+    figure.suptitle(f"{title} (left: query, right: its best reference; lines: inliers that both see)")
+    if out is not None:
+        save_figure(figure, out, title)
+    return figure
+
+
+def _draw_side_by_side(axis: "Axes", query: WorstQuery) -> None:
+    """Draw a query and its best reference at one height, and join the points that both see."""
+    left = read_for_display(query.image.path)
+    height = left.shape[0]
+    placed = [(left, 0.0, 1.0)]
+    if query.reference is not None:
+        right = read_for_display(query.reference.path)
+        placed.append((right, left.shape[1] * 1.03, height / right.shape[0]))
+    width = 0.0
+    for image, offset, scale in placed:
+        width = offset + scale * image.shape[1]
+        axis.imshow(image, extent=(offset, width, height, 0), interpolation="antialiased")
+    if query.reference is not None:
+        _, i, j = np.intersect1d(query.image.point_ids, query.reference.point_ids, return_indices=True)
+        start, end = query.image.pixels[i], query.reference.pixels[j] * placed[1][2] + [placed[1][1], 0.0]
+        step = len(start) // 80 + 1  # more lines than this hide the pictures
+        lines = np.stack([start, end], axis=1)[::step]
+        axis.add_collection(LineCollection(list(lines), colors=GREEN, linewidths=0.5, alpha=0.8))
+        _dots(axis, start, s=4, c=GREEN, lw=0)
+        _dots(axis, end, s=4, c=GREEN, lw=0)
+        if not len(start):
+            axis.text(width / 2, height * 0.96, "no common inliers", ha="center", color="white", fontsize=8,
+                      bbox={"facecolor": "black", "alpha": 0.6, "lw": 0, "pad": 2})  # fmt: skip
+    axis.set(xlim=(0, width), ylim=(height, 0), aspect="equal")
 
 
 def _on(pixels: Array) -> Array:
@@ -281,15 +375,18 @@ def _draw_queries(
 ) -> None:
     has_estimate, has_truth = np.isfinite(seen).all(1), np.isfinite(known).all(1)
     both = has_estimate & has_truth
-    lines = np.full((3 * both.sum(), 2), np.nan)
-    lines[0::3], lines[1::3] = seen[both], known[both]
-    axis.plot(*lines.T, color=ESTIMATED, lw=1.2, alpha=0.9, zorder=4, label="error" if both.any() else None)
-    found = has_truth & has_estimate
-    _dots(axis, known[found], s=52, facecolors="none", edgecolors=TRUE, lw=1.4, zorder=5,
-                 label="query, true" if found.any() else None)  # fmt: skip
+    errors = np.where(both, np.linalg.norm(estimated[:, :3, 3] - true[:, :3, 3], axis=1), np.nan)
+    colours = error_colours(errors) / 255.0
+    lines = np.stack([seen[both], known[both]], axis=1)
+    axis.add_collection(LineCollection(list(lines), colors=list(colours[both]), linewidths=1.6, zorder=4))
+    _dots(axis, known[both], s=52, facecolors="none", edgecolors=TRUE, lw=1.2, zorder=5,
+                 label="query, true" if both.any() else None)  # fmt: skip
     lost = has_truth & ~has_estimate
-    _dots(axis, known[lost], s=42, marker="x", color=TRUE, lw=1.6, zorder=5,
-                 label="query without a pose" if lost.any() else None)  # fmt: skip
-    _draw_heading(
-        axis, seen[has_estimate], estimated[has_estimate], axes, ESTIMATED, window, "query, estimated"
-    )
+    _dots(axis, known[lost], s=42, marker="x", color=ESTIMATED, lw=1.8, zorder=6,
+                 label="query without a pose, where it truly was" if lost.any() else None)  # fmt: skip
+    length = 0.035 * max(np.ptp(window[0]), np.ptp(window[1]))
+    heads = seen + length * estimated[:, :3, 2] @ axes.T
+    lines = np.stack([seen[has_estimate], heads[has_estimate]], axis=1)
+    axis.add_collection(LineCollection(list(lines), colors=list(colours[has_estimate]), linewidths=1.0, zorder=4))
+    _dots(axis, seen[has_estimate], s=16, c=colours[has_estimate], lw=0, zorder=5,
+                 label="query, estimated; a line leads to its true place" if has_estimate.any() else None)  # fmt: skip

@@ -3,10 +3,10 @@ import pycolmap
 import pytest
 from PIL import Image
 
+from toolkit.figures import error_colours
 from toolkit.geometry import make_pose, project
-from toolkit.recordings import Queries, Views, record_scene
-from toolkit.stills import draw_localization, draw_scene_png
-from toolkit.top_view import ground_axes, places_of
+from toolkit.localization_view import ShownImage
+from toolkit.stills import WorstQuery, draw_localization, draw_scene_png, draw_worst
 from toolkit.upright import up_of_cameras
 
 CAMERA = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=[50, 50, 32, 24])
@@ -43,26 +43,6 @@ def test_up_of_cameras_that_all_look_one_way_and_of_none():
     assert up_of_cameras(np.zeros((0, 4, 4))).tolist() == [0, 0, 1]
 
 
-def test_ground_axes_are_seen_from_above():
-    for up in ([0, 0, -1], [0, 1, 0], [0.1, 0.2, 0.9]):
-        axes, labels = ground_axes(up)
-        np.testing.assert_allclose(np.cross(*axes), up / np.linalg.norm(up), atol=1e-12)
-        assert len(labels) == 2
-    assert ground_axes([0, 0, -1])[1] == ["x [m]", "−y [m]"]
-
-
-def test_far_apart_places_are_told_apart():
-    rng = np.random.default_rng(0)
-    row = np.stack([np.arange(20.0), np.zeros(20)], axis=1)
-    east, north = np.array([100, 0]), np.array([0, 90])
-    positions = np.concatenate([row + east, row + east, row, rng.normal(size=(30, 2)) + north])
-    place = places_of(positions)
-    assert place.tolist() == [0] * 40 + [1] * 20 + [2] * 30
-    assert set(places_of(row)) == {0}
-    assert places_of(np.zeros((3, 2))).tolist() == [0, 0, 0]
-    assert len(places_of(np.zeros((0, 2)))) == 0
-
-
 def test_projection_has_half_pixel_centres_and_leaves_out_what_is_behind():
     pixels, visible = project(np.array([[0, 0, 2.0], [0.4, 0, 2], [0, 0, -1]]), CAMERA, np.eye(4))
     np.testing.assert_allclose(pixels[:2], [[32, 24], [42, 24]])
@@ -85,7 +65,7 @@ def scene():
 
 def test_scene_picture(scene, tmp_path):
     figure = draw_scene_png(*scene, tmp_path / "scene.png", title="a <map>")
-    titles = [axis.get_title() for axis in figure.axes if axis.get_visible()]
+    titles = [axis.get_title() for axis in figure.axes if axis.get_title()]
     assert titles == [
         "place 1: 2 of 2 queries have a pose, 1 estimated outside the picture",
         "place 2: 0 of 1 queries have a pose",
@@ -124,36 +104,48 @@ def test_localization_pictures_of_success_and_failure(tmp_path):
     assert done.get_suptitle() == "query 7: ok · off by 0°, 2 cm"
     assert done.axes[0].get_title() == "query: 15 of 20 map points agree"
     for missing in (None, np.full((4, 4), np.nan)):
-        failed = draw_localization(
-            image, CAMERA, missing, np.zeros((0, 3)), [], tmp_path / "failed.png", "query 8"
-        )
+        failed = draw_localization(image, CAMERA, missing, np.zeros((0, 3)), [], tmp_path / "failed.png", "query 8")
         assert failed.axes[0].get_title() == "query: not localized"
     assert (tmp_path / "failed.png").is_file()
 
 
-def test_recording_holds_the_scene(scene, tmp_path):
-    import rerun as rr
+def test_the_worst_queries_are_drawn_with_the_matches_they_share_with_a_reference(tmp_path):
+    rng = np.random.default_rng(0)
+    files = [tmp_path / "query.jpg", tmp_path / "reference.jpg"]
+    Image.fromarray(rng.integers(0, 255, (48, 64, 3), np.uint8)).save(files[0])
+    Image.fromarray(rng.integers(0, 255, (96, 64, 3), np.uint8)).save(files[1])
+    pixels, points = rng.uniform(0, 48, (5, 2)), rng.normal(size=(5, 3))
+    query = ShownImage("q", files[0], CAMERA, np.eye(4), pixels, points, np.array([4, 7, 1, 2, 9]))
+    reference = ShownImage("r", files[1], CAMERA, np.eye(4), pixels[:3], points[:3], np.array([9, 4, 3]))
+    worst = [
+        WorstQuery("hl in the ios map", "failed: too few matches, 3 matches", query, None),
+        WorstQuery("hl in the ios map", "ok, 5 matches", query, reference, 2.0, 0.5),
+        WorstQuery(
+            "hl in the ios map", "ok", query, ShownImage("x", tmp_path / "gone.jpg", CAMERA, np.eye(4)), 1.0, 0.1
+        ),
+    ]
+    figure = draw_worst(worst, tmp_path / "worst.png", "the worst")
+    first, second, third = figure.axes[:3]
+    assert first.get_title(loc="left").startswith("1. hl in the ios map: failed: too few matches")
+    assert second.get_title(loc="left") == "2. hl in the ios map: off by 2°, 50 cm; ok, 5 matches"
+    lines = second.collections[0].get_segments()
+    # Points 4 and 9 are in both; the reference, twice as high, is drawn at half its size beside the query.
+    np.testing.assert_allclose([line[0] for line in lines], pixels[[0, 4]])
+    np.testing.assert_allclose([line[1] for line in lines], pixels[[1, 0]] / 2 + [64 * 1.03, 0])
+    assert [text.get_text() for text in third.texts] == ["no common inliers"]
+    with Image.open(tmp_path / "worst.png") as image:
+        assert image.text["Description"] == "the worst"
+    assert draw_worst([])
 
-    points, colors, poses, estimated, true = scene
-    files = []
-    for k in range(6):
-        files.append(tmp_path / f"{k}.jpg")
-        Image.fromarray(np.full((48, 64, 3), 40 * k, np.uint8)).save(files[-1])
-    views = Views(poses, [CAMERA] * 6, files, [f"ios_map/a/{k}.jpg" for k in range(6)])
-    of_queries = Views(estimated, [CAMERA] * 3, files[:3], ["a", "b", "c"])
-    queries = {"hl": Queries(estimated, true, ["a", "b", "c"], ["ok", "ok", "failed: x"], of_queries)}
-    path = record_scene(tmp_path / "scene.rrd", views, points, colors, queries, max_images=3, image_size=32)
-    assert [p.name for p in tmp_path.glob("*.rrd")] == ["scene.rrd"]
-    rows: dict[str, int] = {}
-    for chunk in rr.chunk.RrdReader(path).stream().to_chunks():
-        rows[chunk.entity_path] = rows.get(chunk.entity_path, 0) + chunk.num_rows
-    wanted = ["map/points", "map/trajectory", "map/cameras/0", "map/cameras/0/image", "map/cameras/5"]
-    wanted += [f"queries/hl/{name}" for name in ("estimated", "true", "error", "view", "view/image")]
-    assert {f"/world/{name}" for name in wanted} | {"/query/hl"} <= set(rows)
-    assert "/world/map/cameras/1" not in rows
-    assert rows["/query/hl"] == 3
 
+def test_errors_have_the_colours_of_the_legend_and_styles_stay_where_they_are():
+    import matplotlib as mpl
 
-def test_recording_without_queries_or_images(tmp_path):
-    empty = Views(np.zeros((0, 4, 4)), [], [], [])
-    assert record_scene(tmp_path / "empty.rrd", empty, np.zeros((0, 3)), None, {}).stat().st_size > 0
+    before = mpl.rcParams["figure.titleweight"]
+    colours = error_colours([0.001, 0.01, 0.1, 1.0, 50.0, np.nan])
+    assert (colours[0] == colours[1]).all()
+    assert (colours[3] == colours[4]).all()
+    assert len(np.unique(colours, axis=0)) == 4
+    figure = draw_scene_png(np.zeros((0, 3)), None, looking([80, 90]), looking([80, 90]), None)
+    assert figure._suptitle.get_fontweight() == "bold"
+    assert mpl.rcParams["figure.titleweight"] == before != "bold"
