@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo run test test-slow test-browser browser-setup docs-images lab lint bench clean
+.PHONY: help demo run test test-slow test-browser browser-setup docs-images docs-view lab lint bench clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */  make \1|/' | column -t -s '|'
@@ -43,6 +43,9 @@ test-browser: $(INSTALLED)  ## the report and the notebooks' viewer in a real br
 
 docs-images: $(INSTALLED)  ## draw the README's pictures anew from a demo run; first: make browser-setup
 	$(BIN)/python -m docs.make_images
+
+docs-view: $(INSTALLED)  ## draw the README's picture of the localization view anew; needs mesa-vulkan-drivers
+	$(BIN)/python -m docs.view_image
 
 lab: $(INSTALLED)  ## JupyterLab on the notebooks
 	$(BIN)/python -m jupyterlab --notebook-dir notebooks

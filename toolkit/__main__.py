@@ -1,4 +1,4 @@
-"""The command line: `python -m toolkit run|report|check|download|submit|import|export|demo-data`."""
+"""The command line: `python -m toolkit run|report|check|record|download|submit|import|export|demo-data`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -207,6 +207,35 @@ def export_pairs(
     from toolkit import export
 
     print(f"{out}: {export.export_pairs(run, scene, map_device, query_device, out, topk)} pairs")
+
+
+@app.command()
+def record(
+    scene: Annotated[Path, typer.Argument(help="Capture folder, with sessions/ in it.")],
+    device: Annotated[str, typer.Option(help="ios, hl or spot.")],
+    split: Annotated[str, typer.Option(help="map or query.")] = "map",
+    subsession: Annotated[str, typer.Option(help="One recording of the session, or all.")] = "all",
+    keyframes_only: Annotated[bool, typer.Option("--keyframes-only", help="Only the frames asked as queries.")] = False,
+    every: Annotated[int, typer.Option(min=1, help="Every so many frames.")] = 1,
+    spawn: Annotated[bool, typer.Option("--spawn", help="Open the viewer when done.")] = False,
+    vis_retrieve_queries: Annotated[
+        bool, typer.Option("--vis-retrieve-queries", help="Join queries with the references they were localized by.")
+    ] = False,
+    queries_pose: Annotated[Path | None, typer.Option(help="Trajectories file with poses of queries.")] = None,
+    map_dir: Annotated[Path | None, typer.Option(help="Folder of triangulated maps, for points.")] = None,
+    out: Annotated[Path | None, typer.Option(help="File to write, .rrd.")] = None,
+) -> None:
+    """Record a session for the rerun viewer: images on a timeline, cameras, depth and points."""
+    from toolkit.recordings import record_session
+
+    done = record_session(
+        scene, split, device, subsession, keyframes_only, every, spawn, vis_retrieve_queries, queries_pose,
+        out=out, map_dir=map_dir,
+    )  # fmt: skip
+    for message in done.messages:
+        print("Note:", message)
+    print(f"{done.frames} frames, {done.images} images, {done.bytes / 1e6:.1f} MB in {done.seconds:.0f} s")
+    print(f"Open it: {done.command}")
 
 
 def main() -> None:

@@ -15,6 +15,7 @@ from toolkit.figures import ESTIMATED, GREEN, MAP, ORANGE, SKY, TRUE, draw_error
 from toolkit.geometry import pose_error, project
 from toolkit.images import read_for_display
 from toolkit.recordings import (
+    HIDDEN_M,
     camera_depth_m,
     jpeg_of,
     log_points,
@@ -228,23 +229,27 @@ def _log_chosen(
     """Log one query at the current place of the timeline, in place of the one before."""
     import rerun as rr
 
-    for path in ("world/chosen", "world/truth", "world/references", "world/chosen_points", "world/lines"):
-        stream.log(path, rr.Clear(recursive=True))
-    for k, image in enumerate(chosen.cameras[:MAX_CAMERAS]):
+    # What this query lacks is overwritten by nothing, or the last one's would stay.
+    for k in range(MAX_CAMERAS):
+        image = chosen.cameras[k] if k < len(chosen.cameras) else None
         _log_image(stream, f"world/chosen/camera_{k}", image, image_size, size, ESTIMATED, residuals=True)
-    if posed(queries.true[number : number + 1])[0] and chosen.cameras:
-        camera = chosen.cameras[0].camera
-        stream.log("world/truth/camera_0", transform_of(queries.true[number]))
-        stream.log("world/truth/camera_0", pinhole_of(camera, (camera.width, camera.height), size, TRUE))
-    for rank, image in enumerate(chosen.references[:MAX_REFERENCES], start=1):
+    for rank in range(1, MAX_REFERENCES + 1):
+        image = chosen.references[rank - 1] if rank <= len(chosen.references) else None
         _log_image(stream, f"world/references/{rank}", image, image_size, size, SKY, residuals=False)
+    if chosen.cameras:
+        camera, known = chosen.cameras[0].camera, bool(posed(queries.true[number : number + 1])[0])
+        if known:
+            stream.log("world/truth/camera_0", transform_of(queries.true[number]))
+        shown = (camera.width, camera.height)
+        stream.log("world/truth/camera_0", pinhole_of(camera, shown, size if known else HIDDEN_M, TRUE))
     points = np.concatenate([image.points for image in chosen.cameras] or [np.zeros((0, 3))])
     dots = rr.Points3D(points, colors=rgb(GREEN), radii=rr.Radius.ui_points(3))
     stream.log("world/chosen_points", dots)
+    lines = []
     if posed(queries.estimated[number : number + 1])[0]:
         centre = queries.estimated[number, :3, 3]
         lines = [np.stack([centre, image.world_from_cam[:3, 3]]) for image in chosen.references]
-        stream.log("world/lines", rr.LineStrips3D(lines, colors=rgb(ORANGE)))
+    stream.log("world/lines", rr.LineStrips3D(lines, colors=rgb(ORANGE)))
     text = [f"**query {number}: {describe(queries, number)}**", "", *(f"- {image.name}" for image in chosen.cameras)]
     matched = sum(len(image.points) for image in chosen.cameras)
     text += ["", f"{matched} inliers shown: green where the pose puts a point, white where it was measured.", ""]
@@ -258,7 +263,7 @@ def _log_chosen(
 def _log_image(
     stream: "rr.RecordingStream",
     path: str,
-    image: ShownImage,
+    image: ShownImage | None,
     image_size: int,
     size: float,
     colour: str,
@@ -267,24 +272,29 @@ def _log_image(
     """Log a photograph with its camera, and on it where points were measured and where the pose puts them."""
     import rerun as rr
 
-    data, shown = small_jpeg(read_for_display(image.path), image_size)
-    located = bool(np.isfinite(image.world_from_cam).all())
-    if located:
-        stream.log(path, transform_of(image.world_from_cam))
-        stream.log(path, pinhole_of(image.camera, shown, size, colour))
-    stream.log(f"{path}/image", jpeg_of(data))
-    if not len(image.pixels):
-        return
-    scale = np.array(shown) / [image.camera.width, image.camera.height]
-    measured = image.pixels * scale
-    white, green = rr.Radius.ui_points(2.5), rr.Radius.ui_points(3)
+    measured, predicted = np.zeros((0, 2)), np.zeros((0, 2))
+    lines: list[Array] = []
+    if image is None:
+        stream.log(f"{path}/image", jpeg_of(small_jpeg(np.full((1, 1, 3), 60, np.uint8), 1)[0]))
+        # A camera of any kind, too small to be seen.
+        stream.log(path, rr.Pinhole(focal_length=1, width=1, height=1, image_plane_distance=HIDDEN_M))
+    else:
+        data, shown = small_jpeg(read_for_display(image.path), image_size)
+        located = bool(np.isfinite(image.world_from_cam).all())
+        if located:
+            stream.log(path, transform_of(image.world_from_cam))
+        stream.log(path, pinhole_of(image.camera, shown, size if located else HIDDEN_M, colour))
+        stream.log(f"{path}/image", jpeg_of(data))
+        scale = np.array(shown) / [image.camera.width, image.camera.height]
+        measured = image.pixels * scale
+        if located and residuals and len(measured):
+            pixels, visible = project(image.points, image.camera, image.world_from_cam)
+            predicted = pixels[visible] * scale
+            lines = list(np.stack([measured[visible], predicted], axis=1))
+    white, green = rr.Radius.ui_points(1.5), rr.Radius.ui_points(2.5)
+    stream.log(f"{path}/marks/reprojected", rr.Points2D(predicted, colors=rgb(GREEN), radii=green))
     stream.log(f"{path}/marks/measured", rr.Points2D(measured, colors=[255, 255, 255], radii=white))
-    if located and residuals:
-        predicted, visible = project(image.points, image.camera, image.world_from_cam)
-        predicted *= scale
-        stream.log(f"{path}/marks/reprojected", rr.Points2D(predicted[visible], colors=rgb(GREEN), radii=green))
-        lines = np.stack([measured[visible], predicted[visible]], axis=1)
-        stream.log(f"{path}/marks/residuals", rr.LineStrips2D(list(lines), colors=[255, 255, 255]))
+    stream.log(f"{path}/marks/residuals", rr.LineStrips2D(lines, colors=[255, 255, 255]))
 
 
 def describe(queries: Localizations, k: int) -> str:

@@ -149,7 +149,15 @@ class VisualizeSettings(_Section):
     samples: Natural | None = None
     """Queries shown of each pair."""
     recordings: bool | None = None
-    """Write recordings for the rerun viewer."""
+    """Write a recording of each pair for the rerun viewer."""
+    matched_queries: Natural | None = None
+    """Queries of each pair shown in it with references and matches, the worst first."""
+    session_recordings: bool | None = None
+    """Write a recording of each session."""
+    keyframes_only: bool | None = None
+    """Recordings of query sessions hold only keyframes."""
+    every: Positive | None = None
+    """Recordings of sessions hold every so many frames; at most 1000 images where not given."""
 
 
 class Source(_Strict):

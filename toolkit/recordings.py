@@ -43,6 +43,8 @@ FRAME, CAPTURE_TIME = "frame", "capture_time"
 """Timelines: index of the frame in its session, and the timestamp of the files as a duration (microseconds)."""
 POINT_COLOUR = GREY
 MAX_TABS = 12
+HIDDEN_M = 1e-3
+"""Depth of a camera that is not there now: too small to be seen."""
 
 
 # What all recordings share
@@ -563,8 +565,8 @@ class _FrameWriter:
         self._stream, self._session, self._size, self._colour = stream, session, size, colour
         self._last: dict[str, tuple[float, ...]] = {}
         """Numbers last logged, by entity and kind."""
-        self._alive: dict[tuple[str, str], set[str]] = {}
-        """Entities that show something, by subsession and device."""
+        self._alive: dict[tuple[str, str], dict[str, _Loaded]] = {}
+        """Entities of cameras that show something, and what, by subsession and device."""
         self._now: _Frame | None = None
 
     def write(self, frame: _Frame, shots: list[_Loaded]) -> dict[str, int]:
@@ -578,7 +580,7 @@ class _FrameWriter:
         known = bool(np.isfinite(frame.world_from_device).all())
         parts = ["world" if known else "unposed", frame.subsession, *([frame.device] if frame.device else [])]
         root = entity(*parts)
-        shown: set[str] = set()
+        shown: dict[str, _Loaded] = {}
         # A camera without a rig carries its pose itself.
         if known and frame.device:
             self._stream.log(root, transform_of(frame.world_from_device))
@@ -586,10 +588,10 @@ class _FrameWriter:
         for loaded in shots:
             shot = loaded.shot
             path = f"{root}/{entity(shot.slot)}"
-            shown.add(path)
             if shot.is_depth and not loaded.readable:
                 counts["unreadable"] += 1
                 continue
+            shown[path] = loaded
             if known and not frame.device:
                 self._stream.log(path, transform_of(frame.world_from_device))
             elif known and shot.rig_from_sensor is not None:
@@ -606,7 +608,7 @@ class _FrameWriter:
             counts["unposed"] += not known
         # What this device showed before and does not now would hang on at its old place.
         device = (frame.subsession, frame.device or frame.slots[0])
-        self._clear(self._alive.get(device, set()) - shown)
+        self._hide({path: last for path, last in self._alive.get(device, {}).items() if path not in shown})
         self._alive[device] = shown
         return counts
 
@@ -616,20 +618,18 @@ class _FrameWriter:
             return
         self._set_time(self._now.index + 1, self._now.timestamp + 1)
         for shown in self._alive.values():
-            self._clear(shown)
+            self._hide(shown)
         self._alive.clear()
 
     def _set_time(self, index: int, timestamp: int) -> None:
         self._stream.set_time(FRAME, sequence=index)
         self._stream.set_time(CAPTURE_TIME, duration=np.timedelta64(timestamp, "us"))
 
-    def _clear(self, paths: set[str]) -> None:
-        import rerun as rr
-
-        for path in sorted(paths):
-            self._stream.log(path, rr.Clear(recursive=True))
-            for key in [key for key in self._last if key.startswith(f"{path}|")]:
-                del self._last[key]
+    def _hide(self, cameras: dict[str, _Loaded]) -> None:
+        for path, last in cameras.items():
+            camera = self._session.camera(last.shot.sensor_id)
+            self._stream.log(path, pinhole_of(camera, last.size, HIDDEN_M, self._colour))
+            self._last.pop(f"{path}|pinhole", None)
 
     def _log_changed(self, path: str, kind: str, numbers: ArrayLike, make: Any) -> None:
         values = tuple(np.ravel(numbers).tolist())
@@ -659,8 +659,8 @@ def _session_layout(plan: _Plan, poses: Array, up: Array) -> Any:
     ]
     scene = scene_view(poses, up, plan.session.id)
     panel = rrb.TimePanel(state="collapsed", timeline=FRAME, play_state="paused")
-    parts = [scene, rrb.Tabs(*views)] if views else [scene]
-    return rrb.Blueprint(rrb.Horizontal(*parts, column_shares=[2, 1][: len(parts)]), panel, collapse_panels=True)
+    layout = rrb.Horizontal(scene, rrb.Tabs(*views), column_shares=[2, 1]) if views else rrb.Horizontal(scene)
+    return rrb.Blueprint(layout, panel, collapse_panels=True)
 
 
 def _log_trajectories(stream: "rr.RecordingStream", plan: _Plan, device: str) -> None:

@@ -145,7 +145,7 @@ def visualize_scene(
             for q in [q for mapped, q in found if mapped == m]:
                 started = time.perf_counter()
                 name, results = pair_name(capture.name, m, q), found[m, q]
-                pair = _Pair(shown, results, Path(features_dir))
+                located = _Pair(shown, results, Path(features_dir))
                 draw_scene_png(
                     *shown.cloud(),
                     shown.session.world_from_cam(),
@@ -157,11 +157,11 @@ def visualize_scene(
                     map_tracks=session_tracks(shown.session),
                     query_tracks=session_tracks(results.session),
                 )
-                _draw_samples(out / f"localization_{name}", pair, samples)
+                _draw_samples(out / f"localization_{name}", located, samples)
                 recording = out / f"{name}.rrd"
                 if recordings:
-                    _record(recording, pair, matched_queries, world_up)
-                worst += [(pair, int(k)) for k in pair.localizations.worst_first()[:WORST]]
+                    _record(recording, located, matched_queries, world_up)
+                worst += [(located, int(k)) for k in located.localizations.worst_first()[:WORST]]
                 row: dict[str, Any] = {"map_device": m, "query_device": q, "queries": len(results.table)}
                 row["localized"] = int(np.isfinite(results.world_from_rig).all((1, 2)).sum())
                 row["seconds"] = round(time.perf_counter() - started, 3)
