@@ -62,7 +62,7 @@ def draw(recording: Path, out: Path, query: int | None = None) -> None:
     with Image.open(out) as picture:
         small = picture.convert("RGB")
         small.thumbnail((MAX_WIDTH, MAX_WIDTH))
-        small.quantize(256).save(out, optimize=True)
+        small.save(out, optimize=True)
 
 
 if __name__ == "__main__":

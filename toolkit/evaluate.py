@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.devices import colour_of, in_order
 from toolkit.errors import ArtefactError, CaptureError, ToolkitError
-from toolkit.figures import ORANGE, SKY, VERMILLION, new_figure, save_figure
+from toolkit.figures import ORANGE, SKY, VERMILLION, new_figure, save_figure, styled
 from toolkit.files import pair_name, write_atomic, write_sidecar
 from toolkit.geometry import invert, pose_error, transform
 
@@ -567,6 +567,7 @@ class _MapView:
 # Figures
 
 
+@styled
 def draw_evaluation(evaluation: Evaluation) -> dict[str, "Figure"]:
     """Return the figures of an evaluation by name; those for which there is nothing to draw are left out."""
     figures: dict[str, Figure] = {}
@@ -601,6 +602,7 @@ def draw_evaluation(evaluation: Evaluation) -> dict[str, "Figure"]:
     return figures
 
 
+@styled
 def draw_matrices(
     table: pd.DataFrame,
     columns: Sequence[tuple[str, str, float, str]],
@@ -645,10 +647,11 @@ def draw_matrices(
         axis.grid(which="minor", color="white", lw=2)
         axis.spines[:].set_visible(False)
     axes[0].set_ylabel("map")
-    figure.suptitle(title, fontsize=11, fontweight="bold")
+    figure.suptitle(title)
     return figure
 
 
+@styled
 def draw_error_curves(errors: pd.DataFrame, thresholds: Sequence[Threshold] = THRESHOLDS) -> "Figure":
     """Draw cumulative distributions of the errors: a column a query device, a line a map device.
 
@@ -682,15 +685,15 @@ def draw_error_curves(errors: pd.DataFrame, thresholds: Sequence[Threshold] = TH
             axis.set_ylim(0, 102)
             axis.set_xlabel(label)
             axis.grid(alpha=0.25)
-            axis.spines[["top", "right"]].set_visible(False)
             if row == 0:
                 axis.set_title(f"{query} queries", fontsize=10)
         axes[row, 0].set_ylabel("queries below [%]")
     axes[0, 0].legend(frameon=False, fontsize=9)
-    figure.suptitle("How many queries have an error below x", fontsize=11, fontweight="bold")
+    figure.suptitle("How many queries have an error below x")
     return figure
 
 
+@styled
 def draw_losses(losses: pd.DataFrame) -> "Figure":
     """Draw for each pair, a panel a threshold, the share of queries missed, by reason."""
     known = losses.dropna(subset=["threshold"])
@@ -712,12 +715,11 @@ def draw_losses(losses: pd.DataFrame) -> "Figure":
         axis.set_title(f"missed @ {_spoken(threshold)}", fontsize=10)
         axis.set_xlabel("queries [%]")
         axis.grid(axis="x", alpha=0.25)
-        axis.spines[["top", "right"]].set_visible(False)
     axes[0].set_yticks(range(len(pairs)), [f"{q} in {m} map" for m, q in pairs])
     axes[0].invert_yaxis()
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-    figure.suptitle("Where accuracy was lost", fontsize=11, fontweight="bold")
+    figure.suptitle("Where accuracy was lost")
     return figure
 
 

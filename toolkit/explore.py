@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture import Capture, Session
 from toolkit.devices import colour_of
-from toolkit.figures import GREEN, ORANGE, VERMILLION, new_figure
+from toolkit.figures import GREEN, ORANGE, VERMILLION, new_figure, styled
 from toolkit.images import read_for_display
 from toolkit.top_view import ground_axes, places_of
 from toolkit.upright import up_of_cameras
@@ -37,6 +37,7 @@ def describe(capture: Capture, queries: str = "keyframes_pruned_subsampled") -> 
     return pd.DataFrame(rows).set_index("session")
 
 
+@styled
 def draw_samples(capture: Capture, count: int = 4) -> "Figure":
     """Return a figure of `count` images of each session, evenly spread over the recording."""
     names = [name for name in capture if len(capture[name].images)]
@@ -53,6 +54,7 @@ def draw_samples(capture: Capture, count: int = 4) -> "Figure":
     return figure
 
 
+@styled
 def draw_top_view(capture: Capture, up: ArrayLike | None = None) -> "Figure":
     """Return a figure of all camera centres seen from above, metres; queries where the truth is known.
 
@@ -84,6 +86,7 @@ def draw_top_view(capture: Capture, up: ArrayLike | None = None) -> "Figure":
     return figure
 
 
+@styled
 def draw_similarity(embeddings: str | Path, limit: int = 300) -> "Figure":
     """Return a figure of the cosine similarity of a query session's images to another device's map.
 
@@ -107,6 +110,7 @@ def draw_similarity(embeddings: str | Path, limit: int = 300) -> "Figure":
     return figure
 
 
+@styled
 def draw_references(
     sessions_root: str | Path, jsonl: str | Path, samples: int = 4, references: int = 4
 ) -> "Figure":
@@ -173,6 +177,7 @@ def _queries_of(jsonl: str | Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in Path(jsonl).read_text(encoding="utf-8").splitlines()]
 
 
+@styled
 def draw_statuses(paths: Iterable[str | Path]) -> "Figure":
     """Return a figure of the inliers of each query, by pair and status.
 

@@ -135,6 +135,7 @@ def record_localizations(
     up = np.asarray(up_of_cameras(poses) if up is None else up, np.float64)
     size = camera_depth_m(poses[:, :3, 3])
     count = 0
+    sizes: dict[str, tuple[int, int]] = {}
     with open_recording(out, name, _layout(name, poses, up)) as stream:
         stream.log("world", world_axes(up), static=True)
         log_points(stream, points, colors)
@@ -142,7 +143,7 @@ def record_localizations(
         _log_overview(stream, localizations)
         for number, chosen in details:
             stream.set_time(QUERY, sequence=number)
-            _log_chosen(stream, localizations, number, chosen, image_size, 2 * size)
+            _log_chosen(stream, localizations, number, chosen, image_size, 2 * size, sizes)
             count += 1
     logger.info("%s: %d queries, %d of them with matches, in %.0f s", out, len(localizations.names), count,
                 time.perf_counter() - started)  # fmt: skip
@@ -225,6 +226,7 @@ def _log_chosen(
     chosen: QueryDetails,
     image_size: int,
     size: float,
+    sizes: dict[str, tuple[int, int]],
 ) -> None:
     """Log one query at the current place of the timeline, in place of the one before."""
     import rerun as rr
@@ -232,10 +234,10 @@ def _log_chosen(
     # What this query lacks is overwritten by nothing, or the last one's would stay.
     for k in range(MAX_CAMERAS):
         image = chosen.cameras[k] if k < len(chosen.cameras) else None
-        _log_image(stream, f"world/chosen/camera_{k}", image, image_size, size, ESTIMATED, residuals=True)
+        _log_image(stream, f"world/chosen/camera_{k}", image, image_size, size, ESTIMATED, sizes, residuals=True)
     for rank in range(1, MAX_REFERENCES + 1):
         image = chosen.references[rank - 1] if rank <= len(chosen.references) else None
-        _log_image(stream, f"world/references/{rank}", image, image_size, size, SKY, residuals=False)
+        _log_image(stream, f"world/references/{rank}", image, image_size, size, SKY, sizes, residuals=False)
     if chosen.cameras:
         camera, known = chosen.cameras[0].camera, bool(posed(queries.true[number : number + 1])[0])
         if known:
@@ -267,19 +269,27 @@ def _log_image(
     image_size: int,
     size: float,
     colour: str,
+    sizes: dict[str, tuple[int, int]],
     residuals: bool,
 ) -> None:
-    """Log a photograph with its camera, and on it where points were measured and where the pose puts them."""
+    """Log a photograph with its camera, and on it where points were measured and where the pose puts them.
+
+    Where there is none, nothing but grey; `sizes` are of the pictures last logged.
+    """
     import rerun as rr
 
     measured, predicted = np.zeros((0, 2)), np.zeros((0, 2))
     lines: list[Array] = []
     if image is None:
-        stream.log(f"{path}/image", jpeg_of(small_jpeg(np.full((1, 1, 3), 60, np.uint8), 1)[0]))
+        # Of the last one's size: the viewer takes pictures of an entity for frames of a film.
+        width, height = sizes.get(path, (4, 3))
+        blank = np.full((height, width, 3), 60, np.uint8)
+        stream.log(f"{path}/image", jpeg_of(small_jpeg(blank, max(blank.shape))[0]))
         # A camera of any kind, too small to be seen.
         stream.log(path, rr.Pinhole(focal_length=1, width=1, height=1, image_plane_distance=HIDDEN_M))
     else:
         data, shown = small_jpeg(read_for_display(image.path), image_size)
+        sizes[path] = shown
         located = bool(np.isfinite(image.world_from_cam).all())
         if located:
             stream.log(path, transform_of(image.world_from_cam))

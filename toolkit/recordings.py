@@ -20,8 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from toolkit.capture import DEPTH_SCALE, Capture, Session, Trajectory
+from toolkit.devices import colour_of
 from toolkit.errors import ArtefactError, CaptureError, ImageError
-from toolkit.figures import DEVICE_COLOURS, GREY, ORANGE
+from toolkit.figures import GREY, ORANGE
 from toolkit.files import file_fingerprint, files_fingerprint, write_atomic, write_sidecar
 from toolkit.geometry import rotation_to_quaternion
 from toolkit.images import default_workers, prefetch, read_for_display, read_image
@@ -319,7 +320,7 @@ def record_session(
         if asked is not None:
             counts["queries"] = _log_asked(stream, asked, session)
         size = camera_depth_m(finite[:, :3, 3])
-        writer = _FrameWriter(stream, session, size, DEVICE_COLOURS.get(session.device, GREY))
+        writer = _FrameWriter(stream, session, size, colour_of(session.device))
 
         def load(number: int) -> list["_Loaded"]:
             return [_load(session, shot, image_size, quality) for shot in plan.shots(number)]
@@ -667,7 +668,7 @@ def _log_trajectories(stream: "rr.RecordingStream", plan: _Plan, device: str) ->
     """Log the way of each device, a line a subsession: recordings joined would draw paths nobody went."""
     import rerun as rr
 
-    colour = rgb(DEVICE_COLOURS.get(device, GREY))
+    colour = rgb(colour_of(device))
     for name, tracks in plan.tracks.items():
         lines = rr.LineStrips3D([track for track in tracks if len(track) > 1], colors=colour)
         stream.log(f"world/{entity(name)}/trajectory", lines, static=True)
@@ -737,7 +738,7 @@ def _log_asked(stream: "rr.RecordingStream", asked: _Queries, session: Session) 
     keys = list(zip(asked.poses.timestamps.tolist(), asked.poses.device_ids.tolist(), strict=True))
     kept = np.flatnonzero(posed(poses))
     if session.split == "map":
-        colour = rgb(DEVICE_COLOURS.get(asked.query_device, GREY))
+        colour = rgb(colour_of(asked.query_device))
         labels = [f"{time} {device}" for time, device in (keys[k] for k in kept)]
         dots = rr.Points3D(poses[kept, :3, 3], colors=colour, radii=rr.Radius.ui_points(4), labels=labels,
                            show_labels=False)  # fmt: skip

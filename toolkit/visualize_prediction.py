@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from toolkit.figures import BLUE, GREEN, GREY, VERMILLION, new_figure, save_figure
+from toolkit.figures import BLUE, GREEN, GREY, VERMILLION, new_figure, save_figure, styled
 from toolkit.images import read_for_display
 from toolkit.localizers.prediction import View
 from toolkit.localizers.vggt import CameraAnswer, VggtAnswer, VggtLocalizer, VggtQuery
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
+@styled
 def draw_prediction(
     localizer: VggtLocalizer,
     query: VggtQuery,
