@@ -286,7 +286,7 @@ def _on(pixels: Array) -> Array:
 
 def _frame(axis: "Axes", colour: str, width: int, height: int) -> None:
     axis.set(xticks=[], yticks=[], xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
-    axis.spines[:].set(color=colour, linewidth=1.5)
+    axis.spines[:].set(color=colour, linewidth=1.5, visible=True)
 
 
 def _length(metres: float) -> str:

@@ -83,7 +83,7 @@ def _draw_view(
     photograph.imshow(read_for_display(view.path))
     photograph.set_title(label, fontsize=8, color=colour)
     for spine in photograph.spines.values():
-        spine.set(color=colour, linewidth=2.5)
+        spine.set(color=colour, linewidth=2.5, visible=True)
     prediction = found.prediction
     if prediction is None or prediction.depth is None:
         return
