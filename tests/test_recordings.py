@@ -169,7 +169,7 @@ def test_a_map_recording_holds_the_frames_and_poses_of_the_files(capture, map_di
     assert [row[0] for row in logged(found["/unposed/noon/rig_0/lf/image"], "EncodedImage:blob")] == [5]
     assert [row[0] for row in logged(found["/world/noon/rig_0/lf/image"], "EncodedImage:blob")] == [4, 6, 7]
     depths = logged(found["/world/noon/rig_0/lf"], "Pinhole:image_plane_distance")
-    assert [(row[0], row[2][0] < 0.01) for row in depths] == [(4, False), (5, True), (6, False), (8, True)]
+    assert [(row[0], row[2][0] < 0.01) for row in depths] == [(0, True), (4, False), (5, True), (6, False), (8, True)]
     ((index, _, _),) = logged(found["/world/morning/rig_0/lf_depth/depth"], "EncodedDepthImage:blob")
     assert index == 1
     ((line,),) = [row[2] for row in logged(found["/world/morning/trajectory"], "LineStrips3D:strips")]

@@ -321,6 +321,7 @@ def record_session(
             counts["queries"] = _log_asked(stream, asked, session)
         size = camera_depth_m(finite[:, :3, 3])
         writer = _FrameWriter(stream, session, size, colour_of(session.device))
+        writer.announce(plan.frames)
 
         def load(number: int) -> list["_Loaded"]:
             return [_load(session, shot, image_size, quality) for shot in plan.shots(number)]
@@ -612,6 +613,22 @@ class _FrameWriter:
         self._hide({path: last for path, last in self._alive.get(device, {}).items() if path not in shown})
         self._alive[device] = shown
         return counts
+
+    def announce(self, frames: list[_Frame]) -> None:
+        """Log cameras that come later, too small to be seen: the viewer complains of pictures without a camera."""
+        import rerun as rr
+
+        if not frames:
+            return
+        self._set_time(frames[0].index, min(frame.timestamp for frame in frames))
+        begin: dict[str, int] = {}
+        for frame in frames:
+            if np.isfinite(frame.world_from_device).all():
+                parts = ["world", frame.subsession, *([frame.device] if frame.device else [])]
+                for slot in frame.slots:
+                    begin.setdefault(entity(*parts, slot), frame.index)
+        for path in [path for path, index in begin.items() if index > frames[0].index]:
+            self._stream.log(path, rr.Pinhole(focal_length=1, width=1, height=1, image_plane_distance=HIDDEN_M))
 
     def finish(self) -> None:
         """End a subsession: the instant after its last frame shows none of its cameras."""
