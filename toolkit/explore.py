@@ -127,6 +127,7 @@ def draw_references(
     return _draw_rows(sessions_root, jsonl, [[lines[row]] for row in chosen], references)
 
 
+@styled
 def draw_reranked(
     sessions_root: str | Path, jsonl: str | Path, retrieved: str | Path, samples: int = 4, references: int = 3
 ) -> "Figure":
