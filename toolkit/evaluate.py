@@ -553,8 +553,9 @@ class _MapView:
         """Return the points (P, 3) that a reference sees, world, metres."""
         if self.local_map is not None:
             image = self.local_map.index_of.get(str(reference["path"]).split("/sessions/", 1)[-1])
-            found = [] if image is None else self.local_map.observations(image)[1]
-            return self.local_map.points[np.unique(np.asarray(found, np.int64))]
+            if image is None:
+                return np.zeros((0, 3))
+            return self.local_map.points[np.unique(self.local_map.observations(image)[1])]
         from toolkit.mapping import view_bounds
 
         left, right, top, bottom = view_bounds(self.session.camera(reference["sensor_id"]))
