@@ -15,10 +15,10 @@ from toolkit import features
 from toolkit.capture import Session, write_session
 from toolkit.features import (
     DESCRIPTOR_SCALE,
-    FeatureSettings,
     FeatureStore,
     LocalFeatures,
     SiftExtractor,
+    SiftSettings,
     extract_session,
     stretch_contrast,
 )
@@ -64,11 +64,11 @@ def test_keypoints_are_where_the_spots_are_however_the_image_is_turned(
     xy = grid + rng.uniform(-10, 10, grid.shape)
     zoom = np.clip(max(width, height), min_side, max_side) / max(width, height)
     image = spots(width, height, xy, rng.uniform(4, 7, len(xy)) / zoom)
-    extractor = SiftExtractor(FeatureSettings(min_long_side=min_side, max_long_side=max_side))
+    extractor = SiftExtractor(SiftSettings(min_long_side=min_side, max_long_side=max_side))
     biases = []
     for quarter_turns in range(4):
         errors = []
-        found = extractor(np.ascontiguousarray(np.rot90(image, quarter_turns)))
+        found = extractor.extract([np.ascontiguousarray(np.rot90(image, quarter_turns))])[0]
         x, y = xy.T
         expected = [(x, y), (y, width - x), (width - x, height - y), (height - y, x)][quarter_turns]
         assert found.image_size == ((width, height) if quarter_turns % 2 == 0 else (height, width))
@@ -86,7 +86,7 @@ def test_keypoints_are_where_the_spots_are_however_the_image_is_turned(
 def test_scale_is_the_size_of_the_spot_in_pixels_of_the_file() -> None:
     image = spots(800, 600, np.array([[400.0, 300.0]]), np.array([12.0]))
     for side in (400, 800):
-        found = SiftExtractor(FeatureSettings(min_long_side=0, max_long_side=side))(image)
+        found = SiftExtractor(SiftSettings(min_long_side=0, max_long_side=side)).extract([image])[0]
         nearest = np.argmin(((found.keypoints - [400, 300]) ** 2).sum(1))
         # A difference of Gaussians answers strongest a little below the blob's own size.
         assert 0.6 * 12 < found.scales[nearest] < 1.4 * 12
@@ -94,7 +94,7 @@ def test_scale_is_the_size_of_the_spot_in_pixels_of_the_file() -> None:
 
 def test_shapes_types_and_order() -> None:
     image = textured(0)
-    found = SiftExtractor()(image)
+    found = SiftExtractor().extract([image])[0]
     n = len(found)
     assert n > 200
     assert (found.keypoints.shape, found.keypoints.dtype) == ((n, 2), np.float32)
@@ -109,8 +109,8 @@ def test_shapes_types_and_order() -> None:
 
 def test_the_strongest_are_kept_and_come_first() -> None:
     image = textured(1)
-    everything = SiftExtractor(FeatureSettings(max_keypoints=100_000))(image)
-    few = SiftExtractor(FeatureSettings(max_keypoints=100))(image)
+    everything = SiftExtractor(SiftSettings(max_keypoints=100_000)).extract([image])[0]
+    few = SiftExtractor(SiftSettings(max_keypoints=100)).extract([image])[0]
     assert 90 <= len(few) <= 100  # one keypoint may have several orientations
     strongest = {tuple(xy) for xy in everything.keypoints[:130]}
     assert sum(tuple(xy) in strongest for xy in few.keypoints) >= 0.95 * len(few)
@@ -119,7 +119,7 @@ def test_the_strongest_are_kept_and_come_first() -> None:
     faint = np.full((480, 640), 20.0)
     for index, cx in enumerate((500.3, 100.3, 300.3)):
         faint += (220, 140, 60)[index] * np.exp(-((x - cx) ** 2 + (y - 240.2) ** 2) / (2 * 5.0**2))
-    keypoints = SiftExtractor()(faint.astype(np.uint8)).keypoints
+    keypoints = SiftExtractor().extract([faint.astype(np.uint8)])[0].keypoints
     first = [int(np.argmax(np.hypot(*(keypoints - [cx, 240.2]).T) < 1)) for cx in (500.3, 100.3, 300.3)]
     assert first == sorted(first)
     assert len(set(first)) == 3
@@ -128,7 +128,7 @@ def test_the_strongest_are_kept_and_come_first() -> None:
 def test_a_dark_picture_gives_the_same_features() -> None:
     image = textured(2, 640, 480)
     dark = np.round(image * 0.15 + 12).astype(np.uint8)
-    bright, found = SiftExtractor()(image), SiftExtractor()(dark)
+    bright, found = SiftExtractor().extract([image])[0], SiftExtractor().extract([dark])[0]
     assert len(found) > 0.7 * len(bright)
     matches = mutual_matches(similarity(unit_descriptors(bright.descriptors), unit_descriptors(found.descriptors)))
     apart = np.linalg.norm(bright.keypoints[matches[:, 0]] - found.keypoints[matches[:, 1]], axis=1)
@@ -154,7 +154,7 @@ def test_stretch_contrast_keeps_a_full_picture_and_limits_the_gain() -> None:
     ],
 )
 def test_no_structure_no_features(image: NDArray[np.uint8]) -> None:
-    found = SiftExtractor()(image)
+    found = SiftExtractor().extract([image])[0]
     assert len(found) == 0
     assert found.keypoints.shape == (0, 2)
     assert (found.descriptors.shape, found.descriptors.dtype) == ((0, 128), np.uint8)
@@ -181,11 +181,11 @@ def session(tmp_path: Path) -> Session:
     return Session.open(path)
 
 
-SETTINGS = FeatureSettings(min_long_side=0, max_keypoints=200)
+SETTINGS = SiftSettings(min_long_side=0, max_keypoints=200)
 
 
-def extract(session: Session, out: Path, settings: FeatureSettings = SETTINGS, **more: object) -> FeatureStore:
-    return extract_session(session, out, settings, progress=False, **more)  # type: ignore[arg-type]
+def extract(session: Session, out: Path, settings: SiftSettings = SETTINGS, **more: object) -> FeatureStore:
+    return extract_session(session, out, SiftExtractor(settings), progress=False, **more)  # type: ignore[arg-type]
 
 
 def count_reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
@@ -203,6 +203,7 @@ def count_reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def assert_same(a: LocalFeatures, b: LocalFeatures) -> None:
     np.testing.assert_array_equal(a.keypoints, b.keypoints)
     np.testing.assert_array_equal(a.scales, b.scales)
+    np.testing.assert_array_equal(a.scores, b.scores)
     np.testing.assert_array_equal(a.descriptors, b.descriptors)
     assert a.image_size == b.image_size
 
@@ -214,7 +215,7 @@ def test_store_holds_every_photograph_as_the_extractor_gives_it(session: Session
     assert store.failed == {}
     assert session.image_name(1) not in store
     for row in cameras:
-        assert_same(store[session.image_name(row)], SiftExtractor(SETTINGS)(textured(row)))
+        assert_same(store[session.image_name(row)], SiftExtractor(SETTINGS).extract([textured(row)])[0])
     with pytest.raises(KeyError):
         store["ios_map/raw_data/nowhere.png"]
 
@@ -260,7 +261,7 @@ def test_a_changed_image_makes_its_shard_anew(
     seen = count_reads(monkeypatch)
     after = extract(session, tmp_path / "features")
     assert sorted(seen) == ["b/images/0.png", "b/images/1.png"]
-    assert_same(after[name], SiftExtractor(SETTINGS)(textured(99)))
+    assert_same(after[name], SiftExtractor(SETTINGS).extract([textured(99)])[0])
     assert not np.array_equal(after[name].keypoints, old.keypoints)
     assert after.fingerprint != before
 
@@ -273,7 +274,7 @@ def test_changed_settings_make_everything_anew(session: Session, tmp_path: Path,
     settings = replace(SETTINGS, **change)
     after = extract(session, tmp_path / "features", settings)
     name = session.image_name(0)
-    assert_same(after[name], SiftExtractor(settings)(textured(0)))
+    assert_same(after[name], SiftExtractor(settings).extract([textured(0)])[0])
     assert after.fingerprint != before
     assert extract(session, tmp_path / "features").fingerprint == before  # and back
 
@@ -309,7 +310,7 @@ def test_a_torn_shard_is_made_anew(session: Session, tmp_path: Path, keep: float
     again = extract(session, tmp_path / "features")
     for row in (0, 2, 3, 4, 5):
         name = session.image_name(row)
-        assert_same(again[name], SiftExtractor(SETTINGS)(textured(row)))
+        assert_same(again[name], SiftExtractor(SETTINGS).extract([textured(row)])[0])
     assert again.fingerprint == store.fingerprint
     assert shard.stat().st_size > 0.9 * len(content)
 
@@ -382,7 +383,7 @@ def test_image_of_another_size_than_its_camera_is_listed(small_capture: Path, tm
     session = Session.open(tmp_path / "ios_query")
     image = cv2.imread(str(session.image_path(0)))
     cv2.imwrite(str(session.image_path(0)), image[::2, ::2])
-    store = extract_session(session, tmp_path / "features", SETTINGS, rows=np.array([0, 1]), progress=False)
+    store = extract(session, tmp_path / "features", rows=np.array([0, 1]))
     name = session.image_name(0)
     assert name not in store
     assert session.image_name(1) in store

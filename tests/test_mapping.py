@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from toolkit import geometry, mapping
 from toolkit.capture import Capture, Session, Trajectory, write_session
 from toolkit.errors import ArtefactError
-from toolkit.features import FeatureSettings, FeatureStore, extract_session
+from toolkit.features import FeatureStore, SiftExtractor, SiftSettings, extract_session
 from toolkit.files import sidecar_path
 from toolkit.mapping import (
     LocalMap,
@@ -312,8 +312,8 @@ def test_a_file_of_something_else_is_an_artefact_error(tmp_path: Path) -> None:
 def phone(small_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Session, FeatureStore]:
     """The phone's map session of the rendered capture, and its features."""
     session = Capture.open(small_capture)["ios_map"]
-    settings = FeatureSettings(max_keypoints=800)
-    return session, extract_session(session, tmp_path_factory.mktemp("features"), settings, progress=False)
+    sift = SiftExtractor(SiftSettings(max_keypoints=800))
+    return session, extract_session(session, tmp_path_factory.mktemp("features"), sift, progress=False)
 
 
 def test_a_map_of_photographs(phone: tuple[Session, FeatureStore], tmp_path: Path) -> None:

@@ -81,6 +81,7 @@ class World:
             features[name] = LocalFeatures(
                 pixels.astype(np.float32),
                 (SIZE_M * PINHOLE.mean_focal_length() / depth).astype(np.float32),
+                np.ones(len(pixels), np.float32),
                 stored(rng, descriptors[seen]),
                 (640, 480),
             )
@@ -121,6 +122,7 @@ class World:
         return LocalFeatures(
             pixels.astype(np.float32),
             (SIZE_M * camera.mean_focal_length() / depth).astype(np.float32),
+            np.ones(len(pixels), np.float32),
             stored(self.rng, self.descriptors[seen]),
             (camera.width, camera.height),
         )
@@ -201,9 +203,8 @@ def test_a_rig_needs_not_see_with_all_cameras(room: World) -> None:
     """One camera looks away, one was covered, and only one has references."""
     away = facing(0, 0, 0, yaw_deg=180)
     poses = np.stack([RIG_FROM_CAMS[0], away, RIG_FROM_CAMS[1]])
-    covered = LocalFeatures(
-        np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros((0, 128), np.uint8), (640, 480)
-    )
+    nothing = np.zeros(0, np.float32)
+    covered = LocalFeatures(nothing.reshape(0, 2), nothing, nothing, np.zeros((0, 128), np.uint8), (640, 480))
     noise = room.look(PINHOLE, QUERY, outliers=1.0)
     features = [room.look(PINHOLE, QUERY @ poses[0]), noise, covered]
     estimate = room.localizer().localize([PINHOLE] * 3, poses, features, [REFERENCES, [], REFERENCES])
@@ -272,6 +273,7 @@ def test_a_query_from_elsewhere_is_not_ok(room: World, seed: int) -> None:
     stranger = LocalFeatures(
         rng.uniform([0, 0], [640, 480], (1000, 2)).astype(np.float32),
         rng.uniform(1, 4, 1000).astype(np.float32),
+        np.ones(1000, np.float32),
         stored(rng, room.descriptors[rng.integers(0, 1200, 1000)]),  # matches, but nothing in its place
         (640, 480),
     )

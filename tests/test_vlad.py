@@ -19,8 +19,9 @@ def features_of(descriptors: np.ndarray, scale: float = 2.0) -> LocalFeatures:
     root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
     quantised = np.clip(np.round(root * 512), 0, 255).astype(np.uint8)
     return LocalFeatures(
-        np.zeros((count, 2), np.float32), np.full(count, scale, np.float32), quantised, (640, 480)
-    )
+        np.zeros((count, 2), np.float32), np.full(count, scale, np.float32), np.ones(count, np.float32), quantised,
+        (640, 480),
+    )  # fmt: skip
 
 
 def places(count: int, views: int, noise: float, seed: int) -> list[LocalFeatures]:
@@ -92,6 +93,7 @@ def test_fine_keypoints_are_left_out_unless_there_are_no_others() -> None:
     both = LocalFeatures(
         np.concatenate([clutter.keypoints, coarse.keypoints]),
         np.concatenate([clutter.scales, coarse.scales]),
+        np.concatenate([clutter.scores, coarse.scores]),
         np.concatenate([clutter.descriptors, coarse.descriptors]),
         (640, 480),
     )

@@ -16,7 +16,7 @@ from toolkit.capture import Capture, Session
 from toolkit.compute import check_device_name
 from toolkit.embedders import Embedder, create_embedder, resolve_name
 from toolkit.errors import ImageError, ManifestError, ToolkitError
-from toolkit.features import FeatureSettings, LocalFeatures, extract_session
+from toolkit.features import LocalFeatures, SiftExtractor, extract_session
 from toolkit.files import (
     file_fingerprint,
     files_fingerprint,
@@ -120,7 +120,7 @@ def embed_sessions(
         matrix_path = folder / f"{Path(part).name}.npy"
         record = {
             "embedder": embedder.settings,
-            "features": asdict(FeatureSettings()) if embedder.inputs == "features" else None,
+            "features": SiftExtractor().settings if embedder.inputs == "features" else None,
             "images": _images_fingerprint(session, rows),
             "sensors": file_fingerprint(session.path / "sensors.txt"),
             "turns": fingerprint(job.turns.tolist()) if job.turns.any() else None,
@@ -241,7 +241,7 @@ def _vocabulary(
         chosen.setdefault(name, []).append(row)
     record = {
         "vlad": asdict(settings),
-        "features": asdict(FeatureSettings()),
+        "features": SiftExtractor().settings,
         "images": {name: _images_fingerprint(capture[name], np.array(rows)) for name, rows in chosen.items()},
         "seed": seed,
     }

@@ -1,4 +1,4 @@
-"""Local features of images: RootSIFT, extracted once an image and kept for every later stage.
+"""Local features of images, of several kinds: extracted once an image and kept for every later stage.
 
 The cache of a session is a folder of HDF5 shards, each written whole: a killed run loses at most the shard it was
 working on. A shard holds one group an image with `keypoints`, `descriptors`, `scales`, `image_size`.
@@ -6,10 +6,11 @@ working on. A shard holds one group an image with `keypoints`, `descriptors`, `s
 
 import json
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import cv2
 import h5py
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from toolkit.capture import Session
-from toolkit.errors import ImageError
+from toolkit.errors import ImageError, ManifestError
 from toolkit.files import (
     file_fingerprint,
     files_fingerprint,
@@ -32,22 +33,8 @@ from toolkit.images import prefetch, read_image
 
 # RootSIFT vectors have length 1; times 512 they fill the range of a byte, as COLMAP stores them.
 DESCRIPTOR_SCALE = 512.0
+Descriptors = NDArray[np.uint8] | NDArray[np.float16] | NDArray[np.float32]
 SHARD_IMAGES = 64
-
-
-@dataclass(frozen=True)
-class FeatureSettings:
-    """How local features are extracted; part of every fingerprint that rests on them."""
-
-    name: str = "sift"
-    min_long_side: int = 640
-    """Smaller images are enlarged to this long side, pixels, before detection."""
-    max_long_side: int = 1600
-    """Larger images are reduced to this long side, pixels, before detection."""
-    max_keypoints: int = 3072
-    """The strongest responses are kept."""
-    contrast_threshold: float = 0.01
-    """Least contrast of a keypoint, after the image's contrast has been stretched to the full range."""
 
 
 @dataclass(frozen=True)
@@ -57,14 +44,130 @@ class LocalFeatures:
     keypoints: NDArray[np.float32]
     """(N, 2) x y, pixels; the centre of the top-left pixel is (0.5, 0.5)."""
     scales: NDArray[np.float32]
-    """(N,) size of the keypoints, the standard deviation of the blob, pixels."""
-    descriptors: NDArray[np.uint8]
-    """(N, 128) RootSIFT, a unit vector times `DESCRIPTOR_SCALE`."""
+    """(N,) size of the keypoints, the standard deviation of the blob, pixels; 1 for detectors that tell none."""
+    scores: NDArray[np.float32]
+    """(N,) response of the detector, larger is better; comparable within one kind alone."""
+    descriptors: Descriptors
+    """(N, D): unit vectors, or uint8: non-negative unit vectors times `DESCRIPTOR_SCALE` (RootSIFT)."""
     image_size: tuple[int, int]
     """Width, height of the image, pixels."""
 
     def __len__(self) -> int:
         return len(self.keypoints)
+
+    def take(self, part: slice | NDArray[np.int64]) -> "LocalFeatures":
+        """Return some of the features, by index."""
+        return LocalFeatures(
+            self.keypoints[part], self.scales[part], self.scores[part], self.descriptors[part], self.image_size
+        )
+
+
+class Extractor(Protocol):
+    """What finds local features of one kind."""
+
+    colour: bool
+    """Whether images are (H, W, 3) RGB, else (H, W) grey."""
+    batch_size: int
+    """How many images a call is best given."""
+    threaded: bool
+    """Whether `extract` is called best with one image at a time, from several threads at once."""
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """All that the features depend on besides the images, `name` first; part of their fingerprint."""
+        ...
+
+    def extract(self, images: Sequence[NDArray[np.uint8]]) -> list[LocalFeatures]:
+        """Return the features of images, uint8, of any sizes."""
+        ...
+
+
+@dataclass(frozen=True)
+class FeatureKind:
+    """What is peculiar to one kind of local features. Scores are cosine similarities of descriptors."""
+
+    extractor: str
+    """`module:callable` that makes the extractor, imported when it is asked for."""
+    matcher: str
+    """The matcher of queries with references where none is asked for; see `toolkit.matching`."""
+    ratio: float
+    """Lowe's ratio of `mutual` between a query and a reference; 1: no such test."""
+    min_score: float
+    """Least score of a match of `mutual` between a query and a reference."""
+    epipolar_min_score: float
+    """Least score of a match between map images, sought along the epipolar line."""
+    guided_min_score: float
+    """Least score of a match near where a pose puts a map point."""
+    scale_octaves: float
+    """How far the size of a keypoint may be from what the map tells, as a factor of two to this power."""
+
+
+KINDS: dict[str, FeatureKind] = {
+    # RootSIFT has no negative entries: unrelated patches already score about 0.5, so the ratio test decides, and the
+    # less geometry says, the more a score has to.
+    "sift": FeatureKind(
+        "toolkit.features:SiftExtractor.create", "mutual", 0.85, -1.0, epipolar_min_score=0.6, guided_min_score=0.75,
+        scale_octaves=1.0,
+    ),
+    # Scores of unrelated patches scatter about 0, and look-alikes are common: the usual test is a distance below 0.7
+    # (hloc's NN-superpoint), which is a cosine of 1 - 0.7^2 / 2, and none of the ratio. One scale: sizes say nothing.
+    "superpoint": FeatureKind(
+        "toolkit.models.superpoint:SuperPointExtractor", "lightglue", 1.0, 0.755, epipolar_min_score=0.755,
+        guided_min_score=0.755, scale_octaves=float("inf"),
+    ),
+}  # fmt: skip
+"""The kinds of local features that a manifest can name."""
+
+
+def feature_kind(name: str) -> FeatureKind:
+    """Return what is known of a kind of features.
+
+    Raises:
+        ManifestError: it is not known.
+    """
+    if name not in KINDS:
+        raise ManifestError(f"Unknown local features {name!r}. Known: {', '.join(KINDS)}.")
+    return KINDS[name]
+
+
+def create_extractor(
+    name: str, *, checkpoint: str | Path | None = None, device: str = "auto", dtype: str = "auto", **settings: Any
+) -> Extractor:
+    """Return a ready extractor.
+
+    Args:
+        name: a key of `KINDS`.
+        checkpoint: file with a network's weights; None: the hub's cache, else a download. `sift` needs none.
+        device: where a network runs: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
+        dtype: what a network computes in: `auto`, `float32`, `bfloat16`, `float16`.
+        settings: the extractor's own: the fields of `SiftSettings` of `sift`.
+
+    Raises:
+        ManifestError: unknown features or settings.
+        WeightsError: the network has no weights.
+    """
+    module, _, path = feature_kind(name).extractor.partition(":")
+    make: Any = import_module(module)
+    for attribute in path.split("."):
+        make = getattr(make, attribute)
+    factory: Callable[..., Extractor] = make
+    if name == "sift":
+        return factory(**settings)
+    return factory(checkpoint=checkpoint, device=device, dtype=dtype, **settings)
+
+
+@dataclass(frozen=True)
+class SiftSettings:
+    """How SIFT features are extracted; part of every fingerprint that rests on them."""
+
+    min_long_side: int = 640
+    """Smaller images are enlarged to this long side, pixels, before detection."""
+    max_long_side: int = 1600
+    """Larger images are reduced to this long side, pixels, before detection."""
+    max_keypoints: int = 3072
+    """The strongest responses are kept."""
+    contrast_threshold: float = 0.01
+    """Least contrast of a keypoint, after the image's contrast has been stretched to the full range."""
 
 
 def stretch_contrast(gray: NDArray[np.uint8], max_gain: float = 8.0) -> NDArray[np.uint8]:
@@ -81,13 +184,32 @@ def stretch_contrast(gray: NDArray[np.uint8], max_gain: float = 8.0) -> NDArray[
 class SiftExtractor:
     """Extracts RootSIFT features; one instance may be used by several threads."""
 
-    def __init__(self, settings: FeatureSettings | None = None):
-        self.settings = settings or FeatureSettings()
+    colour = False
+    batch_size = 1
+    threaded = True
+
+    def __init__(self, settings: SiftSettings | None = None):
+        self._settings = settings or SiftSettings()
         self._local = threading.local()
 
-    def __call__(self, gray: NDArray[np.uint8]) -> LocalFeatures:
-        """Return the features of a grey image (H, W) uint8."""
-        settings = self.settings
+    @classmethod
+    def create(cls, **settings: Any) -> "SiftExtractor":
+        """Return an extractor with some of the fields of `SiftSettings` changed."""
+        if unknown := sorted(settings.keys() - SiftSettings.__dataclass_fields__.keys()):
+            known = ", ".join(SiftSettings.__dataclass_fields__)
+            raise ManifestError(f"Local features sift have no setting {unknown[0]!r}. Known: {known}.")
+        return cls(SiftSettings(**settings))
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return {"name": "sift", **asdict(self._settings)}
+
+    def extract(self, images: Sequence[NDArray[np.uint8]]) -> list[LocalFeatures]:
+        """Return the features of images, (H, W) grey or (H, W, 3) RGB, uint8."""
+        return [self._extract(image if image.ndim == 2 else _gray(image)) for image in images]
+
+    def _extract(self, gray: NDArray[np.uint8]) -> LocalFeatures:
+        settings = self._settings
         height, width = gray.shape
         long_side = max(height, width)
         target = float(np.clip(long_side, settings.min_long_side, settings.max_long_side))
@@ -101,11 +223,13 @@ class SiftExtractor:
             return LocalFeatures(
                 np.zeros((0, 2), np.float32),
                 np.zeros(0, np.float32),
+                np.zeros(0, np.float32),
                 np.zeros((0, 128), np.uint8),
                 (width, height),
             )
         scale = np.array([width / size[0], height / size[1]])
-        order = np.argsort([-keypoint.response for keypoint in keypoints], kind="stable")[: settings.max_keypoints]
+        responses = np.array([keypoint.response for keypoint in keypoints], np.float32)
+        order = np.argsort(-responses, kind="stable")[: settings.max_keypoints]
         keypoints, descriptors = [keypoints[index] for index in order], descriptors[order]
         xy = np.array([keypoint.pt for keypoint in keypoints])
         # OpenCV puts the centre of the top-left pixel at 0.
@@ -113,17 +237,23 @@ class SiftExtractor:
         sigma = np.array([keypoint.size for keypoint in keypoints]) / 2 * scale.mean()
         root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6))
         quantised = np.clip(np.round(root * DESCRIPTOR_SCALE), 0, 255).astype(np.uint8)
-        return LocalFeatures(xy.astype(np.float32), sigma.astype(np.float32), quantised, (width, height))
+        return LocalFeatures(
+            xy.astype(np.float32), sigma.astype(np.float32), responses[order], quantised, (width, height)
+        )
 
     def _sift(self) -> Any:
         # OpenCV's detector keeps buffers between calls: one a thread.
         if not hasattr(self._local, "sift"):
             self._local.sift = cv2.SIFT.create(
-                nfeatures=self.settings.max_keypoints,
-                contrastThreshold=self.settings.contrast_threshold,
+                nfeatures=self._settings.max_keypoints,
+                contrastThreshold=self._settings.contrast_threshold,
                 enable_precise_upscale=True,
             )
         return self._local.sift
+
+
+def _gray(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 class FeatureStore:
@@ -178,6 +308,7 @@ class FeatureStore:
             return LocalFeatures(
                 group["keypoints"][()],
                 group["scales"][()],
+                group["scores"][()],
                 group["descriptors"][()],
                 (int(group["image_size"][0]), int(group["image_size"][1])),
             )
@@ -186,7 +317,7 @@ class FeatureStore:
 def extract_session(
     session: Session,
     out: str | Path,
-    settings: FeatureSettings | None = None,
+    extractor: Extractor | None = None,
     rows: NDArray[np.int64] | None = None,
     workers: int = 2,
     skip_existing: bool = True,
@@ -197,7 +328,7 @@ def extract_session(
     Args:
         session: the session; only its camera images are read.
         out: folder of all features; this session's go to `<out>/<session id>/`.
-        settings: how to extract.
+        extractor: how to extract; None: SIFT.
         rows: rows of `session.images` that are needed now; all where None. The shards they fall in are extracted.
         workers: threads.
         skip_existing: reuse shards made from the same images and settings.
@@ -205,10 +336,9 @@ def extract_session(
     Returns:
         The store of the features of (at least) the rows asked for. Unreadable images are in its `failed`.
     """
-    settings = settings or FeatureSettings()
+    extractor = extractor or SiftExtractor()
     folder = Path(out) / session.id
     store = FeatureStore(folder)
-    extractor = SiftExtractor(settings)
     cameras = session.camera_rows
     wanted = cameras if rows is None else np.intersect1d(cameras, rows)
     shards = list(_shards(session, cameras))
@@ -218,7 +348,7 @@ def extract_session(
         if not np.isin(members, wanted).any():
             continue
         images = files_fingerprint([session.image_path(int(row)) for row in members])
-        record = {"features": asdict(settings), "images": images, "sensors": calibration}
+        record = {"features": extractor.settings, "images": images, "sensors": calibration}
         if not (skip_existing and is_current(path, record) and store.add_shard(path)):
             todo.append((path, record, members))
     total = sum(len(members) for _, _, members in todo)
@@ -245,7 +375,7 @@ def _shards(session: Session, rows: NDArray[np.int64]) -> Iterator[tuple[str, ND
 
 
 def _write_shard(
-    path: Path, session: Session, rows: NDArray[np.int64], extractor: SiftExtractor, workers: int, bar: Any
+    path: Path, session: Session, rows: NDArray[np.int64], extractor: Extractor, workers: int, bar: Any
 ) -> None:
     def extract(row: int) -> LocalFeatures | str:
         try:
@@ -258,7 +388,7 @@ def _write_shard(
                 f"Image of {image.shape[1]} x {image.shape[0]} pixels, but sensors.txt says {camera.width} x "
                 f"{camera.height} for {sensors[row]}: {session.image_path(row)}"
             )
-        return extractor(image)
+        return extractor.extract([image])[0]
 
     sensors = session.images["sensor_id"].to_numpy()
     names: list[str] = []
@@ -273,6 +403,7 @@ def _write_shard(
                 group = shard.create_group(name)
                 group["keypoints"] = features.keypoints
                 group["scales"] = features.scales
+                group["scores"] = features.scores
                 group["descriptors"] = features.descriptors
                 group["image_size"] = np.array(features.image_size, np.int64)
             bar.update()

@@ -20,7 +20,7 @@ from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.embedders import Embedder, create_embedder, load_embeddings
 from toolkit.errors import ArtefactError, ImageError, ManifestError
-from toolkit.features import FeatureSettings, FeatureStore, LocalFeatures, SiftExtractor, extract_session
+from toolkit.features import FeatureStore, LocalFeatures, SiftExtractor, extract_session
 from toolkit.files import (
     SceneFiles,
     file_fingerprint,
@@ -293,7 +293,7 @@ class _Pair:
             "method": method,
             "pnp": asdict(settings),
             "map": asdict(MapSettings(seed=settings.seed)),
-            "features": asdict(FeatureSettings()),
+            "features": SiftExtractor().settings,
             "retrieval": file_fingerprint(self.retrieval),
             "map_session": session_fingerprint(self.capture[f"{self.map_device}_map"]),
             "query_session": session_fingerprint(self.session),
@@ -649,7 +649,7 @@ def localize_image(
             f"The image is {image.shape[1]} x {image.shape[0]} pixels, its camera {camera.width} x {camera.height}. "
             "Give the intrinsics of the image as it is stored."
         )
-    features: LocalFeatures = SiftExtractor()(gray)
+    features: LocalFeatures = SiftExtractor().extract([gray])[0]
     scores = map.descriptors @ map.embedder.embed([image if learned else features])[0]
     best = np.argsort(-scores, kind="stable")[:topk]
     return map.localizer.localize([camera], np.eye(4)[None], [features], [map.images[best].tolist()])

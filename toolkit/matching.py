@@ -1,16 +1,105 @@
 """Match local features between images: mutual nearest neighbours, narrowed by whatever is known of the geometry."""
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any, Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 
-from toolkit.features import DESCRIPTOR_SCALE
+from toolkit.errors import ManifestError
+from toolkit.features import DESCRIPTOR_SCALE, Descriptors, LocalFeatures
 
 Floats = NDArray[np.float64]
 
 
-def unit_descriptors(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return descriptors (N, 128) as float32 of length about 1, ready for dot products."""
-    return descriptors.astype(np.float32) * np.float32(1.0 / DESCRIPTOR_SCALE)
+@dataclass(frozen=True)
+class PairMatches:
+    """K matches of the features of two images."""
+
+    indices: NDArray[np.int64]
+    """(K, 2) indices of features of the one and of the other; no feature is there twice."""
+    scores: NDArray[np.float32]
+    """(K,) larger is better: cosine similarity of the descriptors, or the confidence of a network."""
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+
+class Matcher(Protocol):
+    """What matches the features of images whose poses are not known."""
+
+    batch_size: int
+    """How many pairs a call is best given."""
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """All that the matches depend on besides the features, `name` first; part of their fingerprint."""
+        ...
+
+    def match(self, pairs: Sequence[tuple[LocalFeatures, LocalFeatures]]) -> list[PairMatches]:
+        """Return the matches of pairs of images."""
+        ...
+
+
+MATCHERS: dict[str, str] = {
+    "mutual": "toolkit.matching:MutualMatcher",
+    "lightglue": "toolkit.models.lightglue:LightGlueMatcher",
+}
+"""Name of a matcher -> `module:callable` that makes it, imported when it is asked for."""
+
+
+def create_matcher(name: str, **options: Any) -> Matcher:
+    """Return a ready matcher.
+
+    Args:
+        name: a key of `MATCHERS`.
+        options: the matcher's own: `ratio` and `min_score` of `mutual`; `checkpoint`, `device`, `dtype` and others
+            of a network.
+
+    Raises:
+        ManifestError: it is not known.
+        WeightsError: the network has no weights.
+    """
+    if name not in MATCHERS:
+        raise ManifestError(f"Unknown matcher {name!r}. Known: {', '.join(MATCHERS)}.")
+    module, _, attribute = MATCHERS[name].partition(":")
+    factory: Callable[..., Matcher] = getattr(import_module(module), attribute)
+    return factory(**options)
+
+
+class MutualMatcher:
+    """Matches mutual nearest neighbours that pass Lowe's ratio test, of any descriptors."""
+
+    batch_size = 1
+
+    def __init__(self, ratio: float = 0.8, min_score: float = -1.0):
+        """
+        Args:
+            ratio, min_score: see `mutual_matches`.
+        """
+        self.ratio = ratio
+        self.min_score = min_score
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return {"name": "mutual", "ratio": self.ratio, "min_score": self.min_score}
+
+    def match(self, pairs: Sequence[tuple[LocalFeatures, LocalFeatures]]) -> list[PairMatches]:
+        """Return the matches of pairs of images; the ratio test is of the first image's features."""
+        found = []
+        for a, b in pairs:
+            scores = similarity(unit_descriptors(a.descriptors), unit_descriptors(b.descriptors))
+            indices = mutual_matches(scores, self.ratio, self.min_score)
+            found.append(PairMatches(indices, scores[indices[:, 0], indices[:, 1]]))
+        return found
+
+
+def unit_descriptors(descriptors: Descriptors) -> NDArray[np.float32]:
+    """Return descriptors (N, D) of `LocalFeatures` as float32 of length about 1, ready for dot products."""
+    unit = descriptors.astype(np.float32, copy=False)
+    return unit * np.float32(1.0 / DESCRIPTOR_SCALE) if descriptors.dtype == np.uint8 else unit
 
 
 def similarity(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:

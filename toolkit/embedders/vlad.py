@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from toolkit.errors import ArtefactError, ToolkitError
-from toolkit.features import DESCRIPTOR_SCALE, LocalFeatures
+from toolkit.features import LocalFeatures
 from toolkit.files import file_fingerprint, write_atomic
+from toolkit.matching import unit_descriptors
 
 Floats = NDArray[np.float32]
 
@@ -182,7 +183,7 @@ def _select(image: LocalFeatures, settings: VladSettings) -> Floats:
     chosen = np.flatnonzero(scales >= settings.min_scale_px)
     if len(chosen) < settings.min_features:
         chosen = np.sort(np.argsort(-scales, kind="stable")[: settings.min_features])
-    return image.descriptors[chosen].astype(np.float32) / np.float32(DESCRIPTOR_SCALE)
+    return unit_descriptors(image.descriptors[chosen])
 
 
 def _unit(rows: Floats) -> Floats:

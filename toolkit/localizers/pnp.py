@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from toolkit import geometry
-from toolkit.features import FeatureStore, LocalFeatures
+from toolkit.features import Descriptors, FeatureStore, LocalFeatures
 from toolkit.mapping import LocalMap, in_view, view_bounds
 from toolkit.matching import mutual_matches, similarity, unit_descriptors
 
@@ -128,7 +128,7 @@ class PoseEstimate:
 class _MapImage:
     """The features of a map image that see a point, longest tracks first."""
 
-    descriptors: NDArray[np.uint8]
+    descriptors: Descriptors
     points: Ints
     scales: NDArray[np.float32]
 
