@@ -3,23 +3,30 @@
 import json
 import os
 import shutil
+import signal
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from toolkit import features
+from toolkit import features, groups
 from toolkit.capture import Session, write_session
+from toolkit.errors import ArtefactError, ManifestError
 from toolkit.features import (
     DESCRIPTOR_SCALE,
     FeatureStore,
     LocalFeatures,
     SiftExtractor,
     SiftSettings,
+    create_extractor,
     extract_session,
+    features_path,
     stretch_contrast,
 )
 from toolkit.files import is_current, sidecar_path
@@ -182,6 +189,7 @@ def session(tmp_path: Path) -> Session:
 
 
 SETTINGS = SiftSettings(min_long_side=0, max_keypoints=200)
+SIFT = SiftExtractor(SETTINGS)
 
 
 def extract(session: Session, out: Path, settings: SiftSettings = SETTINGS, **more: object) -> FeatureStore:
@@ -231,36 +239,39 @@ def test_a_second_call_reads_no_image_and_gives_the_same(
     assert first.fingerprint == again.fingerprint
     for name in first.names:
         assert_same(first[name], again[name])
-    opened = FeatureStore.open(tmp_path / "features" / "ios_map")
+    opened = FeatureStore.open(first.path)
     assert sorted(opened.names) == sorted(first.names)
     extract(session, tmp_path / "features", skip_existing=False)
     assert len(seen) == 5
 
 
-def test_only_the_shards_of_the_rows_asked_for_are_made(
+def test_only_the_rows_asked_for_are_made_and_others_are_added_later(
     session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen = count_reads(monkeypatch)
     store = extract(session, tmp_path / "features", rows=np.array([5]))
-    assert sorted(seen) == ["b/images/0.png", "b/images/1.png"]
-    assert session.image_name(5) in store
-    assert session.image_name(0) not in store
+    assert seen == ["b/images/1.png"]
+    assert store.names == [session.image_name(5)]
+    before = store.fingerprint
     seen.clear()
     everything = extract(session, tmp_path / "features")
-    assert sorted(seen) == ["a/images/0.png", "a/images/1.png", "a/images/2.png"]
+    assert sorted(seen) == [f"a/images/{k}.png" for k in range(3)] + ["b/images/0.png"]
     assert len(everything.names) == 5
+    assert everything.path == store.path
+    assert_same(store[session.image_name(5)], everything[session.image_name(5)])  # the old file stays open
+    again = extract(session, tmp_path / "features", rows=np.array([5]))
+    assert again.names == [session.image_name(5)]
+    assert again.fingerprint == before  # what rests on these rows does not change with what else is there
     assert len(extract(session, tmp_path / "features", rows=np.zeros(0, np.int64)).names) == 0
 
 
-def test_a_changed_image_makes_its_shard_anew(
-    session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_changed_image_is_made_anew(session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = extract(session, tmp_path / "features")
     name, old, before = session.image_name(4), store[session.image_name(4)], store.fingerprint
     cv2.imwrite(str(session.image_path(4)), textured(99))
     seen = count_reads(monkeypatch)
     after = extract(session, tmp_path / "features")
-    assert sorted(seen) == ["b/images/0.png", "b/images/1.png"]
+    assert seen == ["b/images/0.png"]
     assert_same(after[name], SiftExtractor(SETTINGS).extract([textured(99)])[0])
     assert not np.array_equal(after[name].keypoints, old.keypoints)
     assert after.fingerprint != before
@@ -300,72 +311,219 @@ def test_unreadable_images_are_listed_and_the_others_are_not_lost(
 
 
 @pytest.mark.parametrize("keep", [0, 100, 0.5, -1])
-def test_a_torn_shard_is_made_anew(session: Session, tmp_path: Path, keep: float) -> None:
+def test_a_torn_file_is_made_anew(session: Session, tmp_path: Path, keep: float) -> None:
     store = extract(session, tmp_path / "features")
-    shard = tmp_path / "features" / "ios_map" / "a" / "00000.h5"
-    content = shard.read_bytes()
+    content = store.path.read_bytes()
     size = len(content) - 1 if keep == -1 else int(keep * len(content)) if 0 < keep < 1 else int(keep)
-    shard.write_bytes(content[:size])
-    assert sidecar_path(shard).exists()  # the record says that all is well
+    store.path.write_bytes(content[:size])
+    assert sidecar_path(store.path).exists()  # the record says that all is well
     again = extract(session, tmp_path / "features")
     for row in (0, 2, 3, 4, 5):
         name = session.image_name(row)
         assert_same(again[name], SiftExtractor(SETTINGS).extract([textured(row)])[0])
     assert again.fingerprint == store.fingerprint
-    assert shard.stat().st_size > 0.9 * len(content)
+    assert store.path.stat().st_size > 0.9 * len(content)
 
 
-def test_open_leaves_out_a_torn_shard(session: Session, tmp_path: Path) -> None:
-    extract(session, tmp_path / "features")
-    shard = tmp_path / "features" / "ios_map" / "b" / "00000.h5"
-    shard.write_bytes(shard.read_bytes()[:1000])
-    assert len(FeatureStore.open(tmp_path / "features" / "ios_map").names) == 3
+def test_a_file_of_the_right_size_that_is_no_hdf5_is_made_anew(session: Session, tmp_path: Path) -> None:
+    store = extract(session, tmp_path / "features")
+    store.path.write_bytes(b"\0" * store.path.stat().st_size)
+    assert_same(extract(session, tmp_path / "features")[session.image_name(0)], SIFT.extract([textured(0)])[0])
 
 
-def test_a_shard_without_its_record_is_made_anew(
+def test_open_refuses_a_torn_file_and_one_of_something_else(session: Session, tmp_path: Path) -> None:
+    path = extract(session, tmp_path / "features").path
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(ArtefactError, match="cannot be read"):
+        FeatureStore.open(path)
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["numbers"] = np.zeros(3)
+    with pytest.raises(ArtefactError, match="no local features"):
+        FeatureStore.open(tmp_path / "other.h5")
+
+
+def test_a_file_without_its_record_is_made_anew(
     session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    extract(session, tmp_path / "features")
-    sidecar_path(tmp_path / "features" / "ios_map" / "b" / "00000.h5").unlink()
+    sidecar_path(extract(session, tmp_path / "features").path).unlink()
     seen = count_reads(monkeypatch)
-    extract(session, tmp_path / "features")
-    assert sorted(seen) == ["b/images/0.png", "b/images/1.png"]
+    assert len(extract(session, tmp_path / "features")) == len(seen) == 5
 
 
-def test_a_killed_run_keeps_its_finished_shards(
+def test_a_stopped_run_keeps_its_finished_parts(
     session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def killed(path: Path, gray: bool = False) -> NDArray[np.uint8]:
+    def stopped(path: Path, gray: bool = False) -> NDArray[np.uint8]:
         if "/b/" in str(path):
             raise KeyboardInterrupt
         return read_image(path, gray)
 
-    monkeypatch.setattr(features, "read_image", killed)
+    monkeypatch.setattr(groups, "PART_GROUPS", 2)
+    monkeypatch.setattr(features, "read_image", stopped)
     with pytest.raises(KeyboardInterrupt):
         extract(session, tmp_path / "features", workers=1)
-    assert not (tmp_path / "features" / "ios_map" / "b" / "00000.h5").exists()
-    assert not list((tmp_path / "features").rglob(".*partial*"))
+    assert not list((tmp_path / "features").rglob("*partial*"))
     seen = count_reads(monkeypatch)
     store = extract(session, tmp_path / "features")
-    assert sorted(seen) == ["b/images/0.png", "b/images/1.png"]
-    assert len(store.names) == 5
+    assert sorted(seen) == ["a/images/2.png", "b/images/0.png", "b/images/1.png"]
+    assert len(store) == 5
+    assert sorted(path.name for path in store.path.parent.iterdir()) == [
+        store.path.name, sidecar_path(store.path).name
+    ]  # fmt: skip
 
 
-def test_shards_are_cut_by_number_of_images(session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(features, "SHARD_IMAGES", 2)
+KILLED = """
+import os, signal, sys
+import numpy as np
+from toolkit import features, groups
+from toolkit.capture import Session
+
+folder, out = sys.argv[1:]
+groups.PART_GROUPS = 2
+class Killed(features.SiftExtractor):
+    count = 0
+    def extract(self, images):
+        self.count += 1
+        if self.count == 4:  # two images are in a whole part, the third in one that is being written
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().extract(images)
+sift = Killed(features.SiftSettings(min_long_side=0, max_keypoints=200))
+features.prefetch = lambda function, items, workers: map(function, items)  # the one before has been written
+features.extract_session(Session.open(folder), out, sift, progress=False)
+"""
+
+
+def test_a_killed_writer_loses_no_more_than_a_part(
+    session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "features"
+    first = extract(session, out, rows=np.array([5]))  # a whole file is already there
+    ended = subprocess.run([sys.executable, "-c", KILLED, str(session.path), str(out)], check=False)
+    assert ended.returncode == -signal.SIGKILL
+    left = list(first.path.parent.glob(f".{first.path.name}.parts/.*partial*"))
+    assert len(left) == 1  # torn, under a name that nobody takes for a part
+    left[0].rename(left[0].with_name("00001.h5"))  # and under one that might be
+    seen = count_reads(monkeypatch)
+    store = extract(session, out)
+    assert sorted(seen) == ["a/images/2.png", "b/images/0.png"]
+    for row in (0, 2, 3, 4, 5):
+        assert_same(store[session.image_name(row)], SIFT.extract([textured(row)])[0])
+    assert not list(first.path.parent.glob(".*"))
+
+
+def test_the_record_beside_a_file_says_what_it_was_made_from(session: Session, tmp_path: Path) -> None:
     store = extract(session, tmp_path / "features")
-    folder = tmp_path / "features" / "ios_map"
-    found = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.h5"))
-    assert found == ["a/00000.h5", "a/00001.h5", "b/00000.h5"]
-    assert len(store.names) == 5
+    record = json.loads(sidecar_path(store.path).read_text())["settings"]
+    assert record["made_by"]["max_keypoints"] == 200
+    assert record["groups"] == store.made_from
+    assert is_current(store.path, record)
+    assert store.path == features_path(tmp_path / "features", "ios_map", SIFT.settings)
 
 
-def test_the_record_beside_a_shard_says_what_it_was_made_from(session: Session, tmp_path: Path) -> None:
-    extract(session, tmp_path / "features")
-    shard = tmp_path / "features" / "ios_map" / "a" / "00000.h5"
-    record = json.loads(sidecar_path(shard).read_text())["settings"]
-    assert record["features"]["max_keypoints"] == 200
-    assert is_current(shard, record)
+def test_an_image_that_is_listed_twice_is_there_once(session: Session, tmp_path: Path) -> None:
+    images = session.path / "images.txt"
+    lines = images.read_text().splitlines()
+    images.write_text("\n".join([*lines, lines[-1]]) + "\n")
+    twice = Session.open(session.path)
+    assert len(twice.camera_rows) == 6
+    assert len(extract(twice, tmp_path / "features")) == 5
+
+
+def hloc_features(path: Path, name: str) -> dict[str, NDArray]:
+    """Read an image's features as hloc's matcher does, and its keypoints as hloc's triangulation does."""
+    with h5py.File(str(path), "r", libver="latest") as file:
+        return {key: item.__array__() for key, item in file[name].items()}
+
+
+def test_files_are_in_the_layout_of_hloc(session: Session, tmp_path: Path) -> None:
+    store = extract(session, tmp_path / "features")
+    name = session.image_name(0)
+    ours, theirs = store[name], hloc_features(store.path, name)
+    np.testing.assert_array_equal(theirs["keypoints"] + 0.5, ours.keypoints)  # "COLMAP origin"
+    assert theirs["descriptors"].shape == (128, len(ours))
+    np.testing.assert_array_equal(theirs["descriptors"].T.astype(np.float32), unit_descriptors(ours.descriptors))
+    np.testing.assert_allclose(np.linalg.norm(theirs["descriptors"].astype(np.float32), axis=0), 1, atol=0.02)
+    np.testing.assert_array_equal(theirs["scores"], ours.scores)
+    assert theirs["image_size"].tolist() == [320, 240]
+    with h5py.File(store.path) as file:  # every data set is an image's: hloc takes its parent for one
+        items: dict[str, bool] = {}
+        file.visititems(lambda key, item: items.update({key: isinstance(item, h5py.Dataset)}))
+        assert {key.rpartition("/")[0] for key, is_dataset in items.items() if is_dataset} == set(store.names)
+        assert file.attrs["top_left_pixel_center"] == 0
+
+
+def test_a_file_of_hloc_is_read(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    path = tmp_path / "feats-superpoint-n4096-r1024.h5"
+    xy = rng.uniform(0, 1000, (50, 2)).astype(np.float16)
+    descriptors = rng.normal(size=(256, 50)).astype(np.float16)
+    with h5py.File(path, "a", libver="latest") as file:
+        group = file.create_group("db/1.jpg")
+        group.create_dataset("keypoints", data=xy)
+        group["keypoints"].attrs["uncertainty"] = 1.5
+        group.create_dataset("descriptors", data=descriptors)
+        group.create_dataset("scores", data=np.ones(50, np.float16))
+        group.create_dataset("image_size", data=np.array([1000, 800]))
+    store = FeatureStore.open(path)
+    assert store.names == ["db/1.jpg"]
+    found = store["db/1.jpg"]
+    assert found.keypoints.dtype == np.float32
+    np.testing.assert_array_equal(found.keypoints, xy.astype(np.float32) + 0.5)
+    np.testing.assert_array_equal(found.descriptors, descriptors.T)
+    np.testing.assert_array_equal(unit_descriptors(found.descriptors), descriptors.T.astype(np.float32))
+    np.testing.assert_array_equal(found.scales, np.ones(50, np.float32))
+    assert found.image_size == (1000, 800)
+
+
+class Batched:
+    """An extractor as a network is one: in colour, some images at a time, float descriptors."""
+
+    colour, batch_size, threaded = True, 2, False
+
+    def __init__(self) -> None:
+        self.calls: list[list[tuple[int, ...]]] = []
+
+    @property
+    def settings(self) -> dict:
+        return {"name": "corners"}
+
+    def extract(self, images: list[NDArray[np.uint8]]) -> list[LocalFeatures]:
+        self.calls.append([image.shape for image in images])
+        one, place = np.ones(1, np.float32), np.array([[0.25, 7]], np.float32)
+        means = [np.full((1, 4), image.mean() / 512, np.float16) for image in images]
+        return [LocalFeatures(place, one, one, mean, (320, 240)) for mean in means]
+
+
+def test_a_network_gets_batches_in_colour_and_its_numbers_come_back(session: Session, tmp_path: Path) -> None:
+    session.image_path(2).unlink()
+    corners = Batched()
+    store = extract_session(session, tmp_path / "features", corners, progress=False)
+    assert [shape for call in corners.calls for shape in call] == [(240, 320, 3)] * 4
+    assert max(map(len, corners.calls)) == 2
+    assert set(store.failed) == {session.image_name(2)}
+    for row in (0, 3, 4, 5):
+        found = store[session.image_name(row)]
+        np.testing.assert_allclose(found.keypoints, [[0.25, 7]], atol=1e-7)
+        mean = np.float16(read_image(session.image_path(row)).mean() / 512)
+        np.testing.assert_array_equal(found.descriptors, np.full((1, 4), mean, np.float16))
+    both = extract(session, tmp_path / "features")
+    assert both.path != store.path
+    assert both.fingerprint != store.fingerprint
+
+
+def test_extractors_by_name() -> None:
+    sift = create_extractor("sift", max_keypoints=200, min_long_side=0)
+    assert sift.settings == SIFT.settings
+    assert next(iter(sift.settings)) == "name"
+    with pytest.raises(ManifestError, match=r"no setting 'keypoints'.*max_keypoints"):
+        create_extractor("sift", keypoints=5)
+    with pytest.raises(ManifestError, match="Unknown local features 'surf'"):
+        create_extractor("surf")
+
+
+def test_sift_of_a_colour_image_is_that_of_its_grey_one() -> None:
+    gray = textured(0)
+    assert_same(SIFT.extract([np.repeat(gray[:, :, None], 3, axis=2)])[0], SIFT.extract([gray])[0])
 
 
 def test_the_same_features_from_a_copy_of_the_capture_elsewhere(session: Session, tmp_path: Path) -> None:

@@ -1,14 +1,16 @@
 """Local features of images, of several kinds: extracted once an image and kept for every later stage.
 
-The cache of a session is a folder of HDF5 shards, each written whole: a killed run loses at most the shard it was
-working on. A shard holds one group an image with `keypoints`, `descriptors`, `scales`, `image_size`.
+Those of a session are kept in one HDF5 file for each kind and settings, in the layout of hloc
+(https://github.com/cvg/Hierarchical-Localization): a group an image, under the image's name, with `keypoints` (N, 2),
+`descriptors` (D, N) of unit length, `scores` (N,) and `image_size` (2,), and the `scales` (N,) of keypoints. There the
+centre of the top-left pixel is at 0, as the attribute of the file says; here, and in `LocalFeatures`, at 0.5.
 """
 
-import json
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib import import_module
+from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -19,22 +21,23 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from toolkit.capture import Session
-from toolkit.errors import ImageError, ManifestError
-from toolkit.files import (
-    file_fingerprint,
-    files_fingerprint,
-    fingerprint,
-    is_current,
-    sidecar_path,
-    write_atomic,
-    write_sidecar,
-)
+from toolkit.errors import ArtefactError, ImageError, ManifestError
+from toolkit.files import files_fingerprint, fingerprint, read_sidecar
+from toolkit.groups import GroupWriter
 from toolkit.images import prefetch, read_image
 
 # RootSIFT vectors have length 1; times 512 they fill the range of a byte, as COLMAP stores them.
 DESCRIPTOR_SCALE = 512.0
 Descriptors = NDArray[np.uint8] | NDArray[np.float16] | NDArray[np.float32]
-SHARD_IMAGES = 64
+PIXEL_CENTER = "top_left_pixel_center"
+"""Attribute of a file: where the centre of the top-left pixel is."""
+SCALE = "scale"
+"""Attribute of the descriptors of a file: they were bytes, over this."""
+# Files have bytes as float16, exactly: a byte over a power of two has 8 significant bits, float16 holds 11. A look-up
+# is several times quicker than a product and a conversion.
+_HALVES = (np.arange(256) / DESCRIPTOR_SCALE).astype(np.float16)
+_BYTES = np.zeros(1 << 16, np.uint8)
+_BYTES[_HALVES.view(np.uint16)] = np.arange(256)
 
 
 @dataclass(frozen=True)
@@ -256,62 +259,112 @@ def _gray(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
-class FeatureStore:
-    """Read access to the extracted features of one session, keyed by image name (`Session.image_name`)."""
+def features_path(out: str | Path, session_id: str, settings: Mapping[str, Any]) -> Path:
+    """Return the file of a session's features in the folder of all features, by the extractor's settings."""
+    return Path(out) / session_id / f"{settings['name']}-{fingerprint(settings)}.h5"
 
-    def __init__(self, folder: Path):
-        self.folder = Path(folder)
-        self.failed: dict[str, str] = {}
+
+class FeatureStore(Mapping[str, LocalFeatures]):
+    """Read access to the local features of many images, by image name (`Session.image_name`).
+
+    Safe to use from several threads. The features of an image are read when they are asked for.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        made_from: Mapping[str, str],
+        failed: Mapping[str, str] | None = None,
+        settings: Mapping[str, Any] | None = None,
+    ):
+        self.path = path
+        self.made_from = dict(made_from)
+        """Name of an image -> fingerprint of what its features were made from."""
+        self.failed = dict(failed or {})
         """Images that could not be read, with the reason."""
-        self._shard_of: dict[str, Path] = {}
-        self._open: dict[Path, h5py.File] = {}
+        self.settings = dict(settings or {})
+        """Of the extractor; empty where they are not known."""
+        self._file: h5py.File | None = None
+        self._bytes = False
+        self._offset = np.float32(0)
         self._lock = threading.Lock()
 
     @classmethod
-    def open(cls, folder: str | Path) -> "FeatureStore":
-        """Open all features of a session that are on disk, whatever they were made from."""
-        store = cls(Path(folder))
-        for path in sorted(Path(folder).rglob("[!.]*.h5")):
-            store.add_shard(path)
-        return store
+    def open(cls, path: str | Path) -> "FeatureStore":
+        """Open a file of features, the toolkit's or hloc's, whatever it was made from.
 
-    def add_shard(self, path: Path) -> bool:
-        """Take up the images of a shard; False if the file is torn."""
+        Raises:
+            ArtefactError: it is missing, torn, or holds no features.
+        """
+        record = read_sidecar(path)
+        if record is not None and "groups" in record:
+            failed = {name: reason for name, (_, reason) in record["failed"].items()}
+            return cls(Path(path), record["groups"], failed, record["made_by"])
+        names: list[str] = []
+
+        def visit(name: str, item: h5py.HLObject) -> None:
+            if isinstance(item, h5py.Dataset) and name.endswith("/keypoints"):
+                names.append(name.removesuffix("/keypoints"))
+
         try:
-            with h5py.File(path, "r") as shard:
-                names, failed = json.loads(shard.attrs["names"]), json.loads(shard.attrs["failed"])
-        except (OSError, KeyError):
-            return False
-        self._shard_of.update(dict.fromkeys(names, path))
-        self.failed.update(failed)
-        return True
+            with h5py.File(path, "r") as file:
+                file.visititems(visit)
+        except OSError as error:
+            raise ArtefactError(f"Local features {path} cannot be read ({error}). Extract them again.") from None
+        if not names:
+            raise ArtefactError(
+                f"{path} holds no local features; expected a group an image with `keypoints` and `descriptors`."
+            )
+        return cls(Path(path), dict.fromkeys(names, files_fingerprint([Path(path)])))
 
     @property
     def fingerprint(self) -> str:
         """16 hex digits that identify the images and settings that the features were made from."""
-        shards = sorted({*self._shard_of.values()})
-        return fingerprint([[path.name, file_fingerprint(sidecar_path(path))] for path in shards])
+        return fingerprint([self.settings, self.made_from, sorted(self.failed)])
 
     @property
     def names(self) -> list[str]:
-        return list(self._shard_of)
+        return list(self.made_from)
 
-    def __contains__(self, name: str) -> bool:
-        return name in self._shard_of
+    def __contains__(self, name: object) -> bool:
+        return name in self.made_from
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.made_from)
+
+    def __len__(self) -> int:
+        return len(self.made_from)
 
     def __getitem__(self, name: str) -> LocalFeatures:
-        path = self._shard_of[name]
-        with self._lock:  # HDF5 is not safe to use from several threads
-            if path not in self._open:
-                self._open[path] = h5py.File(path, "r")
-            group = self._open[path][name]
-            return LocalFeatures(
-                group["keypoints"][()],
-                group["scales"][()],
-                group["scores"][()],
-                group["descriptors"][()],
-                (int(group["image_size"][0]), int(group["image_size"][1])),
-            )
+        if name not in self.made_from:
+            raise KeyError(name)
+        with self._lock:
+            if self._file is None:
+                self._open(name)
+            group = self._file[name]
+            arrays = {key: item[()] for key, item in group.items() if isinstance(item, h5py.Dataset)}
+        try:
+            keypoints = arrays["keypoints"].astype(np.float32, copy=False) + self._offset
+            descriptors = arrays["descriptors"]
+            size = arrays["image_size"]
+        except KeyError as error:
+            raise ArtefactError(f"{self.path}: {name} has no {error}; expected the layout of hloc.") from None
+        if self._bytes:
+            descriptors = np.take(_BYTES, descriptors.view(np.uint16))
+        ones = np.ones(len(keypoints), np.float32)
+        return LocalFeatures(
+            keypoints,
+            arrays.get("scales", ones).astype(np.float32, copy=False),
+            arrays.get("scores", ones).astype(np.float32, copy=False),
+            _transposed(descriptors),
+            (int(size[0]), int(size[1])),
+        )
+
+    def _open(self, name: str) -> None:
+        """Open the file; what holds for one image holds for all."""
+        self._file = h5py.File(self.path, "r")
+        self._offset = np.float32(0.5 - self._file.attrs.get(PIXEL_CENTER, 0.0))
+        self._bytes = self._file[name]["descriptors"].attrs.get(SCALE) == DESCRIPTOR_SCALE
 
 
 def extract_session(
@@ -325,88 +378,106 @@ def extract_session(
 ) -> FeatureStore:
     """Extract the local features of a session's images, or reuse those that are there.
 
+    A killed run goes on where it was, but for at most `groups.PART_GROUPS` images. Memory does not grow with the
+    session.
+
     Args:
         session: the session; only its camera images are read.
-        out: folder of all features; this session's go to `<out>/<session id>/`.
+        out: folder of all features; this session's go to `features_path`.
         extractor: how to extract; None: SIFT.
-        rows: rows of `session.images` that are needed now; all where None. The shards they fall in are extracted.
+        rows: rows of `session.images` that are needed; all where None.
         workers: threads.
-        skip_existing: reuse shards made from the same images and settings.
+        skip_existing: reuse the features of images that have not changed since.
 
     Returns:
-        The store of the features of (at least) the rows asked for. Unreadable images are in its `failed`.
+        The store of the features of the rows asked for. Unreadable images are in its `failed`.
     """
     extractor = extractor or SiftExtractor()
-    folder = Path(out) / session.id
-    store = FeatureStore(folder)
-    cameras = session.camera_rows
-    wanted = cameras if rows is None else np.intersect1d(cameras, rows)
-    shards = list(_shards(session, cameras))
-    calibration = file_fingerprint(session.path / "sensors.txt")
-    todo: list[tuple[Path, dict[str, Any], NDArray[np.int64]]] = []
-    for path, members in ((folder / name, members) for name, members in shards):
-        if not np.isin(members, wanted).any():
-            continue
-        images = files_fingerprint([session.image_path(int(row)) for row in members])
-        record = {"features": extractor.settings, "images": images, "sensors": calibration}
-        if not (skip_existing and is_current(path, record) and store.add_shard(path)):
-            todo.append((path, record, members))
-    total = sum(len(members) for _, _, members in todo)
-    cv2_threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # the images are the parallel dimension
-    try:
-        with tqdm(total=total, desc=f"features {session.id}", unit="image", disable=not progress or not total) as bar:
-            for path, record, members in todo:
-                _write_shard(path, session, members, extractor, workers, bar)
-                write_sidecar(path, record)
-                store.add_shard(path)
-    finally:
-        cv2.setNumThreads(cv2_threads)
-    return store
-
-
-def _shards(session: Session, rows: NDArray[np.int64]) -> Iterator[tuple[str, NDArray[np.int64]]]:
-    """Cut the rows into shards that do not cross subsessions; yields file names and rows."""
-    subsessions = session.subsession_of(rows)
-    for subsession in dict.fromkeys(subsessions):
-        members = rows[subsessions == subsession]
-        for start in range(0, len(members), SHARD_IMAGES):
-            yield f"{subsession}/{start // SHARD_IMAGES:05d}.h5", members[start : start + SHARD_IMAGES]
-
-
-def _write_shard(
-    path: Path, session: Session, rows: NDArray[np.int64], extractor: Extractor, workers: int, bar: Any
-) -> None:
-    def extract(row: int) -> LocalFeatures | str:
+    wanted = session.camera_rows if rows is None else np.intersect1d(session.camera_rows, rows)
+    row_of: dict[str, int] = {}
+    for row in wanted.tolist():
+        row_of.setdefault(session.image_name(row), row)  # a line of images.txt may be there twice
+    made_from = {name: _made_from(session, row) for name, row in row_of.items()}
+    path, label = features_path(out, session.id, extractor.settings), f"{extractor.settings['name']} {session.id}"
+    with GroupWriter(path, extractor.settings, {PIXEL_CENTER: 0.0}) as writer:
+        index = writer.index
+        done = {*index.groups.items(), *((name, note[0]) for name, note in index.failed.items())}
+        todo = [item for item in made_from.items() if not (skip_existing and item in done)]
+        cv2_threads = cv2.getNumThreads()
+        cv2.setNumThreads(1)  # the images are the parallel dimension
         try:
-            image = read_image(session.image_path(row), gray=True)
+            with tqdm(total=len(todo), desc=label, unit="image", disable=not progress or not todo) as bar:
+                found = _extract(session, [row_of[image] for image, _ in todo], extractor, workers)
+                for (image, source), features in zip(todo, found, strict=True):
+                    if isinstance(features, str):
+                        writer.fail(image, source, features)
+                    else:
+                        _write(writer, image, source, features)
+                    bar.update()
+        finally:
+            cv2.setNumThreads(cv2_threads)
+        writer.finish()
+        index = writer.index
+    failed = {name: index.failed[name][1] for name in made_from if name in index.failed}
+    known = {name: source for name, source in made_from.items() if name in index.groups}
+    return FeatureStore(path, known, failed, extractor.settings)
+
+
+def _transposed(matrix: NDArray[Any]) -> NDArray[Any]:
+    """Return a copy (M, N) of a matrix (N, M)."""
+    # OpenCV is ten times quicker at it, but knows no matrix without entries, and no float16 in some versions.
+    return cv2.transpose(matrix) if matrix.size and matrix.dtype == np.uint8 else np.ascontiguousarray(matrix.T)
+
+
+def _made_from(session: Session, row: int) -> str:
+    """Identify an image by name, size and time of change of its file, and by the size that its camera has."""
+    camera = session.camera(session.images["sensor_id"].iloc[row])
+    return fingerprint([files_fingerprint([session.image_path(row)]), camera.width, camera.height])
+
+
+def _extract(
+    session: Session, rows: list[int], extractor: Extractor, workers: int
+) -> Iterator[LocalFeatures | str]:
+    """Yield the features of each image, or why it has none."""
+    sensors = session.images["sensor_id"].to_numpy()
+
+    def read(row: int) -> NDArray[np.uint8] | str:
+        try:
+            image = read_image(session.image_path(row), gray=not extractor.colour)
         except ImageError as error:
             return str(error)
         camera = session.camera(sensors[row])
-        if image.shape != (camera.height, camera.width):
+        if image.shape[:2] != (camera.height, camera.width):
             return (
                 f"Image of {image.shape[1]} x {image.shape[0]} pixels, but sensors.txt says {camera.width} x "
                 f"{camera.height} for {sensors[row]}: {session.image_path(row)}"
             )
-        return extractor.extract([image])[0]
+        return image
 
-    sensors = session.images["sensor_id"].to_numpy()
-    names: list[str] = []
-    failed: dict[str, str] = {}
-    with write_atomic(path) as temporary, h5py.File(temporary, "w") as shard:
-        for row, features in zip(rows, prefetch(extract, rows.tolist(), workers), strict=True):
-            name = session.image_name(int(row))
-            if isinstance(features, str):
-                failed[name] = features
-            elif name not in shard:  # a line of images.txt may be there twice
-                names.append(name)
-                group = shard.create_group(name)
-                group["keypoints"] = features.keypoints
-                group["scales"] = features.scales
-                group["scores"] = features.scores
-                group["descriptors"] = features.descriptors
-                group["image_size"] = np.array(features.image_size, np.int64)
-            bar.update()
-        # Attributes are limited to 64 kB in HDF5's old layout: 64 names stay below it.
-        shard.attrs["names"] = json.dumps(names)
-        shard.attrs["failed"] = json.dumps(failed)
+    def both(row: int) -> LocalFeatures | str:
+        image = read(row)
+        return image if isinstance(image, str) else extractor.extract([image])[0]
+
+    if extractor.threaded:
+        yield from prefetch(both, rows, workers)
+        return
+    images = prefetch(read, rows, workers, ahead=2 * extractor.batch_size)
+    while batch := list(islice(images, extractor.batch_size)):
+        found = iter(extractor.extract([image for image in batch if not isinstance(image, str)]))
+        for image in batch:
+            yield image if isinstance(image, str) else next(found)
+
+
+def _write(writer: GroupWriter, name: str, made_from: str, features: LocalFeatures) -> None:
+    """Write the features of an image as hloc has them."""
+    descriptors = _transposed(features.descriptors)
+    quantised = descriptors.dtype == np.uint8
+    arrays = {
+        # Exact from 0.5 px on, where the difference has no more digits than the number.
+        "keypoints": features.keypoints - np.float32(0.5),
+        "scales": features.scales,
+        "scores": features.scores,
+        "descriptors": np.take(_HALVES, descriptors) if quantised else descriptors,
+        "image_size": np.array(features.image_size, np.int64),
+    }
+    writer.add(name, made_from, arrays, {"descriptors": {SCALE: DESCRIPTOR_SCALE}} if quantised else {})

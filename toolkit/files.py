@@ -85,18 +85,24 @@ def write_sidecar(path: str | Path, settings: dict[str, Any]) -> None:
     write_text(sidecar_path(path), json.dumps(record, indent=1, default=_jsonable) + "\n")
 
 
-def is_current(path: str | Path, settings: dict[str, Any]) -> bool:
-    """Tell whether the artefact `path` is whole and was made by this version from exactly these settings."""
-    if not Path(path).exists():
-        return False
+def read_sidecar(path: str | Path) -> dict[str, Any] | None:
+    """Return the settings that the artefact `path` was made from; None unless it is whole and of this version."""
     try:
         record = json.loads(sidecar_path(path).read_text(encoding="utf-8"))
+        current = {"version": __version__, "bytes": Path(path).stat().st_size}
     except (OSError, ValueError):
-        return False
-    if not isinstance(record, dict):
-        return False
-    current = {"version": __version__, "fingerprint": fingerprint(settings), "bytes": Path(path).stat().st_size}
-    return all(record.get(key) == value for key, value in current.items())
+        return None
+    if not isinstance(record, dict) or any(record.get(key) != value for key, value in current.items()):
+        return None
+    settings = record.get("settings")
+    whole = isinstance(settings, dict) and record.get("fingerprint") == fingerprint(settings)
+    return settings if whole else None
+
+
+def is_current(path: str | Path, settings: dict[str, Any]) -> bool:
+    """Tell whether the artefact `path` is whole and was made by this version from exactly these settings."""
+    found = read_sidecar(path)
+    return found is not None and fingerprint(found) == fingerprint(settings)
 
 
 class Progress:

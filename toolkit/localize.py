@@ -20,7 +20,7 @@ from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.embedders import Embedder, create_embedder, load_embeddings
 from toolkit.errors import ArtefactError, ImageError, ManifestError
-from toolkit.features import FeatureStore, LocalFeatures, SiftExtractor, extract_session
+from toolkit.features import FeatureStore, LocalFeatures, SiftExtractor, extract_session, features_path
 from toolkit.files import (
     SceneFiles,
     file_fingerprint,
@@ -607,7 +607,8 @@ class Map:
         vectors, table = load_embeddings(files.embeddings / session)
         names = [path.split("/sessions/", 1)[-1] for path in table["abs_path"]]
         indices = np.array([local_map.index_of.get(name, -1) for name in names], np.int64)
-        localizer = PnpLocalizer(local_map, FeatureStore.open(files.features / session))
+        store = FeatureStore.open(features_path(files.features, session, SiftExtractor().settings))
+        localizer = PnpLocalizer(local_map, store)
         if embedder is None:
             embedder = create_embedder("vlad", vocabulary=files.embeddings / "vlad.npz")
         if embedder.dim != vectors.shape[1]:

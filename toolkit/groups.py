@@ -1,0 +1,180 @@
+"""HDF5 files of named groups of arrays: one file a session, added to run by run, safe against a kill.
+
+HDF5 itself is not: a file that was open for writing when its writer died cannot be read. So a run writes what it makes
+to hidden parts, each whole or not there at all, and joins them to the file when it ends; the next run takes up the
+parts that a killed one has left. The record beside the file tells for each group what it was made from.
+"""
+
+import shutil
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import h5py
+from numpy.typing import NDArray
+
+from toolkit.files import read_sidecar, sidecar_path, write_atomic, write_sidecar
+
+PART_GROUPS = 64
+"""Groups a part: what a kill costs at most."""
+
+
+@dataclass
+class Index:
+    """What a file holds."""
+
+    groups: dict[str, str] = field(default_factory=dict)
+    """Name of a group -> fingerprint of what it was made from."""
+    failed: dict[str, list[str]] = field(default_factory=dict)
+    """Name of what could not be made -> the fingerprint of what it should have been made from, and the reason."""
+
+    def update(self, later: "Index") -> None:
+        """Take over what was made later; it replaces what was there."""
+        for name in later.groups:
+            self.failed.pop(name, None)
+        for name in later.failed:
+            self.groups.pop(name, None)
+        self.groups |= later.groups
+        self.failed |= later.failed
+
+    def record(self, made_by: Mapping[str, Any]) -> dict[str, Any]:
+        return {"made_by": made_by, "groups": self.groups, "failed": self.failed}
+
+
+def read_index(path: Path, made_by: Mapping[str, Any]) -> Index | None:
+    """Return what a file holds that was made by these settings; None if it is torn, or not there, or another's."""
+    record = read_sidecar(path)
+    if record is None or record.get("made_by") != made_by:
+        return None
+    try:
+        with h5py.File(path, "r"):  # HDF5 notices a file that is shorter than it was
+            return Index(record["groups"], record["failed"])
+    except (OSError, KeyError):
+        return None
+
+
+class GroupWriter:
+    """Adds groups to a file; a context, whose work stands when `finish` returns.
+
+    One process at a time may add to a file. Others may read it meanwhile: it is replaced, never changed.
+    """
+
+    def __init__(self, path: Path, made_by: Mapping[str, Any], attributes: Mapping[str, Any] | None = None):
+        """
+        Args:
+            path: the file, `.h5`.
+            made_by: JSON; what all groups were made by. Groups of a file made by something else are not kept.
+            attributes: of the file, for other readers.
+        """
+        self.path = path
+        self.index = Index()
+        """What is there, and in parts."""
+        self._made_by = made_by
+        self._attributes = attributes or {}
+        self._folder = path.with_name(f".{path.name}.parts")
+        self._parts: dict[Path, Index] = {}
+        self._whole = read_index(path, made_by)
+        for part in sorted(self._folder.glob("[!.]*.h5")):
+            index = read_index(part, made_by)
+            if index is None:
+                _remove(part)
+            else:
+                self._parts[part] = index
+        for known in (self._whole, *self._parts.values()):
+            if known is not None:
+                self.index.update(known)
+        self._stack = ExitStack()
+        self._open: tuple[Path, h5py.File, Index] | None = None
+
+    def __enter__(self) -> "GroupWriter":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)  # drops a part that is not complete
+
+    def add(
+        self,
+        name: str,
+        made_from: str,
+        arrays: Mapping[str, NDArray[Any]],
+        attributes: Mapping[str, Mapping[str, Any]] | None = None,
+    ) -> None:
+        """Write a group, and attributes of some of its arrays; `made_from` identifies what it was made from."""
+        file, index = self._part()
+        group = file.create_group(name)
+        for key, array in arrays.items():
+            group[key] = array
+        for key, values in (attributes or {}).items():
+            group[key].attrs.update(values)
+        index.groups[name] = made_from
+        self._close_if_full(index)
+
+    def fail(self, name: str, made_from: str, reason: str) -> None:
+        """Note why there is no such group."""
+        _, index = self._part()
+        index.failed[name] = [made_from, reason]
+        self._close_if_full(index)
+
+    def finish(self) -> None:
+        """Join all parts to the file."""
+        self._close_part()
+        if not self._parts:
+            return
+        joined = Index() if self._whole is None else self._whole
+        parts = dict(self._parts)
+        with write_atomic(self.path) as temporary:
+            if self._whole is None:
+                first = next(iter(parts))
+                joined.update(parts.pop(first))
+                shutil.copyfile(first, temporary)
+            else:
+                shutil.copyfile(self.path, temporary)
+            with h5py.File(temporary, "a", libver="latest") as file:
+                for part, index in parts.items():
+                    joined.update(index)
+                    for name in (*index.groups, *index.failed):
+                        if name in file:
+                            del file[name]
+                    with h5py.File(part, "r") as source:
+                        for name in index.groups:
+                            source.copy(name, file, name)
+        write_sidecar(self.path, joined.record(self._made_by))
+        self._whole, self.index = joined, joined
+        for part in self._parts:
+            _remove(part)
+        self._folder.rmdir()
+        self._parts = {}
+
+    def _part(self) -> tuple[h5py.File, Index]:
+        """Return the part that is being written, a new one where there is none."""
+        if self._open is None:
+            last = max((int(path.stem) for path in self._parts), default=-1)
+            path = self._folder / f"{last + 1:05d}.h5"
+            temporary = self._stack.enter_context(write_atomic(path))
+            file = self._stack.enter_context(h5py.File(temporary, "w", libver="latest"))
+            file.attrs.update(self._attributes)
+            self._open = path, file, Index()
+        return self._open[1:]
+
+    def _close_if_full(self, index: Index) -> None:
+        if len(index.groups) + len(index.failed) >= PART_GROUPS:
+            self._close_part()
+
+    def _close_part(self) -> None:
+        if self._open is not None:
+            path, _, index = self._open
+            self._open = None
+            self._stack.close()
+            write_sidecar(path, index.record(self._made_by))
+            self._parts[path] = index
+            self.index.update(index)
+
+
+def _remove(path: Path) -> None:
+    path.unlink(missing_ok=True)
+    sidecar_path(path).unlink(missing_ok=True)
