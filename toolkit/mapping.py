@@ -1,6 +1,6 @@
 """The map: images with known poses, and points triangulated from matches between them."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, lru_cache
@@ -17,14 +17,21 @@ from tqdm.auto import tqdm
 from toolkit import geometry
 from toolkit.capture import Session
 from toolkit.errors import ArtefactError, ImageError
-from toolkit.features import FeatureStore, LocalFeatures
+from toolkit.features import FeatureStore, LocalFeatures, feature_kind
 from toolkit.files import fingerprint, is_current, write_atomic, write_sidecar
+from toolkit.groups import GroupWriter
 from toolkit.images import prefetch, read_image
-from toolkit.matching import match_along_epipolar_lines, unit_descriptors
+from toolkit.matching import (
+    MatchStore,
+    PairMatches,
+    group_name,
+    match_along_epipolar_lines,
+    matches_path,
+    unit_descriptors,
+    write_matches,
+)
 
 Floats = NDArray[np.float64]
-
-PAIRS_A_FILE = 500
 
 
 def rays_of(camera: pycolmap.Camera, pixels: NDArray[np.floating]) -> Floats:
@@ -118,8 +125,9 @@ def match_pairs(
     world_from_cams: Floats,
     max_error_px: float = 4.0,
     ratio: float = 0.9,
+    min_score: float = 0.6,
     workers: int = 1,
-) -> Iterator[NDArray[np.int64]]:
+) -> Iterator[PairMatches]:
     """Match the features of image pairs whose poses are known, along epipolar lines only.
 
     Args:
@@ -128,10 +136,11 @@ def match_pairs(
         cameras, world_from_cams: N images, (N, 4, 4).
         max_error_px: largest distance of a match to its epipolar line, at either side.
         ratio: Lowe's ratio, among the candidates along the line.
+        min_score: least cosine similarity of a match.
         workers: threads.
 
     Yields:
-        For each pair (K, 2) indices of matched features.
+        The matches of each pair.
     """
     cams_from_world = geometry.invert(world_from_cams)
 
@@ -140,14 +149,16 @@ def match_pairs(
         features = load(index)
         return unit_descriptors(features.descriptors), rays_of(cameras[index], features.keypoints)
 
-    def match(pair: NDArray[np.int64]) -> NDArray[np.int64]:
+    def match(pair: NDArray[np.int64]) -> PairMatches:
         i, j = int(pair[0]), int(pair[1])
         (descriptors_i, rays_i), (descriptors_j, rays_j) = prepare(i), prepare(j)
         angle_i, angle_j = (max_error_px / cameras[index].mean_focal_length() for index in (i, j))
         j_from_i = cams_from_world[j] @ world_from_cams[i]
-        return match_along_epipolar_lines(
-            descriptors_i, descriptors_j, rays_i, rays_j, j_from_i, angle_i, angle_j, ratio
+        indices = match_along_epipolar_lines(
+            descriptors_i, descriptors_j, rays_i, rays_j, j_from_i, angle_i, angle_j, ratio, min_score
         )
+        scores = np.einsum("kd,kd->k", descriptors_i[indices[:, 0]], descriptors_j[indices[:, 1]])
+        return PairMatches(indices, scores)
 
     return prefetch(match, pairs, workers)
 
@@ -236,13 +247,9 @@ class LocalMap:
 
     def save(self, path: str | Path) -> None:
         """Write the map as one `.npz` file."""
-        cameras = [
-            f"{c.model.name}, {c.width}, {c.height}, " + ", ".join(repr(float(p)) for p in c.params)
-            for c in self.cameras
-        ]
         arrays: dict[str, Any] = {
             "image_names": np.array(self.image_names, np.str_),
-            "cameras": np.array(cameras, np.str_),
+            "cameras": np.array([camera_text(camera) for camera in self.cameras], np.str_),
         }
         for name in ("world_from_cams", "points", "colors", "obs_image", "obs_keypoint", "obs_point"):
             arrays[name] = getattr(self, name)
@@ -265,6 +272,12 @@ class LocalMap:
             raise ArtefactError(
                 f"The triangulated map {path} cannot be read ({error}). Build it with the localize stage."
             ) from None
+
+
+def camera_text(camera: pycolmap.Camera) -> str:
+    """Return a camera in one line: model, width, height, parameters, all their digits."""
+    params = ", ".join(repr(float(p)) for p in camera.params)
+    return f"{camera.model.name}, {camera.width}, {camera.height}, {params}"
 
 
 def _camera(text: str) -> pycolmap.Camera:
@@ -421,7 +434,8 @@ def build_map(
 ) -> LocalMap:
     """Triangulate the map of a session from its poses, or load the one at `path` if it is current.
 
-    Matches are kept beside it in `<name>.matches/`, some hundred pairs a file, so that a killed run goes on there.
+    Matches are kept beside it (see `toolkit.matching.matches_path`), so that a killed run goes on there, and one after
+    a change matches only the images that have changed.
 
     Args:
         session: a map session.
@@ -453,55 +467,66 @@ def build_map(
     devices = session.images["timestamp"].astype(str) + " " + session.device_ids
     groups = np.unique(devices.to_numpy(str)[rows], return_inverse=True)[1]
     pairs = select_pairs(poses[rows], cameras, groups, settings.pairs_per_image)
-    matches: list[NDArray[np.int64]] = []
-    with tqdm(total=len(pairs), desc=f"match {session.id}", unit="pair") as bar:
-        for start in range(0, len(pairs), PAIRS_A_FILE):
-            part = pairs[start : start + PAIRS_A_FILE]
-            cache = Path(path).with_suffix(".matches") / f"{start // PAIRS_A_FILE:05d}.npz"
-            record = {
-                "inputs": inputs,
-                "pairs": fingerprint(part.tolist()),
-                "max_epipolar_error_px": settings.max_epipolar_error_px,
-                "ratio": settings.ratio,
-            }
-            kept = _load_matches(cache) if skip_existing and is_current(cache, record) else None
-            if kept is None:
-                found = match_pairs(
-                    part,
-                    lambda index: features[names[rows[index]]],
-                    cameras,
-                    poses[rows],
-                    settings.max_epipolar_error_px,
-                    settings.ratio,
-                    workers,
-                )
-                kept = list(found)
-                _save_matches(cache, kept)
-                write_sidecar(cache, record)
-            matches += kept
-            bar.update(len(part))
-    keypoints = [features[names[row]].keypoints for row in rows]
-    local_map = triangulate([names[row] for row in rows], cameras, poses[rows], keypoints, pairs, matches, settings)
+    names = [names[row] for row in rows]
+    keypoints = [features[name].keypoints for name in names]
+    made_by = {"features": [features.settings] * 2, "matcher": _matcher(features, settings)}
+    matches_file = matches_path(Path(path).parent, session.id, session.id, made_by)
+    with GroupWriter(matches_file, made_by) as writer:
+        counts = [len(xy) for xy in keypoints]
+        _match(writer, features, names, counts, cameras, poses[rows], pairs, made_by["matcher"], skip_existing, workers)
+        writer.finish()
+    kept = MatchStore(matches_file)
+    matches = [kept[names[i], names[j]].indices for i, j in pairs]
+    local_map = triangulate(names, cameras, poses[rows], keypoints, pairs, matches, settings)
     local_map = _colored(local_map, session, rows, keypoints)
     local_map.save(path)
     write_sidecar(path, map_record)
     return local_map
 
 
-def _save_matches(path: Path, parts: list[NDArray[np.int64]]) -> None:
-    """Write the matches of many pairs, one after the other, and how many each pair has."""
-    together = np.concatenate([*parts, np.zeros((0, 2), np.int64)]).astype(np.uint16)  # keypoints are thousands
-    with write_atomic(path) as temporary, open(temporary, "wb") as stream:
-        np.savez(stream, matches=together, counts=np.array([len(part) for part in parts], np.int64))
+def _matcher(features: FeatureStore, settings: MapSettings) -> dict[str, Any]:
+    """Return how the pairs of a map are matched."""
+    return {
+        "name": "epipolar",
+        "max_error_px": settings.max_epipolar_error_px,
+        "ratio": settings.ratio,
+        "min_score": feature_kind(features.settings.get("name", "sift")).epipolar_min_score,
+    }
 
 
-def _load_matches(path: Path) -> list[NDArray[np.int64]] | None:
-    """Return the matches of each pair; None if the file is torn."""
-    try:
-        with np.load(path) as arrays:
-            return np.split(arrays["matches"].astype(np.int64), np.cumsum(arrays["counts"])[:-1])
-    except (OSError, EOFError, ValueError, KeyError, BadZipFile):
-        return None
+def _match(
+    writer: GroupWriter,
+    features: FeatureStore,
+    names: Sequence[str],
+    counts: Sequence[int],
+    cameras: Sequence[pycolmap.Camera],
+    world_from_cams: Floats,
+    pairs: NDArray[np.int64],
+    matcher: Mapping[str, Any],
+    skip_existing: bool,
+    workers: int,
+) -> None:
+    """Match the pairs of a map along epipolar lines, but for those whose matches are there."""
+    made_from = [
+        fingerprint([features.made_from[name], camera_text(camera), pose.tolist()])
+        for name, camera, pose in zip(names, cameras, world_from_cams, strict=True)
+    ]
+    known = writer.index.groups if skip_existing else {}
+    wanted = {(i, j): (group_name(names[i], names[j]), made_from[i] + made_from[j]) for i, j in pairs.tolist()}
+    todo = [pair for pair, (group, source) in wanted.items() if known.get(group) != source]
+    found = match_pairs(
+        np.array(todo, np.int64).reshape(-1, 2),
+        lambda index: features[names[index]],
+        cameras,
+        world_from_cams,
+        matcher["max_error_px"],
+        matcher["ratio"],
+        matcher["min_score"],
+        workers,
+    )
+    label = f"match {names[0].split('/')[0]}"
+    for (i, j), matches in zip(todo, tqdm(found, total=len(todo), desc=label, unit="pair"), strict=True):
+        write_matches(writer, (names[i], names[j]), wanted[i, j][1], (counts[i], counts[j]), matches)
 
 
 def _colored(

@@ -1,15 +1,28 @@
-"""Match local features between images: mutual nearest neighbours, narrowed by whatever is known of the geometry."""
+"""Match local features between images: mutual nearest neighbours, networks, and along epipolar lines.
 
-from collections.abc import Callable, Sequence
+Matches of two sessions are kept in one HDF5 file, in the layout of hloc
+(https://github.com/cvg/Hierarchical-Localization): a group a pair of images, `<image>/<image>` with `/` in the names
+replaced by `-`, with `matches0` (N,), for each feature of the first image that of the second or -1, and
+`matching_scores0` (N,).
+"""
+
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
+from itertools import islice
+from pathlib import Path
 from typing import Any, Protocol
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
+from tqdm.auto import tqdm
 
-from toolkit.errors import ManifestError
-from toolkit.features import DESCRIPTOR_SCALE, Descriptors, LocalFeatures
+from toolkit.errors import ArtefactError, ManifestError
+from toolkit.features import DESCRIPTOR_SCALE, Descriptors, FeatureStore, LocalFeatures
+from toolkit.files import fingerprint
+from toolkit.groups import GroupWriter
 
 Floats = NDArray[np.float64]
 
@@ -94,6 +107,120 @@ class MutualMatcher:
             indices = mutual_matches(scores, self.ratio, self.min_score)
             found.append(PairMatches(indices, scores[indices[:, 0], indices[:, 1]]))
         return found
+
+
+def matches_path(out: str | Path, session0: str, session1: str, made_by: Mapping[str, Any]) -> Path:
+    """Return the file of the matches of two sessions.
+
+    Args:
+        out: folder of all matches.
+        session0, session1: the sessions' ids.
+        made_by: settings of the `features`, each by session, and of the `matcher`.
+    """
+    features, matcher = made_by["features"][0].get("name", "features"), made_by["matcher"]["name"]
+    return Path(out) / f"{session0}-{session1}" / f"{features}-{matcher}-{fingerprint(made_by)}.h5"
+
+
+class MatchStore:
+    """Read access to the matches of two sessions' images. Safe to use from several threads."""
+
+    def __init__(self, path: str | Path):
+        """
+        Args:
+            path: a file of the toolkit or of hloc.
+        """
+        self.path = Path(path)
+        self._file: h5py.File | None = None
+        self._lock = threading.Lock()
+
+    def __getitem__(self, names: tuple[str, str]) -> PairMatches:
+        """Return the matches of two images, in whichever order the file has them.
+
+        Raises:
+            KeyError: the file does not have the pair.
+            ArtefactError: the file cannot be read.
+        """
+        with self._lock:
+            if self._file is None:
+                try:
+                    self._file = h5py.File(self.path, "r")
+                except OSError as error:
+                    raise ArtefactError(f"Matches {self.path} cannot be read ({error}). Match again.") from None
+            reverse = group_name(*names) not in self._file
+            name = group_name(*names[::-1]) if reverse else group_name(*names)
+            if name not in self._file:
+                raise KeyError(names)
+            group = self._file[name]
+            found, scores = group["matches0"][()], group["matching_scores0"][()]
+        first = np.flatnonzero(found >= 0)
+        indices = np.stack([first, found[first].astype(np.int64)], axis=1)
+        return PairMatches(indices[:, ::-1] if reverse else indices, scores[first].astype(np.float32))
+
+
+def write_matches(
+    writer: GroupWriter, names: tuple[str, str], made_from: str, counts: tuple[int, int], matches: PairMatches
+) -> None:
+    """Add the matches of two images, of which each has so many features, to a file."""
+    # hloc has 16 bits too; networks that find more features than these hold are rare.
+    matches0 = np.full(counts[0], -1, np.int16 if max(counts) <= np.iinfo(np.int16).max else np.int32)
+    scores = np.zeros(counts[0], np.float16)
+    matches0[matches.indices[:, 0]] = matches.indices[:, 1]
+    scores[matches.indices[:, 0]] = matches.scores
+    writer.add(group_name(*names), made_from, {"matches0": matches0, "matching_scores0": scores})
+
+
+def match_sessions(
+    stores: tuple[FeatureStore, FeatureStore],
+    pairs: Iterable[tuple[str, str]],
+    matcher: Matcher,
+    out: str | Path,
+    sessions: tuple[str, str],
+    skip_existing: bool = True,
+) -> MatchStore:
+    """Match pairs of images of two sessions, or reuse the matches that are there. A killed run goes on where it was.
+
+    Args:
+        stores: features of the first images and of the second ones.
+        pairs: names of images, the first session's first.
+        matcher: how to match.
+        out: folder of all matches, see `matches_path`.
+        sessions: the sessions' ids.
+        skip_existing: reuse the matches of features that have not changed since.
+
+    Returns:
+        The matches of (at least) these pairs; of a pair with an image that has no features there are none.
+    """
+    made_by = {"features": [store.settings for store in stores], "matcher": matcher.settings}
+    path = matches_path(out, *sessions, made_by)
+    with GroupWriter(path, made_by) as writer:
+        known = writer.index.groups if skip_existing else {}
+        todo = []
+        for name0, name1 in dict.fromkeys(pairs):
+            if name0 in stores[0] and name1 in stores[1]:
+                made_from = stores[0].made_from[name0] + stores[1].made_from[name1]
+                if known.get(group_name(name0, name1)) != made_from:
+                    todo.append((name0, name1, made_from))
+        label = f"{matcher.settings['name']} {' '.join(sessions)}"
+        with tqdm(total=len(todo), desc=label, unit="pair", disable=not todo) as bar:
+            for part in _parts(todo, matcher.batch_size):
+                features = [(stores[0][name0], stores[1][name1]) for name0, name1, _ in part]
+                for (name0, name1, made_from), both, found in zip(part, features, matcher.match(features), strict=True):
+                    counts = len(both[0]), len(both[1])
+                    write_matches(writer, (name0, name1), made_from, counts, found)
+                bar.update(len(part))
+        writer.finish()
+    return MatchStore(path)
+
+
+def _parts(items: Sequence[tuple[str, str, str]], size: int) -> Iterator[list[tuple[str, str, str]]]:
+    rest = iter(items)
+    while part := list(islice(rest, size)):
+        yield part
+
+
+def group_name(name0: str, name1: str) -> str:
+    """Return the group of a file that has the matches of two images."""
+    return f"{name0.replace('/', '-')}/{name1.replace('/', '-')}"
 
 
 def unit_descriptors(descriptors: Descriptors) -> NDArray[np.float32]:
