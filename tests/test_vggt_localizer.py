@@ -591,7 +591,8 @@ def test_a_prediction_finds_what_descriptors_alone_do_not(world: World, pnp: Pnp
     """Descriptors too alike to be matched in all of an image are matched about the predicted pose."""
     cameras, rig_from_cams, features, references = asked_of(world, "ios", 0)
     true = world.queries("ios")[1][0]
-    strict = PnpLocalizer(world.map, pnp.features, PnpSettings(ratio=0.0))
+    strict = PnpLocalizer(world.map, pnp.mapped.features)
+    strict.mapped.matcher = MutualMatcher(ratio=0.0)
     alone = strict.localize(cameras, rig_from_cams, features, references)
     assert alone.status.startswith("failed")
     found = HybridLocalizer(strict).localize(

@@ -105,7 +105,7 @@ class DepthLifter:
         predictions = _predictions(answer)
         points, obs, source, depths = [], [], [], {}
         for image in images:
-            xy = self._pnp.features[local_map.image_names[image]].keypoints.astype(np.float64)
+            xy = self._pnp.mapped.features[local_map.image_names[image]].keypoints.astype(np.float64)
             free = np.setdiff1d(np.arange(len(xy)), local_map.observations(image)[0])
             depth = self._depth(image, xy[free], predictions.get(image))
             if depth is None:
@@ -176,7 +176,7 @@ class _LiftedLocalizer(PnpLocalizer):
     """Localizes in a lifted map; the common scale of each image's depth is unknown within its standard deviation."""
 
     def __init__(self, made: LiftedMap, pnp: PnpLocalizer) -> None:
-        super().__init__(made.local_map, pnp.features, pnp.settings)
+        super().__init__(made.local_map, pnp.mapped.features, pnp.settings)
         self._made = made
 
     def _covariance(

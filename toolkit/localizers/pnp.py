@@ -5,8 +5,7 @@ pose, the points of all covisible map images are projected into the query and ma
 which finds several times as many and makes the pose more precise.
 """
 
-from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from threading import Lock
 
@@ -16,9 +15,10 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from toolkit import geometry
-from toolkit.features import Descriptors, FeatureStore, LocalFeatures
+from toolkit.features import LocalFeatures
+from toolkit.localizers.mapped import MapImage, MappedFeatures
 from toolkit.mapping import LocalMap, in_view, view_bounds
-from toolkit.matching import mutual_matches, similarity, unit_descriptors
+from toolkit.matching import unit_descriptors
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -39,8 +39,6 @@ class PnpSettings:
     """Features of a map image that are used at most, those of the longest tracks."""
     max_query_features: int = 1536
     """Features of a query image that are matched by descriptors alone, the strongest; guided passes use all."""
-    ratio: float = 0.85
-    """Lowe's ratio between a query and one reference."""
     ransac_max_error_deg: float = 0.45
     """Largest reprojection error of an inlier in RANSAC."""
     ransac_max_trials: int = 20000
@@ -51,8 +49,6 @@ class PnpSettings:
     """With fewer, the pose may lie between two, and is sought again under a tighter limit."""
     guided_radii_deg: tuple[float, ...] = (0.7, 0.35)
     """Search radius around a projected map point, one guided pass each."""
-    guided_min_score: float = 0.75
-    """Least cosine similarity of a match in the guided passes."""
     max_ransac_matches: int = 2500
     """Matches that RANSAC sees at most, a random choice: the guided passes find the rest again."""
     max_guided_matches: int = 1000
@@ -125,15 +121,6 @@ class PoseEstimate:
 
 
 @dataclass(frozen=True)
-class _MapImage:
-    """The features of a map image that see a point, longest tracks first."""
-
-    descriptors: Descriptors
-    points: Ints
-    scales: NDArray[np.float32]
-
-
-@dataclass(frozen=True)
 class _Matches:
     """K matches of query pixels to map points."""
 
@@ -178,12 +165,12 @@ class Prior:
 class PnpLocalizer:
     """Localizes queries in one map. Safe to use from several threads; the map is never changed."""
 
-    def __init__(self, local_map: LocalMap, features: FeatureStore, settings: PnpSettings | None = None):
+    def __init__(
+        self, local_map: LocalMap, features: Mapping[str, LocalFeatures], settings: PnpSettings | None = None
+    ):
         self.map = local_map
+        self.mapped = MappedFeatures(local_map, features)
         self.settings = settings or PnpSettings()
-        self.features = features
-        self._cache: OrderedDict[int, _MapImage] = OrderedDict()
-        self._lock = Lock()
 
     def localize(
         self,
@@ -206,14 +193,13 @@ class PnpLocalizer:
         if not any(len(refs) for refs in references):
             return PoseEstimate("failed: no references")
         query = _Query(list(cameras), np.asarray(rig_from_cams, np.float64), list(features))
-        camera, keypoint, point = self._match(query, references)
-        matches = _Matches(camera, query.pixels(camera, keypoint), point)
-        distinct = len(np.unique(point))
+        matches = self._match(query, references)
+        distinct = len(np.unique(matches.point))
         hypotheses = self._hypotheses(query, matches) if distinct >= 4 else []
         if distinct < 4:
-            found = PoseEstimate("failed: too few matches", num_matches=len(point))
+            found = PoseEstimate("failed: too few matches", num_matches=len(matches))
         elif not hypotheses:
-            found = PoseEstimate("failed: no consistent pose", num_matches=len(point))
+            found = PoseEstimate("failed: no consistent pose", num_matches=len(matches))
         else:
             found = self._estimate(query, matches, hypotheses, references)
         for prior in priors:
@@ -367,18 +353,15 @@ class PnpLocalizer:
                 return len(other.matches) / max(len(first.matches), 1)
         return 0.0
 
-    def _match(self, query: "_Query", references: Sequence[Sequence[int]]) -> tuple[Ints, Ints, Ints]:
-        """Match each camera to its references by descriptors; returns camera, keypoint, point, each (K,)."""
+    def _match(self, query: "_Query", references: Sequence[Sequence[int]]) -> _Matches:
+        """Match each camera to its references by descriptors."""
+        limits = self.settings.max_query_features, self.settings.max_map_features
         found = []
         for camera, (features, refs) in enumerate(zip(query.features, references, strict=True)):
-            descriptors = unit_descriptors(features.descriptors[: self.settings.max_query_features])
-            for reference in refs:
-                image = self._image(int(reference))
-                scores = similarity(descriptors, unit_descriptors(image.descriptors))
-                pairs = mutual_matches(scores, self.settings.ratio)
-                found.append(np.column_stack([np.full(len(pairs), camera), pairs[:, 0], image.points[pairs[:, 1]]]))
-        unique = np.unique(np.concatenate(found), axis=0)
-        return unique[:, 0], unique[:, 1], unique[:, 2]
+            keypoint, point = self.mapped.match(features, refs, *limits)
+            found.append(np.column_stack([np.full(len(point), camera), keypoint, point]))
+        camera_index, keypoint, point = np.unique(np.concatenate(found), axis=0).T
+        return _Matches(camera_index, query.pixels(camera_index, keypoint), point)
 
     def _ransac(
         self, query: "_Query", matches: _Matches, max_error_deg: float, least_inliers: int = 0
@@ -452,14 +435,15 @@ class PnpLocalizer:
         nothing = _Matches(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.int64))
         if not len(images):
             return nothing
+        kind = self.mapped.kind
         members = [self._image(int(index)) for index in images]
         point = np.concatenate([member.points for member in members])
         image = np.concatenate([np.full(len(m.points), i) for m, i in zip(members, images, strict=True)])
-        descriptors = np.concatenate([member.descriptors for member in members])
+        descriptors = np.concatenate([member.features.descriptors for member in members])
         depth = np.einsum("oj,oj->o", self.map.cams_from_world[image, 2, :3], self.map.points[point])
         depth += self.map.cams_from_world[image, 2, 3]
         # Size of the feature on the surface, metres: it looks that large from everywhere.
-        size = np.concatenate([member.scales for member in members]) * depth / self.map.focals_px[image]
+        size = np.concatenate([member.features.scales for member in members]) * depth / self.map.focals_px[image]
         found: list[tuple[Ints, Floats, Ints]] = []
         for camera, features in enumerate(query.features):
             radius = np.tan(np.radians(radius_deg)) * query.focals_px[camera]
@@ -475,7 +459,7 @@ class PnpLocalizer:
             order = np.lexsort((near["j"], near["i"]))
             observed, keypoint = visible[near["i"][order]], near["j"][order]
             expected = size[observed] * query.focals_px[camera] / in_cam[observed, 2]
-            similar = np.abs(np.log2(features.scales[keypoint] / np.maximum(expected, 1e-6))) < 1.0
+            similar = np.abs(np.log2(features.scales[keypoint] / np.maximum(expected, 1e-6))) < kind.scale_octaves
             observed, keypoint = observed[similar], keypoint[similar]
             score = np.einsum(
                 "od,od->o",
@@ -483,7 +467,7 @@ class PnpLocalizer:
                 unit_descriptors(features.descriptors[keypoint]),
             )
             order = np.argsort(-score, kind="stable")
-            order = order[score[order] > self.settings.guided_min_score]
+            order = order[score[order] > kind.guided_min_score]
             candidate, keypoint = point[observed[order]], keypoint[order]
             # Best first: the first of each keypoint and of each point, where they are the same match.
             first_of_keypoint = np.unique(keypoint, return_index=True)[1]
@@ -496,21 +480,8 @@ class PnpLocalizer:
         cameras, pixels_of, points = zip(*found, strict=True)
         return _Matches(np.concatenate(cameras), np.concatenate(pixels_of), np.concatenate(points))
 
-    def _image(self, index: int) -> _MapImage:
-        """Return the features of a map image that see points; the last 256 images are kept in memory."""
-        with self._lock:
-            if index in self._cache:
-                self._cache.move_to_end(index)
-                return self._cache[index]
-        keypoint, point = self.map.observations(index)
-        order = np.argsort(-self.map.track_lengths[point], kind="stable")[: self.settings.max_map_features]
-        features = self.features[self.map.image_names[index]]
-        image = _MapImage(features.descriptors[keypoint[order]], point[order], features.scales[keypoint[order]])
-        with self._lock:
-            self._cache[index] = image
-            if len(self._cache) > 256:
-                self._cache.popitem(last=False)
-        return image
+    def _image(self, index: int) -> MapImage:
+        return self.mapped.image(index, self.settings.max_map_features)
 
 
 def agree(world_from_rig: Floats | None, other: Floats | None) -> bool:
