@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from toolkit import geometry
-from toolkit.features import DESCRIPTOR_SCALE, LocalFeatures
+from toolkit.features import DESCRIPTOR_SCALE, KINDS, LocalFeatures
+from toolkit.localizers.mapped import MappedFeatures
 from toolkit.localizers.pnp import PnpLocalizer, PnpSettings, PoseEstimate
 from toolkit.mapping import LocalMap
+from toolkit.matching import MutualMatcher, PairMatches
 
 Floats = NDArray[np.float64]
 SIZE_M = 0.02  # standard deviation of each point's blob on its surface
@@ -387,3 +389,101 @@ def test_localizing_leaves_the_map_as_it_is(room: World) -> None:
     before = {name: getattr(room.local_map, name).tobytes() for name in ("points", "world_from_cams", "obs_point")}
     room.localizer().localize([PINHOLE], np.eye(4)[None], [room.look(PINHOLE, QUERY)], [REFERENCES])
     assert all(getattr(room.local_map, name).tobytes() == content for name, content in before.items())
+
+
+# ------------------------------------------------------------------------------------- several kinds of features
+
+
+def other_kind(world: World, seed: int) -> World:
+    """The same room seen by another detector: other points, and float descriptors of another length."""
+    rng = np.random.default_rng(seed)
+    points = world.points + rng.normal(size=world.points.shape) * 0.05
+    other = World.build(points, world.local_map.world_from_cams)
+    mix = np.linalg.qr(rng.normal(size=(128, 128)))[0][:, :64]
+
+    def mixed(features: LocalFeatures) -> LocalFeatures:
+        units = features.descriptors.astype(np.float32) @ mix
+        units /= np.linalg.norm(units, axis=1, keepdims=True)
+        return replace(features, descriptors=units.astype(np.float16), scales=np.ones(len(features), np.float32))
+
+    other.features = {name: mixed(features) for name, features in other.features.items()}
+    look = other.look
+    other.look = lambda *args, **more: mixed(look(*args, **more))  # type: ignore[method-assign]
+    return other
+
+
+SINGLE_SCALE = replace(KINDS["sift"], scale_octaves=float("inf"))
+
+
+def test_several_kinds_of_features_give_one_pose_with_the_matches_of_all(room: World) -> None:
+    other = other_kind(room, 5)
+    kinds = [MappedFeatures(room.local_map, room.features),
+             MappedFeatures(other.local_map, other.features, SINGLE_SCALE)]  # fmt: skip
+    seen = [room.look(PINHOLE, QUERY, limit=60), other.look(PINHOLE, QUERY, limit=60)]
+    alone = [
+        PnpLocalizer.of([kind]).localize([PINHOLE], np.eye(4)[None], [one], [REFERENCES])
+        for kind, one in zip(kinds, seen, strict=True)
+    ]
+    both = PnpLocalizer.of(kinds)
+    estimate = both.localize([PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
+    check(estimate, QUERY)
+    assert estimate.num_matches == sum(one.num_matches for one in alone)
+    assert estimate.num_inliers >= max(one.num_inliers for one in alone)
+    # Of each kind, points of its own: the second kind's follow the first's.
+    of_other = estimate.point_index >= len(room.local_map.points)
+    assert 0 < of_other.sum() < len(of_other)
+    projected = PINHOLE.img_from_cam(geometry.transform(geometry.invert(QUERY), both.map.points[estimate.point_index]))
+    assert np.linalg.norm(projected - estimate.pixels, axis=1).max() < 6
+    rig = both.localize(RIG_CAMERAS, RIG_FROM_CAMS, [
+        [world.look(camera, QUERY @ pose) for world in (room, other)]
+        for camera, pose in zip(RIG_CAMERAS, RIG_FROM_CAMS, strict=True)
+    ], [REFERENCES] * 3)  # fmt: skip
+    check(rig, QUERY)
+
+
+def test_one_kind_that_sees_nothing_leaves_the_answer_of_the_other(room: World) -> None:
+    other = other_kind(room, 5)
+    kinds = [MappedFeatures(room.local_map, room.features),
+             MappedFeatures(other.local_map, other.features, SINGLE_SCALE)]  # fmt: skip
+    seen = room.look(PINHOLE, QUERY)
+    nothing = other.look(PINHOLE, QUERY, limit=0)
+    expected = room.localizer().localize([PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
+    estimate = PnpLocalizer.of(kinds).localize([PINHOLE], np.eye(4)[None], [[seen, nothing]], [REFERENCES])
+    np.testing.assert_array_equal(estimate.world_from_rig, expected.world_from_rig)
+    assert estimate.num_inliers == expected.num_inliers
+
+
+class Learned:
+    """A matcher as a network is one: it wants all features of both images, and to be asked by one thread at a time."""
+
+    batch_size = 4
+    settings = {"name": "learned"}  # noqa: RUF012
+
+    def __init__(self) -> None:
+        self.sizes: list[tuple[int, int]] = []
+
+    def match(self, pairs):  # type: ignore[no-untyped-def]
+        self.sizes += [(len(a), len(b)) for a, b in pairs]
+        return MutualMatcher(0.85).match(pairs)
+
+
+def test_a_network_sees_all_features_and_is_not_asked_what_is_known(room: World) -> None:
+    network = Learned()
+    localizer = PnpLocalizer.of([MappedFeatures(room.local_map, room.features, matcher=network)])  # type: ignore[arg-type]
+    seen = room.look(PINHOLE, QUERY)
+    asked = ([PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
+    estimate = localizer.localize(*asked)
+    check(estimate, QUERY)
+    sizes = [len(room.features[room.local_map.image_names[index]]) for index in REFERENCES]
+    assert network.sizes == [(len(seen), size) for size in sizes]
+    network.sizes.clear()
+    names = []
+
+    def known(name: str) -> PairMatches:
+        names.append(name)
+        return MutualMatcher(0.85).match([(seen, room.features[name])])[0]
+
+    again = localizer.localize(*asked, known=[[known]])
+    assert network.sizes == []
+    assert names == [room.local_map.image_names[index] for index in REFERENCES]
+    np.testing.assert_array_equal(again.world_from_rig, estimate.world_from_rig)

@@ -21,11 +21,13 @@ from toolkit.features import extract_session
 from toolkit.files import SceneFiles
 from toolkit.localize import COLUMNS, PREDICTION_COLUMNS, localize_pairs
 from toolkit.localizers.hybrid import HybridLocalizer
-from toolkit.localizers.pnp import PnpLocalizer, PnpSettings, PoseEstimate, Prior
+from toolkit.localizers.mapped import MappedFeatures
+from toolkit.localizers.pnp import PnpLocalizer, PoseEstimate, Prior
 from toolkit.localizers.prediction import Prediction, View, create_predictor
 from toolkit.localizers.simulated import SimulatedPredictor
 from toolkit.localizers.vggt import VggtAnswer, VggtLocalizer, VggtQuery, VggtSettings
 from toolkit.mapping import LocalMap
+from toolkit.matching import MutualMatcher
 from toolkit.visualize_prediction import draw_prediction
 
 Floats = NDArray[np.float64]
@@ -591,8 +593,7 @@ def test_a_prediction_finds_what_descriptors_alone_do_not(world: World, pnp: Pnp
     """Descriptors too alike to be matched in all of an image are matched about the predicted pose."""
     cameras, rig_from_cams, features, references = asked_of(world, "ios", 0)
     true = world.queries("ios")[1][0]
-    strict = PnpLocalizer(world.map, pnp.mapped.features)
-    strict.mapped.matcher = MutualMatcher(ratio=0.0)
+    strict = PnpLocalizer.of([MappedFeatures(world.map, pnp.mapped[0].features, matcher=MutualMatcher(ratio=0.0))])
     alone = strict.localize(cameras, rig_from_cams, features, references)
     assert alone.status.startswith("failed")
     found = HybridLocalizer(strict).localize(

@@ -91,8 +91,8 @@ class FeatureKind:
 
     extractor: str
     """`module:callable` that makes the extractor, imported when it is asked for."""
-    matcher: str
-    """The matcher of queries with references where none is asked for; see `toolkit.matching`."""
+    matchers: tuple[str, ...]
+    """What can match queries with references, the first where none is asked for; see `toolkit.matching`."""
     ratio: float
     """Lowe's ratio of `mutual` between a query and a reference; 1: no such test."""
     min_score: float
@@ -109,13 +109,13 @@ KINDS: dict[str, FeatureKind] = {
     # RootSIFT has no negative entries: unrelated patches already score about 0.5, so the ratio test decides, and the
     # less geometry says, the more a score has to.
     "sift": FeatureKind(
-        "toolkit.features:SiftExtractor.create", "mutual", 0.85, -1.0, epipolar_min_score=0.6, guided_min_score=0.75,
-        scale_octaves=1.0,
+        "toolkit.features:SiftExtractor.create", ("mutual",), 0.85, -1.0, epipolar_min_score=0.6,
+        guided_min_score=0.75, scale_octaves=1.0,
     ),
     # Scores of unrelated patches scatter about 0, and look-alikes are common: the usual test is a distance below 0.7
     # (hloc's NN-superpoint), which is a cosine of 1 - 0.7^2 / 2, and none of the ratio. One scale: sizes say nothing.
     "superpoint": FeatureKind(
-        "toolkit.models.superpoint:SuperPointExtractor", "lightglue", 1.0, 0.755, epipolar_min_score=0.755,
+        "toolkit.models.superpoint:SuperPointExtractor", ("lightglue", "mutual"), 1.0, 0.755, epipolar_min_score=0.755,
         guided_min_score=0.755, scale_octaves=float("inf"),
     ),
 }  # fmt: skip
@@ -339,9 +339,7 @@ class FeatureStore(Mapping[str, LocalFeatures]):
         if name not in self.made_from:
             raise KeyError(name)
         with self._lock:
-            if self._file is None:
-                self._open(name)
-            group = self._file[name]
+            group = (self._file or self._open(name))[name]
             arrays = {key: item[()] for key, item in group.items() if isinstance(item, h5py.Dataset)}
         try:
             keypoints = arrays["keypoints"].astype(np.float32, copy=False) + self._offset
@@ -360,11 +358,13 @@ class FeatureStore(Mapping[str, LocalFeatures]):
             (int(size[0]), int(size[1])),
         )
 
-    def _open(self, name: str) -> None:
+    def _open(self, name: str) -> h5py.File:
         """Open the file; what holds for one image holds for all."""
-        self._file = h5py.File(self.path, "r")
-        self._offset = np.float32(0.5 - self._file.attrs.get(PIXEL_CENTER, 0.0))
-        self._bytes = self._file[name]["descriptors"].attrs.get(SCALE) == DESCRIPTOR_SCALE
+        file = h5py.File(self.path, "r")
+        self._offset = np.float32(0.5 - file.attrs.get(PIXEL_CENTER, 0.0))
+        self._bytes = file[name]["descriptors"].attrs.get(SCALE) == DESCRIPTOR_SCALE
+        self._file = file
+        return file
 
 
 def extract_session(

@@ -245,6 +245,37 @@ class LocalMap:
         seen = [np.unique(self.observations(int(image))[1]) for image in images]
         return np.array([[len(np.intersect1d(a, b, assume_unique=True)) for b in seen] for a in seen], np.int64)
 
+    @classmethod
+    def pooled(cls, maps: Sequence["LocalMap"]) -> "LocalMap":
+        """Return one map of maps of one session, each triangulated from another kind of features.
+
+        The points of one map follow those of the map before. A keypoint is one of the kind that its point is of, so
+        the point tells the kind.
+        """
+        if len(maps) == 1:
+            return maps[0]
+        cameras: dict[str, tuple[pycolmap.Camera, Floats]] = {}
+        for one in maps:
+            for name, camera, pose in zip(one.image_names, one.cameras, one.world_from_cams, strict=True):
+                cameras.setdefault(name, (camera, pose))
+        index_of = {name: index for index, name in enumerate(cameras)}
+        starts = np.cumsum([0, *(len(one.points) for one in maps)])
+        image = np.concatenate(
+            [np.array([index_of[name] for name in one.image_names], np.int64)[one.obs_image] for one in maps]
+        )
+        point = np.concatenate([one.obs_point + start for one, start in zip(maps, starts[:-1], strict=True)])
+        order = np.argsort(image, kind="stable")
+        return cls(
+            image_names=list(cameras),
+            cameras=[camera for camera, _ in cameras.values()],
+            world_from_cams=np.stack([pose for _, pose in cameras.values()]),
+            points=np.concatenate([one.points for one in maps]),
+            colors=np.concatenate([one.colors for one in maps]),
+            obs_image=image[order],
+            obs_keypoint=np.concatenate([one.obs_keypoint for one in maps])[order],
+            obs_point=point[order],
+        )
+
     def save(self, path: str | Path) -> None:
         """Write the map as one `.npz` file."""
         arrays: dict[str, Any] = {
@@ -423,6 +454,11 @@ def _refine_points(
     return points[seen], kept
 
 
+def map_path(map_dir: str | Path, session_id: str, features: str = "sift") -> Path:
+    """Return the file of a session's map of one kind of features; that of SIFT has the session's name alone."""
+    return Path(map_dir) / (f"{session_id}.npz" if features == "sift" else f"{session_id}-{features}.npz")
+
+
 def build_map(
     session: Session,
     features: FeatureStore,
@@ -469,11 +505,12 @@ def build_map(
     pairs = select_pairs(poses[rows], cameras, groups, settings.pairs_per_image)
     names = [names[row] for row in rows]
     keypoints = [features[name].keypoints for name in names]
-    made_by = {"features": [features.settings] * 2, "matcher": _matcher(features, settings)}
+    matcher = _matcher(features, settings)
+    made_by = {"features": [features.settings] * 2, "matcher": matcher}
     matches_file = matches_path(Path(path).parent, session.id, session.id, made_by)
     with GroupWriter(matches_file, made_by) as writer:
         counts = [len(xy) for xy in keypoints]
-        _match(writer, features, names, counts, cameras, poses[rows], pairs, made_by["matcher"], skip_existing, workers)
+        _match(writer, features, names, counts, cameras, poses[rows], pairs, matcher, skip_existing, workers)
         writer.finish()
     kept = MatchStore(matches_file)
     matches = [kept[names[i], names[j]].indices for i, j in pairs]

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from toolkit.features import LocalFeatures
 from toolkit.localizers.lifting import DepthLifter
+from toolkit.localizers.mapped import Known
 from toolkit.localizers.pnp import PnpLocalizer, PoseEstimate, Prior, agree
 from toolkit.localizers.vggt import VggtAnswer
 
@@ -35,9 +36,10 @@ class HybridLocalizer:
         self,
         cameras: Sequence[pycolmap.Camera],
         rig_from_cams: Floats,
-        features: Sequence[LocalFeatures],
+        features: Sequence[LocalFeatures | Sequence[LocalFeatures]],
         references: Sequence[Sequence[int]],
         answer: VggtAnswer,
+        known: Sequence[Sequence[Known | None]] = (),
     ) -> PoseEstimate:
         """Return one pose for the cameras of a rig, or for a single camera; `found_by` says from what.
 
@@ -48,15 +50,15 @@ class HybridLocalizer:
         prediction contradicts.
 
         Args:
-            cameras, rig_from_cams, features, references: as for `PnpLocalizer.localize`.
+            cameras, rig_from_cams, features, references, known: as for `PnpLocalizer.localize`.
             answer: what `toolkit.localizers.vggt` says of the same rig.
         """
         predicted = answer.estimate
         prior = _prior(predicted)
         priors = () if prior is None else (prior,)
-        found = self.pnp.localize(cameras, rig_from_cams, features, references, priors)
+        found = self.pnp.localize(cameras, rig_from_cams, features, references, priors, known)
         if found.status != "ok" and self.lifter is not None:
-            lifted = self.lifter.localize(cameras, rig_from_cams, features, references, answer, priors)
+            lifted = self.lifter.localize(cameras, rig_from_cams, features, references, answer, priors, known)
             found = found if lifted is None else _better(found, lifted)
         if predicted.world_from_rig is None:
             return found

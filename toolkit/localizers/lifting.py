@@ -16,7 +16,8 @@ from toolkit import geometry
 from toolkit.alignment import DEPTH_NOISE
 from toolkit.depths import lifted
 from toolkit.features import LocalFeatures
-from toolkit.localizers.pnp import PnpLocalizer, PoseEstimate, Prior, _Matches, _Query
+from toolkit.localizers.mapped import Known, MappedFeatures
+from toolkit.localizers.pnp import PnpLocalizer, PnpSettings, PoseEstimate, Prior, _Matches, _Query
 from toolkit.localizers.vggt import CameraAnswer, VggtAnswer, VggtLocalizer
 from toolkit.mapping import LocalMap
 
@@ -62,16 +63,22 @@ class DepthLifter:
     """Lifts the features of one map's images, and localizes with them. Safe to use from several threads."""
 
     def __init__(self, pnp: PnpLocalizer, vggt: VggtLocalizer) -> None:
-        self._pnp, self._vggt = pnp, vggt
+        """
+        Args:
+            pnp: of several kinds of features, those of the first are lifted and matched.
+            vggt: on the same map.
+        """
+        self._first, self._settings, self._vggt = pnp.mapped[0], pnp.settings, vggt
 
     def localize(
         self,
         cameras: Sequence[pycolmap.Camera],
         rig_from_cams: Floats,
-        features: Sequence[LocalFeatures],
+        features: Sequence[LocalFeatures | Sequence[LocalFeatures]],
         references: Sequence[Sequence[int]],
         answer: VggtAnswer,
         priors: Sequence[Prior] = (),
+        known: Sequence[Sequence[Known | None]] = (),
     ) -> PoseEstimate | None:
         """Return a pose by triangulated and lifted places of the references' features; None where none can be lifted.
 
@@ -79,15 +86,19 @@ class DepthLifter:
         it rests on predicted depth that nothing measured, only if the predicted camera of the query agrees.
 
         Args:
-            cameras, rig_from_cams, features, references, priors: as for `PnpLocalizer.localize`.
+            cameras, rig_from_cams, features, references, priors, known: as for `PnpLocalizer.localize`.
             answer: what `VggtLocalizer` says of the query.
         """
+        count = len(self._first.map.image_names)  # further images are those that only other kinds of features have
+        references = [[image for image in part if image < count] for part in references]
+        features = [one if isinstance(one, LocalFeatures) else one[0] for one in features]
+        known = [kinds[:1] for kinds in known]
         images = list(dict.fromkeys(int(image) for part in references for image in part))
         made = self.lift(images, answer)
         if made is None:
             return None
-        localizer = _LiftedLocalizer(made, self._pnp)
-        found = localizer.localize(cameras, rig_from_cams, features, references, priors)
+        localizer = _LiftedLocalizer(made, self._first, self._settings)
+        found = localizer.localize(cameras, rig_from_cams, features, references, priors, known)
         source = made.image[found.point_index]
         used = [made.depths[int(image)] for image in np.unique(source[source >= 0])]
         whole = np.concatenate([made.triangulated, np.full(len(made.image) - len(made.triangulated), -1)])
@@ -101,11 +112,11 @@ class DepthLifter:
 
     def lift(self, images: Sequence[int], answer: VggtAnswer) -> LiftedMap | None:
         """Return the part of the map that images see, with points for their features that have none."""
-        local_map = self._pnp.map
+        local_map = self._first.map
         predictions = _predictions(answer)
         points, obs, source, depths = [], [], [], {}
         for image in images:
-            xy = self._pnp.mapped.features[local_map.image_names[image]].keypoints.astype(np.float64)
+            xy = self._first.features[local_map.image_names[image]].keypoints.astype(np.float64)
             free = np.setdiff1d(np.arange(len(xy)), local_map.observations(image)[0])
             depth = self._depth(image, xy[free], predictions.get(image))
             if depth is None:
@@ -175,8 +186,8 @@ class DepthLifter:
 class _LiftedLocalizer(PnpLocalizer):
     """Localizes in a lifted map; the common scale of each image's depth is unknown within its standard deviation."""
 
-    def __init__(self, made: LiftedMap, pnp: PnpLocalizer) -> None:
-        super().__init__(made.local_map, pnp.mapped.features, pnp.settings)
+    def __init__(self, made: LiftedMap, mapped: MappedFeatures, settings: PnpSettings) -> None:
+        self._use([MappedFeatures(made.local_map, mapped.features, mapped.kind, mapped.matcher)], settings)
         self._made = made
 
     def _covariance(

@@ -1,5 +1,7 @@
 """Localize by matching a query's features to triangulated map points, and PnP for single cameras and rigs.
 
+Several kinds of features can be used together: their matches are pooled, and a pose is sought that explains them all.
+
 In two steps. First, descriptors alone: the query against its retrieved references, then LO-RANSAC. Then, with that
 pose, the points of all covisible map images are projected into the query and matched only near where they should be,
 which finds several times as many and makes the pose more precise.
@@ -16,7 +18,7 @@ from scipy.spatial import KDTree
 
 from toolkit import geometry
 from toolkit.features import LocalFeatures
-from toolkit.localizers.mapped import MapImage, MappedFeatures
+from toolkit.localizers.mapped import Known, MappedFeatures
 from toolkit.mapping import LocalMap, in_view, view_bounds
 from toolkit.matching import unit_descriptors
 
@@ -131,6 +133,15 @@ class _Matches:
     point: Ints
     """(K,) map point."""
 
+    @classmethod
+    def pooled(cls, parts: "Sequence[_Matches]") -> "_Matches":
+        """Return the matches of all parts."""
+        return cls(
+            np.concatenate([np.zeros(0, np.int64), *(part.camera for part in parts)]),
+            np.concatenate([np.zeros((0, 2)), *(part.pixels for part in parts)]),
+            np.concatenate([np.zeros(0, np.int64), *(part.point for part in parts)]),
+        )
+
     def __len__(self) -> int:
         return len(self.point)
 
@@ -168,32 +179,52 @@ class PnpLocalizer:
     def __init__(
         self, local_map: LocalMap, features: Mapping[str, LocalFeatures], settings: PnpSettings | None = None
     ):
-        self.map = local_map
-        self.mapped = MappedFeatures(local_map, features)
+        """
+        Args:
+            local_map: a map triangulated from SIFT features; see `of` for others.
+            features: of its images, by name.
+        """
+        self._use([MappedFeatures(local_map, features)], settings)
+
+    @classmethod
+    def of(cls, mapped: Sequence[MappedFeatures], settings: PnpSettings | None = None) -> "PnpLocalizer":
+        """Return a localizer that uses several kinds of features together, each with a map of the same session."""
+        localizer = cls.__new__(cls)
+        localizer._use(mapped, settings)
+        return localizer
+
+    def _use(self, mapped: Sequence[MappedFeatures], settings: PnpSettings | None) -> None:
+        self.mapped = list(mapped)
+        self.map = LocalMap.pooled([one.map for one in mapped])
+        """All kinds' points, one kind after the other."""
         self.settings = settings or PnpSettings()
+        self._first_point = np.cumsum([0, *(len(one.map.points) for one in mapped)])
 
     def localize(
         self,
         cameras: Sequence[pycolmap.Camera],
         rig_from_cams: Floats,
-        features: Sequence[LocalFeatures],
+        features: Sequence[LocalFeatures | Sequence[LocalFeatures]],
         references: Sequence[Sequence[int]],
         priors: Sequence[Prior] = (),
+        known: Sequence[Sequence[Known | None]] = (),
     ) -> PoseEstimate:
         """Return one pose for the cameras of a rig, or for a single camera.
 
         Args:
             cameras: C cameras.
             rig_from_cams: (C, 4, 4); the identity for a single camera.
-            features: their local features.
+            features: for each camera its local features, of several kinds a sequence in the order of `mapped`.
             references: for each camera, indices of map images to match it with, best first.
             priors: poses that are hypotheses too. One wins if clearly more guided matches support it; one that
                 confirms an `ok` pose changes nothing.
+            known: for each camera and kind, matches with references that were made before; none where not given.
         """
         if not any(len(refs) for refs in references):
             return PoseEstimate("failed: no references")
-        query = _Query(list(cameras), np.asarray(rig_from_cams, np.float64), list(features))
-        matches = self._match(query, references)
+        kinds = [[one] if isinstance(one, LocalFeatures) else list(one) for one in features]
+        query = _Query(list(cameras), np.asarray(rig_from_cams, np.float64), kinds)
+        matches = self._match(query, references, known)
         distinct = len(np.unique(matches.point))
         hypotheses = self._hypotheses(query, matches) if distinct >= 4 else []
         if distinct < 4:
@@ -353,15 +384,22 @@ class PnpLocalizer:
                 return len(other.matches) / max(len(first.matches), 1)
         return 0.0
 
-    def _match(self, query: "_Query", references: Sequence[Sequence[int]]) -> _Matches:
-        """Match each camera to its references by descriptors."""
+    def _match(
+        self, query: "_Query", references: Sequence[Sequence[int]], known: Sequence[Sequence[Known | None]]
+    ) -> _Matches:
+        """Match each camera to its references by descriptors, those of each kind alone."""
         limits = self.settings.max_query_features, self.settings.max_map_features
         found = []
-        for camera, (features, refs) in enumerate(zip(query.features, references, strict=True)):
-            keypoint, point = self.mapped.match(features, refs, *limits)
-            found.append(np.column_stack([np.full(len(point), camera), keypoint, point]))
-        camera_index, keypoint, point = np.unique(np.concatenate(found), axis=0).T
-        return _Matches(camera_index, query.pixels(camera_index, keypoint), point)
+        for number, (mapped, first_point) in enumerate(zip(self.mapped, self._first_point[:-1], strict=True)):
+            rows = []
+            for camera, refs in enumerate(references):
+                names = [self.map.image_names[int(index)] for index in refs]
+                before = known[camera][number] if known else None
+                keypoint, point = mapped.match(query.features[camera][number], names, *limits, before)
+                rows.append(np.column_stack([np.full(len(point), camera), keypoint, point + first_point]))
+            camera_index, keypoint, point = np.unique(np.concatenate(rows), axis=0).T
+            found.append(_Matches(camera_index, query.pixels(camera_index, keypoint, number), point))
+        return _Matches.pooled(found)
 
     def _ransac(
         self, query: "_Query", matches: _Matches, max_error_deg: float, least_inliers: int = 0
@@ -431,35 +469,51 @@ class PnpLocalizer:
         return order[seen[order] > 0]
 
     def _match_guided(self, query: "_Query", rig_from_world: Floats, images: Ints, radius_deg: float) -> _Matches:
-        """Match the points of map images near where the pose puts them."""
-        nothing = _Matches(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.int64))
-        if not len(images):
-            return nothing
-        kind = self.mapped.kind
-        members = [self._image(int(index)) for index in images]
+        """Match the points of map images near where the pose puts them, those of each kind alone."""
+        names = [self.map.image_names[int(index)] for index in images]
+        return _Matches.pooled(
+            [
+                part
+                for number in range(len(self.mapped))
+                for part in self._match_kind_guided(number, query, rig_from_world, names, radius_deg)
+            ]
+        )
+
+    def _match_kind_guided(
+        self, number: int, query: "_Query", rig_from_world: Floats, names: Sequence[str], radius_deg: float
+    ) -> Iterator[_Matches]:
+        """Yield the guided matches of each camera, of one kind of features."""
+        mapped, first_point = self.mapped[number], int(self._first_point[number])
+        local_map = mapped.map
+        images = [index for name in names if (index := local_map.index_of.get(name)) is not None]
+        if not images:
+            return
+        members = [mapped.image(index, self.settings.max_map_features) for index in images]
         point = np.concatenate([member.points for member in members])
         image = np.concatenate([np.full(len(m.points), i) for m, i in zip(members, images, strict=True)])
         descriptors = np.concatenate([member.features.descriptors for member in members])
-        depth = np.einsum("oj,oj->o", self.map.cams_from_world[image, 2, :3], self.map.points[point])
-        depth += self.map.cams_from_world[image, 2, 3]
+        depth = np.einsum("oj,oj->o", local_map.cams_from_world[image, 2, :3], local_map.points[point])
+        depth += local_map.cams_from_world[image, 2, 3]
         # Size of the feature on the surface, metres: it looks that large from everywhere.
-        size = np.concatenate([member.features.scales for member in members]) * depth / self.map.focals_px[image]
-        found: list[tuple[Ints, Floats, Ints]] = []
-        for camera, features in enumerate(query.features):
+        size = np.concatenate([member.features.scales for member in members]) * depth / local_map.focals_px[image]
+        for camera, kinds in enumerate(query.features):
+            features = kinds[number]
             radius = np.tan(np.radians(radius_deg)) * query.focals_px[camera]
             cam_from_world = geometry.invert(query.rig_from_cams[camera]) @ rig_from_world
-            in_cam = geometry.transform(cam_from_world, self.map.points[point])
+            in_cam = geometry.transform(cam_from_world, local_map.points[point])
             visible = np.flatnonzero(in_view(in_cam[None], query.bounds[camera][None])[0])
             if not len(visible) or not len(features):
                 continue
             projected = np.asarray(query.cameras[camera].img_from_cam(in_cam[visible]))
             finite = np.isfinite(projected).all(axis=1)
             visible, projected = visible[finite], projected[finite]
-            near = KDTree(projected).sparse_distance_matrix(query.trees[camera], radius, output_type="ndarray")
+            tree = query.trees[camera][number]
+            near = KDTree(projected).sparse_distance_matrix(tree, radius, output_type="ndarray")
             order = np.lexsort((near["j"], near["i"]))
             observed, keypoint = visible[near["i"][order]], near["j"][order]
             expected = size[observed] * query.focals_px[camera] / in_cam[observed, 2]
-            similar = np.abs(np.log2(features.scales[keypoint] / np.maximum(expected, 1e-6))) < kind.scale_octaves
+            octaves = np.abs(np.log2(features.scales[keypoint] / np.maximum(expected, 1e-6)))
+            similar = octaves < mapped.kind.scale_octaves
             observed, keypoint = observed[similar], keypoint[similar]
             score = np.einsum(
                 "od,od->o",
@@ -467,21 +521,14 @@ class PnpLocalizer:
                 unit_descriptors(features.descriptors[keypoint]),
             )
             order = np.argsort(-score, kind="stable")
-            order = order[score[order] > kind.guided_min_score]
+            order = order[score[order] > mapped.kind.guided_min_score]
             candidate, keypoint = point[observed[order]], keypoint[order]
             # Best first: the first of each keypoint and of each point, where they are the same match.
             first_of_keypoint = np.unique(keypoint, return_index=True)[1]
             first_of_point = np.unique(candidate, return_index=True)[1]
             mutual = np.intersect1d(first_of_keypoint, first_of_point)[: self.settings.max_guided_matches]
             pixels = features.keypoints[keypoint[mutual]].astype(np.float64)
-            found.append((np.full(len(mutual), camera), pixels, candidate[mutual]))
-        if not found:
-            return nothing
-        cameras, pixels_of, points = zip(*found, strict=True)
-        return _Matches(np.concatenate(cameras), np.concatenate(pixels_of), np.concatenate(points))
-
-    def _image(self, index: int) -> MapImage:
-        return self.mapped.image(index, self.settings.max_map_features)
+            yield _Matches(np.full(len(mutual), camera), pixels, candidate[mutual] + first_point)
 
 
 def agree(world_from_rig: Floats | None, other: Floats | None) -> bool:
@@ -505,19 +552,22 @@ def _matrix(rigid: pycolmap.Rigid3d) -> Floats:
 class _Query:
     """The cameras of a query device, with what the steps above ask of them."""
 
-    def __init__(self, cameras: list[pycolmap.Camera], rig_from_cams: Floats, features: list[LocalFeatures]):
+    def __init__(self, cameras: list[pycolmap.Camera], rig_from_cams: Floats, features: list[list[LocalFeatures]]):
         self.cameras = cameras
         self.rig_from_cams = rig_from_cams
-        self.features = features
+        self.features = features  # of each camera, of each kind
         self.cams_from_rig = [pycolmap.Rigid3d(pose[:3]) for pose in geometry.invert(rig_from_cams)]
         self.focals_px = np.array([camera.mean_focal_length() for camera in cameras])
         self.bounds = np.stack([view_bounds(camera) for camera in cameras])
-        self.trees = [KDTree(f.keypoints) if len(f) else KDTree(np.zeros((1, 2)) - 1e9) for f in features]
+        self.trees = [
+            [KDTree(f.keypoints) if len(f) else KDTree(np.zeros((1, 2)) - 1e9) for f in kinds] for kinds in features
+        ]
 
-    def pixels(self, camera: Ints, keypoint: Ints) -> Floats:
+    def pixels(self, camera: Ints, keypoint: Ints, kind: int) -> Floats:
+        """Return the places (K, 2) of keypoints of one kind."""
         pixels = np.zeros((len(camera), 2))
-        for index, features in enumerate(self.features):
-            pixels[camera == index] = features.keypoints[keypoint[camera == index]]
+        for index, kinds in enumerate(self.features):
+            pixels[camera == index] = kinds[kind].keypoints[keypoint[camera == index]]
         return pixels
 
     def errors_px(self, rig_from_world: Floats, matches: _Matches, points: Floats) -> Floats:
