@@ -1,13 +1,30 @@
 """Matching against brute force, with and without the epipolar geometry."""
 
+from pathlib import Path
+
+import h5py
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from toolkit import geometry
-from toolkit.features import DESCRIPTOR_SCALE
-from toolkit.matching import match_along_epipolar_lines, mutual_matches, similarity, unit_descriptors
+from toolkit.errors import ArtefactError, ManifestError
+from toolkit.features import DESCRIPTOR_SCALE, FeatureStore, LocalFeatures
+from toolkit.groups import GroupWriter
+from toolkit.matching import (
+    MatchStore,
+    MutualMatcher,
+    PairMatches,
+    create_matcher,
+    match_along_epipolar_lines,
+    match_sessions,
+    matchers_of,
+    mutual_matches,
+    similarity,
+    unit_descriptors,
+    write_matches,
+)
 
 Floats = NDArray[np.float64]
 
@@ -301,3 +318,128 @@ def test_a_ray_along_the_baseline_does_no_harm(side: str) -> None:
     with np.errstate(all="raise"):
         found = as_list(match_along_epipolar_lines(a, b, rays_a, rays_b, b_from_a, ANGLE, ANGLE))
     assert len(found) >= 0.95 * (partner >= 0).sum()
+
+
+# ------------------------------------------------------------------------------------------- matchers and files
+
+
+def features_of(units: NDArray[np.float32]) -> LocalFeatures:
+    ones = np.ones(len(units), np.float32)
+    return LocalFeatures(np.zeros((len(units), 2), np.float32), ones, ones, units, (640, 480))
+
+
+def test_the_mutual_matcher_takes_any_descriptors_and_gives_their_similarity() -> None:
+    rng = np.random.default_rng(0)
+    units = np.abs(random_units(rng, 40))
+    order = rng.permutation(40)
+    for stored in (units, units.astype(np.float16), np.round(units * DESCRIPTOR_SCALE).clip(0, 255).astype(np.uint8)):
+        a, b = features_of(stored), features_of(stored[order])
+        forth, back = MutualMatcher(ratio=0.9).match([(a, b), (b, a)])
+        assert forth.indices.tolist() == [[i, int(np.flatnonzero(order == i)[0])] for i in range(40)]
+        assert sorted(map(tuple, back.indices[:, ::-1].tolist())) == sorted(map(tuple, forth.indices.tolist()))
+        np.testing.assert_allclose(forth.scores, 1, atol=0.03)
+        nothing = a.take(slice(0))
+        assert [len(found) for found in MutualMatcher().match([(a, nothing), (nothing, b)])] == [0, 0]
+
+
+def test_matchers_by_name() -> None:
+    matcher = create_matcher("mutual", ratio=0.7)
+    assert matcher.settings == {"name": "mutual", "ratio": 0.7, "min_score": -1.0}
+    with pytest.raises(ManifestError, match="Unknown matcher 'flann'"):
+        create_matcher("flann")
+    assert matchers_of(["sift"]) == {"sift": "mutual"}
+    assert matchers_of(["sift", "superpoint"]) == {"sift": "mutual", "superpoint": "lightglue"}
+    assert matchers_of(["sift", "superpoint"], "lightglue") == {"sift": "mutual", "superpoint": "lightglue"}
+    assert matchers_of(["superpoint"], "mutual") == {"superpoint": "mutual"}
+    for features, matcher, text in (
+        (["sift"], "lightglue", "suits none of the features. Known for sift: mutual"),
+        (["surf"], None, "Unknown local features 'surf'"),
+        ([], None, "expected a list"),
+        ("sift", None, "expected a list"),
+    ):
+        with pytest.raises(ManifestError, match=text):
+            matchers_of(features, matcher)
+
+
+def hloc_matches(path: Path, name0: str, name1: str) -> tuple[NDArray[np.int64], NDArray[np.float16]]:
+    """Read the matches of a pair as hloc does."""
+    with h5py.File(str(path), "r", libver="latest") as file:
+        group = file["/".join((name0.replace("/", "-"), name1.replace("/", "-")))]
+        matches, scores = group["matches0"].__array__(), group["matching_scores0"].__array__()
+    index = np.where(matches != -1)[0]
+    return np.stack([index, matches[index]], -1), scores[index]
+
+
+NAMES = ("ios_query/raw_data/a/1.jpg", "hl_map/raw_data/b/2.jpg")
+
+
+@pytest.mark.parametrize(("count", "kind"), [(100, np.int16), (40_000, np.int32)])
+def test_matches_are_in_the_layout_of_hloc_and_come_back(tmp_path: Path, count: int, kind: type) -> None:
+    path = tmp_path / "matches.h5"
+    indices = np.array([[0, count - 1], [3, 0], [99, 7]])
+    matches = PairMatches(indices, np.array([0.5, 1.0, 0.25], np.float32))
+    with GroupWriter(path, {"name": "test"}) as writer:
+        write_matches(writer, NAMES, "key", (100, count), matches)
+        writer.finish()
+    found, scores = hloc_matches(path, *NAMES)
+    with h5py.File(path) as file:
+        assert file["ios_query-raw_data-a-1.jpg/hl_map-raw_data-b-2.jpg/matches0"].dtype == kind
+    np.testing.assert_array_equal(found, indices)
+    np.testing.assert_array_equal(scores, matches.scores)
+    store = MatchStore(path)
+    np.testing.assert_array_equal(store[NAMES].indices, indices)
+    np.testing.assert_array_equal(store[NAMES].scores, matches.scores)
+    np.testing.assert_array_equal(store[NAMES[::-1]].indices, indices[:, ::-1])
+    with pytest.raises(KeyError):
+        store["other.jpg", NAMES[1]]
+    torn = tmp_path / "torn.h5"
+    torn.write_bytes(path.read_bytes()[:600])
+    with pytest.raises(ArtefactError, match="Match again"):
+        MatchStore(torn)[NAMES]
+
+
+class Counting(MutualMatcher):
+    """Counts the pairs that it is given, some at a time."""
+
+    batch_size = 2
+
+    def __init__(self) -> None:
+        super().__init__(0.9)
+        self.calls: list[int] = []
+
+    def match(self, pairs):  # type: ignore[no-untyped-def]
+        self.calls.append(len(pairs))
+        return super().match(pairs)
+
+
+class Features(FeatureStore):
+    """Features in memory."""
+
+    def __init__(self, images: dict[str, LocalFeatures], made_from: str):
+        super().__init__(Path(), dict.fromkeys(images, made_from), settings={"name": "test"})
+        self.images = images
+
+    def __getitem__(self, name: str) -> LocalFeatures:
+        return self.images[name]
+
+
+def test_pairs_of_sessions_are_matched_once_in_batches_and_others_added(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    images = {f"m/{k}.jpg": features_of(random_units(rng, 30)) for k in range(4)}
+    queries, maps = Features({"q/1.jpg": images["m/2.jpg"]}, "a"), Features(images, "b")
+    matcher, sessions = Counting(), ("ios_query", "hl_map")
+    pairs = [("q/1.jpg", f"m/{k}.jpg") for k in range(3)]
+    asked = [*pairs, pairs[0], ("q/1.jpg", "m/unknown.jpg")]
+    store = match_sessions((queries, maps), asked, matcher, tmp_path, sessions)
+    assert matcher.calls == [2, 1]
+    assert store.path.parent == tmp_path / "ios_query-hl_map"
+    assert [len(store[pair]) for pair in pairs][2] == 30
+    for name0, name1 in pairs:
+        (expected,) = MutualMatcher(0.9).match([(queries[name0], maps[name1])])
+        np.testing.assert_array_equal(store[name0, name1].indices, expected.indices)
+    matcher.calls.clear()
+    again = match_sessions((queries, maps), [*pairs, ("q/1.jpg", "m/3.jpg")], matcher, tmp_path, sessions)
+    assert matcher.calls == [1]
+    assert len(again[pairs[2]]) == 30
+    match_sessions((Features(queries.images, "changed"), maps), pairs, matcher, tmp_path, sessions)
+    assert matcher.calls == [1, 2, 1]

@@ -3,7 +3,7 @@
 import json
 import logging
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,16 @@ from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.embedders import Embedder, create_embedder, load_embeddings
 from toolkit.errors import ArtefactError, ImageError, ManifestError
-from toolkit.features import FeatureStore, LocalFeatures, SiftExtractor, extract_session, features_path
+from toolkit.features import (
+    KINDS,
+    Extractor,
+    FeatureStore,
+    LocalFeatures,
+    SiftExtractor,
+    create_extractor,
+    extract_session,
+    features_path,
+)
 from toolkit.files import (
     SceneFiles,
     file_fingerprint,
@@ -34,10 +43,12 @@ from toolkit.files import (
 from toolkit.images import default_workers, prefetch, read_image
 from toolkit.localizers.hybrid import HybridLocalizer
 from toolkit.localizers.lifting import DepthLifter
+from toolkit.localizers.mapped import Known, MappedFeatures
 from toolkit.localizers.pnp import PnpLocalizer, PnpSettings, PoseEstimate
 from toolkit.localizers.prediction import Predictor, View, create_predictor
 from toolkit.localizers.vggt import VggtAnswer, VggtLocalizer, VggtQuery, VggtSettings
-from toolkit.mapping import LocalMap, MapSettings, build_map
+from toolkit.mapping import LocalMap, MapSettings, build_map, map_path
+from toolkit.matching import Matcher, MatchStore, MutualMatcher, create_matcher, match_sessions, matchers_of
 from toolkit.upright import Turns, upright_turns
 
 log = logging.getLogger(__name__)
@@ -128,6 +139,10 @@ def localize_pairs(
     batch_size: int = 4,
     upright: bool = True,
     world_up: Sequence[float] | None = None,
+    features: Sequence[str] = ("sift",),
+    matcher: str | None = None,
+    features_checkpoint: str | Path | None = None,
+    matcher_checkpoint: str | Path | None = None,
 ) -> pd.DataFrame:
     """Write, for every pair of devices, the poses of the queries (`.txt`) and how they came about (`.csv`).
 
@@ -136,7 +151,7 @@ def localize_pairs(
         retrieval_dir: folder of the retrieval stage's files.
         out_dir: folder of the poses.
         features_dir: folder of local features, shared with the embed stage.
-        map_dir: folder of the triangulated maps, `<device>_map.npz`.
+        map_dir: folder of the triangulated maps, `<device>_map.npz`, and of matches.
         map_device, query_device: `ios`, `hl`, `spot`, or `all` that the capture has.
         method: `pnp`; the baseline `nearest`: the pose of the best reference, marked so in the table; `vggt`: the
             pose of a network that is shown the query and references, aligned to the map; or `hybrid`: the better
@@ -150,17 +165,21 @@ def localize_pairs(
         checkpoint: file with the network's weights; None: the hub's cache, else a download.
         num_references: map images that the network is shown with each query image.
         candidates: retrieved images to choose them from, the best so many; None: all.
-        compute_device: where the network runs: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
-        dtype_compute: of the network: `auto`, `float32`, `bfloat16`, `float16`.
+        compute_device: where networks run: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
+        dtype_compute: of networks: `auto`, `float32`, `bfloat16`, `float16`.
         batch_size: query devices that the network is given at once. Rows do not depend on it.
         upright: show the network images turned so that gravity points down.
         world_up: the direction (3,) that is up in the map's world; None: estimated from its cameras.
+        features: kinds of local features, `sift` or `superpoint`. Of several, the matches are pooled in one pose.
+        matcher: of queries with references, `mutual` or `lightglue`, for the kinds that it suits; None: what is usual
+            for each kind.
+        features_checkpoint, matcher_checkpoint: files with the weights of their networks; None: as for `checkpoint`.
 
     Returns:
         One row a pair: map_device, query_device, queries, ok, low_confidence, failed, seconds, skipped, path.
 
     Raises:
-        ManifestError: unknown method or predictor, or a number that is not positive.
+        ManifestError: unknown method, predictor, features or matcher, or a number that is not positive.
         WeightsError: the network has no weights, before any work is done.
         CaptureError: unknown device or list.
         ArtefactError: the retrieval of a pair is missing.
@@ -175,6 +194,10 @@ def localize_pairs(
     settings = PnpSettings(seed=seed)
     workers = workers or default_workers()
     guide: _Guide | None = None
+    kinds: list[_Kind] = []
+    if method != "nearest":
+        places = {"features": features_checkpoint, "matcher": matcher_checkpoint}
+        kinds = _open_kinds(features, matcher, places, compute_device, dtype_compute)
     if method in PREDICTING:
         guide = _Guide(prediction.open(capture, map_dir), prediction, prediction.turns(capture))
     table = []
@@ -184,17 +207,16 @@ def localize_pairs(
             for asked in capture.devices_with("query", query_device):
                 started = time.perf_counter()
                 pair = _Pair(capture, mapped, asked, Path(retrieval_dir), Path(out_dir), queries)
-                record = pair.record(settings, method)
+                record = pair.record(settings, method, kinds)
                 if guide is not None:
                     record |= guide.record(capture[f"{mapped}_map"])
                 skipped = skip_existing and is_current(pair.txt, record) and pair.csv.exists()
                 if not skipped:
                     if solver is None:
                         session = capture[f"{mapped}_map"]
-                        solver = _open_solver(
-                            session, Path(features_dir), Path(map_dir), settings, method, guide, workers, skip_existing
-                        )
-                    rows = _localize_pair(pair, solver, Path(features_dir), record, workers, skip_existing)
+                        folders = Path(features_dir), Path(map_dir)
+                        solver = _open_solver(session, *folders, settings, method, kinds, guide, workers, skip_existing)
+                    rows = _localize_pair(pair, solver, *folders, record, workers, skip_existing)
                     _write_poses(pair, rows, COLUMNS if guide is None else [*COLUMNS, *PREDICTION_COLUMNS])
                     write_sidecar(pair.txt, record)
                 counts = pd.read_csv(pair.csv)["status"].str.split(":").str[0].value_counts()
@@ -210,6 +232,40 @@ def localize_pairs(
                     }
                 )
     return pd.DataFrame(table)
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """One kind of local features: how they are found and matched."""
+
+    name: str
+    extractor: Extractor
+    matcher: Matcher
+
+
+def _open_kinds(
+    features: Sequence[str],
+    matcher: str | None,
+    checkpoints: Mapping[str, str | Path | None],
+    compute_device: str,
+    dtype_compute: str,
+) -> list[_Kind]:
+    """Return the kinds of local features that are asked for, with their networks ready.
+
+    Raises:
+        ManifestError, WeightsError: see `localize_pairs`.
+    """
+    names = matchers_of(features, matcher)
+    device = {"device": compute_device, "dtype": dtype_compute}
+    kinds = []
+    for name, matched_by in names.items():
+        extractor = create_extractor(name, checkpoint=checkpoints["features"], **device)
+        if matched_by == "mutual":
+            kinds.append(_Kind(name, extractor, MutualMatcher(KINDS[name].ratio, KINDS[name].min_score)))
+        else:
+            network = create_matcher(matched_by, checkpoint=checkpoints["matcher"], **device)
+            kinds.append(_Kind(name, extractor, network))
+    return kinds
 
 
 @dataclass(frozen=True)
@@ -233,6 +289,9 @@ class _Solver:
     """The localizers of one map that a method asks; without any, the method is `nearest`."""
 
     pnp: PnpLocalizer | None = None
+    kinds: Sequence[_Kind] = ()
+    stores: Sequence[FeatureStore] = ()
+    """Of each kind, the map's features."""
     vggt: VggtLocalizer | None = None
     method: str = "nearest"
     batch_size: int = 1
@@ -286,14 +345,15 @@ class _Pair:
     def session(self) -> Session:
         return self.capture[f"{self.query_device}_query"]
 
-    def record(self, settings: PnpSettings, method: str) -> dict[str, Any]:
+    def record(self, settings: PnpSettings, method: str, kinds: "Sequence[_Kind]") -> dict[str, Any]:
         """Return what the poses depend on."""
         keyframes = self.session.keyframes(self.queries)
         return {
             "method": method,
             "pnp": asdict(settings),
             "map": asdict(MapSettings(seed=settings.seed)),
-            "features": SiftExtractor().settings,
+            "features": [kind.extractor.settings for kind in kinds],
+            "matchers": [kind.matcher.settings for kind in kinds],
             "retrieval": file_fingerprint(self.retrieval),
             "map_session": session_fingerprint(self.capture[f"{self.map_device}_map"]),
             "query_session": session_fingerprint(self.session),
@@ -328,28 +388,96 @@ def _open_solver(
     map_dir: Path,
     settings: PnpSettings,
     method: str,
+    kinds: Sequence[_Kind],
     guide: _Guide | None,
     workers: int,
     skip_existing: bool,
 ) -> _Solver:
-    """Return the localizers of a map session; its triangulated map is built or loaded where they need it."""
+    """Return the localizers of a map session; its triangulated maps are built or loaded where they need them."""
     if method == "nearest":
         return _Solver()
-    store = extract_session(session, features_dir, workers=workers)
-    inputs = fingerprint([session_fingerprint(session), store.fingerprint])
-    path = map_dir / f"{session.id}.npz"
-    local_map = build_map(session, store, path, MapSettings(seed=settings.seed), skip_existing, inputs, workers)
-    pnp = PnpLocalizer(local_map, store, settings)
+    stores, mapped = [], []
+    for kind in kinds:
+        store = extract_session(session, features_dir, kind.extractor, workers=workers)
+        inputs = fingerprint([session_fingerprint(session), store.fingerprint])
+        path = map_path(map_dir, session.id, kind.name)
+        local_map = build_map(session, store, path, MapSettings(seed=settings.seed), skip_existing, inputs, workers)
+        stores.append(store)
+        mapped.append(MappedFeatures(local_map, store, KINDS[kind.name], kind.matcher))
+    pnp = PnpLocalizer.of(mapped, settings)
     if guide is None:
-        return _Solver(pnp, method=method)
-    vggt = VggtLocalizer(local_map, session, guide.predictor, guide.settings.references, guide.turns)
-    return _Solver(pnp if method == "hybrid" else None, vggt, method, guide.settings.batch_size, guide.turns)
+        return _Solver(pnp, kinds, stores, method=method)
+    vggt = VggtLocalizer(mapped[0].map, session, guide.predictor, guide.settings.references, guide.turns)
+    return _Solver(
+        pnp if method == "hybrid" else None, kinds, stores, vggt, method, guide.settings.batch_size, guide.turns
+    )
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """The local features of a query session, and what networks have matched of them."""
+
+    stores: Sequence[FeatureStore]
+    """Of each kind."""
+    matches: Sequence[MatchStore | None]
+    """Of each kind that a network matches."""
+
+    def usable(self, name: str) -> bool:
+        return all(name in store for store in self.stores)
+
+    def reason(self, name: str) -> str:
+        """Return why an image is not usable."""
+        return next((store.failed[name] for store in self.stores if name in store.failed), "no features")
+
+    def features(self, name: str) -> list[LocalFeatures]:
+        return [store[name] for store in self.stores]
+
+    def known(self, name: str) -> list[Known | None]:
+        """Return what gives the matches of an image, of each kind."""
+
+        def of(store: MatchStore) -> Known:
+            return lambda reference: store[name, reference]
+
+        return [None if store is None else of(store) for store in self.matches]
+
+
+def _ask(
+    pair: _Pair,
+    solver: _Solver,
+    pnp: PnpLocalizer,
+    rows: NDArray[np.int64],
+    references: dict[tuple[int, str], list[dict[str, Any]]],
+    features_dir: Path,
+    map_dir: Path,
+    workers: int,
+    skip_existing: bool,
+) -> _Asked:
+    """Extract the features of query images, and match them with their references where that takes a network."""
+    session = pair.session
+    stores = [extract_session(session, features_dir, kind.extractor, rows, workers) for kind in solver.kinds]
+    images = session.images.iloc[rows]
+    keys = zip(images["timestamp"].tolist(), images["sensor_id"].tolist(), strict=True)
+    asked = [
+        (session.image_name(int(row)), name)
+        for row, key in zip(rows, keys, strict=True)
+        for name in map(_reference_name, references.get(key, []))
+        if name in pnp.map.index_of
+    ]
+    sessions = session.id, f"{pair.map_device}_map"
+    matches = [
+        None
+        if isinstance(kind.matcher, MutualMatcher)
+        else match_sessions(both, asked, kind.matcher, map_dir, sessions, skip_existing)
+        for kind, both in zip(solver.kinds, zip(stores, solver.stores, strict=True), strict=True)
+    ]
+    return _Asked(stores, matches)
 
 
 def _localize_pair(
     pair: _Pair,
     solver: _Solver,
     features_dir: Path,
+    map_dir: Path,
     record: dict[str, Any],
     workers: int,
     skip_existing: bool,
@@ -360,17 +488,18 @@ def _localize_pair(
     keys = list(zip(keyframes["timestamp"].tolist(), keyframes["device_id"].tolist(), strict=True))
     members = session.rows_of_keyframes(keyframes)
     references = pair.references()
-    store = None
+    local = None
     if solver.pnp is not None:
         rows = np.unique(np.concatenate([*members, np.zeros(0, np.int64)]))
-        store = extract_session(session, features_dir, rows=rows, workers=workers)
+        folders = features_dir, map_dir
+        local = _ask(pair, solver, solver.pnp, rows, references, *folders, workers, skip_existing)
 
     def solve(task: tuple[int, _QueryDevice, VggtAnswer | None, float]) -> dict[str, Any]:
         index, query, answer, seconds = task
         started = time.perf_counter() - seconds
         estimate, names = PoseEstimate("failed: no images of this device at this time"), list[str]()
-        if query.names and solver.pnp is not None and store is not None:
-            estimate, names = _pnp(query, solver, store, answer)
+        if query.names and solver.pnp is not None and local is not None:
+            estimate, names = _pnp(query, solver, local, answer)
         elif query.names and answer is not None and solver.vggt is not None:
             estimate, names = answer.estimate, _names(solver.vggt.map, answer.estimate.references)
         elif query.names:
@@ -463,12 +592,12 @@ def _names(local_map: LocalMap, images: Sequence[int]) -> list[str]:
 
 
 def _pnp(
-    query: _QueryDevice, solver: _Solver, store: FeatureStore, answer: VggtAnswer | None = None
+    query: _QueryDevice, solver: _Solver, local: _Asked, answer: VggtAnswer | None = None
 ) -> tuple[PoseEstimate, list[str]]:
     """Localize by matching; with what a network says of the query, by both."""
-    usable = [index for index, name in enumerate(query.names) if name in store]
+    usable = [index for index, name in enumerate(query.names) if local.usable(name)]
     if not usable:
-        reasons = "; ".join(store.failed.get(name, "no features") for name in query.names)
+        reasons = "; ".join(local.reason(name) for name in query.names)
         return PoseEstimate(f"failed: no readable image ({reasons})"), []
     localizer = solver.pnp
     assert localizer is not None
@@ -478,13 +607,14 @@ def _pnp(
         for index in usable
     ]
     cameras, rig_from_cams = [query.cameras[index] for index in usable], query.rig_from_cams[usable]
-    features = [store[query.names[index]] for index in usable]
+    features = [local.features(query.names[index]) for index in usable]
+    known = [local.known(query.names[index]) for index in usable]
     try:
         if answer is None:
-            estimate = localizer.localize(cameras, rig_from_cams, features, references)
+            estimate = localizer.localize(cameras, rig_from_cams, features, references, known=known)
         else:
             hybrid = HybridLocalizer(localizer, solver.lifter)
-            estimate = hybrid.localize(cameras, rig_from_cams, features, references, answer)
+            estimate = hybrid.localize(cameras, rig_from_cams, features, references, answer, known)
     except Exception as error:  # one bad query never ends a run
         log.exception("localizing %s", query.names[0])
         return PoseEstimate(f"failed: {type(error).__name__}: {error}"), []
@@ -552,6 +682,7 @@ def explain_query(
     settings: PredictorSettings | None = None,
     queries: str = "keyframes_pruned_subsampled",
     index: int = 0,
+    features: Sequence[str] = ("sift",),
 ) -> tuple[VggtLocalizer, VggtQuery, VggtAnswer]:
     """Ask the predictor about one query of a finished run again, and return all that it said.
 
@@ -567,7 +698,7 @@ def explain_query(
     """
     capture = Capture.from_sessions_root(sessions_root)
     pair = _Pair(capture, map_device, query_device, Path(retrieval_dir), Path(retrieval_dir), queries)
-    local_map = LocalMap.load(Path(map_dir) / f"{map_device}_map.npz")
+    local_map = LocalMap.load(map_path(map_dir, f"{map_device}_map", features[0]))
     settings = settings or PredictorSettings()
     network, turns = settings.open(capture, map_dir), settings.turns(capture)
     localizer = VggtLocalizer(local_map, capture[f"{map_device}_map"], network, settings.references, turns)

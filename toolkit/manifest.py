@@ -132,6 +132,14 @@ class LocalizeSettings(_Section):
     """Query devices that the network is given at once."""
     upright: bool | None = None
     """Show the network images turned so that gravity points down."""
+    features: Annotated[list[Literal["sift", "superpoint"]], Field(min_length=1)] | None = None
+    """Local features; of several, the matches are pooled in one pose."""
+    matcher: Literal["mutual", "lightglue"] | None = None
+    """Of queries with references; without it, what is usual for the features."""
+    features_checkpoint: str | None = None
+    """File with the weights of learned features; without it the hub's cache, else a download."""
+    matcher_checkpoint: str | None = None
+    """File with the weights of a learned matcher; likewise."""
 
 
 class EvaluateSettings(_Section):
@@ -339,9 +347,10 @@ def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
     }
     for stage in ("embed", "localize"):
         section = getattr(manifest, stage)
-        if section.checkpoint is not None:
-            weights = _expand(section.checkpoint, folder, f"{source}: {stage}.checkpoint")
-            update[stage] = section.model_copy(update={"checkpoint": str(weights)})
+        given = {key: text for key, text in section.given().items() if key.endswith("checkpoint")}
+        if given:
+            weights = {key: str(_expand(text, folder, f"{source}: {stage}.{key}")) for key, text in given.items()}
+            update[stage] = section.model_copy(update=weights)
     names = [Path(capture).name for capture in update["captures"]]
     if twice := {name for name in names if names.count(name) > 1}:
         raise ManifestError(

@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from toolkit.errors import ArtefactError, ManifestError
-from toolkit.features import DESCRIPTOR_SCALE, Descriptors, FeatureStore, LocalFeatures
+from toolkit.features import DESCRIPTOR_SCALE, KINDS, Descriptors, FeatureStore, LocalFeatures, feature_kind
 from toolkit.files import fingerprint
 from toolkit.groups import GroupWriter
+from toolkit.models.weights import LIGHTGLUE, SUPERPOINT, WeightsSource
 
 Floats = NDArray[np.float64]
 
@@ -61,6 +62,8 @@ MATCHERS: dict[str, str] = {
     "lightglue": "toolkit.models.lightglue:LightGlueMatcher",
 }
 """Name of a matcher -> `module:callable` that makes it, imported when it is asked for."""
+LOCAL_WEIGHTS: dict[str, WeightsSource] = {"superpoint": SUPERPOINT, "lightglue": LIGHTGLUE}
+"""The weights of the extractors and matchers that need some."""
 
 
 def create_matcher(name: str, **options: Any) -> Matcher:
@@ -80,6 +83,21 @@ def create_matcher(name: str, **options: Any) -> Matcher:
     module, _, attribute = MATCHERS[name].partition(":")
     factory: Callable[..., Matcher] = getattr(import_module(module), attribute)
     return factory(**options)
+
+
+def matchers_of(features: Sequence[str], matcher: str | None = None) -> dict[str, str]:
+    """Return the matcher of each kind of features.
+
+    Raises:
+        ManifestError: no features, unknown ones, or a matcher that suits none of them.
+    """
+    if isinstance(features, str) or not len(features):
+        raise ManifestError(f"features is {features!r}; expected a list of one or more of {', '.join(KINDS)}.")
+    suited = {name: feature_kind(name).matchers for name in features}
+    if matcher is not None and not any(matcher in known for known in suited.values()):
+        text = "; ".join(f"{name}: {', '.join(known)}" for name, known in suited.items())
+        raise ManifestError(f"The matcher {matcher!r} suits none of the features. Known for {text}.")
+    return {name: matcher if matcher in known else known[0] for name, known in suited.items()}
 
 
 class MutualMatcher:

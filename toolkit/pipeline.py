@@ -32,6 +32,7 @@ from toolkit.embedders import resolve_name
 from toolkit.errors import ManifestError, ToolkitError
 from toolkit.files import SceneFiles, files_fingerprint, fingerprint, write_text
 from toolkit.manifest import STAGES, Manifest, load_manifest, nearest
+from toolkit.matching import LOCAL_WEIGHTS, matchers_of
 from toolkit.models.weights import VGGT, WeightsSource, find_any, resolve_any
 from toolkit.notebook import (
     COUNTS_MIME,
@@ -312,17 +313,26 @@ def _name_embedder(manifest: Manifest, say: Say) -> Manifest:
 
 def _require_weights(stage: str, parameters: dict[str, Any]) -> None:
     """Find or download the weights that a stage needs, before hours of work and where its progress is seen."""
-    if sources := _weights_needed(stage, parameters):
-        resolve_any(sources, parameters.get("checkpoint"))
+    for sources, checkpoint in _weights_needed(stage, parameters):
+        resolve_any(sources, checkpoint)
 
 
-def _weights_needed(stage: str, parameters: dict[str, Any]) -> tuple[WeightsSource, ...]:
-    """Return the weights, any of which will do, of the network that a stage runs with these parameters, if it does."""
+def _weights_needed(stage: str, parameters: dict[str, Any]) -> list[tuple[tuple[WeightsSource, ...], str | None]]:
+    """Return the weights of each network that a stage runs with these parameters: any of some will do, or the file."""
+    checkpoint = parameters.get("checkpoint")
     if stage == "embed" and parameters.get("model") in EMBEDDER_WEIGHTS:
-        return (EMBEDDER_WEIGHTS[parameters["model"]],)
-    if stage == "localize" and parameters.get("method") in ("vggt", "hybrid"):
-        return VGGT if parameters.get("predictor", "vggt") == "vggt" else ()
-    return ()
+        return [((EMBEDDER_WEIGHTS[parameters["model"]],), checkpoint)]
+    method = parameters.get("method", "pnp")
+    if stage != "localize" or method == "nearest":
+        return []
+    needed: list[tuple[tuple[WeightsSource, ...], str | None]] = []
+    if method in ("vggt", "hybrid") and parameters.get("predictor", "vggt") == "vggt":
+        needed.append((VGGT, checkpoint))
+    names = matchers_of(parameters.get("features") or ["sift"], parameters.get("matcher"))
+    for key, used in (("features", names.keys()), ("matcher", names.values())):
+        for name in sorted({*used} & LOCAL_WEIGHTS.keys()):
+            needed.append(((LOCAL_WEIGHTS[name],), parameters.get(f"{key}_checkpoint")))
+    return needed
 
 
 def _captures(manifest: Manifest) -> list[Path]:
@@ -418,9 +428,9 @@ def _inputs_of(job: Job, capture: str) -> str:
 
 def _weights_of(job: Job) -> str | None:
     """Return what identifies the file with the weights that a job uses, None if it uses none or has none yet."""
-    sources = _weights_needed(job.stage, job.parameters)
-    path = find_any(sources, job.parameters.get("checkpoint")) if sources else None
-    return files_fingerprint([path.resolve()]) if path else None
+    needed = _weights_needed(job.stage, job.parameters)
+    paths = [path for sources, checkpoint in needed if (path := find_any(sources, checkpoint))]
+    return files_fingerprint([path.resolve() for path in paths]) if paths else None
 
 
 @cache

@@ -68,6 +68,22 @@ VGGT_1B_COMMERCIAL = WeightsSource(
 )
 VGGT = (VGGT_1B, VGGT_1B_COMMERCIAL)
 """Of one architecture: what is on the machine is taken."""
+SUPERPOINT = WeightsSource(
+    model="SuperPoint",
+    repo_id="magic-leap-community/superpoint",
+    filename="model.safetensors",
+    licence="Magic Leap's, for academic or non-profit organizations: noncommercial research use only",
+    alternative="use `sift` features, which need none",
+    setting="localize.features_checkpoint",
+)
+LIGHTGLUE = WeightsSource(
+    model="LightGlue",
+    repo_id="ETH-CVG/lightglue_superpoint",
+    filename="model.safetensors",
+    licence="Apache-2.0; the file also holds SuperPoint's, noncommercial research use only",
+    alternative="use the matcher `mutual`, or `sift` features, which need none",
+    setting="localize.matcher_checkpoint",
+)
 
 
 def find_weights(source: WeightsSource, checkpoint: str | Path | None = None) -> Path | None:
