@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -15,11 +16,12 @@ from toolkit import geometry
 from toolkit.capture import Capture, Trajectory
 from toolkit.embed import embed_sessions
 from toolkit.errors import ArtefactError, CaptureError, ImageError, ManifestError, ToolkitError
-from toolkit.features import extract_session
+from toolkit.features import KINDS, LocalFeatures, SiftExtractor, SiftSettings, extract_session
 from toolkit.files import SceneFiles, sidecar_path
 from toolkit.images import read_image
 from toolkit.localize import COLUMNS, Map, localize_image, localize_pairs
 from toolkit.localizers.pnp import PnpLocalizer, PoseEstimate
+from toolkit.matching import MATCHERS, MutualMatcher, unit_descriptors
 from toolkit.retrieve import retrieve_pairs
 
 LIST = "keyframes_original"
@@ -460,3 +462,103 @@ def test_a_map_with_the_embedder_it_was_made_with(
     answer = localize_image(opened, path, camera)
     np.testing.assert_allclose(answer.world_from_rig, expected.world_from_rig, atol=1e-9)
     assert learned.seen == [(camera.height, camera.width, 3)], "it is given colours"
+
+
+# ------------------------------------------------------------------------------------- other features, and several
+
+
+class OtherFeatures(SiftExtractor):
+    """A second kind of features, without weights: keypoints of a smaller image, float descriptors, in batches."""
+
+    threaded, batch_size = False, 3
+
+    def __init__(self, **of_networks: object) -> None:
+        super().__init__(SiftSettings(min_long_side=0, max_long_side=448))
+
+    @property
+    def settings(self) -> dict:
+        return super().settings | {"name": "other"}
+
+    def extract(self, images: Sequence[np.ndarray]) -> list[LocalFeatures]:
+        return [
+            replace(found, descriptors=unit_descriptors(found.descriptors).astype(np.float16))
+            for found in super().extract(images)
+        ]
+
+
+class OtherMatcher(MutualMatcher):
+    """Matches as a network does: asked by the stage, for all pairs, before any pose is sought."""
+
+    asked = 0
+
+    def __init__(self, **of_networks: object) -> None:
+        super().__init__(ratio=0.85)
+
+    def match(self, pairs):  # type: ignore[no-untyped-def]
+        OtherMatcher.asked += len(pairs)
+        return super().match(pairs)
+
+
+class Wrapped:
+    """A matcher that is no `MutualMatcher`."""
+
+    batch_size = 5
+    settings = {"name": "network"}  # noqa: RUF012
+
+    def __init__(self, **of_networks: object) -> None:
+        self.match = OtherMatcher().match
+
+
+@pytest.fixture
+def other_kind(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A manifest can name the features `other` and the matcher `network`."""
+    kind = replace(KINDS["sift"], extractor=f"{__name__}:OtherFeatures", matchers=("network", "mutual"))
+    monkeypatch.setitem(KINDS, "other", kind)
+    monkeypatch.setitem(MATCHERS, "network", f"{__name__}:Wrapped")
+    monkeypatch.setattr(OtherMatcher, "asked", 0)
+
+
+def test_several_features_are_pooled_in_one_pose(
+    small_capture: Path, finished: tuple[SceneFiles, pd.DataFrame], run: SceneFiles, other_kind: None
+) -> None:
+    run_stage(small_capture, run, query_device="ios", features=["sift", "other"])
+    alone, both = rows_of(finished[0], "ios"), rows_of(run, "ios")
+    assert {path.name for path in run.maps.glob("*.npz")} == {"ios_map.npz", "ios_map-other.npz"}
+    assert (both["num_matches"] > 1.3 * alone["num_matches"]).all()
+    assert both["num_inliers"].sum() > 1.2 * alone["num_inliers"].sum()
+    assert (both["status"] == "ok").sum() >= (alone["status"] == "ok").sum()
+    session = Capture.open(small_capture)["ios_query"]
+    estimated = Trajectory.read(run.poses_txt("ios", "ios"))
+    true = session.ground_truth.lookup(estimated.timestamps, estimated.device_ids)
+    rotation_deg, distance_m = geometry.pose_error(estimated.world_from_device, true)
+    assert np.median(rotation_deg) < 0.1
+    assert np.median(distance_m) < 0.01
+
+
+def test_what_a_network_has_matched_is_kept(small_capture: Path, run: SceneFiles, other_kind: None) -> None:
+    first = run_stage(small_capture, run, query_device="ios", features=["other"])
+    assert first["ok"].sum() > 0
+    asked = OtherMatcher.asked
+    retrieved = [json.loads(line) for line in run.retrieval("ios", "ios").read_text().splitlines()]
+    assert 0 < asked <= sum(len(row["topk"]) for row in retrieved)
+    before = run.poses_txt("ios", "ios").read_bytes()
+    run.poses_txt("ios", "ios").unlink()
+    run_stage(small_capture, run, query_device="ios", features=["other"])
+    assert OtherMatcher.asked == asked
+    assert run.poses_txt("ios", "ios").read_bytes() == before
+    mutual = run_stage(small_capture, run, query_device="ios", features=["other"], matcher="mutual")
+    assert not mutual["skipped"].any()
+    assert OtherMatcher.asked == asked
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"features": ["surf"]}, "Unknown local features 'surf'"),
+        ({"features": []}, "expected a list of one or more"),
+        ({"matcher": "lightglue"}, "suits none of the features. Known for sift: mutual"),
+    ],
+)
+def test_wrong_features_are_refused(small_capture: Path, run: SceneFiles, options: dict, text: str) -> None:
+    with pytest.raises(ManifestError, match=text):
+        run_stage(small_capture, run, **options)
