@@ -355,6 +355,23 @@ def test_a_current_map_is_loaded_and_another_is_built(
         assert built
 
 
+def test_after_a_change_only_the_pairs_of_the_changed_image_are_matched(
+    phone: tuple[Session, FeatureStore], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session, store = phone
+    quick = MapSettings(pairs_per_image=2)
+    asked: list[list[list[int]]] = []
+    work = mapping.match_pairs
+    monkeypatch.setattr(mapping, "match_pairs", lambda pairs, *args: asked.append(pairs.tolist()) or work(pairs, *args))
+    first = build_map(session, store, tmp_path / "ios_map.npz", quick, inputs="a")
+    changed = {**store.made_from, store.names[0]: "another image"}
+    other = FeatureStore(store.path, changed, settings=store.settings)
+    assert_equal(build_map(session, other, tmp_path / "ios_map.npz", quick, inputs="b"), first)
+    everything, again = asked
+    assert again == [pair for pair in everything if 0 in pair]
+    assert 0 < len(again) < len(everything)
+
+
 def test_a_torn_map_with_a_valid_record_is_built_anew(phone: tuple[Session, FeatureStore], tmp_path: Path) -> None:
     session, store = phone
     path, quick = tmp_path / "ios_map.npz", MapSettings(pairs_per_image=2)

@@ -299,3 +299,18 @@ def test_other_weights_in_the_same_place_are_noticed(place: Path, go: Callable[.
     assert go(*options)["embed"] == "reused"
     weights.write_bytes(b"other")
     assert go(*options)["embed"] == "done"
+
+
+def test_the_weights_of_every_network_of_a_stage_are_asked_for() -> None:
+    def needed(**parameters: object) -> list[tuple[list[str], object]]:
+        found = pipeline._weights_needed("localize", parameters)
+        return [([source.model for source in sources], place) for sources, place in found]
+
+    assert needed() == needed(features=["sift"]) == needed(method="nearest", features=["superpoint"]) == []
+    assert needed(features=["sift", "superpoint"], matcher_checkpoint="/w/lg") == [
+        (["SuperPoint"], None), (["LightGlue"], "/w/lg")
+    ]  # fmt: skip
+    assert needed(features=["superpoint"], matcher="mutual", features_checkpoint="sp") == [(["SuperPoint"], "sp")]
+    both = needed(method="hybrid", features=["superpoint"], checkpoint="vggt.pt")
+    assert both[0] == (["VGGT-1B", "VGGT-1B-Commercial"], "vggt.pt")
+    assert [models for models, _ in both[1:]] == [["SuperPoint"], ["LightGlue"]]

@@ -2,8 +2,9 @@
 
 import logging
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from toolkit.capture import Capture, Session
 from toolkit.compute import check_device_name
 from toolkit.embedders import Embedder, create_embedder, resolve_name
 from toolkit.errors import ImageError, ManifestError, ToolkitError
-from toolkit.features import LocalFeatures, SiftExtractor, extract_session
+from toolkit.features import FeatureStore, LocalFeatures, SiftExtractor, extract_session
 from toolkit.files import (
     file_fingerprint,
     files_fingerprint,
@@ -112,6 +113,13 @@ def embed_sessions(
     turns = _turns(capture, embedder, upright, world_up)
     if subsession == "all":
         _remove_former(out_dir, _session_names(capture, device), jobs)
+
+    @cache
+    def store_of(session_id: str) -> FeatureStore:
+        """Return the features of all that is embedded of a session: its file is then written once."""
+        rows = [rows for session, _, rows in jobs if session.id == session_id]
+        return extract_session(capture[session_id], features_dir, rows=np.concatenate(rows))
+
     table = []
     for session, part, rows in jobs:
         started = time.perf_counter()
@@ -134,7 +142,7 @@ def embed_sessions(
             # The same images in batches of another size are the same up to rounding.
             identity = {**record, "batch_size": batch_size}
             with MatrixWriter(matrix_path, embedder.dim, dtype, identity, resume=skip_existing) as writer:
-                failed = _embed_job(embedder, job, writer, batch_size, normalize, features_dir)
+                failed = _embed_job(embedder, job, writer, batch_size, normalize, store_of)
                 embedded = writer.count
                 _write_tables(folder, _manifest(capture, session, rows, failed), failed)
                 writer.finish()
@@ -266,7 +274,12 @@ def _vocabulary(
 
 
 def _embed_job(
-    embedder: Embedder, job: _Job, writer: MatrixWriter, batch_size: int, normalize: bool, features_dir: Path
+    embedder: Embedder,
+    job: _Job,
+    writer: MatrixWriter,
+    batch_size: int,
+    normalize: bool,
+    store_of: Callable[[str], FeatureStore],
 ) -> dict[int, str]:
     """Write the vectors of the readable images, in order; returns why the others (by row) have none."""
     failed: dict[int, str] = {}
@@ -275,7 +288,7 @@ def _embed_job(
         done = note["done"]
         failed |= dict(note["failed"])
     source = _features if embedder.inputs == "features" else _images
-    inputs = source(embedder, job, done, batch_size, features_dir)
+    inputs = source(embedder, job, done, batch_size, store_of)
     label = f"embed {job.session.id}/{job.part}"
     with tqdm(total=len(job.rows), initial=done, desc=label, unit="image") as bar:
         for batch, unreadable in _batches(inputs, batch_size):
@@ -290,17 +303,17 @@ def _embed_job(
 
 
 def _features(
-    embedder: Embedder, job: _Job, done: int, batch_size: int, features_dir: Path
+    embedder: Embedder, job: _Job, done: int, batch_size: int, store_of: Callable[[str], FeatureStore]
 ) -> Iterator[tuple[int, LocalFeatures | str]]:
     """Yield row and local features of the images after the first `done`, or why there are none."""
-    store = extract_session(job.session, features_dir, rows=job.rows)
+    store = store_of(job.session.id)
     for row in job.rows[done:].tolist():
         name = job.session.image_name(row)
         yield row, store[name] if name in store else store.failed.get(name, "no local features were extracted")
 
 
 def _images(
-    embedder: Embedder, job: _Job, done: int, batch_size: int, features_dir: Path
+    embedder: Embedder, job: _Job, done: int, batch_size: int, store_of: Callable[[str], FeatureStore]
 ) -> Iterator[tuple[int, NDArray[np.uint8] | str]]:
     """Yield row and prepared image of the images after the first `done`, or why it cannot be read."""
 
