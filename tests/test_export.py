@@ -62,7 +62,7 @@ def test_rigs_that_are_made_anew_for_each_frame_are_one(model: Path, small_captu
 
 def test_points_have_their_tracks_colours_and_pixels(model: Path, run: SceneFiles) -> None:
     read, local_map = pycolmap.Reconstruction(str(model)), LocalMap.load(run.maps / "hl_map.npz")
-    store = FeatureStore.open(run.features / "hl_map")
+    store = FeatureStore.of_session(run.features, "hl_map")
     assert read.num_points3D() == len(local_map.points) > 100
     assert read.compute_num_observations() == len(local_map.obs_point)
     points = [read.points3D[key] for key in sorted(read.points3D)]

@@ -43,7 +43,7 @@ def export_colmap(
         raise ManifestError(f"{out}: there are files already. Give an empty or new folder.")
     session = Captures([Path(run)], [] if capture is None else [capture])[scene][session_id]
     local_map = LocalMap.load(files.maps / f"{session_id}.npz")
-    model = colmap_model(local_map, session, FeatureStore.open(files.features / session_id))
+    model = colmap_model(local_map, session, FeatureStore.of_session(files.features, session_id))
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as folder:
         part = Path(folder) / "model"

@@ -317,6 +317,20 @@ class FeatureStore(Mapping[str, LocalFeatures]):
             )
         return cls(Path(path), dict.fromkeys(names, files_fingerprint([Path(path)])))
 
+    @classmethod
+    def of_session(cls, out: str | Path, session_id: str, settings: Mapping[str, Any] | None = None) -> "FeatureStore":
+        """Open all features of a session that are there.
+
+        Args:
+            out: folder of all features.
+            session_id: the session's.
+            settings: of the extractor; None: of SIFT.
+
+        Raises:
+            ArtefactError: there are none, or the file is torn.
+        """
+        return cls.open(features_path(out, session_id, settings or SiftExtractor().settings))
+
     @property
     def fingerprint(self) -> str:
         """16 hex digits that identify the images and settings that the features were made from."""

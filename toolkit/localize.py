@@ -28,7 +28,6 @@ from toolkit.features import (
     SiftExtractor,
     create_extractor,
     extract_session,
-    features_path,
 )
 from toolkit.files import (
     SceneFiles,
@@ -738,7 +737,7 @@ class Map:
         vectors, table = load_embeddings(files.embeddings / session)
         names = [path.split("/sessions/", 1)[-1] for path in table["abs_path"]]
         indices = np.array([local_map.index_of.get(name, -1) for name in names], np.int64)
-        store = FeatureStore.open(features_path(files.features, session, SiftExtractor().settings))
+        store = FeatureStore.of_session(files.features, session)
         localizer = PnpLocalizer(local_map, store)
         if embedder is None:
             embedder = create_embedder("vlad", vocabulary=files.embeddings / "vlad.npz")
