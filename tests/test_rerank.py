@@ -17,6 +17,7 @@ from toolkit.evaluate import overlap_in_view, overlap_table
 from toolkit.features import LocalFeatures
 from toolkit.files import SceneFiles, sidecar_path
 from toolkit.geometry import invert, make_pose, transform
+from toolkit.matching import MutualMatcher
 from toolkit.rerank import VerifySettings, count_inliers, is_meaningful, rerank_pairs
 from toolkit.retrieve import retrieve_pairs
 
@@ -277,7 +278,7 @@ def test_wrong_settings_and_files_are_refused(small_capture: Path, files: SceneF
 def test_map_images_in_memory_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rerank, "MAP_IMAGES_KEPT", 2)
     features = LocalFeatures(
-        np.zeros((9, 2), np.float32), np.ones(9, np.float32), np.zeros((9, 128), np.uint8), (640, 480)
+        np.zeros((9, 2), np.float32), *[np.ones(9, np.float32)] * 2, np.zeros((9, 128), np.uint8), (640, 480)
     )
     read: list[str] = []
 
@@ -286,7 +287,7 @@ def test_map_images_in_memory_are_bounded(monkeypatch: pytest.MonkeyPatch) -> No
             read.append(name)
             return features
 
-    verifier = rerank.Verifier(VerifySettings(max_features=4), rerank.MutualMatcher(0.8))
+    verifier = rerank.Verifier(VerifySettings(max_features=4), MutualMatcher(0.8))
     for name in "abab":
         assert len(verifier._features(name, Store())) == 4  # type: ignore[arg-type]
     assert read == ["a", "b"]

@@ -9,10 +9,10 @@ import logging
 import time
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from threading import Lock
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -25,7 +25,7 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
 from toolkit.errors import ArtefactError, ManifestError
-from toolkit.features import FeatureSettings, FeatureStore, LocalFeatures, extract_session
+from toolkit.features import FeatureStore, LocalFeatures, SiftExtractor, extract_session
 from toolkit.files import (
     file_fingerprint,
     is_current,
@@ -35,7 +35,7 @@ from toolkit.files import (
     write_text,
 )
 from toolkit.images import default_workers, prefetch
-from toolkit.matching import mutual_matches, similarity, unit_descriptors
+from toolkit.matching import Matcher, MutualMatcher
 
 log = logging.getLogger(__name__)
 
@@ -58,39 +58,6 @@ class VerifySettings:
     max_trials: int = 500
     """Samples of five matches, the best matches first."""
     seed: int = 0
-
-
-@dataclass(frozen=True)
-class PairMatches:
-    """Matches of two images."""
-
-    indices: NDArray[np.int64]
-    """(K, 2) rows of the features of either."""
-    scores: NDArray[np.float32]
-    """(K,) higher is surer."""
-
-
-class Matcher(Protocol):
-    """Matches the local features of images, many pairs at a time."""
-
-    def match(self, pairs: Sequence[tuple[LocalFeatures, LocalFeatures]]) -> list[PairMatches]:
-        """Return the matches of each pair."""
-
-
-@dataclass(frozen=True)
-class MutualMatcher:
-    """Mutual nearest neighbours that pass Lowe's ratio test."""
-
-    ratio: float
-
-    def match(self, pairs: Sequence[tuple[LocalFeatures, LocalFeatures]]) -> list[PairMatches]:
-        """Return the matches of each pair."""
-        return [self._match(one, other) for one, other in pairs]
-
-    def _match(self, one: LocalFeatures, other: LocalFeatures) -> PairMatches:
-        scores = similarity(unit_descriptors(one.descriptors), unit_descriptors(other.descriptors))
-        indices = mutual_matches(scores, self.ratio)
-        return PairMatches(indices, scores[indices[:, 0], indices[:, 1]])
 
 
 def rerank_pairs(
@@ -240,9 +207,7 @@ class Verifier:
         return inliers, [len(found.indices) for found in matched]
 
     def _strongest(self, features: LocalFeatures) -> LocalFeatures:
-        part = slice(self.settings.max_features)
-        keypoints, scales, descriptors = features.keypoints[part], features.scales[part], features.descriptors[part]
-        return replace(features, keypoints=keypoints, scales=scales, descriptors=descriptors)
+        return features.take(slice(self.settings.max_features))
 
     def _features(self, name: str, store: FeatureStore) -> LocalFeatures:
         with self._lock:
@@ -366,7 +331,7 @@ class _Pair:
             read_references(self.retrieval)  # says what is missing
         return {
             "retrieval": file_fingerprint(self.retrieval),
-            "features": asdict(FeatureSettings()),
+            "features": SiftExtractor().settings,
             "verify": asdict(settings),
             "topn": topn,
             "topk": topk,
