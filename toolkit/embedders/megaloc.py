@@ -1,6 +1,5 @@
 """MegaLoc as an embedder: photographs as they come, resized, in batches, on any device."""
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from pathlib import Path
@@ -16,7 +15,7 @@ from toolkit.compute import Fitting, resolve_device, resolve_precision
 from toolkit.errors import ManifestError, ToolkitError
 from toolkit.models.megaloc import PATCH, MegaLoc
 from toolkit.models.vit import IMAGENET_MEAN, IMAGENET_STD
-from toolkit.models.weights import MEGALOC, resolve_weights
+from toolkit.models.weights import MEGALOC, resolve_weights, weights_digest
 
 
 class MegaLocEmbedder:
@@ -56,7 +55,7 @@ class MegaLocEmbedder:
             checkpoint = resolve_weights(MEGALOC, checkpoint)
         # A network that is given stays the caller's, with its type and device.
         model = deepcopy(checkpoint) if isinstance(checkpoint, MegaLoc) else MegaLoc.from_checkpoint(checkpoint)
-        self._weights = _digest(model)
+        self._weights = weights_digest(model)
         self.dim = model.dim
         self._model = model.to(self._device, self._dtype).eval()
         self._mean = torch.tensor(IMAGENET_MEAN, device=self._device).view(1, 3, 1, 1)
@@ -109,12 +108,3 @@ class MegaLocEmbedder:
         normalised = (images.permute(0, 3, 1, 2).float() / 255 - self._mean) / self._std
         descriptors: Tensor = self._model(normalised)
         return descriptors
-
-
-def _digest(model: MegaLoc) -> str:
-    """Return 16 hex digits that identify the weights by their values."""
-    digest = hashlib.sha256()
-    for name, tensor in model.state_dict().items():
-        digest.update(name.encode())
-        digest.update(tensor.detach().cpu().contiguous().flatten().view(torch.uint8).numpy())
-    return digest.hexdigest()[:16]

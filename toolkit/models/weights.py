@@ -253,6 +253,17 @@ def load_checkpoint(
     module.requires_grad_(False).eval()
 
 
+def weights_digest(module: "nn.Module") -> str:
+    """Return 16 hex digits that identify the weights of a module by their names and values."""
+    import torch
+
+    digest = hashlib.sha256()
+    for name, tensor in module.state_dict().items():
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().contiguous().flatten().view(torch.uint8).numpy())
+    return digest.hexdigest()[:16]
+
+
 def _progress_bar() -> type:
     """Return a bar that shows wherever those of the stages do: the library's own only does on a terminal."""
     from huggingface_hub.utils import are_progress_bars_disabled
