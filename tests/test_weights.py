@@ -18,9 +18,14 @@ from torch import nn
 
 from tests.fake_hub import FakeHub, serving, use_hub
 from toolkit.errors import ToolkitError
+from toolkit.features import create_extractor
+from toolkit.matching import create_matcher
 from toolkit.models.weights import (
+    LIGHTGLUE,
     MEGALOC,
+    SUPERPOINT,
     WeightsError,
+    WeightsSource,
     find_weights,
     load_checkpoint,
     read_state_dict,
@@ -136,6 +141,31 @@ def test_wrong_checksum(hub: FakeHub, tmp_path: Path) -> None:
     assert f"expected {hub.etag}" in message
     assert not [path for path in (tmp_path / "cache").rglob("*") if path.is_file() and path.stat().st_size > 1000]
     assert_recovers(hub)
+
+
+@pytest.mark.parametrize(("source", "create"), [(SUPERPOINT, create_extractor), (LIGHTGLUE, create_matcher)])
+def test_local_features_and_matches(
+    hub: FakeHub, monkeypatch: pytest.MonkeyPatch, source: WeightsSource, create: Callable[..., Any]
+) -> None:
+    pytest.importorskip("transformers", reason="needs the extra `learned`")
+    name = source.model.lower()
+    hub.weights = f"/{source.repo_id}/resolve/main/{source.filename}"
+    with monkeypatch.context() as patch:
+        patch.setattr(constants, "HF_HUB_OFFLINE", True)
+        with pytest.raises(WeightsError) as caught:
+            create(name, device="cpu")
+    message = str(caught.value)
+    for part in (f"`model.safetensors` of https://huggingface.co/{source.repo_id}", "research use only", "`sift`"):
+        assert part in message
+    # What the hub sends is no such network: it was fetched, read and refused by its keys.
+    with pytest.raises(WeightsError, match=rf"not weights of {source.model}, which has \d+ keys; found 1"):
+        create(name, device="cpu")
+    path = find_weights(source)
+    assert path is not None
+    hub.requests.clear()
+    with pytest.raises(WeightsError, match="not weights"):
+        create(name, checkpoint=path.parent, device="cpu")
+    assert hub.requests == []
 
 
 @pytest.mark.parametrize("cuts", [[], [70_000] * 100])  # never reached; reached, and its commit is known
