@@ -249,11 +249,11 @@ def spy(monkeypatch: pytest.MonkeyPatch, fail_at: int | None = None, error: Base
     calls: list[int] = []
     work: Callable[..., PoseEstimate] = PnpLocalizer.localize
 
-    def counted(self: PnpLocalizer, *args: object) -> PoseEstimate:
+    def counted(self: PnpLocalizer, *args: object, **named: object) -> PoseEstimate:
         calls.append(len(calls))
         if error is not None and calls[-1] == fail_at:
             raise error
-        return work(self, *args)
+        return work(self, *args, **named)
 
     monkeypatch.setattr(PnpLocalizer, "localize", counted)
     return calls
