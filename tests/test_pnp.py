@@ -324,6 +324,31 @@ def test_what_is_there_once_decides_between_like_places() -> None:
     assert estimate.rival_support < 0.8
 
 
+@pytest.mark.parametrize("place", range(5))
+def test_the_right_one_of_many_like_places_is_found(place: int) -> None:
+    """Only weak features, which are not matched at first, tell the places apart: each has to be tried."""
+    rng = np.random.default_rng(0)
+    shifts = np.array([[3.0 * index, 0, 0] for index in range(5)])
+    like = rng.uniform([-0.8, -0.8, 4], [0.8, 0.8, 5], (200, 3))
+    once = rng.uniform([-0.8, -0.8, 4], [0.8, 0.8, 5], (100, 3)) + shifts[place]
+    poses = np.stack([facing(x + shift, 0, 0) for shift, _, _ in shifts for x in (-0.3, 0.3)])
+    sees = {index: np.arange(200) + 200 * (index // 2) for index in range(10)}
+    for index in (2 * place, 2 * place + 1):
+        sees[index] = np.concatenate([sees[index], np.arange(1000, 1100)])
+    descriptors = np.concatenate([*[random_descriptors(rng, 200)] * 5, random_descriptors(rng, 100)])
+    world = World.build(np.concatenate([*(like + shift for shift in shifts), once]), poses, descriptors, sees)
+    pose = facing(shifts[place, 0] + 0.1, 0.1, 0.3)
+    strong = world.look(PINHOLE, pose, only=np.arange(200) + 200 * place)
+    weak = world.look(PINHOLE, pose, only=np.arange(1000, 1100))
+    both = {
+        name: np.concatenate([getattr(strong, name), getattr(weak, name)])
+        for name in ("keypoints", "scales", "scores", "descriptors")
+    }
+    seen = LocalFeatures(**both, image_size=(640, 480))
+    localizer = world.localizer(max_query_features=len(strong), contested_references=10)
+    check(localizer.localize([PINHOLE], np.eye(4)[None], [seen], [list(range(10))]), pose, 0.2, 0.02)
+
+
 @pytest.mark.parametrize("rig", [False, True])
 def test_covariance_is_the_scatter_of_the_poses(rig: bool) -> None:
     """Of world_from_rig @ Exp(d), d = rotation, then translation, in the rig's frame: by 200 noisy queries.

@@ -48,7 +48,10 @@ class PnpSettings:
     """With more inliers than this share of the matches, no other pose is looked for: what is left over cannot support
     one by more than `ok_rival_support`."""
     contested_inlier_ratio: float = 0.4
-    """With fewer, the pose may lie between two, and is sought again under a tighter limit."""
+    """With fewer, the pose may lie between two: it is sought again under a tighter limit, and by single references."""
+    contested_references: int = 4
+    """References, those with the most matches, that then give a pose each: together, look-alikes can outvote the one
+    that shows the place."""
     guided_radii_deg: tuple[float, ...] = (0.7, 0.35)
     """Search radius around a projected map point, one guided pass each."""
     max_ransac_matches: int = 2500
@@ -226,7 +229,7 @@ class PnpLocalizer:
         query = _Query(list(cameras), np.asarray(rig_from_cams, np.float64), kinds)
         matches = self._match(query, references, known)
         distinct = len(np.unique(matches.point))
-        hypotheses = self._hypotheses(query, matches) if distinct >= 4 else []
+        hypotheses = self._hypotheses(query, matches, references) if distinct >= 4 else []
         if distinct < 4:
             found = PoseEstimate("failed: too few matches", num_matches=len(matches))
         elif not hypotheses:
@@ -277,13 +280,15 @@ class PnpLocalizer:
         points = [self.map.observations(int(image))[1] for image in images]
         return self._covisible(np.unique(np.concatenate([np.zeros(0, np.int64), *points])))
 
-    def _hypotheses(self, query: "_Query", matches: "_Matches") -> "list[_Hypothesis]":
+    def _hypotheses(
+        self, query: "_Query", matches: "_Matches", references: Sequence[Sequence[int]]
+    ) -> "list[_Hypothesis]":
         """Return refined poses, best supported first.
 
         Repeated structure (a row of like windows) gives several poses that many descriptors agree with, and
         RANSAC may take one of them or something in between. So unless the first is clear, others are sought, with a
-        tighter limit and among the matches that the first leaves over, and the guided matches decide: only the
-        right pose puts the rest of the map where it is seen.
+        tighter limit, among the matches that the first leaves over and among those of single references, and the
+        guided matches decide: only the right pose puts the rest of the map where it is seen.
         """
         settings = self.settings
         start = self._ransac(query, matches, settings.ransac_max_error_deg)
@@ -306,7 +311,25 @@ class PnpLocalizer:
             support = self._inliers(query, start, rest).sum()
             if share < settings.contested_inlier_ratio or support >= inliers.sum() / 2:
                 found.append(self._improve(query, start, matches))
+        if share < settings.contested_inlier_ratio:
+            self._add_by_reference(query, matches, references, found)
         return sorted(found, key=lambda hypothesis: -len(hypothesis.matches))
+
+    def _add_by_reference(
+        self,
+        query: "_Query",
+        matches: "_Matches",
+        references: Sequence[Sequence[int]],
+        found: "list[_Hypothesis]",
+    ) -> None:
+        """Add the poses that matches with single references agree on, where they are clearly others."""
+        every = dict.fromkeys(int(index) for of_camera in references for index in of_camera)
+        shown = {index: np.isin(matches.point, self.map.observations(index)[1]) for index in every}
+        best = sorted(shown, key=lambda index: -int(shown[index].sum()))
+        for index in best[: self.settings.contested_references]:
+            start = self._ransac(query, matches[shown[index]], self.settings.ransac_max_error_deg, least_inliers=5)
+            if start is not None and not any(agree(one.world_from_rig, geometry.invert(start)) for one in found):
+                found.append(self._improve(query, start, matches))
 
     def _inliers(self, query: "_Query", rig_from_world: Floats, matches: "_Matches") -> NDArray[np.bool_]:
         errors = query.errors_deg(rig_from_world, matches, self.map.points)
