@@ -411,8 +411,9 @@ def _anchor(raw: dict[str, Any], folder: Path) -> None:
     if "output_root" in raw:
         raw["output_root"] = anchor(raw["output_root"])
     for stage in ("embed", "localize"):
-        if isinstance(raw.get(stage), dict) and "checkpoint" in raw[stage]:
-            raw[stage]["checkpoint"] = anchor(raw[stage]["checkpoint"])
+        if isinstance(raw.get(stage), dict):
+            files = {key: anchor(text) for key, text in raw[stage].items() if str(key).endswith("checkpoint")}
+            raw[stage] = raw[stage] | files
 
 
 def _read_yaml(path: Path, heir: Path | None = None) -> dict[str, Any]:
