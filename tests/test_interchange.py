@@ -1,5 +1,7 @@
 """Import: COLMAP models and folders of images become sessions; what cannot be used is said."""
 
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -150,6 +152,14 @@ def test_a_folder_without_a_model_is_refused(tmp_path: Path) -> None:
         import_colmap(tmp_path, tmp_path, tmp_path / "PLACE")
 
 
+def test_a_model_with_an_empty_file_is_refused(model: Path, tmp_path: Path) -> None:
+    (tmp_path / "binary").mkdir()
+    pycolmap.Reconstruction(str(model)).write_binary(str(tmp_path / "binary"))
+    (tmp_path / "binary" / "points3D.bin").write_bytes(b"")
+    with pytest.raises(CaptureError, match="no COLMAP model can be read here"):
+        import_colmap(tmp_path / "binary", tmp_path / "photos", tmp_path / "PLACE")
+
+
 # ------------------------------------------------------------------------------------------------ folders of images
 
 
@@ -237,6 +247,20 @@ def test_images_without_a_focal_length_are_left_out(folder: Path, tmp_path: Path
     assert read_number({1: "many", 2: float("inf")}, 1) == read_number({2: float("inf")}, 2) == 0
 
 
+def test_an_image_of_absurd_size_is_a_row(folder: Path, tmp_path: Path) -> None:
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", 30_000, 30_000, 8, 2, 0, 0, 0))
+    (folder / "absurd.png").write_bytes(b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", b"") + chunk(b"IEND", b""))
+    for camera in (CAMERA, None):
+        save(folder / "c.jpg", tags={0xA405: 30})
+        report = import_images(folder, tmp_path / f"PLACE-{camera is None}", camera=camera)
+        status = report.images.set_index("image")["status"]
+        assert status["absurd.png"].startswith("cannot be read as an image")
+        assert status["c.jpg"] == "imported"
+
+
 def test_times_are_those_of_the_camera_where_all_have_one(tmp_path: Path) -> None:
     for second in (7, 5):
         save(tmp_path / "photos" / f"{second}.jpg", tags={0x9291: "25"}, time=f"2024:05:01 10:00:{second:02d}")
@@ -296,6 +320,10 @@ def test_wrong_choices_name_the_known_ones_and_nothing_is_overwritten(folder: Pa
     for options in ({"split": "train"}, {"placing": "move"}, {"poses_are": "cam_to_world"}):
         with pytest.raises(ManifestError, match="Known: "):
             import_images(folder, tmp_path / "PLACE", camera=CAMERA, **options)
+    for device in ("../drone", "", "my drone", "a/b"):
+        with pytest.raises(ManifestError, match="expected small letters, digits"):
+            import_images(folder, tmp_path / "PLACE", device=device, camera=CAMERA)
+    assert not (tmp_path / "PLACE").exists()
     import_images(folder, tmp_path / "PLACE", camera=CAMERA)
     with pytest.raises(CaptureError, match="ios_query exists already"):
         import_images(folder, tmp_path / "PLACE", camera=CAMERA)

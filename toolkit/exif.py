@@ -31,7 +31,7 @@ def read_header(path: Path) -> tuple[tuple[int, int], dict[int, Any]]:
         with PIL.Image.open(path) as image:
             exif = image.getexif()
             return image.size, {**exif, **exif.get_ifd(_EXIF)}
-    except (OSError, SyntaxError, ValueError) as error:
+    except (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError) as error:
         raise ImageError(f"cannot be read as an image ({error})") from None
 
 

@@ -9,6 +9,7 @@ ty tz` are its pose; `camera_id` names a camera of a `cameras.txt` in COLMAP's f
 """
 
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
@@ -95,12 +96,12 @@ def import_colmap(
 
     Raises:
         CaptureError: no model in the folder, the session exists already, or no image is left.
-        ManifestError: an unknown split or placing.
+        ManifestError: an unknown split or placing, or a device that cannot be part of a name.
     """
     session = _new_session(capture, device, split, placing)
     try:
         reconstruction = pycolmap.Reconstruction(str(model))
-    except (ValueError, RuntimeError) as error:
+    except (ValueError, RuntimeError, MemoryError) as error:  # the last where a file is cut short
         reason = str(error).strip().split("\n")[0]
         raise CaptureError(f"{model}: no COLMAP model can be read here ({reason}). Expected cameras, images, points3D "
                            "as .bin or .txt.") from None  # fmt: skip
@@ -155,7 +156,7 @@ def import_images(
     Raises:
         CaptureError: a malformed table or camera (names file and line), intrinsics that are nowhere, a map without
             poses, the session exists already, or no image is left.
-        ManifestError: an unknown split, placing or direction.
+        ManifestError: an unknown split, placing or direction, or a device that cannot be part of a name.
     """
     if poses_are not in POSE_DIRECTIONS:
         raise ManifestError(f"poses_are: unknown {poses_are!r}. {nearest(poses_are, POSE_DIRECTIONS)}")
@@ -194,6 +195,8 @@ def _new_session(capture: str | Path, device: str, split: str, placing: str) -> 
         raise ManifestError(f"split: unknown {split!r}. {nearest(split, SPLITS)}")
     if placing not in PLACING:
         raise ManifestError(f"images: unknown choice {placing!r}. {nearest(placing, PLACING)}")
+    if not re.fullmatch(r"[a-z0-9-]+", device):  # as `extra_devices` of a manifest has it
+        raise ManifestError(f"device: found {device!r}, expected small letters, digits and '-', such as ios or drone.")
     session = Path(capture) / "sessions" / f"{device}_{split}"
     if session.exists():
         raise CaptureError(f"{session} exists already. Import into another capture or device, or remove it first.")
