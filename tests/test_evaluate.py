@@ -197,6 +197,11 @@ def test_poses_of_another_tool_need_no_table(scene):
     assert [row["state"], row["ok"], row["failed"]] == ["evaluated", 3, 1]
 
 
+def test_a_damaged_table_of_queries_is_named(scene):
+    (scene[1] / f"TINY_{IOS}.csv").write_text("")
+    assert evaluate_ios(scene).recall["state"].item().startswith("unreadable table of queries (")
+
+
 def test_table_of_other_queries_is_named_stale(scene):
     write_poses(scene[1], IOS, [(0, "phone", pose(), "ok")])
     result = evaluate_ios(scene)

@@ -240,6 +240,12 @@ def test_wrong_choices_are_named(capture, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_folder_without_the_map_is_said(capture, tmp_path):
+    done = record_session(capture, "map", "hl", map_dir=tmp_path, out=tmp_path / "x.rrd", progress=False)
+    assert done.points == 0
+    assert done.messages == [f"{tmp_path}: holds no map for this recording, so no points are shown."]
+
+
 def test_the_viewer_is_opened_when_asked_for(capture, tmp_path, monkeypatch):
     opened = []
     monkeypatch.setattr("toolkit.recordings.subprocess.Popen", lambda command, **_: opened.append(command))

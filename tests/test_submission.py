@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
-from toolkit.__main__ import app
+from toolkit.__main__ import app, main
 from toolkit.capture import Trajectory, write_session
 from toolkit.errors import ArtefactError, CaptureError, ManifestError, ToolkitError
 from toolkit.files import SceneFiles
@@ -234,6 +234,30 @@ def test_wrong_values_name_the_known_ones(run: Path, tmp_path: Path) -> None:
         collect([run], queries="few")
     with pytest.raises(ManifestError, match=r"desc\.txt: no such file"):
         collect([run], str(tmp_path / "desc.txt"))
+
+
+@pytest.mark.parametrize("text", ["", "timestamp,device_id\n100,s/phone\n", "timestamp,device_id,status\nx,a,ok\n"])
+def test_a_damaged_table_of_queries_is_named(run: Path, text: str) -> None:
+    path = SceneFiles(run, "HYDRO").poses_csv("ios", "ios")
+    path.write_text(text)
+    with pytest.raises(ArtefactError, match=r"map_ios_query_ios\.csv: .*Localize this pair again"):
+        collect([run])
+
+
+def test_a_capture_that_is_of_no_scene_is_refused(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(ManifestError, match=r"HYDRA: a capture of another name than the scene\. Expected HYDRO, SUCC"):
+        collect([run], captures=[tmp_path / "HYDRA"])
+
+
+def test_a_place_that_cannot_be_written_is_one_paragraph(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").touch()
+    for out in (tmp_path / "folder", tmp_path / "file" / "submission.zip"):
+        monkeypatch.setattr("sys.argv", ["toolkit", "submit", str(run), "--description", "Ours.", "--out", str(out)])
+        with pytest.raises(SystemExit, match=r"^Error: .*(folder|file).*See that it can be read and written"):
+            main()
 
 
 def test_nothing_to_submit_is_an_error(run: Path) -> None:

@@ -244,6 +244,12 @@ def main() -> None:
         app(prog_name="python -m toolkit")
     except ToolkitError as error:
         raise SystemExit(f"Error: {error}") from None
+    except OSError as error:
+        if error.filename is None:
+            raise
+        path = error.filename2 or error.filename
+        todo = "See that it can be read and written, or name another."
+        raise SystemExit(f"Error: {path}: {error.strerror}. {todo}") from None
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from toolkit.errors import ArtefactError, CaptureError, ToolkitError
 from toolkit.figures import ORANGE, SKY, VERMILLION, new_figure, save_figure, styled
 from toolkit.files import pair_name, write_atomic, write_sidecar
 from toolkit.geometry import invert, pose_error, transform
+from toolkit.tables import read_query_table
 
 if TYPE_CHECKING:
     import pycolmap
@@ -293,9 +294,12 @@ def _read_results(stem: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, 
     results["num_inliers"] = np.nan
     if not table.is_file():
         return results, "evaluated"
-    columns = {"timestamp": np.int64, "device_id": str}
-    details = pd.read_csv(table, dtype=columns).drop_duplicates(list(columns))
-    merged = keys.merge(details, how="left", on=list(columns))
+    columns = ["timestamp", "device_id"]
+    try:
+        details = read_query_table(table, ["status"]).drop_duplicates(columns)
+    except ArtefactError as error:
+        return results, f"unreadable table of queries ({error})"
+    merged = keys.merge(details, how="left", on=columns)
     known = merged["status"].notna().to_numpy()
     if "num_inliers" in merged:
         results["num_inliers"] = merged["num_inliers"].to_numpy(float)

@@ -41,7 +41,7 @@ def export_colmap(
     files, session_id, out = SceneFiles(Path(run), scene), f"{device}_map", Path(out)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ManifestError(f"{out}: there are files already. Give an empty or new folder.")
-    session = Captures([Path(run)], [] if capture is None else [capture])[scene][session_id]
+    session = Captures([Path(run)], [] if capture is None else [capture], [scene])[scene][session_id]
     local_map = LocalMap.load(files.maps / f"{session_id}.npz")
     model = colmap_model(local_map, session, FeatureStore.of_session(files.features, session_id))
     out.parent.mkdir(parents=True, exist_ok=True)

@@ -27,6 +27,7 @@ from toolkit.files import file_fingerprint, files_fingerprint, write_atomic, wri
 from toolkit.geometry import rotation_to_quaternion
 from toolkit.images import default_workers, prefetch, read_for_display, read_image
 from toolkit.mapping import LocalMap
+from toolkit.tables import read_query_table
 from toolkit.top_view import places_of
 from toolkit.upright import up_of_cameras
 
@@ -308,7 +309,11 @@ def record_session(
     plan = _Plan.of(session, subsession, queries if keyframes_only else None, every, asked)
     finite = plan.all_poses[posed(plan.all_poses)]
     up = np.asarray(up_of_cameras(finite) if world_up is None else world_up, np.float64)
-    messages = [] if len(finite) else [f"{session.id}: no frame has a pose; images are shown without a place."]
+    without = []
+    if map_dir is not None and points_file is None:
+        without = [f"{map_dir}: holds no map for this recording, so no points are shown."]
+    unposed = [] if len(finite) else [f"{session.id}: no frame has a pose; images are shown without a place."]
+    messages = [*unposed, *without]
     counts: dict[str, int] = {"frames": len(plan.frames), "images": 0, "unreadable": 0, "unposed": 0, "depth_maps": 0}
     with open_recording(path, f"{capture.name}_{session.id}", _session_layout(plan, finite, up)) as stream:
         stream.log("world", world_axes(up), static=True)
@@ -728,7 +733,7 @@ class _Queries:
                     f"{path}: which references a query was localized by stands in the table beside it, "
                     f"{prefix}<M>_query_<Q>.csv; not found. Localize again, or leave vis_retrieve_queries out."
                 )
-            rows = pd.read_csv(table, dtype={"timestamp": np.int64, "device_id": str, "references": str})
+            rows = read_query_table(table, ["references"])
             for row in rows.itertuples():
                 if isinstance(row.references, str) and row.references:
                     references[int(row.timestamp), str(row.device_id)] = row.references.split(";")

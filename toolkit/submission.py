@@ -21,7 +21,7 @@ from toolkit.check import UNIT_TOLERANCE
 from toolkit.errors import ArtefactError, CaptureError, ManifestError, ToolkitError
 from toolkit.files import SceneFiles, file_fingerprint, write_atomic, write_sidecar
 from toolkit.geometry import invert, qt_from_pose
-from toolkit.tables import KeyIndex, read_table
+from toolkit.tables import KeyIndex, read_query_table, read_table
 
 FAILED = ("nearest", "leave-out")
 LEFT_OUT, FILLED = "left out", "nearest"
@@ -202,7 +202,7 @@ def collect(
         raise ManifestError(f"{', '.join(map(str, folders))}: no poses in it. Run the manifest first.")
     found = [challenge for challenge in CHALLENGES if present & set(challenge.scenes)]
     challenge = found[0] if found else None
-    places = Captures(folders, captures)
+    places = Captures(folders, captures, sorted(present.union(scenes, challenge.scenes if challenge else ())))
     submission = Submission(
         _description(description), [], {}, failed, Path(out) if out else folders[0] / "submission.zip"
     )
@@ -229,9 +229,13 @@ def _rules_of(scene: str, captures: "Captures") -> Challenge:
 
 
 class Captures:
-    """The capture of each scene: a folder that was given, else where the runs found it. Each is opened once."""
+    """The capture of each scene: a folder that was given, else where the runs found it. Each is opened once.
 
-    def __init__(self, runs: Iterable[Path], given: Iterable[str | Path]) -> None:
+    Raises:
+        ManifestError: a folder that was given is not named after one of the scenes, or holds no capture.
+    """
+
+    def __init__(self, runs: Iterable[Path], given: Iterable[str | Path], scenes: Sequence[str]) -> None:
         self._places: dict[str, Path] = {}
         self._open: dict[str, Capture] = {}
         for run in runs:
@@ -240,7 +244,10 @@ class Captures:
                 self._places |= {row["scene"]: Path(row["parameters"]["sessions_root"]).parent for row in rows}
             except (OSError, ValueError, KeyError, TypeError):
                 continue  # poses of another tool, or stages run by hand: then the captures must be given
-        self._places |= {Path(path).resolve().name: Path(path).resolve() for path in given}
+        for path in map(Path, given):
+            if path.resolve().name not in scenes:
+                raise ManifestError(f"{path}: a capture of another name than the scene. Expected {', '.join(scenes)}.")
+            self._places[path.resolve().name] = path.resolve()
 
     def __getitem__(self, scene: str) -> Capture:
         if scene not in self._places:
@@ -347,7 +354,7 @@ def _statuses(path: Path) -> dict[Key, str]:
     """Return the status of each query, where the run has a table of them."""
     if not path.is_file():
         return {}
-    table = pd.read_csv(path, dtype={"timestamp": np.int64, "device_id": str, "status": str})
+    table = read_query_table(path, ["status"])
     return dict(zip(zip(table["timestamp"].tolist(), table["device_id"], strict=True), table["status"], strict=True))
 
 
