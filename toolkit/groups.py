@@ -5,18 +5,22 @@ to hidden parts, each whole or not there at all, and joins them to the file when
 parts that a killed one has left. The record beside the file tells for each group what it was made from.
 """
 
+import logging
 import shutil
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import h5py
+from filelock import FileLock, Timeout
 from numpy.typing import NDArray
 
 from toolkit.files import read_sidecar, sidecar_path, write_atomic, write_sidecar
+
+log = logging.getLogger(__name__)
 
 PART_GROUPS = 64
 """Groups a part: what a kill costs at most."""
@@ -59,7 +63,8 @@ def read_index(path: Path, made_by: Mapping[str, Any]) -> Index | None:
 class GroupWriter:
     """Adds groups to a file; a context, whose work stands when `finish` returns.
 
-    One process at a time may add to a file. Others may read it meanwhile: it is replaced, never changed.
+    One process at a time adds to a file; another that wants to waits, and then goes on from what is there. Others may
+    read it meanwhile: it is replaced, never changed.
     """
 
     def __init__(self, path: Path, made_by: Mapping[str, Any], attributes: Mapping[str, Any] | None = None):
@@ -76,7 +81,11 @@ class GroupWriter:
         self._attributes = attributes or {}
         self._folder = path.with_name(f".{path.name}.parts")
         self._parts: dict[Path, Index] = {}
+        self._locked, self._writing = ExitStack(), ExitStack()
+        self._wait_for_others()
         self._whole = read_index(path, made_by)
+        if self._whole is None and path.exists():
+            log.warning("%s is torn, or of another version of the toolkit: what it held is made again.", path)
         for part in sorted(self._folder.glob("[!.]*.h5")):
             index = read_index(part, made_by)
             if index is None:
@@ -86,7 +95,6 @@ class GroupWriter:
         for known in (self._whole, *self._parts.values()):
             if known is not None:
                 self.index.update(known)
-        self._stack = ExitStack()
         self._open: tuple[Path, h5py.File, Index] | None = None
 
     def __enter__(self) -> "GroupWriter":
@@ -95,7 +103,10 @@ class GroupWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._stack.__exit__(kind, error, trace)  # drops a part that is not complete
+        try:
+            self._writing.__exit__(kind, error, trace)  # drops a part that is not complete
+        finally:
+            self._locked.close()
 
     def add(
         self,
@@ -150,13 +161,29 @@ class GroupWriter:
         self._folder.rmdir()
         self._parts = {}
 
+    def _wait_for_others(self) -> None:
+        """Hold the file against other writers until the context ends. A killed process holds nothing."""
+        place = self.path.with_name(f".{self.path.name}.lock")
+        lock = FileLock(place)
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                lock.acquire(timeout=0)
+            except Timeout:
+                log.warning("%s: another process adds to it; waiting until it is done.", self.path)
+                lock.acquire()
+        except OSError:  # a folder that is only read: what is there can be reused, and adding says why it cannot
+            return
+        self._locked.callback(lock.release)
+        self._locked.callback(_remove_quietly, place)  # while it is held: who waits for it sees that it is gone
+
     def _part(self) -> tuple[h5py.File, Index]:
         """Return the part that is being written, a new one where there is none."""
         if self._open is None:
             last = max((int(path.stem) for path in self._parts), default=-1)
             path = self._folder / f"{last + 1:05d}.h5"
-            temporary = self._stack.enter_context(write_atomic(path))
-            file = self._stack.enter_context(h5py.File(temporary, "w", libver="latest"))
+            temporary = self._writing.enter_context(write_atomic(path))
+            file = self._writing.enter_context(h5py.File(temporary, "w", libver="latest"))
             file.attrs.update(self._attributes)
             self._open = path, file, Index()
         return self._open[1:]
@@ -169,10 +196,15 @@ class GroupWriter:
         if self._open is not None:
             path, _, index = self._open
             self._open = None
-            self._stack.close()
+            self._writing.close()
             write_sidecar(path, index.record(self._made_by))
             self._parts[path] = index
             self.index.update(index)
+
+
+def _remove_quietly(path: Path) -> None:
+    with suppress(OSError):  # some systems do not remove an open file
+        path.unlink()
 
 
 def _remove(path: Path) -> None:
