@@ -51,9 +51,8 @@ def test_a_second_writer_waits_and_goes_on_from_what_is_there(
 
 def test_a_writer_that_fails_lets_the_next_one_in(tmp_path: Path) -> None:
     path = tmp_path / "file.h5"
-    with pytest.raises(RuntimeError), GroupWriter(path, MADE_BY) as writer:
-        add(writer, "a")
-        raise RuntimeError
+    with pytest.raises(ValueError, match="exists"), GroupWriter(path, MADE_BY) as writer:
+        add(writer, "a", "a")
     with GroupWriter(path, MADE_BY) as writer:
         assert not writer.index.groups
         add(writer, "b")
