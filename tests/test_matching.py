@@ -17,6 +17,7 @@ from toolkit.matching import (
     MutualMatcher,
     PairMatches,
     create_matcher,
+    group_names,
     match_along_epipolar_lines,
     match_sessions,
     matchers_of,
@@ -379,7 +380,7 @@ def test_matches_are_in_the_layout_of_hloc_and_come_back(tmp_path: Path, count: 
     indices = np.array([[0, count - 1], [3, 0], [99, 7]])
     matches = PairMatches(indices, np.array([0.5, 1.0, 0.25], np.float32))
     with GroupWriter(path, {"name": "test"}) as writer:
-        write_matches(writer, NAMES, "key", (100, count), matches)
+        write_matches(writer, group_names([NAMES])[NAMES], "key", (100, count), matches)
         writer.finish()
     found, scores = hloc_matches(path, *NAMES)
     with h5py.File(path) as file:
@@ -443,3 +444,23 @@ def test_pairs_of_sessions_are_matched_once_in_batches_and_others_added(tmp_path
     assert len(again[pairs[2]]) == 30
     match_sessions((Features(queries.images, "changed"), maps), pairs, matcher, tmp_path, sessions)
     assert matcher.calls == [1, 2, 1]
+
+
+def test_names_that_differ_in_dash_and_slash_alone_keep_their_own_matches(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    images = {
+        name: features_of(random_units(rng, 20 + k)) for k, name in enumerate(["a/b-c.jpg", "a-b/c.jpg", "d.jpg"])
+    }
+    features = Features(images, "key")
+    matcher, sessions = Counting(), ("ios_map", "ios_map")
+    pairs = [("a/b-c.jpg", "d.jpg"), ("a-b/c.jpg", "d.jpg"), ("a/b-c.jpg", "a-b/c.jpg")]
+    for _ in range(2):
+        store = match_sessions((features, features), pairs, matcher, tmp_path, sessions)
+        for name0, name1 in pairs:
+            (expected,) = MutualMatcher(0.9).match([(images[name0], images[name1])])
+            np.testing.assert_array_equal(store[name0, name1].indices, expected.indices)
+            np.testing.assert_array_equal(store[name1, name0].indices, expected.indices[:, ::-1])
+    assert matcher.calls == [2, 1]  # the second time, all are there
+    match_sessions((features, features), pairs[:1], matcher, tmp_path, sessions)
+    assert matcher.calls == [2, 1]
+    hloc_matches(store.path, *pairs[2])

@@ -24,7 +24,7 @@ from toolkit.images import prefetch, read_image
 from toolkit.matching import (
     MatchStore,
     PairMatches,
-    group_name,
+    group_names,
     match_along_epipolar_lines,
     matches_path,
     unit_descriptors,
@@ -549,7 +549,8 @@ def _match(
         for name, camera, pose in zip(names, cameras, world_from_cams, strict=True)
     ]
     known = writer.index.groups if skip_existing else {}
-    wanted = {(i, j): (group_name(names[i], names[j]), made_from[i] + made_from[j]) for i, j in pairs.tolist()}
+    groups = group_names([(names[i], names[j]) for i, j in pairs.tolist()], writer.index.groups)
+    wanted = {(i, j): (groups[names[i], names[j]], made_from[i] + made_from[j]) for i, j in pairs.tolist()}
     todo = [pair for pair, (group, source) in wanted.items() if known.get(group) != source]
     found = match_pairs(
         np.array(todo, np.int64).reshape(-1, 2),
@@ -563,7 +564,7 @@ def _match(
     )
     label = f"match {names[0].split('/')[0]}"
     for (i, j), matches in zip(todo, tqdm(found, total=len(todo), desc=label, unit="pair"), strict=True):
-        write_matches(writer, (names[i], names[j]), wanted[i, j][1], (counts[i], counts[j]), matches)
+        write_matches(writer, *wanted[i, j], (counts[i], counts[j]), matches)
 
 
 def _colored(

@@ -2,12 +2,13 @@
 
 Matches of two sessions are kept in one HDF5 file, in the layout of hloc
 (https://github.com/cvg/Hierarchical-Localization): a group a pair of images, `<image>/<image>` with `/` in the names
-replaced by `-`, with `matches0` (N,), for each feature of the first image that of the second or -1, and
-`matching_scores0` (N,).
+replaced by `-` (see `group_names` for names that this makes the same), with `matches0` (N,), for each feature of the
+first image that of the second or -1, and `matching_scores0` (N,).
 """
 
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from itertools import islice
@@ -164,27 +165,27 @@ class MatchStore:
                     self._file = h5py.File(self.path, "r")
                 except OSError as error:
                     raise ArtefactError(f"Matches {self.path} cannot be read ({error}). Match again.") from None
-            reverse = group_name(*names) not in self._file
-            name = group_name(*names[::-1]) if reverse else group_name(*names)
-            if name not in self._file:
+            places = [(of(*names[::step]), step) for step in (1, -1) for of in (_own_group_name, group_name)]
+            found = [(place, step) for place, step in places if place in self._file]
+            if not found:
                 raise KeyError(names)
-            group = self._file[name]
-            found, scores = group["matches0"][()], group["matching_scores0"][()]
-        first = np.flatnonzero(found >= 0)
-        indices = np.stack([first, found[first].astype(np.int64)], axis=1)
+            group, reverse = self._file[found[0][0]], found[0][1] < 0
+            partners, scores = group["matches0"][()], group["matching_scores0"][()]
+        first = np.flatnonzero(partners >= 0)
+        indices = np.stack([first, partners[first].astype(np.int64)], axis=1)
         return PairMatches(indices[:, ::-1] if reverse else indices, scores[first].astype(np.float32))
 
 
 def write_matches(
-    writer: GroupWriter, names: tuple[str, str], made_from: str, counts: tuple[int, int], matches: PairMatches
+    writer: GroupWriter, group: str, made_from: str, counts: tuple[int, int], matches: PairMatches
 ) -> None:
-    """Add the matches of two images, of which each has so many features, to a file."""
+    """Add the matches of two images, of which each has so many features, to a file, as a group of `group_names`."""
     # hloc has 16 bits too; networks that find more features than these hold are rare.
     matches0 = np.full(counts[0], -1, np.int16 if max(counts) <= np.iinfo(np.int16).max else np.int32)
     scores = np.zeros(counts[0], np.float16)
     matches0[matches.indices[:, 0]] = matches.indices[:, 1]
     scores[matches.indices[:, 0]] = matches.scores
-    writer.add(group_name(*names), made_from, {"matches0": matches0, "matching_scores0": scores})
+    writer.add(group, made_from, {"matches0": matches0, "matching_scores0": scores})
 
 
 def match_sessions(
@@ -212,19 +213,20 @@ def match_sessions(
     path = matches_path(out, *sessions, made_by)
     with GroupWriter(path, made_by) as writer:
         known = writer.index.groups if skip_existing else {}
+        there = [(name0, name1) for name0, name1 in pairs if name0 in stores[0] and name1 in stores[1]]
+        groups = group_names(there, writer.index.groups)
         todo = []
-        for name0, name1 in dict.fromkeys(pairs):
-            if name0 in stores[0] and name1 in stores[1]:
-                made_from = stores[0].made_from[name0] + stores[1].made_from[name1]
-                if known.get(group_name(name0, name1)) != made_from:
-                    todo.append((name0, name1, made_from))
+        for name0, name1 in groups:
+            made_from = stores[0].made_from[name0] + stores[1].made_from[name1]
+            if known.get(groups[name0, name1]) != made_from:
+                todo.append((name0, name1, made_from))
         label = f"{matcher.settings['name']} {' '.join(sessions)}"
         with tqdm(total=len(todo), desc=label, unit="pair", disable=not todo) as bar:
             for part in _parts(todo, matcher.batch_size):
                 features = [(stores[0][name0], stores[1][name1]) for name0, name1, _ in part]
                 for (name0, name1, made_from), both, found in zip(part, features, matcher.match(features), strict=True):
                     counts = len(both[0]), len(both[1])
-                    write_matches(writer, (name0, name1), made_from, counts, found)
+                    write_matches(writer, groups[name0, name1], made_from, counts, found)
                 bar.update(len(part))
         writer.finish()
     return MatchStore(path)
@@ -239,6 +241,28 @@ def _parts(items: Sequence[tuple[str, str, str]], size: int) -> Iterator[list[tu
 def group_name(name0: str, name1: str) -> str:
     """Return the group of a file that has the matches of two images."""
     return f"{name0.replace('/', '-')}/{name1.replace('/', '-')}"
+
+
+def group_names(pairs: Iterable[tuple[str, str]], known: Container[str] = ()) -> dict[tuple[str, str], str]:
+    """Return the groups of pairs of images: those of `group_name`, where no two pairs share one.
+
+    Images whose names differ in `-` against `/` alone would. Their pairs have groups of their own, which readers of
+    hloc's layout do not find.
+
+    Args:
+        pairs: names of images.
+        known: groups that the file has.
+    """
+    shared = {pair: group_name(*pair) for pair in pairs}
+    count = Counter(shared.values())
+    return {
+        pair: own if (own := _own_group_name(*pair)) in known or count[group] > 1 else group
+        for pair, group in shared.items()
+    }
+
+
+def _own_group_name(name0: str, name1: str) -> str:
+    return f"{group_name(name0, name1)}~{fingerprint([name0, name1])}"
 
 
 def unit_descriptors(descriptors: Descriptors) -> NDArray[np.float32]:
