@@ -60,6 +60,22 @@ def test_a_writer_that_fails_lets_the_next_one_in(tmp_path: Path) -> None:
     assert not list(tmp_path.glob(".*.lock"))
 
 
+def test_what_a_killed_writer_was_writing_does_not_stop_the_next_one(tmp_path: Path) -> None:
+    path = tmp_path / "file.h5"
+    torn = tmp_path / ".file.h5.parts" / ".00000.h5.abc.partial.h5"
+    for names in (["a"], ["b"], []):
+        torn.parent.mkdir()
+        torn.write_bytes(b"torn")
+        (tmp_path / ".file.h5.abc.partial.h5").write_bytes(b"torn")
+        with GroupWriter(path, MADE_BY) as writer:
+            add(writer, *names)
+            writer.finish()
+        assert not list(tmp_path.glob(".*"))
+    index = read_index(path, MADE_BY)
+    assert index is not None
+    assert index.groups.keys() == {"a", "b"}
+
+
 @pytest.mark.parametrize("size", [0, 1000])
 def test_a_torn_file_is_made_again_and_says_so(tmp_path: Path, size: int, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "file.h5"

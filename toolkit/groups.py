@@ -134,8 +134,14 @@ class GroupWriter:
     def finish(self) -> None:
         """Join all parts to the file."""
         self._close_part()
-        if not self._parts:
-            return
+        if self._parts:
+            self._join()
+        # With what a killed run was writing, here and beside the file.
+        shutil.rmtree(self._folder, ignore_errors=True)
+        for torn in self.path.parent.glob(f".{self.path.name}.*.partial.h5"):
+            _remove_quietly(torn)
+
+    def _join(self) -> None:
         joined = Index() if self._whole is None else self._whole
         parts = dict(self._parts)
         with write_atomic(self.path) as temporary:
@@ -156,9 +162,6 @@ class GroupWriter:
                             source.copy(name, file, name)
         write_sidecar(self.path, joined.record(self._made_by))
         self._whole, self.index = joined, joined
-        for part in self._parts:
-            _remove(part)
-        self._folder.rmdir()
         self._parts = {}
 
     def _wait_for_others(self) -> None:
