@@ -12,7 +12,9 @@ from types import SimpleNamespace
 
 import nbformat
 import pytest
+import torch
 from nbformat.v4 import new_code_cell, new_notebook
+from safetensors.torch import save_file
 
 from toolkit import notebook, pipeline
 from toolkit.errors import ManifestError, ToolkitError, WeightsError
@@ -314,3 +316,18 @@ def test_the_weights_of_every_network_of_a_stage_are_asked_for() -> None:
     both = needed(method="hybrid", features=["superpoint"], checkpoint="vggt.pt")
     assert both[0] == (["VGGT-1B", "VGGT-1B-Commercial"], "vggt.pt")
     assert [models for models, _ in both[1:]] == [["SuperPoint"], ["LightGlue"]]
+
+
+@pytest.mark.parametrize("content", ["another model", "torn"])
+def test_weights_of_another_network_are_refused_before_anything_runs(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "weights.safetensors"
+    save_file({"module.encoder.conv_blocks.0.conv_a.weight": torch.zeros(2)}, path)
+    parameters = {"features": ["superpoint"], "features_checkpoint": str(path)}
+    pipeline._require_weights("localize", parameters | {"matcher": "mutual"})
+    if content == "torn":
+        path.write_bytes(path.read_bytes()[:-1])
+        setting, model = "features_checkpoint", "SuperPoint"
+    else:
+        setting, model = "matcher_checkpoint", "LightGlue"
+    with pytest.raises(WeightsError, match=f"(?s)not weights of {model}.*`localize.{setting}`.*Or use .*`sift`"):
+        pipeline._require_weights("localize", parameters | {"matcher_checkpoint": str(path)})

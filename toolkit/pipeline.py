@@ -33,7 +33,7 @@ from toolkit.errors import ManifestError, ToolkitError
 from toolkit.files import SceneFiles, files_fingerprint, fingerprint, write_text
 from toolkit.manifest import STAGES, Manifest, load_manifest, nearest
 from toolkit.matching import LOCAL_WEIGHTS, matchers_of
-from toolkit.models.weights import VGGT, WeightsSource, find_any, resolve_any
+from toolkit.models.weights import VGGT, WeightsSource, check_weights, find_any, resolve_any
 from toolkit.notebook import (
     COUNTS_MIME,
     TEXT_BARS,
@@ -314,7 +314,7 @@ def _name_embedder(manifest: Manifest, say: Say) -> Manifest:
 def _require_weights(stage: str, parameters: dict[str, Any]) -> None:
     """Find or download the weights that a stage needs, before hours of work and where its progress is seen."""
     for sources, checkpoint in _weights_needed(stage, parameters):
-        resolve_any(sources, checkpoint)
+        check_weights(sources[0], resolve_any(sources, checkpoint))
 
 
 def _weights_needed(stage: str, parameters: dict[str, Any]) -> list[tuple[tuple[WeightsSource, ...], str | None]]:

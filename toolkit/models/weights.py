@@ -38,6 +38,8 @@ class WeightsSource:
     """What to do without them: the end of a sentence that begins with "Or"."""
     setting: str = "embed.checkpoint"
     """Key of the manifest that names a file to use instead."""
+    tensor: str = ""
+    """Name of a tensor in the file that is in no other of these; empty: not known."""
 
     def __str__(self) -> str:
         return f"`{self.filename}` of {_HUB}/{self.repo_id} (licence: {self.licence})"
@@ -75,6 +77,7 @@ SUPERPOINT = WeightsSource(
     licence="Magic Leap's, for academic or non-profit organizations: noncommercial research use only",
     alternative="use `sift` features, which need none",
     setting="localize.features_checkpoint",
+    tensor="encoder.conv_blocks.0.conv_a.weight",
 )
 LIGHTGLUE = WeightsSource(
     model="LightGlue",
@@ -83,6 +86,7 @@ LIGHTGLUE = WeightsSource(
     licence="Apache-2.0; the file also holds SuperPoint's, noncommercial research use only",
     alternative="use the matcher `mutual`, or `sift` features, which need none",
     setting="localize.matcher_checkpoint",
+    tensor="match_assignment_layers.8.matchability.weight",
 )
 
 
@@ -163,6 +167,29 @@ def resolve_any(sources: Sequence[WeightsSource], checkpoint: str | Path | None 
         WeightsError: see `resolve_weights`.
     """
     return find_any(sources, checkpoint) or resolve_weights(sources[0], checkpoint)
+
+
+def check_weights(source: WeightsSource, path: Path) -> None:
+    """Refuse a safetensors file that is damaged or of another model, by its header alone.
+
+    Raises:
+        WeightsError: it is.
+    """
+    if path.suffix.lower() != ".safetensors" or not source.tensor:
+        return
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, "pt") as file:
+            names = {name.removeprefix("module.") for name in file.keys()}  # noqa: SIM118 - it is no mapping
+        found = f"{len(names)} tensors, none of which is {source.tensor}"
+    except (SafetensorError, OSError) as error:
+        names, found = set(), f"no whole safetensors file ({_first_line(error)})"
+    if source.tensor not in names:
+        raise WeightsError(
+            f"{path}: these are not weights of {source.model}: found {found}. Expected {source}. Correct "
+            f"`{source.setting}`, or get the file again. Or {source.alternative}."
+        )
 
 
 def read_state_dict(path: str | Path) -> "dict[str, Tensor]":
