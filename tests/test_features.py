@@ -546,3 +546,12 @@ def test_image_of_another_size_than_its_camera_is_listed(small_capture: Path, tm
     assert name not in store
     assert session.image_name(1) in store
     assert "sensors.txt says" in store.failed[name]
+
+
+def test_a_damaged_file_says_what_to_do(session: Session, tmp_path: Path) -> None:
+    store = extract(session, tmp_path / "features")
+    content = store.path.read_bytes()
+    quarter = len(content) // 4
+    store.path.write_bytes(content[:quarter] + bytes(2 * quarter) + content[3 * quarter :])
+    with pytest.raises(ArtefactError, match="is made again"):
+        list(store.values())

@@ -397,6 +397,10 @@ def test_matches_are_in_the_layout_of_hloc_and_come_back(tmp_path: Path, count: 
     torn.write_bytes(path.read_bytes()[:600])
     with pytest.raises(ArtefactError, match="Match again"):
         MatchStore(torn)[NAMES]
+    content = path.read_bytes()
+    torn.write_bytes(content[: len(content) // 8] + bytes(len(content) - len(content) // 8))
+    with pytest.raises(ArtefactError, match=r"Delete the file|Match again"):
+        MatchStore(torn)[NAMES]
 
 
 class Counting(MutualMatcher):

@@ -353,14 +353,22 @@ class FeatureStore(Mapping[str, LocalFeatures]):
         if name not in self.made_from:
             raise KeyError(name)
         with self._lock:
-            group = (self._file or self._open(name))[name]
-            arrays = {key: item[()] for key, item in group.items() if isinstance(item, h5py.Dataset)}
+            try:
+                group = (self._file or self._open(name))[name]
+                arrays = {key: item[()] for key, item in group.items() if isinstance(item, h5py.Dataset)}
+            except (OSError, RuntimeError, KeyError) as error:  # what HDF5 raises for what is not its format
+                raise ArtefactError(
+                    f"Local features {self.path} are damaged at {name} ({error}). Delete the file: it is made again."
+                ) from None
         try:
             keypoints = arrays["keypoints"].astype(np.float32, copy=False) + self._offset
             descriptors = arrays["descriptors"]
             size = arrays["image_size"]
         except KeyError as error:
-            raise ArtefactError(f"{self.path}: {name} has no {error}; expected the layout of hloc.") from None
+            raise ArtefactError(
+                f"{self.path}: {name} has no {error}; expected the layout of hloc. If a run made the file, delete it: "
+                "it is made again."
+            ) from None
         if self._bytes:
             descriptors = np.take(_BYTES, descriptors.view(np.uint16))
         ones = np.ones(len(keypoints), np.float32)

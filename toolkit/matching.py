@@ -166,11 +166,17 @@ class MatchStore:
                 except OSError as error:
                     raise ArtefactError(f"Matches {self.path} cannot be read ({error}). Match again.") from None
             places = [(of(*names[::step]), step) for step in (1, -1) for of in (_own_group_name, group_name)]
-            found = [(place, step) for place, step in places if place in self._file]
-            if not found:
-                raise KeyError(names)
-            group, reverse = self._file[found[0][0]], found[0][1] < 0
-            partners, scores = group["matches0"][()], group["matching_scores0"][()]
+            try:
+                found = [(self._file[place], step) for place, step in places if place in self._file]
+                arrays = [found[0][0][key][()] for key in ("matches0", "matching_scores0")] if found else []
+            except (OSError, RuntimeError, KeyError) as error:  # what HDF5 raises for what is not its format
+                raise ArtefactError(
+                    f"Matches {self.path} are damaged at {' and '.join(names)} ({error}). Delete the file: it is made "
+                    "again."
+                ) from None
+        if not found:
+            raise KeyError(names)
+        (partners, scores), reverse = arrays, found[0][1] < 0
         first = np.flatnonzero(partners >= 0)
         indices = np.stack([first, partners[first].astype(np.int64)], axis=1)
         return PairMatches(indices[:, ::-1] if reverse else indices, scores[first].astype(np.float32))
