@@ -2,8 +2,9 @@
 
 import json
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pycolmap
@@ -14,10 +15,10 @@ from toolkit.capture import Capture
 from toolkit.embed import embed_sessions
 from toolkit.errors import ArtefactError, ManifestError
 from toolkit.evaluate import overlap_in_view, overlap_table
-from toolkit.features import LocalFeatures
+from toolkit.features import KINDS, LocalFeatures, SiftExtractor
 from toolkit.files import SceneFiles, sidecar_path
 from toolkit.geometry import invert, make_pose, transform
-from toolkit.matching import MutualMatcher
+from toolkit.matching import LocalMethod, MutualMatcher
 from toolkit.rerank import VerifySettings, count_inliers, is_meaningful, rerank_pairs
 from toolkit.retrieve import retrieve_pairs
 
@@ -231,14 +232,10 @@ def test_a_query_that_fails_keeps_the_order_of_retrieval(
     rows[0]["topk"] = []
     write(files.retrieval("ios", "hl"), rows)
 
-    class Broken:
-        def __init__(self, ratio: float):
-            pass
+    def broken(*_: Any) -> Any:
+        raise RuntimeError("no such luck")
 
-        def match(self, pairs: Any) -> Any:
-            raise RuntimeError("no such luck")
-
-    monkeypatch.setattr(rerank, "MutualMatcher", Broken)
+    monkeypatch.setattr(MutualMatcher, "match", broken)
     table = run(small_capture, files)
     found = rerank.read_references(reranked(files))
     assert table["kept"].item() == table["queries"].item() == len(rows)
@@ -247,6 +244,42 @@ def test_a_query_that_fails_keeps_the_order_of_retrieval(
         assert new["reason"] == "RuntimeError: no such luck"
         assert [hit["path"] for hit in new["topk"]] == [hit["path"] for hit in old["topk"][:4]]
         assert all(hit["score"] == 0 for hit in new["topk"])
+
+
+def test_a_network_matches_all_references_of_a_query_at_once(
+    small_capture: Path, files: SceneFiles, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What stands in for a network finds the same matches, so the order is that of `mutual`."""
+    batches: list[int] = []
+    matcher = MutualMatcher(KINDS["sift"].ratio)
+
+    class Network:
+        batch_size = 8
+        settings: ClassVar[dict[str, Any]] = {"name": "network"}
+
+        def match(self, pairs: Sequence[Any]) -> Any:
+            batches.append(len(pairs))
+            return matcher.match(pairs)
+
+    run(small_capture, files)
+    expected = reranked(files).read_bytes()
+    asked: list[Any] = []
+
+    def create(*options: Any) -> list[LocalMethod]:
+        asked.extend(options)
+        return [LocalMethod("sift", SiftExtractor(), Network())]
+
+    monkeypatch.setattr(rerank, "create_local_methods", create)
+    table = run(small_capture, files, features="superpoint", matcher="lightglue", matcher_checkpoint="glue.safetensors")
+    assert asked == [["superpoint"], "lightglue", None, "glue.safetensors", "auto", "auto"]
+    assert not table["skipped"].item(), "other matches, another file"
+    assert batches == [6] * table["queries"].item()
+    assert reranked(files).read_bytes() == expected
+
+
+def test_a_matcher_that_does_not_suit_is_refused(small_capture: Path, files: SceneFiles) -> None:
+    with pytest.raises(ManifestError, match="'lightglue' suits none of the features"):
+        run(small_capture, files, matcher="lightglue")
 
 
 def test_an_image_without_features_is_named(small_capture: Path, files: SceneFiles, tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 import json
 import logging
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -22,11 +22,9 @@ from toolkit.embedders import Embedder, create_embedder, load_embeddings
 from toolkit.errors import ArtefactError, ImageError, ManifestError
 from toolkit.features import (
     KINDS,
-    Extractor,
     FeatureStore,
     LocalFeatures,
     SiftExtractor,
-    create_extractor,
     extract_session,
 )
 from toolkit.files import (
@@ -47,7 +45,7 @@ from toolkit.localizers.pnp import PnpLocalizer, PnpSettings, PoseEstimate
 from toolkit.localizers.prediction import Predictor, View, create_predictor
 from toolkit.localizers.vggt import VggtAnswer, VggtLocalizer, VggtQuery, VggtSettings
 from toolkit.mapping import LocalMap, MapSettings, build_map, map_path
-from toolkit.matching import Matcher, MatchStore, MutualMatcher, create_matcher, match_sessions, matchers_of
+from toolkit.matching import LocalMethod, MatchStore, MutualMatcher, create_local_methods, match_sessions
 from toolkit.upright import Turns, upright_turns
 
 log = logging.getLogger(__name__)
@@ -193,10 +191,11 @@ def localize_pairs(
     settings = PnpSettings(seed=seed)
     workers = workers or default_workers()
     guide: _Guide | None = None
-    kinds: list[_Kind] = []
+    kinds: list[LocalMethod] = []
     if method != "nearest":
-        places = {"features": features_checkpoint, "matcher": matcher_checkpoint}
-        kinds = _open_kinds(features, matcher, places, compute_device, dtype_compute)
+        kinds = create_local_methods(
+            features, matcher, features_checkpoint, matcher_checkpoint, compute_device, dtype_compute
+        )
     if method in PREDICTING:
         guide = _Guide(prediction.open(capture, map_dir), prediction, prediction.turns(capture))
     table = []
@@ -234,40 +233,6 @@ def localize_pairs(
 
 
 @dataclass(frozen=True)
-class _Kind:
-    """One kind of local features: how they are found and matched."""
-
-    name: str
-    extractor: Extractor
-    matcher: Matcher
-
-
-def _open_kinds(
-    features: Sequence[str],
-    matcher: str | None,
-    checkpoints: Mapping[str, str | Path | None],
-    compute_device: str,
-    dtype_compute: str,
-) -> list[_Kind]:
-    """Return the kinds of local features that are asked for, with their networks ready.
-
-    Raises:
-        ManifestError, WeightsError: see `localize_pairs`.
-    """
-    names = matchers_of(features, matcher)
-    device = {"device": compute_device, "dtype": dtype_compute}
-    kinds = []
-    for name, matched_by in names.items():
-        extractor = create_extractor(name, checkpoint=checkpoints["features"], **device)
-        if matched_by == "mutual":
-            kinds.append(_Kind(name, extractor, MutualMatcher(KINDS[name].ratio, KINDS[name].min_score)))
-        else:
-            network = create_matcher(matched_by, checkpoint=checkpoints["matcher"], **device)
-            kinds.append(_Kind(name, extractor, network))
-    return kinds
-
-
-@dataclass(frozen=True)
 class _Guide:
     """What predicts, and how it is asked."""
 
@@ -288,7 +253,7 @@ class _Solver:
     """The localizers of one map that a method asks; without any, the method is `nearest`."""
 
     pnp: PnpLocalizer | None = None
-    kinds: Sequence[_Kind] = ()
+    kinds: Sequence[LocalMethod] = ()
     stores: Sequence[FeatureStore] = ()
     """Of each kind, the map's features."""
     vggt: VggtLocalizer | None = None
@@ -344,7 +309,7 @@ class _Pair:
     def session(self) -> Session:
         return self.capture[f"{self.query_device}_query"]
 
-    def record(self, settings: PnpSettings, method: str, kinds: "Sequence[_Kind]") -> dict[str, Any]:
+    def record(self, settings: PnpSettings, method: str, kinds: Sequence[LocalMethod]) -> dict[str, Any]:
         """Return what the poses depend on."""
         keyframes = self.session.keyframes(self.queries)
         return {
@@ -387,7 +352,7 @@ def _open_solver(
     map_dir: Path,
     settings: PnpSettings,
     method: str,
-    kinds: Sequence[_Kind],
+    kinds: Sequence[LocalMethod],
     guide: _Guide | None,
     workers: int,
     skip_existing: bool,

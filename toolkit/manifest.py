@@ -24,6 +24,7 @@ Natural = Annotated[int, Field(ge=0)]
 PositiveNumber = Annotated[float, Field(gt=0)]
 ComputeDevice = Annotated[str, Field(pattern=f"^({DEVICE_NAME})$")]
 DevicePair = Annotated[list[str], Field(min_length=2, max_length=2)]
+LocalFeaturesName = Literal["sift", "superpoint"]
 Threshold = Annotated[list[PositiveNumber], Field(min_length=2, max_length=2)]
 
 
@@ -109,8 +110,18 @@ class RerankSettings(_Section):
     """Retrieved images whose matches are verified; retrieval finds so many, if `retrieve.topk` does not say."""
     topk: Positive | None = None
     """References kept of them."""
-    ratio: PositiveNumber | None = None
-    """Lowe's ratio of the matches."""
+    features: LocalFeaturesName | None = None
+    """Local features whose matches are verified."""
+    matcher: Literal["mutual", "lightglue"] | None = None
+    """Of queries with references; without it, what is usual for the features."""
+    features_checkpoint: str | None = None
+    """File with the weights of learned features; without it the hub's cache, else a download."""
+    matcher_checkpoint: str | None = None
+    """File with the weights of a learned matcher; likewise."""
+    compute_device: ComputeDevice | None = None
+    """auto, cpu, cuda, cuda:<number> or mps."""
+    dtype_compute: Literal["auto", "float32", "bfloat16", "float16"] | None = None
+    """Precision of networks; auto: what is fast on the device."""
 
 
 class LocalizeSettings(_Section):
@@ -132,7 +143,7 @@ class LocalizeSettings(_Section):
     """Query devices that the network is given at once."""
     upright: bool | None = None
     """Show the network images turned so that gravity points down."""
-    features: Annotated[list[Literal["sift", "superpoint"]], Field(min_length=1)] | None = None
+    features: Annotated[list[LocalFeaturesName], Field(min_length=1)] | None = None
     """Local features; of several, the matches are pooled in one pose."""
     matcher: Literal["mutual", "lightglue"] | None = None
     """Of queries with references; without it, what is usual for the features."""

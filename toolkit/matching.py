@@ -21,7 +21,16 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from toolkit.errors import ArtefactError, ManifestError
-from toolkit.features import DESCRIPTOR_SCALE, KINDS, Descriptors, FeatureStore, LocalFeatures, feature_kind
+from toolkit.features import (
+    DESCRIPTOR_SCALE,
+    KINDS,
+    Descriptors,
+    Extractor,
+    FeatureStore,
+    LocalFeatures,
+    create_extractor,
+    feature_kind,
+)
 from toolkit.files import fingerprint
 from toolkit.groups import GroupWriter
 from toolkit.models.weights import LIGHTGLUE, SUPERPOINT, WeightsSource
@@ -126,6 +135,48 @@ class MutualMatcher:
             indices = mutual_matches(scores, self.ratio, self.min_score)
             found.append(PairMatches(indices, scores[indices[:, 0], indices[:, 1]]))
         return found
+
+
+@dataclass(frozen=True)
+class LocalMethod:
+    """One kind of local features: how they are found and matched."""
+
+    name: str
+    """A key of `KINDS`."""
+    extractor: Extractor
+    matcher: Matcher
+
+
+def create_local_methods(
+    features: Sequence[str],
+    matcher: str | None = None,
+    features_checkpoint: str | Path | None = None,
+    matcher_checkpoint: str | Path | None = None,
+    device: str = "auto",
+    dtype: str = "auto",
+) -> list[LocalMethod]:
+    """Return the kinds of local features that are asked for, with their networks ready.
+
+    Args:
+        features: keys of `KINDS`.
+        matcher: a key of `MATCHERS`; None: what is usual for the features. `mutual` takes the limits of the kind.
+        features_checkpoint, matcher_checkpoint: files with the weights of networks; None: the hub's cache, else a
+            download.
+        device, dtype: of networks, see `create_extractor`.
+
+    Raises:
+        ManifestError: unknown features, or a matcher that suits none of them.
+        WeightsError: a network has no weights.
+    """
+    methods = []
+    for name, matched_by in matchers_of(features, matcher).items():
+        extractor = create_extractor(name, checkpoint=features_checkpoint, device=device, dtype=dtype)
+        if matched_by == "mutual":
+            methods.append(LocalMethod(name, extractor, MutualMatcher(KINDS[name].ratio, KINDS[name].min_score)))
+        else:
+            network = create_matcher(matched_by, checkpoint=matcher_checkpoint, device=device, dtype=dtype)
+            methods.append(LocalMethod(name, extractor, network))
+    return methods
 
 
 def matches_path(out: str | Path, session0: str, session1: str, made_by: Mapping[str, Any]) -> Path:

@@ -323,12 +323,13 @@ def _weights_needed(stage: str, parameters: dict[str, Any]) -> list[tuple[tuple[
     if stage == "embed" and parameters.get("model") in EMBEDDER_WEIGHTS:
         return [((EMBEDDER_WEIGHTS[parameters["model"]],), checkpoint)]
     method = parameters.get("method", "pnp")
-    if stage != "localize" or method == "nearest":
+    if stage not in ("rerank", "localize") or method == "nearest":
         return []
     needed: list[tuple[tuple[WeightsSource, ...], str | None]] = []
     if method in ("vggt", "hybrid") and parameters.get("predictor", "vggt") == "vggt":
         needed.append((VGGT, checkpoint))
-    names = matchers_of(parameters.get("features") or ["sift"], parameters.get("matcher"))
+    features = parameters.get("features") or "sift"  # of reranking one, of localizing several
+    names = matchers_of([features] if isinstance(features, str) else features, parameters.get("matcher"))
     for key, used in (("features", names.keys()), ("matcher", names.values())):
         for name in sorted({*used} & LOCAL_WEIGHTS.keys()):
             needed.append(((LOCAL_WEIGHTS[name],), parameters.get(f"{key}_checkpoint")))

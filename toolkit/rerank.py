@@ -25,7 +25,7 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
 from toolkit.errors import ArtefactError, ManifestError
-from toolkit.features import FeatureStore, LocalFeatures, SiftExtractor, extract_session
+from toolkit.features import Extractor, FeatureStore, LocalFeatures, extract_session
 from toolkit.files import (
     file_fingerprint,
     is_current,
@@ -35,7 +35,7 @@ from toolkit.files import (
     write_text,
 )
 from toolkit.images import default_workers, prefetch
-from toolkit.matching import Matcher, MutualMatcher
+from toolkit.matching import LocalMethod, Matcher, create_local_methods
 
 log = logging.getLogger(__name__)
 
@@ -49,8 +49,6 @@ MAP_IMAGES_KEPT = 256
 class VerifySettings:
     """How a query image is compared with a map image; part of the fingerprint of what is reranked."""
 
-    ratio: float = 0.85
-    """Lowe's ratio of the matches."""
     max_features: int = 1536
     """Features of an image that are matched at most, the strongest."""
     max_error_deg: float = 0.2
@@ -69,7 +67,12 @@ def rerank_pairs(
     query_device: str = "all",
     topn: int = 30,
     topk: int = 10,
-    ratio: float = 0.85,
+    features: str = "sift",
+    matcher: str | None = None,
+    features_checkpoint: str | Path | None = None,
+    matcher_checkpoint: str | Path | None = None,
+    compute_device: str = "auto",
+    dtype_compute: str = "auto",
     skip_existing: bool = True,
     workers: int = 0,
     seed: int = 0,
@@ -89,7 +92,11 @@ def rerank_pairs(
         map_device, query_device: `ios`, `hl`, `spot`, or `all` that the capture has.
         topn: retrieved images that are verified, the best so many of those in the file.
         topk: references kept of them.
-        ratio: Lowe's ratio of the matches.
+        features: kind of local features, `sift` or `superpoint`.
+        matcher: `mutual` or `lightglue`; None: what is usual for the features.
+        features_checkpoint, matcher_checkpoint: files with the weights of their networks; None: the hub's cache, else a
+            download.
+        compute_device, dtype_compute: of networks, see `toolkit.compute`.
         skip_existing: reuse what was made from the same inputs and settings, and go on where a run was killed.
         workers: threads; 0 takes the number of cores, at most 8.
         seed: of RANSAC. Equal seeds give equal files, whatever the number of threads.
@@ -99,14 +106,18 @@ def rerank_pairs(
         another first reference than before), seconds, skipped, path.
 
     Raises:
-        ManifestError: topk is below 1 or above topn.
+        ManifestError: topk is below 1 or above topn; unknown features, or a matcher that does not suit them.
+        WeightsError: a network has no weights.
         CaptureError: unknown device.
         ArtefactError: the retrieval of a pair is missing, torn, or of another capture.
     """
     if not 1 <= topk <= topn:
         raise ManifestError(f"topk is {topk} and topn {topn}; expected 1 <= topk <= topn.")
     capture = Capture.from_sessions_root(sessions_root)
-    settings = VerifySettings(ratio=ratio, seed=seed)
+    settings = VerifySettings(seed=seed)
+    method = create_local_methods(
+        [features], matcher, features_checkpoint, matcher_checkpoint, compute_device, dtype_compute
+    )[0]
     workers = workers or default_workers()
     table = []
     cv2_threads = cv2.getNumThreads()
@@ -114,16 +125,17 @@ def rerank_pairs(
     try:
         with threadpool_limits(1, "blas"):
             for mapped in capture.devices_with("map", map_device):
-                verifier = Verifier(settings, MutualMatcher(settings.ratio))
+                verifier = Verifier(settings, method.matcher)
                 for asked in capture.devices_with("query", query_device):
                     started = time.perf_counter()
                     pair = _Pair(capture, mapped, asked, Path(retrieval_dir), Path(out_dir))
-                    record = pair.record(settings, topn, topk)
+                    record = pair.record(settings, method, topn, topk)
                     skipped = skip_existing and is_current(pair.path, record)
                     if not skipped:
                         rows = _rerank_pair(
-                            pair, verifier, Path(features_dir), topn, topk, record, workers, skip_existing
-                        )
+                            pair, verifier, method.extractor, Path(features_dir), topn, topk, record, workers,
+                            skip_existing,
+                        )  # fmt: skip
                         write_text(pair.path, "".join(json.dumps(row) + "\n" for row in rows))
                         write_sidecar(pair.path, record)
                         pair.progress.unlink(missing_ok=True)
@@ -325,13 +337,14 @@ class _Pair:
     def sessions(self) -> tuple[Session, Session]:
         return self.capture[f"{self.map_device}_map"], self.capture[f"{self.query_device}_query"]
 
-    def record(self, settings: VerifySettings, topn: int, topk: int) -> dict[str, Any]:
+    def record(self, settings: VerifySettings, method: LocalMethod, topn: int, topk: int) -> dict[str, Any]:
         """Return what the reranked file depends on."""
         if not self.retrieval.exists():
             read_references(self.retrieval)  # says what is missing
         return {
             "retrieval": file_fingerprint(self.retrieval),
-            "features": SiftExtractor().settings,
+            "features": method.extractor.settings,
+            "matcher": method.matcher.settings,
             "verify": asdict(settings),
             "topn": topn,
             "topk": topk,
@@ -343,6 +356,7 @@ class _Pair:
 def _rerank_pair(
     pair: _Pair,
     verifier: Verifier,
+    extractor: Extractor,
     features_dir: Path,
     topn: int,
     topk: int,
@@ -356,8 +370,8 @@ def _rerank_pair(
     asked = _rows_of(query_session, [_name(query) for query in queries], pair.retrieval)
     names = list(dict.fromkeys(_name(found) for query in queries for found in query["topk"][:topn]))
     known = _rows_of(map_session, names, pair.retrieval)
-    query_store = extract_session(query_session, features_dir, rows=asked, workers=workers)
-    map_store = extract_session(map_session, features_dir, rows=known, workers=workers)
+    query_store = extract_session(query_session, features_dir, extractor, rows=asked, workers=workers)
+    map_store = extract_session(map_session, features_dir, extractor, rows=known, workers=workers)
 
     def rerank(query: dict[str, Any]) -> dict[str, Any]:
         try:
@@ -374,7 +388,9 @@ def _rerank_pair(
             key=lambda query: _name(query["topk"][0]) if query["topk"] else "",
         )
         label = f"rerank {pair.query_device} in {pair.map_device}"
-        for row in tqdm(prefetch(rerank, todo, workers), total=len(todo), desc=label, unit="image"):
+        # A network matches the references of one query as a batch, and keeps the device busy by that.
+        threads = workers if extractor.threaded else 1
+        for row in tqdm(prefetch(rerank, todo, threads), total=len(todo), desc=label, unit="image"):
             progress.add(row)
             done[_key(row)] = row
     return [done[_key(query)] for query in queries]
