@@ -316,6 +316,10 @@ def test_the_weights_of_every_network_of_a_stage_are_asked_for() -> None:
     both = needed(method="hybrid", features=["superpoint"], checkpoint="vggt.pt")
     assert both[0] == (["VGGT-1B", "VGGT-1B-Commercial"], "vggt.pt")
     assert [models for models, _ in both[1:]] == [["SuperPoint"], ["LightGlue"]]
+    reranking = pipeline._weights_needed("rerank", {"features": "superpoint"})
+    settings = [sources[0].setting for sources, _ in reranking]
+    assert settings == ["rerank.features_checkpoint", "rerank.matcher_checkpoint"]
+    assert pipeline._weights_needed("rerank", {}) == []
 
 
 @pytest.mark.parametrize("content", ["another model", "torn"])

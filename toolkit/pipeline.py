@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
@@ -332,7 +332,8 @@ def _weights_needed(stage: str, parameters: dict[str, Any]) -> list[tuple[tuple[
     names = matchers_of([features] if isinstance(features, str) else features, parameters.get("matcher"))
     for key, used in (("features", names.keys()), ("matcher", names.values())):
         for name in sorted({*used} & LOCAL_WEIGHTS.keys()):
-            needed.append(((LOCAL_WEIGHTS[name],), parameters.get(f"{key}_checkpoint")))
+            source = replace(LOCAL_WEIGHTS[name], setting=f"{stage}.{key}_checkpoint")
+            needed.append(((source,), parameters.get(f"{key}_checkpoint")))
     return needed
 
 
