@@ -62,7 +62,7 @@ def draw(recording: Path, out: Path, query: int | None = None) -> None:
     with Image.open(out) as picture:
         small = picture.convert("RGB")
         small.thumbnail((MAX_WIDTH, MAX_WIDTH))
-        small.save(out, optimize=True)
+        small.quantize(128, dither=Image.Dither.NONE).save(out, optimize=True)  # a README is read over slow lines
 
 
 if __name__ == "__main__":
