@@ -349,6 +349,7 @@ def test_the_right_one_of_many_like_places_is_found(place: int) -> None:
     check(localizer.localize([PINHOLE], np.eye(4)[None], [seen], [list(range(10))]), pose, 0.2, 0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rig", [False, True])
 def test_covariance_is_the_scatter_of_the_poses(rig: bool) -> None:
     """Of world_from_rig @ Exp(d), d = rotation, then translation, in the rig's frame: by 200 noisy queries.
