@@ -16,7 +16,7 @@ from toolkit.capture import Capture, Session, Trajectory
 from toolkit.devices import colour_of, in_order
 from toolkit.errors import ArtefactError, CaptureError, ToolkitError
 from toolkit.figures import ORANGE, SKY, VERMILLION, new_figure, save_figure, styled
-from toolkit.files import pair_name, write_atomic, write_sidecar
+from toolkit.files import image_name, pair_name, write_atomic, write_sidecar
 from toolkit.geometry import invert, pose_error, transform
 from toolkit.tables import read_query_table
 
@@ -556,7 +556,7 @@ class _MapView:
     def seen_by(self, reference: dict[str, Any]) -> Array:
         """Return the points (P, 3) that a reference sees, world, metres."""
         if self.local_map is not None:
-            image = self.local_map.index_of.get(str(reference["path"]).split("/sessions/", 1)[-1])
+            image = self.local_map.index_of.get(image_name(str(reference["path"])))
             if image is None:
                 return np.zeros((0, 3))
             return self.local_map.points[np.unique(self.local_map.observations(image)[1])]

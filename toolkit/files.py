@@ -214,6 +214,11 @@ class SceneFiles:
         return self.poses_dir / f"{pair_name(self.scene, map_device, query_device)}.csv"
 
 
+def image_name(path: str) -> str:
+    """Return the name of an image (`<session>/raw_data/<path>`) that outputs give as `<scene>/sessions/<name>`."""
+    return path.split("/sessions/", 1)[-1]
+
+
 def pair_name(scene: str, map_device: str, query_device: str) -> str:
     """Return the file stem of a map x query pair, as the challenge names it."""
     return f"{scene}_map_{map_device}_query_{query_device}"

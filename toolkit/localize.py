@@ -31,6 +31,7 @@ from toolkit.files import (
     SceneFiles,
     file_fingerprint,
     fingerprint,
+    image_name,
     is_current,
     open_progress,
     pair_name,
@@ -529,8 +530,7 @@ def _read_query(
 
 
 def _reference_name(reference: dict[str, Any]) -> str:
-    """Return the image name (`<session>/raw_data/<path>`) of a retrieved image (`<scene>/sessions/<name>`)."""
-    return str(reference["path"]).split("/sessions/", 1)[-1]
+    return image_name(str(reference["path"]))
 
 
 def _vggt_query(session: Session, query: _QueryDevice, local_map: LocalMap) -> VggtQuery:
@@ -700,7 +700,7 @@ class Map:
         session = f"{device}_map"
         local_map = LocalMap.load(files.maps / f"{session}.npz")
         vectors, table = load_embeddings(files.embeddings / session)
-        names = [path.split("/sessions/", 1)[-1] for path in table["abs_path"]]
+        names = [image_name(path) for path in table["abs_path"]]
         indices = np.array([local_map.index_of.get(name, -1) for name in names], np.int64)
         store = FeatureStore.of_session(files.features, session)
         localizer = PnpLocalizer(local_map, store)

@@ -28,6 +28,7 @@ from toolkit.errors import ArtefactError, ManifestError
 from toolkit.features import Extractor, FeatureStore, LocalFeatures, extract_session
 from toolkit.files import (
     file_fingerprint,
+    image_name,
     is_current,
     open_progress,
     pair_name,
@@ -453,8 +454,8 @@ def _key(row: dict[str, Any]) -> tuple[str, str]:
 
 
 def _name(entry: dict[str, Any]) -> str:
-    """Return the image name (`<session>/raw_data/<path>`) of a retrieved or asked image."""
-    return str(entry["path"]).split("/sessions/", 1)[-1]
+    """Return the name of a retrieved or asked image."""
+    return image_name(str(entry["path"]))
 
 
 def _rows_of(session: Session, names: Sequence[str], path: Path) -> NDArray[np.int64]:

@@ -123,10 +123,10 @@ class DepthLifter:
                 continue
             known = np.flatnonzero(np.isfinite(depth.depth_m))
             in_cam = lifted(local_map.cameras[image], xy[free[known]], depth.depth_m[known])
-            known = known[np.isfinite(in_cam).all(axis=1)]
+            finite = np.isfinite(in_cam).all(axis=1)
+            known, in_cam = known[finite], in_cam[finite]
             if not len(known):
                 continue
-            in_cam = lifted(local_map.cameras[image], xy[free[known]], depth.depth_m[known])
             points.append(geometry.transform(local_map.world_from_cams[image], in_cam))
             obs.append(np.column_stack([np.full(len(known), image), free[known]]))
             source.append(np.full(len(known), image))
