@@ -81,7 +81,7 @@ def localize_session(session: "Session", localizer: "PnpLocalizer", seed: int) -
     from toolkit.geometry import pose_error
     from toolkit.images import read_image
 
-    extract = SiftExtractor()
+    extractor = SiftExtractor()
     keyframes = session.keyframes("keyframes_original")
     assert session.ground_truth is not None
     truth = session.ground_truth.lookup(keyframes["timestamp"].to_numpy(np.int64), keyframes["device_id"])
@@ -91,7 +91,7 @@ def localize_session(session: "Session", localizer: "PnpLocalizer", seed: int) -
         rig_from_cams = session.rig_from_cam(rows)
         for turn, how in enumerate(DEGRADATIONS):
             rng = np.random.default_rng([seed, index, turn])
-            features = [extract(degrade(image, how, rng)) for image in images]
+            features = extractor.extract([degrade(image, how, rng) for image in images])
             for chosen in REFERENCES:
                 world_from_cams = truth[index] @ rig_from_cams
                 poses = localizer.map.world_from_cams
