@@ -70,9 +70,12 @@ def write_references(folder: Path, pair: str, found: dict[tuple[int, str, str], 
     lines = []
     for (time, device, sensor), poses in found.items():
         trs = RIG_FROM_CAM.get(sensor, np.eye(4)).tolist()
-        topk = [{"rank": k, "score": 1.0, "Tws": p.tolist()} for k, p in enumerate(poses)]
-        line = {"timestamp": str(time), "device_id": device, "sensor_id": sensor, "Trs": trs, "topk": topk}
-        lines.append(json.dumps(line))
+        path = "TINY/sessions/ios_{}/raw_data/{}.jpg"
+        topk = [
+            {"rank": k, "score": 1.0, "path": path.format("map", k), "Tws": p.tolist()} for k, p in enumerate(poses)
+        ]
+        line = {"path": path.format("query", time), "device_id": device, "sensor_id": sensor, "timestamp": str(time)}
+        lines.append(json.dumps(line | {"Trs": trs, "topk": topk}))
     (folder / f"TINY_{pair}.jsonl").write_text("\n".join(lines) + "\n")
 
 

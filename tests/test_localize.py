@@ -159,7 +159,7 @@ def test_nearest_is_the_pose_of_the_best_reference_and_labelled(small_capture: P
         ({"map_device": "drone"}, ToolkitError, r"drone.*ios, hl, spot"),
         ({"query_device": "drone"}, ToolkitError, r"drone.*ios, hl, spot"),
         ({"queries": "keyframes_best"}, CaptureError, "original"),
-        ({"map_device": "hl"}, ArtefactError, r"query ios: .*SMALL_map_hl_query_ios\.jsonl is missing.*retrieve"),
+        ({"map_device": "hl"}, ArtefactError, r"No references: .*SMALL_map_hl_query_ios\.jsonl is missing.*retrieve"),
     ],
 )
 def test_wrong_questions_are_refused(

@@ -19,6 +19,7 @@ from toolkit.features import KINDS, LocalFeatures, SiftExtractor
 from toolkit.files import SceneFiles, sidecar_path
 from toolkit.geometry import invert, make_pose, transform
 from toolkit.matching import LocalMethod, MutualMatcher
+from toolkit.references import read_references
 from toolkit.rerank import VerifySettings, count_inliers, is_meaningful, rerank_pairs
 from toolkit.retrieve import retrieve_pairs
 
@@ -130,7 +131,7 @@ def finished(small_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> S
     embed_sessions(sessions, files.embeddings, features_dir=files.features)
     retrieve_pairs(sessions, files.embeddings, "ios", "hl", files.retrieval_dir, topk=6, queries=LIST)
     path = files.retrieval("ios", "hl")
-    rows = rerank.read_references(path)
+    rows = read_references(path)
     for row in rows:  # the best come last, so that there is something to put right
         row["topk"] = [
             hit | {"rank": rank, "score": 1 - 0.1 * rank} for rank, hit in enumerate(row["topk"][::-1], start=1)
@@ -165,14 +166,14 @@ def test_the_right_references_come_first(small_capture: Path, finished: SceneFil
     folders = {"retrieved": finished.retrieval_dir, "reranked": finished.reranked_dir}
     row = overlap_table(small_capture / "sessions", folders, None, "ios", "hl").iloc[0]
     assert row["state"] == "evaluated"
-    assert row["images"] == len(rerank.read_references(reranked(finished)))
+    assert row["images"] == len(read_references(reranked(finished)))
     assert row["reranked_mean"] > row["retrieved_mean"]
     assert row["reranked"] >= row["retrieved"]
 
 
 def test_rows_are_those_of_retrieval_with_both_scores(finished: SceneFiles) -> None:
-    before = rerank.read_references(finished.retrieval("ios", "hl"))
-    after = rerank.read_references(reranked(finished))
+    before = read_references(finished.retrieval("ios", "hl"))
+    after = read_references(reranked(finished))
     assert len(before) == len(after) > 0
     for old, new in zip(before, after, strict=True):
         assert {key: new[key] for key in old if key != "topk"} == {key: old[key] for key in old if key != "topk"}
@@ -222,13 +223,13 @@ def test_what_is_current_is_reused_and_a_killed_run_goes_on(
     assert reranked(files).read_bytes() == before
     assert not list(files.reranked_dir.glob(".*"))
     assert run(small_capture, files, topk=2)["skipped"].tolist() == [False]
-    assert all(len(row["topk"]) == 2 for row in rerank.read_references(reranked(files)))
+    assert all(len(row["topk"]) == 2 for row in read_references(reranked(files)))
 
 
 def test_a_query_that_fails_keeps_the_order_of_retrieval(
     small_capture: Path, files: SceneFiles, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rows = rerank.read_references(files.retrieval("ios", "hl"))
+    rows = read_references(files.retrieval("ios", "hl"))
     rows[0]["topk"] = []
     write(files.retrieval("ios", "hl"), rows)
 
@@ -237,7 +238,7 @@ def test_a_query_that_fails_keeps_the_order_of_retrieval(
 
     monkeypatch.setattr(MutualMatcher, "match", broken)
     table = run(small_capture, files)
-    found = rerank.read_references(reranked(files))
+    found = read_references(reranked(files))
     assert table["kept"].item() == table["queries"].item() == len(rows)
     assert "no reference" in found[0]["reason"]
     for old, new in zip(rows[1:], found[1:], strict=True):
@@ -285,10 +286,10 @@ def test_a_matcher_that_does_not_suit_is_refused(small_capture: Path, files: Sce
 def test_an_image_without_features_is_named(small_capture: Path, files: SceneFiles, tmp_path: Path) -> None:
     capture = Path(shutil.copytree(small_capture, tmp_path / "data" / small_capture.name))
     session = Capture.open(capture)["hl_query"]
-    row = rerank.read_references(files.retrieval("ios", "hl"))[0]
+    row = read_references(files.retrieval("ios", "hl"))[0]
     (session.path.parent / rerank._name(row)).write_bytes(b"no image")
     run(capture, files)
-    found = rerank.read_references(reranked(files))
+    found = read_references(reranked(files))
     assert "cannot be decoded" in found[0]["reason"]
     assert found[1]["reason"] == ""
 

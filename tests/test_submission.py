@@ -67,7 +67,8 @@ def make_poses(run: Path, scene: str, mapped: str, query: str, times: tuple[int,
         for score in (0.4, 0.9, 0.5):  # three cameras; the second has the best reference
             reference = make_pose(np.eye(3), [score, time, 0])
             row = {"timestamp": str(time), "device_id": device_of(query, time), "sensor_id": "s/phone"}
-            row |= {"Trs": RIG_FROM_CAM.tolist(), "topk": [{"score": score, "Tws": reference.tolist()}]}
+            image = {"path": "map/1.jpg", "score": score, "Tws": reference.tolist()}
+            row |= {"Trs": RIG_FROM_CAM.tolist(), "topk": [image]}
             lines.append(row if time != 100 else row | {"topk": []})
     files.retrieval_dir.mkdir(exist_ok=True, parents=True)
     files.retrieval(mapped, query).write_text("".join(json.dumps(line) + "\n" for line in lines))

@@ -1,6 +1,5 @@
 """Say how good poses are: errors, recall, retrieval recall, and where accuracy was lost."""
 
-import json
 import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -18,6 +17,7 @@ from toolkit.errors import ArtefactError, CaptureError, ToolkitError
 from toolkit.figures import ORANGE, SKY, VERMILLION, new_figure, save_figure, styled
 from toolkit.files import image_name, pair_name, write_atomic, write_sidecar
 from toolkit.geometry import invert, pose_error, transform
+from toolkit.references import read_references
 from toolkit.tables import read_query_table
 
 if TYPE_CHECKING:
@@ -400,7 +400,7 @@ def _retrieval_recall(
     if not path.is_file():
         return {"state": "no retrieval file", "queries": len(keys)}, None
     try:
-        lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+        lines = read_references(path)
         index = pd.DataFrame(
             {"timestamp": [int(x["timestamp"]) for x in lines], "device_id": [x["device_id"] for x in lines]}
         )
@@ -410,7 +410,7 @@ def _retrieval_recall(
         for i, line in enumerate(lines):
             for rank, reference in enumerate(line["topk"]):
                 references[i, rank] = reference["Tws"]
-    except (ValueError, KeyError, TypeError) as error:
+    except (ArtefactError, ValueError, KeyError, TypeError) as error:
         state = f"unreadable retrieval file ({type(error).__name__}: {error})"
         return {"state": state, "queries": len(keys)}, None
     cameras = _poses_of(truth, index) @ device_from_cam  # type: ignore[arg-type]
@@ -521,7 +521,7 @@ def _overlap(path: Path, name: str, session: Session, scene: "_MapView") -> dict
     if session.ground_truth is None:
         return {"state": "no ground truth"}
     try:
-        lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+        lines = read_references(path)
         times, devices = [int(line["timestamp"]) for line in lines], [line["device_id"] for line in lines]
         cameras = session.ground_truth.lookup(times, devices) @ np.array([x["Trs"] for x in lines]).reshape(-1, 4, 4)
         shares = []
@@ -530,7 +530,7 @@ def _overlap(path: Path, name: str, session: Session, scene: "_MapView") -> dict
                 seen = scene.seen_by(line["topk"][0]) if line["topk"] else np.zeros((0, 3))
                 centre = np.array(line["topk"][0]["Tws"])[:3, 3] if line["topk"] else np.zeros(3)
                 shares.append(overlap_in_view(seen, centre, camera, session.camera(line["sensor_id"])))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (ArtefactError, OSError, ValueError, KeyError, TypeError) as error:
         return {"state": f"{path.name} of the {name} cannot be read ({type(error).__name__})"}
     row: dict[str, Any] = {"images": len(shares), "points": "view" if scene.local_map is None else "map"}
     if shares:

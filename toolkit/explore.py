@@ -1,6 +1,5 @@
 """Tables and figures for the notebooks: what a capture holds, and what the stages made of it."""
 
-import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +12,7 @@ from toolkit.capture import Capture, Session
 from toolkit.devices import colour_of
 from toolkit.figures import GREEN, ORANGE, VERMILLION, new_figure, styled
 from toolkit.images import read_for_display
+from toolkit.references import read_references
 from toolkit.top_view import ground_axes, places_of
 from toolkit.upright import up_of_cameras
 
@@ -122,7 +122,7 @@ def draw_references(
         samples: queries shown, evenly spread.
         references: references shown of each.
     """
-    lines = _queries_of(jsonl)
+    lines = read_references(jsonl)
     chosen = np.unique(np.linspace(0, len(lines) - 1, min(samples, len(lines))).round().astype(int))
     return _draw_rows(sessions_root, jsonl, [[lines[row]] for row in chosen], references)
 
@@ -142,7 +142,7 @@ def draw_reranked(
         samples: queries shown.
         references: references shown of each, before and after.
     """
-    before, after = _queries_of(retrieved), _queries_of(jsonl)
+    before, after = read_references(retrieved), read_references(jsonl)
     moved = [-row["topk"][0]["retrieval_rank"] if row["topk"] else 0 for row in after]
     chosen = np.argsort(moved, kind="stable")[:samples]
     return _draw_rows(sessions_root, jsonl, [[before[row], after[row]] for row in chosen], references)
@@ -172,10 +172,6 @@ def _draw_rows(
             axis.imshow(read_for_display(files[side][int(entry["timestamp"]), entry["sensor_id"]]))
             axis.set_title(title, fontsize=8)
     return figure
-
-
-def _queries_of(jsonl: str | Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in Path(jsonl).read_text(encoding="utf-8").splitlines()]
 
 
 @styled

@@ -1,6 +1,5 @@
 """What other tools read: the map as a COLMAP model, retrieval as a list of pairs for hloc."""
 
-import json
 import tempfile
 from pathlib import Path
 
@@ -11,9 +10,10 @@ from numpy.typing import NDArray
 from toolkit.capture import Session
 from toolkit.errors import ArtefactError, ManifestError
 from toolkit.features import FeatureStore
-from toolkit.files import SceneFiles, write_atomic, write_text
+from toolkit.files import SceneFiles, image_name, write_atomic, write_text
 from toolkit.geometry import invert, qt_from_pose
 from toolkit.mapping import LocalMap
+from toolkit.references import read_references
 from toolkit.submission import Captures
 from toolkit.tables import POSE_NAMES
 
@@ -150,18 +150,12 @@ def export_pairs(
         ArtefactError: the run has no such retrieval, a line of it is malformed, or a name has a space in it.
     """
     path = SceneFiles(Path(run), scene).retrieval(map_device, query_device)
-    if not path.is_file():
-        raise ArtefactError(f"No retrieval of this pair: {path} is missing. Run the retrieve stage first.")
     pairs = []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
-        try:
-            row = json.loads(line)
-            names = [entry["path"].split("/sessions/", 1)[1] for entry in (row, *row["topk"][:topk])]
-        except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
-            raise ArtefactError(f"{path}, line {number}: not a retrieval row ({error!r}). Retrieve again.") from None
+    for row in read_references(path, "path"):
+        names = [image_name(str(entry["path"])) for entry in (row, *row["topk"][:topk])]
         spaced = [name for name in names if len(name.split()) != 1]
         if spaced:
-            raise ArtefactError(f"{path}, line {number}: hloc's lists cannot hold the space in {spaced[0]!r}.")
+            raise ArtefactError(f"{path}: hloc's lists cannot hold the space in {spaced[0]!r}.")
         pairs += [f"{names[0]} {name}" for name in names[1:]]
     write_text(out, "".join(f"{pair}\n" for pair in pairs))
     return len(pairs)

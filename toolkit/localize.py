@@ -1,6 +1,5 @@
 """The localize stage: references and local features in, one pose a query device out."""
 
-import json
 import logging
 import time
 from collections.abc import Iterator, Sequence
@@ -47,6 +46,7 @@ from toolkit.localizers.prediction import Predictor, View, create_predictor
 from toolkit.localizers.vggt import VggtAnswer, VggtLocalizer, VggtQuery, VggtSettings
 from toolkit.mapping import LocalMap, MapSettings, build_map, map_path
 from toolkit.matching import LocalMethod, MatchStore, MutualMatcher, create_local_methods, match_sessions
+from toolkit.references import read_references
 from toolkit.upright import Turns, upright_turns
 
 log = logging.getLogger(__name__)
@@ -290,13 +290,7 @@ class _Pair:
 
     @property
     def retrieval(self) -> Path:
-        path = self.retrieval_dir / f"{self.name}.jsonl"
-        if not path.exists():
-            raise ArtefactError(
-                f"No retrieval of map {self.map_device} and query {self.query_device}: {path} is missing. "
-                "Run the retrieve stage first (python -m toolkit run MANIFEST --only retrieve)."
-            )
-        return path
+        return self.retrieval_dir / f"{self.name}.jsonl"
 
     @property
     def txt(self) -> Path:
@@ -313,6 +307,8 @@ class _Pair:
     def record(self, settings: PnpSettings, method: str, kinds: Sequence[LocalMethod]) -> dict[str, Any]:
         """Return what the poses depend on."""
         keyframes = self.session.keyframes(self.queries)
+        if not self.retrieval.exists():
+            read_references(self.retrieval)  # says what is missing
         return {
             "method": method,
             "pnp": asdict(settings),
@@ -328,17 +324,8 @@ class _Pair:
 
     def references(self) -> dict[tuple[int, str], list[dict[str, Any]]]:
         """Return for each query image (timestamp, sensor) the retrieved map images, best first."""
-        found = {}
-        with open(self.retrieval, encoding="utf-8") as lines:
-            for number, line in enumerate(lines, start=1):
-                try:
-                    row = json.loads(line)
-                    found[int(row["timestamp"]), str(row["sensor_id"])] = row["topk"]
-                except (ValueError, KeyError, TypeError) as error:
-                    raise ArtefactError(
-                        f"{self.retrieval}, line {number}: not a retrieval row ({error!r}). Retrieve again."
-                    ) from None
-        return found
+        rows = read_references(self.retrieval)
+        return {(int(row["timestamp"]), str(row["sensor_id"])): row["topk"] for row in rows}
 
 
 def session_fingerprint(session: Session) -> str:

@@ -37,6 +37,7 @@ from toolkit.files import (
 )
 from toolkit.images import default_workers, prefetch
 from toolkit.matching import LocalMethod, Matcher, create_local_methods
+from toolkit.references import read_references
 
 log = logging.getLogger(__name__)
 
@@ -149,30 +150,6 @@ def rerank_pairs(
     finally:
         cv2.setNumThreads(cv2_threads)
     return pd.DataFrame(table)
-
-
-def read_references(path: str | Path) -> list[dict[str, Any]]:
-    """Return the rows of a file of references, one a query image.
-
-    Raises:
-        ArtefactError: the file is missing, or a line of it is no such row.
-    """
-    rows: list[dict[str, Any]] = []
-    try:
-        with open(path, encoding="utf-8") as lines:
-            for line in lines:
-                row = json.loads(line)
-                if not {"path", "timestamp", "sensor_id", "topk"} <= row.keys():
-                    raise ValueError(f"keys {sorted(row)}; expected path, timestamp, sensor_id, topk and others")
-                rows.append(row)
-    except FileNotFoundError:
-        raise ArtefactError(
-            f"No references: {path} is missing. Run the retrieve stage first "
-            "(python -m toolkit run MANIFEST --only retrieve)."
-        ) from None
-    except (ValueError, AttributeError) as error:
-        raise ArtefactError(f"{path}, line {len(rows) + 1}: not a retrieval row ({error}). Retrieve again.") from None
-    return rows
 
 
 class Verifier:
@@ -366,7 +343,7 @@ def _rerank_pair(
     skip_existing: bool,
 ) -> list[dict[str, Any]]:
     """Rerank the query images of a pair that a killed run has not; returns a row for each, in the file's order."""
-    queries = read_references(pair.retrieval)
+    queries = read_references(pair.retrieval, "path")
     map_session, query_session = pair.sessions
     asked = _rows_of(query_session, [_name(query) for query in queries], pair.retrieval)
     names = list(dict.fromkeys(_name(found) for query in queries for found in query["topk"][:topn]))

@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,6 +20,7 @@ from toolkit.check import UNIT_TOLERANCE
 from toolkit.errors import ArtefactError, CaptureError, ManifestError, ToolkitError
 from toolkit.files import SceneFiles, file_fingerprint, write_atomic, write_sidecar
 from toolkit.geometry import invert, qt_from_pose
+from toolkit.references import read_references
 from toolkit.tables import KeyIndex, read_query_table, read_table
 
 FAILED = ("nearest", "leave-out")
@@ -364,9 +364,8 @@ def _nearest_references(path: Path) -> tuple[dict[Key, np.ndarray], str]:
     if not path.is_file():
         return {}, f"no retrieval to fill it from: {path} is missing"
     best: dict[Key, tuple[float, np.ndarray]] = {}
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+    for row in read_references(path):
         try:
-            row: dict[str, Any] = json.loads(line)
             key = int(row["timestamp"]), str(row["device_id"])
             for reference in row["topk"][:1]:
                 world_from_rig = np.array(reference["Tws"], np.float64) @ invert(np.array(row["Trs"], np.float64))
@@ -374,7 +373,8 @@ def _nearest_references(path: Path) -> tuple[dict[Key, np.ndarray], str]:
                 if key not in best or score > best[key][0]:
                     best[key] = score, world_from_rig
         except (ValueError, KeyError, TypeError) as error:
-            raise ArtefactError(f"{path}, line {number}: not a retrieval row ({error!r}). Retrieve again.") from None
+            found = f"{path}, query of {row['timestamp']}: not a retrieval row"
+            raise ArtefactError(f"{found} ({error!r}). Retrieve again.") from None
     return {key: pose for key, (_, pose) in best.items()}, "no reference was retrieved"
 
 
