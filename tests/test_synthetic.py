@@ -221,6 +221,22 @@ def test_other_seeds_and_rooms_look_different() -> None:
     assert not np.array_equal(texture(0, 0), texture(0, 4))
 
 
+def test_look_alikes_come_in_two_models_and_other_things_do_not() -> None:
+    def textures(material: synthetic.Material, look_alikes: bool) -> set[bytes]:
+        seen = set()
+        for index in range(2):
+            scene = Scene(np.zeros(3), (4, 4, 3), False)
+            for number in range(6):
+                scene.plate((0, 0, 0), (1, 0, 0), (0, 0, -1), 0.9 + 0.02 * number, 2.0, material, 100, lit=False)
+                paint(scene, 0, index, number, look_alikes)
+            seen |= {quad.gray[0][:160, :64].tobytes() for quad in scene.quads}
+        return seen
+
+    assert len(textures(synthetic.door, True)) == 2
+    assert len(textures(synthetic.door, False)) == 12
+    assert len(textures(synthetic.poster, True)) == 12
+
+
 def test_a_complete_capture_is_left_as_it_is_and_an_incomplete_one_is_not(
     demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -230,7 +246,7 @@ def test_a_complete_capture_is_left_as_it_is_and_an_incomplete_one_is_not(
     out = tmp_path / "C"
     shutil.copytree(demo, out)
 
-    def started(*_: object) -> None:
+    def started(*_: object, **__: object) -> None:
         raise InterruptedError("renders anew")
 
     monkeypatch.setattr(synthetic, "paint", started)
@@ -244,7 +260,7 @@ def test_a_complete_capture_is_left_as_it_is_and_an_incomplete_one_is_not(
 
 
 def test_a_rendering_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object) -> None:
+    def fail(*_: object, **__: object) -> None:
         raise OSError("disk full")
 
     monkeypatch.setattr(synthetic, "paint", fail)

@@ -59,6 +59,8 @@ UP = np.array([0.0, 0.0, 1.0])
 NEAR_M = 0.05
 LEVELS = 6  # of the mip-maps; texture sides are multiples of 2 ** (LEVELS - 1)
 SAMPLES = 2  # a side of a pixel
+SOLD_OFTEN = ("books", "crate", "door", "drawers", "window")
+MODELS = 2  # of each of these things, where a world has look-alikes
 
 
 def _random(*key: int | str) -> Rng:
@@ -460,12 +462,20 @@ def _light(scene: Scene, quad: Quad) -> Image:
     return cv2.GaussianBlur(lit.reshape(rows, columns).astype(np.float32), (3, 3), 0)
 
 
-def paint(scene: Scene, seed: int, index: int, number: int) -> None:
+def paint(scene: Scene, seed: int, index: int, number: int, look_alikes: bool = False) -> None:
     """Make the texture of one rectangle and its mip-maps, light baked in."""
     quad = scene.quads[number]
     multiple = 2 ** (LEVELS - 1)
     h, w = (max(multiple, round(side * quad.ppm / multiple) * multiple) for side in (quad.height, quad.width))
-    image = quad.material(_random(seed, index, "quad", number), h, w, quad.ppm)
+    rng = _random(seed, index, "quad", number)
+    name = getattr(quad.material, "func", quad.material).__name__
+    if look_alikes and name in SOLD_OFTEN:
+        # A model is drawn for whole metres: things of unequal width then begin alike.
+        tall, wide = (round(np.ceil(side) * quad.ppm) + multiple for side in (quad.height, quad.width))
+        model = _random(seed, "model", name, int(rng.integers(MODELS)))
+        image = quad.material(model, tall, wide, quad.ppm)[:h, :w]
+    else:
+        image = quad.material(rng, h, w, quad.ppm)
     if quad.lit:
         light = cv2.resize(_light(scene, quad), (w, h), interpolation=cv2.INTER_LINEAR)
         image = cv2.multiply(image, cv2.merge([light] * 3), dtype=cv2.CV_8U)
@@ -941,7 +951,12 @@ def _write_session(path: Path, split: str, table: Tables) -> None:
 
 
 def render_capture(
-    out: str | Path, rooms: int = 2, frames: int = 12, seed: int = 0, progress: bool = True
+    out: str | Path,
+    rooms: int = 2,
+    frames: int = 12,
+    seed: int = 0,
+    progress: bool = True,
+    look_alikes: bool = False,
 ) -> Path:
     """Render a capture of `rooms` rooms by a phone, a headset and a robot; return its folder.
 
@@ -954,6 +969,8 @@ def render_capture(
         frames: frames (rig poses) a room and map session, at least 2; query sessions have half as many.
         seed: of everything; the same seed gives the same bytes.
         progress: whether to show a bar.
+        look_alikes: whether doors, windows, shelves, cabinets and crates come in two models each, the same in all
+            rooms, which are easily taken for one another.
 
     Raises:
         CaptureError: a setting is out of range, or `out` holds something else than a rendered capture.
@@ -966,6 +983,7 @@ def render_capture(
             f"Expected rooms >= 1, frames >= 2, seed >= 0; found {rooms=}, {frames=}, {seed=}."
         )
     settings = {"format": FORMAT, "rooms": rooms, "frames": frames, "seed": seed}
+    settings |= {"look_alikes": 1} if look_alikes else {}
     if _is_complete(out, settings):
         return out
     if out.exists() and any(out.iterdir()) and not (out / "demo.json").exists():
@@ -991,7 +1009,8 @@ def render_capture(
             try:
                 for index in range(rooms):
                     scene = build_room(seed, index)
-                    for _ in pool.map(partial(paint, scene, seed, index), range(len(scene.quads))):
+                    painting_one = partial(paint, scene, seed, index, look_alikes=look_alikes)
+                    for _ in pool.map(painting_one, range(len(scene.quads))):
                         pass
                     waiting = []
                     for shot in _plan_room(scene, seed, index, frames, hours, tables):
