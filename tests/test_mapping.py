@@ -188,6 +188,35 @@ def test_noise_is_averaged_over_the_views() -> None:
     assert np.median(errors) < 5e-3
 
 
+@pytest.mark.parametrize("count", [2, 4])
+def test_the_scatter_of_points_is_their_covariance(count: int) -> None:
+    data = Ring(PINHOLE, count=count, points=3000, noise_px=0.5)
+    local_map = data.triangulate()
+    assert local_map.noise_px == pytest.approx(0.5, rel=0.05)
+    true_point = np.zeros(len(local_map.points), np.int64)
+    true_point[local_map.obs_point] = data.truth(local_map)
+    asked = np.random.default_rng(0).permutation(len(local_map.points))
+    covariances = local_map.point_covariances(asked)
+    errors = (local_map.points - data.points[true_point])[asked]
+    round_errors = np.linalg.solve(np.linalg.cholesky(covariances), errors[..., None])[..., 0]
+    scatter = round_errors.T @ round_errors / len(errors)
+    np.testing.assert_allclose(np.linalg.eigvalsh(scatter), 1, atol=0.15)
+
+
+def test_a_point_of_one_view_has_no_covariance() -> None:
+    data = Ring(PINHOLE, count=3)
+    local_map = data.triangulate()
+    first = local_map.obs_image == 0
+    seen_once = replace(
+        local_map,
+        obs_image=local_map.obs_image[first],
+        obs_keypoint=local_map.obs_keypoint[first],
+        obs_point=local_map.obs_point[first],
+    )
+    assert np.isnan(seen_once.point_covariances(np.arange(5))).all()
+    assert seen_once.point_covariances(np.zeros(0, np.int64)).shape == (0, 3, 3)
+
+
 def test_wrong_matches_are_dropped() -> None:
     data, rng = Ring(PINHOLE), np.random.default_rng(1)
     wrong = 0
@@ -261,6 +290,7 @@ def assert_equal(a: LocalMap, b: LocalMap) -> None:
     assert [(c.model, c.width, c.height, list(c.params)) for c in a.cameras] == [
         (c.model, c.width, c.height, list(c.params)) for c in b.cameras
     ]
+    assert a.noise_px == b.noise_px
     for name in ("world_from_cams", "points", "colors", "obs_image", "obs_keypoint", "obs_point"):
         first, second = getattr(a, name), getattr(b, name)
         assert first.dtype == second.dtype

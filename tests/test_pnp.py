@@ -98,6 +98,7 @@ class World:
             obs_image=image,
             obs_keypoint=keypoint,
             obs_point=point,
+            noise_px=0.0,  # the points are exact
         )
         return cls(points, descriptors, local_map, features, rng)
 
@@ -350,9 +351,9 @@ def test_the_right_one_of_many_like_places_is_found(place: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rig", [False, True])
-def test_covariance_is_the_scatter_of_the_poses(rig: bool) -> None:
-    """Of world_from_rig @ Exp(d), d = rotation, then translation, in the rig's frame: by 200 noisy queries.
+@pytest.mark.parametrize(("rig", "map_noise_px"), [(False, 0.0), (True, 0.0), (False, 1.0)])
+def test_covariance_is_the_scatter_of_the_poses(rig: bool, map_noise_px: float) -> None:
+    """Of world_from_rig @ Exp(d), d = rotation, then translation, in the rig's frame: by 200 noisy queries and maps.
 
     The camera has so many pixels that 1 px of noise stays far below the limit of an inlier.
     """
@@ -366,9 +367,12 @@ def test_covariance_is_the_scatter_of_the_poses(rig: bool) -> None:
     poses = rig_from_body @ poses
     true = QUERY @ geometry.invert(rig_from_body)
     exact = [world.look(c, true @ p, noise_px=0, limit=150) for c, p in zip(cameras, poses, strict=True)]
-    localizer = world.localizer()
+    sure = replace(world.local_map, noise_px=map_noise_px)
+    spread_of_points = np.linalg.cholesky(sure.point_covariances(np.arange(400)) + 1e-18 * np.eye(3))
     motions, predicted = [], []
     for _ in range(200):
+        moved = world.points + np.einsum("pij,pj->pi", spread_of_points, rng.normal(size=(400, 3)))
+        localizer = PnpLocalizer(replace(sure, points=moved), world.features)
         noisy = [
             replace(f, keypoints=(f.keypoints + rng.normal(size=f.keypoints.shape)).astype(np.float32)) for f in exact
         ]

@@ -123,9 +123,8 @@ def map_dir(tmp_path_factory):
     points, colors = rng.normal(size=(3, 3)), rng.integers(0, 255, (3, 3), np.uint8)
     images = np.array([0, 0, 1, 1, 2, 2])
     observed = np.array([0, 1, 0, 1, 0, 2])  # point 0 is seen by three, the others by fewer
-    local_map = LocalMap(
-        ["a", "b", "c"], [camera] * 3, np.tile(np.eye(4), (3, 1, 1)), points, colors, images, np.arange(6), observed
-    )
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    local_map = LocalMap(["a", "b", "c"], [camera] * 3, poses, points, colors, images, np.arange(6), observed, 1.0)
     local_map.save(folder / "hl_map.npz")
     return folder
 

@@ -42,6 +42,19 @@ def rays_of(camera: pycolmap.Camera, pixels: NDArray[np.floating]) -> Floats:
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
+def projection_jacobian(in_cams: Floats, focals_px: Floats) -> Floats:
+    """Return how the projections of points (n, 3) in cameras' frames move with them, pixels a metre: (n, 2, 3).
+
+    d(f x/z, f y/z), with the depth z at least 1 mm.
+    """
+    z = np.maximum(in_cams[:, 2], 1e-3)
+    scale = focals_px / z
+    jacobian = np.zeros((len(in_cams), 2, 3))
+    jacobian[:, 0, 0] = jacobian[:, 1, 1] = scale
+    jacobian[:, :, 2] = -scale[:, None] * in_cams[:, :2] / z[:, None]
+    return jacobian
+
+
 def select_pairs(
     world_from_cams: Floats,
     cameras: Sequence[pycolmap.Camera],
@@ -201,6 +214,8 @@ class LocalMap:
     obs_image: NDArray[np.int64]
     obs_keypoint: NDArray[np.int64]
     obs_point: NDArray[np.int64]
+    noise_px: float
+    """Standard deviation of an observation, by axis."""
 
     @cached_property
     def index_of(self) -> dict[str, int]:
@@ -234,6 +249,26 @@ class LocalMap:
         part = slice(self._image_starts[image], self._image_starts[image + 1])
         return self.obs_keypoint[part], self.obs_point[part]
 
+    def point_covariances(self, points: NDArray[np.int64]) -> Floats:
+        """Return the covariance (n, 3, 3) of the places of n points, square metres, as least squares triangulate them.
+
+        A point that fewer than two images see has NaN.
+        """
+        order, starts = self._by_point
+        counts = starts[points + 1] - starts[points]
+        which = np.repeat(np.arange(len(points)), counts)  # the point of each observation
+        within = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
+        image = self.obs_image[order[np.repeat(starts[points], counts) + within]]
+        in_cams = geometry.transform(self.cams_from_world[image], self.points[points[which], None])[:, 0]
+        jacobian = projection_jacobian(in_cams, self.focals_px[image]) @ self.cams_from_world[image, :3, :3]
+        information = np.zeros((len(points), 3, 3))
+        np.add.at(information, which, np.einsum("oki,okj->oij", jacobian, jacobian))
+        # A little damping, so that two views from one place are uncertain and not an error.
+        information += 1e-9 * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        covariances = np.full((len(points), 3, 3), np.nan)
+        covariances[counts > 1] = self.noise_px**2 * np.linalg.inv(information[counts > 1])
+        return covariances
+
     def images_seeing(self, points: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return how many of the given points each image sees, (N,)."""
         order, starts = self._by_point
@@ -265,6 +300,7 @@ class LocalMap:
         )
         point = np.concatenate([one.obs_point + start for one, start in zip(maps, starts[:-1], strict=True)])
         order = np.argsort(image, kind="stable")
+        sizes = [max(len(one.points), 1) for one in maps]
         return cls(
             image_names=list(cameras),
             cameras=[camera for camera, _ in cameras.values()],
@@ -274,6 +310,7 @@ class LocalMap:
             obs_image=image[order],
             obs_keypoint=np.concatenate([one.obs_keypoint for one in maps])[order],
             obs_point=point[order],
+            noise_px=float(np.sqrt(np.average([one.noise_px**2 for one in maps], weights=sizes))),
         )
 
     def save(self, path: str | Path) -> None:
@@ -282,7 +319,7 @@ class LocalMap:
             "image_names": np.array(self.image_names, np.str_),
             "cameras": np.array([camera_text(camera) for camera in self.cameras], np.str_),
         }
-        for name in ("world_from_cams", "points", "colors", "obs_image", "obs_keypoint", "obs_point"):
+        for name in ("world_from_cams", "points", "colors", "obs_image", "obs_keypoint", "obs_point", "noise_px"):
             arrays[name] = getattr(self, name)
         with write_atomic(path) as temporary, open(temporary, "wb") as stream:
             np.savez(stream, **arrays)
@@ -298,7 +335,8 @@ class LocalMap:
             with np.load(path) as arrays:
                 data = {name: arrays[name] for name in arrays.files}
             names, cameras = data.pop("image_names").tolist(), data.pop("cameras").tolist()
-            return cls(image_names=names, cameras=[_camera(text) for text in cameras], **data)
+            noise_px = float(data.pop("noise_px"))
+            return cls(image_names=names, cameras=[_camera(text) for text in cameras], noise_px=noise_px, **data)
         except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile) as error:
             raise ArtefactError(
                 f"The triangulated map {path} cannot be read ({error}). Build it with the localize stage."
@@ -381,7 +419,9 @@ def triangulate(
         np.int64,
     ).reshape(-1, 3)
     observations = observations[np.lexsort((observations[:, 1], observations[:, 0]))]
-    points, observations = _refine_points(points, observations, cameras, world_from_cams, keypoints, settings)
+    points, observations, noise_px = _refine_points(
+        points, observations, cameras, world_from_cams, keypoints, settings
+    )
     return LocalMap(
         image_names=list(names),
         cameras=list(cameras),
@@ -391,6 +431,7 @@ def triangulate(
         obs_image=observations[:, 0],
         obs_keypoint=observations[:, 1],
         obs_point=observations[:, 2],
+        noise_px=noise_px,
     )
 
 
@@ -402,14 +443,14 @@ def _refine_points(
     keypoints: Sequence[NDArray[np.float32]],
     settings: MapSettings,
     iterations: int = 8,
-) -> tuple[Floats, NDArray[np.int64]]:
+) -> tuple[Floats, NDArray[np.int64], float]:
     """Minimise the reprojection errors of each point under a Cauchy loss of 1 px, by Gauss-Newton on all at once.
 
     Errors are measured on the undistorted image plane, times the focal length. Observations beyond the limit are
-    dropped, and then points that fewer than two images see.
+    dropped, and then points that fewer than two images see. Also returned is the standard deviation of the errors.
     """
     if not len(points):
-        return points, observations
+        return points, observations, 1.0
     cams_from_world = geometry.invert(world_from_cams)
     image, keypoint, _ = observations.T
     plane = np.zeros((len(observations), 2))
@@ -429,10 +470,7 @@ def _refine_points(
     count = len(points)
     for _ in range(iterations):
         error, in_cam, _ = residuals(points, observations)
-        z = np.maximum(in_cam[:, 2], 1e-3)
-        # d(x/z, y/z)/d(world point) = (R0 - x/z R2) / z, (R1 - y/z R2) / z
-        jacobian = (rotation[:, :2] - (in_cam[:, :2] / z[:, None])[..., None] * rotation[:, 2:3]) / z[:, None, None]
-        jacobian *= focal[:, None, None]
+        jacobian = projection_jacobian(in_cam, focal) @ rotation
         weight = 1.0 / (1.0 + (error**2).sum(1))
         hessian = np.einsum("o,oki,okj->oij", weight, jacobian, jacobian).reshape(-1, 9)
         gradient = np.einsum("o,oki,ok->oi", weight, jacobian, error)
@@ -449,9 +487,13 @@ def _refine_points(
     seen = np.bincount(views, minlength=count) >= 2
     seen &= np.isfinite(points).all(axis=1)
     new_index = np.cumsum(seen) - 1
-    kept = kept[seen[kept[:, 2]]]
+    used = seen[kept[:, 2]]
+    kept = kept[used]
     kept[:, 2] = new_index[kept[:, 2]]
-    return points[seen], kept
+    # Two coordinates an observation, three parameters a point.
+    freedom = max(2 * len(kept) - 3 * int(seen.sum()), 1)
+    noise_px = float(np.sqrt((error[good][used] ** 2).sum() / freedom))
+    return points[seen], kept, noise_px
 
 
 def map_path(map_dir: str | Path, session_id: str, features: str = "sift") -> Path:

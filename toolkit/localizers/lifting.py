@@ -17,7 +17,15 @@ from toolkit.alignment import DEPTH_NOISE
 from toolkit.depths import lifted
 from toolkit.features import LocalFeatures
 from toolkit.localizers.mapped import Known, MappedFeatures
-from toolkit.localizers.pnp import PnpLocalizer, PnpSettings, PoseEstimate, Prior, _Matches, _Query
+from toolkit.localizers.pnp import (
+    PnpLocalizer,
+    PnpSettings,
+    PoseEstimate,
+    Prior,
+    _Matches,
+    _Query,
+    least_squares_covariance,
+)
 from toolkit.localizers.vggt import CameraAnswer, VggtAnswer, VggtLocalizer
 from toolkit.mapping import LocalMap
 
@@ -151,6 +159,7 @@ class DepthLifter:
             obs_image=rows[:, 0],
             obs_keypoint=rows[:, 1],
             obs_point=rows[:, 2],
+            noise_px=local_map.noise_px,
         )
         image_of = np.concatenate([np.full(len(triangulated), -1), *source])
         return LiftedMap(part, triangulated, image_of, depths)
@@ -190,31 +199,31 @@ class _LiftedLocalizer(PnpLocalizer):
         self._use([MappedFeatures(made.local_map, mapped.features, mapped.kind, mapped.matcher)], settings)
         self._made = made
 
-    def _covariance(
-        self, query: _Query, rig_from_world: Floats, matches: _Matches, errors_px: Floats
-    ) -> Floats | None:
+    def _covariance(self, query: _Query, rig_from_world: Floats, matches: _Matches) -> Floats | None:
         made = self._made
         source = made.image[matches.point]
         images = np.unique(source[source >= 0])
-        if len(matches) < 4 or not len(images):
-            return super()._covariance(query, rig_from_world, matches, errors_px)
-        size = 6 + len(images)
-        information = np.zeros((size, size))
-        for part, of_pose, of_point in query.jacobians(rig_from_world, matches, made.local_map.points):
-            row = np.zeros((int(part.sum()), 2, size))
-            row[:, :, :6] = of_pose
-            for number, image in enumerate(images):
-                mine = source[part] == image
-                # A change s of the scale moves a point by s times its place relative to the image's camera.
-                arm = made.local_map.points[matches.point[part][mine]] - made.local_map.world_from_cams[image, :3, 3]
-                row[mine, :, 6 + number] = np.einsum("okj,oj->ok", of_point[mine], arm)
-            information += np.einsum("oki,okj->ij", row, row)
-        information /= float((errors_px**2).sum()) / max(2 * len(matches) - 6, 1)
-        information[6:, 6:] += np.linalg.inv(_scale_covariance([made.depths[int(image)] for image in images]))
-        # Rotations, places and scales are of like size; what is not determined shows here.
-        if not np.isfinite(information).all() or np.linalg.cond(information) > 1e14:
-            return None
-        return np.asarray(np.linalg.inv(information)[:6, :6], np.float64)
+        if not len(images):
+            return super()._covariance(query, rig_from_world, matches)
+        of_pose, of_point = query.jacobians(rig_from_world, matches, made.local_map.points)
+        of_scales = np.zeros((len(matches), 2, len(images)))
+        for number, image in enumerate(images):
+            mine = source == image
+            # A change s of the scale moves a point by s times its place relative to the image's camera.
+            arm = made.local_map.points[matches.point[mine]] - made.local_map.world_from_cams[image, :3, 3]
+            of_scales[mine, :, number] = np.einsum("okj,oj->ok", of_point[mine], arm)
+        noise = self._noise_of_points(query, matches, of_point)
+        noise[source >= 0] = 0  # what is a lifted point's own shows in its error
+        known = np.zeros((6 + len(images),) * 2)
+        known[6:, 6:] = np.linalg.inv(_scale_covariance([made.depths[int(image)] for image in images]))
+        # Rotations, places and scales are of like size; what is not determined shows in the whole.
+        covariance = least_squares_covariance(
+            np.concatenate([of_pose, of_scales], axis=2),
+            query.errors_px(rig_from_world, matches, made.local_map.points),
+            noise,
+            known,
+        )
+        return None if covariance is None else covariance[:6, :6]
 
 
 def _scale_covariance(depths: Sequence[Depth]) -> Floats:

@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 from toolkit import geometry
 from toolkit.features import LocalFeatures
 from toolkit.localizers.mapped import Known, MappedFeatures
-from toolkit.mapping import LocalMap, in_view, view_bounds
+from toolkit.mapping import LocalMap, in_view, projection_jacobian, view_bounds
 from toolkit.matching import unit_descriptors
 
 Floats = NDArray[np.float64]
@@ -144,6 +144,11 @@ class _Matches:
             np.concatenate([np.zeros((0, 2)), *(part.pixels for part in parts)]),
             np.concatenate([np.zeros(0, np.int64), *(part.point for part in parts)]),
         )
+
+    def rows(self) -> NDArray[np.void]:
+        """Return the matches (K,) as values that can be compared."""
+        rows = np.column_stack([self.camera, self.point, self.pixels])
+        return rows.view([("", rows.dtype)] * rows.shape[1])[:, 0]
 
     def __len__(self) -> int:
         return len(self.point)
@@ -370,12 +375,15 @@ class PnpLocalizer:
             reason = f"failed: too few inliers ({independent} within {settings.ransac_max_error_deg} deg)"
             return PoseEstimate(reason, num_matches=len(matches), num_inliers=independent)
         errors = query.errors_px(rig_from_world, guided, self.map.points)
+        # Guided matches follow the pose that they were sought about: of how exact it is, those tell that were found
+        # without it.
+        found_twice = guided[np.isin(guided.rows(), inliers.rows())]
         asked = np.unique(np.concatenate([np.asarray(refs, np.int64) for refs in references]))
         seen = self.map.images_seeing(np.unique(inliers.point))
         estimate = PoseEstimate(
             status="ok",
             world_from_rig=geometry.invert(rig_from_world),
-            covariance=self._covariance(query, rig_from_world, guided, errors),
+            covariance=self._covariance(query, rig_from_world, found_twice),
             num_matches=len(matches),
             num_inliers=independent,
             num_guided=len(guided),
@@ -393,11 +401,24 @@ class PnpLocalizer:
         )
         return estimate if certain else replace(estimate, status="low_confidence")
 
-    def _covariance(
-        self, query: "_Query", rig_from_world: Floats, matches: "_Matches", errors_px: Floats
-    ) -> Floats | None:
-        """Return the covariance (6, 6) of a pose; the map's points count as exact."""
-        return query.covariance(rig_from_world, matches, self.map.points, errors_px)
+    def _covariance(self, query: "_Query", rig_from_world: Floats, matches: _Matches) -> Floats | None:
+        """Return the covariance (6, 6) of a pose that rests on matches; None where it is not defined."""
+        of_pose, of_point = query.jacobians(rig_from_world, matches, self.map.points)
+        errors = query.errors_px(rig_from_world, matches, self.map.points)
+        return least_squares_covariance(of_pose, errors, self._noise_of_points(query, matches, of_point))
+
+    def _noise_of_points(self, query: "_Query", matches: _Matches, of_point: Floats) -> Floats:
+        """Return the covariance (K, 2, 2) of projections that comes from their points, square pixels; NaN if unknown.
+
+        Args:
+            query, matches: K matches.
+            of_point: (K, 2, 3), how projections move with their points.
+        """
+        noise = of_point @ self.map.point_covariances(matches.point) @ of_point.transpose(0, 2, 1)
+        # A match counts only where its point is seen near where it should be: no more of the point's noise is in it.
+        limit_px = np.tan(np.radians(self.settings.max_error_deg)) * query.focals_px[matches.camera]
+        share = 2 * limit_px**2 / np.maximum(np.trace(noise, axis1=1, axis2=2), 1e-12)
+        return np.asarray(noise * np.minimum(share, 1)[:, None, None], np.float64)
 
     def _rival_support(self, hypotheses: "list[_Hypothesis]") -> float:
         """Return the support of the best pose that is another one, relative to the best pose's."""
@@ -572,6 +593,37 @@ def _matrix(rigid: pycolmap.Rigid3d) -> Floats:
     return np.vstack([rigid.matrix(), [0.0, 0.0, 0.0, 1.0]])
 
 
+def least_squares_covariance(
+    of_unknowns: Floats, errors_px: Floats, noise_px2: Floats, known: Floats | None = None
+) -> Floats | None:
+    """Return the covariance (U, U) of unknowns that least squares found from K projections; None where undefined.
+
+    The sandwich N^-1 M N^-1 (Huber 1967): N is how well unit noise would determine the unknowns, M the noise that there
+    is. That of the keypoints is told by the spread of the errors; what projections have beside it, by `noise_px2`.
+
+    Args:
+        of_unknowns: (K, 2, U), how projections move with the unknowns.
+        errors_px: (K,).
+        noise_px2: (K, 2, 2), covariance of each projection that comes from its point; not finite: the point tells
+            nothing.
+        known: (U, U), information on the unknowns from elsewhere.
+    """
+    told = np.isfinite(noise_px2).all(axis=(1, 2))
+    of_unknowns, errors_px, noise_px2 = of_unknowns[told], errors_px[told], noise_px2[told]
+    if len(errors_px) < 4:
+        return None
+    # Two coordinates a point, six parameters of the pose.
+    variance = float((errors_px**2).sum()) / max(2 * len(errors_px) - 6, 1)
+    known = np.zeros((of_unknowns.shape[2],) * 2) if known is None else known
+    information = np.einsum("oki,okj->ij", of_unknowns, of_unknowns) + variance * known
+    if not np.isfinite(information).all() or np.linalg.cond(information) > 1e14:
+        return None
+    noise = noise_px2 + variance * np.eye(2)
+    middle = np.einsum("oki,okl,olj->ij", of_unknowns, noise, of_unknowns) + variance**2 * known
+    inverse = np.linalg.inv(information)
+    return np.asarray(inverse @ middle @ inverse, np.float64)
+
+
 class _Query:
     """The cameras of a query device, with what the steps above ask of them."""
 
@@ -610,30 +662,14 @@ class _Query:
         errors = self.errors_px(rig_from_world, matches, points)
         return np.degrees(np.arctan(errors / self.focals_px[matches.camera]))
 
-    def covariance(self, rig_from_world: Floats, matches: _Matches, points: Floats, errors_px: Floats) -> Floats | None:
-        """Return the covariance (6, 6) of the pose, from the spread of the errors; None where it is not defined.
+    def jacobians(self, rig_from_world: Floats, matches: _Matches, points: Floats) -> tuple[Floats, Floats]:
+        """Return how the projections of matches move, in pixels.
 
-        For world_from_rig @ Exp(d), d = rotation (radians), translation (metres) in the rig's frame, as the
-        benchmark's poses have it: the noise acts on the right.
+        With a small motion d of the rig: (K, 2, 6), d = rotation (radians), translation (metres) in the rig's frame,
+        world_from_rig @ Exp(d), as the benchmark's covariances have it; with a motion of the point in the world:
+        (K, 2, 3).
         """
-        if len(matches) < 4:
-            return None
-        information = np.zeros((6, 6))
-        for _, jacobian, _ in self.jacobians(rig_from_world, matches, points):
-            information += np.einsum("oki,okj->ij", jacobian, jacobian)
-        if np.linalg.cond(information) > 1e14:
-            return None
-        # Two coordinates a point, six parameters.
-        variance = float((errors_px**2).sum()) / max(2 * len(matches) - 6, 1)
-        return np.asarray(np.linalg.inv(information) * variance, np.float64)
-
-    def jacobians(
-        self, rig_from_world: Floats, matches: _Matches, points: Floats
-    ) -> Iterator[tuple[NDArray[np.bool_], Floats, Floats]]:
-        """Yield, for each camera, which matches (K,) are its k, and how their projections move, in pixels.
-
-        With a motion d of the rig as in `covariance`: (k, 2, 6); with a motion of the point in the world: (k, 2, 3).
-        """
+        of_pose, of_point = np.zeros((len(matches), 2, 6)), np.zeros((len(matches), 2, 3))
         for index in np.unique(matches.camera):
             part = matches.camera == index
             cam_from_rig = geometry.invert(self.rig_from_cams[index])
@@ -644,10 +680,7 @@ class _Query:
             zero = np.zeros_like(x)
             skew = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
             moved = np.concatenate([skew, np.broadcast_to(-np.eye(3), skew.shape)], axis=2)
-            moved = cam_from_rig[:3, :3] @ moved
-            u, v, depth = in_cam[:, 0], in_cam[:, 1], np.maximum(in_cam[:, 2], 1e-6)
-            inverse = self.focals_px[index] / depth
-            projection = np.zeros((len(x), 2, 3))
-            projection[:, 0, 0] = projection[:, 1, 1] = inverse
-            projection[:, 0, 2], projection[:, 1, 2] = -inverse * u / depth, -inverse * v / depth
-            yield part, projection @ moved, projection @ (cam_from_rig[:3, :3] @ rig_from_world[:3, :3])
+            projection = projection_jacobian(in_cam, np.full(len(in_cam), self.focals_px[index]))
+            of_pose[part] = projection @ (cam_from_rig[:3, :3] @ moved)
+            of_point[part] = projection @ (cam_from_rig[:3, :3] @ rig_from_world[:3, :3])
+        return of_pose, of_point
