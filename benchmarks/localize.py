@@ -1,11 +1,14 @@
 """Time, memory and accuracy of all map x query pairs of a capture, from nothing, beside hloc + SIFT.
 
-    python benchmarks/localize.py [--capture PATH] [--hloc CHECKOUT [--hloc-python PYTHON]] [--threads 2] [--out FILE]
+    python benchmarks/localize.py [--capture PATH] [--hloc CHECKOUT [--hloc-python PYTHON] | --plain] [--threads 2]
 
 Both do the same job on the same cores, one right after the other, each in a fresh process and an empty folder: local
 features once an image, a map of each device triangulated from its known poses, and a pose for each query of the
 keyframe list in each map. hloc gets the toolkit's retrieved references for nothing. Wall seconds mean little while
 others use the machine; CPU seconds mean more. Without a capture, a small one is rendered.
+
+With --plain, the toolkit is compared with itself: one RANSAC a query, with no guided matching and no search for
+rivals. Features and maps are the same, and count for both as they were measured once.
 """
 
 import argparse
@@ -17,7 +20,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -69,22 +72,7 @@ def run_toolkit(sessions_root: Path, run: Path, queries: str, threads: int) -> d
 
     imported = _clocks()
     files = SceneFiles(run, sessions_root.parent.name)
-    inner = {"features": np.zeros(2), "map": np.zeros(2)}
-
-    def timed(function: Callable[..., Any], part: str) -> Callable[..., Any]:
-        def call(*args: Any, **kwargs: Any) -> Any:
-            began = _clocks()
-            try:
-                return function(*args, **kwargs)
-            finally:
-                inner[part] = inner[part] + _clocks() - began
-
-        return call
-
-    # The stages are run as they are; what they call is timed to tell their parts apart.
-    embed.extract_session = timed(partial(embed.extract_session, progress=False), "features")
-    localize.extract_session = timed(partial(localize.extract_session, progress=False), "features")
-    localize.build_map = timed(localize.build_map, "map")
+    inner = _time_parts(embed, localize)
     started = _clocks()
     table = embed.embed_sessions(sessions_root, files.embeddings, features_dir=files.features)
     embedded, features = _clocks(), inner["features"]
@@ -119,6 +107,27 @@ def run_toolkit(sessions_root: Path, run: Path, queries: str, threads: int) -> d
     }
 
 
+def _time_parts(*stages: Any) -> dict[str, NDArray[np.float64]]:
+    """Time what stages call, to tell their parts apart; else they run as they are."""
+    inner = {"features": np.zeros(2), "map": np.zeros(2)}
+
+    def timed(function: Callable[..., Any], part: str) -> Callable[..., Any]:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            began = _clocks()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                inner[part] = inner[part] + _clocks() - began
+
+        return call
+
+    for stage in stages:
+        stage.extract_session = timed(partial(stage.extract_session, progress=False), "features")
+        if hasattr(stage, "build_map"):
+            stage.build_map = timed(stage.build_map, "map")
+    return inner
+
+
 def _clocks() -> NDArray[np.float64]:
     """Return the wall clock, and the CPU seconds of this process and of its children that have ended."""
     usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
@@ -133,6 +142,33 @@ def measure_toolkit(sessions_root: Path, run: Path, queries: str, threads: int) 
     fields = in_own_process(run_toolkit, sessions_root, run, queries, threads)
     measured = Measurement(**fields, load=[before, os.getloadavg()[0]])
     measured.pairs = accuracy(sessions_root, SceneFiles(run, sessions_root.parent.name).poses_dir, queries)
+    return measured
+
+
+PLAIN: dict[str, Any] = {"guided_radii_deg": (), "clear_inlier_ratio": 0.0}
+
+
+def localize_plainly(sessions_root: Path, run: Path, queries: str, threads: int) -> list[float]:
+    """Localize in a finished run's maps with the plain setting; returns wall and CPU seconds."""
+    from toolkit import localize
+    from toolkit.files import SceneFiles
+
+    files = SceneFiles(run, sessions_root.parent.name)
+    inner = _time_parts(localize)
+    localize.PnpSettings = partial(localize.PnpSettings, **PLAIN)
+    started = _clocks()
+    folders = (files.retrieval_dir, run / "plain_poses", files.features, files.maps)
+    localize.localize_pairs(sessions_root, *folders, queries=queries, workers=threads)
+    return [float(value) for value in _clocks() - started - inner["features"] - inner["map"]]
+
+
+def measure_plain(ours: Measurement, sessions_root: Path, run: Path, queries: str, threads: int) -> Measurement:
+    """Measure the plain setting in a process of its own, on the features and maps of a run of the toolkit."""
+    before = os.getloadavg()[0]
+    seconds, cpu = in_own_process(localize_plainly, sessions_root, run, queries, threads)
+    measured = replace(ours, seconds=ours.seconds | {"localize": seconds}, cpu=ours.cpu | {"localize": cpu})
+    measured = replace(measured, load=[before, os.getloadavg()[0]])
+    measured.pairs = accuracy(sessions_root, run / "plain_poses", queries)
     return measured
 
 
@@ -265,10 +301,10 @@ def accuracy(sessions_root: Path, poses_dir: Path, queries: str) -> list[dict[st
     return rows
 
 
-def markdown(capture: str, threads: int, ours: Measurement, theirs: Measurement | None) -> str:
-    """Return the tables of a benchmark."""
+def markdown(capture: str, threads: int, ours: Measurement, theirs: Measurement | None, other: str) -> str:
+    """Return the tables of a benchmark, `theirs` under the name `other`."""
     tools = [ours, theirs] if theirs else [ours]
-    names = ["toolkit", "hloc + SIFT"][: len(tools)]
+    names = ["toolkit", other][: len(tools)]
     header = ["stage"]
     for name in names:
         header += [f"{name}: s", "CPU s"]
@@ -316,12 +352,15 @@ def main() -> None:
     parser.add_argument("--queries", default="keyframes_pruned_subsampled", help="keyframe list (default: %(default)s)")
     parser.add_argument("--threads", type=int, default=2, help="cores for each tool (default: %(default)s)")
     parser.add_argument("--hloc", help="checkout of cvg/Hierarchical-Localization, to run hloc + SIFT too")
+    parser.add_argument("--plain", action="store_true", help="compare with the toolkit's plain setting instead")
     parser.add_argument("--hloc-python", default=sys.executable, help="interpreter with hloc's needs (default: this)")
     parser.add_argument("--hloc-map-pairs", type=int, default=20, help="partners of a map image (default: %(default)s)")
     parser.add_argument("--repeat", type=int, default=1, help="runs in turn; the fastest of each tool counts")
     add_out(parser)
     options = parser.parse_args()
     check_out(parser, options.out)
+    if options.plain and options.hloc:
+        parser.error("--plain and --hloc are two comparisons: give one.")
     limit_cores(options.threads)
     from toolkit.capture import Capture
     from toolkit.errors import ToolkitError
@@ -349,12 +388,16 @@ def main() -> None:
                 arguments = (sessions_root, run, options.queries, options.threads, options.hloc_map_pairs)
                 theirs.append(measure_hloc(checkout, options.hloc_python, *arguments))
                 print(f"hloc {theirs[-1].total:.1f} s", file=sys.stderr)
+            elif options.plain:
+                theirs.append(measure_plain(ours[-1], sessions_root, run, options.queries, options.threads))
+                print(f"plain {theirs[-1].total:.1f} s", file=sys.stderr)
     best = min(ours, key=lambda measured: measured.total)
     other = min(theirs, key=lambda measured: measured.total) if theirs else None
-    text = markdown(sessions_root.parent.name, options.threads, best, other)
+    label = "plain" if options.plain else "hloc + SIFT"
+    text = markdown(sessions_root.parent.name, options.threads, best, other, label)
     results = {"toolkit": vars(best) | {"total": best.total}}
     if other:
-        results["hloc"] = vars(other) | {"total": other.total}
+        results["plain" if options.plain else "hloc"] = vars(other) | {"total": other.total}
     document = {"capture": sessions_root.parent.name, "queries": options.queries, "threads": options.threads}
     print(text)
     write_out(options.out, text, document | results)

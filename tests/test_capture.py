@@ -301,6 +301,14 @@ def test_trajectories_keep_poses_and_covariances_exactly(tmp_path: Path) -> None
     assert header == "# timestamp, device_id, qw, qx, qy, qz, tx, ty, tz, *covar"
 
 
+def test_a_covariance_that_is_nan_is_left_out(tmp_path: Path) -> None:
+    covariances = np.stack([np.eye(6), np.full((6, 6), np.nan)])
+    Trajectory([1, 2], ["a", "b"], np.tile(np.eye(7)[0], (2, 1)), covariances).write(tmp_path / "t.txt")
+    lines = (tmp_path / "t.txt").read_text().splitlines()
+    assert [line.count(",") for line in lines[-2:]] == [8 + 36, 8]
+    np.testing.assert_array_equal(Trajectory.read(tmp_path / "t.txt").covariances, covariances)
+
+
 def test_rows_without_covariance_are_nan(tmp_path: Path) -> None:
     numbers = ", ".join(map(str, range(36)))
     (tmp_path / "t.txt").write_text(f"1, a, 1, 0, 0, 0, 0, 0, 0\n2, a, 1, 0, 0, 0, 0, 0, 0, {numbers}\n")

@@ -128,6 +128,9 @@ def test_retrieval_becomes_a_list_of_pairs(tmp_path: Path) -> None:
     path.write_text("{}\n")
     with pytest.raises(ArtefactError, match=r"_query_hl\.jsonl, line 1: not a retrieval row"):
         export_pairs(tmp_path, "PLACE", "ios", "hl", tmp_path / "pairs.txt")
+    path.write_text(json.dumps(row | {"path": "hl_query/1.jpg"}) + "\n")
+    with pytest.raises(ArtefactError, match=r"expected images as SCENE/sessions/.*found 'hl_query/1\.jpg'"):
+        export_pairs(tmp_path, "PLACE", "ios", "hl", tmp_path / "pairs.txt")
     with pytest.raises(ArtefactError, match=r"No references: .* is missing"):
         export_pairs(tmp_path, "PLACE", "hl", "hl", tmp_path / "pairs.txt")
 

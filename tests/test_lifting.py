@@ -67,7 +67,7 @@ def pointless(session: Session, store: FeatureStore) -> LocalMap:
         [session.image_name(row) for row in rows],
         [session.camera(str(session.images["sensor_id"].iloc[row])) for row in rows],
         session.world_from_cam(rows),
-        np.zeros((0, 3)), np.zeros((0, 3), np.uint8), nothing, nothing, nothing, 1.0,
+        np.zeros((0, 3)), np.zeros((0, 3), np.uint8), nothing, nothing, nothing, np.zeros(0, np.float32),
     )  # fmt: skip
 
 

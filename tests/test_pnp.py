@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from toolkit import geometry
 from toolkit.features import DESCRIPTOR_SCALE, KINDS, LocalFeatures
 from toolkit.localizers.mapped import MappedFeatures
-from toolkit.localizers.pnp import PnpLocalizer, PnpSettings, PoseEstimate
+from toolkit.localizers.pnp import PnpLocalizer, PnpSettings, PoseEstimate, least_squares_covariance
 from toolkit.mapping import LocalMap
 from toolkit.matching import MutualMatcher, PairMatches
 
@@ -98,7 +98,7 @@ class World:
             obs_image=image,
             obs_keypoint=keypoint,
             obs_point=point,
-            noise_px=0.0,  # the points are exact
+            noise_px=np.zeros(len(points), np.float32),  # the points are exact
         )
         return cls(points, descriptors, local_map, features, rng)
 
@@ -367,7 +367,7 @@ def test_covariance_is_the_scatter_of_the_poses(rig: bool, map_noise_px: float) 
     poses = rig_from_body @ poses
     true = QUERY @ geometry.invert(rig_from_body)
     exact = [world.look(c, true @ p, noise_px=0, limit=150) for c, p in zip(cameras, poses, strict=True)]
-    sure = replace(world.local_map, noise_px=map_noise_px)
+    sure = replace(world.local_map, noise_px=np.full(400, map_noise_px, np.float32))
     spread_of_points = np.linalg.cholesky(sure.point_covariances(np.arange(400)) + 1e-18 * np.eye(3))
     motions, predicted = [], []
     for _ in range(200):
@@ -390,6 +390,49 @@ def test_covariance_is_the_scatter_of_the_poses(rig: bool, map_noise_px: float) 
     # And the summary that people read.
     assert estimate.position_std_m == pytest.approx(np.sqrt(np.trace(estimate.covariance[3:, 3:])))
     assert estimate.rotation_std_deg == pytest.approx(np.degrees(np.sqrt(np.trace(estimate.covariance[:3, :3]))))
+
+
+def test_guided_matches_alone_make_no_pose_more_certain(room: World) -> None:
+    """They follow the pose that they were sought about: only what was found without it counts."""
+    seen = room.look(PINHOLE, QUERY)
+    stds, guided = [], []
+    for known_to_descriptors in (1536, 100):
+        localizer = room.localizer(max_query_features=known_to_descriptors)
+        found = localizer.localize([PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
+        stds.append(found.position_std_m)
+        guided.append(found.num_guided)
+    assert guided[1] > 0.9 * guided[0] > 150
+    assert stds[1] > 1.25 * stds[0]
+
+
+def test_a_point_that_is_not_known_well_tells_less(room: World) -> None:
+    """But never less than a match within the limit of an inlier does."""
+    seen = room.look(PINHOLE, QUERY)
+
+    def std(noise_px: float) -> float:
+        local_map = replace(room.local_map, noise_px=np.full(len(room.points), noise_px, np.float32))
+        localizer = PnpLocalizer(local_map, room.features)
+        return localizer.localize([PINHOLE], np.eye(4)[None], [seen], [REFERENCES]).position_std_m
+
+    exact, noisy, hopeless, worse = std(0), std(2), std(1e3), std(1e6)
+    assert 1.2 * exact < noisy < hopeless
+    assert worse == pytest.approx(hopeless, rel=1e-3)
+
+
+def test_what_is_known_of_unknowns_beside_the_matches_counts() -> None:
+    """Of two unknowns that move projections alike, one is known within 0.1: the other then has that and the noise."""
+    rng = np.random.default_rng(0)
+    of_one = rng.normal(size=(400, 2, 1))
+    of_unknowns = np.concatenate([of_one, of_one], axis=2)
+    errors, nothing = np.full(400, np.sqrt(2.0)), np.zeros((400, 2, 2))
+    assert least_squares_covariance(of_unknowns, errors, nothing) is None
+    covariance = least_squares_covariance(of_unknowns, errors, nothing, np.diag([0.0, 100.0]))
+    alone = least_squares_covariance(of_one, errors, nothing)
+    np.testing.assert_allclose(covariance[0, 0], alone[0, 0] + 0.01, rtol=1e-6)
+    # Points without a covariance tell nothing.
+    nothing[:200] = np.nan
+    half = least_squares_covariance(of_one, errors, nothing)
+    assert 1.7 < half[0, 0] / alone[0, 0] < 2.4
 
 
 def test_more_noise_is_more_uncertainty(room: World) -> None:

@@ -124,7 +124,10 @@ def map_dir(tmp_path_factory):
     images = np.array([0, 0, 1, 1, 2, 2])
     observed = np.array([0, 1, 0, 1, 0, 2])  # point 0 is seen by three, the others by fewer
     poses = np.tile(np.eye(4), (3, 1, 1))
-    local_map = LocalMap(["a", "b", "c"], [camera] * 3, poses, points, colors, images, np.arange(6), observed, 1.0)
+    keypoints, noise_px = np.arange(6), np.ones(3, np.float32)
+    local_map = LocalMap(
+        ["a", "b", "c"], [camera] * 3, poses, points, colors, images, keypoints, observed, noise_px
+    )
     local_map.save(folder / "hl_map.npz")
     return folder
 

@@ -221,7 +221,7 @@ def test_other_seeds_and_rooms_look_different() -> None:
     assert not np.array_equal(texture(0, 0), texture(0, 4))
 
 
-def test_look_alikes_come_in_two_models_and_other_things_do_not() -> None:
+def test_look_alikes_come_in_few_models_and_other_things_do_not() -> None:
     def textures(material: synthetic.Material, look_alikes: bool) -> set[bytes]:
         seen = set()
         for index in range(2):

@@ -135,10 +135,13 @@ class Trajectory:
         )
 
     def write(self, path: str | Path) -> None:
-        """Write the file in one piece, with numbers that read back exactly."""
-        covariances = self.covariances
-        values = self.qt if covariances is None else np.hstack([self.qt, covariances.reshape(-1, 36)])
-        rows = zip(self.timestamps.tolist(), self._ids.to_pylist(), values.tolist(), strict=True)
+        """Write the file in one piece, with numbers that read back exactly; a covariance that is NaN is left out."""
+        covariances, values = self.covariances, self.qt.tolist()
+        if covariances is not None:
+            known = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
+            flat = covariances.reshape(-1, 36).tolist()
+            values = [pose + flat[row] if known[row] else pose for row, pose in enumerate(values)]
+        rows = zip(self.timestamps.tolist(), self._ids.to_pylist(), values, strict=True)
         write_table(
             Path(path),
             "timestamp, device_id, qw, qx, qy, qz, tx, ty, tz, *covar",

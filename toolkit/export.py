@@ -152,7 +152,11 @@ def export_pairs(
     path = SceneFiles(Path(run), scene).retrieval(map_device, query_device)
     pairs = []
     for row in read_references(path, "path"):
-        names = [image_name(str(entry["path"])) for entry in (row, *row["topk"][:topk])]
+        paths = [str(entry["path"]) for entry in (row, *row["topk"][:topk])]
+        strange = [name for name in paths if "/sessions/" not in name]
+        if strange:
+            raise ArtefactError(f"{path}: expected images as SCENE/sessions/..., found {strange[0]!r}. Retrieve again.")
+        names = [image_name(name) for name in paths]
         spaced = [name for name in names if len(name.split()) != 1]
         if spaced:
             raise ArtefactError(f"{path}: hloc's lists cannot hold the space in {spaced[0]!r}.")

@@ -44,7 +44,7 @@ from toolkit.localizers.mapped import Known, MappedFeatures
 from toolkit.localizers.pnp import PnpLocalizer, PnpSettings, PoseEstimate
 from toolkit.localizers.prediction import Predictor, View, create_predictor
 from toolkit.localizers.vggt import VggtAnswer, VggtLocalizer, VggtQuery, VggtSettings
-from toolkit.mapping import LocalMap, MapSettings, build_map, map_path
+from toolkit.mapping import LocalMap, MapSettings, build_map, map_path, map_settings
 from toolkit.matching import LocalMethod, MatchStore, MutualMatcher, create_local_methods, match_sessions
 from toolkit.references import read_references
 from toolkit.upright import Turns, upright_turns
@@ -312,7 +312,7 @@ class _Pair:
         return {
             "method": method,
             "pnp": asdict(settings),
-            "map": asdict(MapSettings(seed=settings.seed)),
+            "map": map_settings(MapSettings(seed=settings.seed)),
             "features": [kind.extractor.settings for kind in kinds],
             "matchers": [kind.matcher.settings for kind in kinds],
             "retrieval": file_fingerprint(self.retrieval),
@@ -613,12 +613,13 @@ def _write_poses(pair: _Pair, rows: list[dict[str, Any]], columns: list[str]) ->
     with write_atomic(pair.csv) as temporary:
         pd.DataFrame(rows, columns=columns).to_csv(temporary, index=False)
     posed = [row for row in rows if row["qt"] is not None]
-    covariances = [row["covariance"] for row in posed]
+    unknown = [float("nan")] * 36
+    covariances = [row["covariance"] or unknown for row in posed]
     trajectory = Trajectory(
         np.array([row["timestamp"] for row in posed], np.int64),
         [row["device_id"] for row in posed],
         np.array([row["qt"] for row in posed], np.float64).reshape(-1, 7),
-        np.array(covariances, np.float64).reshape(-1, 6, 6) if posed and None not in covariances else None,
+        np.array(covariances, np.float64).reshape(-1, 6, 6) if any(row["covariance"] for row in posed) else None,
     )
     trajectory.write(pair.txt)
     (pair.out_dir / f".{pair.name}.partial.jsonl").unlink(missing_ok=True)

@@ -34,6 +34,10 @@ from toolkit.matching import (
 Floats = NDArray[np.float64]
 
 
+_MAP_FORMAT = 2
+"""Raised when the same settings give another file: maps of before are then built anew."""
+
+
 def rays_of(camera: pycolmap.Camera, pixels: NDArray[np.floating]) -> Floats:
     """Return unit rays (N, 3) in the camera's frame of pixels (N, 2)."""
     if not len(pixels):
@@ -193,6 +197,11 @@ class MapSettings:
     seed: int = 0
 
 
+def map_settings(settings: MapSettings) -> dict[str, Any]:
+    """Return what a map depends on besides what it is made of; part of fingerprints."""
+    return {**asdict(settings), "format": _MAP_FORMAT}
+
+
 @dataclass(frozen=True)
 class LocalMap:
     """Posed images and the points triangulated from them, as arrays.
@@ -214,8 +223,8 @@ class LocalMap:
     obs_image: NDArray[np.int64]
     obs_keypoint: NDArray[np.int64]
     obs_point: NDArray[np.int64]
-    noise_px: float
-    """Standard deviation of an observation, by axis."""
+    noise_px: NDArray[np.float32]
+    """(P,) standard deviation of the observations of each point, by axis; all of one kind of features have the same."""
 
     @cached_property
     def index_of(self) -> dict[str, int]:
@@ -259,6 +268,9 @@ class LocalMap:
         which = np.repeat(np.arange(len(points)), counts)  # the point of each observation
         within = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
         image = self.obs_image[order[np.repeat(starts[points], counts) + within]]
+        # Keypoints of one image at one place (two orientations) are one view.
+        which, image = np.unique(np.column_stack([which, image]), axis=0).T
+        views = np.bincount(which, minlength=len(points))
         in_cams = geometry.transform(self.cams_from_world[image], self.points[points[which], None])[:, 0]
         jacobian = projection_jacobian(in_cams, self.focals_px[image]) @ self.cams_from_world[image, :3, :3]
         information = np.zeros((len(points), 3, 3))
@@ -266,7 +278,8 @@ class LocalMap:
         # A little damping, so that two views from one place are uncertain and not an error.
         information += 1e-9 * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         covariances = np.full((len(points), 3, 3), np.nan)
-        covariances[counts > 1] = self.noise_px**2 * np.linalg.inv(information[counts > 1])
+        noise_px2 = self.noise_px[points].astype(np.float64) ** 2
+        covariances[views > 1] = noise_px2[views > 1, None, None] * np.linalg.inv(information[views > 1])
         return covariances
 
     def images_seeing(self, points: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -300,7 +313,6 @@ class LocalMap:
         )
         point = np.concatenate([one.obs_point + start for one, start in zip(maps, starts[:-1], strict=True)])
         order = np.argsort(image, kind="stable")
-        sizes = [max(len(one.points), 1) for one in maps]
         return cls(
             image_names=list(cameras),
             cameras=[camera for camera, _ in cameras.values()],
@@ -310,7 +322,7 @@ class LocalMap:
             obs_image=image[order],
             obs_keypoint=np.concatenate([one.obs_keypoint for one in maps])[order],
             obs_point=point[order],
-            noise_px=float(np.sqrt(np.average([one.noise_px**2 for one in maps], weights=sizes))),
+            noise_px=np.concatenate([one.noise_px for one in maps]),
         )
 
     def save(self, path: str | Path) -> None:
@@ -335,8 +347,7 @@ class LocalMap:
             with np.load(path) as arrays:
                 data = {name: arrays[name] for name in arrays.files}
             names, cameras = data.pop("image_names").tolist(), data.pop("cameras").tolist()
-            noise_px = float(data.pop("noise_px"))
-            return cls(image_names=names, cameras=[_camera(text) for text in cameras], noise_px=noise_px, **data)
+            return cls(image_names=names, cameras=[_camera(text) for text in cameras], **data)
         except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile) as error:
             raise ArtefactError(
                 f"The triangulated map {path} cannot be read ({error}). Build it with the localize stage."
@@ -431,7 +442,7 @@ def triangulate(
         obs_image=observations[:, 0],
         obs_keypoint=observations[:, 1],
         obs_point=observations[:, 2],
-        noise_px=noise_px,
+        noise_px=np.full(len(points), noise_px, np.float32),
     )
 
 
@@ -528,7 +539,7 @@ def build_map(
         ArtefactError: no image has both a pose and features.
     """
     settings = settings or MapSettings()
-    map_record = {"map": asdict(settings), "inputs": inputs}
+    map_record = {"map": map_settings(settings), "inputs": inputs}
     if skip_existing and is_current(path, map_record):
         with suppress(ArtefactError):  # torn behind our back: build it anew
             return LocalMap.load(path)

@@ -60,7 +60,7 @@ NEAR_M = 0.05
 LEVELS = 6  # of the mip-maps; texture sides are multiples of 2 ** (LEVELS - 1)
 SAMPLES = 2  # a side of a pixel
 SOLD_OFTEN = ("books", "crate", "door", "drawers", "window")
-MODELS = 2  # of each of these things, where a world has look-alikes
+MODELS = 2  # of each of these things and each size in whole metres, where a world has look-alikes
 
 
 def _random(*key: int | str) -> Rng:
@@ -969,8 +969,8 @@ def render_capture(
         frames: frames (rig poses) a room and map session, at least 2; query sessions have half as many.
         seed: of everything; the same seed gives the same bytes.
         progress: whether to show a bar.
-        look_alikes: whether doors, windows, shelves, cabinets and crates come in two models each, the same in all
-            rooms, which are easily taken for one another.
+        look_alikes: whether doors, windows, shelves, cabinets and crates come in few models, the same in all rooms,
+            which are easily taken for one another.
 
     Raises:
         CaptureError: a setting is out of range, or `out` holds something else than a rendered capture.

@@ -150,6 +150,7 @@ class DepthLifter:
         rows = np.concatenate([old, new])
         rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
         together = np.concatenate([local_map.points[triangulated], *points])
+        image_of = np.concatenate(source)
         part = LocalMap(
             image_names=local_map.image_names,
             cameras=local_map.cameras,
@@ -159,10 +160,9 @@ class DepthLifter:
             obs_image=rows[:, 0],
             obs_keypoint=rows[:, 1],
             obs_point=rows[:, 2],
-            noise_px=local_map.noise_px,
+            noise_px=np.concatenate([local_map.noise_px[triangulated], np.zeros(len(image_of), np.float32)]),
         )
-        image_of = np.concatenate([np.full(len(triangulated), -1), *source])
-        return LiftedMap(part, triangulated, image_of, depths)
+        return LiftedMap(part, triangulated, np.concatenate([np.full(len(triangulated), -1), image_of]), depths)
 
     def _depth(self, image: int, xy: Floats, predicted: tuple[CameraAnswer, int] | None) -> Depth | None:
         """Return the depth at pixels of a map image: of the capture's depth maps, else predicted."""

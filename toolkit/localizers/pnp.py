@@ -147,7 +147,7 @@ class _Matches:
 
     def rows(self) -> NDArray[np.void]:
         """Return the matches (K,) as values that can be compared."""
-        rows = np.column_stack([self.camera, self.point, self.pixels])
+        rows = np.ascontiguousarray(np.column_stack([self.camera, self.point, self.pixels]))
         return rows.view([("", rows.dtype)] * rows.shape[1])[:, 0]
 
     def __len__(self) -> int:
@@ -417,7 +417,7 @@ class PnpLocalizer:
         noise = of_point @ self.map.point_covariances(matches.point) @ of_point.transpose(0, 2, 1)
         # A match counts only where its point is seen near where it should be: no more of the point's noise is in it.
         limit_px = np.tan(np.radians(self.settings.max_error_deg)) * query.focals_px[matches.camera]
-        share = 2 * limit_px**2 / np.maximum(np.trace(noise, axis1=1, axis2=2), 1e-12)
+        share = limit_px**2 / np.maximum(np.trace(noise, axis1=1, axis2=2), 1e-12)
         return np.asarray(noise * np.minimum(share, 1)[:, None, None], np.float64)
 
     def _rival_support(self, hypotheses: "list[_Hypothesis]") -> float:
@@ -599,7 +599,8 @@ def least_squares_covariance(
     """Return the covariance (U, U) of unknowns that least squares found from K projections; None where undefined.
 
     The sandwich N^-1 M N^-1 (Huber 1967): N is how well unit noise would determine the unknowns, M the noise that there
-    is. That of the keypoints is told by the spread of the errors; what projections have beside it, by `noise_px2`.
+    is: the spread of the errors, and `noise_px2`. The spread holds a part of the latter already; that it counts twice
+    stands for what is not known, as the errors of the map's poses.
 
     Args:
         of_unknowns: (K, 2, U), how projections move with the unknowns.
