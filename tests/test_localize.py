@@ -6,13 +6,14 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Literal
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from toolkit import geometry
+from toolkit import geometry, localize
 from toolkit.capture import Capture, Trajectory
 from toolkit.embed import embed_sessions
 from toolkit.errors import ArtefactError, CaptureError, ImageError, ManifestError, ToolkitError
@@ -21,6 +22,7 @@ from toolkit.files import SceneFiles, sidecar_path
 from toolkit.images import read_image
 from toolkit.localize import COLUMNS, Map, localize_image, localize_pairs
 from toolkit.localizers.pnp import PnpLocalizer, PoseEstimate
+from toolkit.mapping import LocalMap
 from toolkit.matching import MATCHERS, MutualMatcher, unit_descriptors
 from toolkit.retrieve import retrieve_pairs
 
@@ -168,6 +170,29 @@ def test_wrong_questions_are_refused(
     with pytest.raises(error, match=re.compile(message, re.DOTALL)):
         run_stage(small_capture, run, **wrong)
     assert not run.poses_dir.exists() or not list(run.poses_dir.glob("*.txt"))
+
+
+def test_a_pose_without_covariance_leaves_the_others_theirs(tmp_path: Path) -> None:
+    rows = [
+        {"timestamp": time, "device_id": "a", "qt": [1.0, 0, 0, 0, 0, 0, 0], "covariance": covariance}
+        for time, covariance in ((1, np.eye(6).ravel().tolist()), (2, None))
+    ]
+    pair = SimpleNamespace(name="pair", out_dir=tmp_path, csv=tmp_path / "pair.csv", txt=tmp_path / "pair.txt")
+    localize._write_poses(pair, rows, ["timestamp", "device_id"])  # type: ignore[arg-type]
+    np.testing.assert_array_equal(Trajectory.read(pair.txt).covariances, [np.eye(6), np.full((6, 6), np.nan)])
+
+
+def test_a_map_of_an_older_format_is_built_anew(small_capture: Path, run: SceneFiles) -> None:
+    run_stage(small_capture, run, query_device="ios")
+    path = run.maps / "ios_map.npz"
+    with np.load(path) as arrays:
+        old = {name: arrays[name] for name in arrays.files if name != "noise_px"}
+    np.savez(path, **old)
+    for record in (sidecar_path(path), sidecar_path(run.poses_txt("ios", "ios"))):
+        record.write_text(record.read_text().replace('"format": 2', '"format": 1'))
+    table = run_stage(small_capture, run, query_device="ios")
+    assert not table["skipped"].any()
+    assert (LocalMap.load(path).noise_px > 0).all()
 
 
 @pytest.mark.parametrize("line", ["{", '{"timestamp": "1"}', '{"timestamp": "x", "sensor_id": "a", "topk": []}', "[]"])
