@@ -88,6 +88,7 @@ def test_a_good_capture_has_no_problems(capture: Path) -> None:
         ),
         ("hl_map/images.txt", "30, imu, s/a/10.jpg", ":6: error: sensor 'imu' of an image is no camera"),
         ("hl_map/depths.txt", "10, s/a, s/a/10.png", ":1: error: missing file raw_data/s/a/10.png"),
+        ("hl_map/depths.txt", "10, render/s/x, s/a/10.jpg", ":1: error: unknown sensor 'render/s/x'"),
         ("hl_map/rigs.txt", f"r, s/x, {QT}", ":6: error: unknown sensor 's/x': not in sensors.txt"),
         (
             "hl_map/rigs.txt",
@@ -191,6 +192,11 @@ def test_a_long_list_of_problems_can_be_cut(capture: Path) -> None:
     assert f"... and {count - 2} more: python -m toolkit check {capture}" in lines
     assert "more:" not in report.text()
     assert "more:" not in report.text(most=count)
+
+
+def test_depth_that_was_rendered_for_a_photograph_is_known(capture: Path) -> None:
+    append(capture, "hl_map/depths.txt", "10, render/s/a, s/a/10.jpg\n")
+    assert found(capture) == []
 
 
 def test_warnings_alone_leave_it_ok(capture: Path) -> None:

@@ -180,6 +180,8 @@ class _SessionCheck:
         table = self.session.tables[file]
         sensors = table.columns["sensor_id"]
         unknown = ~_is_in(sensors, self.sensor_ids)
+        if file == "depths.txt":  # maps that were rendered for a photograph: <prefix>/<sensor id>
+            unknown &= ~_is_in(pc.replace_substring_regex(sensors, "^[^/]*/", ""), self.sensor_ids)
         self._add_rows(file, unknown, "unknown sensor {!r}: not in sensors.txt", "sensor_id")
         types = self._column("sensors.txt", "sensor_type")
         others = self.sensor_ids.filter(
