@@ -10,8 +10,10 @@ which finds several times as many and makes the pose more precise.
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from threading import Lock
+from typing import Any
 
 import numpy as np
+import poselib
 import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
@@ -26,8 +28,10 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-# COLMAP's solver for rigs with baselines draws from the C library's generator, which threads share: two at once would
-# disturb each other's sequence, and equal seeds give unequal poses.
+_RANSAC_CONFIDENCE = 0.9999
+
+# PoseLib's solver for rigs draws from the C library's generator, which threads share: without a seed of its own, or two
+# at once, equal seeds would give poses that are unequal in their last digits.
 _RIG_RANSAC = Lock()
 
 CONFIRMED = (5.0, 0.5)  # degrees, metres: further apart, two answers contradict each other
@@ -448,7 +452,7 @@ class PnpLocalizer:
     def _ransac(
         self, query: "_Query", matches: _Matches, max_error_deg: float, least_inliers: int = 0
     ) -> Floats | None:
-        """Return rig_from_world by LO-RANSAC, or None; a pose with fewer than `least_inliers` may be missed."""
+        """Return rig_from_world by LO-RANSAC (PoseLib), or None; one with fewer than `least_inliers` may be missed."""
         if len(np.unique(matches.point)) < 4:
             return None
         if len(matches) > self.settings.max_ransac_matches:
@@ -457,34 +461,16 @@ class PnpLocalizer:
             kept[chosen[: self.settings.max_ransac_matches]] = True
             least_inliers = least_inliers * self.settings.max_ransac_matches // len(matches)
             matches = matches[kept]
-        options = pycolmap.RANSACOptions()
-        options.max_error = float(np.tan(np.radians(max_error_deg)) * query.focals_px.mean())
-        options.random_seed = self.settings.seed
-        options.min_num_trials = 100
-        options.confidence = 0.9999
-        ratio = np.clip(least_inliers / len(matches), 1e-3, 0.99)
-        trials = np.log(1 - options.confidence) / np.log1p(-(ratio**3))  # to draw three inliers once
-        options.max_num_trials = int(np.clip(trials, options.min_num_trials, self.settings.ransac_max_trials))
-        refinement = pycolmap.AbsolutePoseRefinementOptions()
-        points = self.map.points[matches.point]
-        if len(query.cameras) == 1:
-            estimation = pycolmap.AbsolutePoseEstimationOptions()
-            estimation.ransac = options
-            answer = pycolmap.estimate_and_refine_absolute_pose(
-                matches.pixels, points, query.cameras[0], estimation, refinement
-            )
-            return None if answer is None else query.rig_from_cams[0] @ _matrix(answer["cam_from_world"])
-        with _RIG_RANSAC:
-            answer = pycolmap.estimate_and_refine_generalized_absolute_pose(
-                matches.pixels,
-                points,
-                matches.camera.tolist(),
-                query.cams_from_rig,
-                query.cameras,
-                options,
-                refinement,
-            )
-        return None if answer is None else _matrix(answer["rig_from_world"])
+        least = np.clip(least_inliers / len(matches), 1e-3, 0.99)
+        trials = np.log(1 - _RANSAC_CONFIDENCE) / np.log1p(-(least**3))  # to draw three inliers once
+        options = {
+            "success_prob": _RANSAC_CONFIDENCE,
+            "dyn_num_trials_mult": 1.0,
+            "min_iterations": 100,
+            "max_iterations": int(np.clip(trials, 100, self.settings.ransac_max_trials)),
+            "seed": self.settings.seed,
+        }
+        return query.ransac(matches, self.map.points, max_error_deg, options)
 
     def _refine(self, query: "_Query", rig_from_world: Floats, matches: _Matches) -> Floats | None:
         """Minimise the reprojection error of all matches, robustly (Cauchy, 1 px)."""
@@ -645,6 +631,42 @@ class _Query:
         for index, kinds in enumerate(self.features):
             pixels[camera == index] = kinds[kind].keypoints[keypoint[camera == index]]
         return pixels
+
+    def ransac(
+        self, matches: _Matches, points: Floats, max_error_deg: float, options: Mapping[str, Any]
+    ) -> Floats | None:
+        """Return the pose rig_from_world (4, 4) that the most matches to points (P, 3) agree with; None without any.
+
+        Errors are those on the plane at depth 1, where no lens bends anything, times one focal length.
+        """
+        focal_px = float(self.focals_px.mean())
+        options = {**options, "max_reproj_error": float(np.tan(np.radians(max_error_deg)) * focal_px)}
+        plane, seen, cameras = [], [], []
+        for index, camera in enumerate(self.cameras):
+            part = matches.camera == index
+            xy = np.asarray(camera.cam_from_img(matches.pixels[part])).reshape(-1, 2)
+            finite = np.isfinite(xy).all(axis=1)
+            plane.append(focal_px * xy[finite])
+            seen.append(points[matches.point[part][finite]])
+            params = [focal_px, 0.0, 0.0]
+            cameras.append(
+                {"model": "SIMPLE_PINHOLE", "width": camera.width, "height": camera.height, "params": params}
+            )
+        if sum(map(len, seen)) < 4:
+            return None
+        if len(self.cameras) == 1:
+            found, info = poselib.estimate_absolute_pose(plane[0], seen[0], cameras[0], options)
+        else:
+            places = [poselib.CameraPose() for _ in self.cameras]
+            for place, cam_from_rig in zip(places, self.cams_from_rig, strict=True):
+                place.Rt = cam_from_rig.matrix()
+            with _RIG_RANSAC:
+                pycolmap.set_random_seed(options["seed"])  # that of the C library, too
+                found, info = poselib.estimate_generalized_absolute_pose(plane, seen, places, cameras, options)
+        if info["num_inliers"] < 4 or not np.isfinite(found.Rt).all():
+            return None
+        pose = np.vstack([found.Rt, [0.0, 0.0, 0.0, 1.0]])
+        return np.asarray(self.rig_from_cams[0] @ pose if len(self.cameras) == 1 else pose, np.float64)
 
     def errors_px(self, rig_from_world: Floats, matches: _Matches, points: Floats) -> Floats:
         """Return the reprojection errors (K,) of matches to points (P, 3), inf behind a camera."""
