@@ -47,7 +47,7 @@ class PnpSettings:
     """Features of a query image that are matched by descriptors alone, the strongest; guided passes use all."""
     ransac_max_error_deg: float = 0.45
     """Largest reprojection error of an inlier in RANSAC."""
-    ransac_max_trials: int = 20000
+    ransac_max_trials: int = 5000
     clear_inlier_ratio: float = 0.56
     """With more inliers than this share of the matches, no other pose is looked for: what is left over cannot support
     one by more than `ok_rival_support`."""
@@ -69,7 +69,7 @@ class PnpSettings:
     min_inliers: int = 12
     """Fewer independently matched inliers than this are no pose."""
     ok_inliers: int = 30
-    """Independently matched inliers that a pose needs to be `ok`."""
+    """Independently matched inliers that a pose needs to be `ok`: see `benchmarks/confidence.py`."""
     ok_rival_support: float = 0.8
     """Support of the best other pose, relative to this one's, up to which a pose is `ok`."""
     ok_position_std_m: float = 0.1
