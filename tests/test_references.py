@@ -1,46 +1,105 @@
-"""Files of references: what is read, and how what is no such file is refused."""
+"""Which retrieved images are shown to a network: similar, seeing the same, and apart."""
 
-import json
-from pathlib import Path
-
+import numpy as np
+import pycolmap
 import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from toolkit.errors import ArtefactError
-from toolkit.references import read_references
+from toolkit import geometry
+from toolkit.localizers.references import select_references
 
-ROW = {"path": "A/sessions/q/1.jpg", "timestamp": "1", "sensor_id": "a", "topk": [{"path": "A/sessions/m/2.jpg"}]}
-
-
-def test_rows_come_as_they_are_and_blank_lines_do_not_count(tmp_path: Path) -> None:
-    path = tmp_path / "pair.jsonl"
-    path.write_text(f"{json.dumps(ROW)}\n\n{json.dumps(ROW | {'topk': []})}\n")
-    assert read_references(path) == [ROW, ROW | {"topk": []}]
+Floats = NDArray[np.float64]
+CAMERA = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[500, 500, 320, 240])
 
 
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("{", "Expecting property name"),
-        ("[]", r"found \[\]; expected the keys"),
-        (json.dumps({"timestamp": "1"}), r"found \['timestamp'\]; expected the keys"),
-        (json.dumps(ROW | {"timestamp": "noon"}), "noon"),
-        ('{"timestamp": Infinity, "sensor_id": "a", "topk": []}', "infinity"),
-        (json.dumps(ROW | {"topk": {}}), "expected a list of references"),
-        (json.dumps(ROW | {"topk": [{"score": 1}]}), "has no path"),
-    ],
-)
-def test_a_line_that_is_no_row_is_named(tmp_path: Path, line: str, message: str) -> None:
-    path = tmp_path / "pair.jsonl"
-    path.write_text(f"{json.dumps(ROW)}\n\n{line}\n")
-    with pytest.raises(ArtefactError, match=rf"pair\.jsonl, line 3: not a retrieval row \(.*{message}.*Retrieve again"):
-        read_references(path)
+def cameras_at(*places: tuple[float, float, float], yaw_deg: tuple[float, ...] = ()) -> Floats:
+    """Return world_from_cam (N, 4, 4) of cameras that look along z, turned about y."""
+    yaws = [*yaw_deg, *[0.0] * (len(places) - len(yaw_deg))]
+    turns = Rotation.from_rotvec([[0.0, np.radians(yaw), 0.0] for yaw in yaws])
+    return geometry.make_pose(turns.as_matrix(), np.array(places))
 
 
-def test_keys_that_a_reader_needs_are_asked_for(tmp_path: Path) -> None:
-    path = tmp_path / "pair.jsonl"
-    path.write_text(json.dumps({key: value for key, value in ROW.items() if key != "path"}))
-    assert read_references(path)[0]["sensor_id"] == "a"
-    with pytest.raises(ArtefactError, match="expected the keys path, sensor_id, timestamp, topk"):
-        read_references(path, "path")
-    with pytest.raises(ArtefactError, match=r"No references: .*none\.jsonl is missing\. Run the retrieve stage"):
-        read_references(tmp_path / "none.jsonl")
+def choose(scores: list[float], poses: Floats, k: int, with_cameras: bool, **more: object) -> list[int]:
+    cameras = [CAMERA] * len(scores) if with_cameras else None
+    return select_references(scores, poses, k, cameras, **more).tolist()  # type: ignore[arg-type]
+
+
+@pytest.fixture(params=[True, False], ids=["cameras", "axes"])
+def with_cameras(request: pytest.FixtureRequest) -> bool:
+    return bool(request.param)
+
+
+def test_near_duplicates_come_last(with_cameras: bool) -> None:
+    poses = cameras_at((0, 0, 0), (0.02, 0, 0), (0, 0.03, 0), (1.2, 0, 0), (-1.2, 0, 0))
+    assert choose([0.9, 0.89, 0.88, 0.6, 0.5], poses, 3, with_cameras) == [0, 3, 4]
+    assert set(choose([0.9, 0.89, 0.88, 0.6, 0.5], poses, 5, with_cameras)[3:]) == {1, 2}
+
+
+def test_a_near_duplicate_is_relative_to_the_depth() -> None:
+    poses = cameras_at((0, 0, 0), (0.1, 0, 0), (0.3, 0, 0))
+    assert choose([0.9, 0.8, 0.5], poses, 2, True, depth_m=10.0) == [0, 2]
+    assert choose([0.9, 0.8, 0.5], poses, 2, True, depth_m=0.4) == [0, 1]
+
+
+def test_an_image_of_another_place_comes_last(with_cameras: bool) -> None:
+    poses = cameras_at((0, 0, 0), (500, 0, 0), (1, 0, 0), (-1, 0, 0))
+    assert choose([0.9, 0.85, 0.5, 0.4], poses, 4, with_cameras) == [0, 2, 3, 1]
+
+
+def test_the_best_score_is_not_first_where_it_alone_is_elsewhere(with_cameras: bool) -> None:
+    poses = cameras_at((0, 0, 0), (1, 0, 0), (300, 0, 0))
+    assert choose([0.7, 0.6, 0.9], poses, 3, with_cameras)[0] == 0
+    # Nobody shares a view with anybody: then the scores decide.
+    poses = cameras_at((0, 0, 0), (100, 0, 0), (300, 0, 0))
+    assert choose([0.7, 0.6, 0.9], poses, 3, with_cameras) == [2, 0, 1]
+
+
+def test_an_image_that_looks_away_comes_last(with_cameras: bool) -> None:
+    poses = cameras_at((0, 0, 0), (1, 0, 0), (0.5, 0, 0), yaw_deg=(0, 180, 5))
+    assert choose([0.9, 0.8, 0.3], poses, 3, with_cameras) == [0, 2, 1]
+
+
+def test_a_wall_between_is_seen_by_the_points_that_are_not_shared() -> None:
+    poses = cameras_at((0, 0, 0), (1, 0, 0), (-1, 0, 0))
+    shared = np.array([[90, 0, 80], [0, 90, 0], [80, 0, 90]])
+    assert choose([0.9, 0.6, 0.6], poses, 2, True, shared_points=shared) == [0, 2]
+    assert choose([0.9, 0.6, 0.6], poses, 2, True) == [0, 1]  # equals are taken in order
+
+
+@pytest.mark.parametrize(("k", "count"), [(0, 0), (1, 1), (3, 3), (10, 3)])
+def test_as_many_as_asked_and_there(k: int, count: int, with_cameras: bool) -> None:
+    poses = cameras_at((0, 0, 0), (1, 0, 0), (2, 0, 0))
+    found = choose([0.1, 0.3, 0.2], poses, k, with_cameras)
+    assert len(found) == len(set(found)) == count
+
+
+def test_none_of_none(with_cameras: bool) -> None:
+    assert choose([], np.zeros((0, 4, 4)), 5, with_cameras) == []
+
+
+def test_without_a_pose_or_a_score_an_image_is_never_chosen(with_cameras: bool) -> None:
+    poses = cameras_at((0, 0, 0), (1, 0, 0), (2, 0, 0), (1, 1, 0))
+    poses[0] = np.nan
+    assert choose([0.9, 0.5, np.nan, 0.4], poses, 4, with_cameras) == [1, 3]
+    poses[:] = np.nan
+    assert choose([0.9, 0.5, 0.3, 0.4], poses, 4, with_cameras) == []
+
+
+def test_one_place_for_all_still_gives_as_many(with_cameras: bool) -> None:
+    poses = cameras_at(*[(0, 0, 0)] * 4, yaw_deg=(0, 5, 10, 15))
+    assert sorted(choose([0.4, 0.9, 0.2, 0.3], poses, 4, with_cameras)) == [0, 1, 2, 3]
+
+
+def test_the_choice_does_not_depend_on_the_order_or_the_world(with_cameras: bool) -> None:
+    rng = np.random.default_rng(0)
+    poses = geometry.make_pose(
+        Rotation.from_rotvec(rng.normal(size=(12, 3)) * 0.2).as_matrix(), rng.normal(size=(12, 3)) * 2
+    )
+    scores = rng.random(12)
+    found = choose(scores.tolist(), poses, 6, with_cameras)
+    order = rng.permutation(12)
+    assert order[choose(scores[order].tolist(), poses[order], 6, with_cameras)].tolist() == found
+    elsewhere = geometry.make_pose(Rotation.random(random_state=1).as_matrix(), [100.0, -50.0, 7.0])
+    assert choose(scores.tolist(), elsewhere @ poses, 6, with_cameras) == found
+    assert choose((scores * 3 + 1).tolist(), poses, 6, with_cameras) == found
