@@ -19,8 +19,8 @@ from toolkit.features import KINDS, LocalFeatures, SiftExtractor
 from toolkit.files import SceneFiles, sidecar_path
 from toolkit.geometry import invert, make_pose, transform
 from toolkit.matching import LocalMethod, MutualMatcher
-from toolkit.references import read_references
 from toolkit.rerank import VerifySettings, count_inliers, is_meaningful, rerank_pairs
+from toolkit.retrieval_files import read_references
 from toolkit.retrieve import retrieve_pairs
 
 WIDE = pycolmap.Camera(model="PINHOLE", width=960, height=720, params=[700, 700, 480, 360])

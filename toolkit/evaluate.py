@@ -17,7 +17,7 @@ from toolkit.errors import ArtefactError, CaptureError, ToolkitError
 from toolkit.figures import ORANGE, SKY, VERMILLION, new_figure, save_figure, styled
 from toolkit.files import image_name, pair_name, write_atomic, write_sidecar
 from toolkit.geometry import invert, pose_error, transform
-from toolkit.references import read_references
+from toolkit.retrieval_files import read_references
 from toolkit.tables import read_query_table
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from toolkit.capture import Capture, Session
 from toolkit.devices import colour_of
 from toolkit.figures import GREEN, ORANGE, VERMILLION, new_figure, styled
 from toolkit.images import read_for_display
-from toolkit.references import read_references
+from toolkit.retrieval_files import read_references
 from toolkit.top_view import ground_axes, places_of
 from toolkit.upright import up_of_cameras
 

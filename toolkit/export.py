@@ -13,7 +13,7 @@ from toolkit.features import FeatureStore
 from toolkit.files import SceneFiles, image_name, write_atomic, write_text
 from toolkit.geometry import invert, qt_from_pose
 from toolkit.mapping import LocalMap
-from toolkit.references import read_references
+from toolkit.retrieval_files import read_references
 from toolkit.submission import Captures
 from toolkit.tables import POSE_NAMES
 

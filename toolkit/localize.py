@@ -46,7 +46,7 @@ from toolkit.localizers.prediction import Predictor, View, create_predictor
 from toolkit.localizers.vggt import VggtAnswer, VggtLocalizer, VggtQuery, VggtSettings
 from toolkit.mapping import LocalMap, MapSettings, build_map, map_path, map_settings
 from toolkit.matching import LocalMethod, MatchStore, MutualMatcher, create_local_methods, match_sessions
-from toolkit.references import read_references
+from toolkit.retrieval_files import read_references
 from toolkit.upright import Turns, upright_turns
 
 log = logging.getLogger(__name__)

@@ -37,7 +37,7 @@ from toolkit.files import (
 )
 from toolkit.images import default_workers, prefetch
 from toolkit.matching import LocalMethod, Matcher, create_local_methods
-from toolkit.references import read_references
+from toolkit.retrieval_files import read_references
 
 log = logging.getLogger(__name__)
 

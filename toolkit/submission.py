@@ -20,7 +20,7 @@ from toolkit.check import UNIT_TOLERANCE
 from toolkit.errors import ArtefactError, CaptureError, ManifestError, ToolkitError
 from toolkit.files import SceneFiles, file_fingerprint, write_atomic, write_sidecar
 from toolkit.geometry import invert, qt_from_pose
-from toolkit.references import read_references
+from toolkit.retrieval_files import read_references
 from toolkit.tables import KeyIndex, read_query_table, read_table
 
 FAILED = ("nearest", "leave-out")

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from toolkit.errors import ArtefactError
-from toolkit.references import read_references
+from toolkit.retrieval_files import read_references
 
 ROW = {"path": "A/sessions/q/1.jpg", "timestamp": "1", "sensor_id": "a", "topk": [{"path": "A/sessions/m/2.jpg"}]}
 
