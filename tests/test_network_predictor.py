@@ -179,7 +179,7 @@ def test_map_images_are_encoded_once(make: Make, photographs: Photographs, monke
     references = [photographs.view() for _ in range(4)]
     groups = [[photographs.view(known=False), *references[start : start + 3]] for start in (0, 1, 0)]
     predictor, forgetful = make(batch_size=2), make(cache_bytes=0)
-    encoded, again = count_encoded(predictor, monkeypatch), count_encoded(forgetful, monkeypatch)
+    encoded = count_encoded(predictor, monkeypatch)  # both share the network
     first = predictor.predict(groups)
     assert len(encoded) == 4 + 3
     second = predictor.predict(groups)
@@ -187,7 +187,7 @@ def test_map_images_are_encoded_once(make: Make, photographs: Photographs, monke
     for one, other, expected in zip(first, second, forgetful.predict(groups), strict=True):
         assert_same(one, other)
         assert_same(one, expected)
-    assert len(again) == 12
+    assert len(encoded) == 4 + 3 + 3 + 12
     for reference in references:
         reference.path.unlink()
     assert np.isfinite(predictor.predict(groups)[1].model_from_cams).all(), "what is kept is not read again"
@@ -385,6 +385,18 @@ def test_settings_and_what_is_refused(make: Make, tmp_path: Path) -> None:
         make(dtype_compute="float16")
     with pytest.raises(WeightsError, match=r"none\.pt"):
         NetworkPredictor(tmp_path / "none.pt")
+
+
+def test_weights_are_held_once(make: Make, photographs: Photographs, tmp_path: Path) -> None:
+    """A stage localizes, then its notebook looks into one query."""
+    group = photographs.group(WIDE, WIDE)
+    first, second = make(), make()
+    expected, found = first.predict([group])[0], second.predict([group])[0]
+    assert first._model is second._model
+    assert np.array_equal(expected.model_from_cams, found.model_from_cams)
+    assert make(dtype_compute="bfloat16")._model is not first._model
+    (tmp_path / "model.pt").write_bytes(b"stands for other weights")
+    assert make()._model is not first._model
 
 
 def test_a_file_of_another_network_is_refused_when_loaded(

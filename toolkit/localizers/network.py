@@ -4,7 +4,7 @@ import logging
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -253,10 +253,8 @@ class NetworkPredictor:
 
     @cached_property
     def _model(self) -> Any:
-        from toolkit.models.vggt import VGGT
-
-        model = VGGT.from_checkpoint(self.checkpoint, heads=self._heads, compute_dtype=self._dtype)
-        return model.to(self._device)
+        fingerprint = files_fingerprint([self.checkpoint])
+        return _load_network(self.checkpoint, fingerprint, self._heads, self._dtype, self._device)
 
     def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
         """Return a prediction for each group of views, in order: the query first, then its references.
@@ -436,6 +434,20 @@ class NetworkPredictor:
             depth[index] = placed.turned_back(np.where(outside, np.float32(np.nan), of_depth))
             confidence[index] = placed.turned_back(np.where(outside, np.float32(np.nan), of_confidence))
         return Prediction(poses, depth, confidence, map_from_image)
+
+
+@lru_cache(maxsize=1)
+def _load_network(
+    checkpoint: Path, fingerprint: str, heads: tuple[str, ...], dtype: "torch.dtype", device: "torch.device"
+) -> Any:
+    """Return VGGT, ready to run; `fingerprint` tells a file from a later one of its name.
+
+    The last one is kept: who looks into a query after a run has a predictor anew, and the weights are gigabytes.
+    """
+    from toolkit.models.vggt import VGGT
+
+    model = VGGT.from_checkpoint(checkpoint, heads=heads, compute_dtype=dtype)
+    return model.to(device)
 
 
 def _nothing(views: int, reason: str = "") -> Prediction:
