@@ -4,6 +4,8 @@ Modules may stand in another type than their input's numbers: `LayerNorm` weight
 block computes in the type of its matrices (`set_matrix_type`) what it adds to its input in the input's type.
 """
 
+import math
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -13,6 +15,31 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 Rope = tuple[Tensor, Tensor]
 """Cosines and signed sines of a rotary position embedding, each (N, 1, C / heads): see `rotate_`."""
+
+
+class Scratch:
+    """Room for the widest numbers of a block, which the next block's are written over.
+
+    On a CPU arrays of tens of MB come from the system for each layer anew, which clears them page by page: 2 to 6 % of
+    a network's time in float32, and the more, the faster the products are.
+    """
+
+    def __init__(self) -> None:
+        self._held = torch.empty(0)
+
+    @classmethod
+    def on(cls, device: torch.device) -> "Scratch | None":
+        """Return room for a pass over some blocks, None where it is of no use: elsewhere, or with gradients."""
+        return cls() if device.type == "cpu" and not torch.is_grad_enabled() else None
+
+    def linear(self, layer: nn.Linear, x: Tensor) -> Tensor:
+        """Return `layer(x)`, (..., C); what was returned before is lost."""
+        shape = (*x.shape[:-1], layer.out_features)
+        count = math.prod(shape)
+        if self._held.numel() < count or self._held.dtype != x.dtype:
+            self._held = x.new_empty(count)
+        out = self._held[:count].view(-1, layer.out_features)
+        return torch.addmm(layer.bias, x.flatten(0, -2), layer.weight.t(), out=out).view(shape)
 
 
 def rotate_(x: Tensor, rope: Rope) -> Tensor:
@@ -45,12 +72,15 @@ class Attention(nn.Module):
             self.k_norm = nn.LayerNorm(dim // num_heads, eps=qk_norm_eps)
         self.proj = nn.Linear(dim, dim)
 
-    def forward(self, x: Tensor, rope: Rope | None = None, every: int = 1) -> Tensor:
+    def forward(
+        self, x: Tensor, rope: Rope | None = None, every: int = 1, scratch: Scratch | None = None
+    ) -> Tensor:
         """Return what tokens 0, every, 2 * every, ... gather from all tokens, (B, ceil(N / every), C)."""
         B, N, C = x.shape
         heads = (self.num_heads, C // self.num_heads)
         if every == 1:
-            q, k, v = self.qkv(x).view(B, N, 3, *heads).unbind(2)
+            qkv = self.qkv(x) if scratch is None else scratch.linear(self.qkv, x)
+            q, k, v = qkv.view(B, N, 3, *heads).unbind(2)
         else:
             weight, bias = self.qkv.weight, self.qkv.bias
             q = F.linear(x[:, ::every], weight[:C], bias[:C]).unflatten(-1, heads)
@@ -72,8 +102,9 @@ class Mlp(nn.Module):
         self.fc1 = nn.Linear(dim, hidden)
         self.fc2 = nn.Linear(hidden, dim if out is None else out)
 
-    def forward(self, x: Tensor) -> Tensor:
-        return self.fc2(torch.ops.aten.gelu_(self.fc1(x)))  # in place: the hidden layer is the largest array
+    def forward(self, x: Tensor, scratch: Scratch | None = None) -> Tensor:
+        hidden = self.fc1(x) if scratch is None else scratch.linear(self.fc1, x)
+        return self.fc2(torch.ops.aten.gelu_(hidden))  # in place: the hidden layer is the largest array
 
 
 class LayerScale(nn.Module):
@@ -100,17 +131,20 @@ class Block(nn.Module):
         self.mlp = Mlp(dim, 4 * dim)
         self.ls2 = LayerScale(dim)
 
-    def forward(self, x: Tensor, rope: Rope | None = None, every: int = 1) -> Tensor:
+    def forward(
+        self, x: Tensor, rope: Rope | None = None, every: int = 1, scratch: Scratch | None = None
+    ) -> Tensor:
         """Return the tokens (B, N, C) one block further.
 
         Args:
             x: (B, N, C).
             rope: position of each token, for queries and keys.
             every: return only tokens 0, every, 2 * every, ...; what is read of the others alone is computed.
+            scratch: shared by the blocks of one pass.
         """
         matrix_type = self.attn.qkv.weight.dtype
-        x = self.ls1(x[:, ::every], self.attn(self.norm1(x).to(matrix_type), rope, every))
-        return self.ls2(x, self.mlp(self.norm2(x).to(matrix_type)))
+        x = self.ls1(x[:, ::every], self.attn(self.norm1(x).to(matrix_type), rope, every, scratch))
+        return self.ls2(x, self.mlp(self.norm2(x).to(matrix_type), scratch))
 
 
 class PatchEmbed(nn.Module):
