@@ -41,7 +41,7 @@ _LEAST_VIEWS = 2
 
 # Bytes that VGGT holds at most, measured in float32: for each number of the tokens (views x tokens x channels) during
 # a block and, with depth, kept of four layers; for each pixel of a frame in the depth head, and apart from pixels.
-_TRUNK_BYTES = 42
+_TRUNK_BYTES = 47
 _KEPT_BYTES = 32
 _DENSE_BYTES_PER_PIXEL = 1500
 _DENSE_BYTES = 32 << 20
