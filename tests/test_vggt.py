@@ -221,17 +221,17 @@ def test_tokens_keep_their_places_among_views(model: VGGT) -> None:
 
 def test_rope_turns_by_place() -> None:
     cosine, sine = rope_of_view(3, 4, 16, torch.device("cpu"))
-    assert cosine.shape == sine.shape == (SPECIAL + 12, 1, 16)
-    x = torch.randn(2, SPECIAL + 12, 3, 16, generator=torch.Generator().manual_seed(0))
+    assert cosine.shape == sine.shape == (SPECIAL + 12, 16)
+    x = torch.randn(2, 3, SPECIAL + 12, 16, generator=torch.Generator().manual_seed(0))
     turned = rotate_(x.clone(), (cosine, sine))
-    assert torch.equal(turned[:, :SPECIAL], x[:, :SPECIAL])
+    assert torch.equal(turned[:, :, :SPECIAL], x[:, :, :SPECIAL])
     # Row 2, column 1 is at place (3, 2). Channels 0 to 7 are of y: i and i + 4 a pair, by place * 100 ** (-i / 4).
     token = SPECIAL + 2 * 4 + 1
     for place, start in ((3, 0), (2, 8)):
         quarter = 100.0 ** -(np.arange(4) / 4)
-        pair = x[0, token, 1, start : start + 8].double().numpy().reshape(2, 4)
+        pair = x[0, 1, token, start : start + 8].double().numpy().reshape(2, 4)
         expected = (pair[0] + 1j * pair[1]) * np.exp(1j * place * quarter)
-        found = turned[0, token, 1, start : start + 8].numpy()
+        found = turned[0, 1, token, start : start + 8].numpy()
         np.testing.assert_allclose(found, np.concatenate([expected.real, expected.imag]), atol=1e-5)
 
 

@@ -14,7 +14,7 @@ IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
 Rope = tuple[Tensor, Tensor]
-"""Cosines and signed sines of a rotary position embedding, each (N, 1, C / heads): see `rotate_`."""
+"""Cosines and signed sines of a rotary position embedding, each (N, C / heads): see `rotate_`."""
 
 
 class Scratch:
@@ -43,7 +43,7 @@ class Scratch:
 
 
 def rotate_(x: Tensor, rope: Rope) -> Tensor:
-    """Turn each pair of channels of queries or keys (B, N, heads, D) by an angle of its own, in place.
+    """Turn each pair of channels of queries or keys (B, heads, N, D) by an angle of its own, in place.
 
     Rotary position embedding (Su et al., RoFormer, 2021) in two dimensions: of the four quarters of D, the first
     two hold pairs (first, second) for y, the last two for x. The sines come with the sign of the pair's other half.
@@ -80,17 +80,17 @@ class Attention(nn.Module):
         heads = (self.num_heads, C // self.num_heads)
         if every == 1:
             qkv = self.qkv(x) if scratch is None else scratch.linear(self.qkv, x)
-            q, k, v = qkv.view(B, N, 3, *heads).unbind(2)
+            parts = qkv.view(B, N, 3, *heads).unbind(2)
         else:
             weight, bias = self.qkv.weight, self.qkv.bias
             q = F.linear(x[:, ::every], weight[:C], bias[:C]).unflatten(-1, heads)
-            k, v = F.linear(x, weight[C:], bias[C:]).view(B, N, 2, *heads).unbind(2)
+            parts = (q, *F.linear(x, weight[C:], bias[C:]).view(B, N, 2, *heads).unbind(2))
+        q, k, v = (part.transpose(1, 2) for part in parts)
         if self.has_qk_norm:
             q, k = self.q_norm(q.float()), self.k_norm(k.float())
         if rope is not None:
             q, k = rotate_(q, (rope[0][::every], rope[1][::every])), rotate_(k, rope)
-        q, k, v = (part.to(v.dtype).transpose(1, 2) for part in (q, k, v))
-        x = F.scaled_dot_product_attention(q, k, v)
+        x = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v)
         return self.proj(x.transpose(1, 2).reshape(B, -1, C))
 
 

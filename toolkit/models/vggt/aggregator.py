@@ -69,7 +69,7 @@ def rope_of_view(rows: int, columns: int, head_dim: int, device: torch.device) -
     cosine, sine = angles.cos(), angles.sin()
     cosine = torch.stack([cosine, cosine], dim=2).flatten(1)
     sine = torch.stack([-sine, sine], dim=2).flatten(1)
-    return cosine[:, None], sine[:, None]
+    return cosine, sine
 
 
 class Aggregator(nn.Module):
@@ -107,7 +107,7 @@ class Aggregator(nn.Module):
         tokens = torch.cat([special.expand(B, -1, -1, -1), patch_tokens.to(special.dtype)], dim=2)
         T = SPECIAL + P
         rope = rope_of_view(rows, columns, self.head_dim, tokens.device)
-        rope_of_views = (rope[0].repeat(S, 1, 1), rope[1].repeat(S, 1, 1))
+        rope_of_views = (rope[0].repeat(S, 1), rope[1].repeat(S, 1))
         scratch = Scratch.on(tokens.device)
         kept = {}
         for layer in range(max(layers) + 1):
