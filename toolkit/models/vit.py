@@ -91,6 +91,7 @@ class Attention(nn.Module):
         if rope is not None:
             q, k = rotate_(q, (rope[0][::every], rope[1][::every])), rotate_(k, rope)
         x = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v)
+        del q, k, v, parts  # for as long as the projection takes, a fifth of what the network holds
         return self.proj(x.transpose(1, 2).reshape(B, -1, C))
 
 
