@@ -76,23 +76,28 @@ class Attention(nn.Module):
         self, x: Tensor, rope: Rope | None = None, every: int = 1, scratch: Scratch | None = None
     ) -> Tensor:
         """Return what tokens 0, every, 2 * every, ... gather from all tokens, (B, ceil(N / every), C)."""
-        B, N, C = x.shape
-        heads = (self.num_heads, C // self.num_heads)
-        if every == 1:
-            qkv = self.qkv(x) if scratch is None else scratch.linear(self.qkv, x)
-            parts = qkv.view(B, N, 3, *heads).unbind(2)
-        else:
-            weight, bias = self.qkv.weight, self.qkv.bias
-            q = F.linear(x[:, ::every], weight[:C], bias[:C]).unflatten(-1, heads)
-            parts = (q, *F.linear(x, weight[C:], bias[C:]).view(B, N, 2, *heads).unbind(2))
-        q, k, v = (part.transpose(1, 2) for part in parts)
+        q, k, v = self._parts(x, every, scratch)
         if self.has_qk_norm:
-            q, k = self.q_norm(q.float()), self.k_norm(k.float())
+            # The norm takes, and makes, numbers in order; where they are converted before, at once in that order.
+            ordered = {"dtype": torch.float32, "memory_format": torch.contiguous_format}
+            q, k = self.q_norm(q.to(**ordered)), self.k_norm(k.to(**ordered))
         if rope is not None:
             q, k = rotate_(q, (rope[0][::every], rope[1][::every])), rotate_(k, rope)
-        x = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v)
-        del q, k, v, parts  # for as long as the projection takes, a fifth of what the network holds
-        return self.proj(x.transpose(1, 2).reshape(B, -1, C))
+        gathered = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v)
+        del q, k, v  # for as long as the projection takes, a fifth of what the network holds
+        return self.proj(gathered.transpose(1, 2).reshape(len(x), -1, x.shape[-1]))
+
+    def _parts(self, x: Tensor, every: int, scratch: Scratch | None) -> tuple[Tensor, ...]:
+        """Return queries, of tokens 0, every, 2 * every, ..., keys and values, each (B, heads, tokens, C / heads)."""
+        C = x.shape[-1]
+        if every == 1:
+            together = self.qkv(x) if scratch is None else scratch.linear(self.qkv, x)
+            parts = together.split(C, dim=-1)
+        else:
+            weight, bias = self.qkv.weight, self.qkv.bias
+            q = F.linear(x[:, ::every], weight[:C], bias[:C])
+            parts = (q, *F.linear(x, weight[C:], bias[C:]).split(C, dim=-1))
+        return tuple(part.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for part in parts)
 
 
 class Mlp(nn.Module):
