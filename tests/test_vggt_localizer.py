@@ -660,6 +660,9 @@ def test_a_prediction_is_drawn_and_labelled(world: World, tmp_path: Path) -> Non
     assert figure.get_suptitle().startswith("SIMULATED, no result")
     failed = VggtAnswer(PoseEstimate("failed: no references"), ())
     assert "failed: no references" in draw_prediction(localizer, queries[0], failed).get_suptitle()
+    undecided = replace(answer.cameras[0], reason="undecided")
+    failed = VggtAnswer(PoseEstimate("failed: undecided"), (undecided,))
+    assert draw_prediction(localizer, queries[0], failed).get_suptitle().count("undecided") == 1
 
 
 class Refuses:

@@ -63,7 +63,8 @@ def draw_prediction(
     estimate = answer.estimate
     known = f"scale known to {estimate.scale_std:.1%}" if np.isfinite(estimate.scale_std) else "scale unknown"
     about = f"{estimate.status}; {known}" if estimate.world_from_rig is not None else estimate.status
-    reasons = textwrap.fill("; ".join(part for part in (about, found.reason) if part), 150)
+    more = "" if found.reason in about else f"; {found.reason}"  # a failed query's status says it
+    reasons = textwrap.fill(about + more, 150)
     figure.suptitle(f"{title}\n{reasons}", fontsize=10, fontweight="bold" if simulated else None)
     if out is not None:
         save_figure(figure, out, title)
