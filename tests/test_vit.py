@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from toolkit.models.vit import Block, Scratch, set_matrix_type
+from toolkit.models.vit import Block, SharedRoom, set_matrix_type
 
 
 def random_block(qk_norm_eps: float | None = None) -> Block:
@@ -21,27 +21,28 @@ def test_blocks_that_share_room_give_the_same_numbers(
     dtype: torch.dtype, qk_norm_eps: float | None, every: int
 ) -> None:
     """Sizes that grow and shrink, as within views and among them; nothing returned is written over later."""
-    block, scratch = random_block(qk_norm_eps), Scratch()
+    block, room = random_block(qk_norm_eps), SharedRoom()
     set_matrix_type(block, dtype)
     tokens = [torch.randn(shape, generator=torch.Generator().manual_seed(1)) for shape in ((2, 9, 16), (1, 36, 16))]
     tokens += [tokens[0][:1], tokens[1].to(dtype)]
     expected = [block(x, every=every) for x in tokens]
-    found = [block(x, every=every, scratch=scratch) for x in tokens]
+    found = [block(x, every=every, room=room) for x in tokens]
     for one, other in zip(found, expected, strict=True):
         assert torch.equal(one, other)
 
 
 def test_room_is_asked_for_once() -> None:
-    block, scratch = random_block(), Scratch()
+    block, room = random_block(), SharedRoom()
     x = torch.randn(2, 9, 16)
-    hidden = scratch.linear(block.mlp.fc1, x)
+    hidden = room.linear(x, block.mlp.fc1.weight, block.mlp.fc1.bias)
     assert torch.equal(hidden, block.mlp.fc1(x))
-    assert scratch.linear(block.attn.qkv, x).data_ptr() == hidden.data_ptr()
+    assert room.linear(x, block.attn.qkv.weight, block.attn.qkv.bias).data_ptr() == hidden.data_ptr()
 
 
 def test_room_is_not_shared_where_gradients_need_the_numbers() -> None:
     cpu = torch.device("cpu")
-    assert Scratch.on(cpu) is None
-    with torch.inference_mode():
-        assert Scratch.on(cpu) is not None
-        assert Scratch.on(torch.device("meta")) is None
+    assert SharedRoom.on(cpu) is None
+    for mode in (torch.inference_mode, torch.no_grad):
+        with mode():
+            assert SharedRoom.on(cpu) is not None
+            assert SharedRoom.on(torch.device("meta")) is None

@@ -64,7 +64,7 @@ def files_fingerprint(paths: list[Path]) -> str:
         try:
             stat = path.stat()
             rows.append([path.name, stat.st_size, stat.st_mtime_ns])
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             rows.append([path.name, None, None])
     return fingerprint(rows)
 

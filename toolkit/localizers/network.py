@@ -4,7 +4,7 @@ import logging
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,7 +41,7 @@ _LEAST_VIEWS = 2
 
 # Bytes that VGGT holds at most, measured in float32: for each number of the tokens (views x tokens x channels) during
 # a block and, with depth, kept of four layers; for each pixel of a frame in the depth head, and apart from pixels.
-_TRUNK_BYTES = 47
+_TRUNK_BYTES = 42
 _KEPT_BYTES = 32
 _DENSE_BYTES_PER_PIXEL = 1500
 _DENSE_BYTES = 32 << 20
@@ -253,8 +253,7 @@ class NetworkPredictor:
 
     @cached_property
     def _model(self) -> Any:
-        fingerprint = files_fingerprint([self.checkpoint])
-        return _load_network(self.checkpoint, fingerprint, self._heads, self._dtype, self._device)
+        return _load_network(self.checkpoint, self._heads, self._dtype, self._device)
 
     def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
         """Return a prediction for each group of views, in order: the query first, then its references.
@@ -436,18 +435,27 @@ class NetworkPredictor:
         return Prediction(poses, depth, confidence, map_from_image)
 
 
-@lru_cache(maxsize=1)
-def _load_network(
-    checkpoint: Path, fingerprint: str, heads: tuple[str, ...], dtype: "torch.dtype", device: "torch.device"
-) -> Any:
-    """Return VGGT, ready to run; `fingerprint` tells a file from a later one of its name.
+_loaded: dict[tuple[Any, ...], Any] = {}
+"""The network that was asked for last, if any."""
 
-    The last one is kept: who looks into a query after a run has a predictor anew, and the weights are gigabytes.
+
+def _load_network(checkpoint: Path, heads: tuple[str, ...], dtype: "torch.dtype", device: "torch.device") -> Any:
+    """Return VGGT, ready to run.
+
+    The last network is kept until another is asked for: a notebook that looks into one query after a run makes a
+    predictor anew, and the weights are gigabytes.
+
+    Raises:
+        WeightsError: see `VGGT.from_checkpoint`.
     """
     from toolkit.models.vggt import VGGT
 
-    model = VGGT.from_checkpoint(checkpoint, heads=heads, compute_dtype=dtype)
-    return model.to(device)
+    key = (checkpoint.resolve(), files_fingerprint([checkpoint]), heads, dtype, device)
+    if key not in _loaded:
+        _loaded.clear()  # before the load: the memory may hold one network, and not two
+        model = VGGT.from_checkpoint(checkpoint, heads=heads, compute_dtype=dtype)
+        _loaded[key] = model.to(device)
+    return _loaded[key]
 
 
 def _nothing(views: int, reason: str = "") -> Prediction:

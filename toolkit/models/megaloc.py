@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from toolkit.models.vit import Block, PatchEmbed, Scratch
+from toolkit.models.vit import Block, PatchEmbed, SharedRoom
 from toolkit.models.weights import load_checkpoint
 
 PATCH = 14
@@ -39,9 +39,9 @@ class Dinov2(nn.Module):
         patches = self.patch_embed(images.to(self.patch_embed.proj.weight.dtype))
         cls_token = (self.cls_token + position[:, :1]).to(patches.dtype).expand(len(images), -1, -1)
         x = torch.cat([cls_token, patches + position[:, 1:].to(patches.dtype)], dim=1)
-        scratch = Scratch.on(x.device)
+        room = SharedRoom.on(x.device)
         for block in self.blocks:
-            x = block(x, scratch=scratch)
+            x = block(x, room=room)
         x = self.norm(x)
         return x[:, 1:], x[:, 0]
 

@@ -4,8 +4,6 @@ Modules may stand in another type than their input's numbers: `LayerNorm` weight
 block computes in the type of its matrices (`set_matrix_type`) what it adds to its input in the input's type.
 """
 
-import math
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -17,29 +15,35 @@ Rope = tuple[Tensor, Tensor]
 """Cosines and signed sines of a rotary position embedding, each (N, C / heads): see `rotate_`."""
 
 
-class Scratch:
-    """Room for the widest numbers of a block, which the next block's are written over.
+class SharedRoom:
+    """One array that the widest layers of a pass write into, each over what the one before left.
 
-    On a CPU arrays of tens of MB come from the system for each layer anew, which clears them page by page: 2 to 6 % of
-    a network's time in float32, and the more, the faster the products are.
+    On a CPU glibc has arrays above 32 MB from the system, anew for each layer, and the system clears them page by page:
+    2 to 6 % of a network's time in float32, and the more, the faster the products are. For one pass in one mode:
+    numbers of `torch.inference_mode` cannot be written over outside of it.
     """
 
     def __init__(self) -> None:
         self._held = torch.empty(0)
 
     @classmethod
-    def on(cls, device: torch.device) -> "Scratch | None":
-        """Return room for a pass over some blocks, None where it is of no use: elsewhere, or with gradients."""
+    def on(cls, device: torch.device) -> "SharedRoom | None":
+        """Return room for a pass; None on another device, where it does not help, and where gradients are recorded,
+        which need what would be written over."""
         return cls() if device.type == "cpu" and not torch.is_grad_enabled() else None
 
-    def linear(self, layer: nn.Linear, x: Tensor) -> Tensor:
-        """Return `layer(x)`, (..., C); what was returned before is lost."""
-        shape = (*x.shape[:-1], layer.out_features)
-        count = math.prod(shape)
+    def linear(self, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        """Return `F.linear(x, weight, bias)`, (..., C); what was returned before is lost."""
+        count = x.shape[:-1].numel() * len(weight)
         if self._held.numel() < count or self._held.dtype != x.dtype:
+            self._held = torch.empty(0)  # let go before more is asked for
             self._held = x.new_empty(count)
-        out = self._held[:count].view(-1, layer.out_features)
-        return torch.addmm(layer.bias, x.flatten(0, -2), layer.weight.t(), out=out).view(shape)
+        out = self._held[:count].view(-1, len(weight))
+        return torch.addmm(bias, x.flatten(0, -2), weight.t(), out=out).view(*x.shape[:-1], len(weight))
+
+
+def _linear(x: Tensor, weight: Tensor, bias: Tensor, room: SharedRoom | None) -> Tensor:
+    return F.linear(x, weight, bias) if room is None else room.linear(x, weight, bias)
 
 
 def rotate_(x: Tensor, rope: Rope) -> Tensor:
@@ -73,30 +77,29 @@ class Attention(nn.Module):
         self.proj = nn.Linear(dim, dim)
 
     def forward(
-        self, x: Tensor, rope: Rope | None = None, every: int = 1, scratch: Scratch | None = None
+        self, x: Tensor, rope: Rope | None = None, every: int = 1, room: SharedRoom | None = None
     ) -> Tensor:
         """Return what tokens 0, every, 2 * every, ... gather from all tokens, (B, ceil(N / every), C)."""
-        q, k, v = self._parts(x, every, scratch)
+        q, k, v = self._parts(x, every, room)
         if self.has_qk_norm:
             # The norm takes, and makes, numbers in order; where they are converted before, at once in that order.
-            ordered = {"dtype": torch.float32, "memory_format": torch.contiguous_format}
-            q, k = self.q_norm(q.to(**ordered)), self.k_norm(k.to(**ordered))
+            q = self.q_norm(q.to(torch.float32, memory_format=torch.contiguous_format))
+            k = self.k_norm(k.to(torch.float32, memory_format=torch.contiguous_format))
         if rope is not None:
             q, k = rotate_(q, (rope[0][::every], rope[1][::every])), rotate_(k, rope)
         gathered = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v)
-        del q, k, v  # for as long as the projection takes, a fifth of what the network holds
+        del q, k, v  # with norms of their own, a fifth of what a pass holds: let go before the projection
         return self.proj(gathered.transpose(1, 2).reshape(len(x), -1, x.shape[-1]))
 
-    def _parts(self, x: Tensor, every: int, scratch: Scratch | None) -> tuple[Tensor, ...]:
+    def _parts(self, x: Tensor, every: int, room: SharedRoom | None) -> tuple[Tensor, ...]:
         """Return queries, of tokens 0, every, 2 * every, ..., keys and values, each (B, heads, tokens, C / heads)."""
         C = x.shape[-1]
+        weight, bias = self.qkv.weight, self.qkv.bias
         if every == 1:
-            together = self.qkv(x) if scratch is None else scratch.linear(self.qkv, x)
-            parts = together.split(C, dim=-1)
+            parts = _linear(x, weight, bias, room).split(C, dim=-1)
         else:
-            weight, bias = self.qkv.weight, self.qkv.bias
             q = F.linear(x[:, ::every], weight[:C], bias[:C])
-            parts = (q, *F.linear(x, weight[C:], bias[C:]).split(C, dim=-1))
+            parts = (q, *_linear(x, weight[C:], bias[C:], room).split(C, dim=-1))
         return tuple(part.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for part in parts)
 
 
@@ -108,8 +111,8 @@ class Mlp(nn.Module):
         self.fc1 = nn.Linear(dim, hidden)
         self.fc2 = nn.Linear(hidden, dim if out is None else out)
 
-    def forward(self, x: Tensor, scratch: Scratch | None = None) -> Tensor:
-        hidden = self.fc1(x) if scratch is None else scratch.linear(self.fc1, x)
+    def forward(self, x: Tensor, room: SharedRoom | None = None) -> Tensor:
+        hidden = _linear(x, self.fc1.weight, self.fc1.bias, room)
         return self.fc2(torch.ops.aten.gelu_(hidden))  # in place: the hidden layer is the largest array
 
 
@@ -138,7 +141,7 @@ class Block(nn.Module):
         self.ls2 = LayerScale(dim)
 
     def forward(
-        self, x: Tensor, rope: Rope | None = None, every: int = 1, scratch: Scratch | None = None
+        self, x: Tensor, rope: Rope | None = None, every: int = 1, room: SharedRoom | None = None
     ) -> Tensor:
         """Return the tokens (B, N, C) one block further.
 
@@ -146,11 +149,11 @@ class Block(nn.Module):
             x: (B, N, C).
             rope: position of each token, for queries and keys.
             every: return only tokens 0, every, 2 * every, ...; what is read of the others alone is computed.
-            scratch: shared by the blocks of one pass.
+            room: of this pass, shared by its blocks.
         """
         matrix_type = self.attn.qkv.weight.dtype
-        x = self.ls1(x[:, ::every], self.attn(self.norm1(x).to(matrix_type), rope, every, scratch))
-        return self.ls2(x, self.mlp(self.norm2(x).to(matrix_type), scratch))
+        x = self.ls1(x[:, ::every], self.attn(self.norm1(x).to(matrix_type), rope, every, room))
+        return self.ls2(x, self.mlp(self.norm2(x).to(matrix_type), room))
 
 
 class PatchEmbed(nn.Module):

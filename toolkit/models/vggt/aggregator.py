@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from toolkit.models.vit import IMAGENET_MEAN, IMAGENET_STD, Block, PatchEmbed, Rope, Scratch
+from toolkit.models.vit import IMAGENET_MEAN, IMAGENET_STD, Block, PatchEmbed, Rope, SharedRoom
 
 PATCH = 14
 REGISTERS = 4
@@ -40,9 +40,9 @@ class PatchEncoder(nn.Module):
         patches = self.patch_embed((images - mean) / std) + self._position(rows, columns)
         special = torch.cat([self.cls_token + self.pos_embed[:, :1], self.register_tokens], dim=1)
         x = torch.cat([special.expand(len(images), -1, -1), patches], dim=1)
-        scratch = Scratch.on(x.device)
+        room = SharedRoom.on(x.device)
         for block in self.blocks:
-            x = block(x, scratch=scratch)
+            x = block(x, room=room)
         return self.norm(x[:, special.shape[1] :])
 
     def _position(self, rows: int, columns: int) -> Tensor:
@@ -108,12 +108,12 @@ class Aggregator(nn.Module):
         T = SPECIAL + P
         rope = rope_of_view(rows, columns, self.head_dim, tokens.device)
         rope_of_views = (rope[0].repeat(S, 1), rope[1].repeat(S, 1))
-        scratch = Scratch.on(tokens.device)
+        room = SharedRoom.on(tokens.device)
         kept = {}
         for layer in range(max(layers) + 1):
             every = T if cameras_only and layer == max(layers) else 1
-            within = self.frame_blocks[layer](tokens.view(B * S, T, C), rope, scratch=scratch).view(B, S * T, C)
-            tokens = self.global_blocks[layer](within, rope_of_views, every, scratch)
+            within = self.frame_blocks[layer](tokens.view(B * S, T, C), rope, room=room).view(B, S * T, C)
+            tokens = self.global_blocks[layer](within, rope_of_views, every, room)
             if layer in layers:
                 kept[layer] = (within.view(B, S, T, C)[:, :, ::every], tokens.view(B, S, -1, C))
         return kept
