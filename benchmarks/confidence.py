@@ -80,9 +80,9 @@ def localize_session(
     session: "Session", localizer: "PnpLocalizer", seed: int, workers: int
 ) -> Iterator[list[dict[str, Any]]]:
     """Yield for each query of a session a row by degradation and choice of references."""
-    from toolkit.features import SiftExtractor
+    from toolkit.capture.images import prefetch, read_image
+    from toolkit.features.features import SiftExtractor
     from toolkit.geometry import pose_error
-    from toolkit.images import prefetch, read_image
 
     extractor = SiftExtractor()
     keyframes = session.keyframes("keyframes_original")
@@ -123,9 +123,9 @@ def measure(
 ) -> Iterator[list[dict[str, Any]]]:
     """Render a capture and yield the rows of each map, but of those of the devices that are done."""
     from toolkit.capture import Capture
-    from toolkit.features import extract_session
+    from toolkit.features.features import extract_session
+    from toolkit.localizers.mapping import build_map
     from toolkit.localizers.pnp import PnpLocalizer
-    from toolkit.mapping import build_map
     from toolkit.synthetic import render_capture
 
     scene = folder / f"SEED{seed}"

@@ -83,7 +83,7 @@ def describe_machine(threads: int, device: str) -> dict[str, Any]:
     """Return what the results depend on besides the code."""
     import torch
 
-    from toolkit.compute import cpu_multiplies_bfloat16, resolve_device, resolve_precision
+    from toolkit.models.compute import cpu_multiplies_bfloat16, resolve_device, resolve_precision
 
     torch.set_num_threads(threads)
     chosen = resolve_device(device)
@@ -192,7 +192,7 @@ def run_toolkit(job: Job, out: Path, precision: str) -> dict[str, Any]:
 
     from toolkit import embed
     from toolkit.capture import Capture
-    from toolkit.images import read_image
+    from toolkit.capture.images import read_image
 
     torch.set_num_threads(job.threads)
     before = os.getloadavg()[0]
@@ -331,8 +331,8 @@ def gpu_rows(checkout: str, job: Job, precisions: tuple[str, ...], batches: tupl
     """Return images/s of the network on a GPU by batch and precision, beside the official forward under autocast."""
     import torch
 
+    from toolkit.capture.images import read_image
     from toolkit.embedders.megaloc import MegaLocEmbedder
-    from toolkit.images import read_image
 
     torch.set_num_threads(job.threads)
     files = sorted(job.sessions_root.glob("ios_map/raw_data/images/*"))

@@ -68,7 +68,7 @@ def run_toolkit(sessions_root: Path, run: Path, queries: str, threads: int) -> d
     start = _clocks()
     from toolkit import embed, localize, retrieve
     from toolkit.files import SceneFiles
-    from toolkit.mapping import LocalMap
+    from toolkit.localizers.mapping import LocalMap
 
     imported = _clocks()
     files = SceneFiles(run, sessions_root.parent.name)

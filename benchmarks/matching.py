@@ -4,7 +4,7 @@
 
 Everything runs on the same features in one process, in turns, and the fastest of `--repeat` counts. `LightGlue, one at
 a time` and `LightGlue, batches of ...` are the same matcher with another `batch_size`; how many of their matches are
-the same is counted. `SIFT mutual` is `toolkit.matching`, pair after pair; OpenCV's brute-force matcher does the same
+the same is counted. `SIFT mutual` is `features.matching`, pair after pair; OpenCV's brute-force matcher does the same
 work (two nearest neighbours, ratio test, and mutual) on the same descriptors. Without a checkpoint LightGlue's weights
 are random: its time does not depend on them, as every layer runs for every pair.
 """
@@ -26,7 +26,7 @@ _RATIO = 0.8
 
 def make_pairs(count: int, keypoints: int, kind: str, seed: int = 0) -> list[tuple[Any, Any]]:
     """Return pairs of made-up features, of which half are alike but for some noise."""
-    from toolkit.features import DESCRIPTOR_SCALE, LocalFeatures
+    from toolkit.features.features import DESCRIPTOR_SCALE, LocalFeatures
 
     random = np.random.default_rng(seed)
 
@@ -54,7 +54,7 @@ def random_weights(seed: int = 0) -> dict[str, Any]:
     """Return weights of the official names and shapes that keep activations finite and match alike descriptors."""
     import torch
 
-    from toolkit.models.superpoint import import_transformers
+    from toolkit.features.superpoint import import_transformers
 
     transformers = import_transformers("LightGlue")
     with torch.device("meta"):
@@ -111,7 +111,7 @@ def same_share(found: list[Any], expected: list[Any]) -> float:
 
 def benchmark_lightglue(args: argparse.Namespace, device: str) -> list[list[str]]:
     """Return rows of the table: name, pairs/s, ratio, part of the matches that are the same."""
-    from toolkit.models.lightglue import LightGlueMatcher
+    from toolkit.features.lightglue import LightGlueMatcher
 
     weights = args.checkpoint or random_weights()
     pairs = make_pairs(args.pairs, args.keypoints, "superpoint")
@@ -132,7 +132,7 @@ def benchmark_lightglue(args: argparse.Namespace, device: str) -> list[list[str]
 
 def benchmark_sift(args: argparse.Namespace) -> list[list[str]]:
     """Return rows of the table, as `benchmark_lightglue`."""
-    from toolkit.matching import create_matcher
+    from toolkit.features.matching import create_matcher
 
     pairs = make_pairs(args.pairs, args.keypoints, "sift")
     matcher = create_matcher("mutual", ratio=_RATIO)
@@ -163,7 +163,7 @@ def main() -> None:
     limit_cores(args.threads)
     import torch
 
-    from toolkit.compute import resolve_device
+    from toolkit.models.compute import resolve_device
 
     torch.set_num_threads(args.threads)
     cv2.setNumThreads(args.threads)

@@ -69,7 +69,7 @@ def run_toolkit(job: dict[str, Any]) -> dict[str, Any]:
     """Predict cameras in this process, which should be a fresh one: `measure`, precision, load; writes them."""
     import torch
 
-    from toolkit.compute import resolve_precision
+    from toolkit.models.compute import resolve_precision
     from toolkit.models.vggt import VGGT
 
     torch.set_num_threads(job["threads"])

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from toolkit.capture import Capture, Trajectory
-from toolkit.export import export_table
+from toolkit.exchange.export import export_table
+from toolkit.exchange.interchange import import_images
+from toolkit.exchange.submission import collect
 from toolkit.files import SceneFiles
-from toolkit.interchange import import_images
-from toolkit.submission import collect
 
 DEVICES = ("ios", "hl", "spot")
 # Runs outside this repository, with the clone on its path. Prints the poses of all images and of a zip file.

@@ -8,18 +8,18 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
-from test_megaloc import tiny_megaloc
 
+from tests.models.test_megaloc import tiny_megaloc
 from toolkit.capture import Session, Trajectory, write_session
+from toolkit.capture.images import read_image
+from toolkit.capture.upright import turned_from_cam
 from toolkit.embed import embed_sessions
 from toolkit.embedders import load_embeddings
 from toolkit.embedders.megaloc import MegaLocEmbedder
 from toolkit.errors import ArtefactError, ManifestError, ToolkitError, WeightsError
 from toolkit.geometry import invert, qt_from_pose
-from toolkit.images import read_image
 from toolkit.models.megaloc import MegaLoc
 from toolkit.retrieve import retrieve_pairs
-from toolkit.upright import turned_from_cam
 
 HL_RIG = "hl_a/rig"
 

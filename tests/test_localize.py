@@ -15,15 +15,15 @@ import pytest
 
 from toolkit import geometry, localize
 from toolkit.capture import Capture, Trajectory
+from toolkit.capture.images import read_image
 from toolkit.embed import embed_sessions
 from toolkit.errors import ArtefactError, CaptureError, ImageError, ManifestError, ToolkitError
-from toolkit.features import KINDS, LocalFeatures, SiftExtractor, SiftSettings, extract_session
+from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor, SiftSettings, extract_session
+from toolkit.features.matching import MATCHERS, MutualMatcher, unit_descriptors
 from toolkit.files import SceneFiles, sidecar_path
-from toolkit.images import read_image
 from toolkit.localize import COLUMNS, Map, localize_image, localize_pairs
+from toolkit.localizers.mapping import LocalMap
 from toolkit.localizers.pnp import PnpLocalizer, PoseEstimate
-from toolkit.mapping import LocalMap
-from toolkit.matching import MATCHERS, MutualMatcher, unit_descriptors
 from toolkit.retrieve import retrieve_pairs
 
 LIST = "keyframes_original"

@@ -15,12 +15,11 @@ from toolkit.capture import Capture
 from toolkit.embed import embed_sessions
 from toolkit.errors import ArtefactError, ManifestError
 from toolkit.evaluate import overlap_in_view, overlap_table
-from toolkit.features import KINDS, LocalFeatures, SiftExtractor
-from toolkit.files import SceneFiles, sidecar_path
+from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor
+from toolkit.features.matching import LocalMethod, MutualMatcher
+from toolkit.files import SceneFiles, read_references, sidecar_path
 from toolkit.geometry import invert, make_pose, transform
-from toolkit.matching import LocalMethod, MutualMatcher
 from toolkit.rerank import VerifySettings, count_inliers, is_meaningful, rerank_pairs
-from toolkit.retrieval_files import read_references
 from toolkit.retrieve import retrieve_pairs
 
 WIDE = pycolmap.Camera(model="PINHOLE", width=960, height=720, params=[700, 700, 480, 360])

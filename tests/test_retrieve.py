@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from test_embed import HL_RIG, write_tiny_capture
 
+from tests.test_embed import HL_RIG, write_tiny_capture
 from toolkit.capture import Capture
 from toolkit.embed import embed_sessions
 from toolkit.errors import ArtefactError, CaptureError, ManifestError

@@ -50,7 +50,7 @@ def run(
 @app.command()
 def report(run_dir: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, for example runs/demo.")]) -> None:
     """Write the report of a run anew, from what lies in its folder."""
-    from toolkit.report import write_report
+    from toolkit.show.report import write_report
 
     print(f"Report: {write_report(run_dir)}")
 
@@ -58,7 +58,7 @@ def report(run_dir: Annotated[Path, typer.Argument(metavar="RUN", help="Run fold
 @app.command()
 def check(capture: Annotated[Path, typer.Argument(help="Capture folder, with sessions/ in it.")]) -> None:
     """Show what a capture holds and every inconsistency, with file and line."""
-    from toolkit.check import check_capture
+    from toolkit.capture.check import check_capture
 
     report = check_capture(capture)
     print(report.text())
@@ -89,7 +89,7 @@ def submit(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would be in the zip, write nothing.")] = False,
 ) -> None:
     """Check the poses of runs and write the zip file that the challenge takes; missing pairs are listed."""
-    from toolkit.submission import collect
+    from toolkit.exchange.submission import collect
 
     if not description.strip() and not dry_run:
         raise ManifestError("--description is missing: a text, or a file. The challenge wants to know what was done.")
@@ -112,7 +112,7 @@ def download(
     ] = None,
 ) -> None:
     """Fetch the captures of a manifest, unpack and check them; goes on where it was stopped."""
-    from toolkit.download import download
+    from toolkit.exchange.download import download
 
     names = [name.strip() for name in sessions.split(",") if name.strip()]
     try:
@@ -147,7 +147,7 @@ def import_colmap(
     placing: Placing = "link",
 ) -> None:
     """Make a session of a COLMAP model: cameras, poses, rigs."""
-    from toolkit import interchange
+    from toolkit.exchange import interchange
 
     print(interchange.import_colmap(model, images, capture, device, split, placing).text())
 
@@ -174,7 +174,7 @@ def import_images(
     placing: Placing = "link",
 ) -> None:
     """Make a session of a folder of images: a map with poses, or queries."""
-    from toolkit import interchange
+    from toolkit.exchange import interchange
 
     report = interchange.import_images(images, capture, device, split, table, poses_are, camera, cameras, placing)
     print(report.text())
@@ -189,7 +189,7 @@ def export_colmap(
     capture: Annotated[Path | None, typer.Option(help="Capture folder, if it has moved since the run.")] = None,
 ) -> None:
     """Write the triangulated map of a run as a COLMAP model."""
-    from toolkit import export
+    from toolkit.exchange import export
 
     print(f"{out}: {export.export_colmap(run, scene, device, out, capture).summary()}")
 
@@ -204,7 +204,7 @@ def export_pairs(
     topk: Annotated[int | None, typer.Option(min=1, help="References a query; else all.")] = None,
 ) -> None:
     """Write the retrieval of a pair as hloc reads it: `query reference` a line."""
-    from toolkit import export
+    from toolkit.exchange import export
 
     print(f"{out}: {export.export_pairs(run, scene, map_device, query_device, out, topk)} pairs")
 
@@ -226,7 +226,7 @@ def record(
     out: Annotated[Path | None, typer.Option(help="File to write, .rrd.")] = None,
 ) -> None:
     """Record a session for the rerun viewer: images on a timeline, cameras, depth and points."""
-    from toolkit.recordings import record_session
+    from toolkit.show.recordings import record_session
 
     done = record_session(
         scene, split, device, subsession, keyframes_only, every, spawn, vis_retrieve_queries, queries_pose,

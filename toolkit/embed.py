@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
-from toolkit.compute import check_device_name
+from toolkit.capture.images import default_workers, prefetch, read_image
+from toolkit.capture.upright import Turns, turn_image, upright_turns
 from toolkit.embedders import Embedder, create_embedder, resolve_name
+from toolkit.embedders.matrix import MatrixWriter
 from toolkit.errors import ImageError, ManifestError, ToolkitError
-from toolkit.features import FeatureStore, LocalFeatures, SiftExtractor, extract_session
+from toolkit.features.features import FeatureStore, LocalFeatures, SiftExtractor, extract_session
 from toolkit.files import (
     file_fingerprint,
     files_fingerprint,
@@ -27,9 +29,7 @@ from toolkit.files import (
     write_atomic,
     write_sidecar,
 )
-from toolkit.images import default_workers, prefetch, read_image
-from toolkit.matrix import MatrixWriter
-from toolkit.upright import Turns, turn_image, upright_turns
+from toolkit.models.compute import check_device_name
 
 log = logging.getLogger(__name__)
 

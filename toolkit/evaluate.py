@@ -12,19 +12,18 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from toolkit.capture import Capture, Session, Trajectory
-from toolkit.devices import colour_of, in_order
+from toolkit.capture.devices import colour_of, in_order
+from toolkit.capture.tables import read_query_table
 from toolkit.errors import ArtefactError, CaptureError, ToolkitError
-from toolkit.figures import ORANGE, SKY, VERMILLION, new_figure, save_figure, styled
-from toolkit.files import image_name, pair_name, write_atomic, write_sidecar
+from toolkit.files import image_name, pair_name, read_references, write_atomic, write_sidecar
 from toolkit.geometry import invert, pose_error, transform
-from toolkit.retrieval_files import read_references
-from toolkit.tables import read_query_table
+from toolkit.show.figures import ORANGE, SKY, VERMILLION, new_figure, save_figure, styled
 
 if TYPE_CHECKING:
     import pycolmap
     from matplotlib.figure import Figure
 
-    from toolkit.mapping import LocalMap
+    from toolkit.localizers.mapping import LocalMap
 
 logger = logging.getLogger(__name__)
 
@@ -467,7 +466,7 @@ def overlap_in_view(points: Array, reference: Array, world_from_cam: Array, came
         world_from_cam: (4, 4) the other camera's pose.
         camera: its intrinsics.
     """
-    from toolkit.mapping import in_view, view_bounds
+    from toolkit.capture.cameras import in_view, view_bounds
 
     if not len(points):
         return 0.0
@@ -547,7 +546,7 @@ class _MapView:
 
     @classmethod
     def open(cls, session: Session, map_dir: Path | None) -> "_MapView":
-        from toolkit.mapping import LocalMap
+        from toolkit.localizers.mapping import LocalMap
 
         with suppress(ArtefactError):
             return cls(session, None if map_dir is None else LocalMap.load(map_dir / f"{session.id}.npz"))
@@ -560,7 +559,7 @@ class _MapView:
             if image is None:
                 return np.zeros((0, 3))
             return self.local_map.points[np.unique(self.local_map.observations(image)[1])]
-        from toolkit.mapping import view_bounds
+        from toolkit.capture.cameras import view_bounds
 
         left, right, top, bottom = view_bounds(self.session.camera(reference["sensor_id"]))
         x, y = np.meshgrid(np.linspace(left, right, 9), np.linspace(top, bottom, 9))

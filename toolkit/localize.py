@@ -17,15 +17,18 @@ from tqdm.auto import tqdm
 
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
+from toolkit.capture.images import default_workers, prefetch, read_image
+from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import Embedder, create_embedder, load_embeddings
 from toolkit.errors import ArtefactError, ImageError, ManifestError
-from toolkit.features import (
+from toolkit.features.features import (
     KINDS,
     FeatureStore,
     LocalFeatures,
     SiftExtractor,
     extract_session,
 )
+from toolkit.features.matching import LocalMethod, MatchStore, MutualMatcher, create_local_methods, match_sessions
 from toolkit.files import (
     SceneFiles,
     file_fingerprint,
@@ -34,20 +37,18 @@ from toolkit.files import (
     is_current,
     open_progress,
     pair_name,
+    read_references,
     write_atomic,
     write_sidecar,
 )
-from toolkit.images import default_workers, prefetch, read_image
 from toolkit.localizers.hybrid import HybridLocalizer
 from toolkit.localizers.lifting import DepthLifter
 from toolkit.localizers.mapped import Known, MappedFeatures
+from toolkit.localizers.mapping import LocalMap, MapSettings, build_map, map_path, map_settings
 from toolkit.localizers.pnp import PnpLocalizer, PnpSettings, PoseEstimate
-from toolkit.localizers.prediction import Predictor, View, create_predictor
+from toolkit.localizers.prediction import Predictor, View
+from toolkit.localizers.predictors import create_predictor
 from toolkit.localizers.vggt import VggtAnswer, VggtLocalizer, VggtQuery, VggtSettings
-from toolkit.mapping import LocalMap, MapSettings, build_map, map_path, map_settings
-from toolkit.matching import LocalMethod, MatchStore, MutualMatcher, create_local_methods, match_sessions
-from toolkit.retrieval_files import read_references
-from toolkit.upright import Turns, upright_turns
 
 log = logging.getLogger(__name__)
 
@@ -643,7 +644,7 @@ def explain_query(
         index: of the query in the keyframe list. The other arguments are those of `localize_pairs`.
 
     Returns:
-        What `toolkit.visualize_prediction.draw_prediction` takes.
+        What `toolkit.show.visualize_prediction.draw_prediction` takes.
 
     Raises:
         ArtefactError: the retrieval or the triangulated map is missing.

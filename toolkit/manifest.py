@@ -11,9 +11,9 @@ from typing import Annotated, Any, Literal, get_args
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from toolkit.compute import DEVICE_NAME
-from toolkit.devices import TABLE
+from toolkit.capture.devices import TABLE
 from toolkit.errors import ManifestError
+from toolkit.models.compute import DEVICE_NAME
 
 STAGES = ("explore", "embed", "retrieve", "rerank", "localize", "evaluate", "visualize")
 OPTIONAL = ("rerank",)

@@ -17,10 +17,9 @@ import tqdm.std
 from toolkit.errors import ManifestError
 from toolkit.files import SceneFiles
 from toolkit.manifest import OPTIONAL, DemoData, nearest
+from toolkit.show import TEXT_BARS
 
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
-TEXT_BARS = "TOOLKIT_TEXT_BARS"
-"""Variable of the environment that is set where no one sees widgets: progress bars are text then."""
 COUNTS_MIME = "application/vnd.visual-localization.counts+json"
 # What each stage is made from, besides the capture. A stage runs again when one of these has run again.
 UPSTREAM: dict[str, tuple[str, ...]] = {

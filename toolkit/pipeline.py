@@ -25,18 +25,17 @@ from pathlib import Path
 from typing import Any
 
 from toolkit import __version__, errors
-from toolkit.devices import extra_devices, table_record
-from toolkit.download import is_unfinished
+from toolkit.capture.devices import extra_devices, table_record
 from toolkit.embedders import WEIGHTS as EMBEDDER_WEIGHTS
 from toolkit.embedders import resolve_name
 from toolkit.errors import ManifestError, ToolkitError
+from toolkit.exchange.download import is_unfinished
+from toolkit.features.matching import LOCAL_WEIGHTS, matchers_of
 from toolkit.files import SceneFiles, files_fingerprint, fingerprint, write_text
 from toolkit.manifest import STAGES, Manifest, load_manifest, nearest
-from toolkit.matching import LOCAL_WEIGHTS, matchers_of
 from toolkit.models.weights import VGGT, WeightsSource, check_weights, find_any, resolve_any
 from toolkit.notebook import (
     COUNTS_MIME,
-    TEXT_BARS,
     UPSTREAM,
     check_parameters,
     notebook_parameters,
@@ -44,6 +43,7 @@ from toolkit.notebook import (
     stage_folders,
     stage_outputs,
 )
+from toolkit.show import TEXT_BARS
 
 # Distributions whose versions may change results.
 _VERSIONS = ("numpy", "pycolmap", "faiss-cpu", "opencv-python-headless", "pandas", "pillow", "torch", "rerun-sdk")
@@ -607,6 +607,6 @@ def _machine() -> dict[str, Any]:
 
 
 def _write_report(run_dir: Path) -> None:
-    from toolkit.report import write_report
+    from toolkit.show.report import write_report
 
     write_report(run_dir)

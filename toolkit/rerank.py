@@ -24,20 +24,20 @@ from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
+from toolkit.capture.images import default_workers, prefetch
 from toolkit.errors import ArtefactError, ManifestError
-from toolkit.features import Extractor, FeatureStore, LocalFeatures, extract_session
+from toolkit.features.features import Extractor, FeatureStore, LocalFeatures, extract_session
+from toolkit.features.matching import LocalMethod, Matcher, create_local_methods
 from toolkit.files import (
     file_fingerprint,
     image_name,
     is_current,
     open_progress,
     pair_name,
+    read_references,
     write_sidecar,
     write_text,
 )
-from toolkit.images import default_workers, prefetch
-from toolkit.matching import LocalMethod, Matcher, create_local_methods
-from toolkit.retrieval_files import read_references
 
 log = logging.getLogger(__name__)
 
@@ -98,7 +98,7 @@ def rerank_pairs(
         matcher: `mutual` or `lightglue`; None: what is usual for the features.
         features_checkpoint, matcher_checkpoint: files with the weights of their networks; None: the hub's cache, else a
             download.
-        compute_device, dtype_compute: of networks, see `toolkit.compute`.
+        compute_device, dtype_compute: of networks, see `toolkit.models.compute`.
         skip_existing: reuse what was made from the same inputs and settings, and go on where a run was killed.
         workers: threads; 0 takes the number of cores, at most 8.
         seed: of RANSAC. Equal seeds give equal files, whatever the number of threads.

@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
-from toolkit.compute import resolve_device
 from toolkit.embedders import load_embeddings
 from toolkit.errors import ArtefactError, ManifestError, ToolkitError
 from toolkit.files import (
@@ -26,6 +25,7 @@ from toolkit.files import (
     write_atomic,
     write_sidecar,
 )
+from toolkit.models.compute import resolve_device
 
 log = logging.getLogger(__name__)
 

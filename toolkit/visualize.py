@@ -14,15 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session, Trajectory
+from toolkit.capture.images import read_for_display
 from toolkit.errors import ArtefactError
-from toolkit.features import FeatureStore, extract_session
+from toolkit.features.features import FeatureStore, extract_session
 from toolkit.files import pair_name
-from toolkit.images import read_for_display
-from toolkit.localization_view import Localizations, QueryDetails, ShownImage, record_localizations
+from toolkit.localizers.mapping import LocalMap
 from toolkit.localizers.pnp import PnpLocalizer, PoseEstimate
-from toolkit.mapping import LocalMap
-from toolkit.recordings import SessionRecording, record_session, session_tracks, sure_points
-from toolkit.stills import WorstQuery, draw_localization, draw_scene_png, draw_worst
+from toolkit.show.localization_view import Localizations, QueryDetails, ShownImage, record_localizations
+from toolkit.show.recordings import SessionRecording, record_session, session_tracks, sure_points
+from toolkit.show.stills import WorstQuery, draw_localization, draw_scene_png, draw_worst
 
 Array = NDArray[np.float64]
 

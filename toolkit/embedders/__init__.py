@@ -18,7 +18,7 @@ class Embedder(Protocol):
 
     name: str
     inputs: Literal["images", "features"]
-    """What `embed` takes: images (H, W, 3) uint8 RGB, or `toolkit.features.LocalFeatures`."""
+    """What `embed` takes: images (H, W, 3) uint8 RGB, or `toolkit.features.features.LocalFeatures`."""
     upright: bool
     """Whether it was learnt from upright photographs, so that images are better turned upright for it."""
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from toolkit.compute import Fitting, resolve_device, resolve_precision
 from toolkit.errors import ManifestError, ToolkitError
+from toolkit.models.compute import Fitting, resolve_device, resolve_precision
 from toolkit.models.megaloc import PATCH, MegaLoc
 from toolkit.models.vit import IMAGENET_MEAN, IMAGENET_STD
 from toolkit.models.weights import MEGALOC, resolve_weights, weights_digest
@@ -42,7 +42,7 @@ class MegaLocEmbedder:
 
         Raises:
             WeightsError: no weights, or other ones.
-            ManifestError, ToolkitError: see `toolkit.compute`.
+            ManifestError, ToolkitError: see `toolkit.models.compute`.
         """
         if not isinstance(image_size, int) or image_size < 9 * PATCH or image_size % PATCH:
             raise ManifestError(

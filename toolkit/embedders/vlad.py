@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from toolkit.errors import ArtefactError, ToolkitError
-from toolkit.features import LocalFeatures
+from toolkit.features.features import LocalFeatures
+from toolkit.features.matching import unit_descriptors
 from toolkit.files import file_fingerprint, write_atomic
-from toolkit.matching import unit_descriptors
 
 Floats = NDArray[np.float32]
 

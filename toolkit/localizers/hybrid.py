@@ -7,7 +7,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from toolkit.features import LocalFeatures
+from toolkit.features.features import LocalFeatures
 from toolkit.localizers.lifting import DepthLifter
 from toolkit.localizers.mapped import Known
 from toolkit.localizers.pnp import PnpLocalizer, PoseEstimate, Prior, agree

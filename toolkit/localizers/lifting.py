@@ -13,10 +13,11 @@ import pycolmap
 from numpy.typing import NDArray
 
 from toolkit import geometry
-from toolkit.alignment import DEPTH_NOISE
-from toolkit.depths import lifted
-from toolkit.features import LocalFeatures
+from toolkit.capture.depths import lifted
+from toolkit.features.features import LocalFeatures
+from toolkit.localizers.alignment import DEPTH_NOISE
 from toolkit.localizers.mapped import Known, MappedFeatures
+from toolkit.localizers.mapping import LocalMap
 from toolkit.localizers.pnp import (
     PnpLocalizer,
     PnpSettings,
@@ -27,7 +28,6 @@ from toolkit.localizers.pnp import (
     least_squares_covariance,
 )
 from toolkit.localizers.vggt import CameraAnswer, VggtAnswer, VggtLocalizer
-from toolkit.mapping import LocalMap
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -8,9 +8,9 @@ from threading import Lock
 import numpy as np
 from numpy.typing import NDArray
 
-from toolkit.features import KINDS, FeatureKind, LocalFeatures
-from toolkit.mapping import LocalMap
-from toolkit.matching import Matcher, MutualMatcher, PairMatches
+from toolkit.features.features import KINDS, FeatureKind, LocalFeatures
+from toolkit.features.matching import Matcher, MutualMatcher, PairMatches
+from toolkit.localizers.mapping import LocalMap
 
 Ints = NDArray[np.int64]
 

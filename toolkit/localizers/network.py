@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from toolkit.compute import PRECISIONS, Fitting, check_device_name, resolve_device, resolve_precision
+from toolkit.capture.images import default_workers, prefetch, read_image
+from toolkit.capture.upright import turn_image, turn_points, turned_from_cam
 from toolkit.errors import ImageError, ManifestError, ToolkitError
 from toolkit.files import files_fingerprint
 from toolkit.geometry import invert, make_pose
-from toolkit.images import default_workers, prefetch, read_image
 from toolkit.localizers.prediction import Prediction, View
+from toolkit.models.compute import PRECISIONS, Fitting, check_device_name, resolve_device, resolve_precision
 from toolkit.models.weights import VGGT as WEIGHTS
 from toolkit.models.weights import resolve_any
-from toolkit.upright import turn_image, turn_points, turned_from_cam
 
 if TYPE_CHECKING:
     import torch
@@ -207,7 +207,7 @@ class NetworkPredictor:
         """
         Args:
             checkpoint: file with the weights; None: the hub's cache, else a download.
-            compute_device, dtype_compute: as `toolkit.compute` takes them, without float16: the trunk's numbers may
+            compute_device, dtype_compute: as `models.compute` takes them, without float16: the trunk's numbers may
                 be larger than it can hold. `auto` is float32 where it would be that. The heads are always float32.
             needs_depth: whether to predict depth too, for a fifth more time.
             batch_size: groups at a time, at most; None: what is usual for the device.

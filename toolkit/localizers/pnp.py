@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from toolkit import geometry
-from toolkit.features import LocalFeatures
+from toolkit.capture.cameras import in_view, projection_jacobian, view_bounds
+from toolkit.features.features import LocalFeatures
+from toolkit.features.matching import unit_descriptors
 from toolkit.localizers.mapped import Known, MappedFeatures
-from toolkit.mapping import LocalMap, in_view, projection_jacobian, view_bounds
-from toolkit.matching import unit_descriptors
+from toolkit.localizers.mapping import LocalMap
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -9,13 +9,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import ArrayLike, NDArray
 
-from toolkit.capture import Session
-from toolkit.errors import ManifestError
-
 Floats = NDArray[np.float64]
 
-PREDICTORS = ("vggt", "simulated")
-"""Names that `create_predictor` takes. `simulated` is taken only where it is asked for by name."""
 LOW_CONFIDENCE = 0.2
 """Share of a view's depths, the least confident, that are not used."""
 
@@ -31,7 +26,7 @@ class View:
     known: bool
     """Whether it is a map image: others will ask for it again, so that its encoding is worth keeping."""
     turns: int = 0
-    """Counter-clockwise quarter turns that bring gravity down, see `toolkit.upright`. A network is shown the image
+    """Counter-clockwise quarter turns that bring gravity down, see `capture.upright`. A network is shown the image
     turned; what comes back is of the image as it is stored."""
 
 
@@ -94,47 +89,3 @@ class Predictor(Protocol):
     def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
         """Return a prediction for each group of views; groups do not influence each other."""
         ...
-
-
-def check_predictor_name(name: str) -> None:
-    """Refuse what is no name of a predictor.
-
-    Raises:
-        ManifestError: none of `PREDICTORS`.
-    """
-    if name not in PREDICTORS:
-        raise ManifestError(f"Unknown predictor {name!r}. Known: {', '.join(PREDICTORS)}.")
-
-
-def create_predictor(
-    name: str,
-    *,
-    sessions: Sequence[Session] = (),
-    map_dir: str | Path | None = None,
-    checkpoint: str | Path | None = None,
-    compute_device: str = "auto",
-    dtype_compute: str = "auto",
-    seed: int = 0,
-) -> Predictor:
-    """Return a ready predictor.
-
-    Args:
-        name: `vggt`, or `simulated`, which looks up true poses and is for tests and for trying things out.
-        sessions: of `simulated`: where the true poses are.
-        map_dir: of `simulated`: folder of the triangulated maps, for depth.
-        checkpoint: of `vggt`: file with the weights; None: the hub's cache, else a download.
-        compute_device, dtype_compute: of `vggt`, as `toolkit.compute` takes them.
-        seed: of `simulated`.
-
-    Raises:
-        ManifestError: unknown name, device or precision.
-        WeightsError: `vggt` and no weights to be had; says what to do.
-    """
-    check_predictor_name(name)
-    if name == "simulated":
-        from toolkit.localizers.simulated import SimulatedPredictor
-
-        return SimulatedPredictor(sessions, map_dir, seed=seed)
-    from toolkit.localizers.network import NetworkPredictor
-
-    return NetworkPredictor(checkpoint, compute_device, dtype_compute)

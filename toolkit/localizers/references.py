@@ -11,7 +11,7 @@ import pycolmap
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit import geometry
-from toolkit.mapping import in_view, view_bounds
+from toolkit.capture.cameras import in_view, view_bounds
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

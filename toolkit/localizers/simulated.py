@@ -21,11 +21,12 @@ from scipy.spatial.transform import Rotation
 
 from toolkit import geometry
 from toolkit.capture import Session
-from toolkit.depths import DepthMaps, lifted
-from toolkit.devices import session_id
+from toolkit.capture.cameras import in_view, view_bounds
+from toolkit.capture.depths import DepthMaps, lifted
+from toolkit.capture.devices import session_id
 from toolkit.errors import CaptureError
+from toolkit.localizers.mapping import LocalMap
 from toolkit.localizers.prediction import Prediction, View
-from toolkit.mapping import LocalMap, in_view, view_bounds
 
 Floats = NDArray[np.float64]
 

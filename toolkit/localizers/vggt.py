@@ -8,16 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from toolkit import geometry
-from toolkit.alignment import Alignment, align_to_map, is_trustworthy, query_pose
 from toolkit.capture import Session
-from toolkit.depths import DepthMaps, SeenDepth, lifted
+from toolkit.capture.depths import DepthMaps, SeenDepth, lifted
+from toolkit.capture.upright import Turns
 from toolkit.errors import ImageError, ToolkitError
+from toolkit.localizers.alignment import Alignment, align_to_map, is_trustworthy, query_pose
+from toolkit.localizers.mapping import LocalMap
 from toolkit.localizers.pnp import PoseEstimate
+from toolkit.localizers.pose_mean import robust_mean_pose
 from toolkit.localizers.prediction import Prediction, Predictor, View
 from toolkit.localizers.references import select_references
-from toolkit.mapping import LocalMap
-from toolkit.pose_mean import robust_mean_pose
-from toolkit.upright import Turns
 
 log = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from toolkit.errors import WeightsError
-from toolkit.hub import failure_reason
+from toolkit.models.hub import failure_reason
 
 if TYPE_CHECKING:
     from torch import Tensor, nn

@@ -1,0 +1,233 @@
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from toolkit.capture import Trajectory, write_session
+from toolkit.capture.check import check_capture
+from toolkit.errors import CaptureError
+
+CAPTURES = Path(__file__).parents[2].parent / "shared" / "data" / "captures"
+PINHOLE = ("camera", "PINHOLE", 64, 48, 50.5, 51.5, 32.0, 24.0)
+QT = "1, 0, 0, 0, 0, 0, 0"
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    """A capture without problems: a map of two rig frames and one query."""
+    root = tmp_path / "PLACE" / "sessions"
+    identity = [1.0, 0, 0, 0, 0, 0, 0]
+    images = [(t, f"s/{c}", f"s/{c}/{t}.jpg") for t in (10, 20) for c in "ab"]
+    sensors = [("s/a", "", *PINHOLE), ("s/b", "", *PINHOLE), ("imu", "", "imu")]
+    rigs = [(f"s/rig_{t}", f"s/{c}", identity) for t in (10, 20) for c in "ab"]
+    poses = Trajectory([10, 20], ["s/rig_10", "s/rig_20"], [identity] * 2, [np.eye(6)] * 2)
+    keyframes = pd.DataFrame({"timestamp": [10, 20], "device_id": ["s/rig_10", "s/rig_20"]})
+    write_session(root / "hl_map", sensors, rigs, poses, images, subsessions=["s"])
+    write_session(
+        root / "hl_query", sensors, rigs, None, images, None, ["s"], {"pruned": keyframes}, ground_truth=poses
+    )
+    for session in ("hl_map", "hl_query"):
+        for _, _, path in images:
+            file = root / session / "raw_data" / path
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.touch()
+    return tmp_path / "PLACE"
+
+
+def found(capture: Path) -> list[str]:
+    return [str(problem) for problem in check_capture(capture).problems]
+
+
+def append(capture: Path, file: str, text: str) -> None:
+    with open(capture / "sessions" / file, "a") as stream:
+        stream.write(text)
+
+
+def test_a_good_capture_has_no_problems(capture: Path) -> None:
+    report = check_capture(capture)
+    assert report.ok
+    assert report.problems == []
+    text = report.text()
+    assert "0 errors, 0 warnings." in text
+    for expected in (
+        "hl_map",
+        "2 camera, 1 imu",
+        "2 PINHOLE 64 48",
+        "2 sensors each",
+        "4 of 4 images have one",
+    ):
+        assert expected in text
+    table = report.tables["hl_query"].set_index("what")
+    assert table.loc["images", "count"] == "4"
+    assert table.loc["poses", "count"] == "-"
+    assert table.loc["keyframes pruned", "count"] == "2"
+    assert table.loc["subsessions", "details"] == "s (4 images)"
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "expected"),
+    [
+        ("hl_map/images.txt", "1, s/a", ":6: error: found 2 values in '1, s/a', expected 3"),
+        ("hl_map/images.txt", "30, s/x, s/a/10.jpg", ":6: error: unknown sensor 's/x': not in sensors.txt"),
+        (
+            "hl_map/images.txt",
+            "20, s/a, s/a/20.jpg",
+            ":6: error: duplicate key (timestamp 20, sensor_id 's/a')",
+        ),
+        ("hl_map/images.txt", "30, s/a, s/a/30.jpg", ":6: error: missing file raw_data/s/a/30.jpg"),
+        (
+            "hl_map/images.txt",
+            "30, s/a, s/a/10.jpg",
+            ":6: warning: image without pose (timestamp 30, sensor 's/a')",
+        ),
+        (
+            "hl_map/images.txt",
+            "10, imu, t/10.jpg",
+            ":6: warning: image t/10.jpg is in no subsession of proc/subsessions.txt",
+        ),
+        ("hl_map/images.txt", "30, imu, s/a/10.jpg", ":6: error: sensor 'imu' of an image is no camera"),
+        ("hl_map/depths.txt", "10, s/a, s/a/10.png", ":1: error: missing file raw_data/s/a/10.png"),
+        ("hl_map/depths.txt", "10, render/s/x, s/a/10.jpg", ":1: error: unknown sensor 'render/s/x'"),
+        ("hl_map/rigs.txt", f"r, s/x, {QT}", ":6: error: unknown sensor 's/x': not in sensors.txt"),
+        (
+            "hl_map/rigs.txt",
+            f"s/rig_10, s/a, {QT}",
+            ":6: error: duplicate key (rig 's/rig_10', sensor 's/a')",
+        ),
+        ("hl_map/rigs.txt", f"imu, s/a, {QT}", ":6: error: rig 'imu' has the name of a sensor"),
+        ("hl_map/rigs.txt", "r, s/a, 0, 0, 0, 0, 1, 1, 1", ":6: error: found a zero quaternion"),
+        ("hl_map/sensors.txt", "s/a, , wifi", ":5: error: duplicate sensor 's/a'"),
+        (
+            "hl_map/sensors.txt",
+            "c, , camera, PINHOLE, 1, 1, 1",
+            ":5: error: found 1 parameters for model PINHOLE",
+        ),
+        (
+            "hl_map/sensors.txt",
+            "c, , depth, PIN, 1, 1, 1",
+            ":5: error: found camera model 'PIN', expected one of",
+        ),
+        ("hl_map/trajectories.txt", f"10, x, {QT}", ":4: error: unknown device 'x'"),
+        (
+            "hl_map/trajectories.txt",
+            f"10, s/rig_10, {QT}",
+            ":4: error: duplicate key (timestamp 10, device_id",
+        ),
+        (
+            "hl_map/trajectories.txt",
+            f"30, s/rig_10, {QT}",
+            ":4: warning: pose without image (timestamp 30, device 's/rig_10')",
+        ),
+        ("hl_map/trajectories.txt", "10, s/a, 0, 0, 0, 0, 1, 1, 1", ":4: error: found a zero quaternion"),
+        ("hl_map/trajectories.txt", "10, s/a, 1, 0, 0, 0, 1, nan, 1", ":4: error: found ty = 'nan'"),
+        (
+            "hl_map/trajectories.txt",
+            "10, s/a, 2, 0, 0, 0, 1, 1, 1",
+            ":4: warning: quaternion 2.0 0.0 0.0 0.0 is not of length 1",
+        ),
+        (
+            "hl_map/trajectories.txt",
+            f"10, s/a, {QT}, 1, 2",
+            ":4: warning: 2 values after the pose, expected none",
+        ),
+        (
+            "hl_map/trajectories.txt",
+            f"10, s/a, {QT}" + ", 1" * 35 + ", nan",
+            ":4: error: the covariance has values that are not finite",
+        ),
+        ("hl_query/proc/keyframes_pruned.txt", "10, x", ":3: error: unknown device 'x'"),
+        (
+            "hl_query/proc/keyframes_pruned.txt",
+            "10, s/rig_10",
+            ":3: error: duplicate key (timestamp 10, device_id",
+        ),
+        (
+            "hl_query/proc/keyframes_pruned.txt",
+            "30, s/rig_10",
+            ":3: error: keyframe without image (timestamp 30",
+        ),
+        ("hl_query/proc/keyframes_pruned.txt", "ten, s/rig_10", ":3: error: found timestamp = 'ten'"),
+        (
+            "hl_query/proc/keyframes_new.txt",
+            "10, s/a",
+            ":1: warning: keyframe without ground truth (timestamp 10",
+        ),
+        ("hl_map/proc/subsessions.txt", "t", ":2: warning: subsession 't' has no images"),
+        ("hl_map/proc/subsessions.txt", "s", ":2: error: duplicate subsession 's'"),
+    ],
+)
+def test_each_inconsistency_is_found_at_its_line(capture: Path, file: str, text: str, expected: str) -> None:
+    append(capture, file, text + "\n")
+    report = check_capture(capture)
+    assert any(str(problem).startswith(file + expected) for problem in report.problems), found(capture)
+    assert expected in report.text()
+
+
+def test_all_problems_are_listed_not_the_first_alone(capture: Path) -> None:
+    append(capture, "hl_map/images.txt", "bad\nworse\n30, s/x, none.jpg\n")
+    append(capture, "hl_query/images.txt", "bad\n")
+    (capture / "sessions" / "hl_map" / "raw_data" / "s" / "a" / "10.jpg").unlink()
+    (capture / "sessions" / "hl_query" / "sensors.txt").unlink()
+    lines = found(capture)
+    assert [line.split(": ")[0] for line in lines if "/images.txt" in line and "found 1 value " in line] == [
+        "hl_map/images.txt:6",
+        "hl_map/images.txt:7",
+        "hl_query/images.txt:6",
+    ]
+    assert "hl_map/images.txt:2: error: missing file raw_data/s/a/10.jpg" in lines
+    assert "hl_map/images.txt:8: error: missing file raw_data/none.jpg" in lines
+    assert any(line.startswith("hl_query/sensors.txt: error: file not found") for line in lines)
+    assert sum("hl_query" in line and "unknown sensor" in line for line in lines) == 8, "4 images, 4 rig rows"
+
+
+def test_a_long_list_of_problems_can_be_cut(capture: Path) -> None:
+    append(capture, "hl_map/images.txt", "".join(f"30, s/a, s/a/none{i}.jpg\n" for i in range(9)))
+    report = check_capture(capture)
+    count = len(report.problems)
+    assert count > 5
+    lines = report.text(most=2).splitlines()
+    assert str(report.problems[1]) in lines
+    assert str(report.problems[2]) not in lines
+    assert f"... and {count - 2} more: python -m toolkit check {capture}" in lines
+    assert "more:" not in report.text()
+    assert "more:" not in report.text(most=count)
+
+
+def test_depth_that_was_rendered_for_a_photograph_is_known(capture: Path) -> None:
+    append(capture, "hl_map/depths.txt", "10, render/s/a, s/a/10.jpg\n")
+    assert found(capture) == []
+
+
+def test_warnings_alone_leave_it_ok(capture: Path) -> None:
+    append(capture, "hl_map/trajectories.txt", f"30, s/rig_10, {QT}\n")
+    report = check_capture(capture)
+    assert report.ok
+    assert "0 errors, 1 warning." in report.text()
+
+
+def test_a_map_without_trajectories_is_an_error(capture: Path) -> None:
+    (capture / "sessions" / "hl_map" / "trajectories.txt").unlink()
+    assert found(capture) == [
+        "hl_map/trajectories.txt: error: file not found: images of a map session need poses"
+    ]
+
+
+def test_a_strange_session_name_is_noted(capture: Path) -> None:
+    (capture / "sessions" / "hl_map").rename(capture / "sessions" / "walk")
+    assert any(
+        "found session name 'walk', expected <ios, hl, spot>_<map or query>" in line
+        for line in found(capture)
+    )
+
+
+def test_what_is_no_capture_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match="has no folder `sessions`"):
+        check_capture(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["STRECHA", "STRECHA_HARD"])
+def test_real_captures_have_no_problems(name: str) -> None:
+    if not (CAPTURES / name).exists():
+        pytest.skip(f"the capture {name} is not on this machine")
+    assert found(CAPTURES / name) == []

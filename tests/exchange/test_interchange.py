@@ -1,0 +1,347 @@
+"""Import: COLMAP models and folders of images become sessions; what cannot be used is said."""
+
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+import pycolmap
+import pytest
+from typer.testing import CliRunner
+
+from toolkit.__main__ import app
+from toolkit.capture import Capture, Session
+from toolkit.capture.check import check_capture
+from toolkit.capture.exif import exif_camera, read_number
+from toolkit.errors import CaptureError, ManifestError
+from toolkit.exchange.interchange import import_colmap, import_images
+from toolkit.geometry import invert, make_pose, pose_from_qt, qt_from_pose, quaternion_to_rotation
+
+SIZE = (64, 48)
+CAMERA = "PINHOLE, 64, 48, 50, 51, 32, 24"
+RIG = make_pose(quaternion_to_rotation([0.9, 0.1, -0.2, 0.3]), [0.11, -0.02, 0.03])  # left from right
+
+
+def pose(number: int) -> np.ndarray:
+    """world_from_cam of an image, far from the origin as real captures are."""
+    rng = np.random.default_rng(number)
+    return make_pose(quaternion_to_rotation(rng.normal(size=4)), rng.normal(size=3) * 100)
+
+
+def save(path: Path, size: tuple[int, int] = SIZE, tags: dict[int, object] | None = None, time: str = "") -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    exif = PIL.Image.Exif()
+    for tag, value in (tags or {}).items():
+        if tag == 0x0112:
+            exif[tag] = value
+        else:
+            exif.get_ifd(0x8769)[tag] = value
+    if time:
+        exif.get_ifd(0x8769)[0x9003] = time
+    PIL.Image.new("RGB", size, (90, 120, 150)).save(path, exif=exif)
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for name in ("b/1.jpg", "a/2.jpg", "a/10.png"):
+        save(tmp_path / "photos" / name)
+    return tmp_path / "photos"
+
+
+def write_table(path: Path, names: list[str], poses: list[np.ndarray]) -> Path:
+    head = "image, qw, qx, qy, qz, tx, ty, tz"
+    rows = [f"{name}, {', '.join(map(repr, qt_from_pose(p).tolist()))}" for name, p in zip(names, poses, strict=True)]
+    path.write_text("\n".join([head, *rows]) + "\n")
+    return path
+
+
+def rigid(a_from_b: np.ndarray) -> pycolmap.Rigid3d:
+    return pycolmap.Rigid3d(a_from_b[:3])
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    """A model of a phone with two images and a rig of two cameras with two frames; one image is not in it."""
+    made = pycolmap.Reconstruction()
+    for camera_id, name in ((1, "SIMPLE_RADIAL"), (2, "OPENCV"), (3, "PINHOLE")):
+        camera = pycolmap.Camera.create_from_model_name(camera_id, name, 50.0, *SIZE)
+        made.add_camera(camera) if camera_id > 1 else made.add_camera_with_trivial_rig(camera)
+    rig = pycolmap.Rig()
+    rig.rig_id = 7
+    rig.add_ref_sensor(made.camera(2).sensor_id)
+    rig.add_sensor(made.camera(3).sensor_id, rigid(invert(RIG)))
+    made.add_rig(rig)
+    for image_id in (1, 2):
+        image = pycolmap.Image(f"phone/{image_id}.jpg", camera_id=1, image_id=image_id)
+        made.add_image_with_trivial_frame(image, rigid(invert(pose(image_id))))
+    for frame_id, members in ((10, (3, 4)), (11, (5,))):
+        frame = pycolmap.Frame()
+        frame.frame_id, frame.rig_id = frame_id, 7
+        for camera_id, image_id in zip((2, 3), members, strict=False):
+            frame.add_data_id(pycolmap.data_t(made.camera(camera_id).sensor_id, image_id))
+        frame.rig_from_world = rigid(invert(pose(frame_id)))
+        made.add_frame(frame)
+        for camera_id, image_id in zip((2, 3), members, strict=False):
+            image = pycolmap.Image(f"rig/{image_id}.jpg", camera_id=camera_id, image_id=image_id)
+            image.frame_id = frame_id
+            made.add_image(image)
+    (tmp_path / "model").mkdir()
+    made.write_text(str(tmp_path / "model"))
+    for name in ("phone/1", "phone/2", "rig/3", "rig/4", "rig/5", "phone/6"):
+        save(tmp_path / "photos" / f"{name}.jpg")
+    return tmp_path / "model"
+
+
+def poses_of(session: Session) -> dict[str, np.ndarray]:
+    poses = session.world_from_cam(ground_truth=session.split == "query")
+    return {path.split("/images/")[1]: p for path, p in zip(session.images["path"], poses, strict=True)}
+
+
+# ------------------------------------------------------------------------------------------------ COLMAP models
+
+
+def test_a_colmap_model_keeps_its_camera_centres_and_rigs(model: Path, tmp_path: Path) -> None:
+    report = import_colmap(model, tmp_path / "photos", tmp_path / "PLACE", device="hl")
+    session = Capture.open(tmp_path / "PLACE")["hl_map"]
+    reference = pycolmap.Reconstruction(str(model))
+    found = poses_of(session)
+    assert len(found) == 5
+    for name, world_from_cam in found.items():
+        image = reference.find_image_with_name(name)
+        np.testing.assert_allclose(world_from_cam[:3, 3], image.projection_center(), rtol=0, atol=1e-9)
+        expected = invert(make_pose(image.cam_from_world().rotation.matrix(), image.cam_from_world().translation))
+        np.testing.assert_allclose(world_from_cam, expected, rtol=0, atol=1e-9)
+    # The second camera of the rig, from the numbers that the model was made of.
+    np.testing.assert_allclose(found["rig/4.jpg"], pose(10) @ RIG, rtol=0, atol=1e-9)
+    assert session.rigs is not None
+    assert session.rigs.to_numpy().tolist() == [["import/rig_7", "import/cam_2"], ["import/rig_7", "import/cam_3"]]
+    assert sorted(set(session.device_ids)) == ["import/cam_1", "import/rig_7"]
+    assert session.camera("import/cam_2").model.name == "OPENCV"
+    assert session.camera("import/cam_1").params.tolist() == reference.camera(1).params.tolist()
+    assert check_capture(tmp_path / "PLACE").problems == []
+    assert "5 of 5 images, 3 cameras\n1 images of the folder are not in the model" in report.text()
+    assert "timestamps: made up" in report.text()
+
+
+def test_images_of_a_model_that_cannot_be_used_are_rows(model: Path, tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    (photos / "phone" / "1.jpg").unlink()
+    (photos / "phone" / "2.jpg").write_bytes(b"no image")
+    save(photos / "rig" / "3.jpg", (32, 24))
+    save(photos / "rig" / "4.jpg", SIZE[::-1], {0x0112: 6})
+    report = import_colmap(model, photos, tmp_path / "PLACE")
+    status = report.images.set_index("image")["status"]
+    assert status["phone/1.jpg"] == "no such file"
+    assert status["phone/2.jpg"].startswith("cannot be read as an image")
+    assert status["rig/3.jpg"] == "the image is stored as 32 x 24 pixels, its camera is of 64 x 48"
+    assert status["rig/4.jpg"].endswith("turn the pixels and remove the EXIF orientation")
+    assert status["rig/5.jpg"] == "imported"
+    session = report.session
+    assert len((session / "proc" / "import.csv").read_text().splitlines()) == 6
+    assert check_capture(tmp_path / "PLACE").ok
+    (photos / "rig" / "5.jpg").unlink()
+    with pytest.raises(CaptureError, match=r"none of 5 images can be imported\. First: phone/1\.jpg: no such file"):
+        import_colmap(model, photos, tmp_path / "OTHER")
+    assert not list((tmp_path / "OTHER").rglob("*"))
+
+
+def test_a_folder_without_a_model_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match="no COLMAP model can be read here"):
+        import_colmap(tmp_path, tmp_path, tmp_path / "PLACE")
+
+
+def test_a_model_with_an_empty_file_is_refused(model: Path, tmp_path: Path) -> None:
+    (tmp_path / "binary").mkdir()
+    pycolmap.Reconstruction(str(model)).write_binary(str(tmp_path / "binary"))
+    (tmp_path / "binary" / "points3D.bin").write_bytes(b"")
+    with pytest.raises(CaptureError, match="no COLMAP model can be read here"):
+        import_colmap(tmp_path / "binary", tmp_path / "photos", tmp_path / "PLACE")
+
+
+# ------------------------------------------------------------------------------------------------ folders of images
+
+
+@pytest.mark.parametrize("direction", ["world_from_cam", "cam_from_world"])
+def test_a_table_of_poses_becomes_a_map(folder: Path, tmp_path: Path, direction: str) -> None:
+    names = ["a/10.png", "b/1.jpg"]
+    poses = {name: pose(number) for number, name in enumerate(names)}
+    written = [p if direction == "world_from_cam" else invert(p) for p in poses.values()]
+    table = write_table(tmp_path / "poses.csv", names, written)
+    options = {"split": "map", "table": table, "poses_are": direction, "camera": CAMERA}
+    import_images(folder, tmp_path / "PLACE", **options)  # type: ignore[arg-type]
+    session = Capture.open(tmp_path / "PLACE")["ios_map"]
+    found = poses_of(session)
+    assert sorted(found) == names
+    for name in names:
+        np.testing.assert_allclose(found[name], poses[name], rtol=0, atol=1e-12)
+    assert session.camera("import/cam_1").params.tolist() == [50, 51, 32, 24]
+    assert check_capture(tmp_path / "PLACE").problems == []
+
+
+def test_a_folder_becomes_queries_without_ground_truth(folder: Path, tmp_path: Path) -> None:
+    report = import_images(folder, tmp_path / "PLACE", "drone", camera=CAMERA)
+    session = Capture.open(tmp_path / "PLACE")["drone_query"]
+    assert session.ground_truth is None
+    assert len(session.keyframes()) == 3
+    assert session.images["path"].tolist() == [f"import/images/{name}" for name in ("a/10.png", "a/2.jpg", "b/1.jpg")]
+    assert session.images["timestamp"].tolist() == [1_000_000, 2_000_000, 3_000_000]
+    assert session.subsessions == ["import"]
+    assert "intrinsics of 3 images: the camera that was given" in report.text()
+    assert session.image_path(0).is_symlink()
+
+
+def test_images_can_be_copied(folder: Path, tmp_path: Path) -> None:
+    report = import_images(folder, tmp_path / "PLACE", camera=CAMERA, placing="copy")
+    path = report.session / "raw_data" / "import" / "images" / "a" / "2.jpg"
+    assert not path.is_symlink()
+    assert path.read_bytes() == (folder / "a" / "2.jpg").read_bytes()
+
+
+def test_cameras_come_from_a_file_or_the_table(folder: Path, tmp_path: Path) -> None:
+    cameras = tmp_path / "cameras.txt"
+    cameras.write_text("# Camera list\n3 PINHOLE 64 48 50 51 32 24\n8 SIMPLE_RADIAL 64 48 40 32 24 0.01\n")
+    table = tmp_path / "t.csv"
+    table.write_text("image,camera_id\na/2.jpg,8\nb/1.jpg,3\na/10.png,8\n")
+    report = import_images(folder, tmp_path / "ONE", table=table, cameras=cameras)
+    cams = report.images.set_index("image")["camera"]
+    assert cams["a/2.jpg"] == cams["a/10.png"] == "SIMPLE_RADIAL, 64, 48, 40.0, 32.0, 24.0, 0.01"
+    assert report.images["sensor_id"].nunique() == 2
+    with pytest.raises(CaptureError, match=r"cameras\.txt has 2 cameras; give a table"):
+        import_images(folder, tmp_path / "TWO", cameras=cameras)
+    table.write_text("image,camera_id\na/2.jpg,9\n")
+    with pytest.raises(CaptureError, match=r"t\.csv, line 2: camera_id '9' is not in cameras\.txt \(there: 3, 8\)"):
+        import_images(folder, tmp_path / "TWO", table=table, cameras=cameras)
+    table.write_text("image,model,width,height,params\na/2.jpg,PINHOLE,64,48,50 51 32 24\n")
+    assert len(import_images(folder, tmp_path / "TWO", table=table).images) == 1
+    table.write_text("image,model,width,height,params\n\na/2.jpg,PINHOLE,64,48,50 51 32\n")
+    with pytest.raises(CaptureError, match=r"t\.csv, line 3: found 3 parameters for model PINHOLE"):
+        import_images(folder, tmp_path / "THREE", table=table)
+    cameras.write_text("1 PINHOLE 64 48 x 51 32 24\n")
+    with pytest.raises(CaptureError, match=r"cameras\.txt, line 1: "):
+        import_images(folder, tmp_path / "THREE", cameras=cameras)
+
+
+# Known answers: 26 mm on film is 26/43.27 of the diagonal; 5 mm at 100 pixels a millimetre is 500 pixels.
+@pytest.mark.parametrize(
+    ("tags", "focal", "how"),
+    [
+        ({0xA405: 26, 0x920A: 4.2}, 26 * 80 / np.sqrt(36**2 + 24**2), "FocalLengthIn35mmFilm"),
+        ({0x920A: 5.0, 0xA20E: 1000.0, 0xA210: 3}, 500.0, "FocalPlaneXResolution"),
+        ({0x920A: 5.0, 0xA20E: 2540.0, 0xA002: 128}, 250.0, "FocalPlaneXResolution"),
+    ],
+)
+def test_a_focal_length_is_guessed_from_exif(tmp_path: Path, tags: dict[int, object], focal: float, how: str) -> None:
+    camera, said = exif_camera(save(tmp_path / "x.jpg", tags=tags))
+    assert camera.params.tolist() == pytest.approx([focal, 32, 24], rel=1e-12)
+    assert said.startswith("a guess from EXIF (")
+    assert how in said
+
+
+def test_images_without_a_focal_length_are_left_out(folder: Path, tmp_path: Path) -> None:
+    save(folder / "c.jpg", tags={0xA405: 30})
+    report = import_images(folder, tmp_path / "PLACE")
+    assert (report.images["status"] == "no focal length in EXIF: give the camera, or cameras.txt").sum() == 3
+    assert "1 images: a guess from EXIF" in report.text()
+    assert read_number({1: "many", 2: float("inf")}, 1) == read_number({2: float("inf")}, 2) == 0
+
+
+def test_an_image_of_absurd_size_is_a_row(folder: Path, tmp_path: Path) -> None:
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", 30_000, 30_000, 8, 2, 0, 0, 0))
+    (folder / "absurd.png").write_bytes(b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", b"") + chunk(b"IEND", b""))
+    for camera in (CAMERA, None):
+        save(folder / "c.jpg", tags={0xA405: 30})
+        report = import_images(folder, tmp_path / f"PLACE-{camera is None}", camera=camera)
+        status = report.images.set_index("image")["status"]
+        assert status["absurd.png"].startswith("cannot be read as an image")
+        assert status["c.jpg"] == "imported"
+
+
+def test_times_are_those_of_the_camera_where_all_have_one(tmp_path: Path) -> None:
+    for second in (7, 5):
+        save(tmp_path / "photos" / f"{second}.jpg", tags={0x9291: "25"}, time=f"2024:05:01 10:00:{second:02d}")
+    report = import_images(tmp_path / "photos", tmp_path / "ONE", camera=CAMERA)
+    first = 1714557600 * 10**6 + 250_000
+    assert report.images.set_index("image")["timestamp"].to_dict() == {
+        "5.jpg": first + 5 * 10**6,
+        "7.jpg": first + 7 * 10**6,
+    }
+    assert "of the camera's clock" in report.text()
+    save(tmp_path / "photos" / "9.jpg", time="2024:05:01 10:00:05")
+    twice = import_images(tmp_path / "photos", tmp_path / "TWO", camera=CAMERA)
+    assert "of the camera's clock" in twice.text()  # a quarter of a second apart
+    save(tmp_path / "photos" / "9.jpg")
+    without = import_images(tmp_path / "photos", tmp_path / "THREE", camera=CAMERA)
+    assert "made up, a second apart in the order of the images (some images have no time in EXIF)" in without.text()
+
+
+def test_turned_images_are_used_as_stored_and_said_so(folder: Path, tmp_path: Path) -> None:
+    save(folder / "b" / "1.jpg", tags={0x0112: 6})
+    report = import_images(folder, tmp_path / "PLACE", camera=CAMERA)
+    assert "1 images have an EXIF tag that asks for turning: the pixels are used as stored" in report.text()
+
+
+def test_names_that_the_format_cannot_hold_are_left_out(folder: Path, tmp_path: Path) -> None:
+    save(folder / "one, two.jpg")
+    save(tmp_path / "outside.jpg")
+    status = import_images(folder, tmp_path / "PLACE", camera=CAMERA).images.set_index("image")["status"]
+    assert "comma" in status["one, two.jpg"]
+    table = tmp_path / "t.csv"
+    table.write_text("image\n../outside.jpg\na/2.jpg\n")
+    status = import_images(folder, tmp_path / "OTHER", table=table, camera=CAMERA).images.set_index("image")["status"]
+    assert status["../outside.jpg"] == "not a path inside the folder of images"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("name,qw\n", r"unknown column 'name'"),
+        ("image,qw,qx,qy,qz,tx,ty\n", r"column 'tz' is missing"),
+        ("qw,qx,qy,qz,tx,ty,tz\n", r"column 'image' is missing"),
+        ("image,qw,qx,qy,qz,tx,ty,tz\n\na/2.jpg,1,0,0,0,0,0,nan\n", r"t\.csv, line 3: found the pose 1, 0.* nan"),
+        ("image,qw,qx,qy,qz,tx,ty,tz\na/2.jpg,1,1,0,0,0,0,0\n", r"line 2: found the pose .*length 1"),
+        ("image\na/2.jpg\na/2.jpg\n", r"line 3: image 'a/2\.jpg' again"),
+        ("image\na/2.jpg\n", r"A map needs poses"),
+        ("", r"cannot be read as a CSV table"),
+    ],
+)
+def test_malformed_tables_are_refused(folder: Path, tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "t.csv").write_text(text)
+    with pytest.raises(CaptureError, match=message):
+        import_images(folder, tmp_path / "PLACE", split="map", table=tmp_path / "t.csv", camera=CAMERA)
+    assert not (tmp_path / "PLACE").exists()
+
+
+def test_wrong_choices_name_the_known_ones_and_nothing_is_overwritten(folder: Path, tmp_path: Path) -> None:
+    for options in ({"split": "train"}, {"placing": "move"}, {"poses_are": "cam_to_world"}):
+        with pytest.raises(ManifestError, match="Known: "):
+            import_images(folder, tmp_path / "PLACE", camera=CAMERA, **options)
+    for device in ("../drone", "", "my drone", "a/b"):
+        with pytest.raises(ManifestError, match="expected small letters, digits"):
+            import_images(folder, tmp_path / "PLACE", device=device, camera=CAMERA)
+    assert not (tmp_path / "PLACE").exists()
+    import_images(folder, tmp_path / "PLACE", camera=CAMERA)
+    with pytest.raises(CaptureError, match="ios_query exists already"):
+        import_images(folder, tmp_path / "PLACE", camera=CAMERA)
+    with pytest.raises(CaptureError, match="no such folder of images"):
+        import_images(tmp_path / "nowhere", tmp_path / "OTHER")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(CaptureError, match="no image in or below it"):
+        import_images(tmp_path / "empty", tmp_path / "OTHER")
+
+
+def test_the_command_line_imports(model: Path, tmp_path: Path) -> None:
+    photos, place = str(tmp_path / "photos"), str(tmp_path / "PLACE")
+    done = CliRunner().invoke(app, ["import", "colmap", str(model), photos, place, "--device", "spot"])
+    assert done.exit_code == 0, done.output
+    assert "5 of 5 images" in done.output
+    done = CliRunner().invoke(app, ["import", "images", photos, place, "--camera", CAMERA, "--images", "copy"])
+    assert done.exit_code == 0, done.output
+    assert Capture.open(place).session_ids == ["ios_query", "spot_map"]
+    poses = Capture.open(place)["spot_map"].trajectory
+    assert poses is not None
+    np.testing.assert_allclose(pose_from_qt(poses.qt)[0, 3], [0, 0, 0, 1])

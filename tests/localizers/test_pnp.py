@@ -1,0 +1,562 @@
+"""PnP in a synthetic map whose points, descriptors and poses are known."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import pycolmap
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from toolkit import geometry
+from toolkit.features.features import DESCRIPTOR_SCALE, KINDS, LocalFeatures
+from toolkit.features.matching import MutualMatcher, PairMatches
+from toolkit.localizers.mapped import MappedFeatures
+from toolkit.localizers.mapping import LocalMap
+from toolkit.localizers.pnp import PnpLocalizer, PnpSettings, PoseEstimate, least_squares_covariance
+
+Floats = NDArray[np.float64]
+SIZE_M = 0.02  # standard deviation of each point's blob on its surface
+
+CAMERAS = {
+    "PINHOLE": pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[500, 505, 322, 239]),
+    "OPENCV": pycolmap.Camera(
+        model="OPENCV", width=640, height=480, params=[500, 505, 322, 239, -0.25, 0.08, 0.002, -0.001]
+    ),
+    "OPENCV_FISHEYE": pycolmap.Camera(
+        model="OPENCV_FISHEYE", width=640, height=480, params=[300, 302, 322, 239, 0.03, -0.01, 0.002, 0.001]
+    ),
+}
+PINHOLE = CAMERAS["PINHOLE"]
+
+
+def random_descriptors(rng: np.random.Generator, count: int) -> Floats:
+    vectors = np.abs(rng.normal(size=(count, 128)))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def stored(rng: np.random.Generator, descriptors: Floats, noise: float = 0.3) -> NDArray[np.uint8]:
+    """Return what an image keeps of descriptors: each time a little different."""
+    shaky = np.abs(descriptors + noise * rng.normal(size=descriptors.shape) / np.sqrt(128))
+    shaky /= np.maximum(np.linalg.norm(shaky, axis=1, keepdims=True), 1e-9)
+    return np.clip(np.round(shaky * DESCRIPTOR_SCALE), 0, 255).astype(np.uint8)
+
+
+def project(
+    camera: pycolmap.Camera, cam_from_world: Floats, points: Floats
+) -> tuple[Floats, Floats, NDArray[np.int64]]:
+    """Return pixels, depths and indices of the points that a camera sees."""
+    in_cam = geometry.transform(cam_from_world, points)
+    pixels = np.full((len(points), 2), np.nan)
+    front = np.flatnonzero(in_cam[:, 2] > 0.2)
+    pixels[front] = np.asarray(camera.img_from_cam(in_cam[front])).reshape(-1, 2)
+    with np.errstate(invalid="ignore"):
+        inside = np.flatnonzero(((pixels > 0) & (pixels < [camera.width, camera.height])).all(axis=1))
+    return pixels[inside], in_cam[inside, 2], inside
+
+
+@dataclass
+class World:
+    """Points with descriptors, a map that sees them, and what a query would see."""
+
+    points: Floats
+    descriptors: Floats
+    local_map: LocalMap
+    features: dict[str, LocalFeatures]
+    rng: np.random.Generator
+
+    @classmethod
+    def build(
+        cls, points: Floats, world_from_cams: Floats, descriptors: Floats | None = None, sees: dict | None = None
+    ) -> "World":
+        """Make a map; `sees` limits what an image sees to some points."""
+        rng = np.random.default_rng(7)
+        descriptors = random_descriptors(rng, len(points)) if descriptors is None else descriptors
+        names = [f"ios_map/raw_data/{index}.jpg" for index in range(len(world_from_cams))]
+        features, observations = {}, []
+        for index, (name, pose) in enumerate(zip(names, geometry.invert(world_from_cams), strict=True)):
+            pixels, depth, seen = project(PINHOLE, pose, points)
+            keep = np.isin(seen, (sees or {}).get(index, seen))
+            pixels, depth, seen = pixels[keep], depth[keep], seen[keep]
+            features[name] = LocalFeatures(
+                pixels.astype(np.float32),
+                (SIZE_M * PINHOLE.mean_focal_length() / depth).astype(np.float32),
+                np.ones(len(pixels), np.float32),
+                stored(rng, descriptors[seen]),
+                (640, 480),
+            )
+            observations.append(np.column_stack([np.full(len(seen), index), np.arange(len(seen)), seen]))
+        image, keypoint, point = np.concatenate(observations).astype(np.int64).T
+        local_map = LocalMap(
+            image_names=names,
+            cameras=[PINHOLE] * len(names),
+            world_from_cams=world_from_cams,
+            points=points,
+            colors=np.zeros((len(points), 3), np.uint8),
+            obs_image=image,
+            obs_keypoint=keypoint,
+            obs_point=point,
+            noise_px=np.zeros(len(points), np.float32),  # the points are exact
+        )
+        return cls(points, descriptors, local_map, features, rng)
+
+    def localizer(self, **settings: object) -> PnpLocalizer:
+        return PnpLocalizer(self.local_map, self.features, PnpSettings(**settings))  # type: ignore[arg-type]
+
+    def look(
+        self,
+        camera: pycolmap.Camera,
+        world_from_cam: Floats,
+        noise_px: float = 0.5,
+        outliers: float = 0.0,
+        limit: int | None = None,
+        only: NDArray[np.int64] | None = None,
+    ) -> LocalFeatures:
+        """Return the features of a query; outliers wear the descriptor of another point that the map has."""
+        pixels, depth, seen = project(camera, geometry.invert(world_from_cam), self.points)
+        keep = np.isin(seen, only) if only is not None else np.ones(len(seen), bool)
+        keep = self.rng.permutation(np.flatnonzero(keep))[:limit]
+        pixels, depth, seen = pixels[keep], depth[keep], seen[keep]
+        wrong = self.rng.random(len(seen)) < outliers
+        pixels = pixels + noise_px * self.rng.normal(size=pixels.shape)
+        pixels[wrong] = self.rng.uniform([0, 0], [camera.width, camera.height], (int(wrong.sum()), 2))
+        return LocalFeatures(
+            pixels.astype(np.float32),
+            (SIZE_M * camera.mean_focal_length() / depth).astype(np.float32),
+            np.ones(len(pixels), np.float32),
+            stored(self.rng, self.descriptors[seen]),
+            (camera.width, camera.height),
+        )
+
+
+def facing(x: float, y: float, z: float, yaw_deg: float = 0.0, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Floats:
+    """Return world_from_cam; without a turn the camera looks along the world's z, y down."""
+    turn = Rotation.from_euler("YXZ", [yaw_deg, pitch_deg, roll_deg], degrees=True).as_matrix()
+    return geometry.make_pose(turn, [x, y, z])
+
+
+MAP_POSES = np.stack([facing(x, y, 0, -6 * x) for x in (-2.0, -1.0, 0.0, 1.0, 2.0) for y in (-0.5, 0.5)])
+REFERENCES = list(range(10))
+QUERY = facing(0.4, -0.2, 0.7, yaw_deg=8, pitch_deg=-4, roll_deg=3)
+
+
+@pytest.fixture(scope="module")
+def room() -> World:
+    """A cloud of points in front of ten cameras."""
+    return World.build(np.random.default_rng(0).uniform([-4, -2.5, 3.5], [4, 2.5, 8], (1200, 3)), MAP_POSES)
+
+
+def check(estimate: PoseEstimate, true: Floats, max_deg: float = 0.1, max_m: float = 0.01) -> None:
+    assert estimate.status == "ok"
+    assert estimate.world_from_rig is not None
+    rotation_deg, distance_m = geometry.pose_error(estimate.world_from_rig, true)
+    assert rotation_deg < max_deg
+    assert distance_m < max_m
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+def test_a_single_camera(room: World, model: str) -> None:
+    camera = CAMERAS[model]
+    estimate = room.localizer().localize([camera], np.eye(4)[None], [room.look(camera, QUERY)], [REFERENCES])
+    check(estimate, QUERY)
+    assert min(estimate.num_guided, estimate.num_inliers) > 500
+    assert estimate.num_matches >= estimate.num_inliers
+    assert 0 < estimate.inlier_ratio <= 1
+    assert 0.4 < estimate.rmse_px < 0.9  # of 0.5 px a coordinate
+    assert set(estimate.references) <= set(REFERENCES)
+    # What the pose rests on can be looked at: those points, projected, are those pixels.
+    assert len(estimate.pixels) == len(estimate.point_index) == len(estimate.camera_index) == estimate.num_guided
+    in_cam = geometry.transform(geometry.invert(estimate.world_from_rig), room.points[estimate.point_index])
+    errors = np.linalg.norm(np.asarray(camera.img_from_cam(in_cam)) - estimate.pixels, axis=1)
+    assert np.sqrt(np.mean(errors**2)) == pytest.approx(estimate.rmse_px, rel=0.01)
+
+
+def test_exact_pixels_give_the_exact_pose(room: World) -> None:
+    seen = room.look(PINHOLE, QUERY, noise_px=0)
+    estimate = room.localizer().localize([PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
+    check(estimate, QUERY, 1e-4, 1e-5)
+
+
+RIG_FROM_CAMS = np.stack(
+    [
+        facing(0.3, 0.1, 0.0, yaw_deg=15),
+        facing(-0.3, -0.1, 0.05, yaw_deg=-20, roll_deg=90),
+        facing(0.0, 0.3, -0.2, pitch_deg=12),
+    ]
+)
+RIG_CAMERAS = [CAMERAS["OPENCV"], PINHOLE, CAMERAS["OPENCV_FISHEYE"]]
+
+
+def test_the_pose_of_a_rig_is_the_rigs(room: World) -> None:
+    features = [room.look(c, QUERY @ r) for c, r in zip(RIG_CAMERAS, RIG_FROM_CAMS, strict=True)]
+    estimate = room.localizer().localize(RIG_CAMERAS, RIG_FROM_CAMS, features, [REFERENCES] * 3)
+    check(estimate, QUERY)
+    assert set(estimate.camera_index) == {0, 1, 2}
+
+
+def test_one_camera_off_the_rigs_centre_gives_the_rigs_pose(room: World) -> None:
+    features = [room.look(PINHOLE, QUERY @ RIG_FROM_CAMS[1])]
+    estimate = room.localizer().localize([PINHOLE], RIG_FROM_CAMS[1:2], features, [REFERENCES])
+    check(estimate, QUERY)
+
+
+def test_a_rig_needs_not_see_with_all_cameras(room: World) -> None:
+    """One camera looks away, one was covered, and only one has references."""
+    away = facing(0, 0, 0, yaw_deg=180)
+    poses = np.stack([RIG_FROM_CAMS[0], away, RIG_FROM_CAMS[1]])
+    nothing = np.zeros(0, np.float32)
+    covered = LocalFeatures(nothing.reshape(0, 2), nothing, nothing, np.zeros((0, 128), np.uint8), (640, 480))
+    noise = room.look(PINHOLE, QUERY, outliers=1.0)
+    features = [room.look(PINHOLE, QUERY @ poses[0]), noise, covered]
+    estimate = room.localizer().localize([PINHOLE] * 3, poses, features, [REFERENCES, [], REFERENCES])
+    check(estimate, QUERY)
+    assert set(estimate.camera_index) == {0}
+
+
+@pytest.mark.parametrize("rig", [False, True])
+def test_seventy_percent_outliers(room: World, rig: bool) -> None:
+    cameras = RIG_CAMERAS if rig else [PINHOLE]
+    poses = RIG_FROM_CAMS if rig else np.eye(4)[None]
+    features = [room.look(c, QUERY @ p, outliers=0.7) for c, p in zip(cameras, poses, strict=True)]
+    estimate = room.localizer().localize(cameras, poses, features, [REFERENCES] * len(cameras))
+    check(estimate, QUERY, 0.2, 0.02)
+    assert estimate.inlier_ratio < 0.45
+
+
+def test_points_on_one_plane() -> None:
+    wall = np.random.default_rng(0).uniform([-4, -2.5, 6], [4, 2.5, 6], (800, 3))
+    world = World.build(wall, MAP_POSES)
+    for pose in (QUERY, facing(0, 0, 1)):  # aslant, and straight on
+        estimate = world.localizer().localize([PINHOLE], np.eye(4)[None], [world.look(PINHOLE, pose)], [REFERENCES])
+        check(estimate, pose, 0.2, 0.02)
+
+
+def test_no_references(room: World) -> None:
+    seen = room.look(PINHOLE, QUERY)
+    estimate = room.localizer().localize([PINHOLE], np.eye(4)[None], [seen], [[]])
+    assert estimate.status == "failed: no references"
+    assert estimate.world_from_rig is None
+    assert estimate.covariance is None
+    assert (estimate.num_matches, estimate.num_inliers, estimate.inlier_ratio) == (0, 0, 0.0)
+    assert np.isnan([estimate.position_std_m, estimate.rotation_std_deg]).all()
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_too_few_matches(room: World, count: int) -> None:
+    seen = room.look(PINHOLE, QUERY, limit=count)
+    estimate = room.localizer().localize([PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
+    assert estimate.status == "failed: too few matches"
+    assert estimate.world_from_rig is None
+    assert estimate.num_matches <= count * len(REFERENCES)
+
+
+@pytest.mark.parametrize("rig", [False, True])
+def test_eight_matches_are_no_pose(room: World, rig: bool) -> None:
+    """Fewer than `min_inliers`, however well they agree."""
+    cameras = RIG_CAMERAS if rig else [PINHOLE]
+    poses = RIG_FROM_CAMS if rig else np.eye(4)[None]
+    features = [room.look(c, QUERY @ p, limit=8 // len(cameras)) for c, p in zip(cameras, poses, strict=True)]
+    estimate = room.localizer().localize(cameras, poses, features, [REFERENCES] * len(cameras))
+    assert estimate.status.startswith("failed: ")
+    assert estimate.world_from_rig is None
+
+
+def test_between_least_and_ok_a_pose_is_of_low_confidence(room: World) -> None:
+    seen = room.look(PINHOLE, QUERY, limit=20)
+    estimate = room.localizer().localize([PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
+    assert estimate.status == "low_confidence"
+    assert geometry.pose_error(estimate.world_from_rig, QUERY)[1] < 0.1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_query_from_elsewhere_is_not_ok(room: World, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    stranger = LocalFeatures(
+        rng.uniform([0, 0], [640, 480], (1000, 2)).astype(np.float32),
+        rng.uniform(1, 4, 1000).astype(np.float32),
+        np.ones(1000, np.float32),
+        stored(rng, room.descriptors[rng.integers(0, 1200, 1000)]),  # matches, but nothing in its place
+        (640, 480),
+    )
+    estimate = room.localizer().localize([PINHOLE], np.eye(4)[None], [stranger], [REFERENCES])
+    assert estimate.status != "ok"
+
+
+def test_a_map_image_without_points_does_no_harm(room: World) -> None:
+    none = np.zeros(0, np.int64)
+    world = World.build(room.points, MAP_POSES, room.descriptors, sees={0: none, 1: none})
+    seen = world.look(PINHOLE, QUERY)
+    check(world.localizer().localize([PINHOLE], np.eye(4)[None], [seen], [REFERENCES]), QUERY)
+    alone = world.localizer().localize([PINHOLE], np.eye(4)[None], [seen], [[0, 1]])
+    assert alone.status == "failed: too few matches"
+
+
+def twins(extra: int) -> tuple[World, NDArray[np.int64]]:
+    """Two copies of a structure 2 m apart, and `extra` points that are only once; what a query at the first sees."""
+    rng = np.random.default_rng(0)
+    first = rng.uniform([-0.8, -0.8, 4], [0.8, 0.8, 5], (300, 3))
+    once = rng.uniform([-0.8, -0.8, 4], [0.8, 0.8, 5], (extra, 3))
+    descriptors = random_descriptors(rng, 300)
+    poses = np.stack([facing(x + shift, y, 0) for shift in (0, 2) for x in (-0.4, 0, 0.4) for y in (-0.3, 0.3)])
+    a, b, c = np.arange(300), np.arange(300, 600), np.arange(600, 600 + extra)
+    sees = {index: np.concatenate([a, c]) if index < 6 else b for index in range(12)}
+    points = np.concatenate([first, first + np.array([2, 0, 0]), once])
+    world = World.build(points, poses, np.concatenate([descriptors, descriptors, random_descriptors(rng, extra)]), sees)
+    return world, np.concatenate([a, c])
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.3])
+def test_of_two_like_places_none_is_ok(outliers: float) -> None:
+    world, visible = twins(extra=0)
+    seen = world.look(PINHOLE, facing(0.1, 0.1, 0.3), only=visible, outliers=outliers)
+    estimate = world.localizer().localize([PINHOLE], np.eye(4)[None], [seen], [list(range(12))])
+    assert estimate.status == "low_confidence"
+    assert estimate.rival_support > 0.8
+
+
+def test_what_is_there_once_decides_between_like_places() -> None:
+    world, visible = twins(extra=250)
+    pose = facing(0.1, 0.1, 0.3)
+    seen = world.look(PINHOLE, pose, only=visible)
+    estimate = world.localizer().localize([PINHOLE], np.eye(4)[None], [seen], [list(range(12))])
+    check(estimate, pose, 0.2, 0.02)
+    assert estimate.rival_support < 0.8
+
+
+@pytest.mark.parametrize("place", range(5))
+def test_the_right_one_of_many_like_places_is_found(place: int) -> None:
+    """Only weak features, which are not matched at first, tell the places apart: each has to be tried."""
+    rng = np.random.default_rng(0)
+    shifts = np.array([[3.0 * index, 0, 0] for index in range(5)])
+    like = rng.uniform([-0.8, -0.8, 4], [0.8, 0.8, 5], (200, 3))
+    once = rng.uniform([-0.8, -0.8, 4], [0.8, 0.8, 5], (100, 3)) + shifts[place]
+    poses = np.stack([facing(x + shift, 0, 0) for shift, _, _ in shifts for x in (-0.3, 0.3)])
+    sees = {index: np.arange(200) + 200 * (index // 2) for index in range(10)}
+    for index in (2 * place, 2 * place + 1):
+        sees[index] = np.concatenate([sees[index], np.arange(1000, 1100)])
+    descriptors = np.concatenate([*[random_descriptors(rng, 200)] * 5, random_descriptors(rng, 100)])
+    world = World.build(np.concatenate([*(like + shift for shift in shifts), once]), poses, descriptors, sees)
+    pose = facing(shifts[place, 0] + 0.1, 0.1, 0.3)
+    strong = world.look(PINHOLE, pose, only=np.arange(200) + 200 * place)
+    weak = world.look(PINHOLE, pose, only=np.arange(1000, 1100))
+    both = {
+        name: np.concatenate([getattr(strong, name), getattr(weak, name)])
+        for name in ("keypoints", "scales", "scores", "descriptors")
+    }
+    seen = LocalFeatures(**both, image_size=(640, 480))
+    localizer = world.localizer(max_query_features=len(strong), contested_references=10)
+    check(localizer.localize([PINHOLE], np.eye(4)[None], [seen], [list(range(10))]), pose, 0.2, 0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("rig", "map_noise_px"), [(False, 0.0), (True, 0.0), (False, 1.0)])
+def test_covariance_is_the_scatter_of_the_poses(rig: bool, map_noise_px: float) -> None:
+    """Of world_from_rig @ Exp(d), d = rotation, then translation, in the rig's frame: by 200 noisy queries and maps.
+
+    The camera has so many pixels that 1 px of noise stays far below the limit of an inlier.
+    """
+    rng = np.random.default_rng(0)
+    world = World.build(rng.uniform([-4, -2.5, 3.5], [4, 2.5, 8], (400, 3)), MAP_POSES)
+    camera = pycolmap.Camera(model="PINHOLE", width=1920, height=1440, params=[1500, 1500, 960, 720])
+    cameras = [camera] * 2 if rig else [camera]
+    poses = RIG_FROM_CAMS[:2] if rig else np.eye(4)[None]
+    # A rig's frame far from its cameras and turned: its errors of rotation and place are bound together.
+    rig_from_body = geometry.make_pose(Rotation.from_euler("Y", 90, degrees=True).as_matrix(), [0.5, 0, 0])
+    poses = rig_from_body @ poses
+    true = QUERY @ geometry.invert(rig_from_body)
+    exact = [world.look(c, true @ p, noise_px=0, limit=150) for c, p in zip(cameras, poses, strict=True)]
+    sure = replace(world.local_map, noise_px=np.full(400, map_noise_px, np.float32))
+    spread_of_points = np.linalg.cholesky(sure.point_covariances(np.arange(400)) + 1e-18 * np.eye(3))
+    motions, predicted = [], []
+    for _ in range(200):
+        moved = world.points + np.einsum("pij,pj->pi", spread_of_points, rng.normal(size=(400, 3)))
+        localizer = PnpLocalizer(replace(sure, points=moved), world.features)
+        noisy = [
+            replace(f, keypoints=(f.keypoints + rng.normal(size=f.keypoints.shape)).astype(np.float32)) for f in exact
+        ]
+        estimate = localizer.localize(cameras, poses, noisy, [REFERENCES] * len(cameras))
+        assert estimate.status == "ok"
+        motion = geometry.invert(true) @ estimate.world_from_rig
+        motions.append([*Rotation.from_matrix(motion[:3, :3]).as_rotvec(), *motion[:3, 3]])
+        predicted.append(estimate.covariance)
+    scatter, covariance = np.cov(np.array(motions).T), np.mean(predicted, axis=0)
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), np.sqrt(np.diag(scatter)), rtol=0.25)
+    # Not only the sizes: in the coordinates in which the predicted covariance is round, so is the scatter.
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+    spread = np.sqrt(np.linalg.eigvalsh(whiten @ scatter @ whiten.T))
+    assert 0.6 < spread.min() < spread.max() < 1.5
+    # And the summary that people read.
+    assert estimate.position_std_m == pytest.approx(np.sqrt(np.trace(estimate.covariance[3:, 3:])))
+    assert estimate.rotation_std_deg == pytest.approx(np.degrees(np.sqrt(np.trace(estimate.covariance[:3, :3]))))
+
+
+def test_guided_matches_alone_make_no_pose_more_certain(room: World) -> None:
+    """They follow the pose that they were sought about: only what was found without it counts."""
+    seen = room.look(PINHOLE, QUERY)
+    stds, guided = [], []
+    for known_to_descriptors in (1536, 100):
+        localizer = room.localizer(max_query_features=known_to_descriptors)
+        found = localizer.localize([PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
+        stds.append(found.position_std_m)
+        guided.append(found.num_guided)
+    assert guided[1] > 0.9 * guided[0] > 150
+    assert stds[1] > 1.25 * stds[0]
+
+
+def test_a_point_that_is_not_known_well_tells_less(room: World) -> None:
+    """But never less than a match within the limit of an inlier does."""
+    seen = room.look(PINHOLE, QUERY)
+
+    def std(noise_px: float) -> float:
+        local_map = replace(room.local_map, noise_px=np.full(len(room.points), noise_px, np.float32))
+        localizer = PnpLocalizer(local_map, room.features)
+        return localizer.localize([PINHOLE], np.eye(4)[None], [seen], [REFERENCES]).position_std_m
+
+    exact, noisy, hopeless, worse = std(0), std(2), std(1e3), std(1e6)
+    assert 1.2 * exact < noisy < hopeless
+    assert worse == pytest.approx(hopeless, rel=1e-3)
+
+
+def test_what_is_known_of_unknowns_beside_the_matches_counts() -> None:
+    """Of two unknowns that move projections alike, one is known within 0.1: the other then has that and the noise."""
+    rng = np.random.default_rng(0)
+    of_one = rng.normal(size=(400, 2, 1))
+    of_unknowns = np.concatenate([of_one, of_one], axis=2)
+    errors, nothing = np.full(400, np.sqrt(2.0)), np.zeros((400, 2, 2))
+    assert least_squares_covariance(of_unknowns, errors, nothing) is None
+    covariance = least_squares_covariance(of_unknowns, errors, nothing, np.diag([0.0, 100.0]))
+    alone = least_squares_covariance(of_one, errors, nothing)
+    np.testing.assert_allclose(covariance[0, 0], alone[0, 0] + 0.01, rtol=1e-6)
+    # Points without a covariance tell nothing.
+    nothing[:200] = np.nan
+    half = least_squares_covariance(of_one, errors, nothing)
+    assert 1.7 < half[0, 0] / alone[0, 0] < 2.4
+
+
+def test_more_noise_is_more_uncertainty(room: World) -> None:
+    stds = []
+    for noise in (0.2, 0.8):
+        seen = room.look(PINHOLE, QUERY, noise_px=noise)
+        stds.append(room.localizer().localize([PINHOLE], np.eye(4)[None], [seen], [REFERENCES]).position_std_m)
+    assert 2 < stds[1] / stds[0] < 6
+
+
+def test_the_same_answer_in_whatever_order_threads_come(room: World) -> None:
+    poses = [facing(x, 0.1, 0.3, yaw_deg=-5 * x) for x in np.linspace(-1.5, 1.5, 6)]
+    queries = [room.look(PINHOLE, pose, outliers=0.5) for pose in poses]
+
+    def answer(localizer: PnpLocalizer, index: int) -> tuple:
+        estimate = localizer.localize([PINHOLE], np.eye(4)[None], [queries[index]], [REFERENCES])
+        return estimate.status, estimate.world_from_rig.tobytes(), estimate.covariance.tobytes(), estimate.num_guided
+
+    alone = [answer(room.localizer(), index) for index in range(6)]
+    for order in ([5, 0, 3, 1, 4, 2], [0, 1, 2, 3, 4, 5]):
+        with ThreadPoolExecutor(3) as pool:
+            answers = dict(zip(order, pool.map(partial(answer, room.localizer()), order), strict=True))
+        assert [answers[index] for index in range(6)] == alone
+
+
+def test_localizing_leaves_the_map_as_it_is(room: World) -> None:
+    before = {name: getattr(room.local_map, name).tobytes() for name in ("points", "world_from_cams", "obs_point")}
+    room.localizer().localize([PINHOLE], np.eye(4)[None], [room.look(PINHOLE, QUERY)], [REFERENCES])
+    assert all(getattr(room.local_map, name).tobytes() == content for name, content in before.items())
+
+
+# ------------------------------------------------------------------------------------- several kinds of features
+
+
+def other_kind(world: World, seed: int) -> World:
+    """The same room seen by another detector: other points, and float descriptors of another length."""
+    rng = np.random.default_rng(seed)
+    points = world.points + rng.normal(size=world.points.shape) * 0.05
+    other = World.build(points, world.local_map.world_from_cams)
+    mix = np.linalg.qr(rng.normal(size=(128, 128)))[0][:, :64]
+
+    def mixed(features: LocalFeatures) -> LocalFeatures:
+        units = features.descriptors.astype(np.float32) @ mix
+        units /= np.linalg.norm(units, axis=1, keepdims=True)
+        return replace(features, descriptors=units.astype(np.float16), scales=np.ones(len(features), np.float32))
+
+    other.features = {name: mixed(features) for name, features in other.features.items()}
+    look = other.look
+    other.look = lambda *args, **more: mixed(look(*args, **more))  # type: ignore[method-assign]
+    return other
+
+
+SINGLE_SCALE = replace(KINDS["sift"], scale_octaves=float("inf"))
+
+
+def test_several_kinds_of_features_give_one_pose_with_the_matches_of_all(room: World) -> None:
+    other = other_kind(room, 5)
+    kinds = [MappedFeatures(room.local_map, room.features),
+             MappedFeatures(other.local_map, other.features, SINGLE_SCALE)]  # fmt: skip
+    seen = [room.look(PINHOLE, QUERY, limit=60), other.look(PINHOLE, QUERY, limit=60)]
+    alone = [
+        PnpLocalizer.of([kind]).localize([PINHOLE], np.eye(4)[None], [one], [REFERENCES])
+        for kind, one in zip(kinds, seen, strict=True)
+    ]
+    both = PnpLocalizer.of(kinds)
+    estimate = both.localize([PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
+    check(estimate, QUERY)
+    assert estimate.num_matches == sum(one.num_matches for one in alone)
+    assert estimate.num_inliers >= max(one.num_inliers for one in alone)
+    # Of each kind, points of its own: the second kind's follow the first's.
+    of_other = estimate.point_index >= len(room.local_map.points)
+    assert 0 < of_other.sum() < len(of_other)
+    projected = PINHOLE.img_from_cam(geometry.transform(geometry.invert(QUERY), both.map.points[estimate.point_index]))
+    assert np.linalg.norm(projected - estimate.pixels, axis=1).max() < 6
+    rig = both.localize(RIG_CAMERAS, RIG_FROM_CAMS, [
+        [world.look(camera, QUERY @ pose) for world in (room, other)]
+        for camera, pose in zip(RIG_CAMERAS, RIG_FROM_CAMS, strict=True)
+    ], [REFERENCES] * 3)  # fmt: skip
+    check(rig, QUERY)
+
+
+def test_one_kind_that_sees_nothing_leaves_the_answer_of_the_other(room: World) -> None:
+    other = other_kind(room, 5)
+    kinds = [MappedFeatures(room.local_map, room.features),
+             MappedFeatures(other.local_map, other.features, SINGLE_SCALE)]  # fmt: skip
+    seen = room.look(PINHOLE, QUERY)
+    nothing = other.look(PINHOLE, QUERY, limit=0)
+    expected = room.localizer().localize([PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
+    estimate = PnpLocalizer.of(kinds).localize([PINHOLE], np.eye(4)[None], [[seen, nothing]], [REFERENCES])
+    np.testing.assert_array_equal(estimate.world_from_rig, expected.world_from_rig)
+    assert estimate.num_inliers == expected.num_inliers
+
+
+class Learned:
+    """A matcher as a network is one: it wants all features of both images, and to be asked by one thread at a time."""
+
+    batch_size = 4
+    settings = {"name": "learned"}  # noqa: RUF012
+
+    def __init__(self) -> None:
+        self.sizes: list[tuple[int, int]] = []
+
+    def match(self, pairs):  # type: ignore[no-untyped-def]
+        self.sizes += [(len(a), len(b)) for a, b in pairs]
+        return MutualMatcher(0.85).match(pairs)
+
+
+def test_a_network_sees_all_features_and_is_not_asked_what_is_known(room: World) -> None:
+    network = Learned()
+    localizer = PnpLocalizer.of([MappedFeatures(room.local_map, room.features, matcher=network)])  # type: ignore[arg-type]
+    seen = room.look(PINHOLE, QUERY)
+    asked = ([PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
+    estimate = localizer.localize(*asked)
+    check(estimate, QUERY)
+    sizes = [len(room.features[room.local_map.image_names[index]]) for index in REFERENCES]
+    assert network.sizes == [(len(seen), size) for size in sizes]
+    network.sizes.clear()
+    names = []
+
+    def known(name: str) -> PairMatches:
+        names.append(name)
+        return MutualMatcher(0.85).match([(seen, room.features[name])])[0]
+
+    again = localizer.localize(*asked, known=[[known]])
+    assert network.sizes == []
+    assert names == [room.local_map.image_names[index] for index in REFERENCES]
+    np.testing.assert_array_equal(again.world_from_rig, estimate.world_from_rig)

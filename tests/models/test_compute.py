@@ -1,0 +1,98 @@
+"""Devices, precisions, and batches that do not fit."""
+
+import logging
+
+import pytest
+import torch
+
+from toolkit.errors import ManifestError, ToolkitError
+from toolkit.models.compute import Fitting, resolve_device, resolve_precision
+
+
+@pytest.mark.parametrize("name", ["gpu", "cuda:", "cuda:x", "cuda0", "", "CPU", "xpu"])
+def test_unknown_devices(name: str) -> None:
+    with pytest.raises(ManifestError, match="expected auto, cpu, cuda"):
+        resolve_device(name)
+
+
+def test_devices_that_are_not_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+    assert resolve_device("auto").type == "cpu"
+    with pytest.raises(ToolkitError, match="sees no GPU"):
+        resolve_device("cuda")
+    with pytest.raises(ToolkitError, match="no Apple GPU"):
+        resolve_device("mps")
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    assert resolve_device("auto").type == "cuda"
+    assert resolve_device("cuda:1").index == 1
+    with pytest.raises(ToolkitError, match=r"cuda:2.*sees 2 GPUs, cuda:0 to cuda:1"):
+        resolve_device("cuda:2")
+
+
+def test_precisions(monkeypatch: pytest.MonkeyPatch) -> None:
+    cpu, gpu = torch.device("cpu"), torch.device("cuda")
+    assert resolve_precision("float16", cpu) == torch.float16
+    monkeypatch.setattr("toolkit.models.compute.cpu_multiplies_bfloat16", lambda: True)
+    assert resolve_precision("auto", cpu) == torch.bfloat16
+    monkeypatch.setattr("toolkit.models.compute.cpu_multiplies_bfloat16", lambda: False)
+    assert resolve_precision("auto", cpu) == torch.float32
+    assert resolve_precision("auto", torch.device("mps")) == torch.float32
+    for capability, expected in {(7, 5): torch.float16, (8, 0): torch.bfloat16, (9, 0): torch.bfloat16}.items():
+        monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _, value=capability: value)
+        assert resolve_precision("auto", gpu) == expected
+    with pytest.raises(ManifestError, match=r"'half'.*float32, bfloat16"):
+        resolve_precision("half", cpu)
+
+
+class Memory:
+    """A network that holds `most` rows."""
+
+    def __init__(self, most: int, message: str = "CUDA out of memory. Tried to allocate 2 GiB") -> None:
+        self.most, self.message = most, message
+        self.tried: list[int] = []
+
+    def __call__(self, batch: torch.Tensor) -> torch.Tensor:
+        self.tried.append(len(batch))
+        if len(batch) > self.most:
+            raise torch.OutOfMemoryError(self.message)
+        return batch * 2
+
+
+def test_a_batch_that_does_not_fit_is_halved(caplog: pytest.LogCaptureFixture) -> None:
+    memory = Memory(3)
+    fitting = Fitting(memory, "images")
+    batch = torch.arange(10)
+    with caplog.at_level(logging.WARNING):
+        torch.testing.assert_close(fitting(batch), batch * 2)
+    assert memory.tried == [10, 5, 2, 2, 2, 2, 2]
+    assert "10 images do not fit the memory of cpu, going on with 5" in caplog.text
+    torch.testing.assert_close(fitting(batch), batch * 2)
+    assert memory.tried[7:] == [2, 2, 2, 2, 2], "what fits is remembered"
+
+
+def test_not_even_one_row_fits() -> None:
+    with pytest.raises(ToolkitError, match=r"does not hold.*one of the images.*Tried to allocate.*image_size"):
+        Fitting(Memory(0), "images")(torch.arange(3))
+
+
+@pytest.mark.parametrize("message", ["DefaultCPUAllocator: can't allocate memory", "MPS backend out of memory"])
+def test_other_devices_say_it_in_words(message: str) -> None:
+    tried: list[int] = []
+
+    def run(batch: torch.Tensor) -> torch.Tensor:
+        tried.append(len(batch))
+        if len(batch) > 2:
+            raise RuntimeError(message)
+        return batch
+
+    assert len(Fitting(run, "images")(torch.arange(4))) == 4
+    assert tried == [4, 2, 2]
+
+
+def test_other_errors_are_not_taken_for_it() -> None:
+    def run(_: torch.Tensor) -> torch.Tensor:
+        raise RuntimeError("shapes do not fit")
+
+    with pytest.raises(RuntimeError, match="shapes do not fit"):
+        Fitting(run, "images")(torch.arange(4))

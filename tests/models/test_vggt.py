@@ -1,0 +1,536 @@
+"""VGGT: what a small network of its kind must do, the official loader, and the official numbers where they are."""
+
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from toolkit.errors import ImageError, WeightsError
+from toolkit.models.vggt import (
+    HEADS,
+    VGGT,
+    cameras_from_pose_encoding,
+    load_images,
+    pose_encoding_from_cameras,
+    unproject_depth,
+)
+from toolkit.models.vggt.aggregator import SPECIAL, rope_of_view
+from toolkit.models.vggt.heads import add_position, dense_output
+from toolkit.models.vit import rotate_
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+H, W = 42, 56
+KEYS = {
+    "camera": {"pose_enc", "pose_enc_list"},
+    "depth": {"depth", "depth_conf"},
+    "point": {"world_points", "world_points_conf"},
+}
+
+
+def tiny(heads: tuple[str, ...] = HEADS, compute_dtype: torch.dtype = torch.float32) -> VGGT:
+    """A network of VGGT's structure, small, with the same random weights for the parts it has in common."""
+    model = VGGT(
+        heads,
+        compute_dtype,
+        dim=32,
+        depth=5,
+        num_heads=2,
+        encoder_depth=2,
+        encoder_num_heads=4,
+        grid=5,
+        camera_depth=2,
+        camera_num_heads=4,
+        dense_layers=(0, 1, 3, 4),
+        dense_channels=(8, 12, 16, 20),
+        dense_features=16,
+    )
+    for name, parameter in model.named_parameters():
+        seed = int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "little")
+        noise = torch.randn(parameter.shape, generator=torch.Generator().manual_seed(seed))
+        fan_in = parameter[0].numel() if parameter.ndim > 1 else 1
+        centre = 0.7 if parameter.ndim == 1 and name.endswith(("weight", "gamma")) else 0.0
+        with torch.no_grad():
+            parameter.copy_(centre + noise * (0.2 if parameter.ndim == 1 else fan_in**-0.5))
+    return model.requires_grad_(False).eval()
+
+
+@pytest.fixture(scope="module")
+def model() -> VGGT:
+    return tiny()
+
+
+@pytest.fixture(scope="module")
+def images() -> torch.Tensor:
+    """Three views of each of two scenes."""
+    return torch.rand(2, 3, 3, H, W, generator=torch.Generator().manual_seed(0))
+
+
+def assert_equal(found: dict[str, Any], expected: dict[str, Any], atol: float = 2e-5) -> None:
+    assert found.keys() == expected.keys()
+    for name in found:
+        for one, other in zip(_list(found[name]), _list(expected[name]), strict=True):
+            torch.testing.assert_close(one, other, atol=atol, rtol=1e-4, msg=lambda text, name=name: f"{name}: {text}")
+
+
+def _list(value: Any) -> list[torch.Tensor]:
+    return value if isinstance(value, list) else [value]
+
+
+# The network
+
+
+def test_outputs_have_the_official_names_and_shapes(model: VGGT, images: torch.Tensor) -> None:
+    output = model(images)
+    assert output.keys() == set.union(*KEYS.values())
+    assert output["pose_enc"].shape == (2, 3, 9)
+    assert len(output["pose_enc_list"]) == 4
+    assert output["depth"].shape == (2, 3, H, W, 1)
+    assert output["world_points"].shape == (2, 3, H, W, 3)
+    assert output["depth_conf"].shape == output["world_points_conf"].shape == (2, 3, H, W)
+    assert (output["depth"] > 0).all()
+    assert (output["depth_conf"] > 1).all()
+    assert torch.equal(output["pose_enc"], output["pose_enc_list"][-1])
+    assert all(not value.requires_grad for values in output.values() for value in _list(values))
+
+
+def test_scenes_of_a_batch_do_not_see_each_other(model: VGGT, images: torch.Tensor) -> None:
+    together = model(images)
+    for scene in range(2):
+        alone = model(images[scene])
+        part = {name: [v[scene : scene + 1] for v in _list(value)] for name, value in together.items()}
+        assert_equal({name: _list(value) for name, value in alone.items()}, part)
+
+
+def test_only_the_first_view_is_special(model: VGGT, images: torch.Tensor) -> None:
+    output, swapped, first = (model(images[:, order]) for order in ([0, 1, 2], [0, 2, 1], [1, 0, 2]))
+    for name in ("pose_enc", "depth", "world_points"):
+        torch.testing.assert_close(swapped[name][:, [0, 2, 1]], output[name], atol=2e-5, rtol=1e-4)
+        assert not torch.allclose(first[name][:, [1, 0, 2]], output[name], atol=1e-3)
+
+
+def test_views_see_each_other(model: VGGT, images: torch.Tensor) -> None:
+    assert not torch.allclose(model(images[:, :2])["pose_enc"], model(images)["pose_enc"][:, :2], atol=1e-3)
+
+
+@pytest.mark.parametrize("heads", [("camera",), ("depth",), ("point",), ("camera", "depth"), ("depth", "point")])
+def test_heads_asked_for_are_as_with_all(model: VGGT, images: torch.Tensor, heads: tuple[str, ...]) -> None:
+    everything = model(images)
+    expected = {name: everything[name] for head in heads for name in KEYS[head]}
+    assert_equal(model(images, heads=heads), expected)
+    assert_equal(tiny(heads)(images), expected)
+
+
+def test_camera_head_alone_computes_only_camera_tokens_last(model: VGGT, images: torch.Tensor) -> None:
+    patches = model.encode(images[0])[None]
+    every = model.aggregator(patches, 3, 4, {2, 4})
+    only = model.aggregator(patches, 3, 4, {4}, cameras_only=True)
+    assert only.keys() == {4}
+    for part, whole in zip(only[4], every[4], strict=True):
+        assert part.shape == (1, 3, 1, 32)
+        torch.testing.assert_close(part, whole[:, :, :1], atol=1e-5, rtol=1e-4)
+    assert every[2][0].shape == (1, 3, SPECIAL + 12, 32)
+
+
+def test_patch_tokens_may_come_from_a_cache(model: VGGT, images: torch.Tensor) -> None:
+    cached = torch.stack([model.encode(images[:, view]) for view in range(3)], dim=1)
+    assert cached.shape == (2, 3, 12, 32)
+    assert_equal(model(torch.empty(images.shape, device="meta"), patch_tokens=cached), model(images))
+    assert_equal(model(images[1], patch_tokens=cached[1]), model(images[1]))
+
+
+def test_dense_heads_in_any_portions(model: VGGT, images: torch.Tensor) -> None:
+    layers = model.aggregator(model.encode(images.flatten(0, 1)).unflatten(0, (2, 3)), 3, 4, model.dense_layers)
+    values, confidence = dense_output(model.point_head, layers, model.dense_layers, (H, W), 1)
+    for frames in (4, 6, 100):
+        again = dense_output(model.point_head, layers, model.dense_layers, (H, W), frames)
+        torch.testing.assert_close(again, (values, confidence), atol=1e-5, rtol=1e-4)
+
+
+def test_bfloat16_stays_in_the_trunk(model: VGGT, images: torch.Tensor) -> None:
+    half = tiny(compute_dtype=torch.bfloat16)
+    types = {name: parameter.dtype for name, parameter in half.named_parameters()}
+    matrices = {n for n in types if n.endswith(("qkv.weight", "fc1.weight", "fc2.bias")) and n.startswith("aggregator")}
+    assert {types[name] for name in matrices} == {torch.bfloat16}
+    assert all(t == torch.float32 for n, t in types.items() if not n.startswith("aggregator") or "norm" in n)
+    assert half.encode(images[0]).dtype == torch.float32
+    expected = model(images)
+    output = half(images)
+    for name, value in output.items():
+        for one, other in zip(_list(value), _list(expected[name]), strict=True):
+            assert one.dtype == torch.float32
+            error = (one - other).square().mean().sqrt() / other.square().mean().sqrt()
+            assert 1e-5 < error < 0.03, name
+
+
+def test_position_embedding_at_its_own_size_is_as_stored(model: VGGT) -> None:
+    encoder = model.aggregator.patch_embed
+    torch.testing.assert_close(encoder._position(5, 5), encoder.pos_embed[:, 1:])
+    # Resizing keeps the mean of a smooth embedding, and its order: rows first.
+    ramp = torch.arange(5.0).repeat_interleave(5)[None, :, None].expand(1, 25, 32)
+    kept = encoder.pos_embed.clone()
+    encoder.pos_embed[:, 1:] = ramp
+    resized = encoder._position(3, 4).unflatten(1, (3, 4))
+    encoder.pos_embed.copy_(kept)
+    assert (resized.diff(dim=1) > 0.5).all()
+    torch.testing.assert_close(resized[:, :, 0], resized[:, :, 3], atol=1e-4, rtol=0)
+
+
+def test_fields_of_view_are_not_negative_but_go_on_raw(images: torch.Tensor) -> None:
+    model = tiny(("camera",))
+    bias = model.camera_head.pose_branch.fc2.bias
+    bias[7:] = -20.0
+    output = model(images)["pose_enc_list"]
+    assert all((encoding[..., 7:] == 0).all() for encoding in output)
+    bias[7:] = -30.0
+    again = model(images)["pose_enc_list"]
+    assert torch.equal(again[0], output[0])
+    # The next step reads the raw field of view, and so notices.
+    assert not torch.allclose(again[1][..., :7], output[1][..., :7], atol=1e-3)
+
+
+def test_activations_of_dense_heads(images: torch.Tensor) -> None:
+    model = tiny(("depth", "point"))
+    for head, bias in ((model.depth_head, [1.0, 2.0]), (model.point_head, [-2.0, 2.0, 0.5, -1.0])):
+        head.scratch.output_conv2[2].weight.zero_()
+        head.scratch.output_conv2[2].bias.copy_(torch.tensor(bias))
+    output = {name: value[1, 2, 7, 9].double().numpy() for name, value in model(images).items()}
+    np.testing.assert_allclose(output["depth"], [np.e], rtol=1e-6)
+    np.testing.assert_allclose(output["depth_conf"], 1 + np.e**2, rtol=1e-6)
+    np.testing.assert_allclose(output["world_points"], [1 - np.e**2, np.e**2 - 1, np.e**0.5 - 1], rtol=1e-6)
+    np.testing.assert_allclose(output["world_points_conf"], 1 + 1 / np.e, rtol=1e-6)
+
+
+def test_tokens_keep_their_places_among_views(model: VGGT) -> None:
+    trunk = model.aggregator
+    patches = torch.randn(1, 2, 12, 32, generator=torch.Generator().manual_seed(0))
+    within, among = trunk(patches, 3, 4, {0})[0]
+    cosine, sine = rope_of_view(3, 4, 16, torch.device("cpu"))
+    expected = trunk.global_blocks[0](within.flatten(1, 2), (torch.cat([cosine] * 2), torch.cat([sine] * 2)))
+    torch.testing.assert_close(among.flatten(1, 2), expected)
+    assert not torch.allclose(trunk.global_blocks[0](within.flatten(1, 2)), expected, atol=1e-3)
+
+
+def test_rope_turns_by_place() -> None:
+    cosine, sine = rope_of_view(3, 4, 16, torch.device("cpu"))
+    assert cosine.shape == sine.shape == (SPECIAL + 12, 16)
+    x = torch.randn(2, 3, SPECIAL + 12, 16, generator=torch.Generator().manual_seed(0))
+    turned = rotate_(x.clone(), (cosine, sine))
+    assert torch.equal(turned[:, :, :SPECIAL], x[:, :, :SPECIAL])
+    # Row 2, column 1 is at place (3, 2). Channels 0 to 7 are of y: i and i + 4 a pair, by place * 100 ** (-i / 4).
+    token = SPECIAL + 2 * 4 + 1
+    for place, start in ((3, 0), (2, 8)):
+        quarter = 100.0 ** -(np.arange(4) / 4)
+        pair = x[0, 1, token, start : start + 8].double().numpy().reshape(2, 4)
+        expected = (pair[0] + 1j * pair[1]) * np.exp(1j * place * quarter)
+        found = turned[0, 1, token, start : start + 8].numpy()
+        np.testing.assert_allclose(found, np.concatenate([expected.real, expected.imag]), atol=1e-5)
+
+
+def test_position_of_pixels_in_dense_heads() -> None:
+    maps = add_position(torch.zeros(1, 8, 3, 5), aspect=2.0)
+    centre = torch.tensor([0, 0, 1, 1, 0, 0, 1, 1]) * 0.1
+    torch.testing.assert_close(maps[0, :, 1, 2], centre)
+    # Half the width of the plane is 2 / sqrt(5); the last pixel's centre is 1 / 10 of the width from its edge.
+    x, y = 2 / 5**0.5 * 4 / 5, 1 / 5**0.5 * 2 / 3
+    expected = np.concatenate([f([a, a / 10]) for a in (x, y) for f in (np.sin, np.cos)])
+    np.testing.assert_allclose(maps[0, :, 2, 4].numpy(), 0.1 * expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(3, H, W), (1, 3, 3, H, W + 1), (2, 4, H, W), (0, 3, H, W), (1, 0, 3, H, W)])
+def test_images_of_another_shape_are_refused(model: VGGT, shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"expected .*"):
+        model(torch.zeros(shape))
+
+
+def test_other_wrong_input_is_refused(model: VGGT, images: torch.Tensor) -> None:
+    with pytest.raises(ValueError, match=r"patch_tokens have shape .*expected \(2, 3, 12, 32\)"):
+        model(images, patch_tokens=torch.zeros(2, 3, 11, 32))
+    with pytest.raises(ValueError, match="expected some of"):
+        tiny(("camera",))(images, heads=("depth",))
+    for heads in (("track",), (), "camera"):
+        with pytest.raises(ValueError, match="expected some of"):
+            VGGT(heads)
+    with pytest.raises(ValueError, match=r"expected \(N, 3, H, W\)"):
+        model.encode(images)
+
+
+# Loading
+
+
+def test_keys_of_heads_that_are_not_held_are_passed_over() -> None:
+    whole = tiny().state_dict()
+    whole["track_head.tracker.anything"] = torch.zeros(3)
+    model = tiny(("depth",))
+    assert not any(key.startswith(("camera_head", "point_head")) for key in model.state_dict())
+    model.load_state_dict(whole, strict=True)
+    assert torch.equal(model.depth_head.norm.weight, whole["depth_head.norm.weight"])
+    tiny().load_state_dict(whole, strict=True)
+
+
+def test_strict_loading_refuses_the_rest() -> None:
+    model = tiny(("camera",))
+    state = tiny().state_dict()
+    with pytest.raises(RuntimeError, match=r"Missing key.*camera_head\.token_norm\.weight"):
+        model.load_state_dict({k: v for k, v in state.items() if k != "camera_head.token_norm.weight"})
+    with pytest.raises(RuntimeError, match=r"Unexpected key.*aggregator\.extra"):
+        model.load_state_dict({**state, "aggregator.extra": torch.zeros(1)})
+    with pytest.raises(RuntimeError, match=r"size mismatch for aggregator\.camera_token"):
+        model.load_state_dict({**state, "aggregator.camera_token": torch.zeros(1, 2, 1, 31)})
+
+
+def test_checkpoint_of_another_network_is_refused() -> None:
+    with pytest.raises(WeightsError, match=r"camera_token found \(1, 2, 1, 32\), expected \(1, 2, 1, 1024\)"):
+        VGGT.from_checkpoint(tiny().state_dict())
+
+
+def test_checkpoint_fills_a_whole_network(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """From a file, in both types, with the keys of the track head in it."""
+    state = {**tiny().state_dict(), "track_head.x": torch.zeros(1)}
+    torch.save(state, tmp_path / "model.pt")
+    images = torch.rand(2, 3, H, W, generator=torch.Generator().manual_seed(1))
+    constructor = VGGT.__init__
+    sizes = {"dim": 32, "depth": 5, "num_heads": 2, "encoder_depth": 2, "encoder_num_heads": 4, "grid": 5}
+    sizes |= {"camera_depth": 2, "camera_num_heads": 4, "dense_layers": (0, 1, 3, 4), "dense_features": 16}
+    sizes |= {"dense_channels": (8, 12, 16, 20)}
+    monkeypatch.setattr(VGGT, "__init__", lambda self, heads, dtype: constructor(self, heads, dtype, **sizes))
+    model = VGGT.from_checkpoint(tmp_path / "model.pt")
+    assert not model.training
+    assert not any(value.is_meta for value in [*model.parameters(), *model.buffers()])
+    half = VGGT.from_checkpoint(state, heads=("camera",), compute_dtype=torch.bfloat16)
+    monkeypatch.undo()
+    assert_equal(model(images), tiny()(images))
+    assert_equal(half(images), tiny(("camera",), torch.bfloat16)(images))
+
+
+# Cameras
+
+
+def random_cameras(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """cam_from_world (count, 3, 4) and K (count, 3, 3) of 560 x 420 images."""
+    rng = np.random.default_rng(0)
+    q, _ = np.linalg.qr(rng.normal(size=(count, 3, 3)))
+    rotation = q * np.linalg.det(q)[:, None, None]
+    K = np.zeros((count, 3, 3))
+    K[:, 0, 0], K[:, 1, 1] = rng.uniform(200, 900, (2, count))
+    K[:, :2, 2], K[:, 2, 2] = (280, 210), 1
+    return np.concatenate([rotation, rng.normal(size=(count, 3, 1))], axis=2), K
+
+
+def test_pose_encoding_round_trip() -> None:
+    cam_from_world, K = random_cameras(50)
+    encoding = pose_encoding_from_cameras(cam_from_world, K, (420, 560))
+    assert encoding.shape == (50, 9)
+    assert (encoding[:, 6] >= 0).all()
+    pose, intrinsics = cameras_from_pose_encoding(encoding, (420, 560))
+    np.testing.assert_allclose(pose, cam_from_world, atol=1e-12)
+    np.testing.assert_allclose(intrinsics, K, rtol=1e-12)
+    # The quaternion's length and sign say nothing.
+    encoding[:, 3:7] *= -3.0
+    pose, _ = cameras_from_pose_encoding(torch.from_numpy(encoding).view(5, 10, 9), (420, 560))
+    np.testing.assert_allclose(pose.reshape(50, 3, 4), cam_from_world, atol=1e-12)
+
+
+def test_pose_encoding_known_answers() -> None:
+    half = np.sqrt(0.5)
+    # A quarter turn around z takes x to y; 90 degrees high, 53.13 wide.
+    pose, K = cameras_from_pose_encoding([1, 2, 3, 0, 0, half, half, np.pi / 2, 2 * np.arctan(0.5)], (100, 200))
+    np.testing.assert_allclose(pose, [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]], atol=1e-15)
+    np.testing.assert_allclose(K, [[200, 0, 100], [0, 50, 50], [0, 0, 1]], atol=1e-12)
+    _, K = cameras_from_pose_encoding([0, 0, 0, 0, 0, 0, 1, 0, 0], (100, 200))
+    assert np.isinf(K[[0, 1], [0, 1]]).all()
+    with pytest.raises(ValueError, match=r"expected \(\.\.\., 9\)"):
+        cameras_from_pose_encoding(np.zeros((2, 8)), (100, 200))
+    with pytest.raises(ValueError, match="zero or not finite"):
+        cameras_from_pose_encoding(np.zeros(9), (100, 200))
+
+
+def test_unprojected_points_project_back() -> None:
+    cam_from_world, K = random_cameras(3)
+    depth = np.random.default_rng(1).uniform(1, 5, (3, 6, 8, 1))
+    world = unproject_depth(torch.from_numpy(depth), cam_from_world, K)
+    assert world.shape == (3, 6, 8, 3)
+    for pose, k, z, points in zip(cam_from_world, K, depth, world, strict=True):
+        projected = (points @ pose[:, :3].T + pose[:, 3]) @ k.T
+        np.testing.assert_allclose(projected[..., 2], z[..., 0])
+        pixels = projected[..., :2] / projected[..., 2:]
+        np.testing.assert_allclose(pixels[4, 7], [7, 4], atol=1e-9)
+        np.testing.assert_allclose(pixels[0, 0], [0, 0], atol=1e-9)
+
+
+# Images
+
+
+def picture(width: int, height: int, spot: tuple[float, float]) -> np.ndarray:
+    """Black, with a red spot around a point."""
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    pixels = np.zeros((height, width, 3), np.uint8)
+    pixels[..., 0] = 255 * np.exp(-((x - spot[0]) ** 2 + (y - spot[1]) ** 2) / (2 * 8**2))
+    return pixels
+
+
+def find_spot(image: torch.Tensor) -> np.ndarray:
+    """Where the red spot is; white has as much green as red."""
+    weight = (image[0] - image[1]).double().clamp(min=0).numpy()
+    x, y = np.meshgrid(np.arange(weight.shape[1]) + 0.5, np.arange(weight.shape[0]) + 0.5)
+    return np.array([(x * weight).sum(), (y * weight).sum()]) / weight.sum()
+
+
+SIZES = [(640, 480), (300, 700), (1200, 400), (518, 518)]
+
+
+@pytest.mark.parametrize("mode", ["crop", "pad"])
+@pytest.mark.parametrize("together", [True, False])
+def test_a_marked_pixel_goes_where_the_map_says(mode: str, together: bool) -> None:
+    spots = [(0.4 * width, 0.55 * height) for width, height in SIZES]
+    pictures = [picture(*size, spot) for size, spot in zip(SIZES, spots, strict=True)]
+    for index in range(len(SIZES)):
+        views = load_images(pictures if together else pictures[index : index + 1], mode)
+        row = index if together else 0
+        assert views.images.dtype == torch.float32
+        assert all(side % 14 == 0 for side in views.images.shape[2:])
+        assert tuple(views.sizes[row]) == SIZES[index]
+        place = find_spot(views.images[row])
+        np.testing.assert_allclose(views.to_network(row, spots[index]), place, atol=0.1)
+        np.testing.assert_allclose(views.from_network(row, place), spots[index], atol=0.25)
+
+
+@pytest.mark.parametrize("mode", ["crop", "pad"])
+def test_intrinsics_follow_the_pixels(mode: str) -> None:
+    views = load_images([np.zeros((height, width, 3), np.uint8) for width, height in SIZES], mode)
+    K = np.array([[500.0, 0, 310], [0, 480, 255], [0, 0, 1]])
+    point = np.array([0.3, -0.2, 2.0])
+    for index, k in enumerate(views.intrinsics(K)):
+        x, y, z = K @ point
+        u, v, w = k @ point
+        np.testing.assert_allclose([u / w, v / w], views.to_network(index, [x / z, y / z]))
+    each = np.stack([K * [[1 + i], [1 + i], [1]] for i in range(len(SIZES))])
+    np.testing.assert_allclose(views.intrinsics(each)[2], views.intrinsics(each[2])[2])
+
+
+def test_depth_comes_back_to_the_pixels_it_belongs_to() -> None:
+    views = load_images([np.zeros((700, 300, 3), np.uint8), np.zeros((480, 640, 3), np.uint8)])
+    height, width = views.images.shape[2:]
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    depth = 3.0 + 0.01 * x + 0.02 * y  # linear: bilinear interpolation is exact
+    points = np.array([[150.0, 350.0], [20.5, 250.0], [299.0, 210.0]])
+    place = views.to_network(0, points)
+    np.testing.assert_allclose(views.sample(0, depth, points), 3.0 + place @ [0.01, 0.02])
+    # 700 rows became 1204, of which the middle 518 were kept: rows 199.4 to 500.6.
+    whole = views.to_image(0, depth)
+    assert whole.shape == (700, 300)
+    seen = np.flatnonzero(np.isfinite(whole).all(axis=1))
+    assert np.array_equal(np.flatnonzero(np.isfinite(whole).any(axis=1)), seen)
+    assert (seen[0], seen[-1]) == (199, 500)
+    assert np.isfinite(views.to_image(1, depth)).all()
+    with pytest.raises(ValueError, match="the map has shape"):
+        views.sample(0, depth[:-1], points)
+
+
+def test_all_kinds_of_sources_are_alike(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (60, 80, 4)).astype(np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    path = tmp_path / "a.png"
+    expected = load_images([path]).images
+    for source in (str(path), Image.open(path), pixels):
+        assert torch.equal(load_images([source]).images, expected)
+    grey = load_images([pixels[..., 0]]).images
+    assert torch.equal(grey[:, 0], grey[:, 2])
+
+
+def test_wrong_images_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "torn.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    with pytest.raises(ImageError, match=r"not found: .*none\.png"):
+        load_images([tmp_path / "none.png"])
+    with pytest.raises(ImageError, match=r"cannot be decoded: .*torn\.png"):
+        load_images([tmp_path / "torn.png"])
+    with pytest.raises(ImageError, match="1000 x 10 pixels is too elongated"):
+        load_images([np.zeros((10, 1000, 3), np.uint8)])
+    with pytest.raises(ImageError, match="too elongated"):
+        load_images([np.zeros((1000, 10, 3), np.uint8)], "pad")
+    with pytest.raises(ValueError, match="no images"):
+        load_images([])
+    with pytest.raises(ValueError, match="expected one of"):
+        load_images([np.zeros((10, 10, 3), np.uint8)], "stretch")
+
+
+# The official numbers
+
+
+@pytest.fixture(scope="module")
+def golden() -> Iterator[ModuleType]:
+    """The module that reads the fixtures: $GOLDEN, or beside the clone; skips where absent."""
+    folder = Path(os.environ.get("GOLDEN", REPOSITORY.parent / "shared" / "golden"))
+    if not (folder / "golden.py").is_file():
+        pytest.skip(f"needs the golden fixtures: no {folder / 'golden.py'}; set GOLDEN")
+    sys.path.insert(0, str(folder))
+    import golden
+
+    yield golden
+    sys.path.remove(str(folder))
+
+
+def test_keys_are_the_official_ones(golden: ModuleType) -> None:
+    with torch.device("meta"):
+        model = VGGT()
+    official = {k: shape for k, shape in golden.shapes("vggt").items() if not k.startswith("track_head.")}
+    assert {key: tuple(value.shape) for key, value in model.state_dict().items()} == official
+
+
+def test_images_are_as_of_the_official_loader(golden: ModuleType, tmp_path: Path) -> None:
+    image_u8 = golden.weights.image_u8
+    spec = golden.info("vggt")["loader"]
+    paths = []
+    for name, height, width in spec["images"]:
+        Image.fromarray(image_u8(name, height, width)).save(tmp_path / f"{name}.png")
+        paths.append(tmp_path / f"{name}.png")
+    alpha = image_u8("load-alpha-mask", 80, 110)[..., :1]
+    Image.fromarray(np.concatenate([image_u8("load-alpha", 80, 110), alpha], axis=2)).save(tmp_path / "alpha.png")
+    with np.load(golden.HERE / "vggt.golden.npz") as data:
+        for mode in ("crop", "pad"):
+            for which, sources in (("all", paths), ("first", paths[:1]), ("alpha", [tmp_path / "alpha.png"])):
+                images = load_images(sources, mode).images
+                assert list(images.shape) == spec[f"{mode}/{which}"]["shape"]
+                found = np.rint(255 * images.numpy()).astype(int)[:, :, 2::11, 1::13]
+                assert np.abs(found - data[f"loader/{mode}/{which}"]).max() <= 1  # Pillow versions differ by that
+                assert images.mean().item() == pytest.approx(spec[f"{mode}/{which}"]["mean"], abs=1e-3)
+
+
+@pytest.mark.slow
+def test_official_numbers(golden: ModuleType) -> None:
+    """All recorded outputs and slices, in float32. Takes 5 GB of memory."""
+    model = VGGT.from_checkpoint(golden.state("vggt"))
+    trunk, seen = model.aggregator, {}
+    trunk.patch_embed.register_forward_hook(lambda m, i, o: seen.update(patch_tokens=o[:, :6, ::16]))
+    trunk.frame_blocks[0].register_forward_hook(lambda m, i, o: seen.update(frame0=o[:, :8, ::16]))
+    trunk.global_blocks[0].register_forward_hook(lambda m, i, o: seen.update(global0=o[:, :8, ::16]))
+    trunk.register_forward_hook(lambda m, i, o: seen.update(layers=o))
+    wrong = []
+    for case, spec in golden.info("vggt")["cases"].items():
+        images = golden.case_images("vggt", spec)
+        output = model(images[None])
+        outputs = {name: torch.stack(value) if isinstance(value, list) else value for name, value in output.items()}
+        layers = seen.pop("layers")
+        kept_tokens = [torch.cat(layers[layer], dim=-1)[0, :, :8, ::32] for layer in model.dense_layers]
+        outputs |= {**seen, "tokens": torch.stack(kept_tokens)}
+        bias = model.camera_head.pose_branch.fc2.bias
+        kept = bias.clone()
+        bias[7:9] = -0.25
+        outputs["pose_enc_negative_fov"] = model(images[None], heads=("camera",))["pose_enc"]
+        bias.copy_(kept)
+        outputs = {name: value.numpy() for name, value in outputs.items()}
+        pose, K = cameras_from_pose_encoding(output["pose_enc"], images.shape[2:])
+        points = unproject_depth(output["depth"][0], pose[0], K[0])
+        outputs |= {"extrinsic": pose, "intrinsic": K, "unprojected": points}
+        recorded = json.loads((golden.HERE / "vggt.golden.json").read_text())["cases"][case]["outputs"]
+        assert recorded.keys() <= outputs.keys()
+        wrong += [line for line, ok in golden.compare("vggt", case, outputs) if not ok]
+    assert not wrong

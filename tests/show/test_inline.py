@@ -1,0 +1,53 @@
+import os
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from toolkit.errors import ArtefactError
+from toolkit.notebook import TEXT_BARS
+from toolkit.show.inline import ASSETS, show_recording
+from toolkit.show.recordings import open_recording
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    import rerun.blueprint as rrb
+
+    recording, still = tmp_path / "run" / "vis & more.rrd", tmp_path / "run" / "still.png"
+    recording.parent.mkdir()
+    with open_recording(recording, "name", rrb.Blueprint()):
+        pass
+    Image.new("RGB", (4, 3)).save(still)
+    (tmp_path / "notebooks").mkdir()
+    monkeypatch.chdir(tmp_path / "notebooks")
+    return recording, still
+
+
+def test_a_saved_page_has_the_picture_the_link_and_the_command(files, monkeypatch):
+    shown = []
+    monkeypatch.setattr("IPython.display.display", shown.append)
+    monkeypatch.setenv(TEXT_BARS, "1")
+    assert show_recording(*files) is None
+    picture, text = shown
+    assert picture.data == files[1].read_bytes()
+    page = text.data
+    assert 'href="../run/vis &amp; more.rrd"' in page
+    assert "<code>rerun " in page
+
+
+def test_the_viewer_is_served_by_this_process_and_gets_the_whole_file(files, monkeypatch):
+    monkeypatch.delenv(TEXT_BARS, raising=False)
+    monkeypatch.delenv(ASSETS, raising=False)
+    monkeypatch.setattr("IPython.display.display", lambda _: None)
+    viewer = show_recording(*files)
+    assert os.environ[ASSETS] == "serve-local"
+    assert str(viewer._esm).startswith("http://localhost:")
+    ((message, buffers),) = viewer._event_queue
+    assert message == {"type": "rrd"}
+    assert buffers == [files[0].read_bytes()]
+
+
+def test_no_recording_is_said(tmp_path):
+    with pytest.raises(ArtefactError, match=r"gone\.rrd: no such recording"):
+        show_recording(Path(tmp_path / "gone.rrd"))

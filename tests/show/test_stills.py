@@ -1,0 +1,151 @@
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from toolkit.capture.upright import up_of_cameras
+from toolkit.geometry import make_pose, project
+from toolkit.show.figures import error_colours
+from toolkit.show.localization_view import ShownImage
+from toolkit.show.stills import WorstQuery, draw_localization, draw_scene_png, draw_worst
+
+CAMERA = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=[50, 50, 32, 24])
+
+
+def looking(headings_deg, up_axis=2, roll_deg=0.0, pitch_deg=0.0, step=1.0):
+    """Return world_from_cam of cameras in a row; the axis of the world that is up can be chosen."""
+    poses = []
+    for k, heading in enumerate(np.radians(headings_deg)):
+        forward, up = np.array([np.cos(heading), np.sin(heading), 0]), np.array([0, 0, 1.0])
+        pitch, roll = np.radians(pitch_deg), np.radians(roll_deg)
+        z = np.cos(pitch) * forward + np.sin(pitch) * up
+        right = np.cross(forward, up)
+        down = np.cross(z, right)
+        x = np.cos(roll) * right + np.sin(roll) * down
+        rotation = np.roll(np.stack([x, np.cross(z, x), z], axis=1), up_axis + 1, axis=0)
+        poses.append(make_pose(rotation, np.roll([step * k, 0.1 * k, 0], up_axis + 1)))
+    return np.array(poses)
+
+
+@pytest.mark.parametrize("up_axis", [0, 1, 2])
+@pytest.mark.parametrize("roll_deg", [0, 90, -90])
+def test_up_is_found_in_level_pitched_and_rolled_cameras(up_axis, roll_deg):
+    headings = [20, 60, 100, 140, 170]
+    poses = np.concatenate(
+        [looking(headings, up_axis, pitch_deg=10), looking(headings, up_axis, roll_deg, pitch_deg=10)]
+    )
+    up = up_of_cameras(np.concatenate([poses, np.full((1, 4, 4), np.nan)]))
+    assert up @ np.eye(3)[up_axis] > np.cos(np.radians(1))
+
+
+def test_up_of_cameras_that_all_look_one_way_and_of_none():
+    assert up_of_cameras(looking([90] * 5))[2] > 0.99
+    assert up_of_cameras(np.zeros((0, 4, 4))).tolist() == [0, 0, 1]
+
+
+def test_projection_has_half_pixel_centres_and_leaves_out_what_is_behind():
+    pixels, visible = project(np.array([[0, 0, 2.0], [0.4, 0, 2], [0, 0, -1]]), CAMERA, np.eye(4))
+    np.testing.assert_allclose(pixels[:2], [[32, 24], [42, 24]])
+    assert visible.tolist() == [True, True, False]
+
+
+@pytest.fixture
+def scene():
+    rng = np.random.default_rng(0)
+    poses = np.concatenate([looking([80, 90, 100])] * 2)
+    poses[3:, 0, 3] += 100
+    estimated, true = poses[[0, 1, 4]].copy(), poses[[0, 1, 4]].copy()
+    estimated[0, 0, 3] += 0.5
+    estimated[1, 0, 3] += 500  # far outside
+    estimated[2] = np.nan
+    points = rng.normal([2, 5, 0], size=(200, 3))
+    colors = rng.integers(0, 255, (200, 3), np.uint8)
+    return points, colors, poses, estimated, true
+
+
+def test_scene_picture(scene, tmp_path):
+    figure = draw_scene_png(*scene, tmp_path / "scene.png", title="a <map>")
+    titles = [axis.get_title() for axis in figure.axes if axis.get_title()]
+    assert titles == [
+        "place 1: 2 of 2 queries have a pose, 1 estimated outside the picture",
+        "place 2: 0 of 1 queries have a pose",
+    ]
+    with Image.open(tmp_path / "scene.png") as image:
+        assert image.text["Description"] == "a <map>"
+        assert min(image.size) > 300
+
+
+def test_scene_picture_without_points_truth_or_queries(scene):
+    _, _, poses, estimated, _ = scene
+    assert draw_scene_png(np.zeros((0, 3)), None, poses, estimated, None, up=[0, 0, 1])
+    assert draw_scene_png(np.zeros((0, 3)), None, poses[:1], np.zeros((0, 4, 4)), None)
+
+
+def test_localization_pictures_of_success_and_failure(tmp_path):
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 255, (48, 64, 3), np.uint8)
+    points = rng.uniform([-1, -1, 3], [1, 1, 6], (20, 3))
+    keypoints, _ = project(points, CAMERA, np.eye(4))
+    inliers = np.arange(20) < 15
+    references = [(image, "reference 1"), (image[:, :30], "reference 2"), (image[..., 0], "reference 3")]
+    true = make_pose(np.eye(3), [0.02, 0, 0])
+    done = draw_localization(
+        image,
+        CAMERA,
+        np.eye(4),
+        points,
+        references,
+        tmp_path / "done.png",
+        "query 7: ok",
+        keypoints,
+        inliers,
+        true,
+    )
+    assert done.get_suptitle() == "query 7: ok · off by 0°, 2 cm"
+    assert done.axes[0].get_title() == "query: 15 of 20 map points agree"
+    for missing in (None, np.full((4, 4), np.nan)):
+        failed = draw_localization(image, CAMERA, missing, np.zeros((0, 3)), [], tmp_path / "failed.png", "query 8")
+        assert failed.axes[0].get_title() == "query: not localized"
+    assert (tmp_path / "failed.png").is_file()
+
+
+def test_the_worst_queries_are_drawn_with_the_matches_they_share_with_a_reference(tmp_path):
+    rng = np.random.default_rng(0)
+    files = [tmp_path / "query.jpg", tmp_path / "reference.jpg"]
+    Image.fromarray(rng.integers(0, 255, (48, 64, 3), np.uint8)).save(files[0])
+    Image.fromarray(rng.integers(0, 255, (96, 64, 3), np.uint8)).save(files[1])
+    pixels, points = rng.uniform(0, 48, (5, 2)), rng.normal(size=(5, 3))
+    query = ShownImage("q", files[0], CAMERA, np.eye(4), pixels, points, np.array([4, 7, 1, 2, 9]))
+    reference = ShownImage("r", files[1], CAMERA, np.eye(4), pixels[:3], points[:3], np.array([9, 4, 3]))
+    worst = [
+        WorstQuery("hl in the ios map", "failed: too few matches, 3 matches", query, None),
+        WorstQuery("hl in the ios map", "ok, 5 matches", query, reference, 2.0, 0.5),
+        WorstQuery(
+            "hl in the ios map", "ok", query, ShownImage("x", tmp_path / "gone.jpg", CAMERA, np.eye(4)), 1.0, 0.1
+        ),
+    ]
+    figure = draw_worst(worst, tmp_path / "worst.png", "the worst")
+    first, second, third = figure.axes[:3]
+    assert first.get_title(loc="left").startswith("1. hl in the ios map: failed: too few matches")
+    assert second.get_title(loc="left") == "2. hl in the ios map: off by 2°, 50 cm; ok, 5 matches"
+    lines = second.collections[0].get_segments()
+    # Points 4 and 9 are in both; the reference, twice as high, is drawn at half its size beside the query.
+    np.testing.assert_allclose([line[0] for line in lines], pixels[[0, 4]])
+    np.testing.assert_allclose([line[1] for line in lines], pixels[[1, 0]] / 2 + [64 * 1.03, 0])
+    assert [text.get_text() for text in third.texts] == ["no common inliers"]
+    with Image.open(tmp_path / "worst.png") as image:
+        assert image.text["Description"] == "the worst"
+    assert draw_worst([])
+
+
+def test_errors_have_the_colours_of_the_legend_and_styles_stay_where_they_are():
+    import matplotlib as mpl
+
+    before = mpl.rcParams["figure.titleweight"]
+    colours = error_colours([0.001, 0.01, 0.1, 1.0, 50.0, np.nan])
+    assert (colours[0] == colours[1]).all()
+    assert (colours[3] == colours[4]).all()
+    assert len(np.unique(colours, axis=0)) == 4
+    figure = draw_scene_png(np.zeros((0, 3)), None, looking([80, 90]), looking([80, 90]), None)
+    assert figure._suptitle.get_fontweight() == "bold"
+    assert mpl.rcParams["figure.titleweight"] == before != "bold"

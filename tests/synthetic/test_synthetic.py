@@ -1,0 +1,284 @@
+"""The rendered capture: is it exact, deterministic, whole, and what it says it is?"""
+
+import hashlib
+import json
+import os
+import shutil
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from toolkit.capture import Capture, read_depth
+from toolkit.errors import CaptureError
+from toolkit.geometry import invert, make_pose, rotation_angle_deg, transform
+from toolkit.synthetic import render as synthetic
+from toolkit.synthetic import render_capture
+from toolkit.synthetic.render import DEVICES, Quad, Rays, Scene, paint, render
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return render_capture(tmp_path_factory.mktemp("synthetic") / "TINY", 1, 4, seed=3, progress=False)
+
+
+def checker(rng: np.random.Generator, h: int, w: int, ppm: float) -> np.ndarray:
+    """Squares of 32 texels."""
+    y, x = np.mgrid[0:h, 0:w] // 32
+    return np.repeat(((x + y) % 2 * 200 + 30).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def looking_at_wall() -> tuple[Scene, np.ndarray]:
+    """A wall of 3.2 x 3.2 m with squares of 0.2 m, and a camera that sees it askew."""
+    scene = Scene(np.zeros(3), (9.0, 9.0, 9.0), False)
+    scene.plate((-1.6, 4.0, 1.6), (1, 0, 0), (0, 0, -1), 3.2, 3.2, checker, 160, lit=False)
+    paint(scene, 0, 0, 0)
+    return scene, make_pose(synthetic._looking(76.0, 4.0, 9.0), (-0.3, 0.4, 0.1))
+
+
+@pytest.mark.parametrize("sensor", [s for d in DEVICES.values() for s in d.sensors], ids=lambda s: s.name)
+def test_texture_corners_appear_where_the_camera_projects_them(sensor: synthetic.Sensor) -> None:
+    camera = pycolmap.Camera(
+        model=sensor.model, width=sensor.size[0], height=sensor.size[1], params=list(sensor.params)
+    )
+    scene, world_from_cam = looking_at_wall()
+    picture, depth = render(scene.quads, world_from_cam, Rays.of(camera), gray=True)
+    a, b = np.meshgrid(np.arange(3, 14), np.arange(3, 14))
+    corners = np.stack([-1.6 + 0.2 * a.ravel(), np.full(a.size, 4.0), 1.6 - 0.2 * b.ravel()], -1)
+    in_cam = transform(invert(world_from_cam), corners)
+    expected = np.asarray(camera.img_from_cam(in_cam))
+    inside = ((expected > 14) & (expected < np.array(sensor.size) - 14)).all(1)
+    assert inside.sum() > 40
+    # OpenCV counts the centre of the first pixel as 0; it starts a pixel away and must come back.
+    start = np.ascontiguousarray((expected[inside] - 0.5 + 0.7)[:, None], np.float32)
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
+    found = cv2.cornerSubPix(picture, start, (5, 5), (-1, -1), criteria)[:, 0] + 0.5
+    error = found - expected[inside]
+    assert np.abs(np.median(error, axis=0)).max() < 0.03
+    assert np.abs(error).max() < 0.3
+    column, row = expected[inside].astype(int).T
+    rays = np.c_[np.asarray(camera.cam_from_img(np.c_[column, row] + 0.5)), np.ones(len(row))]
+    on_wall = transform(world_from_cam, rays * depth[row, column, None])
+    np.testing.assert_allclose(on_wall[:, 1], 4.0, atol=1e-3)
+
+
+def test_rectangles_behind_and_across_the_camera_are_clipped() -> None:
+    scene = Scene(np.zeros(3), (9.0, 9.0, 9.0), False)
+    scene.plate((-4, 4, 0), (1, 0, 0), (0, -1, 0), 8, 8, checker, 60, lit=False)  # the floor, also behind
+    scene.plate((4, -3, 2), (-1, 0, 0), (0, 0, -1), 8, 2, checker, 60, lit=False)  # a wall behind
+    for number in range(2):
+        paint(scene, 0, 0, number)
+    camera = pycolmap.Camera(model="PINHOLE", width=96, height=72, params=[70, 70, 48, 36])
+    world_from_cam = make_pose(synthetic._looking(90, -20, 0), (0, 0, 1.0))
+    picture, depth = render(scene.quads, world_from_cam, Rays.of(camera), gray=False)
+    assert picture.shape == (72, 96, 3)
+    v = np.arange(72) + 0.5
+    down = np.sin(np.radians(20)) + (v - 36) / 70 * np.cos(np.radians(20))  # of the ray of z = 1
+    expected = np.where(down > 0.25, 1.0 / np.maximum(down, 1e-3), 0)
+    np.testing.assert_allclose(depth[expected > 0, 48], expected[expected > 0], rtol=1e-4)
+
+
+def test_the_nearer_rectangle_hides_the_farther() -> None:
+    scene, world_from_cam = looking_at_wall()
+    plain = partial(synthetic.plain, color=(0, 0, 255))
+    scene.plate((-0.2, 2.0, 0.6), (1, 0, 0), (0, 0, -1), 0.5, 0.5, plain, 100, lit=False)
+    paint(scene, 0, 0, 1)
+    camera = pycolmap.Camera(model="PINHOLE", width=320, height=240, params=[260, 260, 160, 120])
+    picture, depth = render(scene.quads, world_from_cam, Rays.of(camera), gray=False)
+    middle = transform(invert(world_from_cam), np.array([[0.05, 2.0, 0.35]]))
+    column, row = np.asarray(camera.img_from_cam(middle))[0].astype(int)
+    assert picture[row, column].tolist() == [0, 0, 255]
+    assert depth[row, column] == pytest.approx(middle[0, 2], abs=0.02)
+
+
+def test_two_views_agree_through_depth_and_poses(demo: Path) -> None:
+    capture = Capture.open(demo)
+    for name in ("ios_map", "spot_map", "hl_map"):
+        session = capture[name]
+        poses = session.world_from_cam()
+        step = len(DEVICES[name.split("_")[0]].sensors)
+        first, second = 0, step  # the same camera, one frame later
+        rows = session.images.iloc
+        cameras = [session.camera(rows[i].sensor_id) for i in (first, second)]
+        images = [cv2.imread(str(session.image_path(i)), cv2.IMREAD_GRAYSCALE) for i in (first, second)]
+        depths = []
+        for i in (first, second):
+            path = session.depth_path(rows[i].timestamp, rows[i].sensor_id)
+            assert path is not None
+            depths.append(read_depth(path))
+        h, w = images[0].shape
+        u, v = np.meshgrid(np.arange(0, w, 5) + 0.5, np.arange(0, h, 5) + 0.5)
+        pixels = np.stack([u.ravel(), v.ravel()], -1)
+        z = depths[0][v.astype(int).ravel(), u.astype(int).ravel()]
+        points = np.c_[np.asarray(cameras[0].cam_from_img(pixels)) * z[:, None], z]
+        seen = transform(invert(poses[second]) @ poses[first], points)
+        target = np.asarray(cameras[1].img_from_cam(np.where(seen[:, 2:] > 0.1, seen, 1.0)))
+        good = (z > 0) & (seen[:, 2] > 0.1) & (target > 1).all(1) & (target < np.array([w, h]) - 1).all(1)
+        column, row = target[good].astype(int).T
+        apart = np.abs(depths[1][row, column] - seen[good, 2])
+        unhidden = (depths[1][row, column] > 0) & (apart < 0.05)
+        assert unhidden.mean() > 0.7
+        assert np.median(apart[unhidden]) < 0.01
+        where = target[good][unhidden].astype(np.float32) - 0.5
+        warped = cv2.remap(images[1], where[None, :, 0], where[None, :, 1], cv2.INTER_LINEAR)[0]
+        original = images[0][v.astype(int).ravel(), u.astype(int).ravel()][good][unhidden]
+        assert np.corrcoef(warped, original)[0, 1] > 0.8
+
+
+def test_the_format_is_whole(demo: Path) -> None:
+    capture = Capture.open(demo)
+    assert capture.session_ids == ["hl_map", "hl_query", "ios_map", "ios_query", "spot_map", "spot_query"]
+    for name in capture:
+        session, (device, split) = capture[name], name.split("_")
+        frames = 4 if split == "map" else 2
+        assert len(session.images) == frames * len(DEVICES[device].sensors)
+        assert len(session.subsessions) == 2
+        assert (session.trajectory is None) == (split == "query")
+        assert (session.rigs is None) == (device == "ios")
+        assert session.ground_truth is not None
+        assert len(session.ground_truth) == frames
+        assert np.isfinite(session.world_from_cam(ground_truth=True)).all()
+        for row in range(len(session.images)):
+            camera = session.camera(session.images.sensor_id[row])
+            image = cv2.imread(str(session.image_path(row)), cv2.IMREAD_UNCHANGED)
+            assert image.shape[:2] == (camera.height, camera.width)
+            assert image.ndim == (3 if device == "ios" else 2)
+            assert 20 < image.mean() < 230
+            assert image.std() > 15
+        if split == "query":
+            lists = [session.keyframes(n) for n in ("pruned_subsampled", "pruned", "original")]
+            keys = [set(zip(table.timestamp, table.device_id, strict=True)) for table in lists]
+            assert keys[0] <= keys[1] <= keys[2]
+            assert keys[0]
+            assert len(keys[2]) == frames
+
+
+def test_rigs_have_real_baselines_and_a_rolled_camera(demo: Path) -> None:
+    capture = Capture.open(demo)
+    for name, low, high in (("hl_map", 0.08, 0.13), ("spot_map", 0.1, 0.35)):
+        session = capture[name]
+        count = len(DEVICES[name.split("_")[0]].sensors)
+        poses = session.rig_from_cam()[:count]
+        for i in range(count):
+            for j in range(i):
+                assert low < np.linalg.norm(poses[i, :3, 3] - poses[j, :3, 3]) < high
+    left_from_right = (invert(capture["hl_map"].world_from_cam()[0]) @ capture["hl_map"].world_from_cam()[1])[
+        :3, :3
+    ]
+    assert abs(left_from_right[1, 0]) > 0.9  # the right camera's x axis points down
+    focal = {tuple(capture["ios_map"].camera(s).params) for s in capture["ios_map"].images.sensor_id}
+    assert len(focal) == 4
+
+
+def test_queries_are_away_from_the_map_but_see_it() -> None:
+    for seed in range(3):
+        for index in range(2):
+            scene = synthetic.build_room(seed, index)
+            for name in DEVICES:
+                walks = synthetic.walks(scene, seed, index, 12, name)
+                mapped = np.concatenate([walks["map", 0], walks["map", 1]])
+                query = np.concatenate([walks["query", 0], walks["query", 1]])
+                assert (len(mapped), len(query)) == (12, 6)
+                distance = np.linalg.norm(query[:, None, :3, 3] - mapped[None, :, :3, 3], axis=-1)
+                assert distance.min() > 0.3
+                assert distance.min(axis=1).max() < 1.1
+                nearest = mapped[distance.argmin(axis=1)]
+                angle = rotation_angle_deg((invert(nearest) @ query)[:, :3, :3])
+                assert angle.min() > 10
+                assert angle.max() < 30
+                w, d, _ = scene.size
+                local = np.concatenate([mapped, query])[:, :3, 3] - scene.origin
+                assert (np.abs(local[:, :2]) < [w / 2 - 0.8, d / 2 - 0.8]).all()
+                assert (local[:, 2] > 0.5).all()
+                assert (local[:, 2] < 2).all()
+
+
+def digest(folder: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def test_same_seed_same_bytes_on_any_number_of_cores(
+    demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(synthetic, "_cores", lambda: 3 if os.cpu_count() == 1 else 1)
+    again = render_capture(tmp_path / "AGAIN", 1, 4, seed=3, progress=False)
+    assert digest(again) == digest(demo)
+
+
+def test_other_seeds_and_rooms_look_different() -> None:
+    def texture(seed: int, index: int) -> np.ndarray:
+        scene = synthetic.build_room(seed, index)
+        paint(scene, seed, index, 0)
+        return scene.quads[0].gray[3][:30, :30]
+
+    assert not np.array_equal(texture(0, 0), texture(4, 0))  # the same kind of room
+    assert not np.array_equal(texture(0, 0), texture(0, 4))
+
+
+def test_look_alikes_come_in_few_models_and_other_things_do_not() -> None:
+    def textures(material: synthetic.Material, look_alikes: bool) -> set[bytes]:
+        seen = set()
+        for index in range(2):
+            scene = Scene(np.zeros(3), (4, 4, 3), False)
+            for number in range(6):
+                scene.plate((0, 0, 0), (1, 0, 0), (0, 0, -1), 0.9 + 0.02 * number, 2.0, material, 100, lit=False)
+                paint(scene, 0, index, number, look_alikes)
+            seen |= {quad.gray[0][:160, :64].tobytes() for quad in scene.quads}
+        return seen
+
+    assert len(textures(synthetic.door, True)) == 2
+    assert len(textures(synthetic.door, False)) == 12
+    assert len(textures(synthetic.poster, True)) == 12
+
+
+def test_a_complete_capture_is_left_as_it_is_and_an_incomplete_one_is_not(
+    demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert [p.name for p in demo.parent.iterdir()] == ["TINY"]
+    settings = json.loads((demo / "demo.json").read_text())
+    assert (settings["rooms"], settings["frames"], settings["seed"]) == (1, 4, 3)
+    out = tmp_path / "C"
+    shutil.copytree(demo, out)
+
+    def started(*_: object, **__: object) -> None:
+        raise InterruptedError("renders anew")
+
+    monkeypatch.setattr(synthetic, "paint", started)
+    assert render_capture(out, 1, 4, seed=3, progress=False) == out
+    with pytest.raises(InterruptedError):
+        render_capture(out, 1, 4, seed=4, progress=False)
+    next(out.rglob("*.jpg")).unlink()
+    with pytest.raises(InterruptedError):
+        render_capture(out, 1, 4, seed=3, progress=False)
+    assert (out / "demo.json").exists()  # the old one stays until a new one can take its place
+
+
+def test_a_rendering_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(synthetic, "paint", fail)
+    with pytest.raises(OSError, match="disk full"):
+        render_capture(tmp_path / "C", 1, 2, progress=False)
+    assert not list(tmp_path.iterdir())
+
+
+def test_refusals(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match="frames"):
+        render_capture(tmp_path / "C", 1, 1)
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(CaptureError, match=r"demo\.json"):
+        render_capture(tmp_path, 1, 2)
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_a_quad_faces_the_side_it_is_seen_from() -> None:
+    quad = Quad(np.zeros(3), np.array([1.0, 0, 0]), np.array([0, 0, -1.0]), 1, 1, synthetic.plain, 10)
+    np.testing.assert_array_equal(quad.normal, [0, -1, 0])  # right and down as seen from -y

@@ -1,0 +1,90 @@
+"""Imports point down: what stands on what in `toolkit/`. CONTRIBUTING draws the same picture."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+TOOLKIT = Path(__file__).resolve().parents[1] / "toolkit"
+STAGES = ("embed", "retrieve", "rerank", "localize", "evaluate", "visualize")
+# From the ground up. A row may import from the rows above it, and within a name; not from its neighbors in the row.
+LEVELS: list[tuple[str, ...]] = [
+    ("__init__",),
+    ("errors",),
+    ("files", "geometry"),
+    ("capture",),
+    ("models",),
+    ("manifest",),
+    ("features",),
+    ("embedders",),
+    ("localizers",),
+    ("alignment", "exchange", "show", "synthetic"),
+    STAGES,
+    ("notebook",),
+    ("pipeline",),
+    ("__main__",),
+]
+LEVEL = {name: level for level, names in enumerate(LEVELS) for name in names}
+
+
+def module_name(path: Path) -> str:
+    parts = path.relative_to(TOOLKIT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" and len(parts) > 1 else parts)
+
+
+MODULES = {module_name(path): path for path in sorted(TOOLKIT.rglob("*.py"))}
+
+
+def imports_of(path: Path) -> set[str]:
+    """Return the modules of the toolkit that a file imports anywhere, at the top or inside a function."""
+    imported: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        names: list[str] = []
+        if isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        elif isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        for name in names:
+            first, _, rest = name.partition(".")
+            if first != "toolkit":
+                continue
+            while rest and rest not in MODULES:
+                rest = rest.rpartition(".")[0]
+            imported.add(rest or "__init__")
+    return imported
+
+
+def room(module: str) -> str:
+    return module.partition(".")[0]
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_imports_point_down(module: str) -> None:
+    assert room(module) in LEVEL, f"{module}: tell in LEVELS where it stands"
+    for other in imports_of(MODULES[module]):
+        below = LEVEL[room(other)] < LEVEL[room(module)]
+        assert below or room(other) == room(module), f"toolkit.{module} imports toolkit.{other}, which stands above it"
+
+
+def test_no_module_imports_itself_through_others() -> None:
+    graph = {module: imports_of(path) - {module} for module, path in MODULES.items()}
+    # A room's face imports its modules, so a module of the room that imports the face is a circle too.
+    done: set[str] = set()
+
+    def visit(module: str, way: tuple[str, ...]) -> None:
+        assert module not in way, " -> ".join((*way[way.index(module) :], module))
+        if module not in done:
+            for other in graph[module]:
+                visit(other, (*way, module))
+            done.add(module)
+
+    for module in graph:
+        visit(module, ())
+
+
+def test_the_top_level_is_a_table_of_contents() -> None:
+    files = {path.stem for path in TOOLKIT.glob("*.py")} - {"__init__"}
+    assert files == {"__main__", "pipeline", "notebook", *STAGES, "geometry", "files", "errors"} | (
+        {"alignment"}  # the name that other code imports; the work is done in localizers/
+        | {"manifest"}
+    )

@@ -1,0 +1,28 @@
+"""The capture format of LaMAR and CroCoDL: sessions of images with calibration and poses, read, written and checked."""
+
+from toolkit.capture.cameras import CAMERA_TYPES, parse_camera
+from toolkit.capture.session import (
+    COLUMNS,
+    DEPTH_SCALE,
+    RAW_DATA,
+    Capture,
+    Session,
+    Trajectory,
+    read_depth,
+    write_depth,
+    write_session,
+)
+
+__all__ = [
+    "CAMERA_TYPES",
+    "COLUMNS",
+    "DEPTH_SCALE",
+    "RAW_DATA",
+    "Capture",
+    "Session",
+    "Trajectory",
+    "parse_camera",
+    "read_depth",
+    "write_depth",
+    "write_session",
+]

@@ -1,0 +1,84 @@
+"""Cameras: intrinsics as sensors.txt has them, rays, and what a camera sees."""
+
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+CAMERA_TYPES = ("camera", "depth")  # both have intrinsics; only the first takes photographs
+
+
+def parse_camera(sensor_type: str, params: str) -> pycolmap.Camera:
+    """Return the camera that a line of sensors.txt describes.
+
+    Args:
+        params: what follows the sensor type: `MODEL, width, height, parameter, ...`.
+
+    Raises:
+        ValueError: it is not a camera, or its model, size or parameters are not valid.
+    """
+    if sensor_type not in CAMERA_TYPES:
+        raise ValueError(
+            f"found type {sensor_type!r}, expected one with intrinsics: {' or '.join(CAMERA_TYPES)}."
+        )
+    model, *values = [value.strip() for value in params.split(",")]
+    known = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
+    if model not in known:
+        raise ValueError(f"found camera model {model!r}, expected one of {', '.join(sorted(known))}.")
+    count = len(pycolmap.Camera.create_from_model_name(0, model, 1.0, 1, 1).params)
+    try:
+        # The benchmark writes whole numbers without a point, other tools `960.0`.
+        numbers = np.array([float(value) for value in values if value], np.float64)
+    except ValueError as error:
+        raise ValueError(f"found {params!r}, expected numbers after the model ({error}).") from None
+    if len(numbers) != count + 2 or not np.all(np.isfinite(numbers)):
+        raise ValueError(
+            f"found {max(len(numbers) - 2, 0)} parameters for model {model} in {params!r}, "
+            f"expected width, height and {count} finite numbers."
+        )
+    width, height = numbers[:2]
+    if width < 1 or height < 1 or width % 1 or height % 1:
+        raise ValueError(f"found image size {width:g} x {height:g}, expected positive whole numbers.")
+    camera = pycolmap.Camera(model=model, width=int(width), height=int(height), params=numbers[2:])
+    if any(camera.params[index] <= 0 for index in camera.focal_length_idxs()):
+        raise ValueError(f"found a focal length that is not positive in {params!r}, expected pixels.")
+    return camera
+
+
+def rays_of(camera: pycolmap.Camera, pixels: NDArray[np.floating]) -> Floats:
+    """Return unit rays (N, 3) in the camera's frame of pixels (N, 2)."""
+    if not len(pixels):
+        return np.zeros((0, 3))
+    rays = np.asarray(camera.cam_ray_from_img(np.asarray(pixels, np.float64)))
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def projection_jacobian(in_cams: Floats, focals_px: Floats) -> Floats:
+    """Return how the projections of points (n, 3) in cameras' frames move with them, pixels a metre: (n, 2, 3).
+
+    d(f x/z, f y/z), with the depth z at least 1 mm.
+    """
+    z = np.maximum(in_cams[:, 2], 1e-3)
+    scale = focals_px / z
+    jacobian = np.zeros((len(in_cams), 2, 3))
+    jacobian[:, 0, 0] = jacobian[:, 1, 1] = scale
+    jacobian[:, :, 2] = -scale[:, None] * in_cams[:, :2] / z[:, None]
+    return jacobian
+
+
+def view_bounds(camera: pycolmap.Camera) -> Floats:
+    """Return x_min, x_max, y_min, y_max of the view at depth 1."""
+    w, h = camera.width, camera.height
+    rays = rays_of(camera, np.array([[0, h / 2], [w, h / 2], [w / 2, 0], [w / 2, h]]))
+    rays = rays / np.maximum(rays[:, 2:], 0.2)  # views wider than 157 degrees are cut there
+    return np.array([rays[0, 0], rays[1, 0], rays[2, 1], rays[3, 1]])
+
+
+def in_view(points_in_cams: Floats, bounds: Floats) -> NDArray[np.bool_]:
+    """Tell which points (J, P, 3) in the cameras' frames lie in the cameras' views (J, 4)."""
+    z = points_in_cams[..., 2]
+    x, y = points_in_cams[..., 0] / np.maximum(z, 1e-6), points_in_cams[..., 1] / np.maximum(z, 1e-6)
+    b = bounds[:, None]
+    return (z > 0.1) & (x > b[..., 0]) & (x < b[..., 1]) & (y > b[..., 2]) & (y < b[..., 3])

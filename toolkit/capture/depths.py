@@ -1,0 +1,286 @@
+"""What the depth maps of a capture say of its photographs.
+
+A depth map belongs to a photograph in one of these ways, as the official tools write `depths.txt`:
+
+- rendered for it: at its time, under its sensor's id or, which is no sensor, `<prefix>/<sensor id>`;
+- measured with it (phones): at its time, under its sensor's id with `cam` replaced by `depth` in the last part;
+- measured by another sensor of its rig (headsets, robots), with intrinsics, a place in the rig and times of its own.
+
+Either way its points are brought into the photograph's camera, and what stands behind something else there is left out.
+"""
+
+import logging
+from collections import OrderedDict
+from dataclasses import dataclass
+from functools import cached_property
+from threading import Lock
+
+import numpy as np
+import pycolmap
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import minimum_filter
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation, Slerp
+
+from toolkit import geometry
+from toolkit.capture.cameras import in_view, rays_of, view_bounds
+from toolkit.capture.session import RAW_DATA, Session, read_depth
+from toolkit.errors import CaptureError
+
+log = logging.getLogger(__name__)
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+MAX_OFFSET_US = 100_000
+"""Between a photograph and the depth map of another sensor: half the period of the slowest, at 5 Hz."""
+MAX_GAP_US = 1_000_000
+"""Between two poses of a sensor, for its place at a time between them."""
+_MOST_POINTS = 30_000  # of a depth map; more say nothing new to a few hundred features
+_HIDDEN = 1.1  # times the depth of what is next to it: behind it, or on its edge
+_CELL = 1.5  # width of a cell in which the nearest hides the others, in spacings of the points
+_FITTED = 8  # points that a surface element is fitted to
+_UNEVEN = 0.05  # relative depth by which one of them may be off
+_KEPT = 32  # photographs whose depth is kept in memory
+
+
+@dataclass(frozen=True)
+class SeenDepth:
+    """Depth that is known at some places of a photograph."""
+
+    pixels: Floats
+    """(P, 2) of the photograph, in rows from the top."""
+    depth_m: Floats
+    """(P,) along the photograph's optical axis."""
+    cell_px: float = 1.0
+    """No two points are nearer than neighbouring cells of this width allow."""
+    reason: str = ""
+    """What was left out and why; without points, why there are none."""
+
+    def __len__(self) -> int:
+        return len(self.depth_m)
+
+    @cached_property
+    def _tree(self) -> KDTree:
+        return KDTree(self.pixels)
+
+    def at(self, xy: ArrayLike) -> Floats:
+        """Return depth (N,), metres, at pixels (N, 2): of a plane through the points about each.
+
+        Inverse depth is linear in the pixels of a plane. NaN where fewer than four points are near, or where they do
+        not lie on one surface.
+        """
+        wanted = np.asarray(xy, np.float64).reshape(-1, 2)
+        found = np.full(len(wanted), np.nan)
+        if len(self) < _FITTED or not len(wanted):
+            return found
+        distance, near = self._tree.query(wanted, k=_FITTED)
+        inside = np.flatnonzero(distance[:, 3] <= 2 * self.cell_px)
+        inverse = 1 / self.depth_m[near[inside]]
+        offset = (self.pixels[near[inside]] - wanted[inside, None]) / self.cell_px
+        rows = np.concatenate([np.ones((*inverse.shape, 1)), offset], axis=2)
+        normal = np.einsum("nki,nkj->nij", rows, rows) + 1e-6 * np.eye(3)  # points on one line: no slope across it
+        plane = np.linalg.solve(normal, np.einsum("nki,nk->ni", rows, inverse)[..., None])
+        off = np.abs((rows @ plane)[..., 0] - inverse).max(axis=1)
+        value = plane[:, 0, 0]
+        smooth = (value > 0) & (off <= _UNEVEN * np.abs(value))
+        found[inside[smooth]] = 1 / value[smooth]
+        return found
+
+
+def lifted(camera: pycolmap.Camera, pixels: Floats, depth_m: Floats) -> Floats:
+    """Return the points (P, 3) in a camera's frame that lie at depths (P,) along its axis behind pixels (P, 2)."""
+    rays = rays_of(camera, pixels)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(rays / rays[:, 2:] * np.asarray(depth_m)[:, None], np.float64)
+
+
+@dataclass(frozen=True)
+class _Source:
+    """A depth map of a photograph."""
+
+    path: str
+    """Below raw_data/."""
+    camera: pycolmap.Camera | None
+    """None: the photograph's, resized."""
+    cam_from_depth: Floats
+    """(4, 4)"""
+
+
+class DepthMaps:
+    """The depth maps of a session, by photograph. Safe to use from several threads."""
+
+    def __init__(self, session: Session, max_offset_us: int = MAX_OFFSET_US) -> None:
+        self._session = session
+        self._max_offset_us = max_offset_us
+        self._kept: OrderedDict[int, SeenDepth] = OrderedDict()
+        self._tracks: dict[str, tuple[Ints, Floats]] = {}
+        self._lock = Lock()
+        self._told: set[str] = set()
+
+    def of(self, row: int) -> SeenDepth:
+        """Return the depth known in a photograph, a row of `Session.images`.
+
+        Of every depth sensor that goes with its camera the map nearest in time counts, no further off than
+        `max_offset_us`. A map that cannot be read or does not fit its sensor is left out, with a reason; it is logged
+        once. Nothing is raised for it.
+        """
+        with self._lock:
+            if row in self._kept:
+                self._kept.move_to_end(row)
+                return self._kept[row]
+        seen = self._see(row)
+        with self._lock:
+            self._kept[row] = seen
+            if len(self._kept) > _KEPT:
+                self._kept.popitem(last=False)
+        return seen
+
+    def _see(self, row: int) -> SeenDepth:
+        image = self._session.images.iloc[row]
+        camera = self._session.camera(str(image["sensor_id"]))
+        sources, reasons = self._sources(row, int(image["timestamp"]), str(image["sensor_id"]))
+        points, spacing = [np.zeros((0, 3))], 0.0
+        for source in sources:
+            try:
+                found, spacing_px = self._points(source, camera)
+            except CaptureError as error:
+                reasons.append(str(error))
+                continue
+            points.append(found)
+            spacing = max(spacing, spacing_px)
+        self._tell(reasons)
+        return _visible(np.concatenate(points), camera, max(1.0, _CELL * spacing), "; ".join(reasons))
+
+    def _tell(self, reasons: list[str]) -> None:
+        with self._lock:
+            new = [reason for reason in reasons if reason not in self._told]
+            self._told.update(new)
+        for reason in new:
+            log.warning("left out: %s", reason)
+
+    @cached_property
+    def _rows_of_sensor(self) -> dict[str, Ints]:
+        """Rows of depths.txt of each sensor, in order of time."""
+        depths = self._session.depths
+        if depths is None:
+            return {}
+        ordered = depths.sort_values("timestamp", kind="stable")
+        return {str(key): np.asarray(rows, np.int64) for key, rows in ordered.groupby("sensor_id").groups.items()}
+
+    @cached_property
+    def _renderings(self) -> dict[str, str]:
+        """Ids `<prefix>/<sensor id>` of depth maps, by sensor id."""
+        ids = [other for other in self._rows_of_sensor if not self._session.has_sensor(other)]
+        return {other.partition("/")[2]: other for other in ids}
+
+    @cached_property
+    def _mates(self) -> dict[str, list[str]]:
+        """Depth sensors that share a rig with each sensor."""
+        rigs = self._session.rigs
+        if rigs is None:
+            return {}
+        depth = rigs[rigs["sensor_id"].isin(list(self._rows_of_sensor))]
+        pairs = rigs.merge(depth, on="rig_id", suffixes=("", "_depth"))[["sensor_id", "sensor_id_depth"]]
+        pairs = pairs[pairs["sensor_id"] != pairs["sensor_id_depth"]].drop_duplicates()
+        return {str(key): [str(i) for i in part] for key, part in pairs.groupby("sensor_id")["sensor_id_depth"]}
+
+    def _sources(self, row: int, timestamp: int, sensor: str) -> tuple[list[_Source], list[str]]:
+        session = self._session
+        if session.depths is None:
+            return [], []
+        mates = self._mates.get(sensor, [])
+        folder, slash, last = sensor.rpartition("/")
+        named = folder + slash + last.replace("cam", "depth")
+        for other in (sensor, self._renderings.get(sensor, ""), "" if named in mates else named):
+            found = self._nearest(other, timestamp, 0)
+            if found is not None:
+                own = other == sensor or not session.has_sensor(other)
+                return [_Source(found[1], None if own else session.camera(other), np.eye(4))], []
+        sources, reasons = [], []
+        world_from_cam = session.world_from_cam([row])[0]
+        for other in mates:
+            found = self._nearest(other, timestamp, self._max_offset_us)
+            if found is None:
+                continue
+            world_from_depth = self._pose(other, found[0])
+            if world_from_depth is None or not np.isfinite(world_from_cam).all():
+                why = "its sensor" if world_from_depth is None else "the photograph"
+                reasons.append(f"depth map {found[1]}: {why} has no pose at that time or about it")
+                continue
+            sources.append(_Source(found[1], session.camera(other), geometry.invert(world_from_cam) @ world_from_depth))
+        return sources, reasons
+
+    def _nearest(self, sensor: str, timestamp: int, tolerance_us: int) -> tuple[int, str] | None:
+        """Return time and path of the depth map of a sensor that is nearest in time."""
+        rows = self._rows_of_sensor.get(sensor)
+        if rows is None or self._session.depths is None:
+            return None
+        times = self._session.depths["timestamp"].to_numpy(np.int64)[rows]
+        best = int(np.argmin(np.abs(times - timestamp)))
+        if abs(int(times[best]) - timestamp) > tolerance_us:
+            return None
+        return int(times[best]), str(self._session.depths["path"].iloc[int(rows[best])])
+
+    def _pose(self, sensor: str, timestamp: int) -> Floats | None:
+        """Return world_from_sensor at a time, between two poses on the way from one to the other, or None."""
+        with self._lock:
+            if sensor not in self._tracks:
+                self._tracks[sensor] = self._session.poses_of_sensor(sensor)
+            times, poses = self._tracks[sensor]
+        after = int(np.searchsorted(times, timestamp))
+        if after < len(times) and times[after] == timestamp:
+            return np.asarray(poses[after])
+        if after in (0, len(times)) or times[after] - times[after - 1] > MAX_GAP_US:
+            return None
+        share = (timestamp - times[after - 1]) / (times[after] - times[after - 1])
+        turn = Slerp([0, 1], Rotation.from_matrix(poses[after - 1 : after + 1, :3, :3]))(share).as_matrix()
+        place = (1 - share) * poses[after - 1, :3, 3] + share * poses[after, :3, 3]
+        return geometry.make_pose(turn, place)
+
+    def _points(self, source: _Source, photograph: pycolmap.Camera) -> tuple[Floats, float]:
+        """Return the points (P, 3) of a depth map in the photograph's camera, and how many pixels they are apart.
+
+        Raises:
+            CaptureError: no such file, not 16 bits, or not of the sensor's size.
+        """
+        path = self._session.path / RAW_DATA / source.path
+        depth = read_depth(path)
+        height, width = depth.shape
+        camera = source.camera or photograph
+        resized = source.camera is None and abs(width - height * camera.width / camera.height) <= 1
+        if not resized and (width, height) != (camera.width, camera.height):
+            raise CaptureError(
+                f"Depth map {path}: found {width} x {height} pixels, expected {camera.width} x {camera.height} as "
+                "sensors.txt says" + (", or that made smaller." if source.camera is None else ".")
+            )
+        step = int(np.ceil(np.sqrt(max(np.count_nonzero(depth) / _MOST_POINTS, 1.0))))
+        y, x = np.nonzero(depth[step // 2 :: step, step // 2 :: step])
+        y, x = y * step + step // 2, x * step + step // 2
+        size = np.array([camera.width / width, camera.height / height])
+        points = lifted(camera, (np.column_stack([x, y]) + 0.5) * size, depth[y, x].astype(np.float64))
+        points = points[np.isfinite(points).all(axis=1)]
+        spacing_px = step * size.max() * photograph.mean_focal_length() / camera.mean_focal_length()
+        return geometry.transform(source.cam_from_depth, points), float(spacing_px)
+
+
+def _visible(points: Floats, camera: pycolmap.Camera, cell_px: float, reason: str) -> SeenDepth:
+    """Project points (P, 3) in a camera's frame, and keep the nearest of each cell that nothing next to it hides."""
+    if len(points):
+        points = points[in_view(points[None], view_bounds(camera)[None])[0]]
+    pixels = np.asarray(camera.img_from_cam(points), np.float64).reshape(-1, 2) if len(points) else np.zeros((0, 2))
+    size = np.array([camera.width, camera.height])
+    inside = (np.isfinite(pixels) & (pixels >= 0) & (pixels < size)).all(axis=1)
+    pixels, depth = pixels[inside], points[inside, 2]
+    if not len(depth):
+        return SeenDepth(np.zeros((0, 2)), np.zeros(0), cell_px, reason or "no depth map of this photograph")
+    column, row = (pixels / cell_px).astype(np.int64).T
+    shape = tuple(int(n) + 1 for n in (size[::-1] / cell_px))
+    cell = row * shape[1] + column
+    order = np.lexsort((depth, cell))
+    nearest = order[np.unique(cell[order], return_index=True)[1]]
+    grid = np.full(shape, np.inf)
+    grid[row[nearest], column[nearest]] = depth[nearest]
+    around = minimum_filter(grid, size=3, mode="nearest")[row[nearest], column[nearest]]
+    kept = nearest[depth[nearest] <= _HIDDEN * around]
+    return SeenDepth(pixels[kept], depth[kept], cell_px, reason)

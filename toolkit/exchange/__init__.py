@@ -1,0 +1,1 @@
+"""Captures and images in, models, pairs and submissions out."""

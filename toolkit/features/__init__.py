@@ -1,0 +1,1 @@
+"""Local features: extractors, matchers, and the files that keep what they found."""

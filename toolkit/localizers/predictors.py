@@ -1,0 +1,53 @@
+"""The predictors by name."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from toolkit.capture import Session
+from toolkit.errors import ManifestError
+from toolkit.localizers.network import NetworkPredictor
+from toolkit.localizers.prediction import Predictor
+from toolkit.localizers.simulated import SimulatedPredictor
+
+PREDICTORS = ("vggt", "simulated")
+"""Names that `create_predictor` takes. `simulated` is taken only where it is asked for by name."""
+
+
+def check_predictor_name(name: str) -> None:
+    """Refuse what is no name of a predictor.
+
+    Raises:
+        ManifestError: none of `PREDICTORS`.
+    """
+    if name not in PREDICTORS:
+        raise ManifestError(f"Unknown predictor {name!r}. Known: {', '.join(PREDICTORS)}.")
+
+
+def create_predictor(
+    name: str,
+    *,
+    sessions: Sequence[Session] = (),
+    map_dir: str | Path | None = None,
+    checkpoint: str | Path | None = None,
+    compute_device: str = "auto",
+    dtype_compute: str = "auto",
+    seed: int = 0,
+) -> Predictor:
+    """Return a ready predictor.
+
+    Args:
+        name: `vggt`, or `simulated`, which looks up true poses and is for tests and for trying things out.
+        sessions: of `simulated`: where the true poses are.
+        map_dir: of `simulated`: folder of the triangulated maps, for depth.
+        checkpoint: of `vggt`: file with the weights; None: the hub's cache, else a download.
+        compute_device, dtype_compute: of `vggt`, as `toolkit.models.compute` takes them.
+        seed: of `simulated`.
+
+    Raises:
+        ManifestError: unknown name, device or precision.
+        WeightsError: `vggt` and no weights to be had; says what to do.
+    """
+    check_predictor_name(name)
+    if name == "simulated":
+        return SimulatedPredictor(sessions, map_dir, seed=seed)
+    return NetworkPredictor(checkpoint, compute_device, dtype_compute)

@@ -1,0 +1,225 @@
+"""Tables and figures for the notebooks: what a capture holds, and what the stages made of it."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+
+from toolkit.capture import Capture, Session
+from toolkit.capture.devices import colour_of
+from toolkit.capture.images import read_for_display
+from toolkit.capture.upright import up_of_cameras
+from toolkit.files import read_references
+from toolkit.show.figures import GREEN, ORANGE, VERMILLION, new_figure, styled
+from toolkit.show.top_view import ground_axes, places_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+MAX_PLACES = 4
+
+
+def describe(capture: Capture, queries: str = "keyframes_pruned_subsampled") -> pd.DataFrame:
+    """Return one row a session: counts of images, posed images, rigs, subsessions and queries asked."""
+    rows = []
+    for name in capture:
+        session = capture[name]
+        row: dict[str, Any] = {"session": name, "device": session.device, "split": session.split}
+        row |= {"images": len(session.images), "subsessions": len(session.subsessions)}
+        row["cameras"] = int(session.sensors["sensor_type"].eq("camera").sum())
+        row["rigs"] = 0 if session.rigs is None else session.rigs["rig_id"].nunique()
+        row["with pose"] = len(_centers(session))
+        row["queries"] = len(session.keyframes(queries)) if session.split == "query" else 0
+        rows.append(row)
+    return pd.DataFrame(rows).set_index("session")
+
+
+@styled
+def draw_samples(capture: Capture, count: int = 4) -> "Figure":
+    """Return a figure of `count` images of each session, evenly spread over the recording."""
+    names = [name for name in capture if len(capture[name].images)]
+    figure = new_figure(2.4 * count, 1.9 * len(names))
+    axes = figure.subplots(len(names), count, squeeze=False)
+    for line, name in zip(axes, names, strict=True):
+        session = capture[name]
+        chosen = np.linspace(0, len(session.images) - 1, count).round().astype(int)
+        for axis, row in zip(line, chosen, strict=True):
+            axis.imshow(read_for_display(session.image_path(row)), interpolation="antialiased")
+            axis.set_xticks([])
+            axis.set_yticks([])
+        line[0].set_ylabel(name)
+    return figure
+
+
+@styled
+def draw_top_view(capture: Capture, up: ArrayLike | None = None) -> "Figure":
+    """Return a figure of all camera centres seen from above, metres; queries where the truth is known.
+
+    Args:
+        capture: what to draw; cameras far from all others get a panel of their own.
+        up: (3,) direction that is up; None: estimated from how the cameras are held.
+    """
+    poses = {name: _poses(capture[name]) for name in capture}
+    everything = np.concatenate(list(poses.values()))
+    axes, labels = ground_axes(up_of_cameras(everything) if up is None else up)
+    seen = {name: of_session[:, :3, 3] @ axes.T for name, of_session in poses.items()}
+    place = places_of(np.concatenate(list(seen.values())))
+    sessions = np.repeat(list(seen), [len(centers) for centers in seen.values()])
+    together = np.concatenate(list(seen.values()))
+    count = min(place.max(initial=0) + 1, MAX_PLACES)
+    figure = new_figure(4.2 * count + 1, 4.6)
+    for number, plot in enumerate(figure.subplots(1, count, squeeze=False)[0]):
+        for name in seen:
+            x, y = together[(place == number) & (sessions == name)].T
+            split, colour = capture[name].split, colour_of(capture[name].device)
+            marker, size = ("o", 14) if split == "map" else ("x", 36)
+            plot.scatter(x, y, s=size, c=colour, marker=marker, label=name, alpha=0.8)
+        plot.set_xlabel(labels[0])
+        plot.set_aspect("equal", adjustable="datalim")
+        if number == 0:
+            plot.set_ylabel(labels[1])
+            plot.legend(fontsize=8)
+    figure.suptitle("Cameras from above: maps (dots), queries where their pose is known (crosses)")
+    return figure
+
+
+@styled
+def draw_similarity(embeddings: str | Path, limit: int = 300) -> "Figure":
+    """Return a figure of the cosine similarity of a query session's images to another device's map.
+
+    Args:
+        embeddings: folder of the descriptors, `<device>_<split>/<subsession>/<subsession>.npy`.
+        limit: at most so many images of a session, evenly spread, are shown.
+    """
+    sessions = sorted(folder for folder in Path(embeddings).iterdir() if folder.is_dir())
+    queries = [folder for folder in sessions if folder.name.endswith("_query")] or sessions
+    maps = [folder for folder in sessions if folder.name.endswith("_map")] or sessions
+    query = queries[0]
+    others = [folder for folder in maps if folder.name.rpartition("_")[0] != query.name.rpartition("_")[0]]
+    map_ = (others or maps)[0]
+    figure = new_figure(8, 4.5)
+    plot = figure.subplots()
+    values = _descriptors(query, limit) @ _descriptors(map_, limit).T
+    image = plot.imshow(values, aspect="auto", interpolation="nearest", cmap="viridis")
+    plot.set_xlabel(f"images of {map_.name}")
+    plot.set_ylabel(f"images of {query.name}")
+    figure.colorbar(image, label="cosine similarity")
+    return figure
+
+
+@styled
+def draw_references(
+    sessions_root: str | Path, jsonl: str | Path, samples: int = 4, references: int = 4
+) -> "Figure":
+    """Return a figure of some query images of a pair, each beside its first references.
+
+    Args:
+        sessions_root: folder `sessions` of the capture.
+        jsonl: the retrieval of a pair, `<scene>_map_<M>_query_<Q>.jsonl`.
+        samples: queries shown, evenly spread.
+        references: references shown of each.
+    """
+    lines = read_references(jsonl)
+    chosen = np.unique(np.linspace(0, len(lines) - 1, min(samples, len(lines))).round().astype(int))
+    return _draw_rows(sessions_root, jsonl, [[lines[row]] for row in chosen], references)
+
+
+@styled
+def draw_reranked(
+    sessions_root: str | Path, jsonl: str | Path, retrieved: str | Path, samples: int = 4, references: int = 3
+) -> "Figure":
+    """Return a figure of query images, each with its first references by retrieval and, to their right, reranked.
+
+    Queries that another reference leads now come first.
+
+    Args:
+        sessions_root: folder `sessions` of the capture.
+        jsonl: the reranked references of a pair, `<scene>_map_<M>_query_<Q>.jsonl`.
+        retrieved: those of the retrieval stage.
+        samples: queries shown.
+        references: references shown of each, before and after.
+    """
+    before, after = read_references(retrieved), read_references(jsonl)
+    moved = [-row["topk"][0]["retrieval_rank"] if row["topk"] else 0 for row in after]
+    chosen = np.argsort(moved, kind="stable")[:samples]
+    return _draw_rows(sessions_root, jsonl, [[before[row], after[row]] for row in chosen], references)
+
+
+def _draw_rows(
+    sessions_root: str | Path, jsonl: str | Path, rows: list[list[dict[str, Any]]], references: int
+) -> "Figure":
+    """Draw a line a query: its image, then its first references as each of its rows has them."""
+    capture = Capture.from_sessions_root(sessions_root)
+    map_device, _, query_device = Path(jsonl).stem.rpartition("_map_")[2].partition("_query_")
+    sides = {"map": capture[f"{map_device}_map"], "query": capture[f"{query_device}_query"]}
+    files = {side: _image_paths(session) for side, session in sides.items()}
+    width = 1 + references * max((len(row) for row in rows), default=1)
+    figure = new_figure(2.2 * width, 1.9 * len(rows))
+    axes = figure.subplots(len(rows), width, squeeze=False)
+    for line, row in zip(axes, rows, strict=True):
+        for axis in line:
+            axis.set_axis_off()
+        shown = [(line[0], "query", row[0], f"query {query_device}")]
+        for part, query in enumerate(row):
+            for axis, hit in zip(line[1 + part * references :], query["topk"][:references], strict=False):
+                verified = "retrieval_rank" in hit
+                title = f"{hit['score']} inliers, was {hit['retrieval_rank']}" if verified else f"{hit['score']:.2f}"
+                shown.append((axis, "map", hit, f"{map_device} {title}"))
+        for axis, side, entry, title in shown:
+            axis.imshow(read_for_display(files[side][int(entry["timestamp"]), entry["sensor_id"]]))
+            axis.set_title(title, fontsize=8)
+    return figure
+
+
+@styled
+def draw_statuses(paths: Iterable[str | Path]) -> "Figure":
+    """Return a figure of the inliers of each query, by pair and status.
+
+    Args:
+        paths: poses of each pair, `<scene>_map_<M>_query_<Q>.txt` or `.csv`.
+    """
+    tables = {
+        Path(path).stem.rpartition("_map_")[2]: pd.read_csv(Path(path).with_suffix(".csv")) for path in paths
+    }
+    figure = new_figure(8, 0.35 * len(tables) + 1.2)
+    plot = figure.subplots()
+    colours = {"ok": GREEN, "low_confidence": ORANGE, "failed": VERMILLION}
+    for status, colour in colours.items():
+        rows = [table[table["status"].str.startswith(status)] for table in tables.values()]
+        inliers = np.concatenate([row["num_inliers"].fillna(0).to_numpy(float) for row in rows])
+        heights = np.repeat(np.arange(len(rows)), [len(row) for row in rows])
+        label = f"{status.replace('_', ' ')}: {len(inliers)}"
+        plot.scatter(np.maximum(inliers, 0.5), heights, s=24, c=colour, alpha=0.6, label=label)
+    plot.set_yticks(range(len(tables)), [name.replace("_query_", " map, query ") for name in tables])
+    plot.invert_yaxis()
+    plot.set_xscale("log")
+    plot.set_xlabel("inliers of a query (log scale; none at the left edge)")
+    figure.legend(fontsize=8, loc="outside lower center", ncols=3)
+    return figure
+
+
+def _descriptors(session: Path, limit: int) -> NDArray[np.float32]:
+    """Return the unit descriptors of a session, (N <= limit, D)."""
+    parts = [np.load(file, mmap_mode="r") for file in sorted(session.rglob("*.npy"))]
+    total = sum(len(part) for part in parts)
+    step = max(1, -(-total // limit))
+    rows = np.concatenate([np.asarray(part[::step], np.float32) for part in parts])
+    return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
+
+
+def _image_paths(session: Session) -> dict[tuple[int, str], Path]:
+    keys = zip(session.images["timestamp"], session.images["sensor_id"], strict=True)
+    return {(int(time), str(sensor)): session.image_path(row) for row, (time, sensor) in enumerate(keys)}
+
+
+def _poses(session: Session) -> NDArray[np.float64]:
+    """Return world_from_cam of the images that have one, (n, 4, 4)."""
+    poses = session.world_from_cam(ground_truth=session.split == "query")
+    return poses[np.isfinite(poses).all((1, 2))]
+
+
+def _centers(session: Session) -> NDArray[np.float64]:
+    return _poses(session)[:, :3, 3]

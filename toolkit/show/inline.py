@@ -1,0 +1,61 @@
+"""Recordings in a notebook: the viewer where someone is there to use it; where not, what is worth keeping."""
+
+import html
+import os
+from pathlib import Path
+from typing import Any
+
+from toolkit.errors import ArtefactError
+from toolkit.show import TEXT_BARS
+from toolkit.show.recordings import open_command
+
+ASSETS = "RERUN_NOTEBOOK_ASSET"
+"""Variable of the viewer's package: where the page gets the viewer from. Read when the package is imported."""
+MAX_INLINE_BYTES = 200_000_000
+
+
+def show_recording(path: str | Path, still: str | Path | None = None, height: int = 600) -> Any:
+    """Show a recording in a notebook: a still picture, a link, the command that opens it, and the viewer itself.
+
+    The viewer is served by this process and needs no network. It is left out where the pipeline runs the notebook:
+    saved pages do not keep what a viewer shows.
+
+    Args:
+        path: recording, `.rrd`.
+        still: picture of the same, for the saved page.
+        height: of the viewer, pixels.
+
+    Returns:
+        The viewer's widget, None where it is left out.
+
+    Raises:
+        ArtefactError: there is no such recording.
+    """
+    from IPython.display import HTML, Image, display
+
+    path = Path(path)
+    if not path.is_file():
+        raise ArtefactError(f"{path}: no such recording. Run the notebook's cells above, with recordings = True.")
+    if still is not None and Path(still).is_file():
+        display(Image(data=Path(still).read_bytes()))
+    # Relative to the notebook, so that the run folder can be moved.
+    link = html.escape(os.path.relpath(path.resolve(), Path.cwd()), quote=True)
+    size_mb = path.stat().st_size / 1e6
+    display(
+        HTML(
+            f'<p>Recording: <a href="{link}" download>{html.escape(path.name)}</a> ({size_mb:.1f} MB). '
+            f"Open it in the project's environment with<br><code>{html.escape(open_command(path.resolve()))}</code></p>"
+        )
+    )
+    if TEXT_BARS in os.environ:
+        return None
+    if path.stat().st_size > MAX_INLINE_BYTES:
+        display(HTML("<p>It is too large to be shown here; use the command.</p>"))
+        return None
+    os.environ.setdefault(ASSETS, "serve-local")
+    import rerun_notebook
+
+    viewer = rerun_notebook.Viewer(width="auto", height=height)
+    viewer.send_rrd(path.read_bytes())
+    display(viewer)
+    return viewer

@@ -1,0 +1,152 @@
+"""Show what a network said of one query: references, aligned cameras, depth, and what was left out."""
+
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from toolkit.capture.images import read_for_display
+from toolkit.capture.upright import up_of_cameras
+from toolkit.localizers.prediction import View
+from toolkit.localizers.vggt import CameraAnswer, VggtAnswer, VggtLocalizer, VggtQuery
+from toolkit.show.figures import BLUE, GREEN, GREY, VERMILLION, new_figure, save_figure, styled
+from toolkit.show.top_view import ground_axes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+
+@styled
+def draw_prediction(
+    localizer: VggtLocalizer,
+    query: VggtQuery,
+    answer: VggtAnswer,
+    camera: int | None = None,
+    up: ArrayLike | None = None,
+    out: str | Path | None = None,
+) -> "Figure":
+    """Draw one query image with its references, and where its network's cameras lie in the map; return the figure.
+
+    Args:
+        localizer: that gave the answer.
+        query, answer: of one query device.
+        camera: which of its images; None: the first with the most consistent references.
+        up: direction (3,) that is up; None: estimated from the map's cameras.
+        out: PNG to write; None: no file.
+    """
+    shown = _most_consistent(answer) if camera is None else camera
+    found = answer.cameras[shown] if answer.cameras else CameraAnswer(np.zeros(0, np.int64))
+    views = [query.views[shown], *(localizer.view(int(index)) for index in found.references)]
+    kept = np.zeros(len(found.references), bool) if found.alignment is None else found.alignment.inliers
+    columns = 3
+    rows = -(-len(views) // columns)
+    figure = new_figure(14, max(5.5, 3.6 * rows))
+    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[1.0, 1.25])[0]
+    _draw_from_above(left.subplots(), localizer, found, kept, up)
+    panels = right.subplots(2 * rows, columns, squeeze=False)
+    for axis in panels.flat:
+        axis.set_axis_off()
+    for number, view in enumerate(views):
+        row, column = 2 * (number // columns), number % columns
+        label, colour = "query", "black"
+        if number:
+            label = f"reference {number}: {'consistent' if kept[number - 1] else 'left out'}"
+            colour = GREEN if kept[number - 1] else VERMILLION
+        _draw_view(panels[row, column], panels[row + 1, column], view, number, found, label, colour)
+    simulated = localizer.predictor.simulated
+    title = f"{'SIMULATED, no result: ' if simulated else ''}{localizer.predictor.name} on {views[0].name}"
+    estimate = answer.estimate
+    known = f"scale known to {estimate.scale_std:.1%}" if np.isfinite(estimate.scale_std) else "scale unknown"
+    about = f"{estimate.status}; {known}" if estimate.world_from_rig is not None else estimate.status
+    more = "" if found.reason in about else f"; {found.reason}"  # a failed query's status says it
+    reasons = textwrap.fill(about + more, 150)
+    figure.suptitle(f"{title}\n{reasons}", fontsize=10, fontweight="bold" if simulated else None)
+    if out is not None:
+        save_figure(figure, out, title)
+    return figure
+
+
+def _most_consistent(answer: VggtAnswer) -> int:
+    counts = [0 if found.alignment is None else found.alignment.num_inliers for found in answer.cameras]
+    return int(np.argmax(counts)) if counts else 0
+
+
+def _draw_view(
+    photograph: "Axes", depth: "Axes", view: View, number: int, found: CameraAnswer, label: str, colour: str
+) -> None:
+    photograph.set_axis_on()
+    photograph.set(xticks=[], yticks=[])
+    photograph.imshow(read_for_display(view.path))
+    photograph.set_title(label, fontsize=8, color=colour)
+    for spine in photograph.spines.values():
+        spine.set(color=colour, linewidth=2.5, visible=True)
+    prediction = found.prediction
+    if prediction is None or prediction.depth is None:
+        return
+    scale = np.nan if found.alignment is None else found.alignment.world_from_model.scale
+    metric = found.alignment is not None and found.alignment.scale_known
+    values = prediction.depth[number] * (scale if metric else 1.0)
+    if not np.isfinite(values).any():
+        return
+    low, high = np.nanpercentile(values, (5, 95))
+    extent = None
+    if prediction.map_from_image is not None:  # in pixels of the photograph
+        scale_x, scale_y, offset_x, offset_y = prediction.map_from_image[number]
+        height, width = values.shape
+        left, right = -offset_x / scale_x, (width - offset_x) / scale_x
+        extent = (left, right, (height - offset_y) / scale_y, -offset_y / scale_y)
+    depth.imshow(values, cmap="viridis", vmin=low, vmax=high, extent=extent)
+    depth.set_title(f"depth {low:.1f} to {high:.1f} {'m' if metric else '(no unit)'}", fontsize=7)
+
+
+def _draw_from_above(
+    axis: "Axes", localizer: VggtLocalizer, found: CameraAnswer, kept: NDArray[np.bool_], up: ArrayLike | None
+) -> None:
+    local_map, alignment = localizer.map, found.alignment
+    axes, labels = ground_axes(up_of_cameras(local_map.world_from_cams) if up is None else up)
+    places = local_map.world_from_cams[found.references]
+    marked = [places]
+    if alignment is not None and found.prediction is not None and np.isfinite(alignment.rotation_std_deg):
+        finite = np.isfinite(found.prediction.model_from_cams[1:]).all(axis=(1, 2))
+        aligned = alignment.world_from_model.apply_to_pose(found.prediction.model_from_cams[1:])
+        marked.append(aligned[kept])
+        for agreed, colour, label in ((True, GREEN, "consistent"), (False, VERMILLION, "left out")):
+            part = (kept == agreed) & finite
+            _draw_cameras(axis, aligned[part], axes, colour, f"predicted, {label}", "o")
+            for start, end in zip(places[part, :3, 3] @ axes.T, aligned[part, :3, 3] @ axes.T, strict=True):
+                axis.plot(*zip(start, end, strict=True), c=colour, lw=0.8)
+    if found.world_from_cam is not None:
+        marked.append(found.world_from_cam[None])
+        _draw_cameras(axis, found.world_from_cam[None], axes, "black", "query", "*")
+    _draw_cameras(axis, places, axes, BLUE, "reference in the map", "s")
+    _draw_cameras(axis, local_map.world_from_cams, axes, GREY, "map", ".")
+    centres = np.concatenate(marked)[:, :3, 3] @ axes.T
+    if not len(centres):
+        centres = local_map.world_from_cams[:, :3, 3] @ axes.T
+    # A window about what is of interest: a camera left out may be far away.
+    middle, half = (centres.min(axis=0) + centres.max(axis=0)) / 2, np.ptp(centres, axis=0).max() * 0.75 + 1.0
+    cloud = local_map.points @ axes.T
+    near = (np.abs(cloud - middle) < half).all(axis=1)
+    axis.scatter(cloud[near, 0], cloud[near, 1], s=1, c="#BBBBBB", lw=0, zorder=0, rasterized=True)
+    axis.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), aspect="equal")
+    axis.set(xlabel=labels[0], ylabel=labels[1])
+    axis.set_title("cameras from above; a line joins a reference's two places", fontsize=9)
+    axis.grid(alpha=0.2)
+    axis.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=3, frameon=False)
+
+
+def _draw_cameras(axis: "Axes", poses: Array, axes: Array, colour: str, label: str, marker: str) -> None:
+    """Draw places (N, 4, 4) from above, with a stroke where they look."""
+    if not len(poses):
+        return
+    places, looks = poses[:, :3, 3] @ axes.T, poses[:, :3, 2] @ axes.T
+    size, layer = (14, 1) if marker == "." else (90 if marker == "*" else 60 if marker == "s" else 28, 3)
+    face = "none" if marker == "s" else colour  # what lies below stays visible
+    x, y = places.T
+    axis.scatter(x, y, s=size, facecolors=face, edgecolors=colour, marker=marker, label=label, zorder=layer)
+    axis.quiver(x, y, *looks.T, color=colour, width=0.003, scale=18, headwidth=3, zorder=layer)
