@@ -7,7 +7,7 @@ random similarity of the world. References stand about a point with the stated s
 distance to it; the query stands 3 m from it. Noise is the root mean square of the length of the error: `by axis`
 means that much along each of the three axes instead, sqrt(3) times more.
 
-The published recipe, as it is implemented here: of 5 references the 4 whose centres Umeyama's similarity (1991) fits
+The published recipe, as it is implemented here: of 5 references the 4 whose centers Umeyama's similarity (1991) fits
 with the least error; that similarity is applied to the query. It has no rule to refuse a pose.
 
 Prints, for each case, the median error of the query's place, the share of scales reported unknown, the share of
@@ -94,9 +94,9 @@ def simulate(case: Case, rng: np.random.Generator, noise_m: float, noise_deg: fl
 
     count = case.references
     direction = rng.normal(size=3)
-    centres = small(count, case.spread_m)
+    centers = small(count, case.spread_m)
     query = QUERY_M * direction / np.linalg.norm(direction)
-    world = geometry.make_pose(rotations(count + 1), np.vstack([centres, query]) + rng.uniform(-50, 50, 3))
+    world = geometry.make_pose(rotations(count + 1), np.vstack([centers, query]) + rng.uniform(-50, 50, 3))
     predicted = world.copy()
     wrong = np.zeros(count, bool)
     wrong[rng.permutation(count)[: case.wrong]] = True
@@ -148,8 +148,8 @@ def published(trial: Trial) -> tuple[Floats, float] | None:
         scale, R, t = umeyama(source[index], target[index])
         error = float(np.sqrt(np.mean(((scale * source[index] @ R.T + t - target[index]) ** 2).sum(axis=1))))
         if best is None or error < best[0]:
-            centre = scale * R @ trial.model_from_query[:3, 3] + t
-            best = error, geometry.make_pose(R @ trial.model_from_query[:3, :3], centre)
+            center = scale * R @ trial.model_from_query[:3, 3] + t
+            best = error, geometry.make_pose(R @ trial.model_from_query[:3, :3], center)
     assert best is not None
     return best[1], best[0]
 
@@ -175,9 +175,9 @@ def run(case: Case, trials: int, seed: int, noise_m: float, noise_deg: float) ->
     return rows
 
 
-def within(degrees: NDArray, metres: NDArray) -> str:
+def within(degrees: NDArray, meters: NDArray) -> str:
     """Return the share within (5 deg, 0.5 m), per cent."""
-    return f"{100 * np.mean((degrees <= 5) & (metres <= 0.5)):5.1f}" if len(degrees) else "    -"
+    return f"{100 * np.mean((degrees <= 5) & (meters <= 0.5)):5.1f}" if len(degrees) else "    -"
 
 
 def main() -> None:

@@ -45,7 +45,7 @@ peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 print(json.dumps([imported - start, opened - imported, done - imported, peak, poses[::997].tolist()]))
 """
 
-# The reader refuses images that are not on disk, so the check for existing files is taken out, in its favour.
+# The reader refuses images that are not on disk, so the check for existing files is taken out, in its favor.
 REFERENCE = """
 import json, resource, sys, time
 sys.path.insert(0, sys.argv[3])

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from toolkit.capture import Session
     from toolkit.localizers.pnp import PnpLocalizer
 
-WRONG = (5.0, 0.5)  # degrees, metres
+WRONG = (5.0, 0.5)  # degrees, meters
 LARGEST_SHARE_WRONG = 0.005
 CONFIDENCE = 0.95
 INLIERS = (12, 15, 20, 25, 30, 40, 50, 60)
@@ -46,7 +46,7 @@ Image = NDArray[np.uint8]
 
 
 def degrade(image: Image, how: str, rng: np.random.Generator) -> Image:
-    """Return a grey image (H, W) as a worse camera, or one in the way of others, would have taken it."""
+    """Return a gray image (H, W) as a worse camera, or one in the way of others, would have taken it."""
     height, width = image.shape
     if "hidden" in how:
         kept = np.zeros(image.shape, np.uint8)

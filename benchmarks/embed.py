@@ -345,9 +345,9 @@ def gpu_rows(checkout: str, job: Job, precisions: tuple[str, ...], batches: tupl
         model = load_official(checkout, str(job.weights), job.device)
         inputs = torch.stack([read(str(path), job.image_size) for path in files])
         for batch in batches:
-            normalised = inputs[torch.arange(batch) % len(inputs)].to(job.device)
+            normalized = inputs[torch.arange(batch) % len(inputs)].to(job.device)
             with torch.inference_mode(), torch.autocast(torch.device(job.device).type, torch.bfloat16):
-                official[batch] = batch / _seconds(lambda x: model(x).cpu(), normalised)
+                official[batch] = batch / _seconds(lambda x: model(x).cpu(), normalized)
         del model
     rows = []
     for precision in precisions:
@@ -444,7 +444,7 @@ def markdown(document: dict[str, Any], ours: list[Measurement], official: Measur
         text += [
             "",
             f"On {machine['gpu']}: the toolkit from decoded images on the host to descriptors there, the official "
-            "forward under bfloat16 autocast from normalised images on the GPU to descriptors on the host. Decoding "
+            "forward under bfloat16 autocast from normalized images on the GPU to descriptors on the host. Decoding "
             f"takes {1000 * document['gpu'][0]['decode']:.1f} ms an image in one thread; its share is of a plain "
             "loop of one decoder and the network.",
             "",

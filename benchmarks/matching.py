@@ -5,7 +5,7 @@
 Everything runs on the same features in one process, in turns, and the fastest of `--repeat` counts. `LightGlue, one at
 a time` and `LightGlue, batches of ...` are the same matcher with another `batch_size`; how many of their matches are
 the same is counted. `SIFT mutual` is `features.matching`, pair after pair; OpenCV's brute-force matcher does the same
-work (two nearest neighbours, ratio test, and mutual) on the same descriptors. Without a checkpoint LightGlue's weights
+work (two nearest neighbors, ratio test, and mutual) on the same descriptors. Without a checkpoint LightGlue's weights
 are random: its time does not depend on them, as every layer runs for every pair.
 """
 
@@ -75,7 +75,7 @@ def random_weights(seed: int = 0) -> dict[str, Any]:
 
 
 def match_with_opencv(pairs: list[tuple[Any, Any]]) -> list[NDArray[np.int64]]:
-    """Return mutual nearest neighbours that pass the ratio test, by OpenCV."""
+    """Return mutual nearest neighbors that pass the ratio test, by OpenCV."""
     matcher = cv2.BFMatcher(cv2.NORM_L2)
     found = []
     for a, b in pairs:

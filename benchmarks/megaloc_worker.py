@@ -94,7 +94,7 @@ def load_official(checkout: str, weights: str, device: str) -> Any:
 
 
 def read(path: str, size: int) -> Any:
-    """Return an image (3, S, S), float32, ImageNet-normalised."""
+    """Return an image (3, S, S), float32, ImageNet-normalized."""
     import numpy as np
     import torch
     from PIL import Image

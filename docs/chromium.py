@@ -224,7 +224,7 @@ def find_viewer(page: "Page", seconds: float = 120) -> "Locator":
 def wait_for_scene(canvas: "Locator", seconds: float = 120) -> bytes:
     """Wait until a viewer has drawn something and return its last screenshot, whatever that shows.
 
-    An empty viewer has a few greys; points, pictures and cameras have many colours (see `is_scene`).
+    An empty viewer has a few grays; points, pictures and cameras have many colors (see `is_scene`).
     """
     deadline = time.monotonic() + seconds
     while True:
@@ -237,13 +237,13 @@ def wait_for_scene(canvas: "Locator", seconds: float = 120) -> bytes:
 
 
 def is_scene(png: bytes) -> bool:
-    """Tell whether a picture of a viewer shows a scene: many colours, on more than a tenth of its pixels."""
-    count, share = colours(png)
+    """Tell whether a picture of a viewer shows a scene: many colors, on more than a tenth of its pixels."""
+    count, share = colors(png)
     return count >= 100 and share > 0.1
 
 
-def colours(png: bytes) -> tuple[int, float]:
-    """Return how many colours a picture has, of 16 steps a channel, and the share of its pixels that do not have the
+def colors(png: bytes) -> tuple[int, float]:
+    """Return how many colors a picture has, of 16 steps a channel, and the share of its pixels that do not have the
     most common one."""
     import numpy as np
     from PIL import Image

@@ -77,7 +77,7 @@ def viewer(browser: "Browser", run: Path, sessions_root: Path) -> bytes:
 
 
 def save(png: bytes, path: Path) -> None:
-    """Write a picture with as many colours of a palette as fit in `LARGEST` bytes."""
+    """Write a picture with as many colors of a palette as fit in `LARGEST` bytes."""
     from PIL import Image
 
     image = Image.open(io.BytesIO(png)).convert("RGB")

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 DEVICES = ("ios", "hl", "spot")
 STRICT, FINE, COARSE = "recall@(1deg,0.1m)", "recall@(5deg,0.5m)", "recall@(5deg,1m)"
 
-# Medians of hloc + SIFT as it comes: rows are maps, columns queries (ios, hl, spot), degrees and centimetres.
+# Medians of hloc + SIFT as it comes: rows are maps, columns queries (ios, hl, spot), degrees and centimeters.
 HLOC = {
     "ios": [(0.03, 0.6), (0.07, 1.0), (0.06, 1.2)],
     "hl": [(0.08, 2.2), (0.09, 2.4), (0.10, 2.5)],
@@ -69,10 +69,10 @@ def test_no_pair_of_strecha_is_less_accurate_than_hloc(
     evaluation_of: Callable[[str], Evaluation], mapped: str, query: str
 ) -> None:
     table = evaluation_of("STRECHA").recall.set_index(["map_device", "query_device"])
-    row, (degrees, centimetres) = table.loc[(mapped, query)], HLOC[mapped][DEVICES.index(query)]
+    row, (degrees, centimeters) = table.loc[(mapped, query)], HLOC[mapped][DEVICES.index(query)]
     # To the digits in which hloc's numbers are known.
     assert round(row["median_rotation_deg"], 2) <= degrees
-    assert round(100 * row["median_translation_m"], 1) <= centimetres
+    assert round(100 * row["median_translation_m"], 1) <= centimeters
 
 
 def test_the_medians_over_all_of_strecha_are_close_to_repaired_hloc(

@@ -13,7 +13,7 @@ SCRIPT = Path(__file__).parents[1] / "benchmarks" / "confidence.py"
 
 @pytest.fixture(scope="module")
 def confidence() -> ModuleType:
-    """The script, which imports its neighbours by their bare names."""
+    """The script, which imports its neighbors by their bare names."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(SCRIPT.parent)
         spec = importlib.util.spec_from_file_location("confidence", SCRIPT)

@@ -25,12 +25,12 @@ def test_an_empty_viewer_is_no_scene() -> None:
     panels = flat.copy()
     panels[:, 100:] = 40
     panels[50:60, ::7] = 230  # text
-    greys = np.broadcast_to(np.arange(300)[None, :, None] % 256, (200, 300, 3))
-    for empty in (flat, panels, greys):
+    grays = np.broadcast_to(np.arange(300)[None, :, None] % 256, (200, 300, 3))
+    for empty in (flat, panels, grays):
         assert not chromium.is_scene(png(empty))
     speck = flat.copy()
     speck[:30, :30] = np.random.default_rng(0).integers(0, 256, (30, 30, 3))
-    assert not chromium.is_scene(png(speck)), "many colours, on 1.5 % of the pixels"
+    assert not chromium.is_scene(png(speck)), "many colors, on 1.5 % of the pixels"
 
 
 def test_points_and_pictures_are_a_scene() -> None:
@@ -41,11 +41,11 @@ def test_points_and_pictures_are_a_scene() -> None:
     assert chromium.is_scene(png(scene))
 
 
-def test_colours_counts_and_shares() -> None:
+def test_colors_counts_and_shares() -> None:
     pixels = np.zeros((10, 10, 3))
     pixels[:2] = [255, 0, 0]
     pixels[2] = [250, 5, 3]  # the same to 16 steps a channel
-    assert chromium.colours(png(pixels)) == (2, pytest.approx(0.3))
+    assert chromium.colors(png(pixels)) == (2, pytest.approx(0.3))
 
 
 def test_a_copied_notebook_works_on_the_run(tmp_path: Path) -> None:

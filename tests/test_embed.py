@@ -16,7 +16,7 @@ from toolkit.capture.upright import turned_from_cam
 from toolkit.embed import embed_sessions
 from toolkit.embedders import load_embeddings
 from toolkit.embedders.megaloc import MegaLocEmbedder
-from toolkit.errors import ArtefactError, ManifestError, ToolkitError, WeightsError
+from toolkit.errors import ArtifactError, ManifestError, ToolkitError, WeightsError
 from toolkit.geometry import invert, qt_from_pose
 from toolkit.models.megaloc import MegaLoc
 from toolkit.retrieve import retrieve_pairs
@@ -305,7 +305,7 @@ def test_a_session_that_lost_its_images_leaves_no_embeddings(tiny: Path, tmp_pat
     images = tiny / "sessions" / "ios_query" / "images.txt"
     images.write_text(images.read_text().splitlines(keepends=True)[0])
     assert set(embed_sessions(tiny / "sessions", out, device="ios")["session"]) == {"ios_map"}
-    with pytest.raises(ArtefactError, match="No embeddings"):
+    with pytest.raises(ArtifactError, match="No embeddings"):
         load_embeddings(out / "ios_query")
 
 

@@ -11,7 +11,7 @@ from toolkit.evaluate import draw_evaluation, evaluate_scene, pose_errors, recal
 from toolkit.geometry import make_pose, pose_error
 
 CAMERA = ("camera", "PINHOLE", "640", "480", "500", "500", "320", "240")
-# Two cameras a metre to either side of the rig's origin, so that a turn of the rig moves them.
+# Two cameras a meter to either side of the rig's origin, so that a turn of the rig moves them.
 RIG_FROM_CAM = {"left": make_pose(np.eye(3), [-1, 0, 0]), "right": make_pose(np.eye(3), [1, 0, 0])}
 
 
@@ -223,7 +223,7 @@ def test_camera_errors_follow_the_rig(tmp_path):
     assert len(device.errors) == 2
     assert device.errors["translation_error_m"].tolist() == [0, np.inf]
     assert camera.errors["sensor_id"].tolist() == ["left", "right"] * 2
-    arc = 2 * np.sin(np.radians(2))  # a camera one metre from the rig's origin moves along the arc
+    arc = 2 * np.sin(np.radians(2))  # a camera one meter from the rig's origin moves along the arc
     np.testing.assert_allclose(camera.errors["translation_error_m"], [arc, arc, np.inf, np.inf])
     np.testing.assert_allclose(camera.errors["rotation_error_deg"][:2], 4)
     assert camera.recall["queries"].item() == 4

@@ -1,4 +1,4 @@
-"""Artefacts: whole or absent, and reused only if made from the same things."""
+"""Artifacts: whole or absent, and reused only if made from the same things."""
 
 import json
 import os
@@ -139,7 +139,7 @@ def test_current_only_with_the_same_settings(tmp_path: Path) -> None:
     assert not files.is_current(path, settings | {"seed": 1})
     assert not files.is_current(path, settings | {"more": None})
     path.unlink()
-    assert not files.is_current(path, settings)  # a record without its artefact
+    assert not files.is_current(path, settings)  # a record without its artifact
 
 
 @pytest.mark.parametrize(

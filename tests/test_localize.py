@@ -17,7 +17,7 @@ from toolkit import geometry, localize
 from toolkit.capture import Capture, Trajectory
 from toolkit.capture.images import read_image
 from toolkit.embed import embed_sessions
-from toolkit.errors import ArtefactError, CaptureError, ImageError, ManifestError, ToolkitError
+from toolkit.errors import ArtifactError, CaptureError, ImageError, ManifestError, ToolkitError
 from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor, SiftSettings, extract_session
 from toolkit.features.matching import MATCHERS, MutualMatcher, unit_descriptors
 from toolkit.files import SceneFiles, sidecar_path
@@ -127,7 +127,7 @@ def test_a_finished_run_leaves_no_partial_files(finished: tuple[SceneFiles, pd.D
     assert names == {stem + end for stem in stems for end in (".txt", ".csv", ".txt.meta.json")}
 
 
-def test_nearest_is_the_pose_of_the_best_reference_and_labelled(small_capture: Path, run: SceneFiles) -> None:
+def test_nearest_is_the_pose_of_the_best_reference_and_labeled(small_capture: Path, run: SceneFiles) -> None:
     table = run_stage(small_capture, run, method="nearest", query_device="hl")
     found = rows_of(run, "hl")
     assert (found["method"] == "nearest").all()
@@ -161,7 +161,7 @@ def test_nearest_is_the_pose_of_the_best_reference_and_labelled(small_capture: P
         ({"map_device": "drone"}, ToolkitError, r"drone.*ios, hl, spot"),
         ({"query_device": "drone"}, ToolkitError, r"drone.*ios, hl, spot"),
         ({"queries": "keyframes_best"}, CaptureError, "original"),
-        ({"map_device": "hl"}, ArtefactError, r"No references: .*SMALL_map_hl_query_ios\.jsonl is missing.*retrieve"),
+        ({"map_device": "hl"}, ArtifactError, r"No references: .*SMALL_map_hl_query_ios\.jsonl is missing.*retrieve"),
     ],
 )
 def test_wrong_questions_are_refused(
@@ -199,7 +199,7 @@ def test_a_map_of_an_older_format_is_built_anew(small_capture: Path, run: SceneF
 def test_a_garbled_retrieval_names_the_line(small_capture: Path, run: SceneFiles, line: str) -> None:
     path = run.retrieval("ios", "ios")
     path.write_text(path.read_text() + line + "\n")
-    with pytest.raises(ArtefactError, match=r"SMALL_map_ios_query_ios\.jsonl, line 4: not a retrieval row"):
+    with pytest.raises(ArtifactError, match=r"SMALL_map_ios_query_ios\.jsonl, line 4: not a retrieval row"):
         run_stage(small_capture, run, query_device="ios")
 
 
@@ -427,8 +427,8 @@ def test_a_picture_may_be_pixels(small_capture: Path, opened: Map) -> None:
     from_file = localize_image(opened, str(path), camera)
     gray = localize_image(opened, read_image(path, gray=True), camera)
     np.testing.assert_allclose(gray.world_from_rig, from_file.world_from_rig, atol=1e-9)
-    colour = localize_image(opened, read_image(path), camera)
-    rotation_deg, distance_m = geometry.pose_error(colour.world_from_rig, from_file.world_from_rig)
+    color = localize_image(opened, read_image(path), camera)
+    rotation_deg, distance_m = geometry.pose_error(color.world_from_rig, from_file.world_from_rig)
     assert rotation_deg < 0.1
     assert distance_m < 0.01
 
@@ -451,7 +451,7 @@ def test_a_picture_of_another_size_than_its_camera_is_refused(small_capture: Pat
 
 
 def test_the_map_of_an_unfinished_run(finished: tuple[SceneFiles, pd.DataFrame]) -> None:
-    with pytest.raises(ArtefactError, match="hl_map"):
+    with pytest.raises(ArtifactError, match="hl_map"):
         Map.open(finished[0].run, finished[0].scene, "hl")
 
 
@@ -475,7 +475,7 @@ def test_a_map_with_the_embedder_it_was_made_with(
     small_capture: Path, finished: tuple[SceneFiles, pd.DataFrame]
 ) -> None:
     files = finished[0]
-    with pytest.raises(ArtefactError, match="but `learned` makes 7"):
+    with pytest.raises(ArtifactError, match="but `learned` makes 7"):
         Map.open(files.run, files.scene, "ios", embedder=Learned(np.zeros(7, np.float32)))
     session = Capture.open(small_capture)["ios_query"]
     path, camera = session.image_path(0), session.camera(session.images["sensor_id"].iloc[0])
@@ -486,7 +486,7 @@ def test_a_map_with_the_embedder_it_was_made_with(
     expected = localize_image(vlad, path, camera)
     answer = localize_image(opened, path, camera)
     np.testing.assert_allclose(answer.world_from_rig, expected.world_from_rig, atol=1e-9)
-    assert learned.seen == [(camera.height, camera.width, 3)], "it is given colours"
+    assert learned.seen == [(camera.height, camera.width, 3)], "it is given colors"
 
 
 # ------------------------------------------------------------------------------------- other features, and several

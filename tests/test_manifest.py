@@ -151,21 +151,21 @@ def test_overrides_are_yaml_and_win(tmp_path: Path) -> None:
         ("captures: [a]\nembed: {image_size: 100}", "embed.image_size"),
         ("captures: [a]\nembed: {image_size: 300}", "multiple of 14"),
         ("captures: [a]\nembed: {compute_device: gpu}", "embed.compute_device"),
-        ("captures: [a]\ndataset: {page: p, licence: l, sessions: [ios_map], sources: {a: {hub: x}}}", "a.hub: found"),
+        ("captures: [a]\ndataset: {page: p, license: l, sessions: [ios_map], sources: {a: {hub: x}}}", "a.hub: found"),
         (
-            "captures: [a]\ndataset: {page: p, licence: l, sessions: [ios_map], sources: {a: {hubs: o/n}}}",
+            "captures: [a]\ndataset: {page: p, license: l, sessions: [ios_map], sources: {a: {hubs: o/n}}}",
             "unknown key 'dataset.sources.a.hubs'. Did you mean 'hub'?",
         ),
         (
-            "captures: [a]\ndataset: {page: p, licence: l, sessions: [ios_map], sources: {a: {}}}",
+            "captures: [a]\ndataset: {page: p, license: l, sessions: [ios_map], sources: {a: {}}}",
             "either `hub` (owner/name) or `urls`",
         ),
-        ("captures: [a]\ndataset: {page: p, licence: l, sessions: [tango_map], sources: {}}", "found 'tango_map'"),
-        ("captures: [a]\ndataset: {page: p, licence: l, sessions: [], sources: {}}", "dataset.sessions is empty"),
-        ("captures: [a]\ndataset: {page: p, licence: l, sessions: 3, sources: {}}", "dataset.sessions: found 3"),
-        ("captures: [a]\ndataset: {page: p, sessions: [ios_map], sources: {}}", "dataset.licence: not given"),
+        ("captures: [a]\ndataset: {page: p, license: l, sessions: [tango_map], sources: {}}", "found 'tango_map'"),
+        ("captures: [a]\ndataset: {page: p, license: l, sessions: [], sources: {}}", "dataset.sessions is empty"),
+        ("captures: [a]\ndataset: {page: p, license: l, sessions: 3, sources: {}}", "dataset.sessions: found 3"),
+        ("captures: [a]\ndataset: {page: p, sessions: [ios_map], sources: {}}", "dataset.license: not given"),
         (
-            "captures: [a]\ndataset: {page: p, licence: l, sessions: {ios_map: map}, sources: {a: {hub: o/n}}}",
+            "captures: [a]\ndataset: {page: p, license: l, sessions: {ios_map: map}, sources: {a: {hub: o/n}}}",
             "works with archives (`urls`) only",
         ),
         ("- a", "expected `key: value` lines"),
@@ -215,7 +215,7 @@ def test_public_captures_have_a_source_and_sessions(monkeypatch: pytest.MonkeyPa
             names = [Path(capture).name for capture in manifest.captures]
             assert list(manifest.dataset.sources) == names
             scenes |= {name: " ".join(manifest.dataset.session_names) for name in names}
-            assert manifest.dataset.licence
+            assert manifest.dataset.license
             assert manifest.dataset.citation
     crocodl = ("HYDRO", "SUCCULENT", "ARCHE_GRANDE", "DESIGN", "ARCHE_D2", "ARCHE_B3", "ARCHE_B5")
     every = "ios_map ios_query hl_map hl_query spot_map spot_query"

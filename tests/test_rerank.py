@@ -13,7 +13,7 @@ import pytest
 from toolkit import rerank
 from toolkit.capture import Capture
 from toolkit.embed import embed_sessions
-from toolkit.errors import ArtefactError, ManifestError
+from toolkit.errors import ArtifactError, ManifestError
 from toolkit.evaluate import overlap_in_view, overlap_table
 from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor
 from toolkit.features.matching import LocalMethod, MutualMatcher
@@ -27,19 +27,19 @@ BENT = pycolmap.Camera(model="OPENCV", width=640, height=480, params=[430, 428, 
 LIST = "keyframes_original"
 
 
-def turned(degrees: float, centre: tuple[float, float, float]) -> np.ndarray:
+def turned(degrees: float, center: tuple[float, float, float]) -> np.ndarray:
     """Return world_from_cam, turned about the vertical."""
     a = np.radians(degrees)
     rotation = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
-    return make_pose(rotation, np.array(centre))
+    return make_pose(rotation, np.array(center))
 
 
-def two_views(count: int, right: int, seed: int = 0, centre: tuple[float, float, float] = (1.2, 0.1, 0.3)) -> Any:
+def two_views(count: int, right: int, seed: int = 0, center: tuple[float, float, float] = (1.2, 0.1, 0.3)) -> Any:
     """Return matched pixels of two cameras, the first `right` of which see the same points, and scores that say so."""
     rng = np.random.default_rng(seed)
     points = rng.uniform([-1.5, -1.2, 4], [1.5, 1.2, 9], (count, 3))
     pixels_a = np.asarray(WIDE.img_from_cam(points))
-    pixels_b = np.asarray(BENT.img_from_cam(transform(invert(turned(-8, centre)), points)))
+    pixels_b = np.asarray(BENT.img_from_cam(transform(invert(turned(-8, center)), points)))
     pixels_b[right:] = rng.uniform(0, [640, 480], (count - right, 2))
     scores = np.where(np.arange(count) < right, 0.9, 0.7) + rng.uniform(0, 0.1, count)
     return pixels_a + rng.normal(0, 0.3, (count, 2)), pixels_b + rng.normal(0, 0.3, (count, 2)), scores
@@ -69,7 +69,7 @@ def test_distortion_is_taken_into_account() -> None:
 
 
 def test_a_camera_that_only_turned_still_agrees() -> None:
-    pixels_a, pixels_b, scores = two_views(150, 150, centre=(0, 0, 0))
+    pixels_a, pixels_b, scores = two_views(150, 150, center=(0, 0, 0))
     assert count_inliers(WIDE, pixels_a, BENT, pixels_b, scores, VerifySettings()) > 120
 
 
@@ -298,13 +298,13 @@ def test_wrong_settings_and_files_are_refused(small_capture: Path, files: SceneF
         run(small_capture, files, topk=7)
     path = files.retrieval("ios", "hl")
     path.write_text(path.read_text() + "{}\n")
-    with pytest.raises(ArtefactError, match=r"line \d+: not a retrieval row"):
+    with pytest.raises(ArtifactError, match=r"line \d+: not a retrieval row"):
         run(small_capture, files)
     path.write_text(path.read_text().splitlines()[0].replace("ios_map/raw_data/", "ios_map/raw_data/x") + "\n")
-    with pytest.raises(ArtefactError, match="of another capture"):
+    with pytest.raises(ArtifactError, match="of another capture"):
         run(small_capture, files)
     path.unlink()
-    with pytest.raises(ArtefactError, match="Run the retrieve stage first"):
+    with pytest.raises(ArtifactError, match="Run the retrieve stage first"):
         run(small_capture, files)
 
 

@@ -10,7 +10,7 @@ import pytest
 from tests.test_embed import HL_RIG, write_tiny_capture
 from toolkit.capture import Capture
 from toolkit.embed import embed_sessions
-from toolkit.errors import ArtefactError, CaptureError, ManifestError
+from toolkit.errors import ArtifactError, CaptureError, ManifestError
 from toolkit.retrieve import load_embeddings, retrieve_pairs, search
 
 BACKENDS = ["faiss", "torch", "numpy"]
@@ -133,7 +133,7 @@ def test_only_listed_keyframes(tiny: Path, tmp_path: Path) -> None:
 
 def test_refused(tiny: Path, tmp_path: Path) -> None:
     sessions, embeddings = tiny / "sessions", tmp_path / "embeddings"
-    with pytest.raises(ArtefactError, match=r"run the embed stage first.*--only embed"):
+    with pytest.raises(ArtifactError, match=r"run the embed stage first.*--only embed"):
         retrieve_pairs(sessions, tmp_path / "nowhere")
     with pytest.raises(CaptureError, match=r"No map session of device 'spot'.*ios, hl"):
         retrieve_pairs(sessions, embeddings, "spot")
@@ -150,19 +150,19 @@ def test_embeddings_that_do_not_fit(tiny: Path, tmp_path: Path) -> None:
     matrix, table = load_embeddings(folder)
     assert table["subsession"].unique().tolist() == ["ios_a"]
     np.save(folder / "ios_a.npy", matrix[:, :3])
-    with pytest.raises(ArtefactError, match="different models"):
+    with pytest.raises(ArtifactError, match="different models"):
         retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", "ios", "hl", skip_existing=False)
     np.save(folder / "ios_a.npy", np.full_like(matrix, np.nan))
-    with pytest.raises(ArtefactError, match="NaN"):
+    with pytest.raises(ArtifactError, match="NaN"):
         retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", "ios", "hl", skip_existing=False)
     np.save(folder / "ios_a.npy", matrix[1:])
-    with pytest.raises(ArtefactError, match=r"does not fit ios_a.npy"):
+    with pytest.raises(ArtifactError, match=r"does not fit ios_a.npy"):
         load_embeddings(folder)
     np.save(folder / "ios_a.npy", matrix)
     manifest = pd.read_csv(folder / "manifest.csv")
     manifest["abs_path"] = manifest["abs_path"].str.replace("1000", "9")
     manifest.to_csv(folder / "manifest.csv", index=False)
-    with pytest.raises(ArtefactError, match="another capture"):
+    with pytest.raises(ArtifactError, match="another capture"):
         retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", "ios", "hl", skip_existing=False)
 
 

@@ -34,7 +34,7 @@ from toolkit.models.compute import check_device_name
 log = logging.getLogger(__name__)
 
 VOCABULARY_IMAGES = 2048
-"""Map images that the vocabulary is learnt from at most, spread evenly: bounds time and memory."""
+"""Map images that the vocabulary is learned from at most, spread evenly: bounds time and memory."""
 
 
 def embed_sessions(
@@ -69,7 +69,7 @@ def embed_sessions(
         subsession: one subsession's name, or `all`.
         batch_size: images a batch.
         compute_device: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`: where a network runs. `vlad` runs on the CPU.
-        normalize: L2-normalise the rows.
+        normalize: L2-normalize the rows.
         skip_existing: reuse subsessions made from the same images and settings.
         dtype: `float32` or `float16`, of the files.
         model: an embedder's name; `auto`: `megaloc` if its weights are on this machine, else `vlad`.

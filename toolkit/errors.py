@@ -13,7 +13,7 @@ class ManifestError(ToolkitError):
     """A manifest or a parameter is not valid."""
 
 
-class ArtefactError(ToolkitError):
+class ArtifactError(ToolkitError):
     """A file that an earlier stage should have written is missing, torn or made from something else."""
 
 

@@ -12,9 +12,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from toolkit.capture import Capture, Session, Trajectory
-from toolkit.capture.devices import colour_of, in_order
+from toolkit.capture.devices import color_of, in_order
 from toolkit.capture.tables import read_query_table
-from toolkit.errors import ArtefactError, CaptureError, ToolkitError
+from toolkit.errors import ArtifactError, CaptureError, ToolkitError
 from toolkit.files import image_name, pair_name, read_references, write_atomic, write_sidecar
 from toolkit.geometry import invert, pose_error, transform
 from toolkit.show.figures import ORANGE, SKY, VERMILLION, new_figure, save_figure, styled
@@ -50,7 +50,7 @@ NO_REFERENCE, NO_POSE, WRONG_POSE = REASONS = ("no good reference", "no pose", "
 def pose_errors(
     estimated: "Trajectory | Array", truth: "Trajectory | Array", keys: pd.DataFrame | None = None
 ) -> tuple[Array, Array]:
-    """Return the rotation error, degrees, and the translation error, metres, of each query, (N,) each.
+    """Return the rotation error, degrees, and the translation error, meters, of each query, (N,) each.
 
     As the LaMAR benchmark defines them: angle and length of inverse(estimated) @ true. A query without an
     estimate has infinite errors; one without a true pose, NaN.
@@ -76,7 +76,7 @@ def pose_errors(
 def recall(
     rotation_deg: Array, translation_m: Array, thresholds: Sequence[Threshold] = THRESHOLDS
 ) -> NDArray[np.float64]:
-    """Return the share of queries, 0 to 1, with both errors strictly below each (degrees, metres) pair.
+    """Return the share of queries, 0 to 1, with both errors strictly below each (degrees, meters) pair.
 
     All queries count; one without a pose has infinite errors and is a miss. NaN where there is no query.
     """
@@ -153,7 +153,7 @@ def evaluate_scene(
         out_dir: where `{recall,errors,retrieval,losses,overlap}.csv` and the figures go; None: nowhere.
         map_device: `all` or one device key; likewise `query_device`.
         queries: the keyframe list that is asked; all of it is the denominator.
-        thresholds: pairs (degrees, metres).
+        thresholds: pairs (degrees, meters).
         retrieval_ks: numbers of references that retrieval recall looks at.
         retrieval_radius_m: a good reference is a map image at most so far from the query's true camera,
         retrieval_angle_deg: and looks in a direction at most so different. The roll about the viewing
@@ -170,7 +170,7 @@ def evaluate_scene(
     """
     if at not in ("device", "camera"):
         raise ToolkitError(f"Unknown at={at!r}. Known: device, camera.")
-    pairs_of_thresholds = tuple((float(degrees), float(metres)) for degrees, metres in thresholds)
+    pairs_of_thresholds = tuple((float(degrees), float(meters)) for degrees, meters in thresholds)
     capture = Capture.from_sessions_root(sessions_root)
     map_devices = _devices(capture, "map", map_device)
     rows: dict[str, list[dict[str, Any]]] = {"recall": [], "retrieval": [], "losses": []}
@@ -296,7 +296,7 @@ def _read_results(stem: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, 
     columns = ["timestamp", "device_id"]
     try:
         details = read_query_table(table, ["status"]).drop_duplicates(columns)
-    except ArtefactError as error:
+    except ArtifactError as error:
         return results, f"unreadable table of queries ({error})"
     merged = keys.merge(details, how="left", on=columns)
     known = merged["status"].notna().to_numpy()
@@ -409,7 +409,7 @@ def _retrieval_recall(
         for i, line in enumerate(lines):
             for rank, reference in enumerate(line["topk"]):
                 references[i, rank] = reference["Tws"]
-    except (ArtefactError, ValueError, KeyError, TypeError) as error:
+    except (ArtifactError, ValueError, KeyError, TypeError) as error:
         state = f"unreadable retrieval file ({type(error).__name__}: {error})"
         return {"state": state, "queries": len(keys)}, None
     cameras = _poses_of(truth, index) @ device_from_cam  # type: ignore[arg-type]
@@ -461,8 +461,8 @@ def overlap_in_view(points: Array, reference: Array, world_from_cam: Array, came
     point that the camera would look at from behind (over 90 degrees from the reference's line of sight) is not seen.
 
     Args:
-        points: (P, 3) triangulated points that the reference observes, world, metres.
-        reference: (3,) its centre.
+        points: (P, 3) triangulated points that the reference observes, world, meters.
+        reference: (3,) its center.
         world_from_cam: (4, 4) the other camera's pose.
         camera: its intrinsics.
     """
@@ -527,9 +527,9 @@ def _overlap(path: Path, name: str, session: Session, scene: "_MapView") -> dict
         for line, camera in zip(lines, cameras, strict=True):
             if np.isfinite(camera).all():
                 seen = scene.seen_by(line["topk"][0]) if line["topk"] else np.zeros((0, 3))
-                centre = np.array(line["topk"][0]["Tws"])[:3, 3] if line["topk"] else np.zeros(3)
-                shares.append(overlap_in_view(seen, centre, camera, session.camera(line["sensor_id"])))
-    except (ArtefactError, OSError, ValueError, KeyError, TypeError) as error:
+                center = np.array(line["topk"][0]["Tws"])[:3, 3] if line["topk"] else np.zeros(3)
+                shares.append(overlap_in_view(seen, center, camera, session.camera(line["sensor_id"])))
+    except (ArtifactError, OSError, ValueError, KeyError, TypeError) as error:
         return {"state": f"{path.name} of the {name} cannot be read ({type(error).__name__})"}
     row: dict[str, Any] = {"images": len(shares), "points": "view" if scene.local_map is None else "map"}
     if shares:
@@ -548,12 +548,12 @@ class _MapView:
     def open(cls, session: Session, map_dir: Path | None) -> "_MapView":
         from toolkit.localizers.mapping import LocalMap
 
-        with suppress(ArtefactError):
+        with suppress(ArtifactError):
             return cls(session, None if map_dir is None else LocalMap.load(map_dir / f"{session.id}.npz"))
         return cls(session, None)
 
     def seen_by(self, reference: dict[str, Any]) -> Array:
-        """Return the points (P, 3) that a reference sees, world, metres."""
+        """Return the points (P, 3) that a reference sees, world, meters."""
         if self.local_map is not None:
             image = self.local_map.index_of.get(image_name(str(reference["path"])))
             if image is None:
@@ -621,7 +621,7 @@ def draw_matrices(
         columns: for each panel a column's name, title, factor and unit.
         title: of the figure.
         better: `higher` or `lower`: which values are good, shown light to dark.
-        limits: range of the colours after the factor; None: of the values.
+        limits: range of the colors after the factor; None: of the values.
     """
     figure = new_figure(3.1 * len(columns) + 0.4, 3.35)
     maps, queries = (in_order(table[c]) for c in ("map_device", "query_device"))
@@ -681,7 +681,7 @@ def draw_error_curves(errors: pd.DataFrame, thresholds: Sequence[Threshold] = TH
                 found = np.sort(values[np.isfinite(values)].to_numpy(float).clip(1e-4))
                 share = 100 * np.arange(len(found) + 1) / len(values)
                 axis.step([low / 2, *found, high * 2], [*share, share[-1]], where="post", lw=1.8,
-                          color=colour_of(map_), label=f"{map_} map")  # fmt: skip
+                          color=color_of(map_), label=f"{map_} map")  # fmt: skip
             for mark in marks:
                 axis.axvline(mark, color="0.45", lw=0.9, ls=":")
             axis.set_xscale("log")
@@ -709,9 +709,9 @@ def draw_losses(losses: pd.DataFrame) -> "Figure":
     for axis, threshold in zip(axes, thresholds, strict=True):
         rows = known[known["threshold"] == threshold].set_index(["map_device", "query_device"]).loc[pairs]
         left = np.zeros(len(rows))
-        for reason, colour in zip(REASONS, (SKY, ORANGE, VERMILLION), strict=True):
+        for reason, color in zip(REASONS, (SKY, ORANGE, VERMILLION), strict=True):
             share = 100 * (rows[reason] / rows["queries"]).to_numpy(float)
-            axis.barh(range(len(rows)), share, left=left, color=colour, label=reason, height=0.72)
+            axis.barh(range(len(rows)), share, left=left, color=color, label=reason, height=0.72)
             left += share
         for y, value in enumerate(left):
             axis.text(value + 0.012 * widest, y, f"{value:.0f}", va="center", fontsize=8, color="0.3")

@@ -1,4 +1,4 @@
-"""Artefacts on disk: written whole or not at all, each with a record of what it was made from."""
+"""Artifacts on disk: written whole or not at all, each with a record of what it was made from."""
 
 import hashlib
 import json
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from toolkit import __version__
-from toolkit.errors import ArtefactError
+from toolkit.errors import ArtifactError
 
 
 @contextmanager
@@ -27,7 +27,7 @@ def write_atomic(path: str | Path) -> Iterator[Path]:
     temporary = Path(name)
     try:
         yield temporary
-        # mkstemp makes private files; an artefact is as readable as any other file of the user.
+        # mkstemp makes private files; an artifact is as readable as any other file of the user.
         umask = os.umask(0)
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
@@ -71,15 +71,15 @@ def files_fingerprint(paths: list[Path]) -> str:
 
 
 def sidecar_path(path: str | Path) -> Path:
-    """Return where the record of what an artefact was made from is kept: `<name>.meta.json` beside it."""
+    """Return where the record of what an artifact was made from is kept: `<name>.meta.json` beside it."""
     path = Path(path)
     return path.with_name(path.name + ".meta.json")
 
 
 def write_sidecar(path: str | Path, settings: dict[str, Any]) -> None:
-    """Record the settings and inputs that the artefact `path` was made from.
+    """Record the settings and inputs that the artifact `path` was made from.
 
-    Call it after the artefact stands: an artefact without a matching record is made again.
+    Call it after the artifact stands: an artifact without a matching record is made again.
     """
     size = Path(path).stat().st_size
     record = {"version": __version__, "fingerprint": fingerprint(settings), "bytes": size, "settings": settings}
@@ -87,7 +87,7 @@ def write_sidecar(path: str | Path, settings: dict[str, Any]) -> None:
 
 
 def read_sidecar(path: str | Path) -> dict[str, Any] | None:
-    """Return the settings that the artefact `path` was made from; None unless it is whole and of this version."""
+    """Return the settings that the artifact `path` was made from; None unless it is whole and of this version."""
     try:
         record = json.loads(sidecar_path(path).read_text(encoding="utf-8"))
         current = {"version": __version__, "bytes": Path(path).stat().st_size}
@@ -101,7 +101,7 @@ def read_sidecar(path: str | Path) -> dict[str, Any] | None:
 
 
 def is_current(path: str | Path, settings: dict[str, Any]) -> bool:
-    """Tell whether the artefact `path` is whole and was made by this version from exactly these settings."""
+    """Tell whether the artifact `path` is whole and was made by this version from exactly these settings."""
     found = read_sidecar(path)
     return found is not None and fingerprint(found) == fingerprint(settings)
 
@@ -125,7 +125,7 @@ def open_progress(path: str | Path, settings: dict[str, Any], keep: bool = True)
     """Open the file of a stage's finished rows, with those that are there if they came of the same settings.
 
     Args:
-        path: the file; the caller removes it once the artefact stands.
+        path: the file; the caller removes it once the artifact stands.
         settings: what the rows depend on.
         keep: False begins anew.
     """
@@ -236,7 +236,7 @@ def read_references(path: str | Path, *needed: str) -> list[dict[str, Any]]:
         needed: further keys that each row must have.
 
     Raises:
-        ArtefactError: the file is missing, or a line of it is no such row.
+        ArtifactError: the file is missing, or a line of it is no such row.
     """
     rows: list[dict[str, Any]] = []
     keys, number = {"timestamp", "sensor_id", "topk", *needed}, 0
@@ -247,12 +247,12 @@ def read_references(path: str | Path, *needed: str) -> list[dict[str, Any]]:
                 if line.strip():
                     rows.append(_checked(json.loads(line), keys))
     except FileNotFoundError:
-        raise ArtefactError(
+        raise ArtifactError(
             f"No references: {path} is missing. Run the retrieve stage first "
             "(python -m toolkit run MANIFEST --only retrieve)."
         ) from None
     except (ValueError, TypeError, OverflowError) as error:
-        raise ArtefactError(f"{path}, line {number}: not a retrieval row ({error}). Retrieve again.") from None
+        raise ArtifactError(f"{path}, line {number}: not a retrieval row ({error}). Retrieve again.") from None
     return rows
 
 

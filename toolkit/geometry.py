@@ -114,7 +114,7 @@ def rotation_angle_deg(rotation: ArrayLike) -> Array:
 
 
 def pose_error(world_from_estimated: ArrayLike, world_from_true: ArrayLike) -> tuple[Array, Array]:
-    """Return the rotation error, degrees, and the translation error, metres, of poses (..., 4, 4).
+    """Return the rotation error, degrees, and the translation error, meters, of poses (..., 4, 4).
 
     As the LaMAR benchmark defines them: the angle and the length of inverse(estimated) @ true.
     """

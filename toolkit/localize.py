@@ -20,7 +20,7 @@ from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import default_workers, prefetch, read_image
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import Embedder, create_embedder, load_embeddings
-from toolkit.errors import ArtefactError, ImageError, ManifestError
+from toolkit.errors import ArtifactError, ImageError, ManifestError
 from toolkit.features.features import (
     KINDS,
     FeatureStore,
@@ -181,7 +181,7 @@ def localize_pairs(
         ManifestError: unknown method, predictor, features or matcher, or a number that is not positive.
         WeightsError: the network has no weights, before any work is done.
         CaptureError: unknown device or list.
-        ArtefactError: the retrieval of a pair is missing.
+        ArtifactError: the retrieval of a pair is missing.
     """
     if method not in METHODS:
         raise ManifestError(f"Unknown method {method!r}. Known: {', '.join(METHODS)}.")
@@ -647,7 +647,7 @@ def explain_query(
         What `toolkit.show.visualize_prediction.draw_prediction` takes.
 
     Raises:
-        ArtefactError: the retrieval or the triangulated map is missing.
+        ArtifactError: the retrieval or the triangulated map is missing.
     """
     capture = Capture.from_sessions_root(sessions_root)
     pair = _Pair(capture, map_device, query_device, Path(retrieval_dir), Path(retrieval_dir), queries)
@@ -683,7 +683,7 @@ class Map:
             embedder: the one that the run was embedded with; None: `vlad`.
 
         Raises:
-            ArtefactError: the run has no such map yet, or was embedded by another embedder.
+            ArtifactError: the run has no such map yet, or was embedded by another embedder.
         """
         files = SceneFiles(Path(run), scene)
         session = f"{device}_map"
@@ -696,7 +696,7 @@ class Map:
         if embedder is None:
             embedder = create_embedder("vlad", vocabulary=files.embeddings / "vlad.npz")
         if embedder.dim != vectors.shape[1]:
-            raise ArtefactError(
+            raise ArtifactError(
                 f"{files.embeddings / session}: descriptors of length {vectors.shape[1]}, but `{embedder.name}` makes "
                 f"{embedder.dim}. Give the embedder that this run was made with: Map.open(..., embedder=...)."
             )

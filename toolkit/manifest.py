@@ -60,7 +60,7 @@ class ExtraDevice(_Strict):
     """Its sessions are `<key>_map` and `<key>_query`."""
     label: str | None = None
     """For people."""
-    colour: Annotated[str, Field(pattern=r"^#[0-9a-fA-F]{6}$")] | None = None
+    color: Annotated[str, Field(pattern=r"^#[0-9a-fA-F]{6}$")] | None = None
     """In figures, as #rrggbb."""
     sessions: dict[Literal["map", "query"], str] | None = None
     """Or: what the folders of its sessions are called, e.g. {query: query_drone}."""
@@ -155,7 +155,7 @@ class LocalizeSettings(_Section):
 
 class EvaluateSettings(_Section):
     thresholds: list[Threshold] | None = None
-    """Recall is counted at these (degrees, metres)."""
+    """Recall is counted at these (degrees, meters)."""
     retrieval_ks: list[Positive] | None = None
     """Retrieval recall is counted at these numbers of references."""
     retrieval_radius_m: PositiveNumber | None = None
@@ -203,8 +203,8 @@ class DatasetSettings(_Strict):
 
     page: str
     """Where to read about the data, ask for access and accept terms."""
-    licence: str
-    """Licence of the data."""
+    license: str
+    """License of the data."""
     citation: str = ""
     """What to cite."""
     into: Literal["", "sessions"] = ""

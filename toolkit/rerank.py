@@ -25,7 +25,7 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
 from toolkit.capture.images import default_workers, prefetch
-from toolkit.errors import ArtefactError, ManifestError
+from toolkit.errors import ArtifactError, ManifestError
 from toolkit.features.features import Extractor, FeatureStore, LocalFeatures, extract_session
 from toolkit.features.matching import LocalMethod, Matcher, create_local_methods
 from toolkit.files import (
@@ -111,7 +111,7 @@ def rerank_pairs(
         ManifestError: topk is below 1 or above topn; unknown features, or a matcher that does not suit them.
         WeightsError: a network has no weights.
         CaptureError: unknown device.
-        ArtefactError: the retrieval of a pair is missing, torn, or of another capture.
+        ArtifactError: the retrieval of a pair is missing, torn, or of another capture.
     """
     if not 1 <= topk <= topn:
         raise ManifestError(f"topk is {topk} and topn {topn}; expected 1 <= topk <= topn.")
@@ -439,12 +439,12 @@ def _rows_of(session: Session, names: Sequence[str], path: Path) -> NDArray[np.i
     """Return the rows of `session.images` of image names.
 
     Raises:
-        ArtefactError: an image is not in the session.
+        ArtifactError: an image is not in the session.
     """
     prefix = f"{session.id}/raw_data/"
     rows = pd.Index(session.images["path"]).get_indexer([name.removeprefix(prefix) for name in names])
     if (rows < 0).any():
-        raise ArtefactError(
+        raise ArtifactError(
             f"{path}: {(rows < 0).sum()} images are not in {session.path / 'images.txt'}, first "
             f"{names[int(np.argmax(rows < 0))]}. The file is of another capture: retrieve again."
         )

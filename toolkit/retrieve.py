@@ -15,7 +15,7 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
 from toolkit.embedders import load_embeddings
-from toolkit.errors import ArtefactError, ManifestError, ToolkitError
+from toolkit.errors import ArtifactError, ManifestError, ToolkitError
 from toolkit.files import (
     file_fingerprint,
     fingerprint,
@@ -116,7 +116,7 @@ def retrieve_pairs(
         topk: references a query image.
         use_faiss: search with faiss, else with torch; the result is the same.
         faiss_gpu: search with a faiss built for GPUs.
-        normalize: L2-normalise before the search, so that scores are cosines.
+        normalize: L2-normalize before the search, so that scores are cosines.
         compute_device: where torch computes: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
         queries: the keyframe list that says which devices are asked for, or `all`.
         skip_existing: reuse files made from the same embeddings, poses and settings.
@@ -203,7 +203,7 @@ def _load(session: Session, embeddings: Path) -> _Images:
     names = table["abs_path"].str.split(f"/sessions/{session.path.name}/raw_data/", n=1, regex=False).str[-1]
     rows = pd.Index(session.images["path"]).get_indexer(names)
     if (rows < 0).any():
-        raise ArtefactError(
+        raise ArtifactError(
             f"{folder}: {(rows < 0).sum()} embedded images are not in {session.path / 'images.txt'}, first "
             f"{table['abs_path'][int(np.argmax(rows < 0))]}. They are of another capture: embed again."
         )
@@ -265,7 +265,7 @@ def _write_pair(
 ) -> None:
     pair = f"map {database.session.id}, query {query.session.id}"
     if query.vectors.shape[1] != database.vectors.shape[1]:
-        raise ArtefactError(
+        raise ArtifactError(
             f"{pair}: the map's embeddings have {database.vectors.shape[1]} dimensions, the query's "
             f"{query.vectors.shape[1]}. They are of different models: embed both again with one."
         )
@@ -275,7 +275,7 @@ def _write_pair(
             asked, known, topk, "faiss" if use_faiss else "torch", compute_device, faiss_gpu
         )
     except ValueError as error:
-        raise ArtefactError(f"{pair}: {error}") from error
+        raise ArtifactError(f"{pair}: {error}") from error
     world_from_sensor = database.session.world_from_cam(database.rows).tolist()
     rig_from_sensor = query.session.rig_from_cam(query.rows).tolist()
     references = _records(database.table)

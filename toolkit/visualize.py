@@ -15,7 +15,7 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import read_for_display
-from toolkit.errors import ArtefactError
+from toolkit.errors import ArtifactError
 from toolkit.features.features import FeatureStore, extract_session
 from toolkit.files import pair_name
 from toolkit.localizers.mapping import LocalMap
@@ -45,7 +45,7 @@ class _Map:
     store: FeatureStore | None
 
     def cloud(self) -> tuple[Array, NDArray[np.uint8] | None]:
-        """Return the points, (P, 3), and their colours."""
+        """Return the points, (P, 3), and their colors."""
         return (np.zeros((0, 3)), None) if self.localizer is None else sure_points(self.localizer.map)
 
     @cached_property
@@ -126,7 +126,7 @@ def visualize_scene(
         One row a pair: map_device, query_device, queries, localized, seconds, still, recording.
 
     Raises:
-        ArtefactError: there are no poses at all.
+        ArtifactError: there are no poses at all.
     """
     capture, out = Capture.from_sessions_root(sessions_root), Path(out_dir)
     maps = [d for d in capture.devices if f"{d}_map" in capture and map_device in ("all", d)]
@@ -137,7 +137,7 @@ def visualize_scene(
         if stem.with_name(f"{stem.name}.txt").is_file():
             found[pair] = _load_results(stem, capture[f"{pair[1]}_query"])
     if not found:
-        raise ArtefactError(f"{poses_dir}: no poses of {capture.name} for the devices asked for. Localize them first.")
+        raise ArtifactError(f"{poses_dir}: no poses of {capture.name} for the devices asked for. Localize them first.")
     table, worst = [], []
     with tqdm(total=len(found), desc="visualize", unit="pair") as bar:
         for m in dict.fromkeys(m for m, _ in found):
@@ -183,7 +183,7 @@ def _load_results(stem: Path, session: Session) -> _Results:
     try:
         table = pd.read_csv(stem.with_name(f"{stem.name}.csv"), dtype=keys)
     except (OSError, ValueError) as error:
-        raise ArtefactError(f"{stem}.csv cannot be read ({error}). Localize again.") from None
+        raise ArtifactError(f"{stem}.csv cannot be read ({error}). Localize again.") from None
     rows = session.rows_of_keyframes(table)
     have = np.array([len(part) > 0 for part in rows], bool)
     table, rows = table[have].reset_index(drop=True), [part for part in rows if len(part)]
@@ -214,16 +214,16 @@ class _Pair:
     @cached_property
     def localizations(self) -> Localizations:
         results, row_of = self.results, self.shown.row_of
-        centres = np.full((len(results.rows), 3), np.nan)
+        centers = np.full((len(results.rows), 3), np.nan)
         poses = self.shown.session.world_from_cam()
-        for k in range(len(centres)):
+        for k in range(len(centers)):
             known = [name for name in results.references(k) if name in row_of]
             if known:
-                centres[k] = poses[row_of[known[0]], :3, 3]
+                centers[k] = poses[row_of[known[0]], :3, 3]
         names = [results.session.image_name(int(rows[0])) for rows in results.rows]
         true = np.full_like(results.estimated, np.nan) if results.true is None else results.true
         return Localizations(
-            names, results.table["status"].tolist(), results.estimated, true, results.inliers(), centres
+            names, results.table["status"].tolist(), results.estimated, true, results.inliers(), centers
         )
 
     def details(self, k: int) -> QueryDetails:

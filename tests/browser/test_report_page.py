@@ -31,7 +31,7 @@ def test_report_opens_without_errors_and_fits_the_window(
     page.screenshot(path=tmp_path / "report.png", full_page=True)
     page.evaluate("document.querySelectorAll('details').forEach(details => details.open = true)")
     assert page.evaluate("document.documentElement.scrollWidth - window.innerWidth") <= 0, "with all details open"
-    count, share = chromium.colours((tmp_path / "report.png").read_bytes())
+    count, share = chromium.colors((tmp_path / "report.png").read_bytes())
     assert count > 50, "a page without pictures or shading"
     assert 0.05 < share < 0.95
     context.close()

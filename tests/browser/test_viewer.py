@@ -29,6 +29,6 @@ def test_the_viewer_in_the_notebook_draws_the_scene(
         (tmp_path / "viewer.png").write_bytes(picture)
         page.screenshot(path=tmp_path / "lab.png", timeout=120_000)
         page.close()
-    assert chromium.is_scene(picture), f"colours, and share of pixels that differ: {chromium.colours(picture)}"
+    assert chromium.is_scene(picture), f"colors, and share of pixels that differ: {chromium.colors(picture)}"
     # The viewer asks its maker for news of itself; refused, it works all the same.
     assert all("rerun" in request for request in traffic.outside), traffic.outside

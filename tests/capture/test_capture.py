@@ -446,9 +446,9 @@ def test_real_captures_open(name: str) -> None:
         assert set(session.subsession_of()) == set(session.subsessions)
         frames = session.rows_of_keyframes(session.keyframes("all"))
         assert {len(rows) for rows in frames} == {per_frame[session.device]}
-        # The cameras of a rig share one centre here: only the right direction of composing shows that.
-        centres = session.world_from_cam(ground_truth=True)[:, :3, 3]
-        assert max(np.ptp(centres[rows], axis=0).max() for rows in frames) < 1e-9
+        # The cameras of a rig share one center here: only the right direction of composing shows that.
+        centers = session.world_from_cam(ground_truth=True)[:, :3, 3]
+        assert max(np.ptp(centers[rows], axis=0).max() for rows in frames) < 1e-9
         if session.split == "query":
             assert session.keyframe_lists == ["original", "pruned", "pruned_subsampled"]
             assert all(len(rows) for rows in session.rows_of_keyframes(session.keyframes()))

@@ -63,8 +63,8 @@ def test_rows_can_be_added_and_replaced_for_a_while() -> None:
         assert devices.kinds()[0].label == "phone"  # what the row does not say stays
         assert devices.kinds()[3].label == "Drone"
     assert len(devices.kinds()) == 3
-    assert devices.colour_of("drone").startswith("#")
-    assert len({devices.colour_of(kind.key) for kind in devices.TABLE}) == 3
+    assert devices.color_of("drone").startswith("#")
+    assert len({devices.color_of(kind.key) for kind in devices.TABLE}) == 3
 
 
 def test_sessions_of_lamar_are_found(tmp_path: Path) -> None:

@@ -30,14 +30,14 @@ def test_reads_rgb(tmp_path: Path, picture: np.ndarray, name: str) -> None:
     assert np.abs(image[5:10, 50:70].astype(int) - [0, 0, 100]).max() <= 4
 
 
-def test_grey_and_colour_files_read_as_asked(tmp_path: Path, picture: np.ndarray) -> None:
-    Image.fromarray(picture).save(tmp_path / "colour.png")
-    Image.fromarray(picture[..., 0]).save(tmp_path / "grey.png")
-    gray = read_image(tmp_path / "colour.png", gray=True)
+def test_gray_and_color_files_read_as_asked(tmp_path: Path, picture: np.ndarray) -> None:
+    Image.fromarray(picture).save(tmp_path / "color.png")
+    Image.fromarray(picture[..., 0]).save(tmp_path / "gray.png")
+    gray = read_image(tmp_path / "color.png", gray=True)
     assert gray.shape == (48, 80)
     assert gray[5, 5] == pytest.approx(0.299 * 200, abs=1)  # luma, not one of the channels
-    np.testing.assert_array_equal(read_image(tmp_path / "grey.png", gray=True), picture[..., 0])
-    np.testing.assert_array_equal(read_image(str(tmp_path / "grey.png")), np.repeat(picture[..., :1], 3, axis=2))
+    np.testing.assert_array_equal(read_image(tmp_path / "gray.png", gray=True), picture[..., 0])
+    np.testing.assert_array_equal(read_image(str(tmp_path / "gray.png")), np.repeat(picture[..., :1], 3, axis=2))
 
 
 @pytest.mark.parametrize("orientation", [3, 6])

@@ -106,7 +106,7 @@ def test_four_turns_are_none() -> None:
     assert turned_from_cam(np.array([[0, 1, 2], [3, 0, 1]])).shape == (2, 3, 4, 4)
 
 
-def test_a_turned_pose_keeps_the_centre_and_shows_the_same_world() -> None:
+def test_a_turned_pose_keeps_the_center_and_shows_the_same_world() -> None:
     world_from_cam = _pose(30, -10, 90)
     world_from_cam[:3, 3] = 1, 2, 3
     world_from_turned = world_from_cam @ invert(turned_from_cam(3))

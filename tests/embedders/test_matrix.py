@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from toolkit.embedders.matrix import MatrixWriter
-from toolkit.errors import ArtefactError
+from toolkit.errors import ArtifactError
 
 RECORD = {"model": "x"}
 
@@ -96,7 +96,7 @@ def test_two_writers_do_not_mix(tmp_path: Path) -> None:
     with MatrixWriter(path, 3, "float32", RECORD) as first:
         first.append(rows(0, 2))
         for record in (RECORD, {"model": "y"}):
-            with pytest.raises(ArtefactError, match=r"m\.npy is being written by another process"):
+            with pytest.raises(ArtifactError, match=r"m\.npy is being written by another process"):
                 MatrixWriter(path, 3, "float32", record)
         first.append(rows(2, 4))
         first.finish()

@@ -8,7 +8,7 @@ import pytest
 
 from toolkit.embedders import create_embedder, resolve_name
 from toolkit.embedders.vlad import Vlad, VladSettings
-from toolkit.errors import ArtefactError, ManifestError, ToolkitError, WeightsError
+from toolkit.errors import ArtifactError, ManifestError, ToolkitError, WeightsError
 from toolkit.features.features import LocalFeatures
 
 SETTINGS = VladSettings(words=16, local_dim=16, min_features=20, sample_descriptors=3000)
@@ -17,9 +17,9 @@ SETTINGS = VladSettings(words=16, local_dim=16, min_features=20, sample_descript
 def features_of(descriptors: np.ndarray, scale: float = 2.0) -> LocalFeatures:
     count = len(descriptors)
     root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
-    quantised = np.clip(np.round(root * 512), 0, 255).astype(np.uint8)
+    quantized = np.clip(np.round(root * 512), 0, 255).astype(np.uint8)
     return LocalFeatures(
-        np.zeros((count, 2), np.float32), np.full(count, scale, np.float32), np.ones(count, np.float32), quantised,
+        np.zeros((count, 2), np.float32), np.full(count, scale, np.float32), np.ones(count, np.float32), quantized,
         (640, 480),
     )  # fmt: skip
 
@@ -110,7 +110,7 @@ def test_an_image_without_features_is_a_zero_row() -> None:
 
 @pytest.mark.parametrize("images", [[], [features_of(np.zeros((0, 128)))]])
 def test_nothing_to_learn_from(images: Iterable[LocalFeatures]) -> None:
-    with pytest.raises(ToolkitError, match="cannot be learnt"):
+    with pytest.raises(ToolkitError, match="cannot be learned"):
         learn(list(images))
 
 
@@ -122,10 +122,10 @@ def test_one_image_is_enough() -> None:
 
 
 def test_a_file_that_is_no_vocabulary(tmp_path: Path) -> None:
-    with pytest.raises(ArtefactError, match="run the embed stage"):
+    with pytest.raises(ArtifactError, match="run the embed stage"):
         Vlad.load(tmp_path / "none.npz")
     (tmp_path / "torn.npz").write_bytes(b"PK\x03\x04torn")
-    with pytest.raises(ArtefactError, match=r"torn\.npz"):
+    with pytest.raises(ArtifactError, match=r"torn\.npz"):
         Vlad.load(tmp_path / "torn.npz")
 
 

@@ -41,7 +41,7 @@ MANIFEST = f"""
 captures: [captures/PLACE]
 dataset:
   page: https://example.org/place
-  licence: to be looked at only
+  license: to be looked at only
   citation: A. Uthor, A Place
   into: sessions
   sessions: [ios_map, ios_query]

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from toolkit.__main__ import app
 from toolkit.capture import Capture, Session
-from toolkit.errors import ArtefactError, ManifestError
+from toolkit.errors import ArtifactError, ManifestError
 from toolkit.exchange.export import export_colmap, export_pairs, export_table
 from toolkit.exchange.interchange import import_colmap, import_images
 from toolkit.features.features import FeatureStore, extract_session
@@ -60,7 +60,7 @@ def test_rigs_that_are_made_anew_for_each_frame_are_one(model: Path, small_captu
     assert read.num_cameras() == session.images["sensor_id"].nunique() == 4
 
 
-def test_points_have_their_tracks_colours_and_pixels(model: Path, run: SceneFiles) -> None:
+def test_points_have_their_tracks_colors_and_pixels(model: Path, run: SceneFiles) -> None:
     read, local_map = pycolmap.Reconstruction(str(model)), LocalMap.load(run.maps / "hl_map.npz")
     store = FeatureStore.of_session(run.features, "hl_map")
     assert read.num_points3D() == len(local_map.points) > 100
@@ -95,12 +95,12 @@ def test_nothing_is_overwritten_and_what_is_missing_is_named(
         export_colmap(run.run, run.scene, "hl", model, small_capture)
     with pytest.raises(ManifestError, match="--capture PATH/SMALL"):
         export_colmap(run.run, run.scene, "hl", tmp_path / "model")
-    with pytest.raises(ArtefactError):
+    with pytest.raises(ArtifactError):
         export_colmap(run.run, run.scene, "ios", tmp_path / "model", small_capture)
     changed = Path(shutil.copytree(small_capture, tmp_path / small_capture.name))
     images = changed / "sessions" / "hl_map" / "images.txt"
     images.write_text("\n".join(images.read_text().splitlines()[:-1]) + "\n")
-    with pytest.raises(ArtefactError, match="of the map is not in it"):
+    with pytest.raises(ArtifactError, match="of the map is not in it"):
         export_colmap(run.run, run.scene, "hl", tmp_path / "model", changed)
     assert not (tmp_path / "model").exists()
 
@@ -123,15 +123,15 @@ def test_retrieval_becomes_a_list_of_pairs(tmp_path: Path) -> None:
     assert CliRunner().invoke(app, command).exit_code == 0
     assert (tmp_path / "p.txt").read_text() == lines[0]
     path.write_text(json.dumps(row | {"path": "PLACE/sessions/hl query/1.jpg"}))
-    with pytest.raises(ArtefactError, match=r"hloc's lists cannot hold the space in 'hl query/1\.jpg'"):
+    with pytest.raises(ArtifactError, match=r"hloc's lists cannot hold the space in 'hl query/1\.jpg'"):
         export_pairs(tmp_path, "PLACE", "ios", "hl", tmp_path / "pairs.txt")
     path.write_text("{}\n")
-    with pytest.raises(ArtefactError, match=r"_query_hl\.jsonl, line 1: not a retrieval row"):
+    with pytest.raises(ArtifactError, match=r"_query_hl\.jsonl, line 1: not a retrieval row"):
         export_pairs(tmp_path, "PLACE", "ios", "hl", tmp_path / "pairs.txt")
     path.write_text(json.dumps(row | {"path": "hl_query/1.jpg"}) + "\n")
-    with pytest.raises(ArtefactError, match=r"expected images as SCENE/sessions/.*found 'hl_query/1\.jpg'"):
+    with pytest.raises(ArtifactError, match=r"expected images as SCENE/sessions/.*found 'hl_query/1\.jpg'"):
         export_pairs(tmp_path, "PLACE", "ios", "hl", tmp_path / "pairs.txt")
-    with pytest.raises(ArtefactError, match=r"No references: .* is missing"):
+    with pytest.raises(ArtifactError, match=r"No references: .* is missing"):
         export_pairs(tmp_path, "PLACE", "hl", "hl", tmp_path / "pairs.txt")
 
 

@@ -102,7 +102,7 @@ def poses_of(session: Session) -> dict[str, np.ndarray]:
 # ------------------------------------------------------------------------------------------------ COLMAP models
 
 
-def test_a_colmap_model_keeps_its_camera_centres_and_rigs(model: Path, tmp_path: Path) -> None:
+def test_a_colmap_model_keeps_its_camera_centers_and_rigs(model: Path, tmp_path: Path) -> None:
     report = import_colmap(model, tmp_path / "photos", tmp_path / "PLACE", device="hl")
     session = Capture.open(tmp_path / "PLACE")["hl_map"]
     reference = pycolmap.Reconstruction(str(model))
@@ -223,7 +223,7 @@ def test_cameras_come_from_a_file_or_the_table(folder: Path, tmp_path: Path) -> 
         import_images(folder, tmp_path / "THREE", cameras=cameras)
 
 
-# Known answers: 26 mm on film is 26/43.27 of the diagonal; 5 mm at 100 pixels a millimetre is 500 pixels.
+# Known answers: 26 mm on film is 26/43.27 of the diagonal; 5 mm at 100 pixels a millimeter is 500 pixels.
 @pytest.mark.parametrize(
     ("tags", "focal", "how"),
     [

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from toolkit.__main__ import app, main
 from toolkit.capture import Trajectory, write_session
-from toolkit.errors import ArtefactError, CaptureError, ManifestError, ToolkitError
+from toolkit.errors import ArtifactError, CaptureError, ManifestError, ToolkitError
 from toolkit.exchange.submission import collect
 from toolkit.files import SceneFiles
 from toolkit.geometry import make_pose, pose_from_qt
@@ -174,7 +174,7 @@ def test_scenes_may_be_in_several_runs(run: Path, tmp_path: Path, captures: list
     assert len(submission.missing) == 9  # the challenge's second scene is expected, though no run has it
     assert not collect([run, other], "Ours.").missing
     make_poses(other, "HYDRO", "ios", "ios")
-    with pytest.raises(ArtefactError, match=r"Two runs .*run/HYDRO/.*_ios\.txt and .*other/HYDRO/.*Give one"):
+    with pytest.raises(ArtifactError, match=r"Two runs .*run/HYDRO/.*_ios\.txt and .*other/HYDRO/.*Give one"):
         collect([run, other])
 
 
@@ -204,8 +204,8 @@ def test_poses_that_nobody_asked_for_are_not_written(run: Path, tmp_path: Path, 
     [
         (["100, s/phone, 1, 0, 0, 0, nan, 0, 0"], CaptureError, r"_query_ios\.txt, line 1: found tx = 'nan'"),
         (["100, s/phone, 1, 0, 0"], CaptureError, r"line 1: found 5 values"),
-        (["100, s/phone, 1, 1, 0, 0, 0, 0, 0"], ArtefactError, r"line 1: \(timestamp 100, device 's/phone'\) has a"),
-        (["# x", *["100, s/phone, 1, 0, 0, 0, 0, 0, 0"] * 2], ArtefactError, r"line 3: .*100.* is there twice"),
+        (["100, s/phone, 1, 1, 0, 0, 0, 0, 0"], ArtifactError, r"line 1: \(timestamp 100, device 's/phone'\) has a"),
+        (["# x", *["100, s/phone, 1, 0, 0, 0, 0, 0, 0"] * 2], ArtifactError, r"line 3: .*100.* is there twice"),
     ],
 )
 def test_malformed_poses_are_refused_with_file_line_and_key(
@@ -241,7 +241,7 @@ def test_wrong_values_name_the_known_ones(run: Path, tmp_path: Path) -> None:
 def test_a_damaged_table_of_queries_is_named(run: Path, text: str) -> None:
     path = SceneFiles(run, "HYDRO").poses_csv("ios", "ios")
     path.write_text(text)
-    with pytest.raises(ArtefactError, match=r"map_ios_query_ios\.csv: .*Localize this pair again"):
+    with pytest.raises(ArtifactError, match=r"map_ios_query_ios\.csv: .*Localize this pair again"):
         collect([run])
 
 

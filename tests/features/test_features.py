@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from toolkit.capture import Session, write_session
 from toolkit.capture.images import read_image
-from toolkit.errors import ArtefactError, ManifestError
+from toolkit.errors import ArtifactError, ManifestError
 from toolkit.features import features, groups
 from toolkit.features.features import (
     DESCRIPTOR_SCALE,
@@ -44,7 +44,7 @@ def textured(seed: int, width: int = 320, height: int = 240) -> NDArray[np.uint8
 
 
 def spots(width: int, height: int, xy: NDArray[np.float64], sigma: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Bright Gaussian spots at given places, the centre of the top-left pixel being (0.5, 0.5)."""
+    """Bright Gaussian spots at given places, the center of the top-left pixel being (0.5, 0.5)."""
     y, x = np.mgrid[0:height, 0:width] + 0.5
     image = np.full((height, width), 40.0)
     for (cx, cy), s in zip(xy, sigma, strict=True):
@@ -147,7 +147,7 @@ def test_stretch_contrast_keeps_a_full_picture_and_limits_the_gain() -> None:
     ramp = np.tile(np.arange(256, dtype=np.uint8), (256, 1))
     assert np.abs(stretch_contrast(ramp).astype(int) - ramp).max() <= 6
     faint = np.where(np.indices((64, 64)).sum(0) // 8 % 2, 101, 100).astype(np.uint8)
-    assert np.ptp(stretch_contrast(faint)) <= 8  # noise of one grey value is not blown up to the full range
+    assert np.ptp(stretch_contrast(faint)) <= 8  # noise of one gray value is not blown up to the full range
 
 
 @pytest.mark.parametrize(
@@ -334,11 +334,11 @@ def test_a_file_of_the_right_size_that_is_no_hdf5_is_made_anew(session: Session,
 def test_open_refuses_a_torn_file_and_one_of_something_else(session: Session, tmp_path: Path) -> None:
     path = extract(session, tmp_path / "features").path
     path.write_bytes(path.read_bytes()[:1000])
-    with pytest.raises(ArtefactError, match="cannot be read"):
+    with pytest.raises(ArtifactError, match="cannot be read"):
         FeatureStore.open(path)
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["numbers"] = np.zeros(3)
-    with pytest.raises(ArtefactError, match="no local features"):
+    with pytest.raises(ArtifactError, match="no local features"):
         FeatureStore.open(tmp_path / "other.h5")
 
 
@@ -477,9 +477,9 @@ def test_a_file_of_hloc_is_read(tmp_path: Path) -> None:
 
 
 class Batched:
-    """An extractor as a network is one: in colour, some images at a time, float descriptors."""
+    """An extractor as a network is one: in color, some images at a time, float descriptors."""
 
-    colour, batch_size, threaded = True, 2, False
+    color, batch_size, threaded = True, 2, False
 
     def __init__(self) -> None:
         self.calls: list[list[tuple[int, ...]]] = []
@@ -495,7 +495,7 @@ class Batched:
         return [LocalFeatures(place, one, one, mean, (320, 240)) for mean in means]
 
 
-def test_a_network_gets_batches_in_colour_and_its_numbers_come_back(session: Session, tmp_path: Path) -> None:
+def test_a_network_gets_batches_in_color_and_its_numbers_come_back(session: Session, tmp_path: Path) -> None:
     session.image_path(2).unlink()
     corners = Batched()
     store = extract_session(session, tmp_path / "features", corners, progress=False)
@@ -522,7 +522,7 @@ def test_extractors_by_name() -> None:
         create_extractor("surf")
 
 
-def test_sift_of_a_colour_image_is_that_of_its_grey_one() -> None:
+def test_sift_of_a_color_image_is_that_of_its_gray_one() -> None:
     gray = textured(0)
     assert_same(SIFT.extract([np.repeat(gray[:, :, None], 3, axis=2)])[0], SIFT.extract([gray])[0])
 
@@ -554,5 +554,5 @@ def test_a_damaged_file_says_what_to_do(session: Session, tmp_path: Path) -> Non
     content = store.path.read_bytes()
     quarter = len(content) // 4
     store.path.write_bytes(content[:quarter] + bytes(2 * quarter) + content[3 * quarter :])
-    with pytest.raises(ArtefactError, match="is made again"):
+    with pytest.raises(ArtifactError, match="is made again"):
         list(store.values())

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from toolkit import geometry
-from toolkit.errors import ArtefactError, ManifestError
+from toolkit.errors import ArtifactError, ManifestError
 from toolkit.features.features import DESCRIPTOR_SCALE, FeatureStore, LocalFeatures
 from toolkit.features.groups import GroupWriter
 from toolkit.features.matching import (
@@ -395,11 +395,11 @@ def test_matches_are_in_the_layout_of_hloc_and_come_back(tmp_path: Path, count: 
         store["other.jpg", NAMES[1]]
     torn = tmp_path / "torn.h5"
     torn.write_bytes(path.read_bytes()[:600])
-    with pytest.raises(ArtefactError, match="Match again"):
+    with pytest.raises(ArtifactError, match="Match again"):
         MatchStore(torn)[NAMES]
     content = path.read_bytes()
     torn.write_bytes(content[: len(content) // 8] + bytes(len(content) - len(content) // 8))
-    with pytest.raises(ArtefactError, match=r"Delete the file|Match again"):
+    with pytest.raises(ArtifactError, match=r"Delete the file|Match again"):
         MatchStore(torn)[NAMES]
 
 

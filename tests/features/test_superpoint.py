@@ -15,7 +15,7 @@ from toolkit.features.superpoint import SuperPointExtractor
 transformers = pytest.importorskip("transformers", reason="needs the extra `learned`")
 
 State = dict[str, torch.Tensor]
-# Where `planted_state` sees a keypoint in a bright cell of 8 x 8 pixels, the centre of its first pixel being at 0.
+# Where `planted_state` sees a keypoint in a bright cell of 8 x 8 pixels, the center of its first pixel being at 0.
 COLUMN, ROW = 5, 3
 
 
@@ -139,15 +139,15 @@ def test_the_border_is_that_of_the_photograph(height: int, expected: list[float]
     assert len(found) == 4 * len(expected)  # of 5 cells in a row; in the last, x = 37 is too close to the right
 
 
-def test_grey_and_colour(extractor: SuperPointExtractor) -> None:
-    grey = photograph(3, 48, 64)
-    same, again = extractor.extract([np.repeat(grey[:, :, None], 3, axis=2), grey])
+def test_gray_and_color(extractor: SuperPointExtractor) -> None:
+    gray = photograph(3, 48, 64)
+    same, again = extractor.extract([np.repeat(gray[:, :, None], 3, axis=2), gray])
     assert_equal(same, again)
     red = np.zeros((40, 40, 3), np.uint8)
     red[8:16, 8:16, 0] = 255
     (found,) = planted(threshold=0.2).extract([red])
-    grey_of_red = 76  # of 255, by ITU-R BT.601
-    expected = torch.tensor([40 * grey_of_red / 255, 10] + 63 * [0.0]).softmax(0)[0]
+    gray_of_red = 76  # of 255, by ITU-R BT.601
+    expected = torch.tensor([40 * gray_of_red / 255, 10] + 63 * [0.0]).softmax(0)[0]
     assert found.scores[0] == pytest.approx(float(expected), rel=1e-3)
 
 

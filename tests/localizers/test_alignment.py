@@ -306,8 +306,8 @@ def test_bad_input_is_named() -> None:
             align_to_map(*arguments)
     with pytest.raises(AlignmentError, match="another shape"):
         align_to_map(model, world, depth_ratios=[1.0, 1.0], depth_ratio_stds=[0.1])
-    with pytest.raises(AlignmentError, match="centre_noise_m is 0"):
-        align_to_map(model, world, centre_noise_m=0.0)
+    with pytest.raises(AlignmentError, match="center_noise_m is 0"):
+        align_to_map(model, world, center_noise_m=0.0)
     with pytest.raises(AlignmentError, match="model_from_query"):
         query_pose(align_to_map(model, world), np.full((4, 4), np.nan))
 
@@ -401,15 +401,15 @@ def test_uncertainty_is_calibrated(case: Case, noise_m: float, noise_deg: float)
 
 
 def measure(case: Case, trials: int = 100) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Errors (trials, 2) in degrees and metres, which are `ok`, which scales are unknown, which found all wrong."""
+    """Errors (trials, 2) in degrees and meters, which are `ok`, which scales are unknown, which found all wrong."""
     rows = []
     for seed in range(trials):
         trial = noisy(case, 5000 + seed)
         found = align_to_map(trial.model_from_cams, trial.world_from_cams, depth_ratios=trial.depth_ratios)
         pose, covariance = query_pose(found, trial.model_from_query)
-        degrees, metres = geometry.pose_error(pose, trial.world_from_query)
+        degrees, meters = geometry.pose_error(pose, trial.world_from_query)
         alike = np.array_equal(found.inliers, ~trial.wrong)
-        rows.append((degrees, metres, is_trustworthy(found, covariance), not found.scale_known, alike))
+        rows.append((degrees, meters, is_trustworthy(found, covariance), not found.scale_known, alike))
     table = np.array(rows, np.float64)
     return table[:, :2], table[:, 2] > 0, table[:, 3] > 0, table[:, 4] > 0
 
@@ -447,7 +447,7 @@ def test_what_is_called_ok_is_right() -> None:
 
 
 def test_scale_is_not_biased_by_noise_that_nears_the_baselines() -> None:
-    """Regressing the map on noisy centres would shrink the scale by a fifth here."""
+    """Regressing the map on noisy centers would shrink the scale by a fifth here."""
     ratios = []
     for seed in range(80):
         trial = noisy(Case("", 0.12, references=20), 7000 + seed, noise_m=0.06)

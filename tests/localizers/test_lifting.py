@@ -236,11 +236,11 @@ def test_a_map_of_one_photograph_localizes_what_looks_like_it(small_capture: Pat
     assert table.loc[key, "status"].item() == "ok"
     assert table.loc[key, "method"].item() == "hybrid:simulated/lifted"
     found = poses.lookup([int(query.images["timestamp"].iloc[0])], [query.device_ids[0]])[0]
-    degrees, metres = geometry.pose_error(found, true[0])
+    degrees, meters = geometry.pose_error(found, true[0])
     assert degrees < 0.3
-    assert metres < 0.03
+    assert meters < 0.03
     ok = table[table["status"] == "ok"]
     right = query.ground_truth.lookup(ok["timestamp"], ok["device_id"])
-    degrees, metres = geometry.pose_error(poses.lookup(ok["timestamp"], ok["device_id"]), right)
+    degrees, meters = geometry.pose_error(poses.lookup(ok["timestamp"], ok["device_id"]), right)
     assert (degrees < 1).all()
-    assert (metres < 0.1).all()
+    assert (meters < 0.1).all()

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory, write_session
 from toolkit.capture.cameras import in_view, rays_of, view_bounds
-from toolkit.errors import ArtefactError
+from toolkit.errors import ArtifactError
 from toolkit.features.features import FeatureStore, SiftExtractor, SiftSettings, extract_session
 from toolkit.files import sidecar_path
 from toolkit.localizers import mapping
@@ -307,23 +307,23 @@ def test_a_map_without_points_reads_back(tmp_path: Path) -> None:
 
 
 def test_a_missing_map_says_what_to_do(tmp_path: Path) -> None:
-    with pytest.raises(ArtefactError, match=r"nowhere\.npz cannot be read.*localize stage"):
+    with pytest.raises(ArtifactError, match=r"nowhere\.npz cannot be read.*localize stage"):
         LocalMap.load(tmp_path / "nowhere.npz")
 
 
 @pytest.mark.parametrize("keep", [0, 3, 50, 0.5, 0.99])
-def test_a_torn_map_is_an_artefact_error(tmp_path: Path, keep: float) -> None:
+def test_a_torn_map_is_an_artifact_error(tmp_path: Path, keep: float) -> None:
     path = tmp_path / "map.npz"
     Ring(PINHOLE, count=3, points=50).triangulate().save(path)
     content = path.read_bytes()
     path.write_bytes(content[: int(keep * len(content)) if 0 < keep < 1 else int(keep)])
-    with pytest.raises(ArtefactError, match="cannot be read"):
+    with pytest.raises(ArtifactError, match="cannot be read"):
         LocalMap.load(path)
 
 
-def test_a_file_of_something_else_is_an_artefact_error(tmp_path: Path) -> None:
+def test_a_file_of_something_else_is_an_artifact_error(tmp_path: Path) -> None:
     np.savez(tmp_path / "map.npz", vectors=np.zeros(3))
-    with pytest.raises(ArtefactError, match="cannot be read"):
+    with pytest.raises(ArtifactError, match="cannot be read"):
         LocalMap.load(tmp_path / "map.npz")
 
 
@@ -350,7 +350,7 @@ def test_a_map_of_photographs(phone: tuple[Session, FeatureStore], tmp_path: Pat
         projected = np.asarray(local_map.cameras[image].img_from_cam(in_cam))
         error = np.linalg.norm(projected - store[local_map.image_names[image]].keypoints[keypoint], axis=1)
         assert np.median(error) < 1
-    # The points wear the colours of the photographs, not the grey they start with.
+    # The points wear the colors of the photographs, not the gray they start with.
     assert np.std(local_map.colors.astype(float), axis=0).min() > 10
     assert_equal(LocalMap.load(tmp_path / "ios_map.npz"), local_map)
 
@@ -408,7 +408,7 @@ def test_images_without_features_or_pose_are_left_out(phone: tuple[Session, Feat
     local_map = build_map(session, partial, tmp_path / "ios_map.npz")
     assert sorted(local_map.image_names) == sorted(partial.names)
     assert 0 < len(partial.names) < len(session.images)
-    with pytest.raises(ArtefactError, match="Session ios_map has no image with both"):
+    with pytest.raises(ArtifactError, match="Session ios_map has no image with both"):
         build_map(session, FeatureStore(store.path, {}), tmp_path / "other.npz")
 
 

@@ -147,9 +147,9 @@ def test_a_blob_is_where_the_map_says(
 ) -> None:
     group = photographs.group(size, HIGHER)
     width, height = size
-    centre = np.array([0.3 * width, 0.7 * height])
+    center = np.array([0.3 * width, 0.7 * height])
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    blob = np.exp(-((x - centre[0]) ** 2 + (y - centre[1]) ** 2) / (2 * 4.0**2))
+    blob = np.exp(-((x - center[0]) ** 2 + (y - center[1]) ** 2) / (2 * 4.0**2))
     Image.fromarray(np.rint(255 * blob).astype(np.uint8)).save(group[0].path)
     predictor = make()
     encoded = count_encoded(predictor, monkeypatch)
@@ -158,10 +158,10 @@ def test_a_blob_is_where_the_map_says(
     seen = encoded[0][0].numpy().astype(np.float64)
     scale, offset = found.map_from_image[0, :2], found.map_from_image[0, 2:]
     x, y = np.meshgrid(np.arange(518) + 0.5, np.arange(len(seen)) + 0.5)
-    near = np.hypot(x - (scale * centre + offset)[0], y - (scale * centre + offset)[1]) < 20
+    near = np.hypot(x - (scale * center + offset)[0], y - (scale * center + offset)[1]) < 20
     weight = seen * near
     at = np.array([(x * weight).sum(), (y * weight).sum()]) / weight.sum()
-    np.testing.assert_allclose(at, scale * centre + offset, atol=0.05)
+    np.testing.assert_allclose(at, scale * center + offset, atol=0.05)
 
 
 def test_groups_do_not_change_each_other(make: Make, photographs: Photographs, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -196,7 +196,7 @@ def test_the_pose_of_a_rig_is_the_rigs(room: World) -> None:
     assert set(estimate.camera_index) == {0, 1, 2}
 
 
-def test_one_camera_off_the_rigs_centre_gives_the_rigs_pose(room: World) -> None:
+def test_one_camera_off_the_rigs_center_gives_the_rigs_pose(room: World) -> None:
     features = [room.look(PINHOLE, QUERY @ RIG_FROM_CAMS[1])]
     estimate = room.localizer().localize([PINHOLE], RIG_FROM_CAMS[1:2], features, [REFERENCES])
     check(estimate, QUERY)

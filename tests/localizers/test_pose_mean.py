@@ -56,9 +56,9 @@ def test_mean_leaves_out_what_is_far() -> None:
     poses[2, 0, 0] = np.nan
     mean = robust_mean_pose(poses)
     np.testing.assert_array_equal(np.flatnonzero(mean.inliers), [1, 3, 4, 6])
-    degrees, metres = geometry.pose_error(mean.world_from_cam, pose)
+    degrees, meters = geometry.pose_error(mean.world_from_cam, pose)
     assert degrees < 2
-    assert metres < 0.1
+    assert meters < 0.1
     assert "0, 5, 7 left out: far" in mean.reason
     assert "2 left out: not finite" in mean.reason
 

@@ -652,7 +652,7 @@ def test_the_hybrid_run_is_as_good_as_pnp(run: SceneFiles, small_capture: Path) 
         assert rows["method"].str.fullmatch(r"hybrid:simulated/((pnp|lifted)(\+vggt)?|vggt)").all()
 
 
-def test_a_prediction_is_drawn_and_labelled(world: World, tmp_path: Path) -> None:
+def test_a_prediction_is_drawn_and_labeled(world: World, tmp_path: Path) -> None:
     queries, _ = world.queries("spot")
     localizer = world.localizer(world.predictor(wrong_references=0.3, seed=2))
     (answer,) = localizer.localize(queries[:1])

@@ -176,8 +176,8 @@ def test_the_embedder_sees_what_the_official_loop_sees(tiny: MegaLoc) -> None:
 
 def test_the_embedder_takes_any_photographs(tiny: MegaLoc) -> None:
     embedder = create_embedder("megaloc", checkpoint=tiny, device="cpu", image_size=126)
-    grey = noise(90, 130)[:, :, 0]
-    vectors = embedder.embed([noise(200, 300), noise(126, 126), grey, np.repeat(grey[..., None], 3, axis=2)])
+    gray = noise(90, 130)[:, :, 0]
+    vectors = embedder.embed([noise(200, 300), noise(126, 126), gray, np.repeat(gray[..., None], 3, axis=2)])
     assert vectors.shape == (4, 32)
     assert vectors.dtype == np.float32
     np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-5)

@@ -57,9 +57,9 @@ def tiny(heads: tuple[str, ...] = HEADS, compute_dtype: torch.dtype = torch.floa
         seed = int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "little")
         noise = torch.randn(parameter.shape, generator=torch.Generator().manual_seed(seed))
         fan_in = parameter[0].numel() if parameter.ndim > 1 else 1
-        centre = 0.7 if parameter.ndim == 1 and name.endswith(("weight", "gamma")) else 0.0
+        center = 0.7 if parameter.ndim == 1 and name.endswith(("weight", "gamma")) else 0.0
         with torch.no_grad():
-            parameter.copy_(centre + noise * (0.2 if parameter.ndim == 1 else fan_in**-0.5))
+            parameter.copy_(center + noise * (0.2 if parameter.ndim == 1 else fan_in**-0.5))
     return model.requires_grad_(False).eval()
 
 
@@ -237,9 +237,9 @@ def test_rope_turns_by_place() -> None:
 
 def test_position_of_pixels_in_dense_heads() -> None:
     maps = add_position(torch.zeros(1, 8, 3, 5), aspect=2.0)
-    centre = torch.tensor([0, 0, 1, 1, 0, 0, 1, 1]) * 0.1
-    torch.testing.assert_close(maps[0, :, 1, 2], centre)
-    # Half the width of the plane is 2 / sqrt(5); the last pixel's centre is 1 / 10 of the width from its edge.
+    center = torch.tensor([0, 0, 1, 1, 0, 0, 1, 1]) * 0.1
+    torch.testing.assert_close(maps[0, :, 1, 2], center)
+    # Half the width of the plane is 2 / sqrt(5); the last pixel's center is 1 / 10 of the width from its edge.
     x, y = 2 / 5**0.5 * 4 / 5, 1 / 5**0.5 * 2 / 3
     expected = np.concatenate([f([a, a / 10]) for a in (x, y) for f in (np.sin, np.cos)])
     np.testing.assert_allclose(maps[0, :, 2, 4].numpy(), 0.1 * expected, atol=1e-6)
@@ -442,8 +442,8 @@ def test_all_kinds_of_sources_are_alike(tmp_path: Path) -> None:
     expected = load_images([path]).images
     for source in (str(path), Image.open(path), pixels):
         assert torch.equal(load_images([source]).images, expected)
-    grey = load_images([pixels[..., 0]]).images
-    assert torch.equal(grey[:, 0], grey[:, 2])
+    gray = load_images([pixels[..., 0]]).images
+    assert torch.equal(gray[:, 0], gray[:, 2])
 
 
 def test_wrong_images_are_refused(tmp_path: Path) -> None:

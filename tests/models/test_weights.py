@@ -79,8 +79,8 @@ def test_downloads_once(hub: FakeHub, tmp_path: Path) -> None:
         (404, "EntryNotFound", "no such file in it"),
         (404, "RepoNotFound", "no such repository"),
         (401, "RepoNotFound", "set HF_TOKEN"),
-        (403, "GatedRepo", "accept the licence on the model's page and set HF_TOKEN (HTTP 403)"),
-        (401, "GatedRepo", "accept the licence on the model's page and set HF_TOKEN (HTTP 401)"),
+        (403, "GatedRepo", "accept the license on the model's page and set HF_TOKEN (HTTP 403)"),
+        (401, "GatedRepo", "accept the license on the model's page and set HF_TOKEN (HTTP 401)"),
         (403, "", "set HF_TOKEN"),
         (404, "", "HTTP 404"),
         (503, "", "HTTP 503"),
@@ -476,7 +476,7 @@ def test_long_lists_are_cut() -> None:
     assert "20 unexpected: layer0, layer1, layer2, layer3, layer4, ...\n" in message
 
 
-def test_weights_of_a_part_are_recognised() -> None:
+def test_weights_of_a_part_are_recognized() -> None:
     given = {key.removeprefix("backbone."): value for key, value in state().items() if key.startswith("backbone.")}
     message = refusal(given | {"mask_token": torch.ones(1)})  # plain DINOv2 has one
     assert "those of its part `backbone` alone" in message

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from toolkit.errors import ArtefactError
+from toolkit.errors import ArtifactError
 from toolkit.notebook import TEXT_BARS
 from toolkit.show.inline import ASSETS, show_recording
 from toolkit.show.recordings import open_recording
@@ -49,5 +49,5 @@ def test_the_viewer_is_served_by_this_process_and_gets_the_whole_file(files, mon
 
 
 def test_no_recording_is_said(tmp_path):
-    with pytest.raises(ArtefactError, match=r"gone\.rrd: no such recording"):
+    with pytest.raises(ArtifactError, match=r"gone\.rrd: no such recording"):
         show_recording(Path(tmp_path / "gone.rrd"))

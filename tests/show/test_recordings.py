@@ -7,7 +7,7 @@ import pycolmap
 import pytest
 
 from toolkit.capture import Capture, Trajectory, write_depth, write_session
-from toolkit.errors import ArtefactError, CaptureError
+from toolkit.errors import ArtifactError, CaptureError
 from toolkit.geometry import make_pose, quaternion_to_rotation
 from toolkit.localizers.mapping import LocalMap
 from toolkit.show.localization_view import Localizations, QueryDetails, ShownImage, record_localizations
@@ -221,14 +221,14 @@ def test_queries_stand_where_a_trajectories_file_says(capture, map_dir, tmp_path
     assert [row[0] for row in rows] == [1, 2]
     np.testing.assert_allclose([pose_of(row[2]) for row in rows], estimated, atol=1e-6)
     (lines,) = [row[2] for row in logged(found["/world/queries/references"], "LineStrips3D:strips")]
-    centres = Capture.open(capture)["hl_map"].world_from_cam([0, 4])[:, :3, 3]
-    np.testing.assert_allclose(lines, [[estimated[0, :3, 3], centre] for centre in centres], atol=1e-6)
+    centers = Capture.open(capture)["hl_map"].world_from_cam([0, 4])[:, :3, 3]
+    np.testing.assert_allclose(lines, [[estimated[0, :3, 3], center] for center in centers], atol=1e-6)
     # The same file in the map's recording: points where the queries are.
     done = record_session(capture, "map", "hl", out=tmp_path / "map.rrd", **asked)
     (dots,) = [row[2] for row in logged(read_back(done.path)["/world/queries/poses"], "Points3D:positions")]
     assert done.queries == 2
     np.testing.assert_allclose(dots, estimated[:, :3, 3], atol=1e-6)
-    with pytest.raises(ArtefactError, match="nothing to do with session ios_map"):
+    with pytest.raises(ArtifactError, match="nothing to do with session ios_map"):
         record_session(capture, "map", "ios", out=tmp_path / "x.rrd", **asked)
 
 
@@ -237,7 +237,7 @@ def test_wrong_choices_are_named(capture, tmp_path):
         record_session(capture, "map", "hl", "dusk", out=tmp_path / "x.rrd")
     with pytest.raises(CaptureError, match="every=0"):
         record_session(capture, "map", "hl", every=0, out=tmp_path / "x.rrd")
-    with pytest.raises(ArtefactError, match="queries_pose"):
+    with pytest.raises(ArtifactError, match="queries_pose"):
         record_session(capture, "map", "hl", vis_retrieve_queries=True, out=tmp_path / "x.rrd")
     assert not list(tmp_path.iterdir())
 
@@ -292,8 +292,8 @@ def test_a_localization_view_holds_the_queries(capture, tmp_path):
         tmp_path / "v.rrd", "view", map_poses, points, None, queries, iter(details), image_size=64
     )
     found = read_back(path)
-    (centres,) = [row[2] for row in logged(found["/world/queries/estimated"], "Points3D:positions")]
-    np.testing.assert_allclose(centres, estimated[[0, 1, 3], :3, 3])
+    (centers,) = [row[2] for row in logged(found["/world/queries/estimated"], "Points3D:positions")]
+    np.testing.assert_allclose(centers, estimated[[0, 1, 3], :3, 3])
     (labels,) = [row[2] for row in logged(found["/world/queries/estimated"], "Points3D:labels")]
     assert labels[1] == "#1 b, ok, off by 0°, 0.5 m, 8 inliers"
     (lines,) = [row[2] for row in logged(found["/world/queries/error"], "LineStrips3D:strips")]

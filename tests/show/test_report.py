@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 from PIL import Image, PngImagePlugin
 
-from toolkit.errors import ArtefactError
+from toolkit.errors import ArtifactError
 from toolkit.files import SceneFiles, write_sidecar
 from toolkit.show import report
 from toolkit.show.report import write_report
@@ -241,8 +241,8 @@ def test_unreadable_picture_is_named(full):
 
 
 def test_torn_or_missing_run_is_an_error_that_says_so(tmp_path):
-    with pytest.raises(ArtefactError, match=r"run.json is missing"):
+    with pytest.raises(ArtifactError, match=r"run.json is missing"):
         write_report(tmp_path)
     (tmp_path / "run.json").write_text('{"name": ')
-    with pytest.raises(ArtefactError, match="not whole JSON"):
+    with pytest.raises(ArtifactError, match="not whole JSON"):
         write_report(tmp_path)

@@ -5,7 +5,7 @@ from PIL import Image
 
 from toolkit.capture.upright import up_of_cameras
 from toolkit.geometry import make_pose, project
-from toolkit.show.figures import error_colours
+from toolkit.show.figures import error_colors
 from toolkit.show.localization_view import ShownImage
 from toolkit.show.stills import WorstQuery, draw_localization, draw_scene_png, draw_worst
 
@@ -43,7 +43,7 @@ def test_up_of_cameras_that_all_look_one_way_and_of_none():
     assert up_of_cameras(np.zeros((0, 4, 4))).tolist() == [0, 0, 1]
 
 
-def test_projection_has_half_pixel_centres_and_leaves_out_what_is_behind():
+def test_projection_has_half_pixel_centers_and_leaves_out_what_is_behind():
     pixels, visible = project(np.array([[0, 0, 2.0], [0.4, 0, 2], [0, 0, -1]]), CAMERA, np.eye(4))
     np.testing.assert_allclose(pixels[:2], [[32, 24], [42, 24]])
     assert visible.tolist() == [True, True, False]
@@ -138,14 +138,14 @@ def test_the_worst_queries_are_drawn_with_the_matches_they_share_with_a_referenc
     assert draw_worst([])
 
 
-def test_errors_have_the_colours_of_the_legend_and_styles_stay_where_they_are():
+def test_errors_have_the_colors_of_the_legend_and_styles_stay_where_they_are():
     import matplotlib as mpl
 
     before = mpl.rcParams["figure.titleweight"]
-    colours = error_colours([0.001, 0.01, 0.1, 1.0, 50.0, np.nan])
-    assert (colours[0] == colours[1]).all()
-    assert (colours[3] == colours[4]).all()
-    assert len(np.unique(colours, axis=0)) == 4
+    colors = error_colors([0.001, 0.01, 0.1, 1.0, 50.0, np.nan])
+    assert (colors[0] == colors[1]).all()
+    assert (colors[3] == colors[4]).all()
+    assert len(np.unique(colors, axis=0)) == 4
     figure = draw_scene_png(np.zeros((0, 3)), None, looking([80, 90]), looking([80, 90]), None)
     assert figure._suptitle.get_fontweight() == "bold"
     assert mpl.rcParams["figure.titleweight"] == before != "bold"

@@ -52,7 +52,7 @@ def test_texture_corners_appear_where_the_camera_projects_them(sensor: synthetic
     expected = np.asarray(camera.img_from_cam(in_cam))
     inside = ((expected > 14) & (expected < np.array(sensor.size) - 14)).all(1)
     assert inside.sum() > 40
-    # OpenCV counts the centre of the first pixel as 0; it starts a pixel away and must come back.
+    # OpenCV counts the center of the first pixel as 0; it starts a pixel away and must come back.
     start = np.ascontiguousarray((expected[inside] - 0.5 + 0.7)[:, None], np.float32)
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
     found = cv2.cornerSubPix(picture, start, (5, 5), (-1, -1), criteria)[:, 0] + 0.5

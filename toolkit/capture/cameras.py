@@ -56,7 +56,7 @@ def rays_of(camera: pycolmap.Camera, pixels: NDArray[np.floating]) -> Floats:
 
 
 def projection_jacobian(in_cams: Floats, focals_px: Floats) -> Floats:
-    """Return how the projections of points (n, 3) in cameras' frames move with them, pixels a metre: (n, 2, 3).
+    """Return how the projections of points (n, 3) in cameras' frames move with them, pixels a meter: (n, 2, 3).
 
     d(f x/z, f y/z), with the depth z at least 1 mm.
     """

@@ -53,7 +53,7 @@ class SeenDepth:
     depth_m: Floats
     """(P,) along the photograph's optical axis."""
     cell_px: float = 1.0
-    """No two points are nearer than neighbouring cells of this width allow."""
+    """No two points are nearer than neighboring cells of this width allow."""
     reason: str = ""
     """What was left out and why; without points, why there are none."""
 
@@ -65,7 +65,7 @@ class SeenDepth:
         return KDTree(self.pixels)
 
     def at(self, xy: ArrayLike) -> Floats:
-        """Return depth (N,), metres, at pixels (N, 2): of a plane through the points about each.
+        """Return depth (N,), meters, at pixels (N, 2): of a plane through the points about each.
 
         Inverse depth is linear in the pixels of a plane. NaN where fewer than four points are near, or where they do
         not lie on one surface.

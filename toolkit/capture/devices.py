@@ -25,13 +25,13 @@ class DeviceKind:
     """In session names, file names and tables."""
     label: str
     """For people."""
-    colour: str
+    color: str
     """In figures, as #rrggbb."""
     sessions: Mapping[str, str] = field(default_factory=dict)
     """Name of the session folder by split, where a data set does not call it `<key>_<split>`."""
 
 
-# Colours of Okabe and Ito, which people with any colour vision tell apart. Session names are those of LaMAR.
+# Colors of Okabe and Ito, which people with any color vision tell apart. Session names are those of LaMAR.
 TABLE = (
     DeviceKind("ios", "phone", "#0072B2", {"query": "query_phone"}),
     DeviceKind("hl", "headset", "#D55E00", {"query": "query_hololens"}),
@@ -39,7 +39,7 @@ TABLE = (
 )
 # LaMAR has one map, which all its devices took.
 OTHER_SESSIONS = {"map": ("mixed", "map")}
-_FURTHER_COLOURS = ("#CC79A7", "#8C6D1F", "#332288", "#882255")
+_FURTHER_COLORS = ("#CC79A7", "#8C6D1F", "#332288", "#882255")
 
 
 def kinds() -> tuple[DeviceKind, ...]:
@@ -48,8 +48,8 @@ def kinds() -> tuple[DeviceKind, ...]:
     for row in json.loads(os.environ.get(EXTRA_DEVICES, "[]")):
         known = rows.get(row["key"])
         label = row.get("label") or (known.label if known else row["key"])
-        colour = row.get("colour") or (known.colour if known else _colour_of_other(row["key"]))
-        rows[row["key"]] = DeviceKind(row["key"], label, colour, row.get("sessions") or {})
+        color = row.get("color") or (known.color if known else _color_of_other(row["key"]))
+        rows[row["key"]] = DeviceKind(row["key"], label, color, row.get("sessions") or {})
     return tuple(rows.values())
 
 
@@ -58,7 +58,7 @@ def extra_devices(rows: Sequence[Mapping[str, object]]) -> Iterator[None]:
     """Add rows to the table, here and in processes that are started meanwhile.
 
     Args:
-        rows: `key`, and where they are given `label`, `colour`, `sessions`, as in `DeviceKind`.
+        rows: `key`, and where they are given `label`, `color`, `sessions`, as in `DeviceKind`.
     """
     before = os.environ.get(EXTRA_DEVICES)
     os.environ[EXTRA_DEVICES] = json.dumps([dict(row) for row in rows])
@@ -75,9 +75,9 @@ def table_record() -> list[dict[str, object]]:
     return [asdict(kind) for kind in kinds()]
 
 
-def colour_of(key: str) -> str:
-    """Return the colour of a kind of device, #rrggbb; one of a few for a kind that has no row."""
-    return next((kind.colour for kind in kinds() if kind.key == key), _colour_of_other(key))
+def color_of(key: str) -> str:
+    """Return the color of a kind of device, #rrggbb; one of a few for a kind that has no row."""
+    return next((kind.color for kind in kinds() if kind.key == key), _color_of_other(key))
 
 
 def in_order(keys: Iterable[str]) -> list[str]:
@@ -102,5 +102,5 @@ def session_id(folder: str) -> str:
     return f"{key}_{split}" if split in SPLITS else folder
 
 
-def _colour_of_other(key: str) -> str:
-    return _FURTHER_COLOURS[zlib.crc32(key.encode()) % len(_FURTHER_COLOURS)]
+def _color_of_other(key: str) -> str:
+    return _FURTHER_COLORS[zlib.crc32(key.encode()) % len(_FURTHER_COLORS)]

@@ -11,7 +11,7 @@ import pycolmap
 
 from toolkit.errors import ImageError
 
-# Tags that are read, and the millimetres in a unit of FocalPlaneResolutionUnit.
+# Tags that are read, and the millimeters in a unit of FocalPlaneResolutionUnit.
 ORIENTATION, _EXIF, _TIME, _SUBSECOND = 0x0112, 0x8769, 0x9003, 0x9291
 _FOCAL_MM, _FOCAL_35MM, _WIDTH = 0x920A, 0xA405, 0xA002
 _PLANE_X, _PLANE_UNIT = 0xA20E, 0xA210
@@ -55,7 +55,7 @@ def read_number(exif: Mapping[int, Any], tag: int) -> float:
 
 
 def exif_camera(path: Path) -> tuple[pycolmap.Camera, str]:
-    """Guess the intrinsics of an image from its EXIF tags: no distortion, the middle of the image in its centre.
+    """Guess the intrinsics of an image from its EXIF tags: no distortion, the middle of the image in its center.
 
     FocalLengthIn35mmFilm is taken at the diagonal of 36 mm x 24 mm film, as CIPA DC-008 has it; else FocalLength with
     FocalPlaneXResolution, scaled where the image was resized since.

@@ -40,7 +40,7 @@ def read_image(path: str | Path, gray: bool = False) -> NDArray[np.uint8]:
 
 
 def read_for_display(path: str | Path) -> NDArray[np.uint8]:
-    """Return an image, (H, W, 3) RGB, or a grey one that says so where it cannot be read: pictures go on."""
+    """Return an image, (H, W, 3) RGB, or a gray one that says so where it cannot be read: pictures go on."""
     try:
         return read_image(path)
     except ImageError:

@@ -5,7 +5,7 @@
         proc/subsessions.txt  proc/keyframes_*.txt  proc/alignment_trajectories.txt      (LaMAR: queries.txt)
 
 Directions, said once: `trajectories.txt` and `alignment_trajectories.txt` hold world_from_device,
-`rigs.txt` holds rig_from_sensor. Lengths are metres, timestamps int64 microseconds, quaternions qw qx qy qz.
+`rigs.txt` holds rig_from_sensor. Lengths are meters, timestamps int64 microseconds, quaternions qw qx qy qz.
 An image is known by (timestamp, sensor_id), a device pose and a keyframe by (timestamp, device_id), where
 the device is the rig or, for a sensor in no rig, the sensor itself.
 
@@ -55,7 +55,7 @@ Strings = NDArray[np.object_]
 Rows = ArrayLike | slice | None
 
 RAW_DATA = "raw_data"
-DEPTH_SCALE = 1000.0  # depth maps are 16-bit PNGs in millimetres
+DEPTH_SCALE = 1000.0  # depth maps are 16-bit PNGs in millimeters
 
 COLUMNS: dict[str, Columns] = {
     "sensors.txt": (("sensor_id", ID), ("name", TEXT), ("sensor_type", ID)),
@@ -174,7 +174,7 @@ class Trajectory:
 
     @property
     def world_from_device(self) -> Floats:
-        """(N, 4, 4) float64, metres."""
+        """(N, 4, 4) float64, meters."""
         return pose_from_qt(self.qt)
 
     @cached_property
@@ -513,7 +513,7 @@ class Session:
 
     @property
     def rig_from_sensor_table(self) -> Floats:
-        """rig_from_sensor of each row of `rigs`, (R, 4, 4) float64, metres."""
+        """rig_from_sensor of each row of `rigs`, (R, 4, 4) float64, meters."""
         return pose_from_qt(self._rig_qt)
 
     def rig_from_cam(self, rows: Rows = None) -> Floats:
@@ -524,7 +524,7 @@ class Session:
         return poses
 
     def world_from_cam(self, rows: Rows = None, ground_truth: bool = False) -> Floats:
-        """Return world_from_cam of images, (n, 4, 4) float64, metres; NaN where there is no pose.
+        """Return world_from_cam of images, (n, 4, 4) float64, meters; NaN where there is no pose.
 
         Args:
             rows: rows of `images`; None means all.
@@ -787,7 +787,7 @@ def _numbers(values: Iterable[float]) -> str:
 
 
 def read_depth(path: str | Path) -> NDArray[np.float32]:
-    """Return a depth map, (H, W) float32 metres along the camera's z axis, 0 where unknown.
+    """Return a depth map, (H, W) float32 meters along the camera's z axis, 0 where unknown.
 
     Raises:
         CaptureError: the file is missing or is not a 16-bit image.
@@ -797,22 +797,22 @@ def read_depth(path: str | Path) -> NDArray[np.float32]:
     depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if Path(path).exists() else None
     if depth is None or depth.dtype != np.uint16 or depth.ndim != 2:
         found = "no such file" if not Path(path).exists() else "no 16-bit image of one channel"
-        raise CaptureError(f"Depth map {path}: {found}. Expected a 16-bit PNG in millimetres.")
+        raise CaptureError(f"Depth map {path}: {found}. Expected a 16-bit PNG in millimeters.")
     return (depth / np.float32(DEPTH_SCALE)).astype(np.float32)
 
 
 def write_depth(path: str | Path, depth_m: ArrayLike) -> None:
-    """Write a depth map (H, W), metres, as a 16-bit PNG in millimetres; beyond 65.5 m becomes unknown."""
+    """Write a depth map (H, W), meters, as a 16-bit PNG in millimeters; beyond 65.5 m becomes unknown."""
     import cv2
 
-    millimetres = np.round(np.asarray(depth_m, np.float64) * DEPTH_SCALE)
-    millimetres = np.where(
-        np.isfinite(millimetres) & (millimetres >= 0) & (millimetres <= 65535), millimetres, 0
+    millimeters = np.round(np.asarray(depth_m, np.float64) * DEPTH_SCALE)
+    millimeters = np.where(
+        np.isfinite(millimeters) & (millimeters >= 0) & (millimeters <= 65535), millimeters, 0
     )
-    done, png = cv2.imencode(".png", millimetres.astype(np.uint16))
+    done, png = cv2.imencode(".png", millimeters.astype(np.uint16))
     if not done:
         raise CaptureError(
-            f"Depth map of shape {millimetres.shape} cannot be written to {path}; expected (H, W)."
+            f"Depth map of shape {millimeters.shape} cannot be written to {path}; expected (H, W)."
         )
     with write_atomic(path) as temporary:
         temporary.write_bytes(png.tobytes())

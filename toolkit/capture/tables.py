@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from toolkit.errors import ArtefactError, CaptureError
+from toolkit.errors import ArtifactError, CaptureError
 from toolkit.files import write_atomic
 
 Ints = NDArray[np.int64]
@@ -315,15 +315,15 @@ def read_query_table(path: Path, columns: Sequence[str]) -> pd.DataFrame:
     """Read the CSV file of a pair, a row a query: timestamp int64, device_id and `columns` text, others as they are.
 
     Raises:
-        ArtefactError: the file cannot be read, is no such table, or has not got the columns.
+        ArtifactError: the file cannot be read, is no such table, or has not got the columns.
     """
     types: dict[Any, Any] = {"timestamp": np.int64, "device_id": str, **dict.fromkeys(columns, str)}
     try:
         table = pd.read_csv(path, dtype=types)
     except (OSError, ValueError) as error:
-        raise ArtefactError(f"{path}: not a table of queries ({error}). Localize this pair again.") from None
+        raise ArtifactError(f"{path}: not a table of queries ({error}). Localize this pair again.") from None
     if missing := [name for name in types if name not in table]:
-        raise ArtefactError(f"{path}: column {missing[0]!r} is missing. Localize this pair again.")
+        raise ArtifactError(f"{path}: column {missing[0]!r} is missing. Localize this pair again.")
     return table
 
 

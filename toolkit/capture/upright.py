@@ -1,7 +1,7 @@
-"""Turn images so that gravity points down in them, by multiples of 90 degrees learnt from the map's poses.
+"""Turn images so that gravity points down in them, by multiples of 90 degrees learned from the map's poses.
 
 Headset and robot cameras are mounted rotated, phones are held upright while their sensor lies on its side. What
-a network learnt from upright photographs wants them upright. `k` is always a number of COUNTER-CLOCKWISE quarter
+a network learned from upright photographs wants them upright. `k` is always a number of COUNTER-CLOCKWISE quarter
 turns of the image, as in `np.rot90`; images, intrinsics, poses and pixel positions have each their function, and
 they agree.
 
@@ -100,7 +100,7 @@ def estimate_world_up(sessions: Sequence[Session]) -> WorldUp:
     Raises:
         CaptureError: no image has a pose.
     """
-    axes, centres, groups = _posed_cameras(sessions)
+    axes, centers, groups = _posed_cameras(sessions)
     count = len(axes)
     if not count:
         names = ", ".join(session.id for session in sessions) or "none"
@@ -108,7 +108,7 @@ def estimate_world_up(sessions: Sequence[Session]) -> WorldUp:
             f"No image of the map sessions ({names}) has a pose, so the direction that is up cannot be "
             "estimated: expected poses in trajectories.txt. Give `world_up` in the manifest instead."
         )
-    up, difference = _most_upright(axes, centres, groups)
+    up, difference = _most_upright(axes, centers, groups)
     known, how = difference >= DECISIVE, "as most of its cameras are held"
     if not known:
         near_z = abs(up[2]) >= np.cos(np.radians(25.0))
@@ -131,11 +131,11 @@ def up_of_cameras(world_from_cams: ArrayLike) -> Array:
     return _most_upright(poses[:, :3, :3], poses[:, :3, 3], np.zeros(len(poses), np.int64))[0]
 
 
-def _most_upright(axes: Array, centres: Array, groups: Ints) -> tuple[Array, float]:
+def _most_upright(axes: Array, centers: Array, groups: Ints) -> tuple[Array, float]:
     """Return the direction (3,) that explains the cameras best, and how much better than its opposite."""
     order = np.argsort(groups, kind="stable")
     few = order[_evenly(len(order), 300)]
-    votes, some = _Votes(axes, centres, groups), _Votes(axes[few], centres[few], groups[few])
+    votes, some = _Votes(axes, centers, groups), _Votes(axes[few], centers[few], groups[few])
     candidates = _candidates(some.axes)
     order = np.argsort(-some.scores(candidates), kind="stable")
     ups = _distinct(candidates[order], 4)
@@ -146,7 +146,7 @@ def _most_upright(axes: Array, centres: Array, groups: Ints) -> tuple[Array, flo
 
 
 def _posed_cameras(sessions: Sequence[Session]) -> tuple[Array, Array, Ints]:
-    """Return axes (n, 3, 3), centres (n, 3) and groups (n,) of up to MAX_IMAGES cameras a session, in the world.
+    """Return axes (n, 3, 3), centers (n, 3) and groups (n,) of up to MAX_IMAGES cameras a session, in the world.
 
     The columns of the axes are right, down and forward. A group is a camera of a device over all recordings; cameras
     that took a few of a device's images only, as a phone's with one id an image, are one group.
@@ -213,10 +213,10 @@ class _Votes:
     images would be surer of noise than any belief.
     """
 
-    def __init__(self, axes: Array, centres: Array, groups: Ints) -> None:
+    def __init__(self, axes: Array, centers: Array, groups: Ints) -> None:
         self.axes = axes
         self.member = (groups[:, None] == np.unique(groups)).astype(np.float64)
-        offsets = centres - centres.mean(0)
+        offsets = centers - centers.mean(0)
         self.spread = offsets.T @ offsets / max(float((offsets**2).sum()), 1e-9)
         self.weight = min(1.0, 100 / len(axes))
 
@@ -291,7 +291,7 @@ def _smallest(scatter: Array, near: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class _Learnt:
+class _Learned:
     """Votes of map images for quarter turns, collected under some keys.
 
     Attributes:
@@ -305,7 +305,7 @@ class _Learnt:
     ups: Array
 
     @classmethod
-    def collect(cls, keys: pd.Series, k: Ints, weights: Array, up_in_cam: Array) -> "_Learnt":
+    def collect(cls, keys: pd.Series, k: Ints, weights: Array, up_in_cam: Array) -> "_Learned":
         """Sum the votes of images (n,) by key; images without a key do not vote."""
         codes, unique = pd.factorize(keys, sort=True)
         has = codes >= 0
@@ -341,9 +341,9 @@ class _Table:
         return np.where(rows < 0, -1, turns), np.vstack([self.ups, np.zeros(3)])[rows]
 
 
-def _decide(learnt: _Learnt, share: float) -> _Table:
-    length = np.linalg.norm(learnt.ups, axis=1, keepdims=True)
-    return _Table(learnt.keys, learnt.turns(share), learnt.ups / np.maximum(length, 1e-12))
+def _decide(learned: _Learned, share: float) -> _Table:
+    length = np.linalg.norm(learned.ups, axis=1, keepdims=True)
+    return _Table(learned.keys, learned.turns(share), learned.ups / np.maximum(length, 1e-12))
 
 
 def _keys(session: Session, sensors: pd.Series) -> pd.DataFrame:
@@ -398,7 +398,7 @@ class Turns:
         return digest.hexdigest()[:16]
 
     def record(self, session: Session | None = None) -> dict[str, Any]:
-        """Return what was learnt, for fingerprints; the same maps give the same record.
+        """Return what was learned, for fingerprints; the same maps give the same record.
 
         Args:
             session: one to limit it to: then the record changes only if an image of this session is turned
@@ -478,13 +478,13 @@ def quarter_turns(maps: Sequence[Session], world_up: WorldUp | ArrayLike | None 
         up_in_cam = np.einsum("nij,i->nj", np.concatenate(rotations), up.direction)
     k, weights = _votes_of(up_in_cam)
     tables = {
-        kind: _decide(_Learnt.collect(keys[kind], k, weights, up_in_cam), share) for kind, share in SHARES.items()
+        kind: _decide(_Learned.collect(keys[kind], k, weights, up_in_cam), share) for kind, share in SHARES.items()
     }
     return Turns(up, tables)
 
 
 def upright_turns(capture: Capture, world_up: ArrayLike | None = None) -> Turns:
-    """Return the turns learnt from all map sessions of a capture; see `quarter_turns`."""
+    """Return the turns learned from all map sessions of a capture; see `quarter_turns`."""
     return quarter_turns([capture[name] for name in capture if capture[name].split == "map"], world_up)
 
 
@@ -510,10 +510,10 @@ def _from_rigs(session: Session, sensors: pd.Series, turns: Ints, ups: Array) ->
     up_in_cam = np.einsum("nij,ni->nj", rotations, up_in_rig[rig])
     k, weights = _votes_of(up_in_cam)
     asked = (sensor >= 0) & ~known
-    learnt = _Learnt.collect(
+    learned = _Learned.collect(
         sensors.iloc[sensor[asked]].reset_index(drop=True), k[asked], weights[asked], up_in_cam[asked]
     )
-    table = _decide(learnt, MAJORITY)
+    table = _decide(learned, MAJORITY)
     return np.where(turns < 0, table.find(sensors)[0], turns)
 
 
@@ -561,7 +561,7 @@ def turn_image(image: NDArray[Any], k: int) -> NDArray[Any]:
 def turn_points(xy: ArrayLike, width: int, height: int, k: int) -> Array:
     """Return where pixel positions (N, 2) of an image of this size are after k quarter turns, (N, 2).
 
-    The centre of the top-left pixel is (0.5, 0.5), before and after.
+    The center of the top-left pixel is (0.5, 0.5), before and after.
     """
     x, y = np.moveaxis(np.asarray(xy, np.float64), -1, 0)
     turned = [(x, y), (y, width - x), (width - x, height - y), (height - y, x)][k % 4]
@@ -596,8 +596,8 @@ def turn_camera(camera: "pycolmap.Camera", k: int) -> "pycolmap.Camera":
             f"{', '.join(DIRECTED)}. Set `upright: false` for this capture, or undistort its images."
         )
     params, width, height = np.array(camera.params, np.float64), camera.width, camera.height
-    focal, centre = list(camera.focal_length_idxs()), list(camera.principal_point_idxs())
-    params[centre] = turn_points(params[centre], width, height, k)
+    focal, center = list(camera.focal_length_idxs()), list(camera.principal_point_idxs())
+    params[center] = turn_points(params[center], width, height, k)
     if k % 2:
         params[focal] = params[focal[::-1]]
         width, height = height, width

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from toolkit.errors import ArtefactError, ManifestError
+from toolkit.errors import ArtifactError, ManifestError
 from toolkit.models.weights import MEGALOC, find_weights
 
 
@@ -20,7 +20,7 @@ class Embedder(Protocol):
     inputs: Literal["images", "features"]
     """What `embed` takes: images (H, W, 3) uint8 RGB, or `toolkit.features.features.LocalFeatures`."""
     upright: bool
-    """Whether it was learnt from upright photographs, so that images are better turned upright for it."""
+    """Whether it was learned from upright photographs, so that images are better turned upright for it."""
 
     @property
     def dim(self) -> int:
@@ -100,12 +100,12 @@ def load_embeddings(folder: str | Path) -> tuple[NDArray[np.float32], pd.DataFra
         (N, D) float32; a table of its rows: row_index, device_id, sensor_id, timestamp, abs_path, subsession.
 
     Raises:
-        ArtefactError: there are none, or files do not fit together.
+        ArtifactError: there are none, or files do not fit together.
     """
     folder = Path(folder)
     manifests = sorted(folder.rglob("manifest.csv"))
     if not manifests:
-        raise ArtefactError(
+        raise ArtifactError(
             f"No embeddings in {folder}: run the embed stage first (python -m toolkit run ... --only embed)."
         )
     matrices: list[NDArray[np.float32]] = []
@@ -116,14 +116,14 @@ def load_embeddings(folder: str | Path) -> tuple[NDArray[np.float32], pd.DataFra
             matrix = np.load(path).astype(np.float32, copy=False)
             table = pd.read_csv(manifest, dtype={"device_id": str, "sensor_id": str, "abs_path": str})
         except (OSError, ValueError) as error:
-            raise ArtefactError(f"Embeddings {path} cannot be read ({error}); embed again.") from error
+            raise ArtifactError(f"Embeddings {path} cannot be read ({error}); embed again.") from error
         if list(table.columns) != MANIFEST_COLUMNS or matrix.ndim != 2 or len(matrix) != len(table):
-            raise ArtefactError(
+            raise ArtifactError(
                 f"{manifest} ({len(table)} rows, {', '.join(table.columns)}) does not fit {path.name} "
                 f"{matrix.shape}; expected columns {', '.join(MANIFEST_COLUMNS)} and one row a vector. Embed again."
             )
         if matrices and matrix.shape[1] != matrices[0].shape[1]:
-            raise ArtefactError(
+            raise ArtifactError(
                 f"{path} has {matrix.shape[1]} dimensions, {manifests[0].parent} {matrices[0].shape[1]}; "
                 "embed again."
             )

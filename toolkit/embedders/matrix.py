@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
-from toolkit.errors import ArtefactError
+from toolkit.errors import ArtifactError
 from toolkit.files import fingerprint
 
 if sys.platform != "win32":
@@ -34,7 +34,7 @@ class MatrixWriter:
             resume: go on with what a killed writer left.
 
         Raises:
-            ArtefactError: another process is writing the same matrix.
+            ArtifactError: another process is writing the same matrix.
         """
         self.path = Path(path)
         self._dim, self._dtype = dim, np.dtype(dtype)
@@ -101,7 +101,7 @@ class MatrixWriter:
             fcntl.flock(self._rows, fcntl.LOCK_EX | fcntl.LOCK_NB)  # ends with the process, however it ends
         except BlockingIOError:
             self._rows.close()
-            raise ArtefactError(
+            raise ArtifactError(
                 f"{self.path} is being written by another process. Wait for that run to end, or stop it."
             ) from None
 

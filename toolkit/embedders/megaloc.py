@@ -70,7 +70,7 @@ class MegaLocEmbedder:
         }  # fmt: skip
 
     def prepare(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return an image (H, W, 3) or (H, W), uint8 RGB or grey, as the network takes it, (S, S, 3).
+        """Return an image (H, W, 3) or (H, W), uint8 RGB or gray, as the network takes it, (S, S, 3).
 
         Raises:
             ValueError: another shape or type.
@@ -105,6 +105,6 @@ class MegaLocEmbedder:
         return vectors
 
     def _forward(self, images: Tensor) -> Tensor:
-        normalised = (images.permute(0, 3, 1, 2).float() / 255 - self._mean) / self._std
-        descriptors: Tensor = self._model(normalised)
+        normalized = (images.permute(0, 3, 1, 2).float() / 255 - self._mean) / self._std
+        descriptors: Tensor = self._model(normalized)
         return descriptors

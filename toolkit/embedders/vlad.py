@@ -1,7 +1,7 @@
-"""VLAD of RootSIFT: a global descriptor without weights, its vocabulary learnt from the map's images.
+"""VLAD of RootSIFT: a global descriptor without weights, its vocabulary learned from the map's images.
 
 Residuals of whitened local descriptors to their visual word are summed per word (Jegou et al., CVPR 2010),
-each residual and each word's sum normalised (Delhumeau et al., ACM MM 2013; Arandjelovic and Zisserman,
+each residual and each word's sum normalized (Delhumeau et al., ACM MM 2013; Arandjelovic and Zisserman,
 CVPR 2013), and projected to the principal directions of the map's images.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from toolkit.errors import ArtefactError, ToolkitError
+from toolkit.errors import ArtifactError, ToolkitError
 from toolkit.features.features import LocalFeatures
 from toolkit.features.matching import unit_descriptors
 from toolkit.files import file_fingerprint, write_atomic
@@ -41,15 +41,15 @@ class VladSettings:
     """Most dimensions of the result; it cannot have more than there are map images."""
     prior_images: int = 2000
     """Shrinkage of the whitening: the weight, in images, of the belief that all directions vary alike.
-    Directions learnt from a hundred images say where those were taken, not what repeats between places."""
+    Directions learned from a hundred images say where those were taken, not what repeats between places."""
     sample_descriptors: int = 50_000
-    """Local descriptors that the vocabulary is learnt from."""
+    """Local descriptors that the vocabulary is learned from."""
     iterations: int = 15
     """Rounds of k-means."""
 
 
 class Vlad:
-    """A learnt VLAD: turns the local features of images into global descriptors."""
+    """A learned VLAD: turns the local features of images into global descriptors."""
 
     name = "vlad"
     inputs: Literal["features"] = "features"
@@ -77,7 +77,7 @@ class Vlad:
     def embed(self, inputs: Sequence[LocalFeatures]) -> Floats:
         """Return the global descriptors (B, dim) of images; rows of zeros where an image has no features.
 
-        Similarities are exact dot products; normalise the rows for cosines.
+        Similarities are exact dot products; normalize the rows for cosines.
         """
         return self._aggregate(inputs) @ self.projection
 
@@ -110,7 +110,7 @@ class Vlad:
         sample = np.concatenate(parts) if parts else np.zeros((0, 1), np.float32)
         if len(sample) < 2:
             raise ToolkitError(
-                f"A VLAD vocabulary cannot be learnt: {count} map images gave {len(sample)} local features. "
+                f"A VLAD vocabulary cannot be learned: {count} map images gave {len(sample)} local features. "
                 f"Check that they can be read and are not blank (`python -m toolkit check CAPTURE`)."
             )
         mean = sample.mean(axis=0)
@@ -140,9 +140,9 @@ class Vlad:
             settings = VladSettings(**json.loads(str(arrays.pop("settings"))))
             return cls(settings, arrays, file_fingerprint(vocabulary))
         except FileNotFoundError:
-            raise ArtefactError(f"No VLAD vocabulary {vocabulary}; run the embed stage first.") from None
+            raise ArtifactError(f"No VLAD vocabulary {vocabulary}; run the embed stage first.") from None
         except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
-            raise ArtefactError(
+            raise ArtifactError(
                 f"Not a VLAD vocabulary: {vocabulary} ({error}). Delete it and embed again."
             ) from error
 
@@ -212,7 +212,7 @@ def _kmeans(points: Floats, words: int, iterations: int, rng: np.random.Generato
 def _principal_projection(vectors: Floats, settings: VladSettings) -> Floats:
     """Return the projection (D, dim) to the map's principal directions, with shrunken whitening.
 
-    Not centred: as long as no direction is cut, map images rank by similarity to a query as their whole VLADs
+    Not centered: as long as no direction is cut, map images rank by similarity to a query as their whole VLADs
     do, and a query with nothing in common with the map stays short.
     """
     count = len(vectors)

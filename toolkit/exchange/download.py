@@ -294,7 +294,7 @@ def _session_of(path: str, known: Iterable[str]) -> str | None:
 
 
 def _describe(plan: Plan, in_full: bool, say: Say) -> None:
-    say(f"{plan.folder.name}: {plan.origin}\n  to        {plan.folder}\n  licence   {plan.dataset.licence}")
+    say(f"{plan.folder.name}: {plan.origin}\n  to        {plan.folder}\n  license   {plan.dataset.license}")
     if plan.dataset.citation:
         say(f"  cite      {plan.dataset.citation}")
     say(f"  about     {plan.dataset.page}")

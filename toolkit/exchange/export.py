@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from toolkit.capture import Session
 from toolkit.capture.tables import POSE_NAMES
-from toolkit.errors import ArtefactError, ManifestError
+from toolkit.errors import ArtifactError, ManifestError
 from toolkit.exchange.submission import Captures
 from toolkit.features.features import FeatureStore
 from toolkit.files import SceneFiles, image_name, read_references, write_atomic, write_text
@@ -23,7 +23,7 @@ def export_colmap(
     """Write the triangulated map of a run as a COLMAP model, binary.
 
     Image names are relative to the capture's folder `sessions`. All keypoints are written, also those that see no
-    point, in COLMAP's pixels, which are ours: the centre of the top-left pixel is (0.5, 0.5). A rig's frame is that of
+    point, in COLMAP's pixels, which are ours: the center of the top-left pixel is (0.5, 0.5). A rig's frame is that of
     its first camera, as COLMAP wants it; rigs with the same cameras at the same places are one rig.
 
     Args:
@@ -34,7 +34,7 @@ def export_colmap(
         capture: the capture, where it is no longer where the run found it.
 
     Raises:
-        ArtefactError: the run has no such map.
+        ArtifactError: the run has no such map.
         ManifestError: there are files in `out`, or the capture is not found.
     """
     files, session_id, out = SceneFiles(Path(run), scene), f"{device}_map", Path(out)
@@ -63,12 +63,12 @@ def colmap_model(local_map: LocalMap, session: Session, store: FeatureStore) -> 
         store: local features of its images.
 
     Raises:
-        ArtefactError: the session does not list an image of the map.
+        ArtifactError: the session does not list an image of the map.
     """
     row_of = {session.image_name(row): row for row in range(len(session.images))}
     unknown = [name for name in local_map.image_names if name not in row_of]
     if unknown:
-        raise ArtefactError(f"{session.path}: image {unknown[0]} of the map is not in it. Run the map's stages again.")
+        raise ArtifactError(f"{session.path}: image {unknown[0]} of the map is not in it. Run the map's stages again.")
     rows = np.array([row_of[name] for name in local_map.image_names], np.int64)
     sensors = session.images["sensor_id"].to_numpy(str)[rows]
     frames = _frames(session, rows)
@@ -146,7 +146,7 @@ def export_pairs(
         topk: so many references a query; None: all that were retrieved.
 
     Raises:
-        ArtefactError: the run has no such retrieval, a line of it is malformed, or a name has a space in it.
+        ArtifactError: the run has no such retrieval, a line of it is malformed, or a name has a space in it.
     """
     path = SceneFiles(Path(run), scene).retrieval(map_device, query_device)
     pairs = []
@@ -154,11 +154,11 @@ def export_pairs(
         paths = [str(entry["path"]) for entry in (row, *row["topk"][:topk])]
         strange = [name for name in paths if "/sessions/" not in name]
         if strange:
-            raise ArtefactError(f"{path}: expected images as SCENE/sessions/..., found {strange[0]!r}. Retrieve again.")
+            raise ArtifactError(f"{path}: expected images as SCENE/sessions/..., found {strange[0]!r}. Retrieve again.")
         names = [image_name(name) for name in paths]
         spaced = [name for name in names if len(name.split()) != 1]
         if spaced:
-            raise ArtefactError(f"{path}: hloc's lists cannot hold the space in {spaced[0]!r}.")
+            raise ArtifactError(f"{path}: hloc's lists cannot hold the space in {spaced[0]!r}.")
         pairs += [f"{names[0]} {name}" for name in names[1:]]
     write_text(out, "".join(f"{pair}\n" for pair in pairs))
     return len(pairs)

@@ -148,7 +148,7 @@ def import_images(
         capture: folder of the capture; made where it does not exist.
         device, split: the session is `<device>_<split>`. A map needs poses; those of queries become their ground truth.
         table: CSV file, see the head of this module.
-        poses_are: direction of the table's poses, `world_from_cam` or `cam_from_world`; metres.
+        poses_are: direction of the table's poses, `world_from_cam` or `cam_from_world`; meters.
         camera: intrinsics of all images, `MODEL, width, height, parameter, ...`, with COLMAP's models.
         cameras: COLMAP's cameras.txt; its only camera is of all images, else the table's `camera_id` says which.
         placing: `link` images to where they are, or `copy` them.
@@ -419,7 +419,7 @@ def _read_table(path: Path) -> pd.DataFrame:
             found = ", ".join(row[list(POSE_NAMES)])
             raise CaptureError(
                 f"{path}, line {row['line']}: found the pose {found}; expected seven finite numbers, qw qx qy qz of "
-                "length 1 and metres."
+                "length 1 and meters."
             )
     return rows
 

@@ -18,7 +18,7 @@ import pandas as pd
 from toolkit.capture import COLUMNS, Capture, Trajectory
 from toolkit.capture.check import UNIT_TOLERANCE
 from toolkit.capture.tables import KeyIndex, read_query_table, read_table
-from toolkit.errors import ArtefactError, CaptureError, ManifestError, ToolkitError
+from toolkit.errors import ArtifactError, CaptureError, ManifestError, ToolkitError
 from toolkit.files import SceneFiles, file_fingerprint, read_references, write_atomic, write_sidecar
 from toolkit.geometry import invert, qt_from_pose
 
@@ -187,7 +187,7 @@ def collect(
 
     Raises:
         ManifestError: an unknown value, no such run, or a file that cannot be read as a description.
-        ArtefactError: a pair is in two runs, or a poses file has a key twice or a quaternion that is none.
+        ArtifactError: a pair is in two runs, or a poses file has a key twice or a quaternion that is none.
         CaptureError: a malformed poses file, or no such keyframe list; names file and line.
     """
     if failed not in FAILED:
@@ -287,7 +287,7 @@ def _fill_entry(
         return
     if len(found) > 1:
         both = " and ".join(str(files.poses_txt(*pair)) for files in found)
-        raise ArtefactError(f"Two runs have poses of the same pair: {both}. Give one of the two runs.")
+        raise ArtifactError(f"Two runs have poses of the same pair: {both}. Give one of the two runs.")
     files = found[0]
     asked = _asked(captures[entry.scene], entry.query_device, queries)
     keys = list(zip(asked["timestamp"].tolist(), asked["device_id"].tolist(), strict=True))
@@ -345,7 +345,7 @@ def _read_poses(path: Path) -> Trajectory:
     for rows, what in ((repeated, "is there twice"), (wrong, "has a quaternion that is not of length 1")):
         if len(rows):
             key = f"(timestamp {poses.timestamps[rows[0]]}, device {poses.device_ids[rows[0]]!r})"
-            raise ArtefactError(f"{table.where(rows[0])}: {key} {what}. Localize this pair again, or correct the line.")
+            raise ArtifactError(f"{table.where(rows[0])}: {key} {what}. Localize this pair again, or correct the line.")
     return poses
 
 
@@ -373,7 +373,7 @@ def _nearest_references(path: Path) -> tuple[dict[Key, np.ndarray], str]:
                     best[key] = score, world_from_rig
         except (ValueError, KeyError, TypeError) as error:
             found = f"{path}, query of {row['timestamp']}: not a retrieval row"
-            raise ArtefactError(f"{found} ({error!r}). Retrieve again.") from None
+            raise ArtifactError(f"{found} ({error!r}). Retrieve again.") from None
     return {key: pose for key, (_, pose) in best.items()}, "no reference was retrieved"
 
 

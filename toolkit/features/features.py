@@ -3,7 +3,7 @@
 Those of a session are kept in one HDF5 file for each kind and settings, in the layout of hloc
 (https://github.com/cvg/Hierarchical-Localization): a group an image, under the image's name, with `keypoints` (N, 2),
 `descriptors` (D, N) of unit length, `scores` (N,) and `image_size` (2,), and the `scales` (N,) of keypoints. There the
-centre of the top-left pixel is at 0, as the attribute of the file says; here, and in `LocalFeatures`, at 0.5.
+center of the top-left pixel is at 0, as the attribute of the file says; here, and in `LocalFeatures`, at 0.5.
 """
 
 import threading
@@ -22,7 +22,7 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Session
 from toolkit.capture.images import prefetch, read_image
-from toolkit.errors import ArtefactError, ImageError, ManifestError
+from toolkit.errors import ArtifactError, ImageError, ManifestError
 from toolkit.features.groups import GroupWriter
 from toolkit.files import files_fingerprint, fingerprint, read_sidecar
 
@@ -30,7 +30,7 @@ from toolkit.files import files_fingerprint, fingerprint, read_sidecar
 DESCRIPTOR_SCALE = 512.0
 Descriptors = NDArray[np.uint8] | NDArray[np.float16] | NDArray[np.float32]
 PIXEL_CENTER = "top_left_pixel_center"
-"""Attribute of a file: where the centre of the top-left pixel is."""
+"""Attribute of a file: where the center of the top-left pixel is."""
 SCALE = "scale"
 """Attribute of the descriptors of a file: they were bytes, over this."""
 # Files have bytes as float16, exactly: a byte over a power of two has 8 significant bits, float16 holds 11. A look-up
@@ -45,7 +45,7 @@ class LocalFeatures:
     """Local features of one image, strongest response first, in the pixels of the image as stored."""
 
     keypoints: NDArray[np.float32]
-    """(N, 2) x y, pixels; the centre of the top-left pixel is (0.5, 0.5)."""
+    """(N, 2) x y, pixels; the center of the top-left pixel is (0.5, 0.5)."""
     scales: NDArray[np.float32]
     """(N,) size of the keypoints, the standard deviation of the blob, pixels; 1 for detectors that tell none."""
     scores: NDArray[np.float32]
@@ -68,8 +68,8 @@ class LocalFeatures:
 class Extractor(Protocol):
     """What finds local features of one kind."""
 
-    colour: bool
-    """Whether images are (H, W, 3) RGB, else (H, W) grey."""
+    color: bool
+    """Whether images are (H, W, 3) RGB, else (H, W) gray."""
     batch_size: int
     """How many images a call is best given."""
     threaded: bool
@@ -187,7 +187,7 @@ def stretch_contrast(gray: NDArray[np.uint8], max_gain: float = 8.0) -> NDArray[
 class SiftExtractor:
     """Extracts RootSIFT features; one instance may be used by several threads."""
 
-    colour = False
+    color = False
     batch_size = 1
     threaded = True
 
@@ -208,7 +208,7 @@ class SiftExtractor:
         return {"name": "sift", **asdict(self._settings)}
 
     def extract(self, images: Sequence[NDArray[np.uint8]]) -> list[LocalFeatures]:
-        """Return the features of images, (H, W) grey or (H, W, 3) RGB, uint8."""
+        """Return the features of images, (H, W) gray or (H, W, 3) RGB, uint8."""
         return [self._extract(image if image.ndim == 2 else _gray(image)) for image in images]
 
     def _extract(self, gray: NDArray[np.uint8]) -> LocalFeatures:
@@ -235,13 +235,13 @@ class SiftExtractor:
         order = np.argsort(-responses, kind="stable")[: settings.max_keypoints]
         keypoints, descriptors = [keypoints[index] for index in order], descriptors[order]
         xy = np.array([keypoint.pt for keypoint in keypoints])
-        # OpenCV puts the centre of the top-left pixel at 0.
+        # OpenCV puts the center of the top-left pixel at 0.
         xy = (xy + 0.5) * scale
         sigma = np.array([keypoint.size for keypoint in keypoints]) / 2 * scale.mean()
         root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6))
-        quantised = np.clip(np.round(root * DESCRIPTOR_SCALE), 0, 255).astype(np.uint8)
+        quantized = np.clip(np.round(root * DESCRIPTOR_SCALE), 0, 255).astype(np.uint8)
         return LocalFeatures(
-            xy.astype(np.float32), sigma.astype(np.float32), responses[order], quantised, (width, height)
+            xy.astype(np.float32), sigma.astype(np.float32), responses[order], quantized, (width, height)
         )
 
     def _sift(self) -> Any:
@@ -294,7 +294,7 @@ class FeatureStore(Mapping[str, LocalFeatures]):
         """Open a file of features, the toolkit's or hloc's, whatever it was made from.
 
         Raises:
-            ArtefactError: it is missing, torn, or holds no features.
+            ArtifactError: it is missing, torn, or holds no features.
         """
         record = read_sidecar(path)
         if record is not None and "groups" in record:
@@ -310,9 +310,9 @@ class FeatureStore(Mapping[str, LocalFeatures]):
             with h5py.File(path, "r") as file:
                 file.visititems(visit)
         except OSError as error:
-            raise ArtefactError(f"Local features {path} cannot be read ({error}). Extract them again.") from None
+            raise ArtifactError(f"Local features {path} cannot be read ({error}). Extract them again.") from None
         if not names:
-            raise ArtefactError(
+            raise ArtifactError(
                 f"{path} holds no local features; expected a group an image with `keypoints` and `descriptors`."
             )
         return cls(Path(path), dict.fromkeys(names, files_fingerprint([Path(path)])))
@@ -327,7 +327,7 @@ class FeatureStore(Mapping[str, LocalFeatures]):
             settings: of the extractor; None: of SIFT.
 
         Raises:
-            ArtefactError: there are none, or the file is torn.
+            ArtifactError: there are none, or the file is torn.
         """
         return cls.open(features_path(out, session_id, settings or SiftExtractor().settings))
 
@@ -357,7 +357,7 @@ class FeatureStore(Mapping[str, LocalFeatures]):
                 group = (self._file or self._open(name))[name]
                 arrays = {key: item[()] for key, item in group.items() if isinstance(item, h5py.Dataset)}
             except (OSError, RuntimeError, KeyError) as error:  # what HDF5 raises for what is not its format
-                raise ArtefactError(
+                raise ArtifactError(
                     f"Local features {self.path} are damaged at {name} ({error}). Delete the file: it is made again."
                 ) from None
         try:
@@ -365,7 +365,7 @@ class FeatureStore(Mapping[str, LocalFeatures]):
             descriptors = arrays["descriptors"]
             size = arrays["image_size"]
         except KeyError as error:
-            raise ArtefactError(
+            raise ArtifactError(
                 f"{self.path}: {name} has no {error}; expected the layout of hloc. If a run made the file, delete it: "
                 "it is made again."
             ) from None
@@ -465,7 +465,7 @@ def _extract(
 
     def read(row: int) -> NDArray[np.uint8] | str:
         try:
-            image = read_image(session.image_path(row), gray=not extractor.colour)
+            image = read_image(session.image_path(row), gray=not extractor.color)
         except ImageError as error:
             return str(error)
         camera = session.camera(sensors[row])
@@ -493,13 +493,13 @@ def _extract(
 def _write(writer: GroupWriter, name: str, made_from: str, features: LocalFeatures) -> None:
     """Write the features of an image as hloc has them."""
     descriptors = _transposed(features.descriptors)
-    quantised = descriptors.dtype == np.uint8
+    quantized = descriptors.dtype == np.uint8
     arrays = {
         # Exact from 0.5 px on, where the difference has no more digits than the number.
         "keypoints": features.keypoints - np.float32(0.5),
         "scales": features.scales,
         "scores": features.scores,
-        "descriptors": np.take(_HALVES, descriptors) if quantised else descriptors,
+        "descriptors": np.take(_HALVES, descriptors) if quantized else descriptors,
         "image_size": np.array(features.image_size, np.int64),
     }
-    writer.add(name, made_from, arrays, {"descriptors": {SCALE: DESCRIPTOR_SCALE}} if quantised else {})
+    writer.add(name, made_from, arrays, {"descriptors": {SCALE: DESCRIPTOR_SCALE}} if quantized else {})

@@ -90,7 +90,7 @@ class LightGlueMatcher:
             _check(features)
         found = [PairMatches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32)) for _ in pairs]
         # Pairs with similar numbers of features go together: the smaller are filled up to the largest. Largest first,
-        # so that what did not fit is learnt once.
+        # so that what did not fit is learned once.
         sizes = [max(len(a), len(b)) for a, b in pairs]
         order = [number for number in np.argsort(sizes, kind="stable")[::-1] if all(map(len, pairs[number]))]
         for start in range(0, len(order), self.batch_size):
@@ -106,7 +106,7 @@ class LightGlueMatcher:
         """Return for each feature of the first image its partner, -1 for none, and the confidence, (B, N, 2).
 
         Args:
-            batch: (B, 2, N, 2 + 256 + 1), of each image's features the normalised x y, the descriptor, and 1; rows of
+            batch: (B, 2, N, 2 + 256 + 1), of each image's features the normalized x y, the descriptor, and 1; rows of
                 zeros fill up to N.
         """
         model = self._model
@@ -153,7 +153,7 @@ def _check(features: LocalFeatures) -> None:
     kind, shape = features.descriptors.dtype, features.descriptors.shape
     if kind == np.uint8 or shape[1:] != (DESCRIPTOR_LENGTH,):
         raise ToolkitError(
-            f"LightGlue was learnt with SuperPoint features, (N, {DESCRIPTOR_LENGTH}) unit vectors; found {kind} "
+            f"LightGlue was learned with SuperPoint features, (N, {DESCRIPTOR_LENGTH}) unit vectors; found {kind} "
             f"{shape}. Use the matcher `mutual` with other features."
         )
 
@@ -163,7 +163,7 @@ def _pack(pair: tuple[LocalFeatures, LocalFeatures], length: int) -> NDArray[np.
     packed = np.zeros((2, length, 2 + DESCRIPTOR_LENGTH + 1), np.float32)
     for rows, features in zip(packed, pair, strict=True):
         size = np.array(features.image_size, np.float32)
-        # As in training: pixel centres at whole numbers, the longer side from -1 to 1.
+        # As in training: pixel centers at whole numbers, the longer side from -1 to 1.
         rows[: len(features), :2] = (features.keypoints - 0.5 - size / 2) / (size.max() / 2)
         rows[: len(features), 2:-1] = features.descriptors
         rows[: len(features), -1] = 1

@@ -1,4 +1,4 @@
-"""Match local features between images: mutual nearest neighbours, networks, and along epipolar lines.
+"""Match local features between images: mutual nearest neighbors, networks, and along epipolar lines.
 
 Matches of two sessions are kept in one HDF5 file, in the layout of hloc
 (https://github.com/cvg/Hierarchical-Localization): a group a pair of images, `<image>/<image>` with `/` in the names
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from toolkit.errors import ArtefactError, ManifestError
+from toolkit.errors import ArtifactError, ManifestError
 from toolkit.features.features import (
     DESCRIPTOR_SCALE,
     KINDS,
@@ -111,7 +111,7 @@ def matchers_of(features: Sequence[str], matcher: str | None = None) -> dict[str
 
 
 class MutualMatcher:
-    """Matches mutual nearest neighbours that pass Lowe's ratio test, of any descriptors."""
+    """Matches mutual nearest neighbors that pass Lowe's ratio test, of any descriptors."""
 
     batch_size = 1
 
@@ -208,20 +208,20 @@ class MatchStore:
 
         Raises:
             KeyError: the file does not have the pair.
-            ArtefactError: the file cannot be read.
+            ArtifactError: the file cannot be read.
         """
         with self._lock:
             if self._file is None:
                 try:
                     self._file = h5py.File(self.path, "r")
                 except OSError as error:
-                    raise ArtefactError(f"Matches {self.path} cannot be read ({error}). Match again.") from None
+                    raise ArtifactError(f"Matches {self.path} cannot be read ({error}). Match again.") from None
             places = [(of(*names[::step]), step) for step in (1, -1) for of in (_own_group_name, group_name)]
             try:
                 found = [(self._file[place], step) for place, step in places if place in self._file]
                 arrays = [found[0][0][key][()] for key in ("matches0", "matching_scores0")] if found else []
             except (OSError, RuntimeError, KeyError) as error:  # what HDF5 raises for what is not its format
-                raise ArtefactError(
+                raise ArtifactError(
                     f"Matches {self.path} are damaged at {' and '.join(names)} ({error}). Delete the file: it is made "
                     "again."
                 ) from None
@@ -334,7 +334,7 @@ def similarity(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.flo
 
 
 def mutual_matches(scores: NDArray[np.float32], ratio: float = 0.8, min_score: float = -1.0) -> NDArray[np.int64]:
-    """Return mutual nearest neighbours whose rows pass Lowe's ratio test.
+    """Return mutual nearest neighbors whose rows pass Lowe's ratio test.
 
     Args:
         scores: (N, M) cosine similarities; candidates that geometry excludes are below -1.
@@ -383,14 +383,14 @@ def match_along_epipolar_lines(
 ) -> NDArray[np.int64]:
     """Match two images whose poses are known, comparing only what can be the same point.
 
-    The planes through both camera centres turn about the baseline. Two rays can meet only if they lie in one
-    half-plane, so rays are sorted by the angle of itss and each is compared with its neighbours in that order
+    The planes through both camera centers turn about the baseline. Two rays can meet only if they lie in one
+    half-plane, so rays are sorted by the angle of itss and each is compared with its neighbors in that order
     alone: some hundredths of all pairs. Works on rays, so for every central camera model.
 
     Args:
         descriptors_a, descriptors_b: (N, D), (M, D) unit descriptors.
         rays_a, rays_b: (N, 3), (M, 3) unit rays in the cameras' frames.
-        b_from_a: (4, 4) relative pose, metres.
+        b_from_a: (4, 4) relative pose, meters.
         max_angle_a, max_angle_b: largest angle of a ray to the other's epipolar plane, radians.
         ratio: the nearest must be closer than `ratio` times the second nearest of the candidates.
         min_score: least cosine similarity of a match.
@@ -401,7 +401,7 @@ def match_along_epipolar_lines(
     baseline = np.linalg.norm(b_from_a[:3, 3])
     if baseline < 1e-6 or not len(rays_a) or not len(rays_b):
         return np.zeros((0, 2), np.int64)
-    axis = b_from_a[:3, 3] / baseline  # from b towards a, in b
+    axis = b_from_a[:3, 3] / baseline  # from b toward a, in b
     turn_a, elevation_a = _about_axis(rays_a @ b_from_a[:3, :3].T, axis)
     turn_b, elevation_b = _about_axis(rays_b, axis)
     # The same sideways error is a larger turn close to the epipole.

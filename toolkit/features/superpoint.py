@@ -74,7 +74,7 @@ class SuperPointExtractor:
     Images of one size run together. What a feature is does not depend on what else is in the batch.
     """
 
-    colour = False
+    color = False
     threaded = False
 
     def __init__(
@@ -91,7 +91,7 @@ class SuperPointExtractor:
                 else downloaded there.
             device: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
             dtype: of the encoder: `float32`, `bfloat16`, `float16`; `auto`: what is fast on the device. The heads are
-                always float32: neighbouring pixels must not tie.
+                always float32: neighboring pixels must not tie.
             batch_size: images at a time, at most; None: what is usual for the device.
             settings: fields of `SuperPointSettings`.
 
@@ -124,7 +124,7 @@ class SuperPointExtractor:
         }  # fmt: skip
 
     def extract(self, images: Sequence[NDArray[np.uint8]]) -> list[LocalFeatures]:
-        """Return the features of images, (H, W) grey or (H, W, 3) RGB, uint8, of any sizes; float16 descriptors.
+        """Return the features of images, (H, W) gray or (H, W, 3) RGB, uint8, of any sizes; float16 descriptors.
 
         Raises:
             ValueError: another shape or type.
@@ -147,7 +147,7 @@ class SuperPointExtractor:
         return [found[number] for number in range(len(images))]
 
     def _prepare(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return an image in grey and of the size that the network sees."""
+        """Return an image in gray and of the size that the network sees."""
         image = np.asarray(image)
         if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)) or not image.size:
             raise ValueError(f"an image is {image.dtype} {image.shape}; expected uint8 (H, W) or (H, W, 3) RGB.")
@@ -165,7 +165,7 @@ class SuperPointExtractor:
 
         Args:
             batch: (B, H, W) uint8, padded at the right and below to whole cells.
-            size: (H, W) without that. In x and y the centre of the top-left pixel is at 0.
+            size: (H, W) without that. In x and y the center of the top-left pixel is at 0.
         """
         settings, model = self._settings, self._model
         pixels = batch[:, None].float() / 255
@@ -223,7 +223,7 @@ def _unpack(rows: NDArray[np.float32], size: tuple[int, int], shape: tuple[int, 
         )
     rows = rows[rows[:, 2] > 0]
     (rows_shown, columns_shown), (height, width) = size, shape[:2]
-    # Pixel centres of the network are at whole numbers; resizing keeps corners, not centres, where they are.
+    # Pixel centers of the network are at whole numbers; resizing keeps corners, not centers, where they are.
     keypoints = (rows[:, :2] + 0.5) * np.array([width / columns_shown, height / rows_shown])
     return LocalFeatures(
         keypoints.astype(np.float32),

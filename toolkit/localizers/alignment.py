@@ -1,11 +1,11 @@
 """The similarity that brings predicted cameras into the map, and how well it is known.
 
-A network predicts the cameras of a query and of its references in a frame of its own, `model`, without metres. The
+A network predicts the cameras of a query and of its references in a frame of its own, `model`, without meters. The
 references' poses in the map are known. The noise sits in the prediction; the map counts as exact. So:
 
 - Rotation comes from orientations, which are never degenerate, and from baselines where they are long.
 - Scale is regressed from map to model. The other direction, which is that of Umeyama (1991), divides by the spread
-  of noisy centres and shrinks as the noise nears the baselines (errors in variables; Fuller 1987).
+  of noisy centers and shrinks as the noise nears the baselines (errors in variables; Fuller 1987).
 - Depth ratios, metric over model, give scale without baselines.
 - The noise is unknown. It has a broad prior and is estimated from the residuals.
 - Wrong references are found by a mixture: a reference either has that noise, or is anywhere.
@@ -28,10 +28,10 @@ Ints = NDArray[np.int64]
 DepthSamples = ArrayLike | Sequence[ArrayLike]
 
 OUTLIER_SHARE = 0.2  # the share of wrong references expected before looking
-WRONG_PLACE = 20.0  # wrong centres are spread over that many times the noise expected at least
+WRONG_PLACE = 20.0  # wrong centers are spread over that many times the noise expected at least
 NOISE_FACTOR = np.log(2.5)  # one standard deviation of what is known of a noise before looking, in its logarithm
 DEPTH_NOISE = 0.1  # relative noise expected of one depth ratio
-CENTRE_NOISE_SHARE = 0.01  # of the references' typical distance: a prediction of a wider place is less exact
+CENTER_NOISE_SHARE = 0.01  # of the references' typical distance: a prediction of a wider place is less exact
 _STARTS = 6  # hypotheses refined of all that were scored
 _ROUNDS = 10
 _LEVELS = np.exp(np.linspace(-3.5, 3.5, 29))  # noise over its expected size, to integrate over
@@ -60,7 +60,7 @@ class Sim3:
     def apply_to_pose(self, model_from_cam: ArrayLike) -> Floats:
         """Return world_from_cam, (..., 4, 4), of cameras in the model, (..., 4, 4).
 
-        The centre is transformed, the orientation turned; the camera keeps its own metres, so the pose stays rigid.
+        The center is transformed, the orientation turned; the camera keeps its own meters, so the pose stays rigid.
         """
         pose = np.asarray(model_from_cam, np.float64)
         return geometry.make_pose(self.rotation @ pose[..., :3, :3], self.transform(pose[..., :3, 3]))
@@ -87,7 +87,7 @@ class Alignment:
     rotation_std_deg: float
     """Of the rotation; inf if unknown."""
     rmse_m: float
-    """Of the inliers' centres, after alignment; nan without inliers."""
+    """Of the inliers' centers, after alignment; nan without inliers."""
     reason: str
     """What was left out or is unknown, and why; empty if nothing."""
     num_rivals: int
@@ -97,11 +97,11 @@ class Alignment:
     rotation_covariance: Floats
     """(3, 3) of a small rotation in the world's frame, radians."""
     centroid_covariance: Floats
-    """(3, 3) of the place of the model's centroid in the world, square metres."""
+    """(3, 3) of the place of the model's centroid in the world, square meters."""
     rotation_noise_deg: float
     """Estimated noise of a predicted orientation, of which `rotation_std_deg` is made; also the query's."""
-    centre_noise_m: float
-    """Estimated noise of a predicted centre, brought to metres; also the query's."""
+    center_noise_m: float
+    """Estimated noise of a predicted center, brought to meters; also the query's."""
 
     @property
     def scale_known(self) -> bool:
@@ -119,7 +119,7 @@ def align_to_map(
     depth_ratios: DepthSamples | None = None,
     *,
     depth_ratio_stds: DepthSamples | None = None,
-    centre_noise_m: float = 0.02,
+    center_noise_m: float = 0.02,
     rotation_noise_deg: float = 1.0,
     max_scale_std: float = 0.2,
 ) -> Alignment:
@@ -127,12 +127,12 @@ def align_to_map(
 
     The likelihood of each camera is a mixture of the noise about its place in the map and a constant for a wrong
     one. Every reference and every pair proposes a similarity (with the pair's baseline for scale, and with the
-    depth ratios'); the most likely ones are refined by expectation maximisation, in which the noise is estimated
+    depth ratios'); the most likely ones are refined by expectation maximization, in which the noise is estimated
     too, and the best is kept.
 
     Args:
         model_from_cams: (M, 4, 4) predicted poses of the references. One with a number that is not finite is left out.
-        world_from_cams: (M, 4, 4) their poses in the map, metres; left out likewise.
+        world_from_cams: (M, 4, 4) their poses in the map, meters; left out likewise.
         weights: (M,) relative confidence, not negative: the variance of a camera's noise goes with 1 / weight, its
             say in which references are right with weight. 0 leaves a reference out.
         depth_ratios: metric over predicted depth of map points seen in references. One array (R,), or a list or
@@ -141,7 +141,7 @@ def align_to_map(
             are not finite or not positive are left out.
         depth_ratio_stds: relative standard deviations of the samples, of the same shape, if they differ; only their
             proportions count.
-        centre_noise_m: the noise expected of a predicted centre, as a length. 1 % of the references' typical
+        center_noise_m: the noise expected of a predicted center, as a length. 1 % of the references' typical
             distance is added, in squares. As for `rotation_noise_deg`, the data decide within some factors of it.
         rotation_noise_deg: the noise expected of a predicted orientation, as an angle.
         max_scale_std: a scale with a larger relative standard deviation is called unknown.
@@ -159,7 +159,7 @@ def align_to_map(
         raise AlignmentError(f"Found {len(model)} model_from_cams and {len(world)} world_from_cams: expected as many.")
     weight = checked_weights(weights, len(model))
     ratios = _DepthRatios.of(depth_ratios, depth_ratio_stds, len(model))
-    for name, value in (("centre_noise_m", centre_noise_m), ("rotation_noise_deg", rotation_noise_deg)):
+    for name, value in (("center_noise_m", center_noise_m), ("rotation_noise_deg", rotation_noise_deg)):
         if not (np.isfinite(value) and value > 0):
             raise AlignmentError(f"{name} is {value}: expected a number above 0.")
     finite = model_finite & world_finite
@@ -170,7 +170,7 @@ def align_to_map(
     if not len(usable):
         return _nothing_known(len(model), [*notes, "no usable reference"])
     problem = _Problem(
-        model[usable], world[usable], weight[usable] / weight[usable].mean(), centre_noise_m, rotation_noise_deg
+        model[usable], world[usable], weight[usable] / weight[usable].mean(), center_noise_m, rotation_noise_deg
     )
     depth = ratios.estimate(None)
     found = problem.search(depth)
@@ -180,7 +180,7 @@ def align_to_map(
         others = problem.subset(left_out)
         # Twice the noise of those found: more than that and they do not agree.
         noise = found.state.with_noise(2.0)
-        rival = others.search(depth, (float(noise.rotation_noise[0]), float(noise.centre_noise[0])))
+        rival = others.search(depth, (float(noise.rotation_noise[0]), float(noise.center_noise[0])))
         num_rivals = int(rival.inliers.sum())
         support, against = problem.weight[found.inliers].sum(), others.weight[rival.inliers].sum()
         undecided = bool(against > 0.9 * support)
@@ -211,7 +211,7 @@ def query_pose(alignment: Alignment, model_from_query: ArrayLike) -> tuple[Float
     """Bring a predicted camera into the map, with its covariance.
 
     The covariance has the toolkit's convention, that of `localizers.pnp.PoseEstimate`: (6, 6) of a small motion of
-    the camera in its own frame, world_from_cam @ Exp(d), d = rotation, radians, then translation, metres. It holds
+    the camera in its own frame, world_from_cam @ Exp(d), d = rotation, radians, then translation, meters. It holds
     the query's own noise, taken to be that of the references, the alignment's rotation and scale acting over the
     distance from the references' centroid, and the centroid's place. Its blocks of place (of everything) are infinite
     on the diagonal where the scale (the alignment) is unknown.
@@ -240,7 +240,7 @@ def query_pose(alignment: Alignment, model_from_query: ArrayLike) -> tuple[Float
     shared[:3, :3] += np.eye(3) * noise_rad**2 / 3
     if alignment.scale_known:
         shared[3:, 3:] += alignment.centroid_covariance + np.outer(arm, arm) * alignment.scale_std**2
-        shared[3:, 3:] += np.eye(3) * alignment.centre_noise_m**2 / 3
+        shared[3:, 3:] += np.eye(3) * alignment.center_noise_m**2 / 3
     to_camera = np.kron(np.eye(2), pose[:3, :3].T)
     covariance = to_camera @ shared @ to_camera.T
     if not alignment.scale_known:
@@ -284,9 +284,9 @@ def is_trustworthy(
 class _Problem:
     """References in both frames. Hypotheses are batched: K of them have a membership (K, M) of each reference."""
 
-    def __init__(self, model: Floats, world: Floats, weight: Floats, centre_noise_m: float, rotation_noise_deg: float):
+    def __init__(self, model: Floats, world: Floats, weight: Floats, center_noise_m: float, rotation_noise_deg: float):
         self.weight = weight
-        self.expected = (centre_noise_m, rotation_noise_deg)
+        self.expected = (center_noise_m, rotation_noise_deg)
         self.world_from_model = world[:, :3, :3] @ np.swapaxes(model[:, :3, :3], -1, -2)  # each camera's own opinion
         self.flat_opinions = self.world_from_model.reshape(-1, 9)
         self.model, self.world = model, world
@@ -297,15 +297,15 @@ class _Problem:
         self.outer_cm = (self.c[:, :, None] * self.m[:, None, :]).reshape(-1, 9)
         typical = np.median(np.linalg.norm(self.c, axis=1))
         # Noise by axis, of which three make the length.
-        self.centre_prior = float(np.hypot(centre_noise_m, CENTRE_NOISE_SHARE * typical) / np.sqrt(3))
+        self.center_prior = float(np.hypot(center_noise_m, CENTER_NOISE_SHARE * typical) / np.sqrt(3))
         self.rotation_prior = float(np.radians(rotation_noise_deg) / np.sqrt(3))
         first, second = np.triu_indices(len(self.m), 1)
         gaps_m, gaps_c = (((x[first] - x[second]) ** 2).sum(axis=1) for x in (self.m, self.c))
         # Room, in the model, in which a wrong camera may be: the references' extent.
         self.extent = float(np.sqrt(np.mean(gaps_m))) if len(first) else 0.0
         apart = gaps_m > 1e-18 * max(self.extent**2, 1e-300)
-        ratios = np.sqrt((gaps_c[apart] + 6 * self.centre_prior**2) / gaps_m[apart])
-        # For want of better where centres say nothing.
+        ratios = np.sqrt((gaps_c[apart] + 6 * self.center_prior**2) / gaps_m[apart])
+        # For want of better where centers say nothing.
         self.rough_scale = float(np.median(ratios)) if apart.any() else 1.0
 
     def subset(self, kept: Bools) -> _Problem:
@@ -333,7 +333,7 @@ class _Problem:
                 state = state.with_noise_of(self, members, residuals)
             else:
                 fixed = (np.full(len(state.scale), value) for value in noise)
-                state = replace(state, **dict(zip(("rotation_noise", "centre_noise"), fixed, strict=True)))
+                state = replace(state, **dict(zip(("rotation_noise", "center_noise"), fixed, strict=True)))
             before = members
             scores, members = self.score(state, residuals)
             best = int(np.argmax(scores))
@@ -354,21 +354,21 @@ class _Problem:
             mean_c=np.zeros((count, 3)),
             mean_m=np.zeros((count, 3)),
             rotation_noise=np.full(count, self.rotation_prior),
-            centre_noise=np.full(count, self.centre_prior),
+            center_noise=np.full(count, self.center_prior),
         )
 
     def fit(self, members: Floats, last: _State, depth: _Scale | None) -> _State:
         """Return the weighted least squares similarities (K) of memberships (K, M), given noise by axis.
 
         First the scale for the last rotation, then the rotation for that scale, each in closed form. The scale
-        maximises s^D exp(-|c - s R m|^2 / (2 noise^2)), the likelihood of the model's centres over D coordinates: it
+        maximizes s^D exp(-|c - s R m|^2 / (2 noise^2)), the likelihood of the model's centers over D coordinates: it
         is free of the bias, and positive whatever the data. The rotation joins orientations and baselines (Wahba
         1965).
         """
         share = members * self.weight
         total = np.maximum(share.sum(axis=1), 1e-12)[:, None]
         mean_c, mean_m = share @ self.c / total, share @ self.m / total
-        variance = last.centre_noise**2
+        variance = last.center_noise**2
         cross = (share @ self.outer_cm).reshape(-1, 3, 3)
         cross -= total[:, :, None] * mean_c[:, :, None] * mean_m[:, None, :]
         square_m = ((self.m[None] - mean_m[:, None]) ** 2).sum(axis=2)
@@ -384,15 +384,15 @@ class _Problem:
         scale = np.where(apart, scale, depth.value if depth is not None else self.rough_scale)
         if depth is not None:
             square_c = (share * ((self.c[None] - mean_c[:, None]) ** 2).sum(axis=2)).sum(axis=1)
-            from_centres, from_depth = square_c / variance, 1 / max(depth.std, 1e-6) ** 2
-            part = from_centres / (from_centres + from_depth)
+            from_centers, from_depth = square_c / variance, 1 / max(depth.std, 1e-6) ** 2
+            part = from_centers / (from_centers + from_depth)
             scale = np.exp(part * np.log(scale) + (1 - part) * np.log(depth.value))
         opinions = (share @ self.flat_opinions).reshape(-1, 3, 3) / (last.rotation_noise**2)[:, None, None]
         rotation = _nearest_rotation(opinions + (2 * scale / variance)[:, None, None] * cross)
-        return _State(rotation, scale, mean_c, mean_m, last.rotation_noise, last.centre_noise)
+        return _State(rotation, scale, mean_c, mean_m, last.rotation_noise, last.center_noise)
 
     def residuals(self, state: _State) -> tuple[Floats, Floats]:
-        """Return squared angles (K, M), radians, and squared distances (K, M), metres."""
+        """Return squared angles (K, M), radians, and squared distances (K, M), meters."""
         trace = state.rotation.reshape(-1, 9) @ self.flat_opinions.T
         moved = (self.m[None] - state.mean_m[:, None]) @ np.swapaxes(state.rotation, 1, 2) * state.scale[:, None, None]
         distance = ((self.c[None] - state.mean_c[:, None] - moved) ** 2).sum(axis=2)
@@ -403,18 +403,18 @@ class _Problem:
         """Return the log likelihoods (K) and the probability of each reference to be right (K, M)."""
         angle, distance = residuals
         rotation_noise = state.rotation_noise[:, None] / np.sqrt(self.weight)
-        centre_noise = state.centre_noise[:, None] / np.sqrt(self.weight)
+        center_noise = state.center_noise[:, None] / np.sqrt(self.weight)
         # The density of a wrong one is constant: over all rotations, and over a room about the references. It is the
-        # model's, brought to metres: a scale near zero, which puts all centres at one place, makes it small too.
-        room = 3 * (state.scale * self.extent)[:, None] + WRONG_PLACE * self.centre_prior
+        # model's, brought to meters: a scale near zero, which puts all centers at one place, makes it small too.
+        room = 3 * (state.scale * self.extent)[:, None] + WRONG_PLACE * self.center_prior
         turned = _LOG_SPHERE - _LOG_PEAK - 3 * np.log(rotation_noise) - angle / (2 * rotation_noise**2)
-        placed = 3 * np.log(room / centre_noise) - _LOG_PEAK - distance / (2 * centre_noise**2)
+        placed = 3 * np.log(room / center_noise) - _LOG_PEAK - distance / (2 * center_noise**2)
         right = np.log(1 - OUTLIER_SHARE) + turned + placed
         # Wrong in both, or only in place, or only in orientation.
         wrong = np.log(OUTLIER_SHARE / 3) + np.logaddexp(0.0, np.logaddexp(turned, placed))
         either = np.logaddexp(right, wrong)
         likelihood = either @ self.weight  # a confident reference has more of a say, too
-        for noise, expected in ((state.rotation_noise, self.rotation_prior), (state.centre_noise, self.centre_prior)):
+        for noise, expected in ((state.rotation_noise, self.rotation_prior), (state.center_noise, self.center_prior)):
             likelihood = likelihood - (np.log(noise / expected) / NOISE_FACTOR) ** 2 / 2
         return likelihood, np.exp(right - either)
 
@@ -422,7 +422,7 @@ class _Problem:
         """Return the weighted least squares alignment of the references found, with what it is worth."""
         state, share = found.state, found.members * self.weight
         rotation, scale = state.rotation[0], float(state.scale[0])
-        rotation_noise, centre_noise = float(state.rotation_noise[0]), float(state.centre_noise[0])
+        rotation_noise, center_noise = float(state.rotation_noise[0]), float(state.center_noise[0])
         count = float(found.members.sum())
         c0, m0 = share @ self.c / share.sum(), share @ self.m / share.sum()
         c, m = self.c - c0, self.m - m0
@@ -431,11 +431,11 @@ class _Problem:
         opinions = np.einsum("m,mij->ij", share, self.world_from_model)
         cross = np.einsum("m,mi,mj->ij", share, c, m)
         for _ in range(4):
-            fitted = _State(rotation[None], *(np.array([x]) for x in (scale, c0, m0, rotation_noise, centre_noise)))
+            fitted = _State(rotation[None], *(np.array([x]) for x in (scale, c0, m0, rotation_noise, center_noise)))
             rotation = _nearest_rotation(
-                (opinions / rotation_noise**2 + 2 * scale / centre_noise**2 * cross)[None], keep=rotation
+                (opinions / rotation_noise**2 + 2 * scale / center_noise**2 * cross)[None], keep=rotation
             )[0]
-            estimate = _combined_scale(float(np.sum(rotation * cross)), square_c, centre_noise / scale, depth)
+            estimate = _combined_scale(float(np.sum(rotation * cross)), square_c, center_noise / scale, depth)
             scale_std, conflict = (estimate.std, estimate.conflict) if estimate is not None else (np.inf, False)
             if estimate is not None and scale_std <= max_scale_std:
                 scale = estimate.value
@@ -444,22 +444,22 @@ class _Problem:
             fitted = replace(fitted, rotation=rotation[None], scale=np.array([scale]))
             angle, distance = (values[0] @ share for values in self.residuals(fitted))
             # The rotation is shared by orientations and baselines; each pays for its part.
-            by_orientation, by_baselines = 3 * share.sum() / rotation_noise**2, np.trace(lever) / centre_noise**2
+            by_orientation, by_baselines = 3 * share.sum() / rotation_noise**2, np.trace(lever) / center_noise**2
             part = by_orientation / (by_orientation + by_baselines)
             free = (3 * count - 3 * part, 3 * (count - 1) - 3 * (1 - part) - float(square_c > 0))
             rotation_noise = float(np.sqrt(noise_variance(angle, max(free[0], 0.0), self.rotation_prior)))
-            centre_noise = float(np.sqrt(noise_variance(distance, max(free[1], 0.0), self.centre_prior)))
+            center_noise = float(np.sqrt(noise_variance(distance, max(free[1], 0.0), self.center_prior)))
         known = scale_std <= max_scale_std
         notes = list(notes)
         if conflict:
             notes.append("depth ratios and baselines contradict each other on the scale")
         if not known:
             if depth is None:
-                notes.append("scale unknown: baselines not above the noise of the centres, and no depth ratios")
+                notes.append("scale unknown: baselines not above the noise of the centers, and no depth ratios")
             else:
                 notes.append("scale unknown: neither baselines nor depth ratios give it well enough")
         translation = self.origin_c + c0 - scale * rotation @ (self.origin_m + m0)
-        covariance = np.linalg.inv(np.eye(3) * share.sum() / rotation_noise**2 + lever / centre_noise**2)
+        covariance = np.linalg.inv(np.eye(3) * share.sum() / rotation_noise**2 + lever / center_noise**2)
         plain = ((c - scale * m @ rotation.T) ** 2).sum(axis=1)
         return Alignment(
             world_from_model=Sim3(scale, rotation, translation),
@@ -471,9 +471,9 @@ class _Problem:
             num_rivals=0,
             centroid_m=self.origin_c + c0,
             rotation_covariance=covariance,
-            centroid_covariance=np.eye(3) * centre_noise**2 / share.sum(),
+            centroid_covariance=np.eye(3) * center_noise**2 / share.sum(),
             rotation_noise_deg=float(np.degrees(rotation_noise) * np.sqrt(3)),
-            centre_noise_m=float(centre_noise * np.sqrt(3)),
+            center_noise_m=float(center_noise * np.sqrt(3)),
         )
 
 
@@ -486,10 +486,10 @@ class _State:
     mean_c: Floats
     mean_m: Floats
     rotation_noise: Floats
-    centre_noise: Floats
+    center_noise: Floats
 
     def _parts(self) -> tuple[Floats, ...]:
-        return self.rotation, self.scale, self.mean_c, self.mean_m, self.rotation_noise, self.centre_noise
+        return self.rotation, self.scale, self.mean_c, self.mean_m, self.rotation_noise, self.center_noise
 
     def __getitem__(self, index: Ints | slice) -> _State:
         return _State(*(part[index] for part in self._parts()))
@@ -498,7 +498,7 @@ class _State:
         return _State(*(np.concatenate(pair) for pair in zip(self._parts(), other._parts(), strict=True)))
 
     def with_noise(self, factor: float) -> _State:
-        return replace(self, rotation_noise=self.rotation_noise * factor, centre_noise=self.centre_noise * factor)
+        return replace(self, rotation_noise=self.rotation_noise * factor, center_noise=self.center_noise * factor)
 
     def with_noise_of(self, problem: _Problem, members: Floats, residuals: tuple[Floats, Floats]) -> _State:
         angle, distance = ((members * values) @ problem.weight for values in residuals)
@@ -506,7 +506,7 @@ class _State:
         return replace(
             self,
             rotation_noise=np.sqrt(noise_variance(angle, free, problem.rotation_prior)),
-            centre_noise=np.sqrt(noise_variance(distance, np.maximum(free - 1, 0), problem.centre_prior)),
+            center_noise=np.sqrt(noise_variance(distance, np.maximum(free - 1, 0), problem.center_prior)),
         )
 
 
@@ -531,7 +531,7 @@ class _Scale:
 def _combined_scale(along: float, square_c: float, noise_in_model: float, depth: _Scale | None) -> _Scale | None:
     """Join the scale of baselines and of depth ratios, or None if there is neither.
 
-    1 / scale is linear in the model's noisy centres, so it is averaged by inverse variance. Two that differ by more
+    1 / scale is linear in the model's noisy centers, so it is averaged by inverse variance. Two that differ by more
     than their uncertainty widen it, as in Birge (1932).
     """
     values, variances = [], []
@@ -589,7 +589,7 @@ class _DepthRatios:
     def estimate(self, inliers: Bools | None) -> _Scale | None:
         """Return the scale of the samples, of these references only if they are told apart; None without samples.
 
-        The mixture of noise about one value and of wrong samples anywhere is fitted by expectation maximisation,
+        The mixture of noise about one value and of wrong samples anywhere is fitted by expectation maximization,
         from the middle of the shortest interval that holds half of them (Rousseeuw 1984). What a reference's samples
         have in common is found by the moments of DerSimonian and Laird (1986).
         """
@@ -602,36 +602,36 @@ class _DepthRatios:
         half = (len(log) + 1) // 2 + (len(log) > 2)
         widths = ordered[half - 1 :] - ordered[: len(log) - half + 1]
         start = int(np.argmin(widths))
-        centre = (ordered[start] + ordered[start + half - 1]) / 2
+        center = (ordered[start] + ordered[start + half - 1]) / 2
         noise = max(widths[start], 1e-3)
         room = np.log(max(ordered[-1] - ordered[0], 1.0) + 1.0)
         wrong = OUTLIER_SHARE
         for _ in range(15):
             spread = noise * stds
-            right = np.log1p(-wrong) - np.log(spread * np.sqrt(2 * np.pi)) - ((log - centre) / spread) ** 2 / 2
+            right = np.log1p(-wrong) - np.log(spread * np.sqrt(2 * np.pi)) - ((log - center) / spread) ** 2 / 2
             members = 1 / (1 + np.exp(np.clip(np.log(wrong) - room - right, -700, 700)))
             share = members / stds**2
-            centre = float(share @ log / share.sum())
-            squares, free = share @ (log - centre) ** 2, max(members.sum() - 1, 0.0)
+            center = float(share @ log / share.sum())
+            squares, free = share @ (log - center) ** 2, max(members.sum() - 1, 0.0)
             noise = float(np.sqrt(noise_variance(squares, free, DEPTH_NOISE)))
             before, wrong = wrong, float(np.clip(1 - members.mean(), 0.01, 0.6))
             if abs(wrong - before) < 1e-4:
                 break
         variance = noise**2 / share.sum()
         if self.grouped:
-            centre, variance = _between(log, share, reference, noise, centre, variance)
-        return _Scale(float(np.exp(centre)), float(np.sqrt(variance)))
+            center, variance = _between(log, share, reference, noise, center, variance)
+        return _Scale(float(np.exp(center)), float(np.sqrt(variance)))
 
 
 def _between(
-    log: Floats, share: Floats, reference: Ints, noise: float, centre: float, variance: float
+    log: Floats, share: Floats, reference: Ints, noise: float, center: float, variance: float
 ) -> tuple[float, float]:
     """Return the mean of references' means and its variance, with the variance between references."""
     _, index = np.unique(reference, return_inverse=True)
     total = np.bincount(index, share)
     held = total > 0.5  # a reference all of whose samples are wrong says nothing
     if held.sum() < 2:
-        return centre, variance
+        return center, variance
     means = np.bincount(index, share * log)[held] / total[held]
     information = total[held] / noise**2
     excess = information @ (means - information @ means / information.sum()) ** 2 - (len(means) - 1)
@@ -754,5 +754,5 @@ def _nothing_known(count: int, notes: list[str]) -> Alignment:
         rotation_covariance=unknown,
         centroid_covariance=unknown,
         rotation_noise_deg=np.inf,
-        centre_noise_m=np.inf,
+        center_noise_m=np.inf,
     )

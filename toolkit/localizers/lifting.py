@@ -2,7 +2,7 @@
 
 Depth comes from the capture's depth maps, else from the network that was shown the map image. What is wrong with the
 depth of an image as a whole scales its points about its camera, which no reprojection error tells if all matches are
-of that image: the query then moves towards the image or away from it. So that scale is an unknown of the covariance.
+of that image: the query then moves toward the image or away from it. So that scale is an unknown of the covariance.
 """
 
 from collections.abc import Sequence

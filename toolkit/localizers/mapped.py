@@ -46,7 +46,7 @@ class MappedFeatures:
             local_map: triangulated from these features.
             features: of the map's images, by name.
             kind: what is peculiar to these features.
-            matcher: of a query with a reference; None: mutual nearest neighbours, as suits the kind.
+            matcher: of a query with a reference; None: mutual nearest neighbors, as suits the kind.
         """
         self.map = local_map
         self.features = features
@@ -79,7 +79,7 @@ class MappedFeatures:
             members = [self.image(index, max_map_features) for index in indices]
             found = self.matcher.match([(query, member.features) for member in members])
             points = [member.points for member in members]
-        else:  # a network looks at a feature among its neighbours, those without a point too
+        else:  # a network looks at a feature among its neighbors, those without a point too
             names = [self.map.image_names[index] for index in indices]
             if known is not None:
                 found = [known(name) for name in names]

@@ -18,7 +18,7 @@ from toolkit import geometry
 from toolkit.capture import Session
 from toolkit.capture.cameras import in_view, projection_jacobian, rays_of, view_bounds
 from toolkit.capture.images import prefetch, read_image
-from toolkit.errors import ArtefactError, ImageError
+from toolkit.errors import ArtifactError, ImageError
 from toolkit.features.features import FeatureStore, LocalFeatures, feature_kind
 from toolkit.features.groups import GroupWriter
 from toolkit.features.matching import (
@@ -58,7 +58,7 @@ def select_pairs(
         groups: (N,) images of one group (the cameras of one rig at one instant) are never paired: they have
             next to no baseline.
         per_image: partners an image.
-        depths_m: depths at which points are laid, metres.
+        depths_m: depths at which points are laid, meters.
 
     Returns:
         (P, 2) indices, i < j, sorted.
@@ -181,7 +181,7 @@ class LocalMap:
     world_from_cams: Floats
     """(N, 4, 4)."""
     points: Floats
-    """(P, 3) in the world, metres."""
+    """(P, 3) in the world, meters."""
     colors: NDArray[np.uint8]
     """(P, 3) RGB."""
     obs_image: NDArray[np.int64]
@@ -223,7 +223,7 @@ class LocalMap:
         return self.obs_keypoint[part], self.obs_point[part]
 
     def point_covariances(self, points: NDArray[np.int64]) -> Floats:
-        """Return the covariance (n, 3, 3) of the places of n points, square metres, as least squares triangulate them.
+        """Return the covariance (n, 3, 3) of the places of n points, square meters, as least squares triangulate them.
 
         A point that fewer than two images see has NaN.
         """
@@ -305,7 +305,7 @@ class LocalMap:
         """Read a map.
 
         Raises:
-            ArtefactError: the file is missing or torn.
+            ArtifactError: the file is missing or torn.
         """
         try:
             with np.load(path) as arrays:
@@ -313,7 +313,7 @@ class LocalMap:
             names, cameras = data.pop("image_names").tolist(), data.pop("cameras").tolist()
             return cls(image_names=names, cameras=[_camera(text) for text in cameras], **data)
         except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile) as error:
-            raise ArtefactError(
+            raise ArtifactError(
                 f"The triangulated map {path} cannot be read ({error}). Build it with the localize stage."
             ) from None
 
@@ -350,7 +350,7 @@ def triangulate(
         matches: for each pair (K, 2) indices of keypoints.
 
     Returns:
-        The map, its points not yet coloured.
+        The map, its points not yet colored.
     """
     settings = settings or MapSettings()
     graph = pycolmap.CorrespondenceGraph()
@@ -419,7 +419,7 @@ def _refine_points(
     settings: MapSettings,
     iterations: int = 8,
 ) -> tuple[Floats, NDArray[np.int64], float]:
-    """Minimise the reprojection errors of each point under a Cauchy loss of 1 px, by Gauss-Newton on all at once.
+    """Minimize the reprojection errors of each point under a Cauchy loss of 1 px, by Gauss-Newton on all at once.
 
     Errors are measured on the undistorted image plane, times the focal length. Observations beyond the limit are
     dropped, and then points that fewer than two images see. Also returned is the standard deviation of the errors.
@@ -500,12 +500,12 @@ def build_map(
         workers: threads.
 
     Raises:
-        ArtefactError: no image has both a pose and features.
+        ArtifactError: no image has both a pose and features.
     """
     settings = settings or MapSettings()
     map_record = {"map": map_settings(settings), "inputs": inputs}
     if skip_existing and is_current(path, map_record):
-        with suppress(ArtefactError):  # torn behind our back: build it anew
+        with suppress(ArtifactError):  # torn behind our back: build it anew
             return LocalMap.load(path)
     names = [session.image_name(row) for row in range(len(session.images))]
     poses = session.world_from_cam()
@@ -514,7 +514,7 @@ def build_map(
         np.int64,
     )
     if not len(rows):
-        raise ArtefactError(f"Session {session.id} has no image with both a pose and local features; nothing to map.")
+        raise ArtifactError(f"Session {session.id} has no image with both a pose and local features; nothing to map.")
     sensor_ids = session.images["sensor_id"].to_numpy()
     cameras = [session.camera(sensor_ids[row]) for row in rows]
     devices = session.images["timestamp"].astype(str) + " " + session.device_ids
@@ -587,7 +587,7 @@ def _match(
 def _colored(
     local_map: LocalMap, session: Session, rows: NDArray[np.int64], keypoints: Sequence[NDArray[np.float32]]
 ) -> LocalMap:
-    """Return the map with each point in the colour of its first observation."""
+    """Return the map with each point in the color of its first observation."""
     _, first = np.unique(local_map.obs_point, return_index=True)
     colors = local_map.colors.copy()
     images = local_map.obs_image[first]

@@ -35,7 +35,7 @@ _RANSAC_CONFIDENCE = 0.9999
 # at once, equal seeds would give poses that are unequal in their last digits.
 _RIG_RANSAC = Lock()
 
-CONFIRMED = (5.0, 0.5)  # degrees, metres: further apart, two answers contradict each other
+CONFIRMED = (5.0, 0.5)  # degrees, meters: further apart, two answers contradict each other
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class PoseEstimate:
     world_from_rig: Floats | None = None
     """(4, 4); for a single camera the rig is the camera."""
     covariance: Floats | None = None
-    """(6, 6) of a small motion of the rig in its own frame: rotation, radians, then translation, metres."""
+    """(6, 6) of a small motion of the rig in its own frame: rotation, radians, then translation, meters."""
     num_matches: int = 0
     """2D-3D matches found from descriptors alone."""
     num_inliers: int = 0
@@ -474,7 +474,7 @@ class PnpLocalizer:
         return query.ransac(matches, self.map.points, max_error_deg, options)
 
     def _refine(self, query: "_Query", rig_from_world: Floats, matches: _Matches) -> Floats | None:
-        """Minimise the reprojection error of all matches, robustly (Cauchy, 1 px)."""
+        """Minimize the reprojection error of all matches, robustly (Cauchy, 1 px)."""
         options = pycolmap.AbsolutePoseRefinementOptions()
         points, mask = self.map.points[matches.point], np.ones(len(matches), bool)
         if len(query.cameras) == 1:
@@ -525,7 +525,7 @@ class PnpLocalizer:
         descriptors = np.concatenate([member.features.descriptors for member in members])
         depth = np.einsum("oj,oj->o", local_map.cams_from_world[image, 2, :3], local_map.points[point])
         depth += local_map.cams_from_world[image, 2, 3]
-        # Size of the feature on the surface, metres: it looks that large from everywhere.
+        # Size of the feature on the surface, meters: it looks that large from everywhere.
         size = np.concatenate([member.features.scales for member in members]) * depth / local_map.focals_px[image]
         for camera, kinds in enumerate(query.features):
             features = kinds[number]
@@ -689,7 +689,7 @@ class _Query:
     def jacobians(self, rig_from_world: Floats, matches: _Matches, points: Floats) -> tuple[Floats, Floats]:
         """Return how the projections of matches move, in pixels.
 
-        With a small motion d of the rig: (K, 2, 6), d = rotation (radians), translation (metres) in the rig's frame,
+        With a small motion d of the rig: (K, 2, 6), d = rotation (radians), translation (meters) in the rig's frame,
         world_from_rig @ Exp(d), as the benchmark's covariances have it; with a motion of the point in the world:
         (K, 2, 3).
         """

@@ -22,7 +22,7 @@ class PoseMean:
     world_from_cam: Floats
     """(4, 4)"""
     covariance: Floats
-    """(6, 6) of world_from_cam @ Exp(d), d = rotation, radians, then translation, metres, in the camera's frame;
+    """(6, 6) of world_from_cam @ Exp(d), d = rotation, radians, then translation, meters, in the camera's frame;
     infinite on the diagonal where as many hypotheses say something else."""
     inliers: Bools
     """(H,)"""
@@ -35,7 +35,7 @@ def robust_mean_pose(
     weights: ArrayLike | None = None,
     covariances: ArrayLike | None = None,
     *,
-    centre_noise_m: float = 0.05,
+    center_noise_m: float = 0.05,
     rotation_noise_deg: float = 1.0,
     gate: float = 3.0,
 ) -> PoseMean:
@@ -50,7 +50,7 @@ def robust_mean_pose(
         weights: (H,) relative confidence, not negative; 0 leaves out.
         covariances: (H, 6, 6) in the convention of `PoseMean.covariance`. Together they are widened, never
             narrowed, to explain the spread. Without them the two noises below are estimated from the spread.
-        centre_noise_m: noise expected of a hypothesis, as a length, where there are no covariances.
+        center_noise_m: noise expected of a hypothesis, as a length, where there are no covariances.
         rotation_noise_deg: noise expected, as an angle, likewise.
         gate: hypotheses further from the mean, in standard deviations by axis, are left out.
 
@@ -69,7 +69,7 @@ def robust_mean_pose(
         poses[usable],
         weight[usable] / weight[usable].mean(),
         None if information is None else information[usable],
-        (centre_noise_m / np.sqrt(3), np.radians(rotation_noise_deg) / np.sqrt(3)),
+        (center_noise_m / np.sqrt(3), np.radians(rotation_noise_deg) / np.sqrt(3)),
         gate,
     )
     pose, covariance, inside = problem.solve()
@@ -147,8 +147,8 @@ class _Mean:
         free = 3.0 * (int(inside.sum()) - 1)
         squares = share @ error**2
         rotation = np.sqrt(noise_variance(squares[:3].sum(), free, self.prior[1]))
-        centre = np.sqrt(noise_variance(squares[3:].sum(), free, self.prior[0]))
-        return np.array([rotation] * 3 + [centre] * 3)
+        center = np.sqrt(noise_variance(squares[3:].sum(), free, self.prior[0]))
+        return np.array([rotation] * 3 + [center] * 3)
 
 
 def _log(poses: Floats) -> Floats:

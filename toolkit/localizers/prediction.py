@@ -42,7 +42,7 @@ class Prediction:
     """S arrays (h, w), larger is surer."""
     map_from_image: Floats | None = None
     """(S, 4) scale_x, scale_y, offset_x, offset_y of each view, from pixels of the photograph to those of the depth
-    map; the centre of the top-left pixel is (0.5, 0.5) in both."""
+    map; the center of the top-left pixel is (0.5, 0.5) in both."""
     simulated: bool = False
     reason: str = ""
     """Why there are no cameras, where that is known."""
@@ -50,7 +50,7 @@ class Prediction:
     def depth_at(self, view: int, xy: ArrayLike) -> Floats:
         """Return the depth (N,), in units of the model, at pixels (N, 2) of the photograph.
 
-        Between pixels it is interpolated. NaN outside of the map, where one of the four neighbours is unknown or not
+        Between pixels it is interpolated. NaN outside of the map, where one of the four neighbors is unknown or not
         positive, and where the nearest is among the least confident of the view (`LOW_CONFIDENCE`).
         """
         pixels = np.asarray(xy, np.float64).reshape(-1, 2)
@@ -79,7 +79,7 @@ class Predictor(Protocol):
 
     name: str
     simulated: bool
-    """Whether it looks up the answers; what it takes part in is no result, and is labelled."""
+    """Whether it looks up the answers; what it takes part in is no result, and is labeled."""
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -46,7 +46,7 @@ def select_references(
             their axes agree and their places are near.
         shared_points: (N, N) triangulated points that two images both see, where known: overlapping frusta do not
             tell of a wall between.
-        depth_m: typical depth of the scene, metres.
+        depth_m: typical depth of the scene, meters.
 
     Returns:
         At most k indices in order of choice; candidates whose pose or score is not finite are never chosen. Equal
@@ -84,9 +84,9 @@ def select_references(
 def _shared_view(world_from_cams: Floats, cameras: Sequence[pycolmap.Camera] | None, depth_m: float) -> Floats:
     """Return the share (N, N) of what one camera sees that the other sees too, the mean of both directions."""
     if cameras is None:
-        axes, centres = world_from_cams[:, :3, 2], world_from_cams[:, :3, 3]
+        axes, centers = world_from_cams[:, :3, 2], world_from_cams[:, :3, 3]
         angle_deg = np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1)))
-        apart = np.linalg.norm(centres[:, None] - centres[None], axis=-1) / depth_m
+        apart = np.linalg.norm(centers[:, None] - centers[None], axis=-1) / depth_m
         return np.asarray(np.clip(1 - angle_deg / ADJACENT_DEG, 0, 1) * np.clip(1.5 - apart / 2, 0, 1))
     bounds = np.stack([view_bounds(camera) for camera in cameras])
     steps = np.linspace(0.1, 0.9, 5)

@@ -2,7 +2,7 @@
 
 Poses come from the capture's ground truth and depth from triangulated map points, else from the capture's depth maps;
 both are put under a random similarity, with noise. What it takes part in says nothing about any network, and is
-labelled `simulated` everywhere.
+labeled `simulated` everywhere.
 """
 
 import hashlib
@@ -183,7 +183,7 @@ class SimulatedPredictor:
 
 
 def _nearest_depth(points: Floats, view: View, world_from_cam: Floats, grid: NDArray[np.int64]) -> Floats:
-    """Return depth in metres, (h, w), the median of the points nearest to each pixel of a grid; NaN without points."""
+    """Return depth in meters, (h, w), the median of the points nearest to each pixel of a grid; NaN without points."""
     in_cam = geometry.transform(geometry.invert(world_from_cam), points)
     in_cam = in_cam[in_view(in_cam[None], view_bounds(view.camera)[None])[0]] if len(in_cam) else in_cam
     if not len(in_cam):

@@ -5,7 +5,7 @@ def failure_reason(error: Exception, page: str = "the model's page") -> str:
     """Return in a few words why the hub did not give something; `page` is where its terms are accepted."""
     from huggingface_hub import constants, errors
 
-    sign_in = f"accept the licence on {page} and set HF_TOKEN (HTTP {status_of(error)})"
+    sign_in = f"accept the license on {page} and set HF_TOKEN (HTTP {status_of(error)})"
     if isinstance(error, errors.OfflineModeIsEnabled):
         return "HF_HUB_OFFLINE is set"
     if isinstance(error, errors.EntryNotFoundError) and status_of(error) is not None:

@@ -49,7 +49,7 @@ class Dinov2(nn.Module):
         """Return the position embedding of class token and patches, (1, 1 + rows * columns, C).
 
         Trained for grid x grid patches; for others interpolated as in training, by a factor with an offset of
-        0.1 that the weights have learnt to expect.
+        0.1 that the weights have learned to expect.
         """
         if rows == columns == self.grid:
             return self.pos_embed
@@ -113,7 +113,7 @@ def transport(scores: Tensor, dust_bin: Tensor) -> Tensor:
 
 
 class Aggregator(nn.Module):
-    """From patches and class token to the descriptor before its last normalisation."""
+    """From patches and class token to the descriptor before its last normalization."""
 
     def __init__(self, dim: int, clusters: int, cluster_dim: int, token_dim: int, hidden: int, out: int) -> None:
         super().__init__()
@@ -184,7 +184,7 @@ class MegaLoc(nn.Module):
         """
         if images.ndim != 4 or images.shape[1] != 3 or not images.is_floating_point():
             raise ValueError(
-                f"images are {images.dtype} {tuple(images.shape)}; expected (B, 3, H, W), ImageNet-normalised."
+                f"images are {images.dtype} {tuple(images.shape)}; expected (B, 3, H, W), ImageNet-normalized."
             )
         height, width = (round(side / PATCH) for side in images.shape[2:])  # half to even, as the official code
         if height * width <= self.clusters:

@@ -117,7 +117,7 @@ class Mlp(nn.Module):
 
 
 class LayerScale(nn.Module):
-    """A learnt factor for each channel of a residual (Touvron et al., ICCV 2021)."""
+    """A learned factor for each channel of a residual (Touvron et al., ICCV 2021)."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()
@@ -129,7 +129,7 @@ class LayerScale(nn.Module):
 
 
 class Block(nn.Module):
-    """A transformer block: attention and MLP, each on the normalised stream and added to it, scaled."""
+    """A transformer block: attention and MLP, each on the normalized stream and added to it, scaled."""
 
     def __init__(self, dim: int, num_heads: int, eps: float = 1e-6, qk_norm_eps: float | None = None) -> None:
         super().__init__()
@@ -170,7 +170,7 @@ class PatchEmbed(nn.Module):
 def set_matrix_type(module: nn.Module, dtype: torch.dtype) -> None:
     """Convert the linear layers of a module, and these alone, to a type that its blocks then compute in.
 
-    Norms, layer scales, learnt tokens and the stream of tokens keep theirs: float32 sums of bfloat16 products.
+    Norms, layer scales, learned tokens and the stream of tokens keep theirs: float32 sums of bfloat16 products.
     """
     for part in module.modules():
         if isinstance(part, nn.Linear):

@@ -32,8 +32,8 @@ class WeightsSource:
     """Repository on the Hugging Face hub, `owner/name`."""
     filename: str
     """File in it."""
-    licence: str
-    """Licence of the weights, for messages."""
+    license: str
+    """License of the weights, for messages."""
     alternative: str
     """What to do without them: the end of a sentence that begins with "Or"."""
     setting: str = "embed.checkpoint"
@@ -42,21 +42,21 @@ class WeightsSource:
     """Name of a tensor in the file that is in no other of these; empty: not known."""
 
     def __str__(self) -> str:
-        return f"`{self.filename}` of {_HUB}/{self.repo_id} (licence: {self.licence})"
+        return f"`{self.filename}` of {_HUB}/{self.repo_id} (license: {self.license})"
 
 
 MEGALOC = WeightsSource(
     model="MegaLoc",
     repo_id="gberton/MegaLoc",
     filename="model.safetensors",
-    licence="MIT",
+    license="MIT",
     alternative="set `embed.model: vlad`, which needs none",
 )
 VGGT_1B = WeightsSource(
     model="VGGT-1B",
     repo_id="facebook/VGGT-1B",
     filename="model.pt",
-    licence="non-commercial, as the code's README says of the original checkpoint",
+    license="non-commercial, as the code's README says of the original checkpoint",
     alternative="set `localize.method: pnp`, which needs none",
     setting="localize.checkpoint",
 )
@@ -64,7 +64,7 @@ VGGT_1B_COMMERCIAL = WeightsSource(
     model="VGGT-1B-Commercial",
     repo_id="facebook/VGGT-1B-Commercial",
     filename="model.pt",
-    licence="VGGT License of July 29, 2025: commercial use allowed, not military; access by form",
+    license="VGGT License of July 29, 2025: commercial use allowed, not military; access by form",
     alternative="set `localize.method: pnp`, which needs none",
     setting="localize.checkpoint",
 )
@@ -74,7 +74,7 @@ SUPERPOINT = WeightsSource(
     model="SuperPoint",
     repo_id="magic-leap-community/superpoint",
     filename="model.safetensors",
-    licence="Magic Leap's, for academic or non-profit organizations: noncommercial research use only",
+    license="Magic Leap's, for academic or non-profit organizations: noncommercial research use only",
     alternative="use `sift` features, which need none",
     setting="localize.features_checkpoint",
     tensor="encoder.conv_blocks.0.conv_a.weight",
@@ -83,7 +83,7 @@ LIGHTGLUE = WeightsSource(
     model="LightGlue",
     repo_id="ETH-CVG/lightglue_superpoint",
     filename="model.safetensors",
-    licence="Apache-2.0; the file also holds SuperPoint's, noncommercial research use only",
+    license="Apache-2.0; the file also holds SuperPoint's, noncommercial research use only",
     alternative="use the matcher `mutual`, or `sift` features, which need none",
     setting="localize.matcher_checkpoint",
     tensor="match_assignment_layers.8.matchability.weight",

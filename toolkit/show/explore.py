@@ -9,7 +9,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture import Capture, Session
-from toolkit.capture.devices import colour_of
+from toolkit.capture.devices import color_of
 from toolkit.capture.images import read_for_display
 from toolkit.capture.upright import up_of_cameras
 from toolkit.files import read_references
@@ -56,7 +56,7 @@ def draw_samples(capture: Capture, count: int = 4) -> "Figure":
 
 @styled
 def draw_top_view(capture: Capture, up: ArrayLike | None = None) -> "Figure":
-    """Return a figure of all camera centres seen from above, metres; queries where the truth is known.
+    """Return a figure of all camera centers seen from above, meters; queries where the truth is known.
 
     Args:
         capture: what to draw; cameras far from all others get a panel of their own.
@@ -74,9 +74,9 @@ def draw_top_view(capture: Capture, up: ArrayLike | None = None) -> "Figure":
     for number, plot in enumerate(figure.subplots(1, count, squeeze=False)[0]):
         for name in seen:
             x, y = together[(place == number) & (sessions == name)].T
-            split, colour = capture[name].split, colour_of(capture[name].device)
+            split, color = capture[name].split, color_of(capture[name].device)
             marker, size = ("o", 14) if split == "map" else ("x", 36)
-            plot.scatter(x, y, s=size, c=colour, marker=marker, label=name, alpha=0.8)
+            plot.scatter(x, y, s=size, c=color, marker=marker, label=name, alpha=0.8)
         plot.set_xlabel(labels[0])
         plot.set_aspect("equal", adjustable="datalim")
         if number == 0:
@@ -186,13 +186,13 @@ def draw_statuses(paths: Iterable[str | Path]) -> "Figure":
     }
     figure = new_figure(8, 0.35 * len(tables) + 1.2)
     plot = figure.subplots()
-    colours = {"ok": GREEN, "low_confidence": ORANGE, "failed": VERMILLION}
-    for status, colour in colours.items():
+    colors = {"ok": GREEN, "low_confidence": ORANGE, "failed": VERMILLION}
+    for status, color in colors.items():
         rows = [table[table["status"].str.startswith(status)] for table in tables.values()]
         inliers = np.concatenate([row["num_inliers"].fillna(0).to_numpy(float) for row in rows])
         heights = np.repeat(np.arange(len(rows)), [len(row) for row in rows])
         label = f"{status.replace('_', ' ')}: {len(inliers)}"
-        plot.scatter(np.maximum(inliers, 0.5), heights, s=24, c=colour, alpha=0.6, label=label)
+        plot.scatter(np.maximum(inliers, 0.5), heights, s=24, c=color, alpha=0.6, label=label)
     plot.set_yticks(range(len(tables)), [name.replace("_query_", " map, query ") for name in tables])
     plot.invert_yaxis()
     plot.set_xscale("log")

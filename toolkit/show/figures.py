@@ -1,4 +1,4 @@
-"""What the figures of all stages share: one style, colours, a figure without global state, files with a caption."""
+"""What the figures of all stages share: one style, colors, a figure without global state, files with a caption."""
 
 import io
 from collections.abc import Callable
@@ -19,13 +19,13 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 STYLE = Path(__file__).with_name("figures.mplstyle")
-# Okabe and Ito's colours, which people with any colour vision tell apart.
+# Okabe and Ito's colors, which people with any color vision tell apart.
 BLUE, VERMILLION, GREEN = "#0072B2", "#D55E00", "#009E73"
-ORANGE, SKY, GREY = "#E69F00", "#56B4E9", "#5A5A5A"
-# One meaning a colour, in pictures and recordings alike.
-ESTIMATED, TRUE, MAP = VERMILLION, BLUE, GREY
+ORANGE, SKY, GRAY = "#E69F00", "#56B4E9", "#5A5A5A"
+# One meaning a color, in pictures and recordings alike.
+ESTIMATED, TRUE, MAP = VERMILLION, BLUE, GRAY
 ERROR_RANGE_M = (0.01, 1.0)
-"""Errors of position that the colours of errors tell apart, on a logarithmic scale."""
+"""Errors of position that the colors of errors tell apart, on a logarithmic scale."""
 
 
 def styled(draw: Callable[P, R]) -> Callable[P, R]:
@@ -59,43 +59,43 @@ def save_figure(figure: "Figure", path: str | Path, caption: str = "") -> Path:
 
 
 def error_scale() -> "tuple[Colormap, LogNorm]":
-    """Return the colours of errors of position: perceptually uniform, without ends that vanish on white or black."""
+    """Return the colors of errors of position: perceptually uniform, without ends that vanish on white or black."""
     import matplotlib as mpl
     from matplotlib.colors import ListedColormap, LogNorm
 
-    colours = mpl.colormaps["plasma"](np.linspace(0.25, 0.85, 256))
-    return ListedColormap(colours), LogNorm(*ERROR_RANGE_M, clip=True)
+    colors = mpl.colormaps["plasma"](np.linspace(0.25, 0.85, 256))
+    return ListedColormap(colors), LogNorm(*ERROR_RANGE_M, clip=True)
 
 
-def error_colours(errors_m: ArrayLike) -> NDArray[np.uint8]:
-    """Return the colours (N, 3) RGB of errors (N,), metres; what is not known, NaN, is sky blue."""
+def error_colors(errors_m: ArrayLike) -> NDArray[np.uint8]:
+    """Return the colors (N, 3) RGB of errors (N,), meters; what is not known, NaN, is sky blue."""
     errors = np.asarray(errors_m, np.float64)
-    colours, scale = error_scale()
+    colors, scale = error_scale()
     known = np.isfinite(errors)
     rgb = np.tile(np.array([0x56, 0xB4, 0xE9], np.uint8), (len(errors), 1))
     if known.any():
-        rgb[known] = colours(scale(np.maximum(errors[known], ERROR_RANGE_M[0])), bytes=True)[:, :3]
+        rgb[known] = colors(scale(np.maximum(errors[known], ERROR_RANGE_M[0])), bytes=True)[:, :3]
     return rgb
 
 
 def error_bar(figure: "Figure", axis: Any, **where: Any) -> None:
-    """Draw the legend of errors' colours beside an axis of a figure."""
+    """Draw the legend of errors' colors beside an axis of a figure."""
     from matplotlib.cm import ScalarMappable
 
-    colours, scale = error_scale()
-    bar = figure.colorbar(ScalarMappable(scale, colours), ax=axis, extend="both", **where)
+    colors, scale = error_scale()
+    bar = figure.colorbar(ScalarMappable(scale, colors), ax=axis, extend="both", **where)
     bar.set_label("error of position [m]")
     bar.set_ticks([0.01, 0.1, 1.0], labels=["0.01", "0.1", "1"])
 
 
 @styled
 def draw_error_legend() -> bytes:
-    """Return the legend of errors' colours, PNG."""
+    """Return the legend of errors' colors, PNG."""
     from matplotlib.cm import ScalarMappable
 
-    colours, scale = error_scale()
+    colors, scale = error_scale()
     figure = new_figure(1.3, 2.4)
-    bar = figure.colorbar(ScalarMappable(scale, colours), cax=figure.subplots(), extend="both")
+    bar = figure.colorbar(ScalarMappable(scale, colors), cax=figure.subplots(), extend="both")
     bar.set_label("error of position [m]")
     bar.set_ticks([0.01, 0.1, 1.0], labels=["0.01", "0.1", "1"])
     stream = io.BytesIO()

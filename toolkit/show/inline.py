@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from toolkit.errors import ArtefactError
+from toolkit.errors import ArtifactError
 from toolkit.show import TEXT_BARS
 from toolkit.show.recordings import open_command
 
@@ -29,13 +29,13 @@ def show_recording(path: str | Path, still: str | Path | None = None, height: in
         The viewer's widget, None where it is left out.
 
     Raises:
-        ArtefactError: there is no such recording.
+        ArtifactError: there is no such recording.
     """
     from IPython.display import HTML, Image, display
 
     path = Path(path)
     if not path.is_file():
-        raise ArtefactError(f"{path}: no such recording. Run the notebook's cells above, with recordings = True.")
+        raise ArtifactError(f"{path}: no such recording. Run the notebook's cells above, with recordings = True.")
     if still is not None and Path(still).is_file():
         display(Image(data=Path(still).read_bytes()))
     # Relative to the notebook, so that the run folder can be moved.

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from toolkit.capture.images import read_for_display
 from toolkit.capture.upright import up_of_cameras
 from toolkit.geometry import pose_error, project
-from toolkit.show.figures import ESTIMATED, GREEN, MAP, ORANGE, SKY, TRUE, draw_error_legend, error_colours
+from toolkit.show.figures import ESTIMATED, GREEN, MAP, ORANGE, SKY, TRUE, draw_error_legend, error_colors
 from toolkit.show.recordings import (
     HIDDEN_M,
     camera_depth_m,
@@ -55,7 +55,7 @@ class ShownImage:
     pixels: Array = field(default_factory=lambda: np.zeros((0, 2)))
     """(n, 2) where the points were measured, in the full image."""
     points: Array = field(default_factory=lambda: np.zeros((0, 3)))
-    """(n, 3) the points, metres; projecting them gives what the pose predicts."""
+    """(n, 3) the points, meters; projecting them gives what the pose predicts."""
     point_ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     """(n,) which points of the map they are: the same number in two images is a match."""
 
@@ -86,7 +86,7 @@ class Localizations:
 
     @cached_property
     def errors(self) -> tuple[Array, Array]:
-        """Rotation, degrees, and translation, metres, (Q,) each; NaN without a pose or a true one."""
+        """Rotation, degrees, and translation, meters, (Q,) each; NaN without a pose or a true one."""
         both = posed(self.estimated) & posed(self.true)
         rotation_deg, translation_m = np.full(len(both), np.nan), np.full(len(both), np.nan)
         if both.any():
@@ -116,13 +116,13 @@ def record_localizations(
 
     Entities: `world/{points,map_cameras}`, `world/queries/{estimated,true,error,failed}`; and for the query chosen on
     the timeline `query`: `world/chosen/camera_<k>`, `world/truth/camera_0`, `world/references/<rank>`,
-    `world/chosen_points`, and a page about it, `about`. Errors are coloured by `figures.error_colours`.
+    `world/chosen_points`, and a page about it, `about`. Errors are colored by `figures.error_colors`.
 
     Args:
         out: file to write.
         name: of the recording.
         map_poses: world_from_cam (N, 4, 4) of the map's images; NaN rows are passed over.
-        points: (P, 3), metres.
+        points: (P, 3), meters.
         colors: (P, 3) RGB or None.
         localizations: all queries.
         details: number and details of those that can be chosen; taken one at a time.
@@ -171,7 +171,7 @@ def _layout(name: str, poses: Array, up: Array) -> Any:
     )
     about = rrb.Horizontal(
         rrb.TextDocumentView(origin="about", name="about the query"),
-        rrb.Spatial2DView(origin="legend", name="colours"),
+        rrb.Spatial2DView(origin="legend", name="colors"),
         column_shares=[2, 1],
     )
     side = rrb.Vertical(query, references, about, row_shares=[4, 4, 2])
@@ -190,17 +190,17 @@ def _log_map_cameras(stream: "rr.RecordingStream", poses: Array, size: float) ->
 
 
 def _log_overview(stream: "rr.RecordingStream", queries: Localizations) -> None:
-    """Log all queries: estimates and error lines coloured by error, true places, failures at their references."""
+    """Log all queries: estimates and error lines colored by error, true places, failures at their references."""
     import rerun as rr
 
     found, known = posed(queries.estimated), posed(queries.true)
-    colours = error_colours(queries.errors[1])
+    colors = error_colors(queries.errors[1])
     labels = [f"#{k} {describe(queries, k)}" for k in range(len(queries.names))]
 
-    def dots(path: str, rows: NDArray[np.bool_], centres: Array, colour: Any, radius: float) -> None:
+    def dots(path: str, rows: NDArray[np.bool_], centers: Array, color: Any, radius: float) -> None:
         points = rr.Points3D(
-            centres[rows],
-            colors=colour,
+            centers[rows],
+            colors=color,
             radii=rr.Radius.ui_points(radius),
             labels=[labels[k] for k in np.flatnonzero(rows)],
             show_labels=False,
@@ -208,14 +208,14 @@ def _log_overview(stream: "rr.RecordingStream", queries: Localizations) -> None:
         stream.log(path, points, static=True)
 
     dots("world/queries/true", known, queries.true[:, :3, 3], rgb(TRUE), 3)
-    dots("world/queries/estimated", found, queries.estimated[:, :3, 3], colours[found], 5)
+    dots("world/queries/estimated", found, queries.estimated[:, :3, 3], colors[found], 5)
     both = found & known
     lines = np.stack([queries.estimated[both, :3, 3], queries.true[both, :3, 3]], axis=1)
-    stream.log("world/queries/error", rr.LineStrips3D(list(lines), colors=colours[both]), static=True)
-    centres = queries.nearest_reference.reshape(-1, 3)
-    if len(centres):
-        lost = ~found & np.isfinite(centres).all(1)
-        dots("world/queries/failed", lost, centres, rgb(ESTIMATED), 9)
+    stream.log("world/queries/error", rr.LineStrips3D(list(lines), colors=colors[both]), static=True)
+    centers = queries.nearest_reference.reshape(-1, 3)
+    if len(centers):
+        lost = ~found & np.isfinite(centers).all(1)
+        dots("world/queries/failed", lost, centers, rgb(ESTIMATED), 9)
     stream.log("legend", rr.EncodedImage(contents=draw_error_legend(), media_type="image/png"), static=True)
 
 
@@ -249,8 +249,8 @@ def _log_chosen(
     stream.log("world/chosen_points", dots)
     lines = []
     if posed(queries.estimated[number : number + 1])[0]:
-        centre = queries.estimated[number, :3, 3]
-        lines = [np.stack([centre, image.world_from_cam[:3, 3]]) for image in chosen.references]
+        center = queries.estimated[number, :3, 3]
+        lines = [np.stack([center, image.world_from_cam[:3, 3]]) for image in chosen.references]
     stream.log("world/lines", rr.LineStrips3D(lines, colors=rgb(ORANGE)))
     text = [f"**query {number}: {describe(queries, number)}**", "", *(f"- {image.name}" for image in chosen.cameras)]
     matched = sum(len(image.points) for image in chosen.cameras)
@@ -268,13 +268,13 @@ def _log_image(
     image: ShownImage | None,
     image_size: int,
     size: float,
-    colour: str,
+    color: str,
     sizes: dict[str, tuple[int, int]],
     residuals: bool,
 ) -> None:
     """Log a photograph with its camera, and on it where points were measured and where the pose puts them.
 
-    Where there is none, nothing but grey; `sizes` are of the pictures last logged.
+    Where there is none, nothing but gray; `sizes` are of the pictures last logged.
     """
     import rerun as rr
 
@@ -293,7 +293,7 @@ def _log_image(
         located = bool(np.isfinite(image.world_from_cam).all())
         if located:
             stream.log(path, transform_of(image.world_from_cam))
-        stream.log(path, pinhole_of(image.camera, shown, size if located else HIDDEN_M, colour))
+        stream.log(path, pinhole_of(image.camera, shown, size if located else HIDDEN_M, color))
         stream.log(f"{path}/image", jpeg_of(data))
         scale = np.array(shown) / [image.camera.width, image.camera.height]
         measured = image.pixels * scale

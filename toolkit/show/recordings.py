@@ -20,15 +20,15 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from toolkit.capture import DEPTH_SCALE, Capture, Session, Trajectory
-from toolkit.capture.devices import colour_of
+from toolkit.capture.devices import color_of
 from toolkit.capture.images import default_workers, prefetch, read_for_display, read_image
 from toolkit.capture.tables import read_query_table
 from toolkit.capture.upright import up_of_cameras
-from toolkit.errors import ArtefactError, CaptureError, ImageError
+from toolkit.errors import ArtifactError, CaptureError, ImageError
 from toolkit.files import file_fingerprint, files_fingerprint, write_atomic, write_sidecar
 from toolkit.geometry import rotation_to_quaternion
 from toolkit.localizers.mapping import LocalMap
-from toolkit.show.figures import GREY, ORANGE
+from toolkit.show.figures import GRAY, ORANGE
 from toolkit.show.top_view import places_of
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ Image = NDArray[np.uint8]
 APPLICATION = "visual-localization"
 FRAME, CAPTURE_TIME = "frame", "capture_time"
 """Timelines: index of the frame in its session, and the timestamp of the files as a duration (microseconds)."""
-POINT_COLOUR = GREY
+POINT_COLOR = GRAY
 MAX_TABS = 12
 HIDDEN_M = 1e-3
 """Depth of a camera that is not there now: too small to be seen."""
@@ -114,7 +114,7 @@ def shown_intrinsics(camera: "pycolmap.Camera", shown: tuple[int, int]) -> Array
     return np.diag([shown[0] / camera.width, shown[1] / camera.height, 1.0]) @ camera.calibration_matrix()
 
 
-def pinhole_of(camera: "pycolmap.Camera", shown: tuple[int, int], depth_m: float, colour: str) -> "rr.Pinhole":
+def pinhole_of(camera: "pycolmap.Camera", shown: tuple[int, int], depth_m: float, color: str) -> "rr.Pinhole":
     """Return a pinhole for the image of a camera at the size shown, drawn `depth_m` deep."""
     import rerun as rr
 
@@ -123,7 +123,7 @@ def pinhole_of(camera: "pycolmap.Camera", shown: tuple[int, int], depth_m: float
         resolution=shown,
         camera_xyz=rr.ViewCoordinates.RDF,
         image_plane_distance=depth_m,
-        color=rgb(colour),
+        color=rgb(color),
     )
 
 
@@ -159,34 +159,34 @@ def scene_view(poses: Array, up: Array, name: str) -> Any:
     if len(poses):
         place = places_of(poses[:, :3, 3])
         here = poses[place == np.bincount(place).argmax()]
-        centre, view = here[:, :3, 3].mean(0), here[:, :3, 2].mean(0)
+        center, view = here[:, :3, 3].mean(0), here[:, :3, 2].mean(0)
         view -= up * (view @ up)
         reach = max(3.0, float(np.linalg.norm(np.ptp(here[:, :3, 3], axis=0))))
-        target = centre + 0.3 * reach * view
+        target = center + 0.3 * reach * view
         eye = rrb.EyeControls3D(position=target - reach * view + 0.7 * reach * up, look_target=target, eye_up=up)
     return rrb.Spatial3DView(origin="world", name=name, eye_controls=eye)
 
 
-def camera_depth_m(centres: Array) -> float:
-    """Return how deep to draw the cameras at (N, 3): about half the usual step between neighbours."""
+def camera_depth_m(centers: Array) -> float:
+    """Return how deep to draw the cameras at (N, 3): about half the usual step between neighbors."""
     from scipy.spatial import cKDTree
 
-    spots = np.unique(np.round(centres, 2), axis=0)
+    spots = np.unique(np.round(centers, 2), axis=0)
     if len(spots) < 2:
         return 0.3
     return float(np.clip(np.median(cKDTree(spots).query(spots, k=2)[0][:, 1]) / 2, 0.05, 1.0))
 
 
 def log_points(stream: "rr.RecordingStream", points: ArrayLike, colors: NDArray[np.uint8] | None) -> None:
-    """Log the map's points (P, 3), colours (P, 3) RGB or None, as `world/points`."""
+    """Log the map's points (P, 3), colors (P, 3) RGB or None, as `world/points`."""
     import rerun as rr
 
-    cloud = rr.Points3D(points, colors=rgb(POINT_COLOUR) if colors is None else colors, radii=rr.Radius.ui_points(1.5))
+    cloud = rr.Points3D(points, colors=rgb(POINT_COLOR) if colors is None else colors, radii=rr.Radius.ui_points(1.5))
     stream.log("world/points", cloud, static=True)
 
 
 def sure_points(local_map: LocalMap) -> tuple[Array, NDArray[np.uint8]]:
-    """Return the points that at least three images see, (P, 3), and their colours (P, 3); the rest is noisy."""
+    """Return the points that at least three images see, (P, 3), and their colors (P, 3); the rest is noisy."""
     sure = local_map.track_lengths >= 3
     return local_map.points[sure], local_map.colors[sure]
 
@@ -196,9 +196,9 @@ def posed(poses: Array) -> NDArray[np.bool_]:
     return np.asarray(np.isfinite(poses).all((1, 2)), bool)
 
 
-def rgb(colour: str) -> list[int]:
+def rgb(color: str) -> list[int]:
     """Return the three numbers of `#rrggbb`."""
-    return [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
+    return [int(color[k : k + 2], 16) for k in (1, 3, 5)]
 
 
 # A session
@@ -213,7 +213,7 @@ class SessionRecording:
     """Instants recorded: one a device and time."""
     images: int = 0
     unreadable: int = 0
-    """Images and depth maps that could not be read; a grey picture stands in for an image."""
+    """Images and depth maps that could not be read; a gray picture stands in for an image."""
     unposed: int = 0
     """Images of frames without a pose: shown beside the scene, under `unposed/`."""
     depth_maps: int = 0
@@ -286,7 +286,7 @@ def record_session(
 
     Raises:
         CaptureError: unknown session, subsession or keyframe list.
-        ArtefactError: `vis_retrieve_queries` without the csv of `queries_pose`, or for another session.
+        ArtifactError: `vis_retrieve_queries` without the csv of `queries_pose`, or for another session.
     """
     started = time.perf_counter()
     if every < 1:
@@ -296,7 +296,7 @@ def record_session(
     path = Path(out) if out is not None else Path(f"{capture.name}_{session.id}.rrd")
     asked = None if queries_pose is None else _Queries.read(Path(queries_pose), capture, session, vis_retrieve_queries)
     if asked is None and vis_retrieve_queries:
-        raise ArtefactError("vis_retrieve_queries shows what `queries_pose` was localized by; give that file too.")
+        raise ArtifactError("vis_retrieve_queries shows what `queries_pose` was localized by; give that file too.")
     points_file = _points_file(session, asked, map_dir)
     settings = {
         "images": session.files_fingerprint, "subsession": subsession,
@@ -325,7 +325,7 @@ def record_session(
         if asked is not None:
             counts["queries"] = _log_asked(stream, asked, session)
         size = camera_depth_m(finite[:, :3, 3])
-        writer = _FrameWriter(stream, session, size, colour_of(session.device))
+        writer = _FrameWriter(stream, session, size, color_of(session.device))
         writer.announce(plan.frames)
 
         def load(number: int) -> list["_Loaded"]:
@@ -370,7 +370,7 @@ class _Loaded:
 
     shot: _Shot
     data: bytes
-    """JPEG, or 16-bit PNG of millimetres; empty where a depth map cannot be read."""
+    """JPEG, or 16-bit PNG of millimeters; empty where a depth map cannot be read."""
     size: tuple[int, int]
     """Width and height shown."""
     readable: bool
@@ -478,7 +478,7 @@ class _Plan:
 
 
 def session_tracks(session: Session) -> list[Array]:
-    """Return the ways of a session's cameras, a list of world positions (n, 3), metres, a subsession and device.
+    """Return the ways of a session's cameras, a list of world positions (n, 3), meters, a subsession and device.
 
     Of a rig its first camera's; of a map by the trajectory, of queries by the ground truth.
     """
@@ -493,8 +493,8 @@ def _tracks(frames: pd.DataFrame, poses: Array) -> dict[str, list[Array]]:
     tracks: dict[str, list[Array]] = {}
     groups = frames.reset_index(drop=True).groupby(["subsession", "device_slot"], sort=False)
     for (name, _), rows in groups.indices.items():
-        centres = poses[rows, :3, 3]
-        tracks.setdefault(str(name), []).append(centres[np.isfinite(centres).all(1)])
+        centers = poses[rows, :3, 3]
+        tracks.setdefault(str(name), []).append(centers[np.isfinite(centers).all(1)])
     return tracks
 
 
@@ -568,8 +568,8 @@ def _load(session: Session, shot: _Shot, image_size: int, quality: int) -> _Load
 class _FrameWriter:
     """Logs frames in order; what has not changed since the last frame is not logged again."""
 
-    def __init__(self, stream: "rr.RecordingStream", session: Session, size: float, colour: str) -> None:
-        self._stream, self._session, self._size, self._colour = stream, session, size, colour
+    def __init__(self, stream: "rr.RecordingStream", session: Session, size: float, color: str) -> None:
+        self._stream, self._session, self._size, self._color = stream, session, size, color
         self._last: dict[str, tuple[float, ...]] = {}
         """Numbers last logged, by entity and kind."""
         self._alive: dict[tuple[str, str], dict[str, _Loaded]] = {}
@@ -651,7 +651,7 @@ class _FrameWriter:
     def _hide(self, cameras: dict[str, _Loaded]) -> None:
         for path, last in cameras.items():
             camera = self._session.camera(last.shot.sensor_id)
-            self._stream.log(path, pinhole_of(camera, last.size, HIDDEN_M, self._colour))
+            self._stream.log(path, pinhole_of(camera, last.size, HIDDEN_M, self._color))
             self._last.pop(f"{path}|pinhole", None)
 
     def _log_changed(self, path: str, kind: str, numbers: ArrayLike, make: Any) -> None:
@@ -663,7 +663,7 @@ class _FrameWriter:
     def _log_intrinsics(self, path: str, loaded: _Loaded) -> None:
         camera = self._session.camera(loaded.shot.sensor_id)
         numbers = [*shown_intrinsics(camera, loaded.size).ravel(), *loaded.size]
-        self._log_changed(path, "pinhole", numbers, lambda: pinhole_of(camera, loaded.size, self._size, self._colour))
+        self._log_changed(path, "pinhole", numbers, lambda: pinhole_of(camera, loaded.size, self._size, self._color))
 
 
 def _session_layout(plan: _Plan, poses: Array, up: Array) -> Any:
@@ -690,9 +690,9 @@ def _log_trajectories(stream: "rr.RecordingStream", plan: _Plan, device: str) ->
     """Log the way of each device, a line a subsession: recordings joined would draw paths nobody went."""
     import rerun as rr
 
-    colour = rgb(colour_of(device))
+    color = rgb(color_of(device))
     for name, tracks in plan.tracks.items():
-        lines = rr.LineStrips3D([track for track in tracks if len(track) > 1], colors=colour)
+        lines = rr.LineStrips3D([track for track in tracks if len(track) > 1], colors=color)
         stream.log(f"world/{entity(name)}/trajectory", lines, static=True)
 
 
@@ -709,7 +709,7 @@ class _Queries:
     query_device: str
     references: dict[tuple[int, str], list[str]]
     """Names of map images of a query; empty where they are not asked for."""
-    centres: dict[str, Array]
+    centers: dict[str, Array]
     """World positions (3,) of the references."""
 
     @classmethod
@@ -720,16 +720,16 @@ class _Queries:
         map_device, _, query_device = path.stem.removeprefix(prefix).partition("_query_") if named else ("", "", "")
         of_session = map_device if session.split == "map" else query_device
         if named and of_session != session.device:
-            raise ArtefactError(
+            raise ArtifactError(
                 f"{path.name} holds {query_device} queries in the {map_device} map, which has nothing to do with "
                 f"session {session.id}. Expected a file for that device."
             )
         references: dict[tuple[int, str], list[str]] = {}
-        centres: dict[str, Array] = {}
+        centers: dict[str, Array] = {}
         if with_references:
             table = path.with_suffix(".csv")
             if not named or not table.is_file():
-                raise ArtefactError(
+                raise ArtifactError(
                     f"{path}: which references a query was localized by stands in the table beside it, "
                     f"{prefix}<M>_query_<Q>.csv; not found. Localize again, or leave vis_retrieve_queries out."
                 )
@@ -741,8 +741,8 @@ class _Queries:
             wanted = {name for names in references.values() for name in names}
             images = [k for k in range(len(map_session)) if map_session.image_name(k) in wanted]
             found = map_session.world_from_cam(np.array(images, np.int64))
-            centres = {map_session.image_name(k): pose[:3, 3] for k, pose in zip(images, found, strict=True)}
-        return cls(poses, map_device, query_device, references, centres)
+            centers = {map_session.image_name(k): pose[:3, 3] for k, pose in zip(images, found, strict=True)}
+        return cls(poses, map_device, query_device, references, centers)
 
 
 def _points_file(session: Session, asked: _Queries | None, map_dir: str | Path | None) -> Path | None:
@@ -760,16 +760,16 @@ def _log_asked(stream: "rr.RecordingStream", asked: _Queries, session: Session) 
     keys = list(zip(asked.poses.timestamps.tolist(), asked.poses.device_ids.tolist(), strict=True))
     kept = np.flatnonzero(posed(poses))
     if session.split == "map":
-        colour = rgb(colour_of(asked.query_device))
+        color = rgb(color_of(asked.query_device))
         labels = [f"{time} {device}" for time, device in (keys[k] for k in kept)]
-        dots = rr.Points3D(poses[kept, :3, 3], colors=colour, radii=rr.Radius.ui_points(4), labels=labels,
+        dots = rr.Points3D(poses[kept, :3, 3], colors=color, radii=rr.Radius.ui_points(4), labels=labels,
                            show_labels=False)  # fmt: skip
         stream.log("world/queries/poses", dots, static=True)
     lines = [
-        np.stack([poses[k, :3, 3], asked.centres[name]])
+        np.stack([poses[k, :3, 3], asked.centers[name]])
         for k in kept
         for name in asked.references.get(keys[k], [])
-        if name in asked.centres
+        if name in asked.centers
     ]
     if lines:
         stream.log("world/queries/references", rr.LineStrips3D(lines, colors=rgb(ORANGE)), static=True)

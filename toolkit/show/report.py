@@ -13,7 +13,7 @@ from urllib.parse import quote
 import numpy as np
 import pandas as pd
 
-from toolkit.errors import ArtefactError
+from toolkit.errors import ArtifactError
 from toolkit.files import SceneFiles, sidecar_path, write_text
 
 # All pictures of a page together, before base64 makes them a third larger: the page stays below 10 MB.
@@ -25,7 +25,7 @@ WORST, MOST_REASONS = 10, 12
 EVALUATION_FIGURES = {
     "error_curves": (
         "Error curves",
-        "Share of queries [%] with an error below x, in metres (top) and degrees (bottom). A curve ends where queries "
+        "Share of queries [%] with an error below x, in meters (top) and degrees (bottom). A curve ends where queries "
         "have no pose; dotted lines are the thresholds of the tables.",
     ),
     "losses": (
@@ -57,7 +57,7 @@ class Cell:
 
     text: str
     shade: float | None = None
-    """How dark the cell is, 0 to 1, where a number is shown by colour as well."""
+    """How dark the cell is, 0 to 1, where a number is shown by color as well."""
     bar: float | None = None
     """Length of a bar below the text, 0 to 1."""
     link: str = ""
@@ -124,7 +124,7 @@ def write_report(run_dir: str | Path) -> Path:
     the PNG's `Title` or `Description`.
 
     Raises:
-        ArtefactError: there is no `run.json`, or it is torn.
+        ArtifactError: there is no `run.json`, or it is torn.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
@@ -161,13 +161,13 @@ def _read_run(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise ArtefactError(
+        raise ArtifactError(
             f"No run at {path.parent}: {path.name} is missing. Run a manifest first."
         ) from None
     except ValueError as error:
-        raise ArtefactError(f"{path} is not whole JSON ({error}). Run the manifest again.") from None
+        raise ArtifactError(f"{path} is not whole JSON ({error}). Run the manifest again.") from None
     if not isinstance(content, dict):
-        raise ArtefactError(f"{path}: expected a JSON object, found a {type(content).__name__}.")
+        raise ArtifactError(f"{path}: expected a JSON object, found a {type(content).__name__}.")
     empty = {"name": path.parent.name, "created": "", "status": "", "error": None, "total_seconds": None}
     lists: dict[str, Any] = {"manifest": {}, "versions": {}, "machine": {}, "inputs": {}, "scenes": [], "stages": []}
     run = {**empty, "peak_memory_mb": None, "work_seconds": None, "code": "", **lists, **content}
@@ -428,11 +428,11 @@ def _worst(queries: pd.DataFrame, thresholds: list[str]) -> Table | None:
         return None
     known = "rotation_error_deg" in queries
     if known:
-        degrees, metres = _parse_threshold(thresholds[0]) if thresholds else (1.0, 0.1)
-        rotation, translation = queries["rotation_error_deg"] / degrees, queries["translation_error_m"] / metres
+        degrees, meters = _parse_threshold(thresholds[0]) if thresholds else (1.0, 0.1)
+        rotation, translation = queries["rotation_error_deg"] / degrees, queries["translation_error_m"] / meters
         off = np.maximum(rotation, translation)
         caption = f"The {min(WORST, len(queries))} worst, by the larger of rotation error / {degrees:g}° and "
-        caption += f"translation error / {metres:g} m"
+        caption += f"translation error / {meters:g} m"
     else:
         status = queries["status"]
         off = 2 * status.str.startswith("failed").astype(int) + (status == "low_confidence").astype(int)
@@ -525,8 +525,8 @@ def _number(value: float) -> str:
     return f"{value:.3f}" if value < 0.1 else f"{value:.2f}" if value < 10 else f"{value:.0f}"
 
 
-def _length(metres: float) -> str:
-    return f"{_number(100 * metres)} cm" if metres < 1 else f"{_number(metres)} m" if metres < math.inf else "∞"
+def _length(meters: float) -> str:
+    return f"{_number(100 * meters)} cm" if meters < 1 else f"{_number(meters)} m" if meters < math.inf else "∞"
 
 
 def _seconds(seconds: float | None) -> str:
@@ -538,14 +538,14 @@ def _seconds(seconds: float | None) -> str:
 
 
 def _parse_threshold(name: str) -> tuple[float, float]:
-    """Return degrees and metres of a column such as `recall@(5deg,0.5m)`."""
-    degrees, _, metres = name.rpartition("@")[2].strip("()").partition(",")
-    return float(degrees.removesuffix("deg")), float(metres.removesuffix("m"))
+    """Return degrees and meters of a column such as `recall@(5deg,0.5m)`."""
+    degrees, _, meters = name.rpartition("@")[2].strip("()").partition(",")
+    return float(degrees.removesuffix("deg")), float(meters.removesuffix("m"))
 
 
 def _threshold(name: str) -> str:
-    degrees, metres = _parse_threshold(name)
-    return f"{degrees:g}°, {metres:g}\N{NO-BREAK SPACE}m"
+    degrees, meters = _parse_threshold(name)
+    return f"{degrees:g}°, {meters:g}\N{NO-BREAK SPACE}m"
 
 
 class _Album:

@@ -19,7 +19,7 @@ from toolkit.show.figures import (
     MAP,
     TRUE,
     error_bar,
-    error_colours,
+    error_colors,
     new_figure,
     save_figure,
     styled,
@@ -68,7 +68,7 @@ def draw_scene_png(
     """Draw the map from above with estimated and true queries, one panel a place; return the figure.
 
     Args:
-        points: (P, 3), metres.
+        points: (P, 3), meters.
         colors: (P, 3) RGB, or None.
         map_poses: world_from_cam (N, 4, 4) of the map; NaN rows are passed over.
         queries_est: world_from_cam (Q, 4, 4) of the queries, NaN where there is no pose.
@@ -111,9 +111,9 @@ def draw_scene_png(
         near, mine = point_place == p, query_place == p
         tint = "#9A9A9A" if shades is None else _muted(shades[near])
         _dots(axis, cloud[near], s=1.2, c=tint, lw=0, rasterized=True)
-        for tracks, colour, label in ((map_tracks, MAP, "way of the map's devices"), (query_tracks, TRUE, "true way")):
+        for tracks, color, label in ((map_tracks, MAP, "way of the map's devices"), (query_tracks, TRUE, "true way")):
             for number, track in enumerate(tracks):
-                axis.plot(*(np.asarray(track).reshape(-1, 3) @ axes.T).T, color=colour, lw=0.7, alpha=0.5, zorder=2,
+                axis.plot(*(np.asarray(track).reshape(-1, 3) @ axes.T).T, color=color, lw=0.7, alpha=0.5, zorder=2,
                           label=None if number else label)  # fmt: skip
         _draw_heading(axis, cameras[place == p], map_poses[place == p], axes, MAP, window, "map cameras")
         _draw_queries(axis, seen[mine], known[mine], estimated[mine], true[mine], axes, window)
@@ -215,8 +215,8 @@ def draw_localization(
         panel.set_title(text, fontsize=8)
         _frame(panel, "0.6", image.shape[1], image.shape[0])
     if located and world_from_cam_true is not None and np.isfinite(world_from_cam_true).all():
-        rotation, metres = pose_error(np.asarray(pose), world_from_cam_true)
-        title = f"{title}{' · ' if title else ''}off by {float(rotation):.2g}°, {_length(float(metres))}"
+        rotation, meters = pose_error(np.asarray(pose), world_from_cam_true)
+        title = f"{title}{' · ' if title else ''}off by {float(rotation):.2g}°, {_length(float(meters))}"
     figure.suptitle(title)
     if out is not None:
         save_figure(figure, out, title)
@@ -280,17 +280,17 @@ def _draw_side_by_side(axis: "Axes", query: WorstQuery) -> None:
 
 
 def _on(pixels: Array) -> Array:
-    """Return pixels as imshow counts them: it has the centre of the top-left pixel at (0, 0)."""
+    """Return pixels as imshow counts them: it has the center of the top-left pixel at (0, 0)."""
     return pixels - 0.5
 
 
-def _frame(axis: "Axes", colour: str, width: int, height: int) -> None:
+def _frame(axis: "Axes", color: str, width: int, height: int) -> None:
     axis.set(xticks=[], yticks=[], xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
-    axis.spines[:].set(color=colour, linewidth=1.5, visible=True)
+    axis.spines[:].set(color=color, linewidth=1.5, visible=True)
 
 
-def _length(metres: float) -> str:
-    return f"{100 * metres:.2g} cm" if metres < 0.995 else f"{metres:.3g} m"
+def _length(meters: float) -> str:
+    return f"{100 * meters:.2g} cm" if meters < 0.995 else f"{meters:.3g} m"
 
 
 def _known(poses: Array) -> NDArray[np.bool_]:
@@ -339,7 +339,7 @@ def _outside(positions: Array, window: tuple[tuple[float, float], tuple[float, f
 
 
 def _muted(colors: NDArray[np.uint8]) -> Array:
-    """Return colours for thin points on white: bright ones would not be seen."""
+    """Return colors for thin points on white: bright ones would not be seen."""
     rgb = colors.astype(np.float64) / 255
     return np.clip(rgb * 0.75 + 0.2, 0, 0.75)
 
@@ -349,7 +349,7 @@ def _draw_heading(
     positions: Array,
     poses: Array,
     axes: Array,
-    colour: str,
+    color: str,
     window: tuple[tuple[float, float], tuple[float, float]],
     label: str,
 ) -> None:
@@ -360,8 +360,8 @@ def _draw_heading(
     heads = positions + length * poses[:, :3, 2] @ axes.T
     lines = np.full((3 * len(positions), 2), np.nan)
     lines[0::3], lines[1::3] = positions, heads
-    axis.plot(*lines.T, color=colour, lw=1.0, alpha=0.7)
-    _dots(axis, positions, s=9, color=colour, lw=0, zorder=3, label=label)
+    axis.plot(*lines.T, color=color, lw=1.0, alpha=0.7)
+    _dots(axis, positions, s=9, color=color, lw=0, zorder=3, label=label)
 
 
 def _draw_queries(
@@ -376,9 +376,9 @@ def _draw_queries(
     has_estimate, has_truth = np.isfinite(seen).all(1), np.isfinite(known).all(1)
     both = has_estimate & has_truth
     errors = np.where(both, np.linalg.norm(estimated[:, :3, 3] - true[:, :3, 3], axis=1), np.nan)
-    colours = error_colours(errors) / 255.0
+    colors = error_colors(errors) / 255.0
     lines = np.stack([seen[both], known[both]], axis=1)
-    axis.add_collection(LineCollection(list(lines), colors=list(colours[both]), linewidths=1.6, zorder=4))
+    axis.add_collection(LineCollection(list(lines), colors=list(colors[both]), linewidths=1.6, zorder=4))
     _dots(axis, known[both], s=52, facecolors="none", edgecolors=TRUE, lw=1.2, zorder=5,
                  label="query, true" if both.any() else None)  # fmt: skip
     lost = has_truth & ~has_estimate
@@ -387,6 +387,6 @@ def _draw_queries(
     length = 0.035 * max(np.ptp(window[0]), np.ptp(window[1]))
     heads = seen + length * estimated[:, :3, 2] @ axes.T
     lines = np.stack([seen[has_estimate], heads[has_estimate]], axis=1)
-    axis.add_collection(LineCollection(list(lines), colors=list(colours[has_estimate]), linewidths=1.0, zorder=4))
-    _dots(axis, seen[has_estimate], s=16, c=colours[has_estimate], lw=0, zorder=5,
+    axis.add_collection(LineCollection(list(lines), colors=list(colors[has_estimate]), linewidths=1.0, zorder=4))
+    _dots(axis, seen[has_estimate], s=16, c=colors[has_estimate], lw=0, zorder=5,
                  label="query, estimated; a line leads to its true place" if has_estimate.any() else None)  # fmt: skip

@@ -29,7 +29,7 @@ def places_of(positions: Array, gap_ratio: float = 5.0, share: float = 0.12) -> 
     """Return the number of the place, (N,) counted from 0 in order of appearance, of positions (N, 2 or 3).
 
     Places are apart by more than `share` of the whole extent and by more than `gap_ratio` times the usual
-    step between neighbours.
+    step between neighbors.
     """
     from scipy.cluster.hierarchy import fcluster, linkage
     from scipy.spatial import cKDTree

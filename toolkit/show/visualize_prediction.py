@@ -11,7 +11,7 @@ from toolkit.capture.images import read_for_display
 from toolkit.capture.upright import up_of_cameras
 from toolkit.localizers.prediction import View
 from toolkit.localizers.vggt import CameraAnswer, VggtAnswer, VggtLocalizer, VggtQuery
-from toolkit.show.figures import BLUE, GREEN, GREY, VERMILLION, new_figure, save_figure, styled
+from toolkit.show.figures import BLUE, GRAY, GREEN, VERMILLION, new_figure, save_figure, styled
 from toolkit.show.top_view import ground_axes
 
 if TYPE_CHECKING:
@@ -53,11 +53,11 @@ def draw_prediction(
         axis.set_axis_off()
     for number, view in enumerate(views):
         row, column = 2 * (number // columns), number % columns
-        label, colour = "query", "black"
+        label, color = "query", "black"
         if number:
             label = f"reference {number}: {'consistent' if kept[number - 1] else 'left out'}"
-            colour = GREEN if kept[number - 1] else VERMILLION
-        _draw_view(panels[row, column], panels[row + 1, column], view, number, found, label, colour)
+            color = GREEN if kept[number - 1] else VERMILLION
+        _draw_view(panels[row, column], panels[row + 1, column], view, number, found, label, color)
     simulated = localizer.predictor.simulated
     title = f"{'SIMULATED, no result: ' if simulated else ''}{localizer.predictor.name} on {views[0].name}"
     estimate = answer.estimate
@@ -77,14 +77,14 @@ def _most_consistent(answer: VggtAnswer) -> int:
 
 
 def _draw_view(
-    photograph: "Axes", depth: "Axes", view: View, number: int, found: CameraAnswer, label: str, colour: str
+    photograph: "Axes", depth: "Axes", view: View, number: int, found: CameraAnswer, label: str, color: str
 ) -> None:
     photograph.set_axis_on()
     photograph.set(xticks=[], yticks=[])
     photograph.imshow(read_for_display(view.path))
-    photograph.set_title(label, fontsize=8, color=colour)
+    photograph.set_title(label, fontsize=8, color=color)
     for spine in photograph.spines.values():
-        spine.set(color=colour, linewidth=2.5, visible=True)
+        spine.set(color=color, linewidth=2.5, visible=True)
     prediction = found.prediction
     if prediction is None or prediction.depth is None:
         return
@@ -115,21 +115,21 @@ def _draw_from_above(
         finite = np.isfinite(found.prediction.model_from_cams[1:]).all(axis=(1, 2))
         aligned = alignment.world_from_model.apply_to_pose(found.prediction.model_from_cams[1:])
         marked.append(aligned[kept])
-        for agreed, colour, label in ((True, GREEN, "consistent"), (False, VERMILLION, "left out")):
+        for agreed, color, label in ((True, GREEN, "consistent"), (False, VERMILLION, "left out")):
             part = (kept == agreed) & finite
-            _draw_cameras(axis, aligned[part], axes, colour, f"predicted, {label}", "o")
+            _draw_cameras(axis, aligned[part], axes, color, f"predicted, {label}", "o")
             for start, end in zip(places[part, :3, 3] @ axes.T, aligned[part, :3, 3] @ axes.T, strict=True):
-                axis.plot(*zip(start, end, strict=True), c=colour, lw=0.8)
+                axis.plot(*zip(start, end, strict=True), c=color, lw=0.8)
     if found.world_from_cam is not None:
         marked.append(found.world_from_cam[None])
         _draw_cameras(axis, found.world_from_cam[None], axes, "black", "query", "*")
     _draw_cameras(axis, places, axes, BLUE, "reference in the map", "s")
-    _draw_cameras(axis, local_map.world_from_cams, axes, GREY, "map", ".")
-    centres = np.concatenate(marked)[:, :3, 3] @ axes.T
-    if not len(centres):
-        centres = local_map.world_from_cams[:, :3, 3] @ axes.T
+    _draw_cameras(axis, local_map.world_from_cams, axes, GRAY, "map", ".")
+    centers = np.concatenate(marked)[:, :3, 3] @ axes.T
+    if not len(centers):
+        centers = local_map.world_from_cams[:, :3, 3] @ axes.T
     # A window about what is of interest: a camera left out may be far away.
-    middle, half = (centres.min(axis=0) + centres.max(axis=0)) / 2, np.ptp(centres, axis=0).max() * 0.75 + 1.0
+    middle, half = (centers.min(axis=0) + centers.max(axis=0)) / 2, np.ptp(centers, axis=0).max() * 0.75 + 1.0
     cloud = local_map.points @ axes.T
     near = (np.abs(cloud - middle) < half).all(axis=1)
     axis.scatter(cloud[near, 0], cloud[near, 1], s=1, c="#BBBBBB", lw=0, zorder=0, rasterized=True)
@@ -140,13 +140,13 @@ def _draw_from_above(
     axis.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=3, frameon=False)
 
 
-def _draw_cameras(axis: "Axes", poses: Array, axes: Array, colour: str, label: str, marker: str) -> None:
+def _draw_cameras(axis: "Axes", poses: Array, axes: Array, color: str, label: str, marker: str) -> None:
     """Draw places (N, 4, 4) from above, with a stroke where they look."""
     if not len(poses):
         return
     places, looks = poses[:, :3, 3] @ axes.T, poses[:, :3, 2] @ axes.T
     size, layer = (14, 1) if marker == "." else (90 if marker == "*" else 60 if marker == "s" else 28, 3)
-    face = "none" if marker == "s" else colour  # what lies below stays visible
+    face = "none" if marker == "s" else color  # what lies below stays visible
     x, y = places.T
-    axis.scatter(x, y, s=size, facecolors=face, edgecolors=colour, marker=marker, label=label, zorder=layer)
-    axis.quiver(x, y, *looks.T, color=colour, width=0.003, scale=18, headwidth=3, zorder=layer)
+    axis.scatter(x, y, s=size, facecolors=face, edgecolors=color, marker=marker, label=label, zorder=layer)
+    axis.quiver(x, y, *looks.T, color=color, width=0.003, scale=18, headwidth=3, zorder=layer)

@@ -3,7 +3,7 @@
 Every surface is a textured planar rectangle (textures.py). A picture is made sample by sample, four a
 pixel: the ray of each sample through the camera's own model (distortion included) meets the planes, the
 nearest wins, and its texture is read at the mip level of the sample's footprint. So poses, intrinsics and
-depths are exact. The world has z up and metres; the rooms stand far apart. All randomness comes from the
+depths are exact. The world has z up and meters; the rooms stand far apart. All randomness comes from the
 seed and the name of the thing that is drawn, never from the order of work: the bytes do not depend on the
 number of cores.
 """
@@ -60,7 +60,7 @@ NEAR_M = 0.05
 LEVELS = 6  # of the mip-maps; texture sides are multiples of 2 ** (LEVELS - 1)
 SAMPLES = 2  # a side of a pixel
 SOLD_OFTEN = ("books", "crate", "door", "drawers", "window")
-MODELS = 2  # of each of these things and each size in whole metres, where a world has look-alikes
+MODELS = 2  # of each of these things and each size in whole meters, where a world has look-alikes
 
 
 def _random(*key: int | str) -> Rng:
@@ -73,7 +73,7 @@ def _random(*key: int | str) -> Rng:
 
 @dataclass
 class Quad:
-    """A textured rectangle: its texture's top left corner and unit axes, in world metres."""
+    """A textured rectangle: its texture's top left corner and unit axes, in world meters."""
 
     corner: Array
     right: Array
@@ -147,7 +147,7 @@ class Scene:
 
 
 def _on_wall(scene: Scene, wall: int, along: float, depth: float) -> tuple[float, float, float]:
-    """Return x, y, yaw of a box of this depth set against a wall, `along` metres from the wall's middle."""
+    """Return x, y, yaw of a box of this depth set against a wall, `along` meters from the wall's middle."""
     w, d, _ = scene.size
     gap = depth / 2 + 0.004
     x, y, yaw = [
@@ -346,7 +346,7 @@ def build_room(seed: int, index: int) -> Scene:
         for thing in list(rng.permutation(kind["things"])) * 3:
             width = _furnish(scene, rng, k, along, length / 2 - 0.45 - along, thing)
             along += width and width + rng.uniform(0.08, 0.3)
-        if outdoor:  # the upper storey
+        if outdoor:  # the upper story
             for at in np.arange(-length / 2 + 0.9, length / 2 - 0.6, 1.7):
                 _flat(scene, k, at, 3.1, 1.05, 1.5, window, 300)
                 x, y, yaw = _on_wall(scene, k, at, 0.18)
@@ -470,7 +470,7 @@ def paint(scene: Scene, seed: int, index: int, number: int, look_alikes: bool = 
     rng = _random(seed, index, "quad", number)
     name = getattr(quad.material, "func", quad.material).__name__
     if look_alikes and name in SOLD_OFTEN:
-        # A model is drawn for whole metres: things of unequal width then begin alike.
+        # A model is drawn for whole meters: things of unequal width then begin alike.
         tall, wide = (round(np.ceil(side) * quad.ppm) + multiple for side in (quad.height, quad.width))
         model = _random(seed, "model", name, int(rng.integers(MODELS)))
         image = quad.material(model, tall, wide, quad.ppm)[:h, :w]
@@ -503,7 +503,7 @@ class Rays:
 
     @classmethod
     def of(cls, camera: "pycolmap.Camera") -> "Rays":
-        """Unproject the sample grid; the centre of the top-left pixel is (0.5, 0.5)."""
+        """Unproject the sample grid; the center of the top-left pixel is (0.5, 0.5)."""
         u, v = ((np.arange(SAMPLES * n) + 0.5) / SAMPLES for n in (camera.width, camera.height))
         pixels = np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
         shape = (SAMPLES * camera.height, SAMPLES * camera.width)
@@ -542,7 +542,7 @@ def _visible_area(polygon: Array, rays: Rays) -> tuple[slice, slice] | None:
 
 
 def _texture(level: Image, x: Image, y: Image) -> Image:
-    """Read texels at N places, continuous coordinates (the first texel's centre is 0.5)."""
+    """Read texels at N places, continuous coordinates (the first texel's center is 0.5)."""
     width = 4096  # OpenCV bounds the side of a map
     rows = -(-len(x) // width)
     maps = np.zeros((2, rows * width), np.float32)
@@ -554,9 +554,9 @@ def _texture(level: Image, x: Image, y: Image) -> Image:
 
 
 def render(quads: list[Quad], world_from_cam: Array, rays: Rays, gray: bool) -> tuple[Image, Image]:
-    """Return a picture, (H, W, 3) BGR or (H, W), float32 0..255, and its depth, (H, W) float32 metres.
+    """Return a picture, (H, W, 3) BGR or (H, W), float32 0..255, and its depth, (H, W) float32 meters.
 
-    Depth is along the optical axis at pixel centres; 0 on the sky and where a pixel straddles an edge.
+    Depth is along the optical axis at pixel centers; 0 on the sky and where a pixel straddles an edge.
     """
     height, width = rays.x.shape
     R, center = world_from_cam[:3, :3].T, world_from_cam[:3, 3]
@@ -620,7 +620,7 @@ def render(quads: list[Quad], world_from_cam: Array, rays: Rays, gray: bool) -> 
 
 
 def _depth(quads: list[Quad], owner: Image, nearest: Image) -> Image:
-    """Return depth at pixel centres (H, W): from the mean inverse depth of the samples, exact on a plane."""
+    """Return depth at pixel centers (H, W): from the mean inverse depth of the samples, exact on a plane."""
     low = high = total = nearest[::SAMPLES, ::SAMPLES]
     for i in range(1, SAMPLES**2):
         sample = nearest[i // SAMPLES :: SAMPLES, i % SAMPLES :: SAMPLES]
@@ -754,7 +754,7 @@ def walks(scene: Scene, seed: int, index: int, frames: int, name: str) -> dict[t
 
     The two map walks follow an outer and an inner ring, the queries the ring between them, turned 10 to 25
     degrees away from the nearest map pose. From frame to frame the look turns 15 degrees at most, so that
-    neighbours overlap however few there are.
+    neighbors overlap however few there are.
     """
     device, rng = DEVICES[name], _random(seed, index, "walk", name)
     start = _random(seed, index, "start").uniform(0, 2 * np.pi)
@@ -909,8 +909,8 @@ def _take(shot: Shot, scene: Scene, rays: Rays | None, sessions: Path, seed: int
     raw = sessions / shot.session / "raw_data"
     _save(raw / shot.path, image, [cv2.IMWRITE_JPEG_QUALITY, device.quality])
     if shot.depth_path is not None:
-        millimetres = np.where(depth < 65.0, depth * 1000 + 0.5, 0).astype(np.uint16)
-        _save(raw / shot.depth_path, millimetres, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        millimeters = np.where(depth < 65.0, depth * 1000 + 0.5, 0).astype(np.uint16)
+        _save(raw / shot.depth_path, millimeters, [cv2.IMWRITE_PNG_COMPRESSION, 1])
 
 
 def _save(path: Path, image: Image, options: list[int]) -> None:

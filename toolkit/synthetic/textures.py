@@ -1,6 +1,6 @@
 """Procedural textures of the rendered capture (toolkit/synthetic.py): walls, floors, furniture, pictures.
 
-A material is a function (random generator, height, width, pixels a metre) -> (height, width, 3) BGR uint8.
+A material is a function (random generator, height, width, pixels a meter) -> (height, width, 3) BGR uint8.
 All are rich in corners at several scales, and drawn from the generator alone: the same generator, the same
 bytes.
 """
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Image = NDArray[Any]
 Rng = np.random.Generator
-Material = Callable[[Rng, int, int, float], Image]  # (random, height, width, pixels a metre) -> BGR uint8
+Material = Callable[[Rng, int, int, float], Image]  # (random, height, width, pixels a meter) -> BGR uint8
 
 
 def _f(value: ArrayLike) -> NDArray[np.float32]:
@@ -103,7 +103,7 @@ def _shapes(rng: Rng, image: Image, count: int, low: float, high: float) -> None
 
 
 def plaster(rng: Rng, h: int, w: int, ppm: float, color: Any = (190, 205, 210), band: Any = None) -> Image:
-    """A painted wall with stains, cracks and grain; `band` paints its lower metre with a rail on top."""
+    """A painted wall with stains, cracks and grain; `band` paints its lower meter with a rail on top."""
     image = _painted(color, 0.035 * _noise(rng, h, w, (int(ppm / 3), int(ppm / 12))))
     if band is not None:
         rail = h - int(1.0 * ppm)
@@ -141,7 +141,7 @@ def cells(
     rng: Rng, h: int, w: int, ppm: float, size: tuple[float, float], colors: Any, stagger: str = "half",
     jitter: float = 0.12, joint: Any = (150, 155, 160), motifs: bool = False,
 ) -> Image:  # fmt: skip
-    """Bricks, tiles or planks: cells of `size` (height, width) metres with joints, each of its own tone."""
+    """Bricks, tiles or planks: cells of `size` (height, width) meters with joints, each of its own tone."""
     ch, cw = max(4, int(size[0] * ppm)), max(4, int(size[1] * ppm))
     y, rows, columns = np.arange(h), h // ch + 1, w // cw + 2
     row = y // ch

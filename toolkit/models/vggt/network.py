@@ -1,6 +1,6 @@
 """VGGT (Wang et al., CVPR 2025): cameras, depth and points of a few views of a scene, in one pass of a network.
 
-The official network is at github.com/facebookresearch/vggt, with licences of its own for code and weights.
+The official network is at github.com/facebookresearch/vggt, with licenses of its own for code and weights.
 """
 
 from collections.abc import Mapping, Sequence
@@ -140,7 +140,7 @@ class VGGT(nn.Module):
             For "camera": `pose_enc` (B, S, 9), see `cameras_from_pose_encoding`, and `pose_enc_list`, that after each
             of the head's steps. For "depth": `depth` (B, S, H, W, 1), along the camera's z, and `depth_conf`
             (B, S, H, W), from 1. For "point": `world_points` (B, S, H, W, 3) and `world_points_conf` (B, S, H, W).
-            Cameras, depth and points share one scale, which is not metres. B = 1 where the images have four axes.
+            Cameras, depth and points share one scale, which is not meters. B = 1 where the images have four axes.
 
         Raises:
             ValueError: another shape, or a head that is not held.

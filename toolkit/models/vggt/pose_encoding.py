@@ -1,7 +1,7 @@
 """Cameras as VGGT encodes them, and points from depth.
 
 Nine numbers a camera: translation and quaternion (x, y, z, w, of any length) of `cam_from_world`, then the vertical
-and the horizontal field of view, radians. The principal point is the image's centre. "World" is VGGT's own frame,
+and the horizontal field of view, radians. The principal point is the image's center. "World" is VGGT's own frame,
 near that of the first view, in a unit of its own.
 """
 
@@ -56,7 +56,7 @@ def pose_encoding_from_cameras(cam_from_world: ArrayLike, intrinsics: ArrayLike,
 def unproject_depth(depth: ArrayLike, cam_from_world: ArrayLike, intrinsics: ArrayLike) -> Array:
     """Return the world points (S, H, W, 3) that depth maps show.
 
-    As in the official code the centre of the first pixel is (0, 0) here, not (0.5, 0.5) as elsewhere in this toolkit:
+    As in the official code the center of the first pixel is (0, 0) here, not (0.5, 0.5) as elsewhere in this toolkit:
     for cameras of that convention, take 0.5 from their principal points first.
 
     Args:
@@ -68,8 +68,8 @@ def unproject_depth(depth: ArrayLike, cam_from_world: ArrayLike, intrinsics: Arr
     z = z[..., 0] if z.ndim == 4 else z
     pose, K = np.asarray(cam_from_world, np.float64), np.asarray(intrinsics, np.float64)
     v, u = np.indices(z.shape[1:])
-    focal, centre = K[:, None, None, [0, 1], [0, 1]], K[:, None, None, :2, 2]
-    rays = (np.stack([u, v], axis=-1) - centre) / focal
+    focal, center = K[:, None, None, [0, 1], [0, 1]], K[:, None, None, :2, 2]
+    rays = (np.stack([u, v], axis=-1) - center) / focal
     in_camera = np.concatenate([rays * z[..., None], z[..., None]], axis=-1)
     # Rows of points times R: the inverse rotation of each.
     return np.einsum("shwi,sij->shwj", in_camera - pose[:, None, None, :3, 3], pose[:, :3, :3])

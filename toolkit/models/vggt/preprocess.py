@@ -25,7 +25,7 @@ Source = str | Path | Image.Image | NDArray[np.uint8]
 class Views:
     """Images for the network, and where their pixels came from.
 
-    Image coordinates (x, y) are in pixels; the centre of the top-left one is (0.5, 0.5).
+    Image coordinates (x, y) are in pixels; the center of the top-left one is (0.5, 0.5).
     """
 
     images: Tensor
@@ -97,7 +97,7 @@ def load_images(sources: Sequence[Source], mode: str = "crop") -> Views:
     images then differ in size, white is added around the smaller. EXIF orientation is not applied.
 
     Args:
-        sources: paths, Pillow images, or arrays (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) grey, uint8.
+        sources: paths, Pillow images, or arrays (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) gray, uint8.
         mode: "crop" or "pad".
 
     Raises:
