@@ -1,0 +1,142 @@
+"""What each pose rests on: the correspondences of every query of a pair, in one HDF5 file beside the poses.
+
+A group a query, `<timestamp>/<device_id>`, holds the arrays of `Correspondences` and the names of `LocalizedQuery`.
+Everything that shows, exports or evaluates a localization reads this file, so that it shows what was localized.
+"""
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from toolkit.errors import ArtifactError
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+MAPS = "maps"
+"""Attribute of the file: names of the triangulated maps, one a kind of features, in the folder of maps."""
+_NAMES = ("images", "references", "rejected")
+
+
+def _empty(dtype: Any, *shape: int) -> Any:
+    return field(default_factory=lambda: np.zeros((0, *shape), dtype))
+
+
+@dataclass(frozen=True)
+class Correspondences:
+    """K correspondences of a query device with the map, and the M places where references show their points."""
+
+    camera: Ints = _empty(np.int64)
+    """(K,) index of the query image."""
+    pixels: Floats = _empty(np.float64, 2)
+    """(K, 2) in the query image; the center of the top-left pixel is (0.5, 0.5)."""
+    points: Floats = _empty(np.float64, 3)
+    """(K, 3) in the world, meters."""
+    point_index: Ints = _empty(np.int64)
+    """(K,) index of the map point, those of several maps one after the other; -1: a point lifted by depth."""
+    inlier: NDArray[np.bool_] = _empty(np.bool_)
+    """(K,) whether the pose agrees with it."""
+    found_by: NDArray[np.str_] = _empty("U1")
+    """(K,) `<kind of features>/<descriptors, guided or lifted>`."""
+    view_of: Ints = _empty(np.int64)
+    """(M,) index of a correspondence."""
+    view_reference: Ints = _empty(np.int64)
+    """(M,) index of a reference that sees its point."""
+    view_pixels: Floats = _empty(np.float64, 2)
+    """(M, 2) where, in the reference."""
+
+    def __len__(self) -> int:
+        return len(self.camera)
+
+    def in_camera(self, camera: int) -> Ints:
+        """Return the indices of the correspondences of one query image."""
+        return np.flatnonzero(self.camera == camera)
+
+
+@dataclass(frozen=True)
+class LocalizedQuery:
+    """How one query device was localized."""
+
+    images: list[str] = field(default_factory=list)
+    """Names of the C query images."""
+    references: list[str] = field(default_factory=list)
+    """Names of the map images that the pose rests on, best first."""
+    rejected: list[str] = field(default_factory=list)
+    """Names of the references that contradict the others."""
+    correspondences: Correspondences = field(default_factory=Correspondences)
+
+    def arrays(self) -> dict[str, Any]:
+        """Return what a group of the file holds, by name."""
+        kept = dict(vars(self.correspondences))
+        labels, codes = np.unique(kept.pop("found_by"), return_inverse=True)
+        text = h5py.string_dtype()
+        names = {name: np.array(getattr(self, name), object).astype(text) for name in _NAMES}
+        # Pixels to a hundredth, points to a millimeter at 10 km: half the file.
+        kept |= {"pixels": kept["pixels"].astype(np.float32), "view_pixels": kept["view_pixels"].astype(np.float32)}
+        kept |= {key: kept[key].astype(np.int32) for key in ("camera", "point_index", "view_of", "view_reference")}
+        return kept | names | {"found_by": codes.astype(np.uint8), "found_by_labels": labels.astype(object).astype(text)}
+
+
+def query_group(timestamp: int, device_id: str) -> str:
+    """Return the name of a query's group; `/` in a device's id does not make another level."""
+    return f"{timestamp}/{device_id.replace('/', '-')}"
+
+
+class LocalizedQueries(Mapping[tuple[int, str], LocalizedQuery]):
+    """The queries of one pair, by timestamp and device id; each is read when it is asked for."""
+
+    def __init__(self, path: str | Path):
+        """
+        Args:
+            path: `poses/<pair>.h5`.
+
+        Raises:
+            ArtifactError: it is missing or torn.
+        """
+        self.path = Path(path)
+        try:
+            self._file = h5py.File(self.path, "r")
+        except OSError as error:
+            raise ArtifactError(
+                f"{self.path}: the correspondences of the poses cannot be read ({error}). Localize again."
+            ) from None
+        self.maps: list[str] = json.loads(self._file.attrs.get(MAPS, "[]"))
+        """Names of the triangulated maps that `point_index` counts through."""
+
+    def __contains__(self, key: object) -> bool:
+        return isinstance(key, tuple) and len(key) == 2 and query_group(*key) in self._file
+
+    def __getitem__(self, key: tuple[int, str]) -> LocalizedQuery:
+        name = query_group(*key)
+        if name not in self._file:
+            raise KeyError(key)
+        try:
+            stored = {name: item[()] for name, item in self._file[name].items()}
+            labels = np.array([label.decode() for label in stored.pop("found_by_labels")], np.str_)
+            codes = stored.pop("found_by").astype(np.int64)
+            names = {key: [text.decode() for text in stored.pop(key)] for key in _NAMES}
+            kinds = {key: np.float64 if array.dtype.kind == "f" else np.int64 for key, array in stored.items()}
+            kinds["inlier"] = np.bool_
+            arrays = {key: array.astype(kinds[key]) for key, array in stored.items()}
+        except (OSError, RuntimeError, KeyError) as error:  # what HDF5 raises for what is not its format
+            raise ArtifactError(f"{self.path} is damaged at {name} ({error}). Localize again.") from None
+        found_by = labels[codes] if len(labels) else np.zeros(0, "U1")
+        return LocalizedQuery(**names, correspondences=Correspondences(**arrays, found_by=found_by))
+
+    def __iter__(self) -> Iterator[tuple[int, str]]:
+        for timestamp, group in self._file.items():
+            for device_id in group:
+                yield int(timestamp), device_id
+
+    def __len__(self) -> int:
+        return sum(len(group) for group in self._file.values())
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
