@@ -24,31 +24,47 @@ MAPS = "maps"
 _NAMES = ("images", "references", "rejected")
 
 
-def _empty(dtype: Any, *shape: int) -> Any:
-    return field(default_factory=lambda: np.zeros((0, *shape), dtype))
+def _no_pixels() -> Floats:
+    return np.zeros((0, 2))
+
+
+def _no_points() -> Floats:
+    return np.zeros((0, 3))
+
+
+def _no_indices() -> Ints:
+    return np.zeros(0, np.int64)
+
+
+def _no_flags() -> NDArray[np.bool_]:
+    return np.zeros(0, np.bool_)
+
+
+def _no_labels() -> NDArray[np.str_]:
+    return np.zeros(0, "U1")
 
 
 @dataclass(frozen=True)
 class Correspondences:
     """K correspondences of a query device with the map, and the M places where references show their points."""
 
-    camera: Ints = _empty(np.int64)
+    camera: Ints = field(default_factory=_no_indices)
     """(K,) index of the query image."""
-    pixels: Floats = _empty(np.float64, 2)
+    pixels: Floats = field(default_factory=_no_pixels)
     """(K, 2) in the query image; the center of the top-left pixel is (0.5, 0.5)."""
-    points: Floats = _empty(np.float64, 3)
+    points: Floats = field(default_factory=_no_points)
     """(K, 3) in the world, meters."""
-    point_index: Ints = _empty(np.int64)
+    point_index: Ints = field(default_factory=_no_indices)
     """(K,) index of the map point, those of several maps one after the other; -1: a point lifted by depth."""
-    inlier: NDArray[np.bool_] = _empty(np.bool_)
+    inlier: NDArray[np.bool_] = field(default_factory=_no_flags)
     """(K,) whether the pose agrees with it."""
-    found_by: NDArray[np.str_] = _empty("U1")
+    found_by: NDArray[np.str_] = field(default_factory=_no_labels)
     """(K,) `<kind of features>/<descriptors, guided or lifted>`."""
-    view_of: Ints = _empty(np.int64)
+    view_of: Ints = field(default_factory=_no_indices)
     """(M,) index of a correspondence."""
-    view_reference: Ints = _empty(np.int64)
+    view_reference: Ints = field(default_factory=_no_indices)
     """(M,) index of a reference that sees its point."""
-    view_pixels: Floats = _empty(np.float64, 2)
+    view_pixels: Floats = field(default_factory=_no_pixels)
     """(M, 2) where, in the reference."""
 
     def __len__(self) -> int:
@@ -80,7 +96,8 @@ class LocalizedQuery:
         # Pixels to a hundredth, points to a millimeter at 10 km: half the file.
         kept |= {"pixels": kept["pixels"].astype(np.float32), "view_pixels": kept["view_pixels"].astype(np.float32)}
         kept |= {key: kept[key].astype(np.int32) for key in ("camera", "point_index", "view_of", "view_reference")}
-        return kept | names | {"found_by": codes.astype(np.uint8), "found_by_labels": labels.astype(object).astype(text)}
+        kept |= {"found_by": codes.astype(np.uint8), "found_by_labels": labels.astype(object).astype(text)}
+        return kept | names
 
 
 def query_group(timestamp: int, device_id: str) -> str:
@@ -121,9 +138,8 @@ class LocalizedQueries(Mapping[tuple[int, str], LocalizedQuery]):
             labels = np.array([label.decode() for label in stored.pop("found_by_labels")], np.str_)
             codes = stored.pop("found_by").astype(np.int64)
             names = {key: [text.decode() for text in stored.pop(key)] for key in _NAMES}
-            kinds = {key: np.float64 if array.dtype.kind == "f" else np.int64 for key, array in stored.items()}
-            kinds["inlier"] = np.bool_
-            arrays = {key: array.astype(kinds[key]) for key, array in stored.items()}
+            wide = {"f": np.float64, "i": np.int64, "b": np.bool_}
+            arrays = {key: array.astype(wide[array.dtype.kind]) for key, array in stored.items()}
         except (OSError, RuntimeError, KeyError) as error:  # what HDF5 raises for what is not its format
             raise ArtifactError(f"{self.path} is damaged at {name} ({error}). Localize again.") from None
         found_by = labels[codes] if len(labels) else np.zeros(0, "U1")
