@@ -212,17 +212,16 @@ def run_toolkit(job: Job, out: Path, precision: str) -> dict[str, Any]:
     # The stage is run as it is; what it loads is timed to tell it apart.
     embed.create_embedder = create_and_warm
     wall, cpu = clocks()
-    table = embed.embed_sessions(
-        job.sessions_root,
-        out,
-        model="megaloc",
-        checkpoint=str(job.weights),
-        compute_device=job.device,
-        dtype_compute=precision,
-        image_size=job.image_size,
-        batch_size=job.batch_size,
-        upright=False,
-    )
+    settings = {
+        "model": "megaloc",
+        "checkpoint": str(job.weights),
+        "compute_device": job.device,
+        "dtype_compute": precision,
+        "image_size": job.image_size,
+        "batch_size": job.batch_size,
+        "upright": False,
+    }
+    table = embed.embed_sessions(job.sessions_root, out, settings)
     ended = clocks()
     peak = peak_mb()
     session = Capture.from_sessions_root(job.sessions_root)["ios_map"]
@@ -323,7 +322,7 @@ def embed_shallow(folder: Path, count: int, threads: int) -> dict[str, float]:
     embed.create_embedder = made
     sessions_root = write_capture(folder / "MANY", [image] * count, (160, 120))
     started = time.perf_counter()
-    embed.embed_sessions(sessions_root, folder / "out", model="megaloc", upright=False)
+    embed.embed_sessions(sessions_root, folder / "out", settings={"model": "megaloc", "upright": False})
     return {"peak_mb": peak_mb(), "seconds": time.perf_counter() - started}
 
 

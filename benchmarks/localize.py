@@ -155,10 +155,9 @@ def localize_plainly(sessions_root: Path, run: Path, queries: str, threads: int)
 
     files = SceneFiles(run, sessions_root.parent.name)
     inner = _time_parts(localize)
-    localize.PnpSettings = partial(localize.PnpSettings, **PLAIN)
     started = _clocks()
     folders = (files.retrieval_dir, run / "plain_poses", files.features, files.maps)
-    localize.localize_pairs(sessions_root, *folders, queries=queries, workers=threads)
+    localize.localize_pairs(sessions_root, *folders, {"pnp": PLAIN}, queries=queries, workers=threads)
     return [float(value) for value in _clocks() - started - inner["features"] - inner["map"]]
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.calls import call
 from tests.models.test_megaloc import tiny_megaloc
 from toolkit.capture import Session, Trajectory, write_session
 from toolkit.capture.images import read_image
@@ -125,8 +126,8 @@ def test_reuse_and_resume(tiny: Path, tmp_path: Path) -> None:
     assert again.loc[~again["skipped"], "session"].tolist() == ["hl_map"]
     assert {path: path.read_bytes() for path in out.rglob("*.npy")} == before
 
-    assert not embed_sessions(tiny / "sessions", out, normalize=False)["skipped"].any()
-    assert not embed_sessions(tiny / "sessions", out, dtype="float16")["skipped"].any()
+    assert not embed_sessions(tiny / "sessions", out, settings={"normalize": False})["skipped"].any()
+    assert not embed_sessions(tiny / "sessions", out, settings={"dtype": "float16"})["skipped"].any()
     assert load_embeddings(out / "ios_map")[0].dtype == np.float32
 
 
@@ -148,14 +149,14 @@ def test_a_changed_query_or_map_image(tiny: Path, tmp_path: Path) -> None:
     [
         ({"device": "spot"}, "ios, hl"),
         ({"subsession": "nope"}, "ios_a"),
-        ({"dtype": "int8"}, "float16"),
-        ({"batch_size": 0}, "at least 1"),
-        ({"compute_device": "tpu"}, "auto, cpu, cuda"),
+        ({"dtype": "int8"}, "dtype"),
+        ({"batch_size": 0}, "batch_size"),
+        ({"compute_device": "tpu"}, "compute_device"),
     ],
 )
 def test_refused_parameters(tiny: Path, tmp_path: Path, parameters: dict[str, object], message: str) -> None:
     with pytest.raises(ManifestError, match=message):
-        embed_sessions(tiny / "sessions", tmp_path / "e", **parameters)  # type: ignore[arg-type]
+        call(embed_sessions, tiny / "sessions", tmp_path / "e", **parameters)  # type: ignore[arg-type]
 
 
 def test_no_map_no_vocabulary(tiny: Path, tmp_path: Path) -> None:
@@ -178,7 +179,7 @@ def megaloc(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, object
 def test_a_learned_embedder(tiny: Path, tmp_path: Path, megaloc: dict[str, object]) -> None:
     (tiny / "sessions/hl_map/raw_data/hl_a/images/left/1010.png").write_bytes(b"not an image")
     out = tmp_path / "run" / "e"
-    table = embed_sessions(tiny / "sessions", out, **megaloc)  # type: ignore[arg-type]
+    table = call(embed_sessions, tiny / "sessions", out, **megaloc)  # type: ignore[arg-type]
     assert table[["session", "embedded", "unreadable"]].to_numpy().tolist() == [
         ["ios_map", 6, 0], ["ios_query", 3, 0], ["hl_map", 11, 1], ["hl_query", 6, 0],
     ]  # fmt: skip
@@ -189,16 +190,16 @@ def test_a_learned_embedder(tiny: Path, tmp_path: Path, megaloc: dict[str, objec
         image = read_image(tiny.parent / manifest["abs_path"][row])
         np.testing.assert_allclose(matrix[row], embedder.embed([image])[0], atol=1e-6)
     assert pd.read_csv(out / "hl_map/hl_a/failed.csv")["timestamp"].tolist() == [1010]
-    assert embed_sessions(tiny / "sessions", out, **megaloc)["skipped"].all()  # type: ignore[arg-type]
+    assert call(embed_sessions, tiny / "sessions", out, **megaloc)["skipped"].all()  # type: ignore[arg-type]
     other = megaloc | {"image_size": 140}
-    assert not embed_sessions(tiny / "sessions", out, **other)["skipped"].any()  # type: ignore[arg-type]
+    assert not call(embed_sessions, tiny / "sessions", out, **other)["skipped"].any()  # type: ignore[arg-type]
 
 
 def test_half_precision_on_disk(tiny: Path, tmp_path: Path, megaloc: dict[str, object]) -> None:
     matrices = []
     for dtype in ("float32", "float16"):
         out = tmp_path / dtype
-        embed_sessions(tiny / "sessions", out, device="ios", dtype=dtype, **megaloc)  # type: ignore[arg-type]
+        call(embed_sessions, tiny / "sessions", out, device="ios", dtype=dtype, **megaloc)  # type: ignore[arg-type]
         matrices.append(np.load(out / "ios_map/ios_a/ios_a.npy"))
     assert [matrix.dtype for matrix in matrices] == [np.float32, np.float16]
     np.testing.assert_allclose(matrices[0], matrices[1], atol=1e-3)
@@ -209,7 +210,7 @@ def test_a_killed_run_goes_on_within_a_subsession(
 ) -> None:
     (tiny / "sessions/hl_map/raw_data/hl_a/images/left/1000.png").unlink()
     go = {"device": "hl", **megaloc}
-    embed_sessions(tiny / "sessions", tmp_path / "whole", **go)  # type: ignore[arg-type]
+    call(embed_sessions, tiny / "sessions", tmp_path / "whole", **go)  # type: ignore[arg-type]
     embed, seen = MegaLocEmbedder.embed, []
 
     def dies_at_the_third_batch(self: MegaLocEmbedder, inputs: list[np.ndarray]) -> np.ndarray:
@@ -220,7 +221,7 @@ def test_a_killed_run_goes_on_within_a_subsession(
 
     monkeypatch.setattr(MegaLocEmbedder, "embed", dies_at_the_third_batch)
     with pytest.raises(KeyboardInterrupt):
-        embed_sessions(tiny / "sessions", tmp_path / "e", **go)  # type: ignore[arg-type]
+        call(embed_sessions, tiny / "sessions", tmp_path / "e", **go)  # type: ignore[arg-type]
     assert not (tmp_path / "e/hl_map/hl_a/hl_a.npy").exists()
 
     def counts(self: MegaLocEmbedder, inputs: list[np.ndarray]) -> np.ndarray:
@@ -228,7 +229,7 @@ def test_a_killed_run_goes_on_within_a_subsession(
         return embed(self, inputs)
 
     monkeypatch.setattr(MegaLocEmbedder, "embed", counts)
-    table = embed_sessions(tiny / "sessions", tmp_path / "e", **go)  # type: ignore[arg-type]
+    table = call(embed_sessions, tiny / "sessions", tmp_path / "e", **go)  # type: ignore[arg-type]
     assert seen == [4, 4, 3, 4, 2], "11 images of the map, of which 8 were done, and 6 of the query"
     assert table["unreadable"].tolist() == [1, 0]
     for path in (tmp_path / "whole").rglob("*.*"):
@@ -241,15 +242,15 @@ def test_a_killed_run_goes_on_within_a_subsession(
 def test_no_weights_no_work(tiny: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     for options in ({}, {"checkpoint": str(tmp_path / "none.safetensors")}):
         with pytest.raises(WeightsError, match=r"model\.safetensors(.|\n)*`embed\.model: vlad`"):
-            embed_sessions(tiny / "sessions", tmp_path / "run" / "e", model="megaloc", **options)  # type: ignore[arg-type]
+            call(embed_sessions, tiny / "sessions", tmp_path / "run" / "e", model="megaloc", **options)  # type: ignore[arg-type]
     assert not (tmp_path / "run").exists()
-    table = embed_sessions(tiny / "sessions", tmp_path / "run" / "e", device="ios", model="auto")
+    table = embed_sessions(tiny / "sessions", tmp_path / "run" / "e", settings={"model": "auto"}, device="ios")
     assert set(table["model"]) == {"vlad"}
     assert "model auto: vlad" in caplog.text
 
 
 def test_auto_takes_the_learned_one_where_it_can(tiny: Path, tmp_path: Path, megaloc: dict[str, object]) -> None:
-    table = embed_sessions(tiny / "sessions", tmp_path / "e", **megaloc | {"model": "auto"})  # type: ignore[arg-type]
+    table = call(embed_sessions, tiny / "sessions", tmp_path / "e", **megaloc | {"model": "auto"})  # type: ignore[arg-type]
     assert set(table["model"]) == {"megaloc"}
 
 
@@ -277,9 +278,9 @@ def test_a_rolled_camera_is_described_as_an_upright_one(
     for name, capture, upright in (("as they are", tiny, None), ("turned", rolled, None), ("not", rolled, False)):
         out = tmp_path / name / "e"
         options = megaloc | {"upright": upright, "world_up": [0, -1, 0]}
-        tables.append(embed_sessions(capture / "sessions", out, **options))  # type: ignore[arg-type]
+        tables.append(call(embed_sessions, capture / "sessions", out, **options))  # type: ignore[arg-type]
         matrices[name] = np.load(out / "hl_query/hl_a/hl_a.npy")
-        retrieve_pairs(capture / "sessions", out, "ios", "hl", topk=3)
+        retrieve_pairs(capture / "sessions", out, settings={"topk": 3}, map_device="ios", query_device="hl")
         retrieved[name] = (tmp_path / name / "retrieval/TINY_map_ios_query_hl.jsonl").read_text()
     assert [table.set_index("session").loc["hl_query", "turned"] for table in tables] == [0, 3, 0]
     np.testing.assert_array_equal(matrices["turned"], matrices["as they are"])
@@ -314,7 +315,7 @@ def test_corrected_intrinsics_are_followed(tiny: Path, tmp_path: Path) -> None:
     right = sensors.read_text()
     width = str(Session.open(tiny / "sessions" / "ios_map").camera("ios_a/cam").width)
     sensors.write_text(right.replace(f", {width},", f", {int(width) + 2},"))
-    wrong = embed_sessions(tiny / "sessions", tmp_path / "e", device="ios", model="vlad", skip_existing=True)
+    wrong = embed_sessions(tiny / "sessions", tmp_path / "e", device="ios")
     assert wrong.iloc[0]["embedded"] < 6
     sensors.write_text(right)
     assert embed_sessions(tiny / "sessions", tmp_path / "e", device="ios").iloc[0]["embedded"] == 6

@@ -5,6 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.calls import call
 from toolkit.capture import Trajectory, write_session
 from toolkit.errors import ToolkitError
 from toolkit.evaluate import draw_evaluation, evaluate_scene, pose_errors, recall
@@ -145,7 +146,7 @@ def scene(tmp_path):
 
 
 def evaluate_ios(scene, **options):
-    return evaluate_scene(*scene, options.pop("out", None), map_device="ios", query_device="ios", **options)
+    return call(evaluate_scene, *scene, options.pop("out", None), map_device="ios", query_device="ios", **options)
 
 
 def test_scene_tables(scene, tmp_path):
@@ -218,8 +219,8 @@ def test_camera_errors_follow_the_rig(tmp_path):
     rows = [(0, "rig", make_pose(turned(4, "y"), [0, 0, 0]), "ok"), (1, "rig", None, "failed: x")]
     write_poses(poses, "map_hl_query_hl", rows)
     options = {"map_device": "hl", "query_device": "hl"}
-    device = evaluate_scene(sessions, poses, None, None, **options)
-    camera = evaluate_scene(sessions, poses, None, None, at="camera", **options)
+    device = call(evaluate_scene, sessions, poses, None, None, **options)
+    camera = call(evaluate_scene, sessions, poses, None, None, at="camera", **options)
     assert len(device.errors) == 2
     assert device.errors["translation_error_m"].tolist() == [0, np.inf]
     assert camera.errors["sensor_id"].tolist() == ["left", "right"] * 2

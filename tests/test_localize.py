@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.calls import call
 from toolkit import geometry, localize
 from toolkit.capture import Capture, Trajectory
 from toolkit.capture.images import read_image
@@ -34,7 +35,7 @@ def run_stage(capture: Path, files: SceneFiles, **more: object) -> pd.DataFrame:
     """Localize in the phone's map, one thread where nothing else is said."""
     options = {"map_device": "ios", "queries": LIST, "workers": 1} | more
     folders = (files.retrieval_dir, files.poses_dir, files.features, files.maps)
-    return localize_pairs(capture / "sessions", *folders, **options)  # type: ignore[arg-type]
+    return call(localize_pairs, capture / "sessions", *folders, **options)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")

@@ -76,16 +76,16 @@ def test_inherited_paths_count_from_the_file_that_has_them(tmp_path: Path, monke
     path = write_files(
         tmp_path,
         mine="inherits: bases/base.yaml\nembed: {checkpoint: mine.pt}",
-        bases__base="captures: [here, $DATA/a, ~/b, $HERE/c]\noutput_root: out\nlocalize: {checkpoint: its.pt,"
-        " features_checkpoint: features.pt, matcher_checkpoint: ~/matcher.pt}",
+        bases__base="captures: [here, $DATA/a, ~/b, $HERE/c]\noutput_root: out\nlocalize: {"
+        "predictor: {checkpoint: its.pt}, features: {checkpoint: features.pt}, matcher: {checkpoint: ~/matcher.pt}}",
     )
     manifest = load_manifest(path)
     bases = tmp_path / "bases"
     assert manifest.captures == [str(bases / "here"), "/data/a", "/home/me/b", str(bases / "near/c")]
     assert manifest.output_root == str(bases / "out")
-    assert manifest.localize.checkpoint == str(bases / "its.pt")
-    assert manifest.localize.features_checkpoint == str(bases / "features.pt")
-    assert manifest.localize.matcher_checkpoint == "/home/me/matcher.pt"
+    assert manifest.localize.predictor.checkpoint == str(bases / "its.pt")
+    assert manifest.localize.features.checkpoint == str(bases / "features.pt")
+    assert manifest.localize.matcher.checkpoint == "/home/me/matcher.pt"
     assert manifest.embed.checkpoint == str(tmp_path / "mine.pt")
     path = write_files(tmp_path, mine="inherits: bases/base.yaml\ncaptures: [a]", bases__base="captures: [$UNSET/a]")
     assert load_manifest(path).captures == [str(tmp_path / "a")], "what is replaced need not be known"
@@ -161,7 +161,7 @@ def test_overrides_are_yaml_and_win(tmp_path: Path) -> None:
             "either `hub` (owner/name) or `urls`",
         ),
         ("captures: [a]\ndataset: {page: p, license: l, sessions: [tango_map], sources: {}}", "found 'tango_map'"),
-        ("captures: [a]\ndataset: {page: p, license: l, sessions: [], sources: {}}", "dataset.sessions is empty"),
+        ("captures: [a]\ndataset: {page: p, license: l, sessions: [], sources: {}}", "dataset: sessions is empty"),
         ("captures: [a]\ndataset: {page: p, license: l, sessions: 3, sources: {}}", "dataset.sessions: found 3"),
         ("captures: [a]\ndataset: {page: p, sessions: [ios_map], sources: {}}", "dataset.license: not given"),
         (

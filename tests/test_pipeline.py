@@ -19,7 +19,7 @@ from safetensors.torch import save_file
 from toolkit import notebook, pipeline
 from toolkit.errors import ManifestError, ToolkitError, WeightsError
 from toolkit.files import SceneFiles
-from toolkit.manifest import STAGES, load_manifest
+from toolkit.manifest import STAGES, LocalizeSettings, RerankSettings, load_manifest
 from toolkit.pipeline import StageError
 
 DEFAULT = ("explore", "embed", "retrieve", "localize", "evaluate", "visualize")
@@ -185,9 +185,9 @@ def test_a_failing_cell_stops_with_its_message_and_the_notebook(
 
 
 def test_unknown_parameters_are_refused_before_anything_runs(place: Path) -> None:
-    # The manifest knows `dtype`, but this notebook does not.
+    # This notebook has neither `dtype` nor the dict `settings` for what has no parameter.
     with pytest.raises(
-        ManifestError, match=r"embed\.dtype: 02_embed\.ipynb has no such parameter\. .*Known: model"
+        ManifestError, match=r"embed\.settings: 02_embed\.ipynb has no such parameter\. .*Known: model"
     ):
         pipeline.run(place / "run.yaml", overrides=["embed.dtype=float16"])
     assert not (place / "runs").exists()
@@ -304,34 +304,35 @@ def test_other_weights_in_the_same_place_are_noticed(place: Path, go: Callable[.
 
 
 def test_the_weights_of_every_network_of_a_stage_are_asked_for() -> None:
-    def needed(**parameters: object) -> list[tuple[list[str], object]]:
-        found = pipeline._weights_needed("localize", parameters)
+    def needed(**settings: object) -> list[tuple[list[str], object]]:
+        found = pipeline._weights_needed("localize", LocalizeSettings.of(settings))
         return [([source.model for source in sources], place) for sources, place in found]
 
     assert needed() == needed(features=["sift"]) == needed(method="nearest", features=["superpoint"]) == []
-    assert needed(features=["sift", "superpoint"], matcher_checkpoint="/w/lg") == [
+    assert needed(features=["sift", "superpoint"], matcher={"checkpoint": "/w/lg"}) == [
         (["SuperPoint"], None), (["LightGlue"], "/w/lg")
     ]  # fmt: skip
-    assert needed(features=["superpoint"], matcher="mutual", features_checkpoint="sp") == [(["SuperPoint"], "sp")]
-    both = needed(method="hybrid", features=["superpoint"], checkpoint="vggt.pt")
+    features = {"kinds": ["superpoint"], "checkpoint": "sp"}
+    assert needed(features=features, matcher="mutual") == [(["SuperPoint"], "sp")]
+    both = needed(method="hybrid", features=["superpoint"], predictor={"checkpoint": "vggt.pt"})
     assert both[0] == (["VGGT-1B", "VGGT-1B-Commercial"], "vggt.pt")
     assert [models for models, _ in both[1:]] == [["SuperPoint"], ["LightGlue"]]
-    reranking = pipeline._weights_needed("rerank", {"features": "superpoint"})
+    reranking = pipeline._weights_needed("rerank", RerankSettings.of({"features": "superpoint"}))
     settings = [sources[0].setting for sources, _ in reranking]
-    assert settings == ["rerank.features_checkpoint", "rerank.matcher_checkpoint"]
-    assert pipeline._weights_needed("rerank", {}) == []
+    assert settings == ["rerank.features.checkpoint", "rerank.matcher.checkpoint"]
+    assert pipeline._weights_needed("rerank", RerankSettings()) == []
 
 
 @pytest.mark.parametrize("content", ["another model", "torn"])
 def test_weights_of_another_network_are_refused_before_anything_runs(tmp_path: Path, content: str) -> None:
     path = tmp_path / "weights.safetensors"
     save_file({"module.encoder.conv_blocks.0.conv_a.weight": torch.zeros(2)}, path)
-    parameters = {"features": ["superpoint"], "features_checkpoint": str(path)}
-    pipeline._require_weights("localize", parameters | {"matcher": "mutual"})
+    settings = LocalizeSettings.of({"features": {"kinds": ["superpoint"], "checkpoint": path}})
+    pipeline._require_weights("localize", LocalizeSettings.of(settings, {"matcher": "mutual"}))
     if content == "torn":
         path.write_bytes(path.read_bytes()[:-1])
-        setting, model = "features_checkpoint", "SuperPoint"
+        setting, model = "features.checkpoint", "SuperPoint"
     else:
-        setting, model = "matcher_checkpoint", "LightGlue"
+        setting, model = "matcher.checkpoint", "LightGlue"
     with pytest.raises(WeightsError, match=f"(?s)not weights of {model}.*`localize.{setting}`.*Or use .*`sift`"):
-        pipeline._require_weights("localize", parameters | {"matcher_checkpoint": str(path)})
+        pipeline._require_weights("localize", LocalizeSettings.of(settings, {"matcher": {"checkpoint": path}}))

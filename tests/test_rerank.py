@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from tests.calls import call
 from toolkit import rerank
 from toolkit.capture import Capture
 from toolkit.embed import embed_sessions
@@ -19,7 +20,8 @@ from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor
 from toolkit.features.matching import LocalMethod, MutualMatcher
 from toolkit.files import SceneFiles, read_references, sidecar_path
 from toolkit.geometry import invert, make_pose, transform
-from toolkit.rerank import VerifySettings, count_inliers, is_meaningful, rerank_pairs
+from toolkit.manifest import RerankSettings
+from toolkit.rerank import count_inliers, is_meaningful, rerank_pairs
 from toolkit.retrieve import retrieve_pairs
 
 WIDE = pycolmap.Camera(model="PINHOLE", width=960, height=720, params=[700, 700, 480, 360])
@@ -51,7 +53,7 @@ def two_views(count: int, right: int, seed: int = 0, center: tuple[float, float,
 @pytest.mark.parametrize("right", [40, 80, 200])
 def test_matches_of_one_scene_are_inliers(right: int) -> None:
     pixels_a, pixels_b, scores = two_views(200, right)
-    found = count_inliers(WIDE, pixels_a, BENT, pixels_b, scores, VerifySettings())
+    found = count_inliers(WIDE, pixels_a, BENT, pixels_b, scores, RerankSettings())
     assert 0.85 * right <= found <= right + 0.1 * (200 - right)
 
 
@@ -62,7 +64,7 @@ def test_distortion_is_taken_into_account() -> None:
     pixels_b = np.asarray(BENT.img_from_cam(transform(invert(turned(-8, (1.2, 0.1, 0.3))), points)))
     seen = ((pixels_a > 0) & (pixels_a < [960, 720]) & (pixels_b > 0) & (pixels_b < [640, 480])).all(axis=1)
     pixels_a, pixels_b, scores = pixels_a[seen], pixels_b[seen], np.ones(seen.sum())
-    settings = VerifySettings(max_error_deg=0.08)
+    settings = RerankSettings(max_error_deg=0.08)
     ideal = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=BENT.params[:4])
     assert count_inliers(WIDE, pixels_a, BENT, pixels_b, scores, settings) > 0.95 * seen.sum()
     assert count_inliers(WIDE, pixels_a, ideal, pixels_b, scores, settings) < 0.5 * seen.sum()
@@ -70,30 +72,30 @@ def test_distortion_is_taken_into_account() -> None:
 
 def test_a_camera_that_only_turned_still_agrees() -> None:
     pixels_a, pixels_b, scores = two_views(150, 150, center=(0, 0, 0))
-    assert count_inliers(WIDE, pixels_a, BENT, pixels_b, scores, VerifySettings()) > 120
+    assert count_inliers(WIDE, pixels_a, BENT, pixels_b, scores, RerankSettings()) > 120
 
 
 @pytest.mark.parametrize("count", [6, 12, 30, 100, 300, 800])
 def test_random_matches_count_nothing(count: int) -> None:
     for seed in range(5):
         pixels_a, pixels_b, scores = two_views(count, 0, seed)
-        assert count_inliers(WIDE, pixels_a, BENT, pixels_b, scores, VerifySettings(seed=seed), tests=30) == 0
+        assert count_inliers(WIDE, pixels_a, BENT, pixels_b, scores, RerankSettings(seed=seed), tests=30) == 0
 
 
 def test_what_shares_a_keypoint_counts_once() -> None:
     pixels_a, pixels_b, scores = two_views(60, 60)
-    once = count_inliers(WIDE, pixels_a, BENT, pixels_b, scores, VerifySettings())
+    once = count_inliers(WIDE, pixels_a, BENT, pixels_b, scores, RerankSettings())
     tripled = [np.repeat(values, 3, axis=0) for values in (pixels_a, pixels_b, scores)]
-    assert count_inliers(WIDE, tripled[0], BENT, tripled[1], tripled[2], VerifySettings()) <= once + 2
+    assert count_inliers(WIDE, tripled[0], BENT, tripled[1], tripled[2], RerankSettings()) <= once + 2
 
 
 def test_degenerate_matches_count_nothing_or_little() -> None:
     none = np.zeros((0, 2))
-    assert count_inliers(WIDE, none, BENT, none, np.zeros(0), VerifySettings()) == 0
+    assert count_inliers(WIDE, none, BENT, none, np.zeros(0), RerankSettings()) == 0
     pixels_a, pixels_b, scores = two_views(5, 5)
-    assert count_inliers(WIDE, pixels_a, BENT, pixels_b, scores, VerifySettings()) == 0
+    assert count_inliers(WIDE, pixels_a, BENT, pixels_b, scores, RerankSettings()) == 0
     one_place = np.full((50, 2), 100.0)
-    assert count_inliers(WIDE, one_place, BENT, one_place, np.ones(50), VerifySettings()) == 0
+    assert count_inliers(WIDE, one_place, BENT, one_place, np.ones(50), RerankSettings()) == 0
 
 
 def test_meaning_grows_with_inliers_and_shrinks_with_matches_and_tests() -> None:
@@ -128,7 +130,9 @@ def finished(small_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> S
     files = SceneFiles(tmp_path_factory.mktemp("run"), small_capture.name)
     sessions = small_capture / "sessions"
     embed_sessions(sessions, files.embeddings, features_dir=files.features)
-    retrieve_pairs(sessions, files.embeddings, "ios", "hl", files.retrieval_dir, topk=6, queries=LIST)
+    retrieve_pairs(
+        sessions, files.embeddings, files.retrieval_dir, {"topk": 6}, map_device="ios", query_device="hl", queries=LIST
+    )
     path = files.retrieval("ios", "hl")
     rows = read_references(path)
     for row in rows:  # the best come last, so that there is something to put right
@@ -150,7 +154,7 @@ def files(finished: SceneFiles, tmp_path: Path) -> SceneFiles:
 
 def run(capture: Path, files: SceneFiles, **more: Any) -> Any:
     options = {"map_device": "ios", "query_device": "hl", "topn": 6, "topk": 4, "workers": 1} | more
-    return rerank_pairs(capture / "sessions", files.retrieval_dir, files.features, files.reranked_dir, **options)
+    return call(rerank_pairs, capture / "sessions", files.retrieval_dir, files.features, files.reranked_dir, **options)
 
 
 def write(path: Path, rows: list[dict[str, Any]]) -> None:
@@ -270,8 +274,11 @@ def test_a_network_matches_all_references_of_a_query_at_once(
         return [LocalMethod("sift", SiftExtractor(), Network())]
 
     monkeypatch.setattr(rerank, "create_local_methods", create)
-    table = run(small_capture, files, features="superpoint", matcher="lightglue", matcher_checkpoint="glue.safetensors")
-    assert asked == [["superpoint"], "lightglue", None, "glue.safetensors", "auto", "auto"]
+    glue = {"name": "lightglue", "checkpoint": "glue.safetensors"}
+    table = run(small_capture, files, features="superpoint", matcher=glue)
+    features, matcher, *device = asked
+    assert (features.kinds, matcher.name, matcher.checkpoint) == (["superpoint"], "lightglue", "glue.safetensors")
+    assert device == ["auto", "auto"]
     assert not table["skipped"].item(), "other matches, another file"
     assert batches == [6] * table["queries"].item()
     assert reranked(files).read_bytes() == expected
@@ -294,7 +301,7 @@ def test_an_image_without_features_is_named(small_capture: Path, files: SceneFil
 
 
 def test_wrong_settings_and_files_are_refused(small_capture: Path, files: SceneFiles) -> None:
-    with pytest.raises(ManifestError, match="1 <= topk <= topn"):
+    with pytest.raises(ManifestError, match="topk is 7"):
         run(small_capture, files, topk=7)
     path = files.retrieval("ios", "hl")
     path.write_text(path.read_text() + "{}\n")
@@ -320,7 +327,7 @@ def test_map_images_in_memory_are_bounded(monkeypatch: pytest.MonkeyPatch) -> No
             read.append(name)
             return features
 
-    verifier = rerank.Verifier(VerifySettings(max_features=4), MutualMatcher(0.8))
+    verifier = rerank.Verifier(RerankSettings(max_features=4), MutualMatcher(0.8))
     for name in "abab":
         assert len(verifier._features(name, Store())) == 4  # type: ignore[arg-type]
     assert read == ["a", "b"]

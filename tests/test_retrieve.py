@@ -68,7 +68,7 @@ def lines(path: str | Path) -> list[dict]:
 
 
 def test_all_pairs(tiny: Path, tmp_path: Path) -> None:
-    table = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", topk=4)
+    table = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", settings={"topk": 4})
     assert table[["map_device", "query_device", "queries", "database"]].to_numpy().tolist() == [
         ["ios", "ios", 3, 6],
         ["ios", "hl", 6, 6],
@@ -95,13 +95,13 @@ def test_all_pairs(tiny: Path, tmp_path: Path) -> None:
 
 def test_backends_write_the_same_and_files_are_reused(tiny: Path, tmp_path: Path) -> None:
     retrieve_pairs(tiny / "sessions", tmp_path / "embeddings")
-    retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", out_jsonl=tmp_path / "torch", use_faiss=False)
+    retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", tmp_path / "torch", {"use_faiss": False})
     for path in (tmp_path / "retrieval").glob("*.jsonl"):
         assert path.read_bytes() == (tmp_path / "torch" / path.name).read_bytes()
     assert retrieve_pairs(tiny / "sessions", tmp_path / "embeddings")["skipped"].all()
-    assert not retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", topk=3)["skipped"].any()
-    embed_sessions(tiny / "sessions", tmp_path / "embeddings", dtype="float16")
-    assert not retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", topk=3)["skipped"].any()
+    assert not retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", settings={"topk": 3})["skipped"].any()
+    embed_sessions(tiny / "sessions", tmp_path / "embeddings", settings={"dtype": "float16"})
+    assert not retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", settings={"topk": 3})["skipped"].any()
 
 
 def test_missing_images_and_poses_are_reported(
@@ -113,7 +113,7 @@ def test_missing_images_and_poses_are_reported(
     poses.write_text("\n".join(poses.read_text().splitlines()[:-1]) + "\n")
     embed_sessions(tiny / "sessions", tmp_path / "embeddings", device="hl")
     out = tmp_path / "one.jsonl"
-    row = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", "hl", "hl", out).iloc[0]
+    row = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", out, map_device="hl", query_device="hl").iloc[0]
     assert (row["keyframes"], row["keyframes_missing"], row["queries"], row["images_missing"]) == (3, 1, 3, 3)
     assert (row["database"], row["unposed"]) == (10, 2)
     assert "1 of 3 keyframes have no embedded image" in caplog.text
@@ -124,9 +124,8 @@ def test_only_listed_keyframes(tiny: Path, tmp_path: Path) -> None:
     (tiny / "sessions" / "ios_query" / "proc" / "keyframes_few.txt").write_text(
         "1010, ios_a/cam\n1020, another_device\n"
     )
-    row = retrieve_pairs(
-        tiny / "sessions", tmp_path / "embeddings", "ios", "ios", queries="keyframes_few"
-    ).iloc[0]
+    devices = {"map_device": "ios", "query_device": "ios"}
+    row = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", queries="keyframes_few", **devices).iloc[0]
     assert (row["keyframes"], row["keyframes_missing"], row["queries"]) == (2, 1, 1)
     assert [record["timestamp"] for record in lines(row["path"])] == ["1010"]
 
@@ -136,13 +135,13 @@ def test_refused(tiny: Path, tmp_path: Path) -> None:
     with pytest.raises(ArtifactError, match=r"run the embed stage first.*--only embed"):
         retrieve_pairs(sessions, tmp_path / "nowhere")
     with pytest.raises(CaptureError, match=r"No map session of device 'spot'.*ios, hl"):
-        retrieve_pairs(sessions, embeddings, "spot")
+        retrieve_pairs(sessions, embeddings, map_device="spot")
     with pytest.raises(CaptureError, match="pruned_subsampled"):
         retrieve_pairs(sessions, embeddings, queries="nope")
     with pytest.raises(ManifestError, match="for 4 pairs"):
         retrieve_pairs(sessions, embeddings, out_jsonl=tmp_path / "one.jsonl")
     with pytest.raises(ManifestError, match="topk"):
-        retrieve_pairs(sessions, embeddings, topk=0)
+        retrieve_pairs(sessions, embeddings, settings={"topk": 0})
 
 
 def test_embeddings_that_do_not_fit(tiny: Path, tmp_path: Path) -> None:
@@ -151,10 +150,10 @@ def test_embeddings_that_do_not_fit(tiny: Path, tmp_path: Path) -> None:
     assert table["subsession"].unique().tolist() == ["ios_a"]
     np.save(folder / "ios_a.npy", matrix[:, :3])
     with pytest.raises(ArtifactError, match="different models"):
-        retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", "ios", "hl", skip_existing=False)
+        retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", query_device="hl", skip_existing=False)
     np.save(folder / "ios_a.npy", np.full_like(matrix, np.nan))
     with pytest.raises(ArtifactError, match="NaN"):
-        retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", "ios", "hl", skip_existing=False)
+        retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", query_device="hl", skip_existing=False)
     np.save(folder / "ios_a.npy", matrix[1:])
     with pytest.raises(ArtifactError, match=r"does not fit ios_a.npy"):
         load_embeddings(folder)
@@ -163,7 +162,7 @@ def test_embeddings_that_do_not_fit(tiny: Path, tmp_path: Path) -> None:
     manifest["abs_path"] = manifest["abs_path"].str.replace("1000", "9")
     manifest.to_csv(folder / "manifest.csv", index=False)
     with pytest.raises(ArtifactError, match="another capture"):
-        retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", "ios", "hl", skip_existing=False)
+        retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", query_device="hl", skip_existing=False)
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""The command line: `python -m toolkit run|report|check|record|download|submit|import|export|demo-data`."""
+"""The command line: `python -m toolkit run|settings|report|check|record|download|submit|import|export|demo-data`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -45,6 +45,22 @@ def run(
         print("Interrupted. The same command goes on from here.")
         raise typer.Exit(130) from None
     print(f"Report: {run_dir / 'report.html'}")
+
+
+@app.command()
+def settings(
+    stage: Annotated[str, typer.Argument(help="Only this stage, e.g. localize.")] = "",
+) -> None:
+    """Show all settings of a manifest, with meanings and defaults, as YAML that a manifest can hold."""
+    from toolkit.manifest import STAGES, Manifest, RerankSettings, describe, nearest
+
+    if stage and stage not in STAGES:
+        raise ManifestError(f"settings {stage}: no such stage. {nearest(stage, STAGES)}")
+    sections = {name: field.default for name, field in Manifest.model_fields.items()} | {"rerank": RerankSettings()}
+    if stage:
+        print("\n".join([f"{stage}:", *describe(type(sections[stage]), "  ")]))
+    else:
+        print("\n".join(describe(Manifest)))
 
 
 @app.command()

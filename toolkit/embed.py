@@ -2,8 +2,8 @@
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from toolkit.files import (
     write_atomic,
     write_sidecar,
 )
-from toolkit.models.compute import check_device_name
+from toolkit.manifest import EmbedSettings
 
 log = logging.getLogger(__name__)
 
@@ -40,22 +40,12 @@ VOCABULARY_IMAGES = 2048
 def embed_sessions(
     sessions_root: str | Path,
     out_dir: str | Path,
+    settings: EmbedSettings | Mapping[str, Any] | None = None,
+    *,
     device: str = "auto",
     subsession: str = "all",
-    batch_size: int = 8,
-    compute_device: str = "auto",
-    normalize: bool = True,
-    skip_existing: bool = True,
-    dtype: str = "float32",
-    model: str = "vlad",
-    checkpoint: str | None = None,
-    image_size: int = 322,
-    dtype_compute: str = "auto",
-    upright: bool | None = None,
-    world_up: Sequence[float] | None = None,
     features_dir: str | Path | None = None,
-    dim: int | None = None,
-    seed: int = 0,
+    skip_existing: bool = True,
 ) -> pd.DataFrame:
     """Write `<out_dir>/<session>/<subsession>/<subsession>.npy` (N, D) and its `manifest.csv`.
 
@@ -65,22 +55,11 @@ def embed_sessions(
     Args:
         sessions_root: `<capture>/sessions`.
         out_dir: the embeddings folder; the vocabulary goes there too.
+        settings: see `EmbedSettings`; a dict holds what differs from the defaults.
         device: `ios`, `hl`, `spot`, or `auto`: all that the capture has.
         subsession: one subsession's name, or `all`.
-        batch_size: images a batch.
-        compute_device: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`: where a network runs. `vlad` runs on the CPU.
-        normalize: L2-normalize the rows.
-        skip_existing: reuse subsessions made from the same images and settings.
-        dtype: `float32` or `float16`, of the files.
-        model: an embedder's name; `auto`: `megaloc` if its weights are on this machine, else `vlad`.
-        checkpoint: file with the weights of a learned model; None: the hub's cache, else a download.
-        image_size: side of the square that a learned model sees, a multiple of 14 for `megaloc`.
-        dtype_compute: `float32`, `bfloat16`, `float16`, or `auto`: what is fast where the network runs.
-        upright: turn images so that gravity points down; None: for learned models. `vlad` does not need it.
-        world_up: the direction (3,) that is up in the map's world; None: estimated from its cameras.
         features_dir: folder of the local features that stages share; `<out_dir>/../features` where None.
-        dim: most dimensions of `vlad`; its default where None.
-        seed: of the vocabulary.
+        skip_existing: reuse subsessions made from the same images and settings.
 
     Returns:
         One row a subsession: session, subsession, images, embedded, unreadable, turned, seconds, skipped, model,
@@ -90,27 +69,13 @@ def embed_sessions(
         ManifestError: a parameter is not valid.
         WeightsError: a learned model has no weights, or other ones; before any work.
     """
-    if dtype not in ("float32", "float16"):
-        raise ManifestError(f"dtype is {dtype!r}; expected float32 or float16.")
-    if batch_size < 1:
-        raise ManifestError(f"batch_size is {batch_size}; expected at least 1.")
-    check_device_name(compute_device)
+    settings = EmbedSettings.of(settings)
     out_dir = Path(out_dir)
     features_dir = Path(features_dir) if features_dir is not None else out_dir.parent / "features"
     capture = Capture.from_sessions_root(sessions_root)
     jobs = _jobs(capture, device, subsession)
-    name = resolve_name(model, checkpoint)
-    if model == "auto":
-        log.warning("model auto: %s", name)
-    if name == "vlad":
-        embedder = create_embedder(
-            name, vocabulary=_vocabulary(capture, out_dir, features_dir, dim, seed, skip_existing)
-        )
-    else:
-        embedder = create_embedder(
-            name, checkpoint=checkpoint, device=compute_device, dtype_compute=dtype_compute, image_size=image_size
-        )
-    turns = _turns(capture, embedder, upright, world_up)
+    embedder = _open_embedder(capture, settings, out_dir, features_dir, skip_existing)
+    turns = _turns(capture, embedder, settings)
     if subsession == "all":
         _remove_former(out_dir, _session_names(capture, device), jobs)
 
@@ -132,17 +97,17 @@ def embed_sessions(
             "images": _images_fingerprint(session, rows),
             "sensors": file_fingerprint(session.path / "sensors.txt"),
             "turns": fingerprint(job.turns.tolist()) if job.turns.any() else None,
-            "normalize": normalize,
-            "dtype": dtype,
+            "normalize": settings.normalize,
+            "dtype": settings.dtype,
         }
         skipped = skip_existing and (folder / "manifest.csv").exists() and is_current(matrix_path, record)
         if skipped:
             embedded = len(np.load(matrix_path, mmap_mode="r"))
         else:
             # The same images in batches of another size are the same up to rounding.
-            identity = {**record, "batch_size": batch_size}
-            with MatrixWriter(matrix_path, embedder.dim, dtype, identity, resume=skip_existing) as writer:
-                failed = _embed_job(embedder, job, writer, batch_size, normalize, store_of)
+            identity = {**record, "batch_size": settings.batch_size}
+            with MatrixWriter(matrix_path, embedder.dim, settings.dtype, identity, resume=skip_existing) as writer:
+                failed = _embed_job(embedder, job, writer, settings.batch_size, settings.normalize, store_of)
                 embedded = writer.count
                 _write_tables(folder, _manifest(capture, session, rows, failed), failed)
                 writer.finish()
@@ -160,7 +125,7 @@ def embed_sessions(
                 "turned": int(np.count_nonzero(job.turns)),
                 "seconds": round(time.perf_counter() - started, 3),
                 "skipped": skipped,
-                "model": name,
+                "model": embedder.name,
                 "dim": embedder.dim,
             }
         )
@@ -177,13 +142,29 @@ class _Job:
     turns: NDArray[np.int64]
 
 
-def _turns(
-    capture: Capture, embedder: Embedder, upright: bool | None, world_up: Sequence[float] | None
-) -> Turns | None:
+def _open_embedder(
+    capture: Capture, settings: EmbedSettings, out_dir: Path, features_dir: Path, skip_existing: bool
+) -> Embedder:
+    name = resolve_name(settings.model, settings.checkpoint)
+    if settings.model == "auto":
+        log.warning("model auto: %s", name)
+    if name == "vlad":
+        return create_embedder(name, vocabulary=_vocabulary(capture, out_dir, features_dir, settings, skip_existing))
+    return create_embedder(
+        name,
+        checkpoint=settings.checkpoint,
+        device=settings.compute_device,
+        dtype_compute=settings.dtype_compute,
+        image_size=settings.image_size,
+    )
+
+
+def _turns(capture: Capture, embedder: Embedder, settings: EmbedSettings) -> Turns | None:
     """Return how images are turned upright, or None where they are taken as they are."""
-    if embedder.inputs == "features" or not (embedder.upright if upright is None else upright):
+    upright = embedder.upright if settings.upright is None else settings.upright
+    if embedder.inputs == "features" or not upright:
         return None
-    return upright_turns(capture, world_up)
+    return upright_turns(capture, settings.world_up)
 
 
 def _session_names(capture: Capture, device: str) -> list[str]:
@@ -231,27 +212,26 @@ def _remove_former(
 
 
 def _vocabulary(
-    capture: Capture, out_dir: Path, features_dir: Path, dim: int | None, seed: int, skip_existing: bool
+    capture: Capture, out_dir: Path, features_dir: Path, settings: EmbedSettings, skip_existing: bool
 ) -> Path:
     """Learn the VLAD vocabulary from the map images of all devices, unless a current one is there."""
-    from toolkit.embedders.vlad import Vlad, VladSettings
+    from toolkit.embedders.vlad import Vlad
 
     maps = [capture[name] for name in capture if capture[name].split == "map"]
     if not maps:
         raise ToolkitError(
             f"{capture.path}/sessions has no <device>_map session; `vlad` learns its vocabulary from the map."
         )
-    settings = VladSettings() if dim is None else VladSettings(dim=dim)
     every = [(session.id, int(row)) for session in maps for row in session.camera_rows]
     picked = np.linspace(0, len(every) - 1, min(len(every), VOCABULARY_IMAGES)).astype(int).tolist()
     chosen: dict[str, list[int]] = {}
     for name, row in (every[index] for index in picked):
         chosen.setdefault(name, []).append(row)
     record = {
-        "vlad": asdict(settings),
+        "vlad": settings.vlad.model_dump(),
         "features": SiftExtractor().settings,
         "images": {name: _images_fingerprint(capture[name], np.array(rows)) for name, rows in chosen.items()},
-        "seed": seed,
+        "seed": settings.seed,
     }
     path = out_dir / "vlad.npz"
     if skip_existing and is_current(path, record):
@@ -267,7 +247,7 @@ def _vocabulary(
         for name, image in tqdm(keys, desc="vocabulary", unit="image"):
             yield stores[name][image]
 
-    vlad = Vlad.learn(features, len(keys), settings, seed)
+    vlad = Vlad.learn(features, len(keys), settings.vlad, settings.seed)
     vlad.save(path)
     write_sidecar(path, record)
     return path

@@ -17,6 +17,7 @@ from toolkit.capture.tables import read_query_table
 from toolkit.errors import ArtifactError, CaptureError, ToolkitError
 from toolkit.files import image_name, pair_name, read_references, write_atomic, write_sidecar
 from toolkit.geometry import invert, pose_error, transform
+from toolkit.manifest import EvaluateSettings
 from toolkit.show.figures import ORANGE, SKY, VERMILLION, new_figure, save_figure, styled
 
 if TYPE_CHECKING:
@@ -130,13 +131,11 @@ def evaluate_scene(
     poses_dir: str | Path,
     retrieval_dir: str | Path | None,
     out_dir: str | Path | None,
+    settings: EvaluateSettings | Mapping[str, Any] | None = None,
+    *,
     map_device: str = "all",
     query_device: str = "all",
     queries: str = "keyframes_pruned_subsampled",
-    thresholds: Sequence[Sequence[float]] = THRESHOLDS,
-    retrieval_ks: Sequence[int] = (1, 5, 10),
-    retrieval_radius_m: float = 8.0,
-    retrieval_angle_deg: float = 45.0,
     at: str = "device",
     pairs: Sequence[Sequence[str]] | None = None,
     reranked_dir: str | Path | None = None,
@@ -151,13 +150,9 @@ def evaluate_scene(
         poses_dir: folder of `SCENE_map_<M>_query_<Q>.txt`, and `.csv` where there is one.
         retrieval_dir: folder of `SCENE_map_<M>_query_<Q>.jsonl`; None skips retrieval recall.
         out_dir: where `{recall,errors,retrieval,losses,overlap}.csv` and the figures go; None: nowhere.
+        settings: see `EvaluateSettings`; a dict holds what differs from the defaults.
         map_device: `all` or one device key; likewise `query_device`.
         queries: the keyframe list that is asked; all of it is the denominator.
-        thresholds: pairs (degrees, meters).
-        retrieval_ks: numbers of references that retrieval recall looks at.
-        retrieval_radius_m: a good reference is a map image at most so far from the query's true camera,
-        retrieval_angle_deg: and looks in a direction at most so different. The roll about the viewing
-            direction does not count: a rolled camera sees the same things.
         at: `device` has one error a query device; `camera` one a camera image of it, as the benchmark's own
             code evaluates rigs.
         pairs: only these [map device, query device]; None: all.
@@ -170,7 +165,8 @@ def evaluate_scene(
     """
     if at not in ("device", "camera"):
         raise ToolkitError(f"Unknown at={at!r}. Known: device, camera.")
-    pairs_of_thresholds = tuple((float(degrees), float(meters)) for degrees, meters in thresholds)
+    settings = EvaluateSettings.of(settings)
+    pairs_of_thresholds = tuple((float(degrees), float(meters)) for degrees, meters in settings.thresholds)
     capture = Capture.from_sessions_root(sessions_root)
     map_devices = _devices(capture, "map", map_device)
     rows: dict[str, list[dict[str, Any]]] = {"recall": [], "retrieval": [], "losses": []}
@@ -191,8 +187,8 @@ def evaluate_scene(
             good = None
             if retrieval_dir is not None:
                 path = Path(retrieval_dir if reranked_dir is None else reranked_dir) / f"{name}.jsonl"
-                limits = (retrieval_radius_m, retrieval_angle_deg)
-                row, good = _retrieval_recall(path, keys, truth, capture[f"{map_}_map"], retrieval_ks, limits)
+                limits = (settings.retrieval_radius_m, settings.retrieval_angle_deg)
+                row, good = _retrieval_recall(path, keys, truth, capture[f"{map_}_map"], settings.retrieval_ks, limits)
                 rows["retrieval"].append({**pair, **row})
                 if good is None:
                     messages.append(f"{name}: {row['state']}, so a miss is not put down to retrieval.")
@@ -224,12 +220,8 @@ def evaluate_scene(
     for message in evaluation.messages:
         logger.warning(message)
     if out_dir is not None:
-        settings = {
-            "poses": str(poses_dir), "queries": queries, "thresholds": pairs_of_thresholds, "at": at,
-            "retrieval_ks": list(retrieval_ks), "retrieval_radius_m": retrieval_radius_m,
-            "retrieval_angle_deg": retrieval_angle_deg, "messages": evaluation.messages,
-        }  # fmt: skip
-        write_evaluation(evaluation, out_dir, settings)
+        record = {"poses": str(poses_dir), "queries": queries, "at": at, **settings.model_dump()}
+        write_evaluation(evaluation, out_dir, record | {"messages": evaluation.messages})
     return evaluation
 
 

@@ -2,8 +2,8 @@
 
 import logging
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import default_workers, prefetch, read_image
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import Embedder, create_embedder, load_embeddings
-from toolkit.errors import ArtifactError, ImageError, ManifestError
+from toolkit.errors import ArtifactError, ImageError
 from toolkit.features.features import (
     KINDS,
     FeatureStore,
@@ -44,17 +44,15 @@ from toolkit.files import (
 from toolkit.localizers.hybrid import HybridLocalizer
 from toolkit.localizers.lifting import DepthLifter
 from toolkit.localizers.mapped import Known, MappedFeatures
-from toolkit.localizers.mapping import LocalMap, MapSettings, build_map, map_path, map_settings
-from toolkit.localizers.pnp import PnpLocalizer, PnpSettings, PoseEstimate
+from toolkit.localizers.mapping import LocalMap, build_map, map_path, map_settings
+from toolkit.localizers.pnp import PnpLocalizer, PoseEstimate
 from toolkit.localizers.prediction import Predictor, View
 from toolkit.localizers.predictors import create_predictor
-from toolkit.localizers.vggt import VggtAnswer, VggtLocalizer, VggtQuery, VggtSettings
+from toolkit.localizers.vggt import VggtAnswer, VggtLocalizer, VggtQuery
+from toolkit.manifest import LocalizeSettings
 
 log = logging.getLogger(__name__)
 
-METHODS = ("pnp", "nearest", "vggt", "hybrid")
-PREDICTING = ("vggt", "hybrid")
-"""Methods that need a predictor."""
 COLUMNS = [
     "timestamp", "device_id", "status", "method", "num_inliers", "num_matches", "inlier_ratio", "num_guided",
     "rmse_px", "rival_support", "position_std_m", "rotation_std_deg", "references", "seconds",
@@ -63,85 +61,19 @@ PREDICTION_COLUMNS = ["scale_std", "rejected", "reason"]
 """Further columns of the methods that predict."""
 
 
-@dataclass(frozen=True)
-class PredictorSettings:
-    """What predicts cameras, and what it is shown; the arguments of `localize_pairs` of the same names."""
-
-    predictor: str = "vggt"
-    checkpoint: str | Path | None = None
-    num_references: int = 5
-    candidates: int | None = None
-    compute_device: str = "auto"
-    dtype_compute: str = "auto"
-    batch_size: int = 4
-    upright: bool = True
-    world_up: Sequence[float] | None = None
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("num_references", "candidates", "batch_size"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ManifestError(f"{name} is {value}; expected 1 or more.")
-
-    @property
-    def references(self) -> VggtSettings:
-        """How references are chosen and used."""
-        return VggtSettings(self.num_references, self.candidates)
-
-    def open(self, capture: Capture, map_dir: str | Path) -> Predictor:
-        """Return the predictor for the images of a capture; warn of one that looks up the answers.
-
-        Raises:
-            ManifestError: unknown predictor, device or precision.
-            WeightsError: no weights; says what to do.
-        """
-        predictor = create_predictor(
-            self.predictor,
-            sessions=[capture[key] for key in capture.session_ids] if self.predictor == "simulated" else (),
-            map_dir=map_dir,
-            checkpoint=self.checkpoint,
-            compute_device=self.compute_device,
-            dtype_compute=self.dtype_compute,
-            seed=self.seed,
-        )
-        if predictor.simulated:
-            log.warning(
-                "predictor: %s looks up the true poses of the queries. What comes out is no result.", self.predictor
-            )
-        return predictor
-
-    def turns(self, capture: Capture) -> Turns | None:
-        """Return what makes the images of a capture upright, None where they are shown as they are."""
-        return upright_turns(capture, self.world_up) if self.upright else None
-
-
 def localize_pairs(
     sessions_root: str | Path,
     retrieval_dir: str | Path,
     out_dir: str | Path,
     features_dir: str | Path,
     map_dir: str | Path,
+    settings: LocalizeSettings | Mapping[str, Any] | None = None,
+    *,
     map_device: str = "all",
     query_device: str = "all",
-    method: str = "pnp",
     queries: str = "keyframes_pruned_subsampled",
     skip_existing: bool = True,
     workers: int = 0,
-    seed: int = 0,
-    predictor: str = "vggt",
-    checkpoint: str | Path | None = None,
-    num_references: int = 5,
-    candidates: int | None = None,
-    compute_device: str = "auto",
-    dtype_compute: str = "auto",
-    batch_size: int = 4,
-    upright: bool = True,
-    world_up: Sequence[float] | None = None,
-    features: Sequence[str] = ("sift",),
-    matcher: str | None = None,
-    features_checkpoint: str | Path | None = None,
-    matcher_checkpoint: str | Path | None = None,
 ) -> pd.DataFrame:
     """Write, for every pair of devices, the poses of the queries (`.txt`) and how they came about (`.csv`).
 
@@ -151,28 +83,11 @@ def localize_pairs(
         out_dir: folder of the poses.
         features_dir: folder of local features, shared with the embed stage.
         map_dir: folder of the triangulated maps, `<device>_map.npz`, and of matches.
+        settings: see `LocalizeSettings`; a dict holds what differs from the defaults.
         map_device, query_device: `ios`, `hl`, `spot`, or `all` that the capture has.
-        method: `pnp`; the baseline `nearest`: the pose of the best reference, marked so in the table; `vggt`: the
-            pose of a network that is shown the query and references, aligned to the map; or `hybrid`: the better
-            supported of `pnp` and that, each helped by the other.
         queries: the keyframe list that says which devices are asked for, or `all`.
         skip_existing: reuse what was made from the same inputs and settings, and go on where a run was killed.
         workers: threads; 0 takes the number of cores, at most 8.
-        seed: of RANSAC. Equal seeds give equal files, whatever the number of threads.
-        predictor: of `vggt` and `hybrid`: the network `vggt`, or `simulated`, which looks up true poses: for tests
-            and for trying things out; every row then says so.
-        checkpoint: file with the network's weights; None: the hub's cache, else a download.
-        num_references: map images that the network is shown with each query image.
-        candidates: retrieved images to choose them from, the best so many; None: all.
-        compute_device: where networks run: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
-        dtype_compute: of networks: `auto`, `float32`, `bfloat16`, `float16`.
-        batch_size: query devices that the network is given at once. Rows do not depend on it.
-        upright: show the network images turned so that gravity points down.
-        world_up: the direction (3,) that is up in the map's world; None: estimated from its cameras.
-        features: kinds of local features, `sift` or `superpoint`. Of several, the matches are pooled in one pose.
-        matcher: of queries with references, `mutual` or `lightglue`, for the kinds that it suits; None: what is usual
-            for each kind.
-        features_checkpoint, matcher_checkpoint: files with the weights of their networks; None: as for `checkpoint`.
 
     Returns:
         One row a pair: map_device, query_device, queries, ok, low_confidence, failed, seconds, skipped, path.
@@ -183,23 +98,18 @@ def localize_pairs(
         CaptureError: unknown device or list.
         ArtifactError: the retrieval of a pair is missing.
     """
-    if method not in METHODS:
-        raise ManifestError(f"Unknown method {method!r}. Known: {', '.join(METHODS)}.")
-    prediction = PredictorSettings(
-        predictor, checkpoint, num_references, candidates, compute_device, dtype_compute, batch_size, upright,
-        world_up, seed,
-    )  # fmt: skip
+    settings = LocalizeSettings.of(settings)
+    method = settings.method
     capture = Capture.from_sessions_root(sessions_root)
-    settings = PnpSettings(seed=seed)
     workers = workers or default_workers()
     guide: _Guide | None = None
     kinds: list[LocalMethod] = []
     if method != "nearest":
         kinds = create_local_methods(
-            features, matcher, features_checkpoint, matcher_checkpoint, compute_device, dtype_compute
+            settings.features, settings.matcher, settings.compute_device, settings.dtype_compute
         )
-    if method in PREDICTING:
-        guide = _Guide(prediction.open(capture, map_dir), prediction, prediction.turns(capture))
+    if settings.predicts:
+        guide = _Guide(_open_predictor(settings, capture, map_dir), settings, _turns(settings, capture))
     table = []
     with threadpool_limits(1, "blas"):  # queries are the parallel dimension, and sums stay in one order
         for mapped in capture.devices_with("map", map_device):
@@ -207,7 +117,7 @@ def localize_pairs(
             for asked in capture.devices_with("query", query_device):
                 started = time.perf_counter()
                 pair = _Pair(capture, mapped, asked, Path(retrieval_dir), Path(out_dir), queries)
-                record = pair.record(settings, method, kinds)
+                record = pair.record(settings, kinds)
                 if guide is not None:
                     record |= guide.record(capture[f"{mapped}_map"])
                 skipped = skip_existing and is_current(pair.txt, record) and pair.csv.exists()
@@ -215,7 +125,7 @@ def localize_pairs(
                     if solver is None:
                         session = capture[f"{mapped}_map"]
                         folders = Path(features_dir), Path(map_dir)
-                        solver = _open_solver(session, *folders, settings, method, kinds, guide, workers, skip_existing)
+                        solver = _open_solver(session, *folders, settings, kinds, guide, workers, skip_existing)
                     rows = _localize_pair(pair, solver, *folders, record, workers, skip_existing)
                     _write_poses(pair, rows, COLUMNS if guide is None else [*COLUMNS, *PREDICTION_COLUMNS])
                     write_sidecar(pair.txt, record)
@@ -234,19 +144,41 @@ def localize_pairs(
     return pd.DataFrame(table)
 
 
+def _open_predictor(settings: LocalizeSettings, capture: Capture, map_dir: str | Path) -> Predictor:
+    """Return the predictor for the images of a capture; warn of one that looks up the answers."""
+    name = settings.predictor.name
+    predictor = create_predictor(
+        name,
+        sessions=[capture[key] for key in capture.session_ids] if name == "simulated" else (),
+        map_dir=map_dir,
+        checkpoint=settings.predictor.checkpoint,
+        compute_device=settings.compute_device,
+        dtype_compute=settings.dtype_compute,
+        seed=settings.seed,
+    )
+    if predictor.simulated:
+        log.warning("predictor: %s looks up the true poses of the queries. What comes out is no result.", name)
+    return predictor
+
+
+def _turns(settings: LocalizeSettings, capture: Capture) -> Turns | None:
+    """Return what makes the images of a capture upright, None where they are shown as they are."""
+    return upright_turns(capture, settings.world_up) if settings.predictor.upright else None
+
+
 @dataclass(frozen=True)
 class _Guide:
     """What predicts, and how it is asked."""
 
     predictor: Predictor
-    settings: PredictorSettings
+    settings: LocalizeSettings
     turns: Turns | None
 
     def record(self, mapped: Session) -> dict[str, Any]:
         """Return what poses in the map of a session depend on, besides what those of `pnp` do."""
         predictor = {"name": self.predictor.name} | self.predictor.settings
         turns = None if self.turns is None else self.turns.record()
-        vggt = asdict(self.settings.references)
+        vggt = self.settings.predictor.model_dump(exclude={"name", "checkpoint", "batch_size"})
         return {"predictor": predictor, "vggt": vggt, "turns": turns, "depths": mapped.depths_fingerprint}
 
 
@@ -305,15 +237,15 @@ class _Pair:
     def session(self) -> Session:
         return self.capture[f"{self.query_device}_query"]
 
-    def record(self, settings: PnpSettings, method: str, kinds: Sequence[LocalMethod]) -> dict[str, Any]:
+    def record(self, settings: LocalizeSettings, kinds: Sequence[LocalMethod]) -> dict[str, Any]:
         """Return what the poses depend on."""
         keyframes = self.session.keyframes(self.queries)
         if not self.retrieval.exists():
             read_references(self.retrieval)  # says what is missing
         return {
-            "method": method,
-            "pnp": asdict(settings),
-            "map": map_settings(MapSettings(seed=settings.seed)),
+            "method": settings.method,
+            "pnp": settings.pnp.model_dump() | {"seed": settings.seed},
+            "map": map_settings(settings.map, settings.seed),
             "features": [kind.extractor.settings for kind in kinds],
             "matchers": [kind.matcher.settings for kind in kinds],
             "retrieval": file_fingerprint(self.retrieval),
@@ -339,14 +271,14 @@ def _open_solver(
     session: Session,
     features_dir: Path,
     map_dir: Path,
-    settings: PnpSettings,
-    method: str,
+    settings: LocalizeSettings,
     kinds: Sequence[LocalMethod],
     guide: _Guide | None,
     workers: int,
     skip_existing: bool,
 ) -> _Solver:
     """Return the localizers of a map session; its triangulated maps are built or loaded where they need them."""
+    method = settings.method
     if method == "nearest":
         return _Solver()
     stores, mapped = [], []
@@ -354,15 +286,17 @@ def _open_solver(
         store = extract_session(session, features_dir, kind.extractor, workers=workers)
         inputs = fingerprint([session_fingerprint(session), store.fingerprint])
         path = map_path(map_dir, session.id, kind.name)
-        local_map = build_map(session, store, path, MapSettings(seed=settings.seed), skip_existing, inputs, workers)
+        local_map = build_map(
+            session, store, path, settings.map, settings.seed, skip_existing, inputs, workers
+        )
         stores.append(store)
         mapped.append(MappedFeatures(local_map, store, KINDS[kind.name], kind.matcher))
-    pnp = PnpLocalizer.of(mapped, settings)
+    pnp = PnpLocalizer.of(mapped, settings.pnp, settings.seed)
     if guide is None:
         return _Solver(pnp, kinds, stores, method=method)
-    vggt = VggtLocalizer(mapped[0].map, session, guide.predictor, guide.settings.references, guide.turns)
+    vggt = VggtLocalizer(mapped[0].map, session, guide.predictor, settings.predictor, guide.turns)
     return _Solver(
-        pnp if method == "hybrid" else None, kinds, stores, vggt, method, guide.settings.batch_size, guide.turns
+        pnp if method == "hybrid" else None, kinds, stores, vggt, method, settings.predictor.batch_size, guide.turns
     )
 
 
@@ -632,10 +566,9 @@ def explain_query(
     map_dir: str | Path,
     map_device: str,
     query_device: str,
-    settings: PredictorSettings | None = None,
+    settings: LocalizeSettings | None = None,
     queries: str = "keyframes_pruned_subsampled",
     index: int = 0,
-    features: Sequence[str] = ("sift",),
 ) -> tuple[VggtLocalizer, VggtQuery, VggtAnswer]:
     """Ask the predictor about one query of a finished run again, and return all that it said.
 
@@ -651,10 +584,10 @@ def explain_query(
     """
     capture = Capture.from_sessions_root(sessions_root)
     pair = _Pair(capture, map_device, query_device, Path(retrieval_dir), Path(retrieval_dir), queries)
-    local_map = LocalMap.load(map_path(map_dir, f"{map_device}_map", features[0]))
-    settings = settings or PredictorSettings()
-    network, turns = settings.open(capture, map_dir), settings.turns(capture)
-    localizer = VggtLocalizer(local_map, capture[f"{map_device}_map"], network, settings.references, turns)
+    settings = settings or LocalizeSettings()
+    local_map = LocalMap.load(map_path(map_dir, f"{map_device}_map", settings.features.kinds[0]))
+    network, turns = _open_predictor(settings, capture, map_dir), _turns(settings, capture)
+    localizer = VggtLocalizer(local_map, capture[f"{map_device}_map"], network, settings.predictor, turns)
     rows = pair.session.rows_of_keyframes(pair.session.keyframes(queries).iloc[[index]])[0]
     query = _vggt_query(pair.session, _read_query(pair.session, rows, pair.references(), turns), local_map)
     return localizer, query, localizer.localize([query])[0]

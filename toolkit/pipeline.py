@@ -32,7 +32,17 @@ from toolkit.errors import ManifestError, ToolkitError
 from toolkit.exchange.download import is_unfinished
 from toolkit.features.matching import LOCAL_WEIGHTS, matchers_of
 from toolkit.files import SceneFiles, files_fingerprint, fingerprint, write_text
-from toolkit.manifest import STAGES, Manifest, load_manifest, nearest
+from toolkit.manifest import (
+    STAGES,
+    EmbedSettings,
+    LocalizeSettings,
+    Manifest,
+    RerankSettings,
+    Settings,
+    load_manifest,
+    nearest,
+)
+from toolkit.manifest.messages import nested_model
 from toolkit.models.weights import VGGT, WeightsSource, check_weights, find_any, resolve_any
 from toolkit.notebook import (
     COUNTS_MIME,
@@ -61,6 +71,7 @@ class Job:
 
     stage: str
     files: SceneFiles
+    settings: Settings
     parameters: dict[str, Any]
     label: str = ""
     """Which part of the stage, where it takes several executions; its outputs have it in their path."""
@@ -123,14 +134,16 @@ def run(
 
 def _run(manifest: Manifest, manifest_path: str | Path, only: str | None, force: bool, say: Say) -> Path:
     _require_downloads(manifest, manifest_path)
-    for stage in STAGES:  # a wrong key stops the run before hours of work, not after
-        check_parameters(notebook_path(stage), manifest.stage(stage).given(), f"{manifest_path}: {stage}.")
+    for stage in STAGES:  # a notebook that lacks a parameter stops the run before hours of work, not after
+        path = notebook_path(stage)
+        given = settings_parameters(manifest.stage(stage), notebook_parameters(path))
+        check_parameters(path, given, f"{manifest_path}: {stage}.")
     manifest = _name_embedder(manifest, say)
     run_dir = Path(manifest.output_root) / manifest.name
     stages = [only] if only else [stage for stage in STAGES if stage in manifest.stages]
     for stage in stages:
         if not any(run_dir.glob(f"*/.stages/{stage}*.json")):
-            _require_weights(stage, manifest.stage(stage).given())
+            _require_weights(stage, manifest.stage(stage))
     captures = _captures(manifest)
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
@@ -145,10 +158,10 @@ def _run(manifest: Manifest, manifest_path: str | Path, only: str | None, force:
     inputs = {capture.name: tree_fingerprint(capture / "sessions") for capture in captures}
     for job in jobs:
         # Asked first: to tell whether a job is reusable, all files of its outputs are looked at.
-        if _weights_needed(job.stage, job.parameters) and (
+        if _weights_needed(job.stage, job.settings) and (
             force or not _reusable(job, _inputs_of(job, inputs[job.files.scene]))
         ):
-            _require_weights(job.stage, job.parameters)
+            _require_weights(job.stage, job.settings)
     log = RunLog(run_dir, manifest, inputs)
     try:
         for i, job in enumerate(jobs, 1):
@@ -303,37 +316,38 @@ def tree_fingerprint(folder: Path, part: str = "") -> str:
 def _name_embedder(manifest: Manifest, say: Say) -> Manifest:
     """Return the manifest with the embedder that `auto` stands for; refuses an unknown one."""
     settings = manifest.embed
-    if settings.model is None:
-        return manifest
     name = resolve_name(settings.model, settings.checkpoint)
     if name != settings.model:
         say(f"embed.model {settings.model}: {name}")
     return manifest.model_copy(update={"embed": settings.model_copy(update={"model": name})})
 
 
-def _require_weights(stage: str, parameters: dict[str, Any]) -> None:
+def _require_weights(stage: str, settings: Settings) -> None:
     """Find or download the weights that a stage needs, before hours of work and where its progress is seen."""
-    for sources, checkpoint in _weights_needed(stage, parameters):
+    for sources, checkpoint in _weights_needed(stage, settings):
         check_weights(sources[0], resolve_any(sources, checkpoint))
 
 
-def _weights_needed(stage: str, parameters: dict[str, Any]) -> list[tuple[tuple[WeightsSource, ...], str | None]]:
-    """Return the weights of each network that a stage runs with these parameters: any of some will do, or the file."""
-    checkpoint = parameters.get("checkpoint")
-    if stage == "embed" and parameters.get("model") in EMBEDDER_WEIGHTS:
-        return [((EMBEDDER_WEIGHTS[parameters["model"]],), checkpoint)]
-    method = parameters.get("method", "pnp")
-    if stage not in ("rerank", "localize") or method == "nearest":
-        return []
+def _weights_needed(stage: str, settings: Settings) -> list[tuple[tuple[WeightsSource, ...], str | None]]:
+    """Return the weights of each network that a stage runs with these settings: any of some will do, or the file."""
+    if isinstance(settings, EmbedSettings):
+        weights = EMBEDDER_WEIGHTS.get(settings.model)
+        return [] if weights is None else [((weights,), settings.checkpoint)]
     needed: list[tuple[tuple[WeightsSource, ...], str | None]] = []
-    if method in ("vggt", "hybrid") and parameters.get("predictor", "vggt") == "vggt":
-        needed.append((VGGT, checkpoint))
-    features = parameters.get("features") or "sift"  # of reranking one, of localizing several
-    names = matchers_of([features] if isinstance(features, str) else features, parameters.get("matcher"))
-    for key, used in (("features", names.keys()), ("matcher", names.values())):
-        for name in sorted({*used} & LOCAL_WEIGHTS.keys()):
-            source = replace(LOCAL_WEIGHTS[name], setting=f"{stage}.{key}_checkpoint")
-            needed.append(((source,), parameters.get(f"{key}_checkpoint")))
+    if isinstance(settings, LocalizeSettings):
+        if settings.method == "nearest":
+            return []
+        if settings.predicts and settings.predictor.name == "vggt":
+            needed.append((VGGT, settings.predictor.checkpoint))
+    elif not isinstance(settings, RerankSettings):
+        return []
+    matchers = matchers_of(settings.features.kinds, settings.matcher.name)
+    for key, names, checkpoint in (
+        ("features", matchers.keys(), settings.features.checkpoint),
+        ("matcher", matchers.values(), settings.matcher.checkpoint),
+    ):
+        for name in sorted({*names} & LOCAL_WEIGHTS.keys()):
+            needed.append(((replace(LOCAL_WEIGHTS[name], setting=f"{stage}.{key}.checkpoint"),), checkpoint))
     return needed
 
 
@@ -366,29 +380,40 @@ def _jobs(manifest: Manifest, stage: str, capture: Path, files: SceneFiles, forc
         "sessions_root": capture / "sessions",
         "out_dir": stage_outputs(files, stage),
         "queries": manifest.queries,
-        "seed": manifest.seed,
-        "world_up": manifest.world_up,
     }
     if manifest.rerank is not None:
-        values |= _with_reranking(manifest, stage, files)
+        reranked = {"localize": "retrieval_dir", "evaluate": "reranked_dir"}
+        values |= {name: files.reranked_dir for of, name in reranked.items() if of == stage}
     if force:
         values["skip_existing"] = False
     known = notebook_parameters(notebook_path(stage))
     for label, choice in _parts(manifest, stage, capture):
         parameters = {name: value for name, value in (values | choice).items() if name in known}
-        parameters |= manifest.stage(stage).given()
         plain = {name: str(value) if isinstance(value, Path) else value for name, value in parameters.items()}
-        yield Job(stage, files, plain, label)
+        settings = manifest.stage(stage)
+        yield Job(stage, files, settings, plain | settings_parameters(settings, known), label)
 
 
-def _with_reranking(manifest: Manifest, stage: str, files: SceneFiles) -> dict[str, Any]:
-    """Return what the rerank stage changes for another: how many images are retrieved, and which are localized with."""
-    if stage == "retrieve":
-        settings = notebook_parameters(notebook_path("rerank")) | manifest.stage("rerank").given()
-        return {"topk": settings["topn"]}
-    if stage == "localize":
-        return {"retrieval_dir": files.reranked_dir}
-    return {"reranked_dir": files.reranked_dir} if stage == "evaluate" else {}
+def settings_parameters(settings: Settings, known: Iterable[str]) -> dict[str, Any]:
+    """Return settings as a notebook takes them: those that its parameters cell names, and a dict of the rest.
+
+    Args:
+        settings: only what was said in them counts.
+        known: names of the notebook's parameters.
+    """
+    named: dict[str, Any] = {}
+    rest: dict[str, Any] = {}
+    for key, value in settings.given().items():
+        inner = nested_model(type(settings).model_fields[key].annotation)
+        if key not in known:
+            rest[key] = value
+        elif inner is not None and issubclass(inner, Settings) and isinstance(value, dict):
+            if inner.shorthand in value:
+                named[key] = value.pop(inner.shorthand)
+            rest |= {key: value} if value else {}
+        else:
+            named[key] = value
+    return named | ({"settings": rest} if rest else {})
 
 
 def _parts(manifest: Manifest, stage: str, capture: Path) -> list[tuple[str, dict[str, Any]]]:
@@ -430,7 +455,7 @@ def _inputs_of(job: Job, capture: str) -> str:
 
 def _weights_of(job: Job) -> str | None:
     """Return what identifies the file with the weights that a job uses, None if it uses none or has none yet."""
-    needed = _weights_needed(job.stage, job.parameters)
+    needed = _weights_needed(job.stage, job.settings)
     paths = [path for sources, checkpoint in needed if (path := find_any(sources, checkpoint))]
     return files_fingerprint([path.resolve() for path in paths]) if paths else None
 

@@ -8,8 +8,8 @@ import json
 import logging
 import time
 from collections import OrderedDict
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -25,7 +25,7 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
 from toolkit.capture.images import default_workers, prefetch
-from toolkit.errors import ArtifactError, ManifestError
+from toolkit.errors import ArtifactError
 from toolkit.features.features import Extractor, FeatureStore, LocalFeatures, extract_session
 from toolkit.features.matching import LocalMethod, Matcher, create_local_methods
 from toolkit.files import (
@@ -38,6 +38,7 @@ from toolkit.files import (
     write_sidecar,
     write_text,
 )
+from toolkit.manifest import RerankSettings
 
 log = logging.getLogger(__name__)
 
@@ -47,37 +48,17 @@ MAP_IMAGES_KEPT = 256
 """Map images whose features stay in memory: some 60 MB."""
 
 
-@dataclass(frozen=True)
-class VerifySettings:
-    """How a query image is compared with a map image; part of the fingerprint of what is reranked."""
-
-    max_features: int = 1536
-    """Features of an image that are matched at most, the strongest."""
-    max_error_deg: float = 0.2
-    """Largest Sampson error of an inlier, as an angle seen from the camera."""
-    max_trials: int = 500
-    """Samples of five matches, the best matches first."""
-    seed: int = 0
-
-
 def rerank_pairs(
     sessions_root: str | Path,
     retrieval_dir: str | Path,
     features_dir: str | Path,
     out_dir: str | Path,
+    settings: RerankSettings | Mapping[str, Any] | None = None,
+    *,
     map_device: str = "all",
     query_device: str = "all",
-    topn: int = 30,
-    topk: int = 10,
-    features: str = "sift",
-    matcher: str | None = None,
-    features_checkpoint: str | Path | None = None,
-    matcher_checkpoint: str | Path | None = None,
-    compute_device: str = "auto",
-    dtype_compute: str = "auto",
     skip_existing: bool = True,
     workers: int = 0,
-    seed: int = 0,
 ) -> pd.DataFrame:
     """Write, for every pair of devices, the retrieved map images of each query image in order of verified inliers.
 
@@ -91,17 +72,10 @@ def rerank_pairs(
         retrieval_dir: folder of the retrieval stage's files.
         features_dir: folder of local features, shared with the other stages.
         out_dir: folder of the reranked files.
+        settings: see `RerankSettings`; a dict holds what differs from the defaults.
         map_device, query_device: `ios`, `hl`, `spot`, or `all` that the capture has.
-        topn: retrieved images that are verified, the best so many of those in the file.
-        topk: references kept of them.
-        features: kind of local features, `sift` or `superpoint`.
-        matcher: `mutual` or `lightglue`; None: what is usual for the features.
-        features_checkpoint, matcher_checkpoint: files with the weights of their networks; None: the hub's cache, else a
-            download.
-        compute_device, dtype_compute: of networks, see `toolkit.models.compute`.
         skip_existing: reuse what was made from the same inputs and settings, and go on where a run was killed.
         workers: threads; 0 takes the number of cores, at most 8.
-        seed: of RANSAC. Equal seeds give equal files, whatever the number of threads.
 
     Returns:
         One row a pair: map_device, query_device, queries (images) = confirmed + kept, changed (confirmed ones that have
@@ -113,12 +87,10 @@ def rerank_pairs(
         CaptureError: unknown device.
         ArtifactError: the retrieval of a pair is missing, torn, or of another capture.
     """
-    if not 1 <= topk <= topn:
-        raise ManifestError(f"topk is {topk} and topn {topn}; expected 1 <= topk <= topn.")
+    settings = RerankSettings.of(settings)
     capture = Capture.from_sessions_root(sessions_root)
-    settings = VerifySettings(seed=seed)
     method = create_local_methods(
-        [features], matcher, features_checkpoint, matcher_checkpoint, compute_device, dtype_compute
+        settings.features, settings.matcher, settings.compute_device, settings.dtype_compute
     )[0]
     workers = workers or default_workers()
     table = []
@@ -131,11 +103,11 @@ def rerank_pairs(
                 for asked in capture.devices_with("query", query_device):
                     started = time.perf_counter()
                     pair = _Pair(capture, mapped, asked, Path(retrieval_dir), Path(out_dir))
-                    record = pair.record(settings, method, topn, topk)
+                    record = pair.record(settings, method)
                     skipped = skip_existing and is_current(pair.path, record)
                     if not skipped:
                         rows = _rerank_pair(
-                            pair, verifier, method.extractor, Path(features_dir), topn, topk, record, workers,
+                            pair, verifier, method.extractor, Path(features_dir), settings, record, workers,
                             skip_existing,
                         )  # fmt: skip
                         write_text(pair.path, "".join(json.dumps(row) + "\n" for row in rows))
@@ -158,7 +130,7 @@ class Verifier:
     Safe to use from several threads. The features of the map images used last are kept.
     """
 
-    def __init__(self, settings: VerifySettings, matcher: Matcher):
+    def __init__(self, settings: RerankSettings, matcher: Matcher):
         self.settings = settings
         self.matcher = matcher
         self._kept: OrderedDict[str, LocalFeatures] = OrderedDict()
@@ -218,7 +190,7 @@ def count_inliers(
     camera_b: pycolmap.Camera,
     pixels_b: NDArray[np.floating],
     scores: NDArray[np.floating],
-    settings: VerifySettings,
+    settings: RerankSettings,
     tests: int = 1,
 ) -> int:
     """Return how many matches agree with one essential matrix, or 0 where chance would give as many.
@@ -315,7 +287,7 @@ class _Pair:
     def sessions(self) -> tuple[Session, Session]:
         return self.capture[f"{self.map_device}_map"], self.capture[f"{self.query_device}_query"]
 
-    def record(self, settings: VerifySettings, method: LocalMethod, topn: int, topk: int) -> dict[str, Any]:
+    def record(self, settings: RerankSettings, method: LocalMethod) -> dict[str, Any]:
         """Return what the reranked file depends on."""
         if not self.retrieval.exists():
             read_references(self.retrieval)  # says what is missing
@@ -323,9 +295,9 @@ class _Pair:
             "retrieval": file_fingerprint(self.retrieval),
             "features": method.extractor.settings,
             "matcher": method.matcher.settings,
-            "verify": asdict(settings),
-            "topn": topn,
-            "topk": topk,
+            **settings.model_dump(
+                exclude={"features", "matcher", "compute_device", "dtype_compute"}  # told by the two below
+            ),
             "images": [session.files_fingerprint for session in self.sessions],
             "sensors": [file_fingerprint(session.path / "sensors.txt") for session in self.sessions],
         }
@@ -336,8 +308,7 @@ def _rerank_pair(
     verifier: Verifier,
     extractor: Extractor,
     features_dir: Path,
-    topn: int,
-    topk: int,
+    settings: RerankSettings,
     record: dict[str, Any],
     workers: int,
     skip_existing: bool,
@@ -346,17 +317,17 @@ def _rerank_pair(
     queries = read_references(pair.retrieval, "path")
     map_session, query_session = pair.sessions
     asked = _rows_of(query_session, [_name(query) for query in queries], pair.retrieval)
-    names = list(dict.fromkeys(_name(found) for query in queries for found in query["topk"][:topn]))
+    names = list(dict.fromkeys(_name(found) for query in queries for found in query["topk"][: settings.topn]))
     known = _rows_of(map_session, names, pair.retrieval)
     query_store = extract_session(query_session, features_dir, extractor, rows=asked, workers=workers)
     map_store = extract_session(map_session, features_dir, extractor, rows=known, workers=workers)
 
     def rerank(query: dict[str, Any]) -> dict[str, Any]:
         try:
-            return _reranked(query, verifier, query_session, query_store, map_session, map_store, topn, topk)
+            return _reranked(query, verifier, query_session, query_store, map_session, map_store)
         except Exception as error:  # one bad query never ends a run
             log.exception("reranking %s", query["path"])
-            return _kept(query, topk, f"{type(error).__name__}: {error}")
+            return _kept(query, settings.topk, f"{type(error).__name__}: {error}")
 
     with open_progress(pair.progress, record, keep=skip_existing) as progress:
         done = {_key(row): row for row in progress.rows}
@@ -381,9 +352,8 @@ def _reranked(
     query_store: FeatureStore,
     map_session: Session,
     map_store: FeatureStore,
-    topn: int,
-    topk: int,
 ) -> dict[str, Any]:
+    topn, topk = verifier.settings.topn, verifier.settings.topk
     if _name(query) not in query_store:
         return _kept(query, topk, query_store.failed.get(_name(query), "no local features of the query image"))
     found = query["topk"][:topn]

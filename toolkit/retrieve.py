@@ -3,7 +3,7 @@
 import json
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -25,6 +25,7 @@ from toolkit.files import (
     write_atomic,
     write_sidecar,
 )
+from toolkit.manifest import RetrieveSettings
 from toolkit.models.compute import resolve_device
 
 log = logging.getLogger(__name__)
@@ -95,14 +96,11 @@ def search(
 def retrieve_pairs(
     sessions_root: str | Path,
     map_feats_root: str | Path,
+    out_jsonl: str | Path | None = None,
+    settings: RetrieveSettings | Mapping[str, Any] | None = None,
+    *,
     map_device: str = "all",
     query_device: str = "all",
-    out_jsonl: str | Path | None = None,
-    topk: int = 10,
-    use_faiss: bool = True,
-    faiss_gpu: bool = False,
-    normalize: bool = True,
-    compute_device: str = "auto",
     queries: str = "keyframes_pruned_subsampled",
     skip_existing: bool = True,
 ) -> pd.DataFrame:
@@ -111,13 +109,9 @@ def retrieve_pairs(
     Args:
         sessions_root: `<capture>/sessions`.
         map_feats_root: the embeddings folder, of map and query sessions.
-        map_device, query_device: `ios`, `hl`, `spot`, or `all` that the capture has.
         out_jsonl: a folder, or for one pair a file `*.jsonl`; `<map_feats_root>/../retrieval` where None.
-        topk: references a query image.
-        use_faiss: search with faiss, else with torch; the result is the same.
-        faiss_gpu: search with a faiss built for GPUs.
-        normalize: L2-normalize before the search, so that scores are cosines.
-        compute_device: where torch computes: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
+        settings: see `RetrieveSettings`; a dict holds what differs from the defaults.
+        map_device, query_device: `ios`, `hl`, `spot`, or `all` that the capture has.
         queries: the keyframe list that says which devices are asked for, or `all`.
         skip_existing: reuse files made from the same embeddings, poses and settings.
 
@@ -129,8 +123,7 @@ def retrieve_pairs(
     Raises:
         ToolkitError: see the message: unknown device or list, embeddings missing or of different dimensions.
     """
-    if topk < 1:
-        raise ManifestError(f"topk is {topk}; expected at least 1.")
+    settings = RetrieveSettings.of(settings)
     capture = Capture.from_sessions_root(sessions_root)
     maps = capture.devices_with("map", map_device)
     askers = capture.devices_with("query", query_device)
@@ -156,14 +149,14 @@ def retrieve_pairs(
                 "map": _inputs(session, embeddings),
                 "query": _inputs(query.session, embeddings),
                 "rows": fingerprint(query.rows.tolist()),
-                "topk": topk,
-                "normalize": normalize,
+                "topk": settings.topk,
+                "normalize": settings.normalize,
             }
             skipped = skip_existing and is_current(path, record)
             if database is None:
                 database = _load_database(session, embeddings)
             if not skipped:
-                _write_pair(path, query, database, topk, normalize, use_faiss, faiss_gpu, compute_device)
+                _write_pair(path, query, database, settings)
                 write_sidecar(path, record)
             table.append(
                 {
@@ -257,11 +250,7 @@ def _write_pair(
     path: Path,
     query: _Images,
     database: _Images,
-    topk: int,
-    normalize: bool,
-    use_faiss: bool,
-    faiss_gpu: bool,
-    compute_device: str,
+    settings: RetrieveSettings,
 ) -> None:
     pair = f"map {database.session.id}, query {query.session.id}"
     if query.vectors.shape[1] != database.vectors.shape[1]:
@@ -269,10 +258,15 @@ def _write_pair(
             f"{pair}: the map's embeddings have {database.vectors.shape[1]} dimensions, the query's "
             f"{query.vectors.shape[1]}. They are of different models: embed both again with one."
         )
-    asked, known = (_unit(part.vectors) if normalize else part.vectors for part in (query, database))
+    asked, known = (_unit(part.vectors) if settings.normalize else part.vectors for part in (query, database))
     try:
         scores, indices = search(
-            asked, known, topk, "faiss" if use_faiss else "torch", compute_device, faiss_gpu
+            asked,
+            known,
+            settings.topk,
+            "faiss" if settings.use_faiss else "torch",
+            settings.compute_device,
+            settings.faiss_gpu,
         )
     except ValueError as error:
         raise ArtifactError(f"{pair}: {error}") from error

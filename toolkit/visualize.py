@@ -1,7 +1,7 @@
 """The visualize stage: recordings and still pictures of a scene, from the files that other stages left."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +20,7 @@ from toolkit.features.features import FeatureStore, extract_session
 from toolkit.files import pair_name
 from toolkit.localizers.mapping import LocalMap
 from toolkit.localizers.pnp import PnpLocalizer, PoseEstimate
+from toolkit.manifest import VisualizeSettings
 from toolkit.show.localization_view import Localizations, QueryDetails, ShownImage, record_localizations
 from toolkit.show.recordings import SessionRecording, record_session, session_tracks, sure_points
 from toolkit.show.stills import WorstQuery, draw_localization, draw_scene_png, draw_worst
@@ -88,15 +89,10 @@ def visualize_scene(
     features_dir: str | Path,
     map_dir: str | Path,
     out_dir: str | Path,
+    settings: VisualizeSettings | Mapping[str, Any] | None = None,
+    *,
     map_device: str = "all",
     query_device: str = "all",
-    samples: int = 2,
-    recordings: bool = True,
-    matched_queries: int = 12,
-    session_recordings: bool = True,
-    keyframes_only: bool = False,
-    every: int | None = None,
-    world_up: ArrayLike | None = None,
     pairs: Sequence[Sequence[str]] | None = None,
 ) -> pd.DataFrame:
     """Draw every pair of a scene, and record every pair and session for the rerun viewer.
@@ -111,15 +107,9 @@ def visualize_scene(
         features_dir: folder of local features.
         map_dir: folder of the triangulated maps; a device without one is drawn without points.
         out_dir: where pictures and recordings go.
+        settings: see `VisualizeSettings`; a dict holds what differs from the defaults. A query session without ground
+            truth shows its cameras where they were localized.
         map_device: `all` or one device key; likewise `query_device`.
-        samples: queries shown of each pair, from the least to the best supported.
-        recordings: whether to write recordings of the pairs.
-        matched_queries: queries of each pair that the recording shows with references and matches, the worst first.
-        session_recordings: whether to write recordings of the sessions. A query session without ground truth shows
-            its cameras where they were localized.
-        keyframes_only: sessions' recordings hold only the query sessions' keyframes.
-        every: and only every so many frames; None: so that a session has at most 1000 images.
-        world_up: direction (3,) that is up; None: estimated from the cameras.
         pairs: only these [map device, query device]; None: all.
 
     Returns:
@@ -128,6 +118,7 @@ def visualize_scene(
     Raises:
         ArtifactError: there are no poses at all.
     """
+    settings = VisualizeSettings.of(settings)
     capture, out = Capture.from_sessions_root(sessions_root), Path(out_dir)
     maps = [d for d in capture.devices if f"{d}_map" in capture and map_device in ("all", d)]
     askers = [d for d in capture.devices if f"{d}_query" in capture and query_device in ("all", d)]
@@ -152,28 +143,27 @@ def visualize_scene(
                     results.estimated,
                     results.true,
                     out / f"{name}.png",
-                    up=world_up,
+                    up=settings.world_up,
                     title=f"{q} queries in the {m} map, seen from above",
                     map_tracks=session_tracks(shown.session),
                     query_tracks=session_tracks(results.session),
                 )
-                _draw_samples(out / f"localization_{name}", located, samples)
+                _draw_samples(out / f"localization_{name}", located, settings.samples)
                 recording = out / f"{name}.rrd"
-                if recordings:
-                    _record(recording, located, matched_queries, world_up)
+                if settings.recordings:
+                    _record(recording, located, settings.matched_queries, settings.world_up)
                 worst += [(located, int(k)) for k in located.localizations.worst_first()[:WORST]]
                 row: dict[str, Any] = {"map_device": m, "query_device": q, "queries": len(results.table)}
                 row["localized"] = int(np.isfinite(results.world_from_rig).all((1, 2)).sum())
                 row["seconds"] = round(time.perf_counter() - started, 3)
-                row |= {"still": str(out / f"{name}.png"), "recording": str(recording) if recordings else ""}
+                row |= {"still": str(out / f"{name}.png"), "recording": str(recording) if settings.recordings else ""}
                 table.append(row)
                 bar.update()
     _draw_worst(out / f"worst_{capture.name}.png", capture.name, worst)
-    if session_recordings:
+    if settings.session_recordings:
         sides = dict.fromkeys((*((m, "map") for m, _ in found), *((q, "query") for _, q in found)))
         for device, split in sides:
-            _record_session(out, capture, device, split, found, Path(poses_dir), Path(map_dir),
-                            keyframes_only, every, world_up)  # fmt: skip
+            _record_session(out, capture, device, split, found, Path(poses_dir), Path(map_dir), settings)
     return pd.DataFrame(table)
 
 
@@ -285,9 +275,7 @@ def _record_session(
     found: dict[tuple[str, str], _Results],
     poses_dir: Path,
     map_dir: Path,
-    keyframes_only: bool,
-    every: int | None,
-    world_up: ArrayLike | None,
+    settings: VisualizeSettings,
 ) -> SessionRecording:
     session = capture[f"{device}_{split}"]
     poses = None
@@ -299,13 +287,13 @@ def _record_session(
         capture.path,
         split,
         device,
-        keyframes_only=keyframes_only and split == "query",
-        every=every or 1 + len(session.images) // MAX_FRAMES,
+        keyframes_only=settings.keyframes_only and split == "query",
+        every=settings.every or 1 + len(session.images) // MAX_FRAMES,
         vis_retrieve_queries=poses is not None,
         queries_pose=poses,
         out=out / f"{capture.name}_{session.id}.rrd",
         map_dir=map_dir,
-        world_up=world_up,
+        world_up=settings.world_up,
         progress=False,
     )
 

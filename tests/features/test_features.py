@@ -6,7 +6,6 @@ import shutil
 import signal
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -32,6 +31,7 @@ from toolkit.features.features import (
 )
 from toolkit.features.matching import mutual_matches, similarity, unit_descriptors
 from toolkit.files import is_current, sidecar_path
+from toolkit.manifest import FeaturesSettings
 
 
 def textured(seed: int, width: int = 320, height: int = 240) -> NDArray[np.uint8]:
@@ -282,7 +282,7 @@ def test_a_changed_image_is_made_anew(session: Session, tmp_path: Path, monkeypa
 )
 def test_changed_settings_make_everything_anew(session: Session, tmp_path: Path, change: dict) -> None:
     before = extract(session, tmp_path / "features").fingerprint
-    settings = replace(SETTINGS, **change)
+    settings = SETTINGS.model_copy(update=change)
     after = extract(session, tmp_path / "features", settings)
     name = session.image_name(0)
     assert_same(after[name], SiftExtractor(settings).extract([textured(0)])[0])
@@ -375,7 +375,9 @@ def test_a_stopped_run_keeps_its_finished_parts(
 KILLED = """
 import os, signal, sys
 import numpy as np
+from toolkit.manifest import FeaturesSettings
 from toolkit.features import features
+from toolkit.manifest import FeaturesSettings
 from toolkit.features import groups
 from toolkit.capture import Session
 
@@ -513,13 +515,13 @@ def test_a_network_gets_batches_in_color_and_its_numbers_come_back(session: Sess
 
 
 def test_extractors_by_name() -> None:
-    sift = create_extractor("sift", max_keypoints=200, min_long_side=0)
+    sift = create_extractor("sift", FeaturesSettings.of({"sift": {"max_keypoints": 200, "min_long_side": 0}}))
     assert sift.settings == SIFT.settings
     assert next(iter(sift.settings)) == "name"
-    with pytest.raises(ManifestError, match=r"no setting 'keypoints'.*max_keypoints"):
-        create_extractor("sift", keypoints=5)
+    with pytest.raises(ManifestError, match=r"'sift.keypoints'.*max_keypoints"):
+        FeaturesSettings.of({"sift": {"keypoints": 5}})
     with pytest.raises(ManifestError, match="Unknown local features 'surf'"):
-        create_extractor("surf")
+        create_extractor("surf", FeaturesSettings())
 
 
 def test_sift_of_a_color_image_is_that_of_its_gray_one() -> None:

@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 from numpy.typing import NDArray
 
+from tests.calls import call
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.features.features import FeatureStore, extract_session
@@ -229,7 +230,7 @@ def test_a_map_of_one_photograph_localizes_what_looks_like_it(small_capture: Pat
     write_text(files.retrieval("ios", "ios"), "".join(json.dumps(row) + "\n" for row in rows))
     folders = (files.retrieval_dir, files.poses_dir, files.features, files.maps)
     options = {"map_device": "ios", "query_device": "ios", "queries": "keyframes_original", "workers": 1}
-    localize_pairs(root / "sessions", *folders, method="hybrid", predictor="simulated", **options)  # type: ignore[arg-type]
+    call(localize_pairs, root / "sessions", *folders, method="hybrid", predictor="simulated", **options)  # type: ignore[arg-type]
     table = pd.read_csv(files.poses_csv("ios", "ios"))
     poses = Trajectory.read(files.poses_txt("ios", "ios"))
     key = table["timestamp"] == int(query.images["timestamp"].iloc[0])

@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 from numpy.typing import NDArray
 
+from tests.calls import call
 from toolkit import geometry
 from toolkit import localize as localize_stage
 from toolkit.capture import Capture, Session, Trajectory
@@ -28,7 +29,8 @@ from toolkit.localizers.pnp import PnpLocalizer, PoseEstimate, Prior
 from toolkit.localizers.prediction import Prediction, View
 from toolkit.localizers.predictors import create_predictor
 from toolkit.localizers.simulated import SimulatedPredictor
-from toolkit.localizers.vggt import VggtAnswer, VggtLocalizer, VggtQuery, VggtSettings
+from toolkit.localizers.vggt import VggtAnswer, VggtLocalizer, VggtQuery
+from toolkit.manifest import PredictorSettings
 from toolkit.show.visualize_prediction import draw_prediction
 
 Floats = NDArray[np.float64]
@@ -50,7 +52,7 @@ class World:
         return SimulatedPredictor(self.sessions, self.files.maps if depth else None, **noise)  # type: ignore[arg-type]
 
     def localizer(self, predictor: object, **settings: int) -> VggtLocalizer:
-        return VggtLocalizer(self.map, self.map_session, predictor, VggtSettings(**settings))  # type: ignore[arg-type]
+        return VggtLocalizer(self.map, self.map_session, predictor, PredictorSettings(**settings))  # type: ignore[arg-type]
 
     def queries(self, device: str, count: int = 10) -> tuple[list[VggtQuery], Floats]:
         """Return the queries of a device with the map images that stand and look most alike, and their true poses."""
@@ -77,7 +79,7 @@ class World:
 def run_stage(capture: Path, files: SceneFiles, **more: object) -> pd.DataFrame:
     options = {"map_device": "ios", "queries": LIST, "workers": 1, "predictor": "simulated", "method": "vggt"} | more
     folders = (files.retrieval_dir, files.poses_dir, files.features, files.maps)
-    return localize_pairs(capture / "sessions", *folders, **options)  # type: ignore[arg-type]
+    return call(localize_pairs, capture / "sessions", *folders, **options)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")

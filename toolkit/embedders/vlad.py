@@ -7,7 +7,6 @@ CVPR 2013), and projected to the principal directions of the map's images.
 
 import json
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 from zipfile import BadZipFile
@@ -20,32 +19,9 @@ from toolkit.errors import ArtifactError, ToolkitError
 from toolkit.features.features import LocalFeatures
 from toolkit.features.matching import unit_descriptors
 from toolkit.files import file_fingerprint, write_atomic
+from toolkit.manifest import VladSettings
 
 Floats = NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class VladSettings:
-    """How a VLAD is built; part of every fingerprint that rests on it."""
-
-    words: int = 256
-    """Visual words; fewer where the map has too few descriptors."""
-    local_dim: int = 64
-    """Local descriptors are PCA-whitened to this length."""
-    min_scale_px: float = 1.6
-    """Finer keypoints are left out: blur, noise and another camera's resolution change them first.
-    The standard deviation of the blob in pixels of the image as stored."""
-    min_features: int = 300
-    """At least this many of the coarsest keypoints are taken, however fine they are."""
-    dim: int = 512
-    """Most dimensions of the result; it cannot have more than there are map images."""
-    prior_images: int = 2000
-    """Shrinkage of the whitening: the weight, in images, of the belief that all directions vary alike.
-    Directions learned from a hundred images say where those were taken, not what repeats between places."""
-    sample_descriptors: int = 50_000
-    """Local descriptors that the vocabulary is learned from."""
-    iterations: int = 15
-    """Rounds of k-means."""
 
 
 class Vlad:
@@ -67,7 +43,7 @@ class Vlad:
 
     @property
     def settings(self) -> dict[str, Any]:
-        return {"name": self.name, **asdict(self._settings), "vocabulary": self._fingerprint}
+        return {"name": self.name, **self._settings.model_dump(), "vocabulary": self._fingerprint}
 
     def prepare(self, item: LocalFeatures) -> LocalFeatures:
         """Return the features as they are."""
@@ -149,7 +125,7 @@ class Vlad:
     def save(self, path: str | Path) -> None:
         """Write the vocabulary, .npz, and take its bytes as identity."""
         arrays = {
-            "settings": np.array(json.dumps(asdict(self._settings))),
+            "settings": np.array(json.dumps(self._settings.model_dump())),
             "local_mean": self.local_mean,
             "local_projection": self.local_projection,
             "centroids": self.centroids,

@@ -8,7 +8,7 @@ center of the top-left pixel is at 0, as the attribute of the file says; here, a
 
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib import import_module
 from itertools import islice
 from pathlib import Path
@@ -25,6 +25,7 @@ from toolkit.capture.images import prefetch, read_image
 from toolkit.errors import ArtifactError, ImageError, ManifestError
 from toolkit.features.groups import GroupWriter
 from toolkit.files import files_fingerprint, fingerprint, read_sidecar
+from toolkit.manifest import FeaturesSettings, SiftSettings
 
 # RootSIFT vectors have length 1; times 512 they fill the range of a byte, as COLMAP stores them.
 DESCRIPTOR_SCALE = 512.0
@@ -109,7 +110,7 @@ KINDS: dict[str, FeatureKind] = {
     # RootSIFT has no negative entries: unrelated patches already score about 0.5, so the ratio test decides, and the
     # less geometry says, the more a score has to.
     "sift": FeatureKind(
-        "toolkit.features.features:SiftExtractor.create", ("mutual",), 0.85, -1.0, epipolar_min_score=0.6,
+        "toolkit.features.features:SiftExtractor", ("mutual",), 0.85, -1.0, epipolar_min_score=0.6,
         guided_min_score=0.75, scale_octaves=1.0,
     ),
     # Scores of unrelated patches scatter about 0, and look-alikes are common: the usual test is a distance below 0.7
@@ -133,44 +134,25 @@ def feature_kind(name: str) -> FeatureKind:
     return KINDS[name]
 
 
-def create_extractor(
-    name: str, *, checkpoint: str | Path | None = None, device: str = "auto", dtype: str = "auto", **settings: Any
-) -> Extractor:
+def create_extractor(name: str, settings: FeaturesSettings, device: str = "auto", dtype: str = "auto") -> Extractor:
     """Return a ready extractor.
 
     Args:
         name: a key of `KINDS`.
-        checkpoint: file with a network's weights; None: the hub's cache, else a download. `sift` needs none.
+        settings: holds those of each kind under its name.
         device: where a network runs: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
         dtype: what a network computes in: `auto`, `float32`, `bfloat16`, `float16`.
-        settings: the extractor's own: the fields of `SiftSettings` of `sift`.
 
     Raises:
-        ManifestError: unknown features or settings.
+        ManifestError: unknown features.
         WeightsError: the network has no weights.
     """
-    module, _, path = feature_kind(name).extractor.partition(":")
-    make: Any = import_module(module)
-    for attribute in path.split("."):
-        make = getattr(make, attribute)
-    factory: Callable[..., Extractor] = make
+    module, _, attribute = feature_kind(name).extractor.partition(":")
+    factory: Callable[..., Extractor] = getattr(import_module(module), attribute)
+    own = getattr(settings, name)
     if name == "sift":
-        return factory(**settings)
-    return factory(checkpoint=checkpoint, device=device, dtype=dtype, **settings)
-
-
-@dataclass(frozen=True)
-class SiftSettings:
-    """How SIFT features are extracted; part of every fingerprint that rests on them."""
-
-    min_long_side: int = 640
-    """Smaller images are enlarged to this long side, pixels, before detection."""
-    max_long_side: int = 1600
-    """Larger images are reduced to this long side, pixels, before detection."""
-    max_keypoints: int = 3072
-    """The strongest responses are kept."""
-    contrast_threshold: float = 0.01
-    """Least contrast of a keypoint, after the image's contrast has been stretched to the full range."""
+        return factory(own)
+    return factory(checkpoint=settings.checkpoint, device=device, dtype=dtype, settings=own)
 
 
 def stretch_contrast(gray: NDArray[np.uint8], max_gain: float = 8.0) -> NDArray[np.uint8]:
@@ -195,17 +177,9 @@ class SiftExtractor:
         self._settings = settings or SiftSettings()
         self._local = threading.local()
 
-    @classmethod
-    def create(cls, **settings: Any) -> "SiftExtractor":
-        """Return an extractor with some of the fields of `SiftSettings` changed."""
-        if unknown := sorted(settings.keys() - SiftSettings.__dataclass_fields__.keys()):
-            known = ", ".join(SiftSettings.__dataclass_fields__)
-            raise ManifestError(f"Local features sift have no setting {unknown[0]!r}. Known: {known}.")
-        return cls(SiftSettings(**settings))
-
     @property
     def settings(self) -> dict[str, Any]:
-        return {"name": "sift", **asdict(self._settings)}
+        return {"name": "sift", **self._settings.model_dump()}
 
     def extract(self, images: Sequence[NDArray[np.uint8]]) -> list[LocalFeatures]:
         """Return the features of images, (H, W) gray or (H, W, 3) RGB, uint8."""

@@ -33,6 +33,7 @@ from toolkit.features.features import (
 )
 from toolkit.features.groups import GroupWriter
 from toolkit.files import fingerprint
+from toolkit.manifest import FeaturesSettings, MatcherSettings
 from toolkit.models.weights import LIGHTGLUE, SUPERPOINT, WeightsSource
 
 Floats = NDArray[np.float64]
@@ -148,33 +149,32 @@ class LocalMethod:
 
 
 def create_local_methods(
-    features: Sequence[str],
-    matcher: str | None = None,
-    features_checkpoint: str | Path | None = None,
-    matcher_checkpoint: str | Path | None = None,
-    device: str = "auto",
-    dtype: str = "auto",
+    features: FeaturesSettings, matcher: MatcherSettings, device: str = "auto", dtype: str = "auto"
 ) -> list[LocalMethod]:
     """Return the kinds of local features that are asked for, with their networks ready.
 
     Args:
-        features: keys of `KINDS`.
-        matcher: a key of `MATCHERS`; None: what is usual for the features. `mutual` takes the limits of the kind.
-        features_checkpoint, matcher_checkpoint: files with the weights of networks; None: the hub's cache, else a
-            download.
+        features: the kinds and how they are extracted.
+        matcher: how they are matched; `mutual` takes the limits of the kind.
         device, dtype: of networks, see `create_extractor`.
 
     Raises:
-        ManifestError: unknown features, or a matcher that suits none of them.
+        ManifestError: a matcher that suits none of the features.
         WeightsError: a network has no weights.
     """
     methods = []
-    for name, matched_by in matchers_of(features, matcher).items():
-        extractor = create_extractor(name, checkpoint=features_checkpoint, device=device, dtype=dtype)
+    for name, matched_by in matchers_of(features.kinds, matcher.name).items():
+        extractor = create_extractor(name, features, device, dtype)
         if matched_by == "mutual":
             methods.append(LocalMethod(name, extractor, MutualMatcher(KINDS[name].ratio, KINDS[name].min_score)))
         else:
-            network = create_matcher(matched_by, checkpoint=matcher_checkpoint, device=device, dtype=dtype)
+            network = create_matcher(
+                matched_by,
+                checkpoint=matcher.checkpoint,
+                device=device,
+                dtype=dtype,
+                min_score=matcher.min_confidence,
+            )
             methods.append(LocalMethod(name, extractor, network))
     return methods
 

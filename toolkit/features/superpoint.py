@@ -5,7 +5,6 @@ The network is that of the package `transformers`, of which only `encoder`, `key
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,8 +15,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from toolkit.errors import ManifestError, ToolkitError
+from toolkit.errors import ToolkitError
 from toolkit.features.features import LocalFeatures
+from toolkit.manifest import SuperPointSettings
 from toolkit.models.compute import Fitting, resolve_device, resolve_precision
 from toolkit.models.weights import SUPERPOINT, load_checkpoint, resolve_weights, weights_digest
 
@@ -27,28 +27,6 @@ _CELL = 8
 # A CPU is kept busy by few images; more of them at once take memory and no less time.
 _BATCH = {"cpu": 2}
 _BATCH_ELSEWHERE = 16
-
-
-@dataclass(frozen=True)
-class SuperPointSettings:
-    """How SuperPoint features are extracted; part of every fingerprint that rests on them."""
-
-    max_long_side: int = 1024
-    """Larger images are reduced to this long side, pixels; the aspect is kept."""
-    max_keypoints: int = 2048
-    """The strongest responses are kept."""
-    threshold: float = 0.005
-    """Least response of a keypoint, of at most 1."""
-    nms_radius: int = 4
-    """No two keypoints are closer than this in x and in y, pixels of the reduced image."""
-    border: int = 4
-    """Keypoints closer than this to the image's border are left out, pixels of the reduced image."""
-
-    def __post_init__(self) -> None:
-        least = {"max_long_side": _CELL, "max_keypoints": 1, "threshold": 0.0, "nms_radius": 0, "border": 0}
-        for name, bound in least.items():
-            if getattr(self, name) < bound:
-                raise ManifestError(f"superpoint: {name} is {getattr(self, name)}; expected {bound} or more.")
 
 
 def import_transformers(model: str) -> Any:
@@ -83,7 +61,7 @@ class SuperPointExtractor:
         device: str = "auto",
         dtype: str = "auto",
         batch_size: int | None = None,
-        **settings: Any,
+        settings: SuperPointSettings | None = None,
     ) -> None:
         """
         Args:
@@ -93,17 +71,14 @@ class SuperPointExtractor:
             dtype: of the encoder: `float32`, `bfloat16`, `float16`; `auto`: what is fast on the device. The heads are
                 always float32: neighboring pixels must not tie.
             batch_size: images at a time, at most; None: what is usual for the device.
-            settings: fields of `SuperPointSettings`.
+            settings: how features are found.
 
         Raises:
             WeightsError: no weights, or other ones.
             ManifestError: no such device, precision or setting.
             ToolkitError: the package transformers is missing, or the device.
         """
-        if unknown := sorted(settings.keys() - SuperPointSettings.__dataclass_fields__.keys()):
-            known = ", ".join(SuperPointSettings.__dataclass_fields__)
-            raise ManifestError(f"Local features superpoint have no setting {unknown[0]!r}. Known: {known}.")
-        self._settings = SuperPointSettings(**settings)
+        self._settings = settings or SuperPointSettings()
         self._device = resolve_device(device)
         self._dtype = resolve_precision(dtype, self._device)
         self.batch_size = batch_size or _BATCH.get(self._device.type, _BATCH_ELSEWHERE)
@@ -120,7 +95,7 @@ class SuperPointExtractor:
     def settings(self) -> dict[str, Any]:
         precision = str(self._dtype).removeprefix("torch.")
         return {
-            "name": "superpoint", "weights": self._weights, "dtype_compute": precision, **asdict(self._settings)
+            "name": "superpoint", "weights": self._weights, "dtype_compute": precision, **self._settings.model_dump()
         }  # fmt: skip
 
     def extract(self, images: Sequence[NDArray[np.uint8]]) -> list[LocalFeatures]:

@@ -20,7 +20,6 @@ from toolkit.localizers.mapped import Known, MappedFeatures
 from toolkit.localizers.mapping import LocalMap
 from toolkit.localizers.pnp import (
     PnpLocalizer,
-    PnpSettings,
     PoseEstimate,
     Prior,
     _Matches,
@@ -28,6 +27,7 @@ from toolkit.localizers.pnp import (
     least_squares_covariance,
 )
 from toolkit.localizers.vggt import CameraAnswer, VggtAnswer, VggtLocalizer
+from toolkit.manifest import PnpSettings
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -76,7 +76,7 @@ class DepthLifter:
             pnp: of several kinds of features, those of the first are lifted and matched.
             vggt: on the same map.
         """
-        self._first, self._settings, self._vggt = pnp.mapped[0], pnp.settings, vggt
+        self._first, self._pnp, self._vggt = pnp.mapped[0], pnp, vggt
 
     def localize(
         self,
@@ -105,7 +105,7 @@ class DepthLifter:
         made = self.lift(images, answer)
         if made is None:
             return None
-        localizer = _LiftedLocalizer(made, self._first, self._settings)
+        localizer = _LiftedLocalizer(made, self._first, self._pnp.settings, self._pnp.seed)
         found = localizer.localize(cameras, rig_from_cams, features, references, priors, known)
         source = made.image[found.point_index]
         used = [made.depths[int(image)] for image in np.unique(source[source >= 0])]
@@ -195,8 +195,8 @@ class DepthLifter:
 class _LiftedLocalizer(PnpLocalizer):
     """Localizes in a lifted map; the common scale of each image's depth is unknown within its standard deviation."""
 
-    def __init__(self, made: LiftedMap, mapped: MappedFeatures, settings: PnpSettings) -> None:
-        self._use([MappedFeatures(made.local_map, mapped.features, mapped.kind, mapped.matcher)], settings)
+    def __init__(self, made: LiftedMap, mapped: MappedFeatures, settings: PnpSettings, seed: int) -> None:
+        self._use([MappedFeatures(made.local_map, mapped.features, mapped.kind, mapped.matcher)], settings, seed)
         self._made = made
 
     def _covariance(self, query: _Query, rig_from_world: Floats, matches: _Matches) -> Floats | None:

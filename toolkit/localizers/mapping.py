@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from toolkit.features.matching import (
     write_matches,
 )
 from toolkit.files import fingerprint, is_current, write_atomic, write_sidecar
+from toolkit.manifest import MapSettings
 
 Floats = NDArray[np.float64]
 
@@ -144,26 +145,9 @@ def match_pairs(
     return prefetch(match, pairs, workers)
 
 
-@dataclass(frozen=True)
-class MapSettings:
-    """How a map is triangulated; part of every fingerprint that rests on it."""
-
-    pairs_per_image: int = 14
-    """Partners that an image is matched with."""
-    max_epipolar_error_px: float = 4.0
-    """Largest distance of a match to its epipolar line, at either side."""
-    ratio: float = 0.9
-    """Lowe's ratio, among the candidates along the epipolar line."""
-    max_reprojection_error_px: float = 4.0
-    """Observations further off are taken out of a point's track."""
-    min_triangulation_angle_deg: float = 1.5
-    """Points seen under a smaller angle are dropped: their depth is not known."""
-    seed: int = 0
-
-
-def map_settings(settings: MapSettings) -> dict[str, Any]:
+def map_settings(settings: MapSettings, seed: int) -> dict[str, Any]:
     """Return what a map depends on besides what it is made of; part of fingerprints."""
-    return {**asdict(settings), "format": _MAP_FORMAT}
+    return {**settings.model_dump(), "seed": seed, "format": _MAP_FORMAT}
 
 
 @dataclass(frozen=True)
@@ -337,6 +321,7 @@ def triangulate(
     pairs: NDArray[np.int64],
     matches: Sequence[NDArray[np.int64]],
     settings: MapSettings | None = None,
+    seed: int = 0,
 ) -> LocalMap:
     """Triangulate points from matches between images with known poses, which stay as they are.
 
@@ -375,7 +360,7 @@ def triangulate(
     observed = pycolmap.ObservationManager(reconstruction, graph)
     triangulator = pycolmap.IncrementalTriangulator(graph, reconstruction, observed)
     options = pycolmap.IncrementalTriangulatorOptions()
-    options.random_seed = settings.seed
+    options.random_seed = seed
     options.ignore_two_view_tracks = False
     options.min_angle = settings.min_triangulation_angle_deg
     for index in range(1, len(names) + 1):
@@ -481,6 +466,7 @@ def build_map(
     features: FeatureStore,
     path: str | Path,
     settings: MapSettings | None = None,
+    seed: int = 0,
     skip_existing: bool = True,
     inputs: str = "",
     workers: int = 1,
@@ -494,7 +480,7 @@ def build_map(
         session: a map session.
         features: local features of its images; images that could not be read are left out.
         path: the `.npz` file of the map.
-        settings: how to triangulate.
+        settings, seed: how to triangulate.
         skip_existing: reuse the file if it was made from the same features, poses and settings.
         inputs: fingerprint of what the features and poses were made from.
         workers: threads.
@@ -503,7 +489,7 @@ def build_map(
         ArtifactError: no image has both a pose and features.
     """
     settings = settings or MapSettings()
-    map_record = {"map": map_settings(settings), "inputs": inputs}
+    map_record = {"map": map_settings(settings, seed), "inputs": inputs}
     if skip_existing and is_current(path, map_record):
         with suppress(ArtifactError):  # torn behind our back: build it anew
             return LocalMap.load(path)
@@ -531,7 +517,7 @@ def build_map(
         writer.finish()
     kept = MatchStore(matches_file)
     matches = [kept[names[i], names[j]].indices for i, j in pairs]
-    local_map = triangulate(names, cameras, poses[rows], keypoints, pairs, matches, settings)
+    local_map = triangulate(names, cameras, poses[rows], keypoints, pairs, matches, settings, seed)
     local_map = _colored(local_map, session, rows, keypoints)
     local_map.save(path)
     write_sidecar(path, map_record)

@@ -24,6 +24,7 @@ from toolkit.features.features import LocalFeatures
 from toolkit.features.matching import unit_descriptors
 from toolkit.localizers.mapped import Known, MappedFeatures
 from toolkit.localizers.mapping import LocalMap
+from toolkit.manifest import PnpSettings
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -36,46 +37,6 @@ _RANSAC_CONFIDENCE = 0.9999
 _RIG_RANSAC = Lock()
 
 CONFIRMED = (5.0, 0.5)  # degrees, meters: further apart, two answers contradict each other
-
-
-@dataclass(frozen=True)
-class PnpSettings:
-    """How queries are localized; part of the poses' fingerprint. Angles are seen from the camera."""
-
-    max_map_features: int = 1000
-    """Features of a map image that are used at most, those of the longest tracks."""
-    max_query_features: int = 1536
-    """Features of a query image that are matched by descriptors alone, the strongest; guided passes use all."""
-    ransac_max_error_deg: float = 0.45
-    """Largest reprojection error of an inlier in RANSAC."""
-    ransac_max_trials: int = 5000
-    clear_inlier_ratio: float = 0.56
-    """With more inliers than this share of the matches, no other pose is looked for: what is left over cannot support
-    one by more than `ok_rival_support`."""
-    contested_inlier_ratio: float = 0.4
-    """With fewer, the pose may lie between two: it is sought again under a tighter limit, and by single references."""
-    contested_references: int = 4
-    """References, those with the most matches, that then give a pose each: together, look-alikes can outvote the one
-    that shows the place."""
-    guided_radii_deg: tuple[float, ...] = (0.7, 0.35)
-    """Search radius around a projected map point, one guided pass each."""
-    max_ransac_matches: int = 2500
-    """Matches that RANSAC sees at most, a random choice: the guided passes find the rest again."""
-    max_guided_matches: int = 1000
-    """Guided matches of a camera at most, the most alike."""
-    guided_images: int = 12
-    """Covisible map images whose points are projected."""
-    max_error_deg: float = 0.17
-    """Largest reprojection error of an inlier of the final pose."""
-    min_inliers: int = 12
-    """Fewer independently matched inliers than this are no pose."""
-    ok_inliers: int = 30
-    """Independently matched inliers that a pose needs to be `ok`: see `benchmarks/confidence.py`."""
-    ok_rival_support: float = 0.8
-    """Support of the best other pose, relative to this one's, up to which a pose is `ok`."""
-    ok_position_std_m: float = 0.1
-    """Largest standard deviation of the position for a pose to be `ok`."""
-    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -190,27 +151,32 @@ class PnpLocalizer:
     """Localizes queries in one map. Safe to use from several threads; the map is never changed."""
 
     def __init__(
-        self, local_map: LocalMap, features: Mapping[str, LocalFeatures], settings: PnpSettings | None = None
+        self,
+        local_map: LocalMap,
+        features: Mapping[str, LocalFeatures],
+        settings: PnpSettings | None = None,
+        seed: int = 0,
     ):
         """
         Args:
             local_map: a map triangulated from SIFT features; see `of` for others.
             features: of its images, by name.
         """
-        self._use([MappedFeatures(local_map, features)], settings)
+        self._use([MappedFeatures(local_map, features)], settings, seed)
 
     @classmethod
-    def of(cls, mapped: Sequence[MappedFeatures], settings: PnpSettings | None = None) -> "PnpLocalizer":
+    def of(cls, mapped: Sequence[MappedFeatures], settings: PnpSettings | None = None, seed: int = 0) -> "PnpLocalizer":
         """Return a localizer that uses several kinds of features together, each with a map of the same session."""
         localizer = cls.__new__(cls)
-        localizer._use(mapped, settings)
+        localizer._use(mapped, settings, seed)
         return localizer
 
-    def _use(self, mapped: Sequence[MappedFeatures], settings: PnpSettings | None) -> None:
+    def _use(self, mapped: Sequence[MappedFeatures], settings: PnpSettings | None, seed: int) -> None:
         self.mapped = list(mapped)
         self.map = LocalMap.pooled([one.map for one in mapped])
         """All kinds' points, one kind after the other."""
         self.settings = settings or PnpSettings()
+        self.seed = seed
         self._first_point = np.cumsum([0, *(len(one.map.points) for one in mapped)])
 
     def localize(
@@ -457,7 +423,7 @@ class PnpLocalizer:
         if len(np.unique(matches.point)) < 4:
             return None
         if len(matches) > self.settings.max_ransac_matches:
-            chosen = np.random.default_rng(self.settings.seed).permutation(len(matches))
+            chosen = np.random.default_rng(self.seed).permutation(len(matches))
             kept = np.zeros(len(matches), bool)
             kept[chosen[: self.settings.max_ransac_matches]] = True
             least_inliers = least_inliers * self.settings.max_ransac_matches // len(matches)
@@ -469,7 +435,7 @@ class PnpLocalizer:
             "dyn_num_trials_mult": 1.0,
             "min_iterations": 100,
             "max_iterations": int(np.clip(trials, 100, self.settings.ransac_max_trials)),
-            "seed": self.settings.seed,
+            "seed": self.seed,
         }
         return query.ransac(matches, self.map.points, max_error_deg, options)
 

@@ -18,25 +18,12 @@ from toolkit.localizers.pnp import PoseEstimate
 from toolkit.localizers.pose_mean import robust_mean_pose
 from toolkit.localizers.prediction import Prediction, Predictor, View
 from toolkit.localizers.references import select_references
+from toolkit.manifest import PredictorSettings
 
 log = logging.getLogger(__name__)
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class VggtSettings:
-    """How references are chosen and used; part of the poses' fingerprint."""
-
-    num_references: int = 5
-    """References shown to the network with each query image."""
-    candidates: int | None = None
-    """Retrieved images to choose them from, the best so many; None: all."""
-    depth_points: int = 200
-    """Map points of a reference at most whose depth is compared, those of the longest tracks."""
-    least_points: int = 20
-    """With fewer, the capture's depth map of the reference is asked, where there is one."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +75,7 @@ class VggtLocalizer:
         local_map: LocalMap,
         session: Session,
         predictor: Predictor,
-        settings: VggtSettings | None = None,
+        settings: PredictorSettings | None = None,
         turns: Turns | None = None,
     ):
         """
@@ -99,7 +86,7 @@ class VggtLocalizer:
         """
         self.map = local_map
         self.predictor = predictor
-        self.settings = settings or VggtSettings()
+        self.settings = settings or PredictorSettings()
         self._session = session
         self._depths = DepthMaps(session)
         self._rows = {session.image_name(row): row for row in range(len(session.images))}

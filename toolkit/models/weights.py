@@ -58,7 +58,7 @@ VGGT_1B = WeightsSource(
     filename="model.pt",
     license="non-commercial, as the code's README says of the original checkpoint",
     alternative="set `localize.method: pnp`, which needs none",
-    setting="localize.checkpoint",
+    setting="localize.predictor.checkpoint",
 )
 VGGT_1B_COMMERCIAL = WeightsSource(
     model="VGGT-1B-Commercial",
@@ -66,7 +66,7 @@ VGGT_1B_COMMERCIAL = WeightsSource(
     filename="model.pt",
     license="VGGT License of July 29, 2025: commercial use allowed, not military; access by form",
     alternative="set `localize.method: pnp`, which needs none",
-    setting="localize.checkpoint",
+    setting="localize.predictor.checkpoint",
 )
 VGGT = (VGGT_1B, VGGT_1B_COMMERCIAL)
 """Of one architecture: what is on the machine is taken."""
@@ -76,7 +76,7 @@ SUPERPOINT = WeightsSource(
     filename="model.safetensors",
     license="Magic Leap's, for academic or non-profit organizations: noncommercial research use only",
     alternative="use `sift` features, which need none",
-    setting="localize.features_checkpoint",
+    setting="localize.features.checkpoint",
     tensor="encoder.conv_blocks.0.conv_a.weight",
 )
 LIGHTGLUE = WeightsSource(
@@ -85,7 +85,7 @@ LIGHTGLUE = WeightsSource(
     filename="model.safetensors",
     license="Apache-2.0; the file also holds SuperPoint's, noncommercial research use only",
     alternative="use the matcher `mutual`, or `sift` features, which need none",
-    setting="localize.matcher_checkpoint",
+    setting="localize.matcher.checkpoint",
     tensor="match_assignment_layers.8.matchability.weight",
 )
 

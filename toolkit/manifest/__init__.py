@@ -1,0 +1,52 @@
+"""What to run and with which settings: the manifest, and the tree of settings that all stages share."""
+
+from toolkit.manifest.loading import load_manifest
+from toolkit.manifest.manifest import OPTIONAL, STAGES, DatasetSettings, DemoData, Manifest, Source
+from toolkit.manifest.messages import nearest
+from toolkit.manifest.settings import (
+    EmbedSettings,
+    EvaluateSettings,
+    ExploreSettings,
+    FeaturesSettings,
+    LocalizeSettings,
+    MapSettings,
+    MatcherSettings,
+    PnpSettings,
+    PredictorSettings,
+    RerankSettings,
+    RetrieveSettings,
+    Settings,
+    SiftSettings,
+    SuperPointSettings,
+    VisualizeSettings,
+    VladSettings,
+    describe,
+)
+
+__all__ = [
+    "OPTIONAL",
+    "STAGES",
+    "DatasetSettings",
+    "DemoData",
+    "EmbedSettings",
+    "EvaluateSettings",
+    "ExploreSettings",
+    "FeaturesSettings",
+    "LocalizeSettings",
+    "Manifest",
+    "MapSettings",
+    "MatcherSettings",
+    "PnpSettings",
+    "PredictorSettings",
+    "RerankSettings",
+    "RetrieveSettings",
+    "Settings",
+    "SiftSettings",
+    "Source",
+    "SuperPointSettings",
+    "VisualizeSettings",
+    "VladSettings",
+    "describe",
+    "load_manifest",
+    "nearest",
+]

@@ -1,0 +1,168 @@
+"""Read a manifest: inheritance, paths and variables, `--set`."""
+
+import os
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+
+from toolkit.errors import ManifestError
+from toolkit.manifest.manifest import Manifest
+from toolkit.manifest.messages import explain
+from toolkit.manifest.settings import expand, merge
+
+
+def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
+    """Read and check a manifest.
+
+    `inherits: FILE` (or a list of files, relative to the manifest) takes over what those files say: sections are
+    merged key by key, lists and values replaced, and each path counts from the folder of the file that has it.
+
+    Args:
+        path: YAML file.
+        overrides: `key=value` or `section.key=value`, as deep as the tree of settings is, the value in YAML; merged
+            over what the file says.
+
+    Returns:
+        The manifest with its paths made absolute.
+
+    Raises:
+        ManifestError: naming the file, the key, what was found, and the nearest known key; also the file that an
+            inherited key is from.
+    """
+    path = Path(path)
+    source = str(path)
+    chain = _read_chain(path, ())
+    raw: dict[str, Any] = {}
+    for _, content in chain:
+        raw = merge(raw, expand(Manifest, content))
+    for override in overrides:
+        raw = merge(raw, expand(Manifest, _read_override(override)))
+        source = f"{path} with --set {override}" if source == str(path) else f"{source} {override}"
+    raw.setdefault("name", path.stem)
+    folder = path.resolve().parent
+    try:
+        Manifest.model_validate(raw)  # before paths are looked at, whose messages are about other things
+        raw = _map_paths(raw, lambda text, key: str(_expand(text, folder, f"{source}: {key}")))
+        manifest = Manifest.model_validate(raw)
+    except ValidationError as error:
+        raise ManifestError(explain(error, Manifest, source, _origin(path, chain))) from None
+    names = [Path(capture).name for capture in manifest.captures]
+    if twice := {name for name in names if names.count(name) > 1}:
+        raise ManifestError(
+            f"{source}: captures: two folders are called {sorted(twice)[0]!r}, so their results would "
+            "overwrite each other. Rename one, or use two manifests."
+        )
+    return manifest
+
+
+Chain = list[tuple[Path, dict[str, Any]]]
+"""The files that make up a manifest, each with what it says itself; a later one wins."""
+
+
+def _read_chain(path: Path, heirs: tuple[Path, ...]) -> Chain:
+    if path.resolve() in [heir.resolve() for heir in heirs]:
+        circle = " inherits ".join(map(str, (*heirs, path)))
+        raise ManifestError(f"{circle}: a manifest cannot inherit from itself. Take one of these `inherits` out.")
+    raw = _read_yaml(path, heirs[-1] if heirs else None)
+    bases = raw.pop("inherits", [])
+    bases = [bases] if isinstance(bases, str) else bases
+    if not (isinstance(bases, list) and all(isinstance(base, str) for base in bases)):
+        raise ManifestError(f"{path}: inherits: found {bases!r}, expected a file name or a list of them.")
+    chain: Chain = []
+    for base in bases:
+        file = _expand(base, path.parent, f"{path}: inherits")
+        chain += _read_chain(file, (*heirs, path))
+    return [*chain, (path, _anchor(raw, path.resolve().parent) if heirs else raw)]
+
+
+def _map_paths(raw: dict[str, Any], change: Callable[[str, str], str], where: str = "") -> dict[str, Any]:
+    """Return raw values with every path changed; `change` takes the path and its key."""
+    changed: dict[str, Any] = {}
+    for name, value in raw.items():
+        key = f"{where}{name}"
+        if isinstance(value, dict):
+            value = _map_paths(value, change, f"{key}.")
+        elif str(name).endswith("checkpoint") or key in ("captures", "output_root"):
+            if isinstance(value, list):
+                value = [change(text, key) if isinstance(text, str) else text for text in value]
+            elif isinstance(value, str):
+                value = change(value, key)
+        changed[name] = value
+    return changed
+
+
+def _anchor(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Return the values of a base with absolute paths: they count from its own folder, not from its heir's."""
+
+    def anchor(text: str, key: str) -> str:
+        if text.startswith("~") or "$" in os.path.expandvars(text):
+            return text  # expanded, or refused, at the end: an heir may replace it
+        return os.path.normpath(folder / os.path.expandvars(text))
+
+    return _map_paths(raw, anchor)
+
+
+def _read_yaml(path: Path, heir: Path | None = None) -> dict[str, Any]:
+    try:
+        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        if heir:
+            raise ManifestError(f"{heir}: inherits {path}, and there is no such file. Correct `inherits`.") from None
+        raise ManifestError(f"{path}: no such manifest. data_manifests/demo.yaml is an example.") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ManifestError(f"{path}: cannot be read as a text file ({error}).") from None
+    except yaml.YAMLError as error:
+        text = str(error).replace('"<unicode string>"', str(path))
+        raise ManifestError(f"{path}: not valid YAML. {text}") from None
+    if not isinstance(raw, dict):
+        raise ManifestError(f"{path}: found {type(raw).__name__}, expected `key: value` lines.")
+    return raw
+
+
+def _read_override(override: str) -> dict[str, Any]:
+    """Return `section.key=value` as nested sections."""
+    key, equals, text = override.partition("=")
+    if not equals or not key.strip():
+        raise ManifestError(f"--set {override}: expected key=value, for example localize.method=nearest.")
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ManifestError(f"--set {override}: the value is not valid YAML. {error}") from None
+    for section in reversed(key.strip().split(".")):
+        value = {section: value}
+    return dict(value)
+
+
+def _origin(path: Path, chain: Chain) -> Callable[[list[str]], str]:
+    """Return what tells of a key that an inherited file is where it stands."""
+
+    def origin(keys: list[str]) -> str:
+        giver = next((file for file, content in reversed(chain) if _has(content, keys)), path)
+        return "" if giver == path else f" (in {giver}, which it inherits)"
+
+    return origin
+
+
+def _has(content: Any, keys: list[str]) -> bool:
+    """Tell whether a file itself says something under these keys."""
+    for key in keys:
+        if isinstance(content, list):
+            return True
+        if not isinstance(content, dict) or key not in content:
+            return False
+        content = content[key]
+    return True
+
+
+def _expand(text: str, folder: Path, where: str) -> Path:
+    expanded = os.path.expandvars(text)
+    if unset := re.search(r"\$\{?(\w+)\}?", expanded):
+        raise ManifestError(
+            f"{where}: {text!r} uses the variable ${unset[1]}, which is not set. "
+            f"Set it (export {unset[1]}=...) or write the folder itself."
+        )
+    return Path(os.path.normpath(folder / Path(expanded).expanduser()))

@@ -1,0 +1,64 @@
+"""Validation errors in words: the key, what was found, what was expected, and the nearest known name."""
+
+import difflib
+import re
+from collections.abc import Callable, Iterable
+from typing import Any, get_args
+
+from pydantic import BaseModel, ValidationError
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return a sentence that names the nearest of the known names, and lists them all."""
+    known = sorted(known)
+    match = difflib.get_close_matches(name.lower(), known, n=1, cutoff=0.5)
+    return (f"Did you mean {match[0]!r}? " if match else "") + f"Known: {', '.join(known)}."
+
+
+def nested_model(annotation: Any) -> type[BaseModel] | None:
+    """Return the model in a field's type: `M`, `M | None` and `dict[str, M]` hold M."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next((inner for part in get_args(annotation) if (inner := nested_model(part))), None)
+
+
+def explain(
+    error: ValidationError,
+    model: type[BaseModel],
+    source: str,
+    origin: Callable[[list[str]], str] = lambda keys: "",
+) -> str:
+    """Return the lines of an error.
+
+    Args:
+        error: what pydantic found.
+        model: the model that was validated.
+        source: what was validated, for the first line.
+        origin: returns what to add of where the value under some keys comes from.
+    """
+    lines = []
+    for problem in error.errors():
+        keys = [str(key) for key in problem["loc"] if not re.match(r"literal|list\[|dict\[|constrained", str(key))]
+        where = ".".join(keys) or source
+        if problem["type"] == "extra_forbidden":
+            line = f"unknown key {where!r}. {nearest(keys[-1], _model_at(model, keys[:-1]).model_fields)}"
+        elif problem["type"] == "value_error":
+            line = f"{where}: {problem['ctx']['error']}." if keys else f"{problem['ctx']['error']}."
+        elif problem["type"] == "literal_error" and isinstance(problem["input"], list):
+            continue  # the other branch of `"all" | list`, which says what is wrong in the list
+        elif problem["type"] in ("list_type", "dict_type") and isinstance(problem["input"], list | dict):
+            continue  # likewise, of `list | dict`
+        elif problem["type"] == "missing":
+            line = f"{where}: not given. {problem['msg']}."
+        else:
+            line = f"{where}: found {problem['input']!r}. {problem['msg']}."
+        lines.append(line + origin(keys))
+    return "\n  ".join([f"{source}:", *dict.fromkeys(lines)])
+
+
+def _model_at(model: type[BaseModel], keys: list[str]) -> type[BaseModel]:
+    """Return the model of the section under these keys."""
+    for key in keys:
+        if key in model.model_fields:  # else a name in a mapping of sections
+            model = nested_model(model.model_fields[key].annotation) or model
+    return model

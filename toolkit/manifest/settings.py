@@ -1,0 +1,436 @@
+"""The settings of every stage, as one tree: manifest, notebooks and functions share it.
+
+`python -m toolkit settings` prints it. The sentence under each field is its only documentation.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+import yaml
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from toolkit.errors import ManifestError
+from toolkit.manifest.messages import explain, nested_model
+from toolkit.models.compute import DEVICE_NAME
+
+Positive = Annotated[int, Field(gt=0)]
+Natural = Annotated[int, Field(ge=0)]
+PositiveNumber = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1)]
+ComputeDevice = Annotated[str, Field(pattern=f"^({DEVICE_NAME})$")]
+Precision = Literal["auto", "float32", "bfloat16", "float16"]
+Threshold = Annotated[list[PositiveNumber], Field(min_length=2, max_length=2)]
+
+
+def _check_direction(direction: list[float]) -> list[float]:
+    if not 1e-9 < math.hypot(*direction) < math.inf:
+        raise ValueError(f"found {direction}, expected three finite numbers that are not all zero")
+    return direction
+
+
+Direction = Annotated[list[float], Field(min_length=3, max_length=3), AfterValidator(_check_direction)]
+
+
+class Settings(BaseModel):
+    """Frozen settings that refuse keys and types that they do not know."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True)
+    shorthand: ClassVar[str] = ""
+    """Name of the field that a plain value stands for: `matcher: mutual` is `matcher: {name: mutual}`."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_shorthand(cls, raw: Any) -> Any:
+        return {cls.shorthand: raw} if cls.shorthand and not isinstance(raw, dict | Settings) else raw
+
+    @classmethod
+    def of(cls, *layers: "Settings | Mapping[str, Any] | None") -> Self:
+        """Return the defaults with what the layers say merged over them, a later layer over an earlier one.
+
+        Raises:
+            ManifestError: an unknown key or a value that does not fit; names the key and what was expected.
+        """
+        merged: dict[str, Any] = {}
+        for layer in layers:
+            given = layer.given() if isinstance(layer, Settings) else dict(layer or {})
+            merged = merge(merged, expand(cls, given))
+        try:
+            return cls.model_validate(merged)
+        except ValidationError as error:
+            raise ManifestError(explain(error, cls, cls.__name__)) from None
+
+    @classmethod
+    def needed(cls) -> list[str]:
+        """Return the names of the fields that have no default."""
+        return [name for name, field in cls.model_fields.items() if field.is_required()]
+
+    def given(self) -> dict[str, Any]:
+        """Return what was said, without what was left to the defaults; plain values."""
+        return self.model_dump(mode="json", exclude_unset=True)
+
+
+def expand(model: type[Settings], raw: Mapping[str, Any]) -> dict[str, Any]:
+    """Return raw values of a model with every shorthand written out, so that they can be merged key by key."""
+    expanded: dict[str, Any] = {}
+    for key, value in raw.items():
+        inner = nested_model(model.model_fields[key].annotation) if key in model.model_fields else None
+        if inner and issubclass(inner, Settings):
+            if isinstance(value, dict):
+                value = expand(inner, value)
+            elif inner.shorthand and value is not None:
+                value = {inner.shorthand: value}
+        expanded[key] = _plain(value)
+    return expanded
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as YAML has it, so that callers may also give tuples, paths and numpy's numbers."""
+    if isinstance(value, list | tuple):
+        return [_plain(part) for part in value]
+    return str(value) if isinstance(value, Path) else value.item() if hasattr(value, "item") else value
+
+
+def merge(base: Mapping[str, Any], content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `base` with what `content` says: mappings are merged, anything else is replaced."""
+    merged = dict(base)
+    for key, value in content.items():
+        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
+        merged[key] = merge(merged[key], value) if both else value
+    return merged
+
+
+def describe(model: type[Settings], indent: str = "") -> Iterator[str]:
+    """Yield the lines of a settings tree in YAML: every field with its meaning above it and its default.
+
+    What has to be given is left out. A section that is off is a comment with the defaults that it would have.
+    """
+    for name, field in model.model_fields.items():
+        if field.is_required():
+            continue
+        inner, default = nested_model(field.annotation), field.get_default()
+        yield from (f"{indent}# {line}".rstrip() for line in (field.description or "").splitlines())
+        if inner is not None and issubclass(inner, Settings) and not inner.needed():
+            off = "" if isinstance(default, Settings) else "# "
+            yield f"{indent}{off}{name}:"
+            yield from (f"{off}{line}" for line in describe(inner, indent + "  "))
+        else:
+            text = yaml.safe_dump(default, default_flow_style=True, width=1000).removesuffix("\n...\n").strip()
+            yield f"{indent}{name}: {text}"
+
+
+class ExploreSettings(Settings):
+    """What notebook 01 shows."""
+
+    samples: Positive = 4
+    """Images shown of each session."""
+    world_up: Direction | None = None
+    """Direction that is up in the world; null: estimated from the cameras."""
+
+
+class VladSettings(Settings):
+    """How a VLAD is built."""
+
+    words: Positive = 256
+    """Visual words; fewer where the map has too few descriptors."""
+    local_dim: Positive = 64
+    """Local descriptors are PCA-whitened to this length."""
+    min_scale_px: float = 1.6
+    """Finer keypoints are left out: blur, noise and another camera's resolution change them first.
+    The standard deviation of the blob in pixels of the image as stored."""
+    min_features: Natural = 300
+    """At least this many of the coarsest keypoints are taken, however fine they are."""
+    dim: Positive = 512
+    """Most dimensions of the result; it cannot have more than there are map images."""
+    prior_images: Natural = 2000
+    """Shrinkage of the whitening: the weight, in images, of the belief that all directions vary alike.
+    Directions learned from a hundred images say where those were taken, not what repeats between places."""
+    sample_descriptors: Positive = 50_000
+    """Local descriptors that the vocabulary is learned from."""
+    iterations: Positive = 15
+    """Rounds of k-means."""
+
+
+class EmbedSettings(Settings):
+    """How images become global descriptors."""
+
+    model: str = "vlad"
+    """Global descriptor: vlad, megaloc, or auto: megaloc if its weights are there. `vlad` needs no weights."""
+    checkpoint: str | None = None
+    """File with the weights of a learned model; null: the hub's cache, else a download."""
+    batch_size: Positive = 8
+    """Images a step."""
+    image_size: Annotated[int, Field(ge=126, multiple_of=14)] = 322
+    """Side of the square that a learned model sees, pixels, a multiple of 14."""
+    compute_device: ComputeDevice = "auto"
+    """Where a network runs: auto, cpu, cuda, cuda:<number> or mps. `vlad` runs on the CPU."""
+    dtype_compute: Precision = "auto"
+    """Precision of a learned model; auto: what is fast on the device."""
+    upright: bool | None = None
+    """Turn images so that gravity points down; null: for learned models. `vlad` does not need it."""
+    normalize: bool = True
+    """Scale descriptors to unit length."""
+    dtype: Literal["float32", "float16"] = "float32"
+    """Type of the numbers in the .npy files."""
+    vlad: VladSettings = VladSettings()
+    """Of `vlad`."""
+    seed: Natural = 0
+    """Of the vocabulary."""
+    world_up: Direction | None = None
+    """Direction that is up in the map's world; null: estimated from its cameras."""
+
+
+class RetrieveSettings(Settings):
+    """How references are found."""
+
+    topk: Positive = 10
+    """References a query image."""
+    use_faiss: bool = True
+    """Search with FAISS, else with torch; the result is the same."""
+    faiss_gpu: bool = False
+    """FAISS on the GPU; needs a FAISS built for it."""
+    normalize: bool = True
+    """Compare by cosine: scale descriptors to unit length before the search."""
+    compute_device: ComputeDevice = "auto"
+    """Where torch searches: auto, cpu, cuda, cuda:<number> or mps."""
+
+
+class SiftSettings(Settings):
+    """How SIFT features are extracted."""
+
+    min_long_side: Natural = 640
+    """Smaller images are enlarged to this long side, pixels, before detection."""
+    max_long_side: Positive = 1600
+    """Larger images are reduced to this long side, pixels, before detection."""
+    max_keypoints: Positive = 3072
+    """The strongest responses are kept."""
+    contrast_threshold: Annotated[float, Field(ge=0)] = 0.01
+    """Least contrast of a keypoint, after the image's contrast has been stretched to the full range."""
+
+
+class SuperPointSettings(Settings):
+    """How SuperPoint features are extracted."""
+
+    max_long_side: Annotated[int, Field(ge=8)] = 1024
+    """Larger images are reduced to this long side, pixels; the aspect is kept."""
+    max_keypoints: Positive = 2048
+    """The strongest responses are kept."""
+    threshold: Annotated[float, Field(ge=0)] = 0.005
+    """Least response of a keypoint, of at most 1."""
+    nms_radius: Natural = 4
+    """No two keypoints are closer than this in x and in y, pixels of the reduced image."""
+    border: Natural = 4
+    """Keypoints closer than this to the image's border are left out, pixels of the reduced image."""
+
+
+FeatureName = Literal["sift", "superpoint"]
+
+
+class FeaturesSettings(Settings):
+    """Local features, and how each kind is extracted."""
+
+    shorthand = "kinds"
+    kinds: Annotated[list[FeatureName], Field(min_length=1)] = ["sift"]
+    """Kinds of local features; of several, the matches are pooled in one pose. `features: [sift]` is short for it."""
+    checkpoint: str | None = None
+    """File with the weights of learned features; null: the hub's cache, else a download."""
+    sift: SiftSettings = SiftSettings()
+    """Of `sift`."""
+    superpoint: SuperPointSettings = SuperPointSettings()
+    """Of `superpoint`."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _one_kind(cls, raw: Any) -> Any:
+        """Take `features: sift` as `features: [sift]`."""
+        if isinstance(raw, dict) and isinstance(raw.get("kinds"), str):
+            return {**raw, "kinds": [raw["kinds"]]}
+        return raw
+
+
+class MatcherSettings(Settings):
+    """How the features of a query image and a reference image are matched."""
+
+    shorthand = "name"
+    name: Literal["mutual", "lightglue"] | None = None
+    """mutual: nearest neighbors; lightglue: the network; null: what is usual for the features."""
+    checkpoint: str | None = None
+    """File with the weights of a learned matcher; null: the hub's cache, else a download."""
+    min_confidence: Share = 0.1
+    """Least confidence of a match of a learned matcher."""
+
+
+class RerankSettings(Settings):
+    """How references are put in the order of their verified matches."""
+
+    topn: Positive = 30
+    """Retrieved images whose matches are verified; retrieval finds so many, if `retrieve.topk` does not say."""
+    topk: Positive = 10
+    """References kept of them."""
+    features: FeaturesSettings = FeaturesSettings()
+    """Local features whose matches are verified: one kind."""
+    matcher: MatcherSettings = MatcherSettings()
+    """How they are matched."""
+    max_features: Positive = 1536
+    """Features of an image that are matched at most, the strongest."""
+    max_error_deg: PositiveNumber = 0.2
+    """Largest Sampson error of an inlier, as an angle seen from the camera."""
+    max_trials: Positive = 500
+    """Samples of five matches, the best matches first."""
+    compute_device: ComputeDevice = "auto"
+    """Where networks run: auto, cpu, cuda, cuda:<number> or mps."""
+    dtype_compute: Precision = "auto"
+    """Precision of networks; auto: what is fast on the device."""
+    seed: Natural = 0
+    """Of RANSAC. The same seed gives the same order."""
+
+    @model_validator(mode="after")
+    def _one_kind_of_features(self) -> Self:
+        if len(self.features.kinds) != 1:
+            raise ValueError(f"features has {len(self.features.kinds)} kinds; reranking takes one")
+        if self.topk > self.topn:
+            raise ValueError(f"topk is {self.topk} and topn {self.topn}; expected topk to be at most topn")
+        return self
+
+
+class MapSettings(Settings):
+    """How a map is triangulated."""
+
+    pairs_per_image: Positive = 14
+    """Partners that an image is matched with."""
+    max_epipolar_error_px: PositiveNumber = 4.0
+    """Largest distance of a match to its epipolar line, at either side, pixels."""
+    ratio: PositiveNumber = 0.9
+    """Lowe's ratio, among the candidates along the epipolar line."""
+    max_reprojection_error_px: PositiveNumber = 4.0
+    """Observations further off, in pixels, are taken out of a point's track."""
+    min_triangulation_angle_deg: PositiveNumber = 1.5
+    """Points seen under a smaller angle are dropped: their depth is not known."""
+
+
+class PnpSettings(Settings):
+    """How a pose is found from matches with map points. Angles are seen from the camera."""
+
+    max_map_features: Positive = 1000
+    """Features of a map image that are used at most, those of the longest tracks."""
+    max_query_features: Positive = 1536
+    """Features of a query image that are matched by descriptors alone, the strongest; guided passes use all."""
+    ransac_max_error_deg: PositiveNumber = 0.45
+    """Largest reprojection error of an inlier in RANSAC."""
+    ransac_max_trials: Positive = 5000
+    """Samples that RANSAC draws at most."""
+    clear_inlier_ratio: Share = 0.56
+    """With more inliers than this share of the matches, no other pose is looked for: what is left over cannot support
+    one by more than `ok_rival_support`."""
+    contested_inlier_ratio: Share = 0.4
+    """With fewer, the pose may lie between two: it is sought again under a tighter limit, and by single references."""
+    contested_references: Natural = 4
+    """References, those with the most matches, that then give a pose each: together, look-alikes can outvote the one
+    that shows the place."""
+    guided_radii_deg: list[PositiveNumber] = [0.7, 0.35]
+    """Search radius around a projected map point, one guided pass each."""
+    max_ransac_matches: Positive = 2500
+    """Matches that RANSAC sees at most, a random choice: the guided passes find the rest again."""
+    max_guided_matches: Positive = 1000
+    """Guided matches of a camera at most, the most alike."""
+    guided_images: Positive = 12
+    """Covisible map images whose points are projected."""
+    max_error_deg: PositiveNumber = 0.17
+    """Largest reprojection error of an inlier of the final pose."""
+    min_inliers: Positive = 12
+    """Fewer independently matched inliers than this are no pose."""
+    ok_inliers: Positive = 30
+    """Independently matched inliers that a pose needs to be `ok`: see `benchmarks/confidence.py`."""
+    ok_rival_support: PositiveNumber = 0.8
+    """Support of the best other pose, relative to this one's, up to which a pose is `ok`."""
+    ok_position_std_m: PositiveNumber = 0.1
+    """Largest standard deviation of the position for a pose to be `ok`, meters."""
+
+
+class PredictorSettings(Settings):
+    """The network that predicts cameras, and what it is shown."""
+
+    shorthand = "name"
+    name: Literal["vggt", "simulated"] = "vggt"
+    """What `vggt` and `hybrid` ask; `simulated` looks up true poses, for trying things out."""
+    checkpoint: str | None = None
+    """File with the network's weights; null: the hub's cache, else a download."""
+    num_references: Positive = 5
+    """Map images that the network is shown with each query image."""
+    candidates: Positive | None = None
+    """Retrieved images to choose them from, the best so many; null: all."""
+    batch_size: Positive = 4
+    """Query devices that the network is given at once. Poses do not depend on it."""
+    upright: bool = True
+    """Show the network images turned so that gravity points down."""
+    depth_points: Positive = 200
+    """Map points of a reference at most whose depth is compared, those of the longest tracks."""
+    least_points: Natural = 20
+    """With fewer, the capture's depth map of the reference is asked, where there is one."""
+
+
+Method = Literal["pnp", "nearest", "vggt", "hybrid"]
+
+
+class LocalizeSettings(Settings):
+    """How poses are found."""
+
+    method: Method = "pnp"
+    """pnp: matches with map points; nearest: the pose of the best reference, to compare against; vggt: a network's
+    cameras, aligned to the map; hybrid: the better supported of pnp and vggt, each helped by the other."""
+    features: FeaturesSettings = FeaturesSettings()
+    """Local features."""
+    matcher: MatcherSettings = MatcherSettings()
+    """How a query image is matched with its references, for the kinds of features that the matcher suits."""
+    map: MapSettings = MapSettings()
+    """How the map is triangulated."""
+    pnp: PnpSettings = PnpSettings()
+    """How a pose is found from matches."""
+    predictor: PredictorSettings = PredictorSettings()
+    """Of `vggt` and `hybrid`."""
+    compute_device: ComputeDevice = "auto"
+    """Where networks run: auto, cpu, cuda, cuda:<number> or mps."""
+    dtype_compute: Precision = "auto"
+    """Precision of networks; auto: what is fast on the device."""
+    seed: Natural = 0
+    """Of RANSAC. The same seed gives the same poses, whatever the number of threads."""
+    world_up: Direction | None = None
+    """Direction that is up in the map's world; null: estimated from its cameras."""
+
+    @property
+    def predicts(self) -> bool:
+        """Whether the method asks a network for cameras."""
+        return self.method in ("vggt", "hybrid")
+
+
+class EvaluateSettings(Settings):
+    """What is counted."""
+
+    thresholds: list[Threshold] = [[1.0, 0.1], [5.0, 0.5], [5.0, 1.0]]
+    """Recall is counted at these (degrees, meters)."""
+    retrieval_ks: list[Positive] = [1, 5, 10]
+    """Retrieval recall is counted at these numbers of references."""
+    retrieval_radius_m: PositiveNumber = 8.0
+    """A good reference is at most so far from the query, meters ..."""
+    retrieval_angle_deg: PositiveNumber = 45.0
+    """... and looks in a direction at most so different. The roll about the viewing direction does not count."""
+
+
+class VisualizeSettings(Settings):
+    """What is drawn and recorded."""
+
+    samples: Natural = 2
+    """Queries shown of each pair, from the least to the best supported."""
+    recordings: bool = True
+    """Write a recording of each pair for the rerun viewer."""
+    matched_queries: Natural = 12
+    """Queries of each pair shown in it with references and matches, the worst first."""
+    session_recordings: bool = True
+    """Write a recording of each session."""
+    keyframes_only: bool = False
+    """Recordings of query sessions hold only keyframes."""
+    every: Positive | None = None
+    """Recordings of sessions hold every so many frames; null: so that a session has at most 1000 images."""
+    world_up: Direction | None = None
+    """Direction that is up in the world; null: estimated from the cameras."""
