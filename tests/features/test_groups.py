@@ -91,3 +91,65 @@ def test_a_torn_file_is_made_again_and_says_so(tmp_path: Path, size: int, caplog
     assert f"{path} is torn" in caplog.text
     with h5py.File(path) as file:
         np.testing.assert_array_equal(file["a/values"], [0, 1, 2])
+
+
+def test_notes_and_arrays_outlive_a_kill_and_are_read_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(groups, "PART_GROUPS", 2)
+    path = tmp_path / "file.h5"
+    rows = {name: {"name": name, "value": [1.5, None, float("inf")]} for name in "abcde"}
+    with GroupWriter(path, MADE_BY) as writer:  # ends without `finish`, as a killed run does
+        for name in "abc":
+            writer.add(name, "key", {"values": np.full(2, ord(name))}, note=rows[name])
+        assert writer.notes() == {name: rows[name] for name in "abc"}
+    with GroupWriter(path, MADE_BY) as writer:
+        assert writer.notes() == {name: rows[name] for name in "ab"}, "the part that was not complete is lost"
+        for name in "cde":
+            writer.add(name, "key", {"values": np.full(2, ord(name))}, note=rows[name])
+        assert {name: arrays["values"].tolist() for name, arrays in writer.read()} == {n: [ord(n)] * 2 for n in "abcde"}
+        writer.finish()
+        assert writer.notes() == rows
+    with GroupWriter(path, MADE_BY) as writer:
+        assert writer.notes() == rows
+        add(writer, "b")
+        writer.fail("c", "key", "no such thing")
+        writer.finish()
+        assert writer.notes().keys() == {"a", "d", "e"}, "what replaces a group replaces its note"
+
+
+def test_slow_groups_are_kept_one_by_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(groups, "PART_SECONDS", 0.0)
+    path = tmp_path / "file.h5"
+    with GroupWriter(path, MADE_BY) as writer:
+        add(writer, "a", "b")
+    with GroupWriter(path, MADE_BY) as writer:
+        assert writer.index.groups.keys() == {"a", "b"}
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_discarded_groups_are_in_no_file(tmp_path: Path, finished: bool) -> None:
+    path = tmp_path / "file.h5"
+    with GroupWriter(path, MADE_BY) as writer:
+        add(writer, "a")
+        if finished:
+            writer.finish()
+        add(writer, "b")
+        writer.discard()
+        assert not writer.index.groups
+        add(writer, "c")
+        writer.finish()
+    with h5py.File(path) as file:
+        assert list(file) == ["c"]
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_groups_made_by_something_else_are_replaced_without_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "file.h5"
+    for made_by in (MADE_BY, {"name": "other"}):
+        with GroupWriter(path, made_by, {"by": made_by["name"]}) as writer:
+            assert not writer.index.groups
+            writer.finish()
+        with h5py.File(path) as file:
+            assert (list(file), file.attrs["by"]) == ([], made_by["name"]), "a file without groups is a file"
+    assert not caplog.text
