@@ -123,7 +123,7 @@ def measure(
 ) -> Iterator[list[dict[str, Any]]]:
     """Render a capture and yield the rows of each map, but of those of the devices that are done."""
     from toolkit.capture import Capture
-    from toolkit.features.features import extract_session
+    from toolkit.features.stores import extract_session
     from toolkit.localizers.mapping import build_map
     from toolkit.localizers.pnp import PnpLocalizer
     from toolkit.synthetic import render_capture

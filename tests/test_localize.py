@@ -19,8 +19,9 @@ from toolkit.capture import Capture, Trajectory
 from toolkit.capture.images import read_image
 from toolkit.embed import embed_sessions
 from toolkit.errors import ArtifactError, CaptureError, ImageError, ManifestError, ToolkitError
-from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor, SiftSettings, extract_session
+from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor, SiftSettings
 from toolkit.features.matching import MATCHERS, MutualMatcher, unit_descriptors
+from toolkit.features.stores import extract_session
 from toolkit.files import SceneFiles, sidecar_path
 from toolkit.localize import COLUMNS, Map, localize_image, localize_pairs
 from toolkit.localizers.mapping import LocalMap

@@ -19,7 +19,8 @@ from toolkit.capture.upright import Turns, turn_image, upright_turns
 from toolkit.embedders import Embedder, create_embedder, resolve_name
 from toolkit.embedders.matrix import MatrixWriter
 from toolkit.errors import ImageError, ManifestError, ToolkitError
-from toolkit.features.features import FeatureStore, LocalFeatures, SiftExtractor, extract_session
+from toolkit.features.features import LocalFeatures, SiftExtractor
+from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import (
     file_fingerprint,
     files_fingerprint,

@@ -21,14 +21,9 @@ from toolkit.capture.images import default_workers, prefetch, read_image
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import Embedder, create_embedder, load_embeddings
 from toolkit.errors import ArtifactError, ImageError
-from toolkit.features.features import (
-    KINDS,
-    FeatureStore,
-    LocalFeatures,
-    SiftExtractor,
-    extract_session,
-)
-from toolkit.features.matching import LocalMethod, MatchStore, MutualMatcher, create_local_methods, match_sessions
+from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor
+from toolkit.features.matching import LocalMethod, MutualMatcher, create_local_methods
+from toolkit.features.stores import FeatureStore, MatchStore, extract_session, match_sessions
 from toolkit.files import (
     SceneFiles,
     file_fingerprint,

@@ -26,8 +26,9 @@ from tqdm.auto import tqdm
 from toolkit.capture import Capture, Session
 from toolkit.capture.images import default_workers, prefetch
 from toolkit.errors import ArtifactError
-from toolkit.features.features import Extractor, FeatureStore, LocalFeatures, extract_session
+from toolkit.features.features import Extractor, LocalFeatures
 from toolkit.features.matching import LocalMethod, Matcher, create_local_methods
+from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import (
     file_fingerprint,
     image_name,

@@ -16,7 +16,7 @@ from tqdm.auto import tqdm
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import read_for_display
 from toolkit.errors import ArtifactError
-from toolkit.features.features import FeatureStore, extract_session
+from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import pair_name
 from toolkit.localizers.mapping import LocalMap
 from toolkit.localizers.pnp import PnpLocalizer, PoseEstimate

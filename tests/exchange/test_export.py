@@ -14,7 +14,7 @@ from toolkit.capture import Capture, Session
 from toolkit.errors import ArtifactError, ManifestError
 from toolkit.exchange.export import export_colmap, export_pairs, export_table
 from toolkit.exchange.interchange import import_colmap, import_images
-from toolkit.features.features import FeatureStore, extract_session
+from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import SceneFiles
 from toolkit.localizers.mapping import LocalMap, build_map
 

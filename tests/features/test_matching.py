@@ -1,30 +1,21 @@
 """Matching against brute force, with and without the epipolar geometry."""
 
-from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from toolkit import geometry
-from toolkit.errors import ArtifactError, ManifestError
-from toolkit.features.features import DESCRIPTOR_SCALE, FeatureStore, LocalFeatures
-from toolkit.features.groups import GroupWriter
+from toolkit.errors import ManifestError
+from toolkit.features.features import DESCRIPTOR_SCALE, LocalFeatures
 from toolkit.features.matching import (
-    MatchStore,
     MutualMatcher,
-    PairMatches,
     create_matcher,
-    group_names,
     match_along_epipolar_lines,
-    match_sessions,
     matchers_of,
     mutual_matches,
-    similarity,
     unit_descriptors,
-    write_matches,
 )
 
 Floats = NDArray[np.float64]
@@ -65,7 +56,7 @@ def test_unit_descriptors() -> None:
     unit = unit_descriptors(stored)
     assert unit.dtype == np.float32
     np.testing.assert_allclose(np.linalg.norm(unit, axis=1), 1, atol=0.01)
-    np.testing.assert_allclose(similarity(unit, unit).diagonal(), 1, atol=0.02)
+    np.testing.assert_allclose((unit @ unit.T).diagonal(), 1, atol=0.02)
     assert unit_descriptors(np.zeros((0, 128), np.uint8)).shape == (0, 128)
 
 
@@ -76,7 +67,7 @@ def test_mutual_matches_are_the_brute_force_ones(ratio: float, min_score: float)
     for n, m, dim in [(40, 60, 8), (60, 40, 8), (1, 50, 8), (50, 2, 4), (200, 200, 32)]:
         a = random_units(rng, n, dim)
         b = np.concatenate([near_copies(rng, a[: min(n, m) // 2], 0.3), random_units(rng, m - min(n, m) // 2, dim)])
-        scores = similarity(a, b)
+        scores = a @ b.T
         before = scores.copy()
         found = as_list(mutual_matches(scores, ratio, min_score))
         assert found == brute_force(before, np.ones((n, m), bool), ratio, min_score)
@@ -88,7 +79,7 @@ def test_mutual_matches_are_the_brute_force_ones(ratio: float, min_score: float)
 def test_mutual_matches_find_a_permutation() -> None:
     rng = np.random.default_rng(1)
     a, order = random_units(rng, 100), rng.permutation(100)
-    found = mutual_matches(similarity(a, near_copies(rng, a[order], 0.2)))
+    found = mutual_matches(a @ near_copies(rng, a[order], 0.2).T)
     assert found[:, 0].tolist() == list(range(100))
     np.testing.assert_array_equal(order[found[:, 1]], np.arange(100))
 
@@ -212,7 +203,7 @@ def test_true_correspondences_are_found_and_nothing_else_than_by_brute_force(nam
     allowed, unclear = epipolar_mask(rays_a, rays_b, b_from_a)
     assert 0 < allowed.mean() < 0.1
     assert unclear.mean() < 0.02
-    expected = brute_force(similarity(a, b), allowed, 0.9, 0.6)
+    expected = brute_force(a @ b.T, allowed, 0.9, 0.6)
     assert {match for match in found if not unclear[match]} == {match for match in expected if not unclear[match]}
     true = [(i, j) for i, j in enumerate(partner.tolist()) if j >= 0 and not unclear[i, j]]
     assert len(true) > 20
@@ -228,7 +219,7 @@ def test_the_geometry_decides_between_twins() -> None:
     rays = np.array([[0.0, -0.2, 1], [0.0, 0.2, 1]])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     b_from_a = geometry.make_pose(np.eye(3), [-0.1, 0, 0])
-    assert len(mutual_matches(similarity(descriptors, descriptors), 0.9)) == 0
+    assert len(mutual_matches(descriptors @ descriptors.T, 0.9)) == 0
     found = match_along_epipolar_lines(descriptors, descriptors, rays, rays[::-1], b_from_a, ANGLE, ANGLE)
     assert sorted(as_list(found)) == [(0, 1), (1, 0)]
 
@@ -360,111 +351,3 @@ def test_matchers_by_name() -> None:
     ):
         with pytest.raises(ManifestError, match=text):
             matchers_of(features, matcher)
-
-
-def hloc_matches(path: Path, name0: str, name1: str) -> tuple[NDArray[np.int64], NDArray[np.float16]]:
-    """Read the matches of a pair as hloc does."""
-    with h5py.File(str(path), "r", libver="latest") as file:
-        group = file["/".join((name0.replace("/", "-"), name1.replace("/", "-")))]
-        matches, scores = group["matches0"].__array__(), group["matching_scores0"].__array__()
-    index = np.where(matches != -1)[0]
-    return np.stack([index, matches[index]], -1), scores[index]
-
-
-NAMES = ("ios_query/raw_data/a/1.jpg", "hl_map/raw_data/b/2.jpg")
-
-
-@pytest.mark.parametrize(("count", "kind"), [(100, np.int16), (40_000, np.int32)])
-def test_matches_are_in_the_layout_of_hloc_and_come_back(tmp_path: Path, count: int, kind: type) -> None:
-    path = tmp_path / "matches.h5"
-    indices = np.array([[0, count - 1], [3, 0], [99, 7]])
-    matches = PairMatches(indices, np.array([0.5, 1.0, 0.25], np.float32))
-    with GroupWriter(path, {"name": "test"}) as writer:
-        write_matches(writer, group_names([NAMES])[NAMES], "key", (100, count), matches)
-        writer.finish()
-    found, scores = hloc_matches(path, *NAMES)
-    with h5py.File(path) as file:
-        assert file["ios_query-raw_data-a-1.jpg/hl_map-raw_data-b-2.jpg/matches0"].dtype == kind
-    np.testing.assert_array_equal(found, indices)
-    np.testing.assert_array_equal(scores, matches.scores)
-    store = MatchStore(path)
-    np.testing.assert_array_equal(store[NAMES].indices, indices)
-    np.testing.assert_array_equal(store[NAMES].scores, matches.scores)
-    np.testing.assert_array_equal(store[NAMES[::-1]].indices, indices[:, ::-1])
-    with pytest.raises(KeyError):
-        store["other.jpg", NAMES[1]]
-    torn = tmp_path / "torn.h5"
-    torn.write_bytes(path.read_bytes()[:600])
-    with pytest.raises(ArtifactError, match="Match again"):
-        MatchStore(torn)[NAMES]
-    content = path.read_bytes()
-    torn.write_bytes(content[: len(content) // 8] + bytes(len(content) - len(content) // 8))
-    with pytest.raises(ArtifactError, match=r"Delete the file|Match again"):
-        MatchStore(torn)[NAMES]
-
-
-class Counting(MutualMatcher):
-    """Counts the pairs that it is given, some at a time."""
-
-    batch_size = 2
-
-    def __init__(self) -> None:
-        super().__init__(0.9)
-        self.calls: list[int] = []
-
-    def match(self, pairs):  # type: ignore[no-untyped-def]
-        self.calls.append(len(pairs))
-        return super().match(pairs)
-
-
-class Features(FeatureStore):
-    """Features in memory."""
-
-    def __init__(self, images: dict[str, LocalFeatures], made_from: str):
-        super().__init__(Path(), dict.fromkeys(images, made_from), settings={"name": "test"})
-        self.images = images
-
-    def __getitem__(self, name: str) -> LocalFeatures:
-        return self.images[name]
-
-
-def test_pairs_of_sessions_are_matched_once_in_batches_and_others_added(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    images = {f"m/{k}.jpg": features_of(random_units(rng, 30)) for k in range(4)}
-    queries, maps = Features({"q/1.jpg": images["m/2.jpg"]}, "a"), Features(images, "b")
-    matcher, sessions = Counting(), ("ios_query", "hl_map")
-    pairs = [("q/1.jpg", f"m/{k}.jpg") for k in range(3)]
-    asked = [*pairs, pairs[0], ("q/1.jpg", "m/unknown.jpg")]
-    store = match_sessions((queries, maps), asked, matcher, tmp_path, sessions)
-    assert matcher.calls == [2, 1]
-    assert store.path.parent == tmp_path / "ios_query-hl_map"
-    assert [len(store[pair]) for pair in pairs][2] == 30
-    for name0, name1 in pairs:
-        (expected,) = MutualMatcher(0.9).match([(queries[name0], maps[name1])])
-        np.testing.assert_array_equal(store[name0, name1].indices, expected.indices)
-    matcher.calls.clear()
-    again = match_sessions((queries, maps), [*pairs, ("q/1.jpg", "m/3.jpg")], matcher, tmp_path, sessions)
-    assert matcher.calls == [1]
-    assert len(again[pairs[2]]) == 30
-    match_sessions((Features(queries.images, "changed"), maps), pairs, matcher, tmp_path, sessions)
-    assert matcher.calls == [1, 2, 1]
-
-
-def test_names_that_differ_in_dash_and_slash_alone_keep_their_own_matches(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    images = {
-        name: features_of(random_units(rng, 20 + k)) for k, name in enumerate(["a/b-c.jpg", "a-b/c.jpg", "d.jpg"])
-    }
-    features = Features(images, "key")
-    matcher, sessions = Counting(), ("ios_map", "ios_map")
-    pairs = [("a/b-c.jpg", "d.jpg"), ("a-b/c.jpg", "d.jpg"), ("a/b-c.jpg", "a-b/c.jpg")]
-    for _ in range(2):
-        store = match_sessions((features, features), pairs, matcher, tmp_path, sessions)
-        for name0, name1 in pairs:
-            (expected,) = MutualMatcher(0.9).match([(images[name0], images[name1])])
-            np.testing.assert_array_equal(store[name0, name1].indices, expected.indices)
-            np.testing.assert_array_equal(store[name1, name0].indices, expected.indices[:, ::-1])
-    assert matcher.calls == [2, 1]  # the second time, all are there
-    match_sessions((features, features), pairs[:1], matcher, tmp_path, sessions)
-    assert matcher.calls == [2, 1]
-    hloc_matches(store.path, *pairs[2])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tests.calls import call
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
-from toolkit.features.features import FeatureStore, extract_session
+from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import SceneFiles, write_text
 from toolkit.localize import localize_pairs
 from toolkit.localizers.hybrid import HybridLocalizer

@@ -15,7 +15,8 @@ from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory, write_session
 from toolkit.capture.cameras import in_view, rays_of, view_bounds
 from toolkit.errors import ArtifactError
-from toolkit.features.features import FeatureStore, SiftExtractor, SiftSettings, extract_session
+from toolkit.features.features import SiftExtractor, SiftSettings
+from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import sidecar_path
 from toolkit.localizers import mapping
 from toolkit.localizers.mapping import LocalMap, MapSettings, build_map, select_pairs, triangulate
@@ -386,7 +387,7 @@ def test_after_a_change_only_the_pairs_of_the_changed_image_are_matched(
     work = mapping.match_pairs
     monkeypatch.setattr(mapping, "match_pairs", lambda pairs, *args: asked.append(pairs.tolist()) or work(pairs, *args))
     first = build_map(session, store, tmp_path / "ios_map.npz", quick, inputs="a")
-    changed = {**store.made_from, store.names[0]: "another image"}
+    changed = {**store.made_from, next(iter(store)): "another image"}
     other = FeatureStore(store.path, changed, settings=store.settings)
     assert_equal(build_map(session, other, tmp_path / "ios_map.npz", quick, inputs="b"), first)
     everything, again = asked
@@ -406,8 +407,8 @@ def test_images_without_features_or_pose_are_left_out(phone: tuple[Session, Feat
     session, store = phone
     partial = FeatureStore(store.path, dict(list(store.made_from.items())[:5]), settings=store.settings)
     local_map = build_map(session, partial, tmp_path / "ios_map.npz")
-    assert sorted(local_map.image_names) == sorted(partial.names)
-    assert 0 < len(partial.names) < len(session.images)
+    assert sorted(local_map.image_names) == sorted(partial)
+    assert 0 < len(partial) < len(session.images)
     with pytest.raises(ArtifactError, match="Session ios_map has no image with both"):
         build_map(session, FeatureStore(store.path, {}), tmp_path / "other.npz")
 

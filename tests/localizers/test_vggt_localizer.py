@@ -18,8 +18,8 @@ from toolkit import geometry
 from toolkit import localize as localize_stage
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.errors import CaptureError, ImageError, ManifestError, WeightsError
-from toolkit.features.features import extract_session
 from toolkit.features.matching import MutualMatcher
+from toolkit.features.stores import extract_session
 from toolkit.files import SceneFiles
 from toolkit.localize import COLUMNS, PREDICTION_COLUMNS, localize_pairs
 from toolkit.localizers.hybrid import HybridLocalizer

@@ -11,7 +11,7 @@ from toolkit.capture import Session
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import ArtifactError, ManifestError
 from toolkit.exchange.submission import Captures
-from toolkit.features.features import FeatureStore
+from toolkit.features.stores import FeatureStore
 from toolkit.files import SceneFiles, image_name, read_references, write_atomic, write_text
 from toolkit.geometry import invert, qt_from_pose
 from toolkit.localizers.mapping import LocalMap

@@ -19,17 +19,10 @@ from toolkit.capture import Session
 from toolkit.capture.cameras import in_view, projection_jacobian, rays_of, view_bounds
 from toolkit.capture.images import prefetch, read_image
 from toolkit.errors import ArtifactError, ImageError
-from toolkit.features.features import FeatureStore, LocalFeatures, feature_kind
+from toolkit.features.features import LocalFeatures, feature_kind
 from toolkit.features.groups import GroupWriter
-from toolkit.features.matching import (
-    MatchStore,
-    PairMatches,
-    group_names,
-    match_along_epipolar_lines,
-    matches_path,
-    unit_descriptors,
-    write_matches,
-)
+from toolkit.features.matching import PairMatches, match_along_epipolar_lines, unit_descriptors
+from toolkit.features.stores import FeatureStore, MatchStore, group_names, matches_path, write_matches
 from toolkit.files import fingerprint, is_current, write_atomic, write_sidecar
 from toolkit.manifest import MapSettings
 

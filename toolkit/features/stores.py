@@ -1,0 +1,432 @@
+"""Files of local features and of matches, in the layout of hloc (https://github.com/cvg/Hierarchical-Localization).
+
+The features of a session are in one HDF5 file for each kind and settings: a group for each image, under the image's
+name, with `keypoints` (N, 2), `descriptors` (D, N) of unit length, `scores` (N,) and `image_size` (2,), and in addition
+the `scales` (N,) of the keypoints. In the file the center of the top-left pixel is at 0, as an attribute of the file
+says; here, and in `LocalFeatures`, it is at 0.5.
+
+The matches of two sessions are in one HDF5 file: a group for each pair of images, `<image>/<image>` with `/` in the
+names replaced by `-` (see `group_names` for names that this makes equal), with `matches0` (N,), for each feature of the
+first image the index of the second image's feature or -1, and `matching_scores0` (N,).
+"""
+
+import threading
+from collections import Counter
+from collections.abc import Container, Iterable, Iterator, Mapping
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+from tqdm.auto import tqdm
+
+from toolkit.capture import Session
+from toolkit.capture.images import prefetch, read_image
+from toolkit.errors import ArtifactError, ImageError
+from toolkit.features.features import DESCRIPTOR_SCALE, Extractor, LocalFeatures, SiftExtractor
+from toolkit.features.groups import GroupWriter
+from toolkit.features.matching import Matcher, PairMatches
+from toolkit.files import files_fingerprint, fingerprint, read_sidecar
+
+PIXEL_CENTER = "top_left_pixel_center"
+"""Attribute of a file of features: where the center of the top-left pixel is."""
+SCALE = "scale"
+"""Attribute of the descriptors in a file: they were bytes, divided by this."""
+_HALF_PIXEL = np.float32(0.5)
+# Files hold bytes as float16, exactly: a byte over a power of two has 8 significant bits, float16 holds 11. A look-up
+# is several times quicker than a product and a conversion.
+_HALVES = (np.arange(256) / DESCRIPTOR_SCALE).astype(np.float16)
+_BYTES = np.zeros(1 << 16, np.uint8)
+_BYTES[_HALVES.view(np.uint16)] = np.arange(256)
+# What HDF5 raises where a file is torn or of another format.
+_HDF5_ERRORS = (OSError, RuntimeError, KeyError)
+
+
+def features_path(out: str | Path, session_id: str, settings: Mapping[str, Any]) -> Path:
+    """Return the file of a session's features in the folder of all features, by the extractor's settings."""
+    return Path(out) / session_id / f"{settings['name']}-{fingerprint(settings)}.h5"
+
+
+def as_stored(features: LocalFeatures) -> LocalFeatures:
+    """Return the features as a file gives them back: keypoints next to the image's border lose their last bits."""
+    return _from_arrays(_to_arrays(features), _HALF_PIXEL, features.descriptors.dtype == np.uint8)
+
+
+def _to_arrays(features: LocalFeatures) -> dict[str, NDArray[Any]]:
+    """Return the features of an image as hloc has them."""
+    descriptors = _transposed(features.descriptors)
+    return {
+        # Exact from 0.5 px on, where the difference has no more digits than the number.
+        "keypoints": features.keypoints - _HALF_PIXEL,
+        "scales": features.scales,
+        "scores": features.scores,
+        "descriptors": np.take(_HALVES, descriptors) if descriptors.dtype == np.uint8 else descriptors,
+        "image_size": np.array(features.image_size, np.int64),
+    }
+
+
+def _from_arrays(arrays: Mapping[str, NDArray[Any]], offset: np.float32, quantized: bool) -> LocalFeatures:
+    """Return the features of an image that a file has; hloc's files may lack scores and scales.
+
+    Args:
+        arrays: what the image's group holds.
+        offset: what makes the center of the top-left pixel 0.5.
+        quantized: the descriptors were bytes.
+
+    Raises:
+        KeyError: an array is missing.
+    """
+    keypoints = arrays["keypoints"].astype(np.float32, copy=False) + offset
+    descriptors, (width, height) = arrays["descriptors"], arrays["image_size"]
+    ones = np.ones(len(keypoints), np.float32)
+    return LocalFeatures(
+        keypoints,
+        arrays.get("scales", ones).astype(np.float32, copy=False),
+        arrays.get("scores", ones).astype(np.float32, copy=False),
+        _transposed(np.take(_BYTES, descriptors.view(np.uint16)) if quantized else descriptors),
+        (int(width), int(height)),
+    )
+
+
+def _transposed(matrix: NDArray[Any]) -> NDArray[Any]:
+    """Return a copy (M, N) of a matrix (N, M)."""
+    # OpenCV is ten times quicker at it, but knows no matrix without entries, and no float16 in some versions.
+    return cv2.transpose(matrix) if matrix.size and matrix.dtype == np.uint8 else np.ascontiguousarray(matrix.T)
+
+
+class FeatureStore(Mapping[str, LocalFeatures]):
+    """Read access to the local features of many images, by image name (`Session.image_name`).
+
+    Safe to use from several threads. The features of an image are read each time they are asked for.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        made_from: Mapping[str, str],
+        failed: Mapping[str, str] | None = None,
+        settings: Mapping[str, Any] | None = None,
+    ):
+        self.path = path
+        self.made_from = dict(made_from)
+        """Name of an image -> fingerprint of what its features were made from."""
+        self.failed = dict(failed or {})
+        """Images that could not be read, with the reason."""
+        self.settings = dict(settings or {})
+        """Settings of the extractor; empty where they are not known."""
+        self._file: h5py.File | None = None
+        self._quantized = False
+        self._offset = np.float32(0)
+        self._lock = threading.Lock()
+
+    @classmethod
+    def open(cls, path: str | Path) -> "FeatureStore":
+        """Open a file of features, the toolkit's or hloc's, whatever it was made from.
+
+        Raises:
+            ArtifactError: it is missing, torn, or holds no features.
+        """
+        record = read_sidecar(path)
+        if record is not None and "groups" in record:
+            failed = {name: reason for name, (_, reason) in record["failed"].items()}
+            return cls(Path(path), record["groups"], failed, record["made_by"])
+        items: list[str] = []
+        try:
+            with h5py.File(path, "r") as file:
+                file.visit(items.append)
+        except OSError as error:
+            raise ArtifactError(f"Local features {path} cannot be read ({error}). Extract them again.") from None
+        names = [item.removesuffix("/keypoints") for item in items if item.endswith("/keypoints")]
+        if not names:
+            raise ArtifactError(
+                f"{path} holds no local features; expected a group for each image with `keypoints` and `descriptors`."
+            )
+        return cls(Path(path), dict.fromkeys(names, files_fingerprint([Path(path)])))
+
+    @classmethod
+    def of_session(cls, out: str | Path, session_id: str, settings: Mapping[str, Any] | None = None) -> "FeatureStore":
+        """Open all features of a session that were extracted.
+
+        Args:
+            out: folder of all features.
+            session_id: the session's.
+            settings: of the extractor; None: of SIFT.
+
+        Raises:
+            ArtifactError: there are none, or the file is torn.
+        """
+        return cls.open(features_path(out, session_id, settings or SiftExtractor().settings))
+
+    @property
+    def fingerprint(self) -> str:
+        """16 hex digits that identify the images and settings that the features were made from."""
+        return fingerprint([self.settings, self.made_from, sorted(self.failed)])
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.made_from
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.made_from)
+
+    def __len__(self) -> int:
+        return len(self.made_from)
+
+    def __getitem__(self, name: str) -> LocalFeatures:
+        if name not in self.made_from:
+            raise KeyError(name)
+        with self._lock:
+            try:
+                group = (self._file or self._open(name))[name]
+                arrays = {key: item[()] for key, item in group.items() if isinstance(item, h5py.Dataset)}
+            except _HDF5_ERRORS as error:
+                raise ArtifactError(
+                    f"Local features {self.path} are damaged at {name} ({error}). Delete the file: it is made again."
+                ) from None
+        try:
+            return _from_arrays(arrays, self._offset, self._quantized)
+        except KeyError as error:
+            raise ArtifactError(
+                f"{self.path}: {name} has no {error}; expected the layout of hloc. If a run made the file, delete it: "
+                "it is made again."
+            ) from None
+
+    def _open(self, name: str) -> h5py.File:
+        """Open the file; what holds for one image holds for all."""
+        file = h5py.File(self.path, "r")
+        self._offset = _HALF_PIXEL - np.float32(file.attrs.get(PIXEL_CENTER, 0.0))
+        self._quantized = file[name]["descriptors"].attrs.get(SCALE) == DESCRIPTOR_SCALE
+        self._file = file
+        return file
+
+
+def extract_session(
+    session: Session,
+    out: str | Path,
+    extractor: Extractor | None = None,
+    rows: NDArray[np.int64] | None = None,
+    workers: int = 2,
+    skip_existing: bool = True,
+    progress: bool = True,
+) -> FeatureStore:
+    """Extract the local features of a session's images, or reuse those that were extracted before.
+
+    A killed run goes on where it was, but for one part of `GroupWriter`. Memory does not grow with the session.
+
+    Args:
+        session: the session; only its camera images are read.
+        out: folder of all features; this session's go to `features_path`.
+        extractor: how to extract; None: SIFT.
+        rows: rows of `session.images` that are needed; None: all.
+        workers: threads.
+        skip_existing: reuse the features of images that have not changed since.
+        progress: show a progress bar.
+
+    Returns:
+        The store of the features of these rows. Unreadable images are in its `failed`.
+    """
+    extractor = extractor or SiftExtractor()
+    chosen = session.camera_rows if rows is None else np.intersect1d(session.camera_rows, rows)
+    row_of: dict[str, int] = {}
+    for row in chosen.tolist():
+        row_of.setdefault(session.image_name(row), row)  # a line of images.txt may be there twice
+    made_from = {name: _made_from(session, row) for name, row in row_of.items()}
+    path, label = features_path(out, session.id, extractor.settings), f"{extractor.settings['name']} {session.id}"
+    with GroupWriter(path, extractor.settings, {PIXEL_CENTER: 0.0}) as writer:
+        done = {*writer.index.groups.items(), *((name, source) for name, (source, _) in writer.index.failed.items())}
+        todo = [item for item in made_from.items() if not (skip_existing and item in done)]
+        cv2_threads = cv2.getNumThreads()
+        cv2.setNumThreads(1)  # the images are the parallel dimension
+        try:
+            results = _extract(session, [row_of[name] for name, _ in todo], extractor, workers)
+            with tqdm(total=len(todo), desc=label, unit="image", disable=not progress or not todo) as bar:
+                for (name, source), features in zip(todo, results, strict=True):
+                    if isinstance(features, str):
+                        writer.fail(name, source, features)
+                    else:
+                        quantized = features.descriptors.dtype == np.uint8
+                        attributes = {"descriptors": {SCALE: DESCRIPTOR_SCALE}} if quantized else {}
+                        writer.add(name, source, _to_arrays(features), attributes)
+                    bar.update()
+        finally:
+            cv2.setNumThreads(cv2_threads)
+        writer.finish()
+        index = writer.index
+    failed = {name: index.failed[name][1] for name in made_from if name in index.failed}
+    readable = {name: source for name, source in made_from.items() if name in index.groups}
+    return FeatureStore(path, readable, failed, extractor.settings)
+
+
+def _made_from(session: Session, row: int) -> str:
+    """Identify an image by name, size and time of change of its file, and by the size that its camera has."""
+    camera = session.camera(session.images["sensor_id"].iloc[row])
+    return fingerprint([files_fingerprint([session.image_path(row)]), camera.width, camera.height])
+
+
+def _extract(
+    session: Session, rows: list[int], extractor: Extractor, workers: int
+) -> Iterator[LocalFeatures | str]:
+    """Yield the features of each image, or why it has none."""
+    sensors = session.images["sensor_id"].to_numpy()
+
+    def read(row: int) -> NDArray[np.uint8] | str:
+        try:
+            image = read_image(session.image_path(row), gray=not extractor.color)
+        except ImageError as error:
+            return str(error)
+        camera = session.camera(sensors[row])
+        if image.shape[:2] != (camera.height, camera.width):
+            return (
+                f"Image of {image.shape[1]} x {image.shape[0]} pixels, but sensors.txt says {camera.width} x "
+                f"{camera.height} for {sensors[row]}: {session.image_path(row)}"
+            )
+        return image
+
+    def read_and_extract(row: int) -> LocalFeatures | str:
+        image = read(row)
+        return image if isinstance(image, str) else extractor.extract([image])[0]
+
+    if extractor.threaded:
+        yield from prefetch(read_and_extract, rows, workers)
+        return
+    images = prefetch(read, rows, workers, ahead=2 * extractor.batch_size)
+    while batch := list(islice(images, extractor.batch_size)):
+        features = iter(extractor.extract([image for image in batch if not isinstance(image, str)]))
+        for image in batch:
+            yield image if isinstance(image, str) else next(features)
+
+
+def matches_path(out: str | Path, session0: str, session1: str, made_by: Mapping[str, Any]) -> Path:
+    """Return the file of the matches of two sessions.
+
+    Args:
+        out: folder of all matches.
+        session0, session1: the sessions' ids.
+        made_by: settings of the `features`, each by session, and of the `matcher`.
+    """
+    features, matcher = made_by["features"][0].get("name", "features"), made_by["matcher"]["name"]
+    return Path(out) / f"{session0}-{session1}" / f"{features}-{matcher}-{fingerprint(made_by)}.h5"
+
+
+class MatchStore:
+    """Read access to the matches of two sessions' images. Safe to use from several threads."""
+
+    def __init__(self, path: str | Path):
+        """
+        Args:
+            path: a file of the toolkit or of hloc.
+        """
+        self.path = Path(path)
+        self._file: h5py.File | None = None
+        self._lock = threading.Lock()
+
+    def __getitem__(self, names: tuple[str, str]) -> PairMatches:
+        """Return the matches of two images, in whichever order the file has them.
+
+        Raises:
+            KeyError: the file does not have the pair.
+            ArtifactError: the file cannot be read.
+        """
+        with self._lock:
+            if self._file is None:
+                try:
+                    self._file = h5py.File(self.path, "r")
+                except OSError as error:
+                    raise ArtifactError(f"Matches {self.path} cannot be read ({error}). Match again.") from None
+            candidates = [(of(*names[::step]), step) for step in (1, -1) for of in (_own_group, _shared_group)]
+            try:
+                present = [(self._file[group], step) for group, step in candidates if group in self._file]
+                arrays = [present[0][0][key][()] for key in ("matches0", "matching_scores0")] if present else []
+            except _HDF5_ERRORS as error:
+                raise ArtifactError(
+                    f"Matches {self.path} are damaged at {' and '.join(names)} ({error}). Delete the file: it is made "
+                    "again."
+                ) from None
+        if not present:
+            raise KeyError(names)
+        (partners, scores), (_, step) = arrays, present[0]
+        first = np.flatnonzero(partners >= 0)
+        indices = np.stack([first, partners[first].astype(np.int64)], axis=1)
+        return PairMatches(indices[:, ::step], scores[first].astype(np.float32))
+
+
+def write_matches(
+    writer: GroupWriter, group: str, made_from: str, counts: tuple[int, int], matches: PairMatches
+) -> None:
+    """Add the matches of two images, which have `counts` features, to a file, as a group of `group_names`."""
+    # hloc has 16 bits too; networks that find more features than these hold are rare.
+    matches0 = np.full(counts[0], -1, np.int16 if max(counts) <= np.iinfo(np.int16).max else np.int32)
+    scores = np.zeros(counts[0], np.float16)
+    matches0[matches.indices[:, 0]] = matches.indices[:, 1]
+    scores[matches.indices[:, 0]] = matches.scores
+    writer.add(group, made_from, {"matches0": matches0, "matching_scores0": scores})
+
+
+def match_sessions(
+    stores: tuple[FeatureStore, FeatureStore],
+    pairs: Iterable[tuple[str, str]],
+    matcher: Matcher,
+    out: str | Path,
+    sessions: tuple[str, str],
+    skip_existing: bool = True,
+) -> MatchStore:
+    """Match pairs of images of two sessions, or reuse earlier matches. A killed run goes on where it was.
+
+    Args:
+        stores: features of the first images and of the second ones.
+        pairs: names of images, the first session's first.
+        matcher: how to match.
+        out: folder of all matches, see `matches_path`.
+        sessions: the sessions' ids.
+        skip_existing: reuse the matches of features that have not changed since.
+
+    Returns:
+        The matches of (at least) these pairs; of a pair with an image that has no features there are none.
+    """
+    made_by = {"features": [store.settings for store in stores], "matcher": matcher.settings}
+    path = matches_path(out, *sessions, made_by)
+    with GroupWriter(path, made_by) as writer:
+        done = writer.index.groups if skip_existing else {}
+        readable = [(name0, name1) for name0, name1 in pairs if name0 in stores[0] and name1 in stores[1]]
+        todo = []
+        for (name0, name1), group in group_names(readable, writer.index.groups).items():
+            made_from = stores[0].made_from[name0] + stores[1].made_from[name1]
+            if done.get(group) != made_from:
+                todo.append((name0, name1, group, made_from))
+        label, size = f"{matcher.settings['name']} {' '.join(sessions)}", matcher.batch_size
+        with tqdm(total=len(todo), desc=label, unit="pair", disable=not todo) as bar:
+            for batch in (todo[start : start + size] for start in range(0, len(todo), size)):
+                features = [(stores[0][name0], stores[1][name1]) for name0, name1, *_ in batch]
+                for pair, both, matches in zip(batch, features, matcher.match(features), strict=True):
+                    write_matches(writer, *pair[2:], (len(both[0]), len(both[1])), matches)
+                bar.update(len(batch))
+        writer.finish()
+    return MatchStore(path)
+
+
+def group_names(pairs: Iterable[tuple[str, str]], existing: Container[str] = ()) -> dict[tuple[str, str], str]:
+    """Return the groups of pairs of images: hloc's, unless another pair has the same.
+
+    Images whose names differ only in `-` against `/` share hloc's. Their pairs have groups of their own, which readers
+    of hloc's layout do not find.
+
+    Args:
+        pairs: names of images.
+        existing: groups that the file has.
+    """
+    shared = {pair: _shared_group(*pair) for pair in pairs}
+    count = Counter(shared.values())
+    return {
+        pair: own if (own := _own_group(*pair)) in existing or count[group] > 1 else group
+        for pair, group in shared.items()
+    }
+
+
+def _shared_group(name0: str, name1: str) -> str:
+    return f"{name0.replace('/', '-')}/{name1.replace('/', '-')}"
+
+
+def _own_group(name0: str, name1: str) -> str:
+    return f"{_shared_group(name0, name1)}~{fingerprint([name0, name1])}"
