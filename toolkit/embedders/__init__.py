@@ -1,7 +1,7 @@
 """Global descriptors: one vector an image, for search. A new one is a file here and a line in `EMBEDDERS`."""
 
-from collections.abc import Callable, Sequence
-from importlib import import_module
+import pkgutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -20,7 +20,7 @@ class Embedder(Protocol):
     inputs: Literal["images", "features"]
     """What `embed` takes: images (H, W, 3) uint8 RGB, or `toolkit.features.features.LocalFeatures`."""
     upright: bool
-    """Whether it was learned from upright photographs, so that images are better turned upright for it."""
+    """Whether it was trained with upright photographs, so that images should be turned upright for it."""
 
     @property
     def dim(self) -> int:
@@ -33,11 +33,11 @@ class Embedder(Protocol):
         ...
 
     def prepare(self, item: Any) -> Any:
-        """Return an input in the form that is quickest to embed; for threads, while others are embedded."""
+        """Return an input as the embedder needs it; threads call this while other inputs are embedded."""
         ...
 
     def embed(self, inputs: Sequence[Any]) -> NDArray[np.float32]:
-        """Return (B, D) float32; an image without any structure may have a zero vector."""
+        """Return the vectors (B, D) float32; an image without structure may have a zero vector."""
         ...
 
 
@@ -45,28 +45,22 @@ EMBEDDERS: dict[str, str] = {
     "megaloc": "toolkit.embedders.megaloc:MegaLocEmbedder",
     "vlad": "toolkit.embedders.vlad:Vlad.load",
 }
-"""Name of an embedder -> `module:callable` that makes it, imported when it is asked for."""
+"""Name of an embedder -> `module:callable` that makes it, imported when it is needed. `auto` prefers the first."""
 WEIGHTS = {"megaloc": MEGALOC}
-"""The weights of those that need some."""
-PREFERENCE = ("megaloc", "vlad")
-"""What `auto` takes: the first that needs no weights or has them."""
+"""The weights of the embedders that need some."""
 MANIFEST_COLUMNS = ["row_index", "device_id", "sensor_id", "timestamp", "abs_path"]
 """Columns of the `manifest.csv` that names the image of each row of embeddings."""
 
 
 def resolve_name(name: str, checkpoint: str | Path | None = None) -> str:
-    """Return the embedder that `name` stands for: itself, or for `auto` the best whose weights are there.
+    """Return the embedder that `name` stands for: itself; for `auto` the first whose weights are on this machine.
 
     Raises:
-        ManifestError: it is not known.
-        WeightsError: `checkpoint` is given and is not there.
+        ManifestError: unknown embedder.
+        WeightsError: `checkpoint` is given and is missing.
     """
     if name == "auto":
-        return next(
-            candidate
-            for candidate in PREFERENCE
-            if candidate not in WEIGHTS or find_weights(WEIGHTS[candidate], checkpoint)
-        )
+        return next(key for key in EMBEDDERS if key not in WEIGHTS or find_weights(WEIGHTS[key], checkpoint))
     if name not in EMBEDDERS:
         raise ManifestError(f"Unknown embedder {name!r}. Known: {', '.join([*sorted(EMBEDDERS), 'auto'])}.")
     return name
@@ -82,12 +76,8 @@ def create_embedder(name: str, **options: Any) -> Embedder:
     """
     checkpoint = options.get("checkpoint")
     place = checkpoint if isinstance(checkpoint, str | Path) else None
-    module, _, path = EMBEDDERS[resolve_name(name, place)].partition(":")
-    make: Any = import_module(module)
-    for attribute in path.split("."):
-        make = getattr(make, attribute)
-    factory: Callable[..., Embedder] = make
-    return factory(**options)
+    embedder: Embedder = pkgutil.resolve_name(EMBEDDERS[resolve_name(name, place)])(**options)
+    return embedder
 
 
 def load_embeddings(folder: str | Path) -> tuple[NDArray[np.float32], pd.DataFrame]:

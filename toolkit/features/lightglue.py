@@ -17,11 +17,11 @@ from torch import Tensor
 from toolkit.errors import ManifestError, ToolkitError
 from toolkit.features.features import LocalFeatures
 from toolkit.features.matching import PairMatches
-from toolkit.features.superpoint import DESCRIPTOR_LENGTH, import_transformers
+from toolkit.features.superpoint import DESCRIPTOR_LENGTH, load_network
 from toolkit.models.compute import Fitting, resolve_device, resolve_precision
-from toolkit.models.weights import LIGHTGLUE, load_checkpoint, resolve_weights, weights_digest
+from toolkit.models.weights import LIGHTGLUE, weights_digest
 
-# A CPU is kept busy by few pairs; more of them at once take memory and no less time.
+# Few pairs keep a CPU busy; more at once take more memory and no less time.
 _BATCH = {"cpu": 2}
 _BATCH_ELSEWHERE = 32
 
@@ -30,8 +30,8 @@ class LightGlueMatcher:
     """Matches pairs of images of any sizes, with any numbers of SuperPoint features, in batches, on any device.
 
     Every pair goes through all layers with all its features. The network could stop early or drop features where it
-    is confident; its authors recommend not to where accuracy counts, and a pair's matches would then hang on numbers
-    that rounding, and so the batch, can push over a threshold.
+    is confident. Its authors advise against that where accuracy counts, and rounding, which depends on the batch, could
+    then change a pair's matches.
     """
 
     def __init__(
@@ -47,9 +47,9 @@ class LightGlueMatcher:
             checkpoint: the official file, or its tensors by name (shared, not copied); None: from the hub's cache,
                 else downloaded there. The detector in it is not used.
             device: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
-            dtype: of the products in the layers: `float32`, `bfloat16`, `float16`; `auto`: what is fast on the
+            dtype: of the products in the layers: `float32`, `bfloat16`, `float16`; `auto`: the fastest on the
                 device. Positions and the assignment are always float32.
-            batch_size: pairs at a time, at most; None: what is usual for the device.
+            batch_size: most pairs at a time; None: as suits the device.
             min_score: least confidence of a match, from 0 to 1.
 
         Raises:
@@ -63,11 +63,8 @@ class LightGlueMatcher:
         self._device = resolve_device(device)
         self._dtype = resolve_precision(dtype, self._device)
         self.batch_size = batch_size or _BATCH.get(self._device.type, _BATCH_ELSEWHERE)
-        # Before a download, which would be for nothing.
-        import_transformers("LightGlue")
-        if checkpoint is None or isinstance(checkpoint, str | Path):
-            checkpoint = resolve_weights(LIGHTGLUE, checkpoint)
-        model = load_lightglue(checkpoint)
+        # The official file has a copy of SuperPoint. The features come from elsewhere.
+        model = load_network(LIGHTGLUE, checkpoint, _build, ignore=("keypoint_detector.",))
         self._weights = weights_digest(model)
         self._model = model.to(self._device)
         self._fitting = Fitting(self._forward, "pairs of images")
@@ -88,9 +85,9 @@ class LightGlueMatcher:
         """
         for features in (features for pair in pairs for features in pair):
             _check(features)
-        found = [PairMatches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32)) for _ in pairs]
-        # Pairs with similar numbers of features go together: the smaller are filled up to the largest. Largest first,
-        # so that what did not fit is learned once.
+        matches = [PairMatches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32)) for _ in pairs]
+        # Pairs with similar numbers of features go together, as all are padded to the largest. The largest come first,
+        # so that a batch that does not fit the memory shows at once.
         sizes = [max(len(a), len(b)) for a, b in pairs]
         order = [number for number in np.argsort(sizes, kind="stable")[::-1] if all(map(len, pairs[number]))]
         for start in range(0, len(order), self.batch_size):
@@ -99,20 +96,20 @@ class LightGlueMatcher:
             with torch.inference_mode():
                 results = self._fitting(batch.to(self._device)).cpu().numpy()
             for number, result in zip(part, results, strict=True):
-                found[number] = _unpack(result)
-        return found
+                matches[number] = _unpack(result)
+        return matches
 
     def _forward(self, batch: Tensor) -> Tensor:
         """Return for each feature of the first image its partner, -1 for none, and the confidence, (B, N, 2).
 
         Args:
             batch: (B, 2, N, 2 + 256 + 1), of each image's features the normalized x y, the descriptor, and 1; rows of
-                zeros fill up to N.
+                zeros pad it to N.
         """
         model = self._model
         images = batch.flatten(0, 1)
         real = images[:, :, -1]
-        # Always given: without a mask, the layers of transformers attend to earlier features alone.
+        # Without a mask, the layers of transformers attend only to earlier features.
         mask = real.bool()[:, None, None, :]
         turns = model.positional_encoder(images[:, :, :2])[0]
         with torch.autocast(batch.device.type, self._dtype, enabled=self._dtype != torch.float32):
@@ -132,20 +129,10 @@ class LightGlueMatcher:
         return torch.stack([partners, scores], dim=2)
 
 
-def load_lightglue(checkpoint: str | Path | Mapping[str, Tensor]) -> Any:
-    """Return the network of `transformers` with official weights and no detector, float32, on the CPU, ready to use.
-
-    Raises:
-        WeightsError: not such a file, or other weights; names missing, unexpected and mis-shaped keys.
-        ToolkitError: the package is missing.
-    """
-    transformers = import_transformers("LightGlue")
+def _build(transformers: Any) -> Any:
     config = transformers.LightGlueConfig(keypoint_detector_config=transformers.SuperPointConfig())
-    with torch.device("meta"):
-        model = transformers.LightGlueForKeypointMatching(config)
-    # The official file has a copy of SuperPoint. The features come from elsewhere.
+    model = transformers.LightGlueForKeypointMatching(config)
     del model.keypoint_detector
-    load_checkpoint(model, checkpoint, "LightGlue", ignore=("keypoint_detector.",))
     return model
 
 
@@ -153,7 +140,7 @@ def _check(features: LocalFeatures) -> None:
     kind, shape = features.descriptors.dtype, features.descriptors.shape
     if kind == np.uint8 or shape[1:] != (DESCRIPTOR_LENGTH,):
         raise ToolkitError(
-            f"LightGlue was learned with SuperPoint features, (N, {DESCRIPTOR_LENGTH}) unit vectors; found {kind} "
+            f"LightGlue was trained with SuperPoint features, (N, {DESCRIPTOR_LENGTH}) unit vectors; found {kind} "
             f"{shape}. Use the matcher `mutual` with other features."
         )
 

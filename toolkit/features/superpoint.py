@@ -4,7 +4,7 @@ The network is that of the package `transformers`, of which only `encoder`, `key
 `descriptor_decoder` are used: its processor would squeeze every photograph to 640 x 480.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,12 +19,12 @@ from toolkit.errors import ToolkitError
 from toolkit.features.features import LocalFeatures
 from toolkit.manifest import SuperPointSettings
 from toolkit.models.compute import Fitting, resolve_device, resolve_precision
-from toolkit.models.weights import SUPERPOINT, load_checkpoint, resolve_weights, weights_digest
+from toolkit.models.weights import SUPERPOINT, WeightsSource, load_checkpoint, resolve_weights, weights_digest
 
 DESCRIPTOR_LENGTH = 256
 # Side of the cells of the network's coarsest grid, pixels.
 _CELL = 8
-# A CPU is kept busy by few images; more of them at once take memory and no less time.
+# Few images keep a CPU busy; more at once take more memory and no less time.
 _BATCH = {"cpu": 2}
 _BATCH_ELSEWHERE = 16
 
@@ -41,15 +41,41 @@ def import_transformers(model: str) -> Any:
         raise ToolkitError(
             f"{model} needs the package transformers, which cannot be imported ({error}). Install it, in the folder "
             "of this project: python -m pip install --constraint constraints.txt --editable '.[learned]'. "
-            "Or use `sift` features, which need no more than is there."
+            "Or use `sift` features, which need nothing else."
         ) from error
     return transformers
 
 
-class SuperPointExtractor:
-    """Extracts SuperPoint features: keypoints to the pixel, unit descriptors (256,), on any device.
+def load_network(
+    source: WeightsSource,
+    checkpoint: str | Path | Mapping[str, Tensor] | None,
+    build: Callable[[Any], Any],
+    ignore: tuple[str, ...] = (),
+) -> Any:
+    """Return a network of `transformers` with official weights, float32, on the CPU, ready to use.
 
-    Images of one size run together. What a feature is does not depend on what else is in the batch.
+    Args:
+        source: its weights.
+        checkpoint: the official file, or its tensors by name; None: the hub's cache, else a download.
+        build: makes the network from the package.
+        ignore: prefixes of tensors in the file that the network does not use.
+
+    Raises:
+        WeightsError: no weights, or other ones; names missing, unexpected and mis-shaped keys.
+        ToolkitError: the package is missing; before a download.
+    """
+    with torch.device("meta"):
+        network = build(import_transformers(source.model))
+    if checkpoint is None or isinstance(checkpoint, str | Path):
+        checkpoint = resolve_weights(source, checkpoint)
+    load_checkpoint(network, checkpoint, source.model, ignore)
+    return network
+
+
+class SuperPointExtractor:
+    """Extracts SuperPoint features: keypoints at whole pixels, unit descriptors (256,), on any device.
+
+    Images of one size run together. The features of an image do not depend on the others in the batch.
     """
 
     color = False
@@ -68,10 +94,10 @@ class SuperPointExtractor:
             checkpoint: the official file, or its tensors by name (shared, not copied); None: from the hub's cache,
                 else downloaded there.
             device: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
-            dtype: of the encoder: `float32`, `bfloat16`, `float16`; `auto`: what is fast on the device. The heads are
-                always float32: neighboring pixels must not tie.
-            batch_size: images at a time, at most; None: what is usual for the device.
-            settings: how features are found.
+            dtype: of the encoder: `float32`, `bfloat16`, `float16`; `auto`: the fastest on the device. The heads are
+                always float32, so that neighboring pixels do not tie.
+            batch_size: most images at a time; None: as suits the device.
+            settings: how features are extracted.
 
         Raises:
             WeightsError: no weights, or other ones.
@@ -82,11 +108,7 @@ class SuperPointExtractor:
         self._device = resolve_device(device)
         self._dtype = resolve_precision(dtype, self._device)
         self.batch_size = batch_size or _BATCH.get(self._device.type, _BATCH_ELSEWHERE)
-        # Before a download, which would be for nothing.
-        import_transformers("SuperPoint")
-        if checkpoint is None or isinstance(checkpoint, str | Path):
-            checkpoint = resolve_weights(SUPERPOINT, checkpoint)
-        model = load_superpoint(checkpoint, self._settings)
+        model = load_network(SUPERPOINT, checkpoint, self._build)
         self._weights = weights_digest(model)
         self._model = model.to(self._device)
         self._fitting: dict[tuple[int, int], Fitting] = {}
@@ -98,6 +120,16 @@ class SuperPointExtractor:
             "name": "superpoint", "weights": self._weights, "dtype_compute": precision, **self._settings.model_dump()
         }  # fmt: skip
 
+    def _build(self, transformers: Any) -> Any:
+        # Borders and the number of keypoints are left to `_forward`, which knows where the photograph ends.
+        config = transformers.SuperPointConfig(
+            keypoint_threshold=float(self._settings.threshold),
+            nms_radius=self._settings.nms_radius,
+            max_keypoints=-1,
+            border_removal_distance=0,
+        )
+        return transformers.SuperPointForKeypointDetection(config)
+
     def extract(self, images: Sequence[NDArray[np.uint8]]) -> list[LocalFeatures]:
         """Return the features of images, (H, W) gray or (H, W, 3) RGB, uint8, of any sizes; float16 descriptors.
 
@@ -106,11 +138,11 @@ class SuperPointExtractor:
             ToolkitError: a response is not finite, or not even one image fits the device's memory.
         """
         prepared = [self._prepare(image) for image in images]
-        alike: dict[tuple[int, int], list[int]] = {}
+        of_size: dict[tuple[int, int], list[int]] = {}
         for number, image in enumerate(prepared):
-            alike.setdefault(image.shape, []).append(number)
-        found: dict[int, LocalFeatures] = {}
-        for size, numbers in alike.items():
+            of_size.setdefault(image.shape, []).append(number)
+        features: dict[int, LocalFeatures] = {}
+        for size, numbers in of_size.items():
             fitting = self._fitting.setdefault(size, Fitting(partial(self._forward, size=size), "images"))
             for start in range(0, len(numbers), self.batch_size):
                 part = numbers[start : start + self.batch_size]
@@ -118,8 +150,8 @@ class SuperPointExtractor:
                 with torch.inference_mode():
                     packed = fitting(batch.to(self._device)).cpu().numpy()
                 for number, rows in zip(part, packed, strict=True):
-                    found[number] = _unpack(rows, size, images[number].shape)
-        return [found[number] for number in range(len(images))]
+                    features[number] = _unpack(rows, size, images[number].shape)
+        return [features[number] for number in range(len(images))]
 
     def _prepare(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return an image in gray and of the size that the network sees."""
@@ -161,27 +193,6 @@ class SuperPointExtractor:
             elif not features.isfinite().all():
                 row[0] = torch.nan  # what is not finite is above no threshold
         return packed
-
-
-def load_superpoint(checkpoint: str | Path | Mapping[str, Tensor], settings: SuperPointSettings) -> Any:
-    """Return the network of `transformers` with official weights, float32, on the CPU, ready to use.
-
-    Raises:
-        WeightsError: not such a file, or other weights; names missing, unexpected and mis-shaped keys.
-        ToolkitError: the package is missing.
-    """
-    transformers = import_transformers("SuperPoint")
-    # Borders and the number of keypoints are left to the caller, who knows where the photograph ends.
-    config = transformers.SuperPointConfig(
-        keypoint_threshold=float(settings.threshold),
-        nms_radius=settings.nms_radius,
-        max_keypoints=-1,
-        border_removal_distance=0,
-    )
-    with torch.device("meta"):
-        model = transformers.SuperPointForKeypointDetection(config)
-    load_checkpoint(model, checkpoint, "SuperPoint")
-    return model
 
 
 def _pad(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
