@@ -14,10 +14,11 @@ from tests.models.test_megaloc import tiny_megaloc
 from toolkit.capture import Session, Trajectory, write_session
 from toolkit.capture.images import read_image
 from toolkit.capture.upright import turned_from_cam
-from toolkit.embed import embed_sessions
+from toolkit.embed import VECTORS, embed_sessions, write_matrix
 from toolkit.embedders import load_embeddings
 from toolkit.embedders.megaloc import MegaLocEmbedder
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError, WeightsError
+from toolkit.features.groups import GroupWriter
 from toolkit.geometry import invert, qt_from_pose
 from toolkit.models.megaloc import MegaLoc
 from toolkit.retrieve import retrieve_pairs
@@ -236,6 +237,28 @@ def test_a_killed_run_goes_on_within_a_subsession(
         twin = tmp_path / "e" / path.relative_to(tmp_path / "whole")
         assert path.is_dir() or twin.read_bytes() == path.read_bytes(), path
     assert not list((tmp_path / "e").rglob("*.partial*"))
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float16"])
+@pytest.mark.parametrize("batches", [[], [0], [5, 0, 5, 2]])
+def test_a_matrix_is_what_numpy_writes(tmp_path: Path, dtype: str, batches: list[int]) -> None:
+    vectors = np.random.default_rng(0).random((sum(batches), 3), np.float32)
+    np.save(tmp_path / "numpy.npy", vectors.astype(dtype))
+    with GroupWriter(tmp_path / "ours.npy", {}) as writer:
+        for number, batch in enumerate(np.split(vectors, np.cumsum(batches)[:-1]) if batches else []):
+            writer.add(str(number), arrays={VECTORS: batch})
+        write_matrix(tmp_path / "ours.npy", writer, len(vectors), 3, dtype)
+        writer.discard()
+    assert (tmp_path / "ours.npy").read_bytes() == (tmp_path / "numpy.npy").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["numpy.npy", "ours.npy"]
+
+
+def test_an_embedder_that_gives_other_vectors_is_refused(
+    tiny: Path, tmp_path: Path, megaloc: dict[str, object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(MegaLocEmbedder, "embed", lambda self, inputs: np.zeros((len(inputs), 3), np.float32))
+    with pytest.raises(ValueError, match=r"megaloc gave \(4, 3\)"):
+        embed_sessions(tiny / "sessions", tmp_path / "e", **megaloc)  # type: ignore[arg-type]
 
 
 @pytest.mark.usefixtures("no_hub")

@@ -322,14 +322,13 @@ def test_map_images_in_memory_are_bounded(monkeypatch: pytest.MonkeyPatch) -> No
     )
     read: list[str] = []
 
-    class Store:
+    class Store(dict[str, LocalFeatures]):
         def __getitem__(self, name: str) -> LocalFeatures:
             read.append(name)
             return features
 
-    verifier = rerank.Verifier(RerankSettings(max_features=4), MutualMatcher(0.8))
-    for name in "abab":
-        assert len(verifier._features(name, Store())) == 4  # type: ignore[arg-type]
-    assert read == ["a", "b"]
-    verifier._features("c", Store())  # type: ignore[arg-type]
-    assert len(verifier._kept) == 2
+    verifier = rerank.Verifier(RerankSettings(max_features=4), MutualMatcher(0.8), Store())
+    for name in "ababcab":
+        verifier.verify(features, WIDE, [name], [WIDE])
+    assert read == ["a", "b", "c", "a", "b"]
+    assert len(verifier._map_features("a")) == 4

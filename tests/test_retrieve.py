@@ -13,7 +13,7 @@ from toolkit.embed import embed_sessions
 from toolkit.errors import ArtifactError, CaptureError, ManifestError
 from toolkit.retrieve import load_embeddings, retrieve_pairs, search
 
-BACKENDS = ["faiss", "torch", "numpy"]
+BACKENDS = ["faiss", "torch"]
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

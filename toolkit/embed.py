@@ -17,9 +17,9 @@ from toolkit.capture import Capture, Session
 from toolkit.capture.images import default_workers, prefetch, read_image
 from toolkit.capture.upright import Turns, turn_image, upright_turns
 from toolkit.embedders import Embedder, create_embedder, resolve_name
-from toolkit.embedders.matrix import MatrixWriter
 from toolkit.errors import ImageError, ManifestError, ToolkitError
 from toolkit.features.features import LocalFeatures, SiftExtractor
+from toolkit.features.groups import GroupWriter
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import (
     file_fingerprint,
@@ -34,6 +34,8 @@ from toolkit.manifest import EmbedSettings
 
 log = logging.getLogger(__name__)
 
+VECTORS = "vectors"
+"""Name of the array of a batch."""
 VOCABULARY_IMAGES = 2048
 """Map images that the vocabulary is learned from at most, spread evenly: bounds time and memory."""
 
@@ -107,12 +109,15 @@ def embed_sessions(
         else:
             # The same images in batches of another size are the same up to rounding.
             identity = {**record, "batch_size": settings.batch_size}
-            with MatrixWriter(matrix_path, embedder.dim, settings.dtype, identity, resume=skip_existing) as writer:
-                failed = _embed_job(embedder, job, writer, settings.batch_size, settings.normalize, store_of)
-                embedded = writer.count
+            with GroupWriter(matrix_path, identity) as batches:
+                if not skip_existing:
+                    batches.discard()
+                failed = _embed_job(embedder, job, batches, settings.batch_size, settings.normalize, store_of)
+                embedded = len(rows) - len(failed)
                 _write_tables(folder, _manifest(capture, session, rows, failed), failed)
-                writer.finish()
-            write_sidecar(matrix_path, record)
+                write_matrix(matrix_path, batches, embedded, embedder.dim, settings.dtype)
+                write_sidecar(matrix_path, record)
+                batches.discard()
             if failed:
                 log.warning("%s/%s: %d of %d images cannot be read, see %s",
                             session.id, part, len(failed), len(rows), folder / "failed.csv")  # fmt: skip
@@ -257,30 +262,42 @@ def _vocabulary(
 def _embed_job(
     embedder: Embedder,
     job: _Job,
-    writer: MatrixWriter,
+    batches: GroupWriter,
     batch_size: int,
     normalize: bool,
     store_of: Callable[[str], FeatureStore],
 ) -> dict[int, str]:
-    """Write the vectors of the readable images, in order; returns why the others (by row) have none."""
+    """Add the vectors of the readable images, in order; return why the others (by row) have none."""
     failed: dict[int, str] = {}
-    done = 0
-    for note in writer.notes:  # what a killed run had done
+    done, finished = 0, batches.notes()
+    for note in finished.values():  # what a stopped run had done
         done = note["done"]
         failed |= dict(note["failed"])
     source = _features if embedder.inputs == "features" else _images
     inputs = source(embedder, job, done, batch_size, store_of)
     label = f"embed {job.session.id}/{job.part}"
     with tqdm(total=len(job.rows), initial=done, desc=label, unit="image") as bar:
-        for batch, unreadable in _batches(inputs, batch_size):
+        for number, (batch, unreadable) in enumerate(_batches(inputs, batch_size), start=len(finished)):
             vectors = embedder.embed(batch)
+            if vectors.shape != (len(batch), embedder.dim):
+                raise ValueError(f"{embedder.name} gave {vectors.shape}; expected {(len(batch), embedder.dim)}.")
             if normalize:
                 vectors = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
             failed |= unreadable
             done += len(batch) + len(unreadable)
-            writer.append(vectors, {"done": done, "failed": list(unreadable.items())})
+            note = {"done": done, "failed": list(unreadable.items())}
+            batches.add(f"{number:08d}", arrays={VECTORS: vectors}, note=note)
             bar.update(len(batch) + len(unreadable))
     return failed
+
+
+def write_matrix(path: Path, batches: GroupWriter, rows: int, dim: int, dtype: str) -> None:
+    """Write the vectors of all batches to a file `.npy`, (rows, dim), without holding them in memory."""
+    with write_atomic(path) as temporary, open(temporary, "wb") as stream:
+        header = {"descr": np.dtype(dtype).str, "fortran_order": False, "shape": (rows, dim)}
+        np.lib.format.write_array_header_1_0(stream, header)
+        for _, arrays in batches.read():
+            stream.write(np.ascontiguousarray(arrays[VECTORS], dtype).tobytes())
 
 
 def _features(

@@ -7,11 +7,10 @@ calibrated cameras are rarely found between different places, so the right refer
 import json
 import logging
 import time
-from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 import cv2
@@ -26,14 +25,14 @@ from tqdm.auto import tqdm
 from toolkit.capture import Capture, Session
 from toolkit.capture.images import default_workers, prefetch
 from toolkit.errors import ArtifactError
-from toolkit.features.features import Extractor, LocalFeatures
+from toolkit.features.features import LocalFeatures
+from toolkit.features.groups import GroupWriter
 from toolkit.features.matching import LocalMethod, Matcher, create_local_methods
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import (
     file_fingerprint,
     image_name,
     is_current,
-    open_progress,
     pair_name,
     read_references,
     write_sidecar,
@@ -100,20 +99,13 @@ def rerank_pairs(
     try:
         with threadpool_limits(1, "blas"):
             for mapped in capture.devices_with("map", map_device):
-                verifier = Verifier(settings, method.matcher)
                 for asked in capture.devices_with("query", query_device):
                     started = time.perf_counter()
                     pair = _Pair(capture, mapped, asked, Path(retrieval_dir), Path(out_dir))
                     record = pair.record(settings, method)
                     skipped = skip_existing and is_current(pair.path, record)
                     if not skipped:
-                        rows = _rerank_pair(
-                            pair, verifier, method.extractor, Path(features_dir), settings, record, workers,
-                            skip_existing,
-                        )  # fmt: skip
-                        write_text(pair.path, "".join(json.dumps(row) + "\n" for row in rows))
-                        write_sidecar(pair.path, record)
-                        pair.progress.unlink(missing_ok=True)
+                        _rerank_pair(pair, settings, method, Path(features_dir), record, workers, skip_existing)
                     table.append(
                         {"map_device": mapped, "query_device": asked}
                         | _counts(read_references(pair.path))
@@ -128,14 +120,18 @@ def rerank_pairs(
 class Verifier:
     """Counts, for a query image and map images, the matches that agree with one relative pose.
 
-    Safe to use from several threads. The features of the map images used last are kept.
+    Safe to use from several threads. The features of the map images used last stay in memory.
     """
 
-    def __init__(self, settings: RerankSettings, matcher: Matcher):
+    def __init__(self, settings: RerankSettings, matcher: Matcher, store: Mapping[str, LocalFeatures]):
+        """
+        Args:
+            settings, matcher: how to verify and to match.
+            store: the features of the map images.
+        """
         self.settings = settings
         self.matcher = matcher
-        self._kept: OrderedDict[str, LocalFeatures] = OrderedDict()
-        self._lock = Lock()
+        self._map_features = lru_cache(MAP_IMAGES_KEPT)(lambda name: self._strongest(store[name]))
 
     def verify(
         self,
@@ -143,46 +139,32 @@ class Verifier:
         camera: pycolmap.Camera,
         references: Sequence[str],
         cameras: Sequence[pycolmap.Camera],
-        store: FeatureStore,
     ) -> tuple[list[int], list[int]]:
         """Return the inliers and the matches of a query image with each reference.
 
         Args:
             features, camera: of the query image.
-            references, cameras: names and cameras of map images, each of which is in the store.
-            store: the features of the map's images.
+            references, cameras: names and cameras of map images, all of which have features.
         """
         features = self._strongest(features)
-        known = [self._features(name, store) for name in references]
-        matched = self.matcher.match([(features, other) for other in known])
+        map_features = [self._map_features(name) for name in references]
+        matched = self.matcher.match([(features, other) for other in map_features])
         inliers = [
             count_inliers(
                 camera,
-                features.keypoints[found.indices[:, 0]],
+                features.keypoints[matches.indices[:, 0]],
                 other_camera,
-                other.keypoints[found.indices[:, 1]],
-                found.scores,
+                other.keypoints[matches.indices[:, 1]],
+                matches.scores,
                 self.settings,
                 tests=len(references),
             )
-            for found, other, other_camera in zip(matched, known, cameras, strict=True)
+            for matches, other, other_camera in zip(matched, map_features, cameras, strict=True)
         ]
-        return inliers, [len(found.indices) for found in matched]
+        return inliers, [len(matches) for matches in matched]
 
     def _strongest(self, features: LocalFeatures) -> LocalFeatures:
         return features.take(slice(self.settings.max_features))
-
-    def _features(self, name: str, store: FeatureStore) -> LocalFeatures:
-        with self._lock:
-            if name in self._kept:
-                self._kept.move_to_end(name)
-                return self._kept[name]
-        features = self._strongest(store[name])
-        with self._lock:
-            self._kept[name] = features
-            if len(self._kept) > MAP_IMAGES_KEPT:
-                self._kept.popitem(last=False)
-        return features
 
 
 def count_inliers(
@@ -281,10 +263,6 @@ class _Pair:
         return self.out_dir / self.retrieval.name
 
     @property
-    def progress(self) -> Path:
-        return self.out_dir / f".{self.retrieval.stem}.partial.jsonl"
-
-    @property
     def sessions(self) -> tuple[Session, Session]:
         return self.capture[f"{self.map_device}_map"], self.capture[f"{self.query_device}_query"]
 
@@ -306,44 +284,46 @@ class _Pair:
 
 def _rerank_pair(
     pair: _Pair,
-    verifier: Verifier,
-    extractor: Extractor,
-    features_dir: Path,
     settings: RerankSettings,
+    method: LocalMethod,
+    features_dir: Path,
     record: dict[str, Any],
     workers: int,
     skip_existing: bool,
-) -> list[dict[str, Any]]:
-    """Rerank the query images of a pair that a killed run has not; returns a row for each, in the file's order."""
+) -> None:
+    """Write the reranked file of a pair; rows that a stopped run finished are taken over."""
     queries = read_references(pair.retrieval, "path")
     map_session, query_session = pair.sessions
-    asked = _rows_of(query_session, [_name(query) for query in queries], pair.retrieval)
-    names = list(dict.fromkeys(_name(found) for query in queries for found in query["topk"][: settings.topn]))
-    known = _rows_of(map_session, names, pair.retrieval)
-    query_store = extract_session(query_session, features_dir, extractor, rows=asked, workers=workers)
-    map_store = extract_session(map_session, features_dir, extractor, rows=known, workers=workers)
+    query_rows = _rows_of(query_session, [_name(query) for query in queries], pair.retrieval)
+    names = list(dict.fromkeys(_name(reference) for query in queries for reference in query["topk"][: settings.topn]))
+    map_rows = _rows_of(map_session, names, pair.retrieval)
+    query_store = extract_session(query_session, features_dir, method.extractor, query_rows, workers)
+    map_store = extract_session(map_session, features_dir, method.extractor, map_rows, workers)
+    verifier = Verifier(settings, method.matcher, map_store)
 
-    def rerank(query: dict[str, Any]) -> dict[str, Any]:
+    def rerank(index: int) -> tuple[int, dict[str, Any]]:
+        query = queries[index]
         try:
-            return _reranked(query, verifier, query_session, query_store, map_session, map_store)
+            return index, _reranked(query, verifier, query_session, query_store, map_session, map_store)
         except Exception as error:  # one bad query never ends a run
             log.exception("reranking %s", query["path"])
-            return _kept(query, settings.topk, f"{type(error).__name__}: {error}")
+            return index, _kept(query, settings.topk, f"{type(error).__name__}: {error}")
 
-    with open_progress(pair.progress, record, keep=skip_existing) as progress:
-        done = {_key(row): row for row in progress.rows}
+    with GroupWriter(pair.path, record) as progress:
+        if not skip_existing:
+            progress.discard()
+        todo = [index for index in range(len(queries)) if str(index) not in progress.notes()]
         # Queries with the same best reference follow each other: what they share is read once.
-        todo = sorted(
-            (query for query in queries if _key(query) not in done),
-            key=lambda query: _name(query["topk"][0]) if query["topk"] else "",
-        )
+        todo.sort(key=lambda index: _name(queries[index]["topk"][0]) if queries[index]["topk"] else "")
         label = f"rerank {pair.query_device} in {pair.map_device}"
         # A network matches the references of one query as a batch, and keeps the device busy by that.
-        threads = workers if extractor.threaded else 1
-        for row in tqdm(prefetch(rerank, todo, threads), total=len(todo), desc=label, unit="image"):
-            progress.add(row)
-            done[_key(row)] = row
-    return [done[_key(query)] for query in queries]
+        threads = workers if method.extractor.threaded else 1
+        for index, row in tqdm(prefetch(rerank, todo, threads), total=len(todo), desc=label, unit="image"):
+            progress.add(str(index), note=row)
+        rows = progress.notes()
+        write_text(pair.path, "".join(json.dumps(rows[str(index)]) + "\n" for index in range(len(queries))))
+        write_sidecar(pair.path, record)
+        progress.discard()
 
 
 def _reranked(
@@ -366,7 +346,6 @@ def _reranked(
         query_session.camera(query["sensor_id"]),
         [_name(reference) for reference in readable],
         [map_session.camera(reference["sensor_id"]) for reference in readable],
-        map_store,
     )
     if not any(inliers):
         return _kept(query, topk, "no reference agrees with the query by more than chance")
@@ -395,10 +374,6 @@ def _counts(rows: list[dict[str, Any]]) -> dict[str, int]:
     kept = sum(bool(row["reason"]) for row in rows)
     changed = sum(bool(row["topk"]) and row["topk"][0]["retrieval_rank"] != 1 for row in rows)
     return {"queries": len(rows), "confirmed": len(rows) - kept, "kept": kept, "changed": changed}
-
-
-def _key(row: dict[str, Any]) -> tuple[str, str]:
-    return str(row["timestamp"]), str(row["sensor_id"])
 
 
 def _name(entry: dict[str, Any]) -> str:

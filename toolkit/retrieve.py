@@ -3,7 +3,7 @@
 import json
 import logging
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -30,7 +30,7 @@ from toolkit.models.compute import resolve_device
 
 log = logging.getLogger(__name__)
 
-Backend = Literal["faiss", "torch", "numpy"]
+Backend = Literal["faiss", "torch"]
 _BLOCK_BYTES = 64 << 20
 
 
@@ -51,7 +51,7 @@ def search(
         query: (Q, D), any float type.
         database: (N, D).
         k: how many; at most N are returned.
-        backend: `faiss`, `torch` or `numpy`.
+        backend: `faiss` or `torch`.
         compute_device: where torch computes: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
         faiss_gpu: let faiss compute on the GPU (needs a faiss built for it).
 
@@ -344,59 +344,40 @@ def _candidates(
     faiss_gpu: bool,
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Return the `width` best (scores, indices) (Q, width) of each query, best first, up to rounding."""
-    if backend == "faiss":
-        import faiss
+    if backend == "torch":
+        return _torch_candidates(query, database, width, compute_device)
+    if backend != "faiss":
+        raise ValueError(f"Unknown backend {backend!r}; expected faiss or torch.")
+    import faiss
 
-        if not faiss_gpu:
-            scores, indices = faiss.knn(query, database, width, metric=faiss.METRIC_INNER_PRODUCT)
-            return scores, indices
-        if not hasattr(faiss, "StandardGpuResources"):
-            raise ToolkitError(
-                "faiss_gpu is set, but the installed faiss has no GPU support (faiss-cpu). "
-                "Set faiss_gpu: false, or use_faiss: false with compute_device: cuda."
-            )
-        scores, indices = faiss.knn_gpu(
-            faiss.StandardGpuResources(), query, database, width, metric=faiss.METRIC_INNER_PRODUCT
-        )
+    if not faiss_gpu:
+        scores, indices = faiss.knn(query, database, width, metric=faiss.METRIC_INNER_PRODUCT)
         return scores, indices
-    if backend not in ("torch", "numpy"):
-        raise ValueError(f"Unknown backend {backend!r}; expected faiss, torch or numpy.")
-    blocks = _torch_blocks if backend == "torch" else _numpy_blocks
-    found = np.full((len(query), 0), -np.inf, np.float32)
-    candidates = np.zeros((len(query), 0), np.int64)
-    for scores, indices in blocks(query, database, width, compute_device):
-        found, candidates = (
-            np.concatenate([found, scores], axis=1),
-            np.concatenate([candidates, indices], axis=1),
+    if not hasattr(faiss, "StandardGpuResources"):
+        raise ToolkitError(
+            "faiss_gpu is set, but the installed faiss has no GPU support (faiss-cpu). "
+            "Set faiss_gpu: false, or use_faiss: false with compute_device: cuda."
         )
-        order = np.argsort(-found, axis=1, kind="stable")[:, :width]
-        found, candidates = (
-            np.take_along_axis(found, order, axis=1),
-            np.take_along_axis(candidates, order, axis=1),
-        )
-    return found, candidates
+    scores, indices = faiss.knn_gpu(
+        faiss.StandardGpuResources(), query, database, width, metric=faiss.METRIC_INNER_PRODUCT
+    )
+    return scores, indices
 
 
-def _numpy_blocks(
+def _torch_candidates(
     query: NDArray[np.float32], database: NDArray[np.float32], width: int, compute_device: str
-) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int64]]]:
-    step = max(1, _BLOCK_BYTES // (4 * len(query)))
-    for start in range(0, len(database), step):
-        scores = query @ database[start : start + step].T
-        best = min(width, scores.shape[1])
-        chosen = np.argpartition(-scores, best - 1, axis=1)[:, :best]
-        yield np.take_along_axis(scores, chosen, axis=1), chosen + start
-
-
-def _torch_blocks(
-    query: NDArray[np.float32], database: NDArray[np.float32], width: int, compute_device: str
-) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int64]]]:
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Search the database in blocks, so that the scores of all its rows are never in memory together."""
     import torch
 
     device = resolve_device(compute_device)
     queries = torch.from_numpy(query).to(device)
+    scores = torch.zeros((len(query), 0), device=device)
+    indices = torch.zeros((len(query), 0), dtype=torch.int64, device=device)
     step = max(1, _BLOCK_BYTES // (4 * len(query)))
     for start in range(0, len(database), step):
-        scores = queries @ torch.from_numpy(database[start : start + step]).to(device).T
-        values, chosen = scores.topk(min(width, scores.shape[1]), dim=1)
-        yield values.cpu().numpy(), chosen.cpu().numpy() + start
+        block = queries @ torch.from_numpy(database[start : start + step]).to(device).T
+        numbers = torch.arange(start, start + block.shape[1], device=device).expand(block.shape)
+        scores, best = torch.cat([scores, block], 1).topk(min(width, scores.shape[1] + block.shape[1]))
+        indices = torch.cat([indices, numbers], 1).gather(1, best)
+    return scores.cpu().numpy(), indices.cpu().numpy()

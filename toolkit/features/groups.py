@@ -2,7 +2,7 @@
 
 HDF5 itself is not: a file that was open for writing when its writer died cannot be read. So a run writes what it makes
 to hidden parts, each of which is complete or absent, and joins them to the file when it ends; the next run takes up the
-parts that a killed run left. The record beside the file tells for each group what it was made from.
+parts that a stopped run left. The record beside the file tells for each group what it was made from.
 """
 
 import logging
@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 PART_GROUPS = 64
 PART_SECONDS = 5.0
-"""A part is complete after so many groups or seconds, whichever comes first. A kill costs at most one part."""
+"""A part is closed after so many groups or seconds, whichever comes first. A kill costs at most one part."""
 
 
 @dataclass
@@ -110,15 +110,15 @@ class GroupWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         try:
-            self._writing.__exit__(kind, error, trace)  # drops a part that is not complete
+            self._close_part()  # also after an error: what was added before it is kept
         finally:
             self._locked.close()
 
     def add(
         self,
         name: str,
-        made_from: str,
-        arrays: Mapping[str, NDArray[Any]],
+        made_from: str = "",
+        arrays: Mapping[str, NDArray[Any]] | None = None,
         attributes: Mapping[str, Mapping[str, Any]] | None = None,
         note: Any = None,
     ) -> None:
@@ -126,14 +126,14 @@ class GroupWriter:
 
         Args:
             name: of the group.
-            made_from: fingerprint of what it was made from.
+            made_from: fingerprint of what it was made from, besides what the file was made by.
             arrays: by name.
             attributes: of some of the arrays.
             note: about the group, any JSON; `notes` returns it.
         """
         file, index = self._part()
         group = file.create_group(name)
-        for key, array in arrays.items():
+        for key, array in (arrays or {}).items():
             group[key] = array
         for key, values in (attributes or {}).items():
             group[key].attrs.update(values)
