@@ -15,9 +15,12 @@ import pytest
 from toolkit.capture import Capture, read_depth
 from toolkit.errors import CaptureError
 from toolkit.geometry import invert, make_pose, rotation_angle_deg, transform
-from toolkit.synthetic import render as synthetic
-from toolkit.synthetic import render_capture
-from toolkit.synthetic.render import DEVICES, Quad, Rays, Scene, paint, render
+from toolkit.synthetic import capture as capture_writing
+from toolkit.synthetic import render_capture, textures
+from toolkit.synthetic.devices import DEVICES, Sensor, looking, walks
+from toolkit.synthetic.light import paint
+from toolkit.synthetic.render import Rays, render
+from toolkit.synthetic.scene import Quad, Scene, build_room
 
 
 @pytest.fixture(scope="module")
@@ -36,11 +39,11 @@ def looking_at_wall() -> tuple[Scene, np.ndarray]:
     scene = Scene(np.zeros(3), (9.0, 9.0, 9.0), False)
     scene.plate((-1.6, 4.0, 1.6), (1, 0, 0), (0, 0, -1), 3.2, 3.2, checker, 160, lit=False)
     paint(scene, 0, 0, 0)
-    return scene, make_pose(synthetic._looking(76.0, 4.0, 9.0), (-0.3, 0.4, 0.1))
+    return scene, make_pose(looking(76.0, 4.0, 9.0), (-0.3, 0.4, 0.1))
 
 
 @pytest.mark.parametrize("sensor", [s for d in DEVICES.values() for s in d.sensors], ids=lambda s: s.name)
-def test_texture_corners_appear_where_the_camera_projects_them(sensor: synthetic.Sensor) -> None:
+def test_texture_corners_appear_where_the_camera_projects_them(sensor: Sensor) -> None:
     camera = pycolmap.Camera(
         model=sensor.model, width=sensor.size[0], height=sensor.size[1], params=list(sensor.params)
     )
@@ -72,7 +75,7 @@ def test_rectangles_behind_and_across_the_camera_are_clipped() -> None:
     for number in range(2):
         paint(scene, 0, 0, number)
     camera = pycolmap.Camera(model="PINHOLE", width=96, height=72, params=[70, 70, 48, 36])
-    world_from_cam = make_pose(synthetic._looking(90, -20, 0), (0, 0, 1.0))
+    world_from_cam = make_pose(looking(90, -20, 0), (0, 0, 1.0))
     picture, depth = render(scene.quads, world_from_cam, Rays.of(camera), gray=False)
     assert picture.shape == (72, 96, 3)
     v = np.arange(72) + 0.5
@@ -83,7 +86,7 @@ def test_rectangles_behind_and_across_the_camera_are_clipped() -> None:
 
 def test_the_nearer_rectangle_hides_the_farther() -> None:
     scene, world_from_cam = looking_at_wall()
-    plain = partial(synthetic.plain, color=(0, 0, 255))
+    plain = partial(textures.plain, color=(0, 0, 255))
     scene.plate((-0.2, 2.0, 0.6), (1, 0, 0), (0, 0, -1), 0.5, 0.5, plain, 100, lit=False)
     paint(scene, 0, 0, 1)
     camera = pycolmap.Camera(model="PINHOLE", width=320, height=240, params=[260, 260, 160, 120])
@@ -176,11 +179,11 @@ def test_rigs_have_real_baselines_and_a_rolled_camera(demo: Path) -> None:
 def test_queries_are_away_from_the_map_but_see_it() -> None:
     for seed in range(3):
         for index in range(2):
-            scene = synthetic.build_room(seed, index)
+            scene = build_room(seed, index)
             for name in DEVICES:
-                walks = synthetic.walks(scene, seed, index, 12, name)
-                mapped = np.concatenate([walks["map", 0], walks["map", 1]])
-                query = np.concatenate([walks["query", 0], walks["query", 1]])
+                paths = walks(scene, seed, index, 12, name)
+                mapped = np.concatenate([paths["map", 0], paths["map", 1]])
+                query = np.concatenate([paths["query", 0], paths["query", 1]])
                 assert (len(mapped), len(query)) == (12, 6)
                 distance = np.linalg.norm(query[:, None, :3, 3] - mapped[None, :, :3, 3], axis=-1)
                 assert distance.min() > 0.3
@@ -207,14 +210,14 @@ def digest(folder: Path) -> dict[str, str]:
 def test_same_seed_same_bytes_on_any_number_of_cores(
     demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(synthetic, "_cores", lambda: 3 if os.cpu_count() == 1 else 1)
+    monkeypatch.setattr(capture_writing, "_cores", lambda: 3 if os.cpu_count() == 1 else 1)
     again = render_capture(tmp_path / "AGAIN", 1, 4, seed=3, progress=False)
     assert digest(again) == digest(demo)
 
 
 def test_other_seeds_and_rooms_look_different() -> None:
     def texture(seed: int, index: int) -> np.ndarray:
-        scene = synthetic.build_room(seed, index)
+        scene = build_room(seed, index)
         paint(scene, seed, index, 0)
         return scene.quads[0].gray[3][:30, :30]
 
@@ -223,7 +226,7 @@ def test_other_seeds_and_rooms_look_different() -> None:
 
 
 def test_look_alikes_come_in_few_models_and_other_things_do_not() -> None:
-    def textures(material: synthetic.Material, look_alikes: bool) -> set[bytes]:
+    def drawn(material: textures.Material, look_alikes: bool) -> set[bytes]:
         seen = set()
         for index in range(2):
             scene = Scene(np.zeros(3), (4, 4, 3), False)
@@ -233,9 +236,9 @@ def test_look_alikes_come_in_few_models_and_other_things_do_not() -> None:
             seen |= {quad.gray[0][:160, :64].tobytes() for quad in scene.quads}
         return seen
 
-    assert len(textures(synthetic.door, True)) == 2
-    assert len(textures(synthetic.door, False)) == 12
-    assert len(textures(synthetic.poster, True)) == 12
+    assert len(drawn(textures.door, True)) == 2
+    assert len(drawn(textures.door, False)) == 12
+    assert len(drawn(textures.poster, True)) == 12
 
 
 def test_a_complete_capture_is_left_as_it_is_and_an_incomplete_one_is_not(
@@ -250,7 +253,7 @@ def test_a_complete_capture_is_left_as_it_is_and_an_incomplete_one_is_not(
     def started(*_: object, **__: object) -> None:
         raise InterruptedError("renders anew")
 
-    monkeypatch.setattr(synthetic, "paint", started)
+    monkeypatch.setattr(capture_writing, "paint", started)
     assert render_capture(out, 1, 4, seed=3, progress=False) == out
     with pytest.raises(InterruptedError):
         render_capture(out, 1, 4, seed=4, progress=False)
@@ -264,7 +267,7 @@ def test_a_rendering_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pyte
     def fail(*_: object, **__: object) -> None:
         raise OSError("disk full")
 
-    monkeypatch.setattr(synthetic, "paint", fail)
+    monkeypatch.setattr(capture_writing, "paint", fail)
     with pytest.raises(OSError, match="disk full"):
         render_capture(tmp_path / "C", 1, 2, progress=False)
     assert not list(tmp_path.iterdir())
@@ -280,5 +283,5 @@ def test_refusals(tmp_path: Path) -> None:
 
 
 def test_a_quad_faces_the_side_it_is_seen_from() -> None:
-    quad = Quad(np.zeros(3), np.array([1.0, 0, 0]), np.array([0, 0, -1.0]), 1, 1, synthetic.plain, 10)
+    quad = Quad(np.zeros(3), np.array([1.0, 0, 0]), np.array([0, 0, -1.0]), 1, 1, textures.plain, 10)
     np.testing.assert_array_equal(quad.normal, [0, -1, 0])  # right and down as seen from -y

@@ -1,5 +1,5 @@
 """A rendered capture with exact ground truth, for demos, tests and benchmarks."""
 
-from toolkit.synthetic.render import render_capture
+from toolkit.synthetic.capture import render_capture
 
 __all__ = ["render_capture"]

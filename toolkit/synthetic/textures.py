@@ -1,4 +1,4 @@
-"""Procedural textures of the rendered capture (toolkit/synthetic.py): walls, floors, furniture, pictures.
+"""Procedural textures of the rendered capture : walls, floors, furniture, pictures.
 
 A material is a function (random generator, height, width, pixels a meter) -> (height, width, 3) BGR uint8.
 All are rich in corners at several scales, and drawn from the generator alone: the same generator, the same

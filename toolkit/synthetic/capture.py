@@ -1,0 +1,305 @@
+"""A rendered capture: textured rooms seen by a phone, a headset and a robot, with exact ground truth.
+
+Poses, intrinsics and depths are exact. The world has z up and meters; the rooms stand far apart. All randomness comes
+from the seed and the name of the thing that is drawn, never from the order of work: the bytes do not depend on the
+number of cores.
+"""
+
+import json
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from toolkit.errors import CaptureError
+from toolkit.geometry import Array, invert, pose_from_qt, qt_from_pose
+from toolkit.synthetic.devices import DEVICES, Device, walks
+from toolkit.synthetic.light import paint
+from toolkit.synthetic.render import Rays, render
+from toolkit.synthetic.scene import Scene, build_room, named_rng
+from toolkit.synthetic.textures import Image
+
+if TYPE_CHECKING:
+    import pycolmap
+
+FORMAT = 1  # raise it when the same settings give other bytes
+
+
+@dataclass
+class Shot:
+    """One picture to take."""
+
+    session: str
+    timestamp: int
+    sensor_id: str
+    path: str  # below raw_data/
+    depth_path: str | None
+    camera: "pycolmap.Camera"
+    world_from_cam: Array
+    device: Device
+
+
+@dataclass
+class Tables:
+    """The rows of a session's files, as they are collected."""
+
+    sensors: dict[str, tuple[Any, ...]] = field(default_factory=dict)
+    rigs: list[tuple[int, str, str, Array]] = field(default_factory=list)
+    poses: list[tuple[int, str, Array]] = field(default_factory=list)
+    images: list[tuple[int, str, str]] = field(default_factory=list)
+    depths: list[tuple[int, str, str]] = field(default_factory=list)
+    subsessions: list[str] = field(default_factory=list)
+
+
+def _subsession(name: str, split: str, part: int, hours: int) -> tuple[str, int]:
+    """Return a subsession's name and its first timestamp, microseconds, on the device's clock."""
+    after_us = (
+        (2 * part + (split == "query")) * hours * 3600 + {"ios": 0, "hl": 600, "spot": 1200}[name]
+    ) * 10**6
+    day = 1714557600 * 10**6 + after_us  # 2024-05-01 10:00 UTC
+    stamp = time.gmtime(day // 10**6)
+    if name == "ios":
+        return time.strftime("ios_%Y-%m-%d_%H.%M.%S_000", stamp), 630_000_000_000 + after_us
+    if name == "hl":
+        return time.strftime("hl_%Y-%m-%d-%H-%M-%S-417", stamp), 93_000_000_000 + after_us
+    return time.strftime("spot_%Y-%m-%d-%H-%M", stamp), day
+
+
+def _plan_room(
+    scene: Scene, seed: int, index: int, frames: int, hours: int, tables: dict[str, Tables]
+) -> Iterator[Shot]:
+    """Add one room's frames to the tables of all sessions, and yield its pictures."""
+    import pycolmap
+
+    for name, device in DEVICES.items():
+        for (split, part), bodies in walks(scene, seed, index, frames, name).items():
+            session, table = f"{name}_{split}", tables[f"{name}_{split}"]
+            subsession, start = _subsession(name, split, part, hours)
+            if subsession not in table.subsessions:
+                table.subsessions.append(subsession)
+            rng = named_rng(seed, index, "frames", name, split, part)
+            for i, world_from_body in enumerate(bodies):
+                timestamp = start + int(
+                    1e6 * (5 + 1.4 * (index * (frames + 8) + i)) + rng.integers(0, 700_000)
+                )
+                zoom = float(np.round(rng.normal(1, 0.004), 5))
+                device_id = {
+                    "hl": f"{subsession}/hetrig_{timestamp}",
+                    "spot": f"{subsession}/{timestamp}-body",
+                }.get(name)
+                if device.rig_from_body is not None:
+                    rig_from_body = pose_from_qt(device.rig_from_body)
+                    table.poses.append((timestamp, str(device_id), world_from_body @ invert(rig_from_body)))
+                for sensor in device.sensors:
+                    params, size, label = list(sensor.params), sensor.size, sensor.name
+                    if name == "ios":  # a phone focuses anew for every picture
+                        params[:2] = [round(f * zoom, 3) for f in params[:2]]
+                        label, short = f"phone camera for timestamp {timestamp}", f"cam_phone_{timestamp}"
+                        path = f"{subsession}/images/{timestamp}"
+                    elif name == "hl":
+                        short, path = label, f"{subsession}/images/{label}/{timestamp}"
+                    else:
+                        short = label = f"spot-camera-{label}-image"
+                        path = f"{subsession}/{label}/{timestamp}-{label}"
+                    sensor_id = f"{subsession}/{short}"
+                    table.sensors[sensor_id] = (sensor_id, label, "camera", sensor.model, *size, *params)
+                    camera = pycolmap.Camera(model=sensor.model, width=size[0], height=size[1], params=params)
+                    world_from_cam = world_from_body @ sensor.body_from_cam
+                    if device.rig_from_body is None:
+                        table.poses.append((timestamp, sensor_id, world_from_cam))
+                    else:
+                        rig_from_cam = rig_from_body @ sensor.body_from_cam
+                        table.rigs.append((timestamp, str(device_id), sensor_id, rig_from_cam))
+                    table.images.append((timestamp, sensor_id, f"{path}.jpg"))
+                    depth_path = None
+                    if split == "map":
+                        folder, _, stem = path.partition("/")
+                        depth_path = f"{folder}/depths/{stem.removeprefix('images/')}.png"
+                        table.depths.append((timestamp, sensor_id, depth_path))
+                    yield Shot(
+                        session,
+                        timestamp,
+                        sensor_id,
+                        f"{path}.jpg",
+                        depth_path,
+                        camera,
+                        world_from_cam,
+                        device,
+                    )
+
+
+def _take(shot: Shot, scene: Scene, rays: Rays | None, sessions: Path, seed: int) -> None:
+    """Render one picture as its device sees it, and its depth, into the session's raw_data."""
+    device = shot.device
+    picture, depth = render(scene.quads, shot.world_from_cam, rays or Rays.of(shot.camera), device.gray)
+    h, w = depth.shape
+    y, x = np.ogrid[0:h, 0:w]
+    radius2 = ((x - w / 2) ** 2 + (y - h / 2) ** 2).astype(np.float32) / ((w / 2) ** 2 + (h / 2) ** 2)
+    # Exposure follows the scene only half way, as it does in a device that must not flicker.
+    gain = (device.brightness / max(float(picture.mean()), 20.0)) ** 0.7
+    picture = np.clip(picture * (gain / 255), 0, None) ** device.gamma * 255
+    picture *= (1 - device.vignette * radius2).reshape(h, w, *[1] * (picture.ndim - 2))
+    if not device.gray:
+        picture *= np.asarray(device.tint, np.float32)
+    noise = named_rng(seed, "noise", shot.sensor_id, str(shot.timestamp)).standard_normal(
+        picture.shape, np.float32
+    )
+    image = np.clip(picture + device.noise * noise + 0.5, 0, 255).astype(np.uint8)
+    raw = sessions / shot.session / "raw_data"
+    _save(raw / shot.path, image, [cv2.IMWRITE_JPEG_QUALITY, device.quality])
+    if shot.depth_path is not None:
+        millimeters = np.where(depth < 65.0, depth * 1000 + 0.5, 0).astype(np.uint16)
+        _save(raw / shot.depth_path, millimeters, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+
+
+def _save(path: Path, image: Image, options: list[int]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    done, encoded = cv2.imencode(path.suffix, image, options)
+    if not done:
+        raise CaptureError(f"Cannot encode {path} from an array {image.shape} {image.dtype}.")
+    path.write_bytes(encoded.tobytes())
+
+
+def _write_session(path: Path, split: str, table: Tables) -> None:
+    """Write the text files of a session, rows in order of time."""
+    import pandas as pd
+
+    from toolkit.capture import Trajectory, write_session
+
+    poses = sorted(table.poses, key=lambda row: row[:2])
+    times, ids = [row[0] for row in poses], [row[1] for row in poses]
+    trajectory = Trajectory(times, ids, qt_from_pose(np.stack([row[2] for row in poses])))
+    frames = pd.DataFrame({"timestamp": times, "device_id": ids})
+    pruned = frames[np.arange(len(frames)) % 6 != 5]
+    keyframes = {
+        "original": frames,
+        "pruned": pruned,
+        "pruned_subsampled": pruned[np.arange(len(pruned)) % 3 != 1],
+    }
+    write_session(
+        path,
+        sensors=table.sensors.values(),
+        rigs=[row[1:] for row in sorted(table.rigs, key=lambda row: row[:3])] or None,
+        trajectory=trajectory if split == "map" else None,
+        images=sorted(table.images),
+        depths=sorted(table.depths) or None,
+        subsessions=table.subsessions,
+        keyframes=keyframes if split == "query" else None,
+        ground_truth=trajectory if split == "query" else None,
+    )
+
+
+def render_capture(
+    out: str | Path,
+    rooms: int = 2,
+    frames: int = 12,
+    seed: int = 0,
+    progress: bool = True,
+    look_alikes: bool = False,
+) -> Path:
+    """Render a capture of `rooms` rooms by a phone, a headset and a robot; return its folder.
+
+    Each device has a map and a query session of two subsessions; each subsession walks through all rooms. A
+    folder that holds this very capture already is left as it is. Time grows with rooms * frames, memory not.
+
+    Args:
+        out: the capture's folder; its name is the scene's. Settings are kept in `demo.json` in it.
+        rooms: how many rooms, at least 1.
+        frames: frames (rig poses) a room and map session, at least 2; query sessions have half as many.
+        seed: of everything; the same seed gives the same bytes.
+        progress: whether to show a bar.
+        look_alikes: whether doors, windows, shelves, cabinets and crates come in few models, the same in all rooms,
+            which are easily taken for one another.
+
+    Raises:
+        CaptureError: a setting is out of range, or `out` holds something else than a rendered capture.
+    """
+    from tqdm.auto import tqdm
+
+    out = Path(out)
+    if rooms < 1 or frames < 2 or seed < 0:
+        raise CaptureError(
+            f"Expected rooms >= 1, frames >= 2, seed >= 0; found {rooms=}, {frames=}, {seed=}."
+        )
+    settings = {"format": FORMAT, "rooms": rooms, "frames": frames, "seed": seed}
+    settings |= {"look_alikes": 1} if look_alikes else {}
+    if _is_complete(out, settings):
+        return out
+    if out.exists() and any(out.iterdir()) and not (out / "demo.json").exists():
+        raise CaptureError(
+            f"{out} is not empty and holds no demo.json, so it was not rendered here: choose another folder."
+        )
+    out.parent.mkdir(parents=True, exist_ok=True)
+    # A killed rendering leaves only a hidden folder beside OUT, which the next rendering clears away.
+    for stale in out.parent.glob(f".{out.name}.rendering-*"):
+        if time.time() - stale.stat().st_mtime > 3600:
+            shutil.rmtree(stale, ignore_errors=True)
+    partial_out = Path(tempfile.mkdtemp(prefix=f".{out.name}.rendering-", dir=out.parent))
+    threads = cv2.getNumThreads()
+    try:
+        cv2.setNumThreads(1)  # the pool below has a thread a core
+        sessions = partial_out / "sessions"
+        tables = {f"{name}_{split}": Tables() for name in DEVICES for split in ("map", "query")}
+        hours = 1 + int(1.4 * rooms * (frames + 8) / 3600)
+        pictures = rooms * sum(len(d.sensors) for d in DEVICES.values()) * (frames + max(2, frames // 2))
+        bar = tqdm(total=pictures, desc="render", unit="image", disable=not progress)
+        rays: dict[tuple[float, ...], Rays] = {}
+        with ThreadPoolExecutor(min(_cores(), 8)) as pool:  # a thread may hold 150 MB
+            try:
+                for index in range(rooms):
+                    scene = build_room(seed, index)
+                    painting_one = partial(paint, scene, seed, index, look_alikes=look_alikes)
+                    for _ in pool.map(painting_one, range(len(scene.quads))):
+                        pass
+                    waiting = []
+                    for shot in _plan_room(scene, seed, index, frames, hours, tables):
+                        key = tuple(shot.camera.params)
+                        if shot.device.rig_from_body is not None and key not in rays:
+                            rays[key] = Rays.of(shot.camera)
+                        waiting.append(pool.submit(_take, shot, scene, rays.get(key), sessions, seed))
+                    for work in waiting:
+                        work.result()
+                        bar.update()
+                    os.utime(partial_out)  # still at work: no other process may take it for a leftover
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+        bar.close()
+        for session, table in tables.items():
+            _write_session(sessions / session, session.rpartition("_")[2], table)
+        count = sum(1 for path in partial_out.rglob("*") if path.is_file())
+        (partial_out / "demo.json").write_text(json.dumps({**settings, "files": count}, indent=1) + "\n")
+        partial_out.chmod(0o755)
+        if out.exists():
+            if _is_complete(out, settings):  # another process was faster
+                return out
+            shutil.rmtree(out)
+        partial_out.replace(out)
+    finally:
+        cv2.setNumThreads(threads)
+        shutil.rmtree(partial_out, ignore_errors=True)
+    return out
+
+
+def _cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _is_complete(out: Path, settings: dict[str, int]) -> bool:
+    """Tell whether `out` holds the capture of these settings with all its files."""
+    try:
+        found = json.loads((out / "demo.json").read_text())
+    except (OSError, ValueError):
+        return False
+    count = sum(1 for path in out.rglob("*") if path.is_file()) - 1
+    return bool(found == {**settings, "files": count})

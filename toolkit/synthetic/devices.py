@@ -1,0 +1,157 @@
+"""Who sees the rendered rooms: a phone, a headset and a robot, their cameras and their walks."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from toolkit.geometry import Array, invert, make_pose, rotation_angle_deg
+from toolkit.synthetic.scene import Scene, named_rng
+from toolkit.synthetic.textures import Rng
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """One camera of a device: its place and turn in the body frame (x forward, y left, z up)."""
+
+    name: str
+    model: str
+    size: tuple[int, int]
+    params: tuple[float, ...]
+    at: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    yaw_deg: float = 0.0
+    pitch_deg: float = 0.0
+    roll_deg: float = 0.0
+
+    @property
+    def body_from_cam(self) -> Array:
+        """The camera's pose (4, 4) in the body frame."""
+        return make_pose(looking(self.yaw_deg, self.pitch_deg, self.roll_deg), self.at)
+
+
+@dataclass(frozen=True)
+class Device:
+    """How one kind of device sees the world; `rig_from_body` is None where the camera is the device."""
+
+    sensors: tuple[Sensor, ...]
+    height_m: float
+    sway_deg: float  # of the hand or the gait
+    gray: bool
+    brightness: float  # the mean that its exposure aims at
+    gamma: float
+    tint: tuple[float, float, float]  # BGR
+    vignette: float
+    noise: float
+    quality: int  # JPEG
+    rig_from_body: tuple[float, ...] | None = None  # qw qx qy qz tx ty tz
+
+
+DEVICES = {
+    "ios": Device(
+        (Sensor("cam_phone", "PINHOLE", (960, 720), (735.0, 735.0, 481.8, 357.9)),),
+        1.5, 4.0, False, 122.0, 0.95, (0.92, 1.0, 1.06), 0.12, 2.0, 93,
+    ),
+    "hl": Device(
+        (
+            Sensor("hetlf", "SIMPLE_RADIAL", (480, 640), (402.0, 243.1, 316.4, -0.021),
+                   (0.02, 0.052, 0.0), 12.0),
+            Sensor("hetrf", "SIMPLE_RADIAL", (480, 640), (405.0, 237.4, 322.9, -0.018),
+                   (0.02, -0.05, 0.004), -12.0, 0.0, 90.0),
+        ),
+        1.65, 5.0, True, 98.0, 1.12, (1.0, 1.0, 1.0), 0.25, 3.5, 91,
+        (0.36, 0.55, -0.42, 0.63, 0.08, -0.22, 0.31),
+    ),
+    "spot": Device(
+        (
+            Sensor("frontleft", "OPENCV", (640, 480),
+                   (432.0, 430.0, 318.7, 242.2, -0.062, 0.011, 0.0004, -0.0003),
+                   (0.38, 0.07, 0.0), -9.0, 2.0),
+            Sensor("frontright", "OPENCV", (640, 480),
+                   (428.0, 427.0, 322.6, 237.3, -0.058, 0.009, -0.0002, 0.0004),
+                   (0.38, -0.07, 0.0), 9.0, 2.0),
+            Sensor("left", "OPENCV", (640, 480),
+                   (436.0, 434.0, 315.9, 239.7, -0.065, 0.012, 0.0001, 0.0002),
+                   (0.16, 0.15, 0.02), 78.0, 4.0),
+        ),
+        0.7, 1.5, True, 126.0, 0.86, (1.0, 1.0, 1.0), 0.2, 3.0, 90,
+        (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    ),
+}  # fmt: skip
+
+
+def looking(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Array:
+    """Return a camera's rotation (3, 3) in a frame with z up: yaw left of x, pitch up, roll clockwise."""
+    yaw, pitch, roll = np.radians([yaw_deg, pitch_deg, roll_deg])
+    forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
+    right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
+    down = np.cross(forward, right)
+    c, s = np.cos(roll), np.sin(roll)
+    return np.stack([c * right + s * down, c * down - s * right, forward], axis=-1)
+
+
+BODY_FROM_LEVEL_CAM = make_pose(looking(0, 0, 0), (0, 0, 0))
+
+
+def _walk(rng: Rng, scene: Scene, device: Device, radius: float, angles: Array) -> Array:
+    """Return poses world_from_body (N, 4, 4) along an ellipse around the room's middle, looking across it.
+
+    `angles` (N,) are the directions of the look, radians; `radius` is a share of the room's sides. The wobble
+    is a sum of slow waves, so the walk is smooth however many frames it has.
+    """
+
+    def wave(amplitude: float) -> Array:
+        a, b = rng.uniform(0, 2 * np.pi, 2)
+        return amplitude * (0.6 * np.sin(1.7 * angles + a) + 0.4 * np.sin(4.1 * angles + b))
+
+    w, d, _ = scene.size
+    across = np.stack([w * np.cos(angles), d * np.sin(angles)], -1)
+    x, y = (scene.origin[:2] - (radius + wave(0.008)[:, None]) * across).T
+    z = device.height_m + wave(0.05 * device.sway_deg / 4)
+    yaw = np.degrees(np.arctan2(across[:, 1], across[:, 0])) + wave(7)
+    pitch, roll = -3 + wave(device.sway_deg), wave(device.sway_deg)
+    rotations = np.stack([looking(*turn) for turn in zip(yaw, pitch, roll, strict=True)])
+    return make_pose(rotations, np.stack([x, y, z], -1)) @ invert(BODY_FROM_LEVEL_CAM)
+
+
+def _turn(poses: Array, degrees: Array) -> Array:
+    """Turn poses world_from_body about the world's vertical through their own place."""
+    a = np.radians(degrees)
+    spin = np.zeros((len(poses), 3, 3))
+    spin[:, 0, 0] = spin[:, 1, 1] = np.cos(a)
+    spin[:, 1, 0] = np.sin(a)
+    spin[:, 0, 1] = -spin[:, 1, 0]
+    spin[:, 2, 2] = 1
+    return make_pose(spin @ poses[:, :3, :3], poses[:, :3, 3])
+
+
+def walks(scene: Scene, seed: int, index: int, frames: int, name: str) -> dict[tuple[str, int], Array]:
+    """Return the poses world_from_body of one device in one room, by split and subsession.
+
+    The two map walks follow an outer and an inner ring, the queries the ring between them, turned 10 to 25
+    degrees away from the nearest map pose. From frame to frame the look turns 15 degrees at most, so that
+    neighbors overlap however few there are.
+    """
+    device, rng = DEVICES[name], named_rng(seed, index, "walk", name)
+    start = named_rng(seed, index, "start").uniform(0, 2 * np.pi)
+    span = np.radians(min(360, 15 * frames))
+    poses: dict[tuple[str, int], Array] = {}
+    for split, total in (("map", frames), ("query", max(2, frames // 2))):
+        phase = rng.uniform(0, 0.3)
+        for part, count in enumerate((total - total // 2, total // 2)):
+            share = (np.arange(count) + 0.5 * part + phase) / count
+            margin = 0.0 if split == "map" else 0.1  # queries stay where the map has looked
+            angles = start + span * (margin + (1 - 2 * margin) * share)
+            radius = (0.32, 0.17)[part] if split == "map" else (0.235, 0.255)[part]
+            poses[split, part] = _walk(rng, scene, device, radius, angles)
+    mapped = np.concatenate([poses["map", 0], poses["map", 1]])
+    for part in range(2):
+        query = poses["query", part]
+        nearest = np.argmin(np.linalg.norm(query[:, None, :3, 3] - mapped[None, :, :3, 3], axis=-1), axis=1)
+        best, cost = np.zeros(len(query)), np.full(len(query), np.inf)
+        for turn in np.arange(-30.0, 31.0, 1.0):
+            turned = _turn(query, np.full(len(query), turn))
+            angle = rotation_angle_deg(invert(mapped[nearest])[:, :3, :3] @ turned[:, :3, :3])
+            # The least turn that is far enough, to the left on one walk and to the right on the other.
+            price = abs(turn) + 100 * ((angle < 11) | (angle > 24)) + 8 * ((turn > 0) == bool(part))
+            best, cost = np.where(price < cost, turn, best), np.minimum(price, cost)
+        poses["query", part] = _turn(query, best)
+    return poses

@@ -1,0 +1,108 @@
+"""Light and paint of the rendered capture: the textures of a room's rectangles, with its lamps' light baked in."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from toolkit.synthetic.scene import Quad, Scene, named_rng
+from toolkit.synthetic.textures import Image
+
+LEVELS = 6  # of the mip-maps; texture sides are multiples of 2 ** (LEVELS - 1)
+SOLD_OFTEN = ("books", "crate", "door", "drawers", "window")
+MODELS = 2  # of each of these things and each size in whole meters, where a world has look-alikes
+
+
+def _blocked(scene: Scene, start: Image, way: Image) -> NDArray[np.bool_]:
+    """Tell which segments start + t * way, t in (0, 1), (N, 3) each, are cut by a box (slab test)."""
+    hit = np.zeros(len(start), bool)
+    if not len(start):
+        return hit
+    start, way = np.ascontiguousarray(start.T), np.ascontiguousarray(way.T)
+    end = start + way
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    # A margin keeps rounding from leaving out a segment that the slab test would find cut.
+    lowest, highest = low.min(1) - 1e-3, high.max(1) + 1e-3
+    for center, half, yaw in scene.blockers:
+        reach = np.array([*[np.hypot(half[0], half[1])] * 2, half[2]])
+        if (center + reach < lowest).any() or (center - reach > highest).any():
+            continue
+        near_low, near_high = (center - reach - 1e-3).astype(np.float32), (center + reach + 1e-3).astype(np.float32)
+        near = ~hit
+        for axis in range(3):
+            near &= (low[axis] < near_high[axis]) & (high[axis] > near_low[axis])
+        chosen = np.flatnonzero(near)
+        if not len(chosen):
+            continue
+        c, s = np.float32(np.cos(yaw)), np.float32(np.sin(yaw))
+        px, py, pz = start[:, chosen] - center.astype(np.float32)[:, None]
+        vx, vy, vz = way[:, chosen]
+        enter, leave = np.zeros(len(chosen), np.float32), np.ones(len(chosen), np.float32)
+        for origin, along, side in (
+            (c * px + s * py, c * vx + s * vy, half[0]), (c * py - s * px, c * vy - s * vx, half[1]),
+            (pz, vz, half[2]),
+        ):  # fmt: skip
+            inverse = 1 / np.where(np.abs(along) < 1e-6, np.float32(1e-6), along)
+            middle, spread = -origin * inverse, np.abs(np.float32(side) * inverse)
+            np.maximum(enter, middle - spread, out=enter)
+            np.minimum(leave, middle + spread, out=leave)
+        hit[chosen] = enter < leave
+    return hit
+
+
+def _light(scene: Scene, quad: Quad) -> Image:
+    """Return the light on a rectangle, a small float32 picture: lamps with shadows and ambient occlusion."""
+    rows, columns = max(2, round(quad.height / 0.15)), max(2, round(quad.width / 0.15))
+    t, s = np.mgrid[0:rows, 0:columns] + 0.5
+    points = quad.corner + (s.ravel() * quad.width / columns)[:, None] * quad.right
+    points = points + (t.ravel() * quad.height / rows)[:, None] * quad.down + 0.02 * quad.normal
+    points = points.astype(np.float32)
+    # Directions spread evenly over the hemisphere, denser along the normal as Lambert's law has it.
+    i = np.arange(14) + 0.5
+    radius, angle = np.sqrt(i / 14), i * 2.399963
+    local = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - i / 14)], -1)
+    ways = (1.3 * local @ np.stack([quad.right, quad.down, quad.normal])).astype(np.float32)
+    w, d, h = scene.size
+    low = scene.origin - np.array([w / 2, d / 2, 0])
+    high = scene.origin + np.array([w / 2, d / 2, 99 if scene.outdoor else h])
+    starts, ways = np.repeat(points, len(ways), 0), np.tile(ways, (len(points), 1))
+    ends = starts + ways
+    closed = ((ends < low) | (ends > high)).any(1)
+    inside = np.flatnonzero(~closed)
+    closed[inside] = _blocked(scene, starts[inside], ways[inside])
+    lit = (0.62 if scene.outdoor else 0.58) * (1 - 0.65 * closed.reshape(len(points), -1).mean(1))
+    offsets = np.array([[0, 0], [0.35, 0.1], [-0.35, -0.1]], np.float32) * (1.5 if scene.outdoor else 1.0)
+    for lamp_at in scene.lamps:
+        for dx, dy in offsets:
+            way = (lamp_at + np.array([dx, dy, 0]) - points).astype(np.float32)
+            distance = np.linalg.norm(way, axis=1)
+            cosine = np.clip(way @ quad.normal.astype(np.float32) / distance, 0, 1)
+            if not cosine.any():
+                continue
+            fall = 0.85 / len(scene.lamps) if scene.outdoor else 1.5 / len(scene.lamps) * 6 / (distance**2 + 3.0)
+            lit = lit + fall * cosine / len(offsets) * ~_blocked(scene, points, way)
+    return cv2.GaussianBlur(lit.reshape(rows, columns).astype(np.float32), (3, 3), 0)
+
+
+def paint(scene: Scene, seed: int, index: int, number: int, look_alikes: bool = False) -> None:
+    """Make the texture of rectangle `number` of room `index` and its mip-maps, light baked in."""
+    quad = scene.quads[number]
+    multiple = 2 ** (LEVELS - 1)
+    h, w = (max(multiple, round(side * quad.ppm / multiple) * multiple) for side in (quad.height, quad.width))
+    rng = named_rng(seed, index, "quad", number)
+    name = getattr(quad.material, "func", quad.material).__name__
+    if look_alikes and name in SOLD_OFTEN:
+        # A model is drawn for whole meters: things of unequal width then begin alike.
+        tall, wide = (round(np.ceil(side) * quad.ppm) + multiple for side in (quad.height, quad.width))
+        model = named_rng(seed, "model", name, int(rng.integers(MODELS)))
+        image = quad.material(model, tall, wide, quad.ppm)[:h, :w]
+    else:
+        image = quad.material(rng, h, w, quad.ppm)
+    if quad.lit:
+        light = cv2.resize(_light(scene, quad), (w, h), interpolation=cv2.INTER_LINEAR)
+        image = cv2.multiply(image, cv2.merge([light] * 3), dtype=cv2.CV_8U)
+    for pyramid, level in ((quad.color, image), (quad.gray, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))):
+        pyramid.append(level)
+        for _ in range(LEVELS - 1):
+            height, width = level.shape[:2]
+            level = cv2.resize(level, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+            pyramid.append(level)
