@@ -62,9 +62,8 @@ class Tables:
 
 def _subsession(name: str, split: str, part: int, hours: int) -> tuple[str, int]:
     """Return a subsession's name and its first timestamp, microseconds, on the device's clock."""
-    after_us = (
-        (2 * part + (split == "query")) * hours * 3600 + {"ios": 0, "hl": 600, "spot": 1200}[name]
-    ) * 10**6
+    after_s = (2 * part + (split == "query")) * hours * 3600 + {"ios": 0, "hl": 600, "spot": 1200}[name]
+    after_us = after_s * 10**6
     day = 1714557600 * 10**6 + after_us  # 2024-05-01 10:00 UTC
     stamp = time.gmtime(day // 10**6)
     if name == "ios":
@@ -88,53 +87,38 @@ def _plan_room(
                 table.subsessions.append(subsession)
             rng = named_rng(seed, index, "frames", name, split, part)
             for i, world_from_body in enumerate(bodies):
-                timestamp = start + int(
-                    1e6 * (5 + 1.4 * (index * (frames + 8) + i)) + rng.integers(0, 700_000)
-                )
+                timestamp = start + int(1e6 * (5 + 1.4 * (index * (frames + 8) + i)) + rng.integers(0, 700_000))
                 zoom = float(np.round(rng.normal(1, 0.004), 5))
-                device_id = {
-                    "hl": f"{subsession}/hetrig_{timestamp}",
-                    "spot": f"{subsession}/{timestamp}-body",
-                }.get(name)
+                rig_id = f"{subsession}/" + (f"hetrig_{timestamp}" if name == "hl" else f"{timestamp}-body")
                 if device.rig_from_body is not None:
                     rig_from_body = pose_from_qt(device.rig_from_body)
-                    table.poses.append((timestamp, str(device_id), world_from_body @ invert(rig_from_body)))
+                    table.poses.append((timestamp, rig_id, world_from_body @ invert(rig_from_body)))
                 for sensor in device.sensors:
-                    params, size, label = list(sensor.params), sensor.size, sensor.name
+                    params, label = list(sensor.params), sensor.name
                     if name == "ios":  # a phone focuses anew for every picture
                         params[:2] = [round(f * zoom, 3) for f in params[:2]]
                         label, short = f"phone camera for timestamp {timestamp}", f"cam_phone_{timestamp}"
-                        path = f"{subsession}/images/{timestamp}"
+                        folder, stem = "images/", str(timestamp)
                     elif name == "hl":
-                        short, path = label, f"{subsession}/images/{label}/{timestamp}"
+                        short, folder, stem = label, f"images/{label}/", str(timestamp)
                     else:
                         short = label = f"spot-camera-{label}-image"
-                        path = f"{subsession}/{label}/{timestamp}-{label}"
-                    sensor_id = f"{subsession}/{short}"
-                    table.sensors[sensor_id] = (sensor_id, label, "camera", sensor.model, *size, *params)
-                    camera = pycolmap.Camera(model=sensor.model, width=size[0], height=size[1], params=params)
+                        folder, stem = f"{label}/", f"{timestamp}-{label}"
+                    sensor_id, path = f"{subsession}/{short}", f"{subsession}/{folder}{stem}.jpg"
+                    table.sensors[sensor_id] = (sensor_id, label, "camera", sensor.model, *sensor.size, *params)
+                    width, height = sensor.size
+                    camera = pycolmap.Camera(model=sensor.model, width=width, height=height, params=params)
                     world_from_cam = world_from_body @ sensor.body_from_cam
                     if device.rig_from_body is None:
                         table.poses.append((timestamp, sensor_id, world_from_cam))
                     else:
-                        rig_from_cam = rig_from_body @ sensor.body_from_cam
-                        table.rigs.append((timestamp, str(device_id), sensor_id, rig_from_cam))
-                    table.images.append((timestamp, sensor_id, f"{path}.jpg"))
+                        table.rigs.append((timestamp, rig_id, sensor_id, rig_from_body @ sensor.body_from_cam))
+                    table.images.append((timestamp, sensor_id, path))
                     depth_path = None
                     if split == "map":
-                        folder, _, stem = path.partition("/")
-                        depth_path = f"{folder}/depths/{stem.removeprefix('images/')}.png"
+                        depth_path = f"{subsession}/depths/{folder.removeprefix('images/')}{stem}.png"
                         table.depths.append((timestamp, sensor_id, depth_path))
-                    yield Shot(
-                        session,
-                        timestamp,
-                        sensor_id,
-                        f"{path}.jpg",
-                        depth_path,
-                        camera,
-                        world_from_cam,
-                        device,
-                    )
+                    yield Shot(session, timestamp, sensor_id, path, depth_path, camera, world_from_cam, device)
 
 
 def _take(shot: Shot, scene: Scene, rays: Rays | None, sessions: Path, seed: int) -> None:
@@ -150,10 +134,9 @@ def _take(shot: Shot, scene: Scene, rays: Rays | None, sessions: Path, seed: int
     picture *= (1 - device.vignette * radius2).reshape(h, w, *[1] * (picture.ndim - 2))
     if not device.gray:
         picture *= np.asarray(device.tint, np.float32)
-    noise = named_rng(seed, "noise", shot.sensor_id, str(shot.timestamp)).standard_normal(
-        picture.shape, np.float32
-    )
-    image = np.clip(picture + device.noise * noise + 0.5, 0, 255).astype(np.uint8)
+    rng = named_rng(seed, "noise", shot.sensor_id, str(shot.timestamp))
+    noise = device.noise * rng.standard_normal(picture.shape, np.float32)
+    image = np.clip(picture + noise + 0.5, 0, 255).astype(np.uint8)
     raw = sessions / shot.session / "raw_data"
     _save(raw / shot.path, image, [cv2.IMWRITE_JPEG_QUALITY, device.quality])
     if shot.depth_path is not None:
@@ -180,11 +163,8 @@ def _write_session(path: Path, split: str, table: Tables) -> None:
     trajectory = Trajectory(times, ids, qt_from_pose(np.stack([row[2] for row in poses])))
     frames = pd.DataFrame({"timestamp": times, "device_id": ids})
     pruned = frames[np.arange(len(frames)) % 6 != 5]
-    keyframes = {
-        "original": frames,
-        "pruned": pruned,
-        "pruned_subsampled": pruned[np.arange(len(pruned)) % 3 != 1],
-    }
+    subsampled = pruned[np.arange(len(pruned)) % 3 != 1]
+    keyframes = {"original": frames, "pruned": pruned, "pruned_subsampled": subsampled}
     write_session(
         path,
         sensors=table.sensors.values(),
@@ -199,12 +179,7 @@ def _write_session(path: Path, split: str, table: Tables) -> None:
 
 
 def render_capture(
-    out: str | Path,
-    rooms: int = 2,
-    frames: int = 12,
-    seed: int = 0,
-    progress: bool = True,
-    look_alikes: bool = False,
+    out: str | Path, rooms: int = 2, frames: int = 12, seed: int = 0, progress: bool = True, look_alikes: bool = False
 ) -> Path:
     """Render a capture of `rooms` rooms by a phone, a headset and a robot; return its folder.
 
@@ -223,13 +198,9 @@ def render_capture(
     Raises:
         CaptureError: a setting is out of range, or `out` holds something else than a rendered capture.
     """
-    from tqdm.auto import tqdm
-
     out = Path(out)
     if rooms < 1 or frames < 2 or seed < 0:
-        raise CaptureError(
-            f"Expected rooms >= 1, frames >= 2, seed >= 0; found {rooms=}, {frames=}, {seed=}."
-        )
+        raise CaptureError(f"Expected rooms >= 1, frames >= 2, seed >= 0; found {rooms=}, {frames=}, {seed=}.")
     settings = {"format": FORMAT, "rooms": rooms, "frames": frames, "seed": seed}
     settings |= {"look_alikes": 1} if look_alikes else {}
     if _is_complete(out, settings):
@@ -246,36 +217,8 @@ def render_capture(
     partial_out = Path(tempfile.mkdtemp(prefix=f".{out.name}.rendering-", dir=out.parent))
     threads = cv2.getNumThreads()
     try:
-        cv2.setNumThreads(1)  # the pool below has a thread a core
-        sessions = partial_out / "sessions"
-        tables = {f"{name}_{split}": Tables() for name in DEVICES for split in ("map", "query")}
-        hours = 1 + int(1.4 * rooms * (frames + 8) / 3600)
-        pictures = rooms * sum(len(d.sensors) for d in DEVICES.values()) * (frames + max(2, frames // 2))
-        bar = tqdm(total=pictures, desc="render", unit="image", disable=not progress)
-        rays: dict[tuple[float, ...], Rays] = {}
-        with ThreadPoolExecutor(min(_cores(), 8)) as pool:  # a thread may hold 150 MB
-            try:
-                for index in range(rooms):
-                    scene = build_room(seed, index)
-                    painting_one = partial(paint, scene, seed, index, look_alikes=look_alikes)
-                    for _ in pool.map(painting_one, range(len(scene.quads))):
-                        pass
-                    waiting = []
-                    for shot in _plan_room(scene, seed, index, frames, hours, tables):
-                        key = tuple(shot.camera.params)
-                        if shot.device.rig_from_body is not None and key not in rays:
-                            rays[key] = Rays.of(shot.camera)
-                        waiting.append(pool.submit(_take, shot, scene, rays.get(key), sessions, seed))
-                    for work in waiting:
-                        work.result()
-                        bar.update()
-                    os.utime(partial_out)  # still at work: no other process may take it for a leftover
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
-        bar.close()
-        for session, table in tables.items():
-            _write_session(sessions / session, session.rpartition("_")[2], table)
+        cv2.setNumThreads(1)  # the renderer's pool has a thread a core
+        _render_sessions(partial_out, rooms, frames, seed, progress, look_alikes)
         count = sum(1 for path in partial_out.rglob("*") if path.is_file())
         (partial_out / "demo.json").write_text(json.dumps({**settings, "files": count}, indent=1) + "\n")
         partial_out.chmod(0o755)
@@ -290,6 +233,42 @@ def render_capture(
     return out
 
 
+def _render_sessions(out: Path, rooms: int, frames: int, seed: int, progress: bool, look_alikes: bool) -> None:
+    """Render the pictures of all sessions, room by room, and write the sessions' files."""
+    from tqdm.auto import tqdm
+
+    sessions = out / "sessions"
+    tables = {f"{name}_{split}": Tables() for name in DEVICES for split in ("map", "query")}
+    hours = 1 + int(1.4 * rooms * (frames + 8) / 3600)
+    pictures = rooms * sum(len(d.sensors) for d in DEVICES.values()) * (frames + max(2, frames // 2))
+    rays: dict[tuple[float, ...], Rays] = {}
+    with (
+        tqdm(total=pictures, desc="render", unit="image", disable=not progress) as bar,
+        ThreadPoolExecutor(min(_cores(), 8)) as pool,  # a thread may hold 150 MB
+    ):
+        try:
+            for index in range(rooms):
+                scene = build_room(seed, index)
+                paint_quad = partial(paint, scene, seed, index, look_alikes=look_alikes)
+                for _ in pool.map(paint_quad, range(len(scene.quads))):
+                    pass
+                waiting = []
+                for shot in _plan_room(scene, seed, index, frames, hours, tables):
+                    key = tuple(shot.camera.params)
+                    if shot.device.rig_from_body is not None and key not in rays:
+                        rays[key] = Rays.of(shot.camera)
+                    waiting.append(pool.submit(_take, shot, scene, rays.get(key), sessions, seed))
+                for work in waiting:
+                    work.result()
+                    bar.update()
+                os.utime(out)  # still at work: no other process may take it for a leftover
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    for session, table in tables.items():
+        _write_session(sessions / session, session.rpartition("_")[2], table)
+
+
 def _cores() -> int:
     """Return how many cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -298,8 +277,8 @@ def _cores() -> int:
 def _is_complete(out: Path, settings: dict[str, int]) -> bool:
     """Tell whether `out` holds the capture of these settings with all its files."""
     try:
-        found = json.loads((out / "demo.json").read_text())
+        written = json.loads((out / "demo.json").read_text())
     except (OSError, ValueError):
         return False
     count = sum(1 for path in out.rglob("*") if path.is_file()) - 1
-    return bool(found == {**settings, "files": count})
+    return bool(written == {**settings, "files": count})

@@ -140,14 +140,10 @@ def render(quads: list[Quad], world_from_cam: Array, rays: Rays, gray: bool) -> 
         for at in np.unique(level):
             chosen = level == at
             lx, ly = tw / quad.width / 2.0**at, th / quad.height / 2.0**at
-            picture[index[chosen]] = _texture(
-                pyramid[at], s[chosen] * np.float32(lx), t[chosen] * np.float32(ly)
-            )
+            picture[index[chosen]] = _texture(pyramid[at], s[chosen] * np.float32(lx), t[chosen] * np.float32(ly))
     size = (width // SAMPLES, height // SAMPLES)
-    smooth = cv2.resize(
-        picture.reshape(height, width, -1).astype(np.float32), size, interpolation=cv2.INTER_AREA
-    )
-    return smooth, _depth(quads, owner, nearest)
+    samples = picture.reshape(height, width, -1).astype(np.float32)
+    return cv2.resize(samples, size, interpolation=cv2.INTER_AREA), _depth(quads, owner, nearest)
 
 
 def _depth(quads: list[Quad], owner: Image, nearest: Image) -> Image:

@@ -11,29 +11,8 @@ from typing import Any
 import numpy as np
 
 from toolkit.geometry import Array
-from toolkit.synthetic.textures import (
-    Image,
-    Material,
-    Rng,
-    books,
-    cells,
-    chalk,
-    cloth,
-    clouds,
-    crate,
-    door,
-    drawers,
-    lamp,
-    leaves,
-    notes,
-    painting,
-    plain,
-    plaster,
-    poster,
-    random_color,
-    window,
-    wood,
-)
+from toolkit.synthetic import textures as tex
+from toolkit.synthetic.textures import Image, Material, Rng
 
 UP = np.array([0.0, 0.0, 1.0])
 Place = tuple[float, float, float]  # where a box stands in its room: x, y (meters), and yaw (radians)
@@ -132,7 +111,7 @@ class Scene:
         self, wall: int, along: float, z: float, w: float, h: float, material: Material, ppm: float = 420.0
     ) -> None:
         """Hang a thin board on a wall."""
-        self.box(self.at_wall(wall, along, 0.03), z, (w, 0.03, h), material, plain, ppm=ppm, back=False)
+        self.box(self.at_wall(wall, along, 0.03), z, (w, 0.03, h), material, tex.plain, ppm=ppm, back=False)
 
 
 def _clutter(scene: Scene, rng: Rng, place: Place, z: float, wide: float, deep: float, count: int) -> None:
@@ -142,9 +121,9 @@ def _clutter(scene: Scene, rng: Rng, place: Place, z: float, wide: float, deep: 
     for i in range(count):
         size = rng.uniform([0.1, 0.1, 0.08], [0.26, 0.24, 0.34])
         along, across = (i + 0.5) / count * wide - wide / 2, rng.uniform(-0.2, 0.2) * deep
-        material = [poster, crate, books, cloth][int(rng.integers(4))]
+        material = [tex.poster, tex.crate, tex.books, tex.cloth][int(rng.integers(4))]
         turned = x + along * c - across * s, y + along * s + across * c, yaw + rng.uniform(-0.5, 0.5)
-        scene.box(turned, z, tuple(size), material, material, poster, 450)
+        scene.box(turned, z, tuple(size), material, material, tex.poster, 450)
 
 
 def _furnish(scene: Scene, rng: Rng, wall: int, along: float, room: float, kind: str) -> float:
@@ -159,50 +138,50 @@ def _furnish(scene: Scene, rng: Rng, wall: int, along: float, room: float, kind:
     if width > room:
         return 0.0
     mid = along + width / 2
-    tone = partial(wood, color=np.asarray((60, 100, 145)) * rng.uniform(0.5, 1.5))
+    tone = partial(tex.wood, color=np.asarray((60, 100, 145)) * rng.uniform(0.5, 1.5))
     hang, at = partial(scene.hang, wall), partial(scene.at_wall, wall, mid)
     if kind == "shelf":
-        scene.box(at(0.34), 0, (width, 0.34, rng.uniform(1.75, 2.3)), books, tone, back=False)
+        scene.box(at(0.34), 0, (width, 0.34, rng.uniform(1.75, 2.3)), tex.books, tone, back=False)
     elif kind == "cabinet":
-        scene.box(at(0.45), 0, (width, 0.45, 0.85), drawers, tone, back=False)
+        scene.box(at(0.45), 0, (width, 0.45, 0.85), tex.drawers, tone, back=False)
         _clutter(scene, rng, at(0.45), 0.85, width * 0.9, 0.3, int(rng.integers(2, 5)))
-        hang(mid, 1.45, width * 0.8, rng.uniform(0.6, 0.9), [painting, poster, notes][rng.integers(3)])
+        hang(mid, 1.45, width * 0.8, rng.uniform(0.6, 0.9), [tex.painting, tex.poster, tex.notes][rng.integers(3)])
     elif kind == "posters":
         for z in (0.55, 1.45):
-            hang(mid + rng.uniform(-0.05, 0.05), z, width * rng.uniform(0.7, 0.95), 0.8, poster)
+            hang(mid + rng.uniform(-0.05, 0.05), z, width * rng.uniform(0.7, 0.95), 0.8, tex.poster)
     elif kind == "door":
-        hang(mid, 0, 0.95, 2.05, door, 330)
-        hang(mid, 2.15, 0.6, 0.2, poster)
+        hang(mid, 0, 0.95, 2.05, tex.door, 330)
+        hang(mid, 2.15, 0.6, 0.2, tex.poster)
     elif kind == "window":
-        hang(mid, 1.0, width * 0.95, min(1.3, tall - 1.4), window)
-        radiator = partial(cells, size=(0.6, 0.07), colors=[(200, 205, 205)])
+        hang(mid, 1.0, width * 0.95, min(1.3, tall - 1.4), tex.window)
+        radiator = partial(tex.cells, size=(0.6, 0.07), colors=[(200, 205, 205)])
         scene.box(at(0.14), 0.12, (width * 0.8, 0.14, 0.6), radiator, back=False)
     elif kind == "board":
-        hang(mid, 0.95, width, 1.15, notes if rng.random() < 0.6 else chalk)
-        scene.box(at(0.4), 0, (width * 0.8, 0.4, 0.45), cloth, cloth)
+        hang(mid, 0.95, width, 1.15, tex.notes if rng.random() < 0.6 else tex.chalk)
+        scene.box(at(0.4), 0, (width * 0.8, 0.4, 0.45), tex.cloth, tex.cloth)
     elif kind == "painting":
-        hang(mid, rng.uniform(1.15, 1.35), width, width * rng.uniform(0.6, 0.9), painting)
-        hang(mid + rng.uniform(-0.2, 0.2), 0.6, 0.4, 0.3, poster)
+        hang(mid, rng.uniform(1.15, 1.35), width, width * rng.uniform(0.6, 0.9), tex.painting)
+        hang(mid + rng.uniform(-0.2, 0.2), 0.6, 0.4, 0.3, tex.poster)
     elif kind == "planter":
-        brick = partial(cells, size=(0.08, 0.2), colors=[(60, 80, 150), (70, 95, 170)])
+        brick = partial(tex.cells, size=(0.08, 0.2), colors=[(60, 80, 150), (70, 95, 170)])
         scene.box(at(0.5), 0, (width, 0.5, 0.45), brick)
-        scene.box(at(0.5), 0.45, (width * 0.9, 0.36, rng.uniform(0.3, 0.8)), leaves)
-        hang(mid, 1.5, width * 0.6, 0.8, poster)
+        scene.box(at(0.5), 0.45, (width * 0.9, 0.36, rng.uniform(0.3, 0.8)), tex.leaves)
+        hang(mid, 1.5, width * 0.6, 0.8, tex.poster)
     elif kind == "bench":
         x, y, yaw = at(0.45)
         scene.box((x, y, yaw), 0.38, (width, 0.45, 0.07), tone)
         for side in (-0.4 * width, 0.4 * width):
             scene.box((x + side * np.cos(yaw), y + side * np.sin(yaw), yaw), 0, (0.1, 0.4, 0.38), tone)
-        hang(mid - width * 0.22, 1.1, width * 0.4, 0.75, poster)
-        hang(mid + width * 0.24, 1.2, width * 0.4, 0.55, [painting, poster][rng.integers(2)])
+        hang(mid - width * 0.22, 1.1, width * 0.4, 0.75, tex.poster)
+        hang(mid + width * 0.24, 1.2, width * 0.4, 0.55, [tex.painting, tex.poster][rng.integers(2)])
     elif kind == "crates":
         x, y, yaw = at(0.7)
-        scene.box((x, y, yaw + rng.uniform(-0.2, 0.2)), 0, (0.7, 0.5, 0.55), crate)
-        scene.box((x, y, yaw + rng.uniform(-0.4, 0.4)), 0.55, (0.5, 0.4, 0.42), crate)
+        scene.box((x, y, yaw + rng.uniform(-0.2, 0.2)), 0, (0.7, 0.5, 0.55), tex.crate)
+        scene.box((x, y, yaw + rng.uniform(-0.4, 0.4)), 0.55, (0.5, 0.4, 0.42), tex.crate)
     else:
-        stone = partial(cells, size=(0.3, 0.4), colors=[(150, 165, 175), (130, 150, 165)], joint=(90, 95, 100))
+        stone = partial(tex.cells, size=(0.3, 0.4), colors=[(150, 165, 175), (130, 150, 165)], joint=(90, 95, 100))
         scene.box(at(0.4), 0, (0.4, 0.4, tall), stone)
-        scene.box(at(0.4), 1.3, (0.42, 0.42, 0.5), poster)
+        scene.box(at(0.4), 1.3, (0.42, 0.42, 0.5), tex.poster)
     return width
 
 
@@ -245,31 +224,31 @@ def build_room(seed: int, index: int) -> Scene:
     origin = np.array([28.0 * index, 4.0 * (index % 3), 0.0])
     scene = Scene(origin, (w, d, h), outdoor)
     if kind["wall"] is None:
-        paint = np.asarray(random_color(rng, (0.08, 0.3), (0.7, 0.88)))
-        wall: Material = partial(plaster, color=paint, band=paint * rng.uniform(0.5, 0.75))
+        paint = np.asarray(tex.random_color(rng, (0.08, 0.3), (0.7, 0.88)))
+        wall: Material = partial(tex.plaster, color=paint, band=paint * rng.uniform(0.5, 0.75))
     else:
         ch, cw, colors, stagger = kind["wall"]
-        wall = partial(cells, size=(ch, cw), colors=colors, stagger=stagger)
+        wall = partial(tex.cells, size=(ch, cw), colors=colors, stagger=stagger)
     for k in range(4):
         x, y, yaw = scene.at_wall(k, 0.0, -0.008)
         length = w if k % 2 == 0 else d
         right = np.cross(UP, [-np.sin(yaw), np.cos(yaw), 0.0])
         scene.plate(np.array([x, y, h]) - right * length / 2, right, -UP, length, h, wall, 256)
     ch, cw, colors, stagger = kind["floor"]
-    floor = partial(cells, size=(ch, cw), colors=colors, stagger=stagger, jitter=0.15, motifs=stagger == "none")
+    floor = partial(tex.cells, size=(ch, cw), colors=colors, stagger=stagger, jitter=0.15, motifs=stagger == "none")
     scene.plate((-w / 2, d / 2, 0), (1, 0, 0), (0, -1, 0), w, d, floor, 256)
     if outdoor:
-        scene.plate((-150, -150, 40), (1, 0, 0), (0, 1, 0), 300, 300, clouds, 4, lit=False)
+        scene.plate((-150, -150, 40), (1, 0, 0), (0, 1, 0), 300, 300, tex.clouds, 4, lit=False)
         scene.lamps = [origin + np.array([9.0 + 2 * i, -14.0, 22.0]) for i in (-0.5, 0.5)]
     else:
-        ceiling = partial(cells, size=(0.6, 0.6), colors=[(215, 222, 225)], stagger="none", jitter=0.03)
+        ceiling = partial(tex.cells, size=(0.6, 0.6), colors=[(215, 222, 225)], stagger="none", jitter=0.03)
         scene.plate((-w / 2, -d / 2, h), (1, 0, 0), (0, 1, 0), w, d, ceiling, 160)
-        beam = partial(wood, color=np.asarray((50, 80, 115)) * rng.uniform(0.7, 1.4))
+        beam = partial(tex.wood, color=np.asarray((50, 80, 115)) * rng.uniform(0.7, 1.4))
         for x in np.linspace(-w / 2, w / 2, 5)[1:-1]:
             scene.box((x, 0, 0), h - 0.24, (0.18, d, 0.24), beam, ppm=160)
         for x in (-w / 4 * 1.5, 0.12 * w, w / 4 * 1.5):
             for y in (-d / 5, d / 5):
-                scene.box((x, y, 0), h - 0.04, (0.9, 0.25, 0.04), lamp, lit=False, ppm=120)
+                scene.box((x, y, 0), h - 0.04, (0.9, 0.25, 0.04), tex.lamp, lit=False, ppm=120)
                 scene.lamps.append(origin + np.array([x, y, h - 0.08]))
     for k in range(4):
         length = w if k % 2 == 0 else d
@@ -278,9 +257,9 @@ def build_room(seed: int, index: int) -> Scene:
             width = _furnish(scene, rng, k, along, length / 2 - 0.45 - along, thing)
             along += width and width + rng.uniform(0.08, 0.3)
         if outdoor:  # the upper story
-            sill = partial(plaster, color=(150, 165, 175))
+            sill = partial(tex.plaster, color=(150, 165, 175))
             for at in np.arange(-length / 2 + 0.9, length / 2 - 0.6, 1.7):
-                scene.hang(k, at, 3.1, 1.05, 1.5, window, 300)
+                scene.hang(k, at, 3.1, 1.05, 1.5, tex.window, 300)
                 scene.box(scene.at_wall(k, at, 0.18), 2.98, (1.25, 0.18, 0.1), sill)
     _furnish_middle(scene, rng)
     return scene
@@ -293,31 +272,31 @@ def _furnish_middle(scene: Scene, rng: Rng) -> None:
         x, y, yaw = sx * (w / 2 - 0.42), sy * (d / 2 - 0.42), rng.uniform(0, 6)
         kind = rng.integers(3)
         if kind == 0:
-            scene.box((x, y, yaw), 0, (0.42, 0.42, 0.9), poster)
-            scene.box((x, y, yaw + 0.5), 0.9, (0.3, 0.3, 0.35), books)
+            scene.box((x, y, yaw), 0, (0.42, 0.42, 0.9), tex.poster)
+            scene.box((x, y, yaw + 0.5), 0.9, (0.3, 0.3, 0.35), tex.books)
         elif kind == 1:
-            scene.box((x, y, yaw), 0, (0.4, 0.4, 0.4), crate)
-            scene.box((x, y, yaw + 0.3), 0.4, (0.36, 0.36, 0.8), leaves)
+            scene.box((x, y, yaw), 0, (0.4, 0.4, 0.4), tex.crate)
+            scene.box((x, y, yaw + 0.3), 0.4, (0.36, 0.36, 0.8), tex.leaves)
         else:
-            scene.box((x, y, yaw), 0, (0.5, 0.45, 0.5), crate)
-            scene.box((x, y, yaw + 0.4), 0.5, (0.4, 0.35, 0.4), drawers)
-    yaw, tone = rng.uniform(-0.4, 0.4), partial(wood, color=np.asarray(OAK[0]) * rng.uniform(0.6, 1.2))
+            scene.box((x, y, yaw), 0, (0.5, 0.45, 0.5), tex.crate)
+            scene.box((x, y, yaw + 0.4), 0.5, (0.4, 0.35, 0.4), tex.drawers)
+    yaw, tone = rng.uniform(-0.4, 0.4), partial(tex.wood, color=np.asarray(OAK[0]) * rng.uniform(0.6, 1.2))
     c, s = np.cos(yaw), np.sin(yaw)
     if not scene.outdoor and rng.random() < 0.7:  # a table
-        scene.box((0, 0, yaw), 0.68, (1.3, 0.8, 0.05), tone, top=cloth if rng.random() < 0.5 else tone)
+        scene.box((0, 0, yaw), 0.68, (1.3, 0.8, 0.05), tone, top=tex.cloth if rng.random() < 0.5 else tone)
         for lx, ly in ((0.58, 0.34), (0.58, -0.34), (-0.58, 0.34), (-0.58, -0.34)):
             scene.box((lx * c - ly * s, lx * s + ly * c, yaw), 0, (0.07, 0.07, 0.68), tone)
         _clutter(scene, rng, (0, 0, yaw), 0.73, 1.1, 0.5, 4)
     else:  # a plinth
-        scene.box((0, 0, yaw), 0, (0.8, 0.8, 0.45), poster, top=tone)
-        scene.box((0, 0, yaw + 0.5), 0.45, (0.45, 0.45, 0.4), crate)
-        scene.box((0, 0, yaw + 0.9), 0.85, (0.25, 0.25, 0.45), leaves if scene.outdoor else books)
-    mosaic = partial(cells, size=(0.24, 0.24), colors=MOSAIC, stagger="none", motifs=True)
+        scene.box((0, 0, yaw), 0, (0.8, 0.8, 0.45), tex.poster, top=tone)
+        scene.box((0, 0, yaw + 0.5), 0.45, (0.45, 0.45, 0.4), tex.crate)
+        scene.box((0, 0, yaw + 0.9), 0.85, (0.25, 0.25, 0.45), tex.leaves if scene.outdoor else tex.books)
+    mosaic = partial(tex.cells, size=(0.24, 0.24), colors=MOSAIC, stagger="none", motifs=True)
     rug = 0.3 * w * np.array([c, s, 0]), 0.3 * d * np.array([-s, c, 0])
-    corner, material = rug[1] - rug[0] + [0, 0, 0.012], mosaic if scene.outdoor else cloth
+    corner, material = rug[1] - rug[0] + [0, 0, 0.012], mosaic if scene.outdoor else tex.cloth
     scene.plate(corner, (c, s, 0), (s, -c, 0), 0.6 * w, 0.6 * d, material, 220)
     for i in range(0 if scene.outdoor else 3):  # things that hang
         angle = yaw + i * 2.1
         x, y, z = 0.24 * w * np.cos(angle), 0.24 * d * np.sin(angle), min(h, 3.4) - rng.uniform(0.7, 0.9)
-        scene.box((x, y, angle), z, (0.45, 0.45, 0.3), [cloth, poster, painting][i], ppm=300)
-        scene.box((x, y, angle), z + 0.3, (0.02, 0.02, h - z - 0.3), lamp, lit=False)
+        scene.box((x, y, angle), z, (0.45, 0.45, 0.3), [tex.cloth, tex.poster, tex.painting][i], ppm=300)
+        scene.box((x, y, angle), z + 0.3, (0.02, 0.02, h - z - 0.3), tex.lamp, lit=False)

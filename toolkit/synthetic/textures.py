@@ -1,8 +1,7 @@
-"""Procedural textures of the rendered capture : walls, floors, furniture, pictures.
+"""Procedural textures of the rendered capture: walls, floors, furniture, pictures.
 
-A material is a function (random generator, height, width, pixels a meter) -> (height, width, 3) BGR uint8.
-All are rich in corners at several scales, and drawn from the generator alone: the same generator, the same
-bytes.
+A material is a function (random generator, height, width, pixels a meter) -> (height, width, 3) BGR uint8. All are rich
+in corners at several scales, and drawn from the generator alone: the same generator, the same bytes.
 """
 
 from collections.abc import Callable
@@ -29,10 +28,8 @@ def random_color(
     rng: Rng, saturation: tuple[float, float] = (0.15, 0.75), value: tuple[float, float] = (0.25, 0.95)
 ) -> Any:
     """Return a BGR color; people prefer warm ones and blues."""
-    hue = (rng.normal(28, 20), rng.normal(28, 20), rng.normal(212, 18), rng.uniform(0, 360))[
-        int(rng.integers(4))
-    ] % 360
-    hsv = _f([[[hue, rng.uniform(*saturation), rng.uniform(*value)]]])
+    hues = rng.normal(28, 20), rng.normal(28, 20), rng.normal(212, 18), rng.uniform(0, 360)
+    hsv = _f([[[hues[rng.integers(4)] % 360, rng.uniform(*saturation), rng.uniform(*value)]]])
     return tuple(float(c) for c in cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR)[0, 0] * 255)
 
 
@@ -51,24 +48,7 @@ def _painted(color: Any, shade: Image) -> Image:
 
 
 def _words(rng: Rng, count: int) -> str:
-    syllables = [
-        "ka",
-        "lo",
-        "mi",
-        "ra",
-        "tu",
-        "ze",
-        "bor",
-        "den",
-        "fal",
-        "gri",
-        "hus",
-        "win",
-        "OX",
-        "42",
-        "7",
-        "No.",
-    ]
+    syllables = ["ka", "lo", "mi", "ra", "tu", "ze", "bor", "den", "fal", "gri", "hus", "win", "OX", "42", "7", "No."]
     return " ".join("".join(rng.choice(syllables, rng.integers(1, 4))) for _ in range(count))
 
 
@@ -79,6 +59,24 @@ def _write(rng: Rng, image: Image, x: float, y: float, height: float, color: Any
     cv2.putText(image, _words(rng, words), (int(x), int(y)), font, height / 22, color, thick, cv2.LINE_AA)
 
 
+def _spot(rng: Rng, image: Image) -> list[int]:
+    """Return a random pixel, x and y."""
+    h, w = image.shape[:2]
+    spot: list[int] = (rng.uniform(0, 1, 2) * [w, h]).astype(int).tolist()
+    return spot
+
+
+def _blob(rng: Rng, image: Image, center: list[int], axes: list[float], color: Any) -> None:
+    """Fill an ellipse of the given axes (pixels), turned at random."""
+    cv2.ellipse(image, (center, axes, rng.uniform(0, 180)), color, -1, cv2.LINE_AA)
+
+
+def _wander(rng: Rng, image: Image, steps: int, step: float) -> Image:
+    """Return the corners (steps, 2) of a random walk from a random place, in pixels."""
+    h, w = image.shape[:2]
+    return _i(np.cumsum(rng.normal(0, step, (steps, 2)), 0) + rng.uniform(0, 1, 2) * [w, h])
+
+
 def _shapes(rng: Rng, image: Image, count: int, low: float, high: float) -> None:
     """Scatter discs, boxes, triangles, rings and strokes, of sizes low..high pixels."""
     h, w = image.shape[:2]
@@ -87,19 +85,15 @@ def _shapes(rng: Rng, image: Image, count: int, low: float, high: float) -> None
         x, y = rng.uniform(0, w), rng.uniform(0, h)
         color, kind = random_color(rng, (0.1, 1.0), (0.05, 1.0)), rng.integers(5)
         center, thick = (int(x), int(y)), max(1, int(size / 8))
-        if kind == 0:
-            cv2.circle(image, center, max(1, int(size / 2)), color, -1, cv2.LINE_AA)
-        elif kind == 1:
-            cv2.circle(image, center, max(1, int(size / 2)), color, thick, cv2.LINE_AA)
+        if kind < 2:
+            cv2.circle(image, center, max(1, int(size / 2)), color, thick if kind else -1, cv2.LINE_AA)
         elif kind == 4:
             end = _i(np.array([x, y]) + rng.uniform(-size, size, 2))
             cv2.line(image, center, end.tolist(), color, thick, cv2.LINE_AA)
         else:
             angle = np.arange(kind + 1) * 2 * np.pi / (kind + 1) + rng.uniform(0, 6)
-            polygon = np.stack(
-                [x + size * 0.6 * np.cos(angle), y + size * rng.uniform(0.3, 0.7) * np.sin(angle)], -1
-            )
-            cv2.fillConvexPoly(image, _i(polygon), color, cv2.LINE_AA)
+            polygon = [x + size * 0.6 * np.cos(angle), y + size * rng.uniform(0.3, 0.7) * np.sin(angle)]
+            cv2.fillConvexPoly(image, _i(np.stack(polygon, -1)), color, cv2.LINE_AA)
 
 
 def plaster(rng: Rng, h: int, w: int, ppm: float, color: Any = (190, 205, 210), band: Any = None) -> Image:
@@ -113,21 +107,14 @@ def plaster(rng: Rng, h: int, w: int, ppm: float, color: Any = (190, 205, 210), 
             box = (x + int(0.06 * ppm), rail + int(0.14 * ppm)), (x + int(0.54 * ppm), h - int(0.2 * ppm))
             cv2.rectangle(image, *box, (_f(band) * 0.72).tolist(), max(1, int(0.012 * ppm)), cv2.LINE_AA)
     for _ in range(int(h * w / ppm**2 * 2)):
-        walk = np.cumsum(rng.normal(0, 0.03 * ppm, (rng.integers(3, 9), 2)), 0) + rng.uniform(0, 1, 2) * [
-            w,
-            h,
-        ]
+        walk = _wander(rng, image, int(rng.integers(3, 9)), 0.03 * ppm)
         dark = (_f(color) * rng.uniform(0.55, 0.9)).tolist()
-        cv2.polylines(image, [_i(walk)], False, dark, int(rng.integers(1, 3)), cv2.LINE_AA)
+        cv2.polylines(image, [walk], False, dark, int(rng.integers(1, 3)), cv2.LINE_AA)
     for _ in range(int(h * w / ppm**2 * 10)):
-        spot = (rng.uniform(0, 1, 2) * [w, h]).astype(int).tolist()
+        spot = _spot(rng, image)
         tone = (_f(color) * rng.uniform(0.5, 1.15)).clip(0, 255).tolist()
-        cv2.ellipse(
-            image,
-            (spot, (rng.uniform(2, 0.06 * ppm), rng.uniform(2, 0.04 * ppm)), rng.uniform(0, 180)),
-            tone,
-            -1,
-        )
+        axes = rng.uniform(2, 0.06 * ppm), rng.uniform(2, 0.04 * ppm)
+        cv2.ellipse(image, (spot, axes, rng.uniform(0, 180)), tone, -1)
     return _grain(rng, image, 0.03)
 
 
@@ -170,10 +157,10 @@ def _chip(rng: Rng, image: Image, ppm: float) -> None:
     """Scatter small chips, drips and scratches, as any used surface has them."""
     h, w = image.shape[:2]
     for _ in range(int(h * w / ppm**2 * 14)):
-        x, y = (rng.uniform(0, 1, 2) * [w, h]).astype(int)
+        x, y = _spot(rng, image)
         tone = (_f(image[y, x]) * rng.uniform(0.4, 1.5)).clip(0, 255).tolist()
         axes = rng.uniform(0.008, 0.05, 2) * ppm
-        cv2.ellipse(image, ((int(x), int(y)), axes.tolist(), rng.uniform(0, 180)), tone, -1, cv2.LINE_AA)
+        _blob(rng, image, [x, y], axes.tolist(), tone)
 
 
 def poster(rng: Rng, h: int, w: int, ppm: float) -> Image:
@@ -183,10 +170,8 @@ def poster(rng: Rng, h: int, w: int, ppm: float) -> Image:
     ink = random_color(rng, (0.2, 1.0), (0.05, 0.35))
     top, bottom = int(h * rng.uniform(0.14, 0.25)), int(h * rng.uniform(0.6, 0.8))
     picture = image[top:bottom, int(w * 0.06) : int(w * 0.94)]
-    picture[:] = _painted(
-        random_color(rng),
-        0.25 * _noise(rng, bottom - top, picture.shape[1], (max(4, w // 4), max(4, w // 10))),
-    )
+    color, sizes = random_color(rng), (max(4, w // 4), max(4, w // 10))
+    picture[:] = _painted(color, 0.25 * _noise(rng, bottom - top, picture.shape[1], sizes))
     _shapes(rng, picture, int(rng.integers(10, 26)), w * 0.04, w * 0.45)
     _write(rng, image, w * 0.06, top * 0.75, min(top * 0.5, w * 0.13), ink, 1)
     line = 0.022 * ppm
@@ -198,21 +183,16 @@ def poster(rng: Rng, h: int, w: int, ppm: float) -> Image:
 
 def painting(rng: Rng, h: int, w: int, ppm: float) -> Image:
     """Hills and brush strokes in a dark or gilded frame."""
-    sky, ground = (
-        _f(random_color(rng, (0.1, 0.5), (0.6, 1.0))),
-        _f(random_color(rng, (0.2, 0.7), (0.2, 0.6))),
-    )
+    sky, ground = (_f(random_color(rng, *ranges)) for ranges in (((0.1, 0.5), (0.6, 1.0)), ((0.2, 0.7), (0.2, 0.6))))
     horizon = h * (0.5 + 0.12 * _noise(rng, 1, w, (max(8, w // 4), max(4, w // 12)))[0])
     below = np.clip((np.arange(h)[:, None] - horizon) / 4, 0, 1)[..., None]
-    image = (sky * (1 - below) + ground * below) * (
-        1 + 0.12 * _noise(rng, h, w, (max(4, h // 8), 6), 3)[..., None]
-    )
-    image = image.clip(0, 255).astype(np.uint8)
+    strokes = 1 + 0.12 * _noise(rng, h, w, (max(4, h // 8), 6), 3)[..., None]
+    image = ((sky * (1 - below) + ground * below) * strokes).clip(0, 255).astype(np.uint8)
     for _ in range(int(rng.integers(60, 140))):
-        center = (rng.uniform(0, 1, 2) * [w, h]).astype(int).tolist()
+        center = _spot(rng, image)
         axes = (rng.uniform(0.015, 0.09, 2) * w).tolist()
         tone = (_f(image[center[1], center[0]]) * 0.4 + 0.6 * _f(random_color(rng))).tolist()
-        cv2.ellipse(image, (center, axes, rng.uniform(0, 180)), tone, -1, cv2.LINE_AA)
+        _blob(rng, image, center, axes, tone)
     frame = max(3, int(0.045 * ppm))
     wood = (40, 90, 130) if rng.random() < 0.5 else (35, 35, 45)
     cv2.rectangle(image, (0, 0), (w, h), wood, 2 * frame)
@@ -249,13 +229,8 @@ def books(rng: Rng, h: int, w: int, ppm: float) -> Image:
             cv2.rectangle(image, (int(x), top), (right - 1, bottom), color.tolist(), -1)
             for _ in range(int(rng.integers(1, 4))):
                 y, tall = int(rng.uniform(top, bottom - 4)), int(rng.uniform(0.01, 0.06) * ppm)
-                cv2.rectangle(
-                    image,
-                    (int(x) + 1, y),
-                    (right - 2, min(y + tall, bottom)),
-                    random_color(rng, (0, 0.6)),
-                    -1,
-                )
+                end = right - 2, min(y + tall, bottom)
+                cv2.rectangle(image, (int(x) + 1, y), end, random_color(rng, (0, 0.6)), -1)
             image[top:bottom, right - 1 : right] = color * 0.45
             x += width
         image[bottom : bottom + thick] = board
@@ -271,9 +246,8 @@ def drawers(rng: Rng, h: int, w: int, ppm: float) -> Image:
     across, down = max(1, round(w / ppm / 0.45)), int(rng.integers(1, 4))
     for i in range(across):
         for j in range(down):
-            x0, x1, y0, y1 = (
-                int(v) for v in (i * w / across, (i + 1) * w / across, j * h / down, (j + 1) * h / down)
-            )
+            x0, x1 = int(i * w / across), int((i + 1) * w / across)
+            y0, y1 = int(j * h / down), int((j + 1) * h / down)
             cv2.rectangle(image, (x0 + 3, y0 + 3), (x1 - 4, y1 - 4), (color * 0.4).tolist(), 2)
             mid = ((x0 + x1) // 2, (y0 + y1) // 2)
             cv2.ellipse(image, (mid, (0.13 * ppm, 0.03 * ppm), 0), (180, 190, 200), -1, cv2.LINE_AA)
@@ -315,10 +289,9 @@ def chalk(rng: Rng, h: int, w: int, ppm: float) -> Image:
         x, y = rng.uniform(0, 0.8) * w, rng.uniform(0.1, 0.95) * h
         _write(rng, image, x, y, rng.uniform(0.03, 0.08) * ppm, (215, 225, 220), int(rng.integers(1, 4)))
     for _ in range(int(w * h / ppm**2 * 6)):
-        walk = np.cumsum(rng.normal(0, 0.06 * ppm, (6, 2)), 0) + rng.uniform(0, 1, 2) * [w, h]
-        cv2.polylines(
-            image, [_i(walk)], bool(rng.integers(2)), random_color(rng, (0, 0.5), (0.7, 1)), 2, cv2.LINE_AA
-        )
+        walk = _wander(rng, image, 6, 0.06 * ppm)
+        closed, color = bool(rng.integers(2)), random_color(rng, (0, 0.5), (0.7, 1))
+        cv2.polylines(image, [walk], closed, color, 2, cv2.LINE_AA)
     cv2.rectangle(image, (0, 0), (w, h), (60, 95, 130), max(4, int(0.07 * ppm)))
     return _grain(rng, image, 0.03)
 
@@ -393,12 +366,12 @@ def leaves(rng: Rng, h: int, w: int, ppm: float) -> Image:
     """Foliage and flowers."""
     image = _painted((30, 60, 35), 0.3 * _noise(rng, h, w, (8, 20)))
     for _ in range(int(h * w / ppm**2 * 500)):
-        center = (rng.uniform(0, 1, 2) * [w, h]).astype(int).tolist()
+        center = _spot(rng, image)
         tone = _f((50, 130, 70)) * rng.uniform(0.4, 1.5)
         if rng.random() < 0.07:
             tone = _f(random_color(rng, (0.5, 1), (0.7, 1)))
         axes = (rng.uniform(0.015, 0.06, 2) * ppm).tolist()
-        cv2.ellipse(image, (center, axes, rng.uniform(0, 180)), tone.clip(0, 255).tolist(), -1, cv2.LINE_AA)
+        _blob(rng, image, center, axes, tone.clip(0, 255).tolist())
     return image
 
 
