@@ -1,21 +1,64 @@
-"""What several tests share: a small rendered capture, and real captures where they are present."""
+"""What several tests share: a small rendered capture and its features, and real captures where they are present.
+
+What takes long to make is made once, also where pytest-xdist has several workers: the first makes it, the others wait.
+"""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # The workers share the cores: one thread each, here (before torch is imported) and in what a test starts.
+    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+
 
 @pytest.fixture(scope="session")
-def small_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], object]], Path]:
+    """A function (name, make) -> folder of that name, filled by `make(folder)` in the first worker that asks for it."""
+    base = tmp_path_factory.getbasetemp()
+    root = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def folder(name: str, make: Callable[[Path], object]) -> Path:
+        place = root / f"shared-{name}"
+        with FileLock(f"{place}.lock"):
+            if not (place / ".made").exists():
+                place.mkdir(exist_ok=True)
+                make(place)
+                (place / ".made").touch()
+        return place
+
+    return folder
+
+
+@pytest.fixture(scope="session")
+def small_capture(made_once: Callable[[str, Callable[[Path], object]], Path]) -> Path:
     """A rendered capture of one room, all three devices; do not write to it."""
     from toolkit.synthetic import render_capture
 
-    return render_capture(
-        tmp_path_factory.mktemp("data") / "SMALL", rooms=1, frames=6, seed=0, progress=False
-    )
+    def make(folder: Path) -> None:
+        render_capture(folder / "SMALL", rooms=1, frames=6, seed=0, progress=False)
+
+    return made_once("capture", make) / "SMALL"
+
+
+@pytest.fixture(scope="session")
+def small_features(small_capture: Path, made_once: Callable[[str, Callable[[Path], object]], Path]) -> Path:
+    """A features folder with the SIFT features (default settings) of all sessions of `small_capture`; copy it."""
+    from toolkit.capture import Capture
+    from toolkit.features.features import extract_session
+
+    def make(folder: Path) -> None:
+        capture = Capture.open(small_capture)
+        for session_id in capture:
+            extract_session(capture[session_id], folder / "features", progress=False)
+
+    return made_once("features", make) / "features"
 
 
 @pytest.fixture(scope="session")

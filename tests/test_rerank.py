@@ -125,9 +125,10 @@ def test_overlap_is_the_share_of_points_in_view() -> None:
 
 
 @pytest.fixture(scope="module")
-def finished(small_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> SceneFiles:
+def finished(small_capture: Path, small_features: Path, tmp_path_factory: pytest.TempPathFactory) -> SceneFiles:
     """A retrieval in the phone's map in reversed order, reranked; do not write to it."""
     files = SceneFiles(tmp_path_factory.mktemp("run"), small_capture.name)
+    shutil.copytree(small_features, files.features)
     sessions = small_capture / "sessions"
     embed_sessions(sessions, files.embeddings, features_dir=files.features)
     retrieve_pairs(

@@ -20,10 +20,11 @@ from toolkit.localizers.mapping import LocalMap, build_map
 
 
 @pytest.fixture(scope="module")
-def run(small_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> SceneFiles:
+def run(small_capture: Path, small_features: Path, tmp_path_factory: pytest.TempPathFactory) -> SceneFiles:
     """A run that has built the headset's map; do not write to it."""
     files = SceneFiles(tmp_path_factory.mktemp("run"), small_capture.name)
     session = Capture.open(small_capture)["hl_map"]
+    shutil.copytree(small_features, files.features)
     store = extract_session(session, files.features, workers=1, progress=False)
     build_map(session, store, files.maps / "hl_map.npz")
     return files

@@ -73,8 +73,9 @@ def pointless(session: Session, store: FeatureStore) -> LocalMap:
 
 
 @pytest.fixture(scope="module")
-def world(small_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> World:
+def world(small_capture: Path, small_features: Path, tmp_path_factory: pytest.TempPathFactory) -> World:
     folder = tmp_path_factory.mktemp("lifting")
+    shutil.copytree(small_features, folder / "features")
     capture = Capture.open(small_capture)
     mapped = capture["ios_map"]
     bare = folder / "ios_map"  # the same photographs, without depth maps

@@ -83,9 +83,10 @@ def run_stage(capture: Path, files: SceneFiles, **more: object) -> pd.DataFrame:
 
 
 @pytest.fixture(scope="module")
-def finished(small_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> SceneFiles:
+def finished(small_capture: Path, small_features: Path, tmp_path_factory: pytest.TempPathFactory) -> SceneFiles:
     """A run that has localized all devices in the phone's map by predictions; do not write to it."""
     files = SceneFiles(tmp_path_factory.mktemp("vggt"), small_capture.name)
+    shutil.copytree(small_features, files.features)
     capture = Capture.open(small_capture)
     for device in capture.devices:
         write_retrieval(files.retrieval("ios", device), capture["ios_map"], capture[f"{device}_query"])
