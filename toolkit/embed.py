@@ -29,6 +29,7 @@ from toolkit.files import (
     sidecar_path,
     write_atomic,
     write_sidecar,
+    write_text,
 )
 from toolkit.manifest import EmbedSettings
 
@@ -135,6 +136,8 @@ def embed_sessions(
                 "dim": embedder.dim,
             }
         )
+    made_with = settings.model_copy(update={"model": embedder.name})
+    write_text(out_dir / "settings.json", made_with.model_dump_json(indent=1) + "\n")
     return pd.DataFrame(table)
 
 

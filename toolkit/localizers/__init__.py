@@ -1,1 +1,6 @@
-"""Localizers: a query's features and its references in, a pose and how far to trust it out."""
+"""The ways to find a pose, behind one interface."""
+
+from toolkit.localizers.base import Localizer, PoseEstimate, Query, References, View
+from toolkit.localizers.map import Map, create_localizer
+
+__all__ = ["Localizer", "Map", "PoseEstimate", "Query", "References", "View", "create_localizer"]

@@ -4,16 +4,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import pycolmap
-from numpy.typing import NDArray
 
-from toolkit.features.features import LocalFeatures
+from toolkit.localizers.base import PoseEstimate, Prior, Query, References, agree
+from toolkit.localizers.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
 from toolkit.localizers.lifting import DepthLifter
-from toolkit.localizers.mapped import Known
-from toolkit.localizers.pnp import PnpLocalizer, PoseEstimate, Prior, agree
-from toolkit.localizers.vggt import VggtAnswer
-
-Floats = NDArray[np.float64]
+from toolkit.localizers.pnp import PnpLocalizer
 
 SEARCH_DEG = (1.0, 6.0)  # limits of the radius in which features are sought about a predicted pose
 TIE = 0.8  # of the other's matches: with more, there is no reason to change
@@ -23,60 +18,68 @@ NEARBY_M = 3.0  # depth at which the uncertainty of a place is seen as an angle
 class HybridLocalizer:
     """Adds a prediction to the hypotheses of a `PnpLocalizer`, and depth where its points do not suffice."""
 
-    def __init__(self, pnp: PnpLocalizer, lifter: DepthLifter | None = None):
+    def __init__(self, pnp: PnpLocalizer, feed_forward: FeedForwardLocalizer):
         """
         Args:
             pnp: matches with triangulated points.
-            lifter: of the same map; None: features without a point are not used.
+            feed_forward: of the same map.
         """
         self.pnp = pnp
-        self.lifter = lifter
+        self.feed_forward = feed_forward
+        self.lifter = DepthLifter(pnp, feed_forward)
+
+    @property
+    def image_names(self) -> list[str]:
+        return self.pnp.image_names
+
+    @property
+    def batch_size(self) -> int:
+        return self.feed_forward.batch_size
+
+    def predict(self, queries: Sequence[tuple[Query, Sequence[References]]]) -> list[FeedForwardAnswer]:
+        """Return what the network says of each query; see `Localizer`."""
+        return self.feed_forward.predict(queries)
 
     def localize(
-        self,
-        cameras: Sequence[pycolmap.Camera],
-        rig_from_cams: Floats,
-        features: Sequence[LocalFeatures | Sequence[LocalFeatures]],
-        references: Sequence[Sequence[int]],
-        answer: VggtAnswer,
-        known: Sequence[Sequence[Known | None]] = (),
+        self, query: Query, references: Sequence[References], prediction: FeedForwardAnswer | None = None
     ) -> PoseEstimate:
         """Return one pose for the cameras of a rig, or for a single camera; `found_by` says from what.
 
-        `pnp`: the prediction has changed nothing. `pnp+vggt`: features sought about the predicted pose, in its
+        `pnp`: the prediction has changed nothing. `pnp+vggt`: features sought around the predicted pose, in its
         consistent references, support the answer better than those matched without it. `lifted`, `lifted+vggt`: where
         that is not `ok`, and features placed by a capture's depth maps, or by predicted depth too, support a pose
         better. `vggt`: the predicted pose itself, where matching finds none, or only an uncertain one that a certain
         prediction contradicts.
 
         Args:
-            cameras, rig_from_cams, features, references, known: as for `PnpLocalizer.localize`.
-            answer: what `toolkit.localizers.vggt` says of the same rig.
+            query, references: see `Localizer`.
+            prediction: what `predict` returned; None: the network is asked here.
         """
+        answer = self.predict([(query, references)])[0] if prediction is None else prediction
         predicted = answer.estimate
         prior = _prior(predicted)
         priors = () if prior is None else (prior,)
-        found = self.pnp.localize(cameras, rig_from_cams, features, references, priors, known)
-        if found.status != "ok" and self.lifter is not None:
-            lifted = self.lifter.localize(cameras, rig_from_cams, features, references, answer, priors, known)
-            found = found if lifted is None else _better(found, lifted)
+        estimate = self.pnp.localize(query, references, None, priors)
+        if estimate.status != "ok":
+            lifted = self.lifter.localize(query, references, answer, priors)
+            estimate = estimate if lifted is None else _better(estimate, lifted)
         if predicted.world_from_rig is None:
-            return found
-        lost = found.world_from_rig is None
-        elsewhere = not agree(found.world_from_rig, predicted.world_from_rig)
-        if lost or (elsewhere and found.status != "ok" and predicted.status == "ok"):
-            why = found.status if lost else "matching gives an uncertain pose elsewhere"
+            return estimate
+        lost = estimate.world_from_rig is None
+        elsewhere = not agree(estimate.world_from_rig, predicted.world_from_rig)
+        if lost or (elsewhere and estimate.status != "ok" and predicted.status == "ok"):
+            why = estimate.status if lost else "matching gives an uncertain pose elsewhere"
             return replace(predicted, reason="; ".join(part for part in (predicted.reason, why) if part))
-        reason = "; ".join(part for part in (predicted.reason, found.reason) if part)
-        return replace(found, scale_std=predicted.scale_std, rejected=predicted.rejected, reason=reason)
+        reason = "; ".join(part for part in (predicted.reason, estimate.reason) if part)
+        return replace(estimate, scale_std=predicted.scale_std, rejected=predicted.rejected, reason=reason)
 
 
-def _better(found: PoseEstimate, lifted: PoseEstimate) -> PoseEstimate:
+def _better(matched: PoseEstimate, lifted: PoseEstimate) -> PoseEstimate:
     """Return the pose with the better status, else the lifted one only if clearly more matches support it."""
     rank = {"ok": 2, "low_confidence": 1}
-    one, other = rank.get(found.status, 0), rank.get(lifted.status, 0)
-    clearly_more = found.num_guided <= TIE * lifted.num_guided
-    return lifted if other > one or (other == one > 0 and clearly_more) else found
+    rank_matched, rank_lifted = rank.get(matched.status, 0), rank.get(lifted.status, 0)
+    clearly_more = matched.num_guided <= TIE * lifted.num_guided
+    return lifted if rank_lifted > rank_matched or (rank_lifted == rank_matched > 0 and clearly_more) else matched
 
 
 def _prior(predicted: PoseEstimate) -> Prior | None:

@@ -9,24 +9,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from toolkit import geometry
 from toolkit.capture.depths import lifted
-from toolkit.features.features import LocalFeatures
 from toolkit.localizers.alignment import DEPTH_NOISE
-from toolkit.localizers.mapped import Known, MappedFeatures
+from toolkit.localizers.base import PoseEstimate, Prior, Query, References
+from toolkit.localizers.feed_forward import CameraAnswer, FeedForwardAnswer, FeedForwardLocalizer
 from toolkit.localizers.mapping import LocalMap
-from toolkit.localizers.pnp import (
-    PnpLocalizer,
-    PoseEstimate,
-    Prior,
-    _Matches,
-    _Query,
-    least_squares_covariance,
-)
-from toolkit.localizers.vggt import CameraAnswer, VggtAnswer, VggtLocalizer
+from toolkit.localizers.matches import MappedFeatures
+from toolkit.localizers.pnp import PnpLocalizer
+from toolkit.localizers.rig import Matches, RigQuery, least_squares_covariance
 from toolkit.manifest import PnpSettings
 
 Floats = NDArray[np.float64]
@@ -70,23 +63,16 @@ class LiftedMap:
 class DepthLifter:
     """Lifts the features of one map's images, and localizes with them. Safe to use from several threads."""
 
-    def __init__(self, pnp: PnpLocalizer, vggt: VggtLocalizer) -> None:
+    def __init__(self, pnp: PnpLocalizer, vggt: FeedForwardLocalizer) -> None:
         """
         Args:
             pnp: of several kinds of features, those of the first are lifted and matched.
             vggt: on the same map.
         """
-        self._first, self._pnp, self._vggt = pnp.mapped[0], pnp, vggt
+        self._first, self._pnp, self._vggt = pnp.matcher.mapped[0], pnp, vggt
 
     def localize(
-        self,
-        cameras: Sequence[pycolmap.Camera],
-        rig_from_cams: Floats,
-        features: Sequence[LocalFeatures | Sequence[LocalFeatures]],
-        references: Sequence[Sequence[int]],
-        answer: VggtAnswer,
-        priors: Sequence[Prior] = (),
-        known: Sequence[Sequence[Known | None]] = (),
+        self, query: Query, references: Sequence[References], answer: FeedForwardAnswer, priors: Sequence[Prior] = ()
     ) -> PoseEstimate | None:
         """Return a pose by triangulated and lifted places of the references' features; None where none can be lifted.
 
@@ -94,31 +80,44 @@ class DepthLifter:
         it rests on predicted depth that nothing measured, only if the predicted camera of the query agrees.
 
         Args:
-            cameras, rig_from_cams, features, references, priors, known: as for `PnpLocalizer.localize`.
-            answer: what `VggtLocalizer` says of the query.
+            query, references, priors: as for `PnpLocalizer.localize`.
+            answer: what `FeedForwardLocalizer` says of the query.
         """
         count = len(self._first.map.image_names)  # further images are those that only other kinds of features have
-        references = [[image for image in part if image < count] for part in references]
-        features = [one if isinstance(one, LocalFeatures) else one[0] for one in features]
-        known = [kinds[:1] for kinds in known]
-        images = list(dict.fromkeys(int(image) for part in references for image in part))
-        made = self.lift(images, answer)
-        if made is None:
+        references = [
+            References(part.images[part.images < count], part.scores[part.images < count]) for part in references
+        ]
+        query = replace(
+            query,
+            features=[kinds if isinstance(kinds, str) else kinds[:1] for kinds in query.features],
+            network_matches=[kinds[:1] for kinds in query.network_matches],
+        )
+        images = list(dict.fromkeys(int(image) for part in references for image in part.images))
+        lifted_map = self.lift(images, answer)
+        if lifted_map is None:
             return None
-        localizer = _LiftedLocalizer(made, self._first, self._pnp.settings, self._pnp.seed)
-        found = localizer.localize(cameras, rig_from_cams, features, references, priors, known)
-        source = made.image[found.point_index]
-        used = [made.depths[int(image)] for image in np.unique(source[source >= 0])]
-        whole = np.concatenate([made.triangulated, np.full(len(made.image) - len(made.triangulated), -1)])
-        label = "lifted+vggt" if any(depth.predicted for depth in used) else "lifted"
-        found = replace(found, found_by=label, point_index=whole[found.point_index])
+        localizer = _LiftedLocalizer(lifted_map, self._first, self._pnp.settings, self._pnp.seed)
+        estimate = localizer.localize(query, references, None, priors)
+        matched = estimate.correspondences
+        source = lifted_map.image[matched.point_index]
+        rests_on = np.char.endswith(matched.found_by, "/guided") & (source >= 0)
+        used = [lifted_map.depths[int(image)] for image in np.unique(source[rests_on])]
+        whole = np.concatenate(
+            [lifted_map.triangulated, np.full(len(lifted_map.image) - len(lifted_map.triangulated), -1)]
+        )
+        found_by = np.where(source >= 0, f"{self._first.name}/lifted", matched.found_by)
+        estimate = replace(
+            estimate,
+            found_by="lifted+vggt" if any(depth.predicted for depth in used) else "lifted",
+            correspondences=replace(matched, point_index=whole[matched.point_index], found_by=found_by),
+        )
         guessed = any(not depth.measured for depth in used)
-        if found.status == "ok" and guessed and not _consistent(found, answer.estimate):
+        if estimate.status == "ok" and guessed and not _consistent(estimate, answer.estimate):
             why = "the predicted camera contradicts the pose that its depth gives"
-            return replace(found, status="low_confidence", reason=why)
-        return found
+            return replace(estimate, status="low_confidence", reason=why)
+        return estimate
 
-    def lift(self, images: Sequence[int], answer: VggtAnswer) -> LiftedMap | None:
+    def lift(self, images: Sequence[int], answer: FeedForwardAnswer) -> LiftedMap | None:
         """Return the part of the map that images see, with points for their features that have none."""
         local_map = self._first.map
         predictions = _predictions(answer)
@@ -196,10 +195,11 @@ class _LiftedLocalizer(PnpLocalizer):
     """Localizes in a lifted map; the common scale of each image's depth is unknown within its standard deviation."""
 
     def __init__(self, made: LiftedMap, mapped: MappedFeatures, settings: PnpSettings, seed: int) -> None:
-        self._use([MappedFeatures(made.local_map, mapped.features, mapped.kind, mapped.matcher)], settings, seed)
+        features = MappedFeatures(made.local_map, mapped.features, mapped.kind, mapped.matcher, mapped.name)
+        super().__init__([features], settings, seed)
         self._made = made
 
-    def _covariance(self, query: _Query, rig_from_world: Floats, matches: _Matches) -> Floats | None:
+    def _covariance(self, query: RigQuery, rig_from_world: Floats, matches: Matches) -> Floats | None:
         made = self._made
         source = made.image[matches.point]
         images = np.unique(source[source >= 0])
@@ -237,7 +237,7 @@ def _scale_covariance(depths: Sequence[Depth]) -> Floats:
     return np.diag(stds**2 - common**2) + np.outer(common, common)
 
 
-def _predictions(answer: VggtAnswer) -> dict[int, tuple[CameraAnswer, int]]:
+def _predictions(answer: FeedForwardAnswer) -> dict[int, tuple[CameraAnswer, int]]:
     """Return for each consistent reference what was predicted of it, and its place in the prediction."""
     found: dict[int, tuple[CameraAnswer, int]] = {}
     for camera in answer.cameras:

@@ -16,7 +16,8 @@ from toolkit.capture.upright import turn_image, turn_points, turned_from_cam
 from toolkit.errors import ImageError, ManifestError, ToolkitError
 from toolkit.files import files_fingerprint
 from toolkit.geometry import invert, make_pose
-from toolkit.localizers.prediction import Prediction, View
+from toolkit.localizers.base import View
+from toolkit.localizers.prediction import Prediction
 from toolkit.models.compute import PRECISIONS, Fitting, check_device_name, resolve_device, resolve_precision
 from toolkit.models.weights import VGGT as WEIGHTS
 from toolkit.models.weights import resolve_any
@@ -94,9 +95,10 @@ class _Placed:
     """(H, W) of the network's images of its group."""
 
     @property
-    def key(self) -> tuple[Path, tuple[int, int], int]:
+    def key(self) -> tuple[Path | int, tuple[int, int], int]:
         """Of its encoding: in images of one size a photograph lies in one way."""
-        return self.view.path, self.size, self.view.turns
+        image = self.view.image
+        return image if isinstance(image, Path) else id(image), self.size, self.view.turns
 
     @property
     def map_from_image(self) -> NDArray[np.float64]:
@@ -336,7 +338,7 @@ class NetworkPredictor:
         asked = set()
         for placed in (placed for batch in batches for group in batch for placed in group):
             yield None if placed.key in self._cache or placed.key in asked else placed
-            if placed.view.known:
+            if placed.view.in_map:
                 asked.add(placed.key)
 
     def _encode(self, images: "Sequence[tuple[_Placed, Tensor]]") -> "dict[Any, Tensor]":
@@ -353,7 +355,7 @@ class NetworkPredictor:
             for (placed, _), tokens in zip(part, fitting(batch).to("cpu", dtype), strict=True):
                 # A copy: a part of the batch would hold all of it in memory.
                 found[placed.key] = tokens.clone()
-                if placed.view.known:
+                if placed.view.in_map:
                     self._cache.put(placed.key, found[placed.key])
         return found
 
@@ -471,15 +473,17 @@ def _read(placed: _Placed | None) -> "Tensor | ImageError | None":
     from toolkit.models.vggt import load_images
 
     try:
-        path, turns = placed.view.path, placed.view.turns
-        loaded = load_images([turn_image(read_image(path), turns) if turns else path], placed.mode)
+        image, turns = placed.view.image, placed.view.turns
+        if turns:
+            image = turn_image(read_image(image) if isinstance(image, Path) else image, turns)
+        loaded = load_images([image], placed.mode)
     except ImageError as error:
         return error
     found, expected = tuple(loaded.sizes[0].tolist()), _shown_size(placed.view)
     if found != expected:
         turned = " when upright" if turns else ""
         return ImageError(
-            f"Image of {found[0]} x {found[1]} pixels{turned}: {placed.view.path}; its camera has "
+            f"Image of {found[0]} x {found[1]} pixels{turned}: {placed.view.name}; its camera has "
             f"{expected[0]} x {expected[1]}. Correct the size in `sensors.txt`, or the image."
         )
     missing = placed.size[0] - loaded.images.shape[2]

@@ -2,32 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-import pycolmap
 from numpy.typing import ArrayLike, NDArray
+
+from toolkit.localizers.base import View
 
 Floats = NDArray[np.float64]
 
 LOW_CONFIDENCE = 0.2
 """Share of a view's depths, the least confident, that are not used."""
-
-
-@dataclass(frozen=True)
-class View:
-    """One photograph that a network is shown."""
-
-    name: str
-    """`<session>/raw_data/<path>`, as `Session.image_name` gives it."""
-    path: Path
-    camera: pycolmap.Camera
-    known: bool
-    """Whether it is a map image: others will ask for it again, so that its encoding is worth keeping."""
-    turns: int = 0
-    """Counter-clockwise quarter turns that bring gravity down, see `capture.upright`. A network is shown the image
-    turned; what comes back is of the image as it is stored."""
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ def create_predictor(
     *,
     sessions: Sequence[Session] = (),
     map_dir: str | Path | None = None,
+    features: str = "sift",
     checkpoint: str | Path | None = None,
     compute_device: str = "auto",
     dtype_compute: str = "auto",
@@ -38,7 +39,7 @@ def create_predictor(
     Args:
         name: `vggt`, or `simulated`, which looks up true poses and is for tests and for trying things out.
         sessions: of `simulated`: where the true poses are.
-        map_dir: of `simulated`: folder of the triangulated maps, for depth.
+        map_dir, features: of `simulated`: folder of the triangulated maps, for depth, and their kind of features.
         checkpoint: of `vggt`: file with the weights; None: the hub's cache, else a download.
         compute_device, dtype_compute: of `vggt`, as `toolkit.models.compute` takes them.
         seed: of `simulated`.
@@ -49,5 +50,5 @@ def create_predictor(
     """
     check_predictor_name(name)
     if name == "simulated":
-        return SimulatedPredictor(sessions, map_dir, seed=seed)
+        return SimulatedPredictor(sessions, map_dir, features, seed=seed)
     return NetworkPredictor(checkpoint, compute_device, dtype_compute)

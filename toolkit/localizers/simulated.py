@@ -25,8 +25,9 @@ from toolkit.capture.cameras import in_view, view_bounds
 from toolkit.capture.depths import DepthMaps, lifted
 from toolkit.capture.devices import session_id
 from toolkit.errors import CaptureError
-from toolkit.localizers.mapping import LocalMap
-from toolkit.localizers.prediction import Prediction, View
+from toolkit.localizers.base import View
+from toolkit.localizers.mapping import LocalMap, map_path
+from toolkit.localizers.prediction import Prediction
 
 Floats = NDArray[np.float64]
 
@@ -51,6 +52,7 @@ class SimulatedPredictor:
         self,
         sessions: Sequence[Session],
         map_dir: str | Path | None = None,
+        features: str = "sift",
         *,
         rotation_noise_deg: float = 1.0,
         position_noise_m: float = 0.03,
@@ -61,7 +63,8 @@ class SimulatedPredictor:
         """
         Args:
             sessions: those that the views are of, with ground truth.
-            map_dir: folder of triangulated maps, `<session>.npz`; None, or none of a session: no depth.
+            map_dir: folder of triangulated maps; None, or none of a session: no depth.
+            features: kind of local features that they are triangulated from.
             rotation_noise_deg: standard deviation of a camera's rotation, as an angle.
             position_noise_m: standard deviation of a camera's place, as a length.
             depth_noise: relative standard deviation of each pixel's depth.
@@ -70,6 +73,7 @@ class SimulatedPredictor:
         """
         self._sessions = {session.id: session for session in sessions}
         self._map_dir = None if map_dir is None else Path(map_dir)
+        self._features = features
         self._noise = {
             "rotation_noise_deg": rotation_noise_deg,
             "position_noise_m": position_noise_m,
@@ -137,7 +141,7 @@ class SimulatedPredictor:
         rng = self._random(names, view.name)
         turn = Rotation.from_rotvec(rng.normal(size=3) * np.radians(self._noise["rotation_noise_deg"]) / np.sqrt(3))
         moved = rng.normal(size=3) * self._noise["position_noise_m"] / np.sqrt(3)
-        if view.known and rng.random() < self._noise["wrong_references"]:
+        if view.in_map and rng.random() < self._noise["wrong_references"]:
             turn = Rotation.random(random_state=rng)
             moved = rng.normal(size=3) * max(2.0, float(np.ptp(group[:, :3, 3], axis=0).max()))
         return geometry.make_pose(world_from_cam[:3, :3] @ turn.as_matrix(), world_from_cam[:3, 3] + moved)
@@ -145,12 +149,12 @@ class SimulatedPredictor:
     def _depth(self, view: View, group: list[View], names: list[str], grid: NDArray[np.int64]) -> Floats:
         key = f"{view.name} {grid}"
         with self._lock:
-            kept = self._depths.get(key) if view.known else None
+            kept = self._depths.get(key) if view.in_map else None
         if kept is None:
-            points = self._points(view) if view.known else np.concatenate([self._points(v) for v in group])
+            points = self._points(view) if view.in_map else np.concatenate([self._points(v) for v in group])
             kept = _nearest_depth(points, view, self._truth[view.name], grid)
             with self._lock:
-                if view.known:  # the depth of others depends on the group
+                if view.in_map:  # the depth of others depends on the group
                     self._depths[key] = kept
                 if len(self._depths) > _KEPT:
                     self._depths.popitem(last=False)
@@ -159,7 +163,7 @@ class SimulatedPredictor:
     def _points(self, view: View) -> Floats:
         """Return points (P, 3) that a map image sees, of the map, else of its depth maps; none of another image."""
         session = session_id(view.name.split("/", 1)[0])
-        found = self._map(session) if view.known else None
+        found = self._map(session) if view.in_map else None
         if found is None or view.name not in found.index_of:
             return np.zeros((0, 3))
         points = found.points[np.unique(found.observations(found.index_of[view.name])[1])]
@@ -177,7 +181,7 @@ class SimulatedPredictor:
     def _map(self, session: str) -> LocalMap | None:
         with self._lock:
             if session not in self._maps:
-                path = None if self._map_dir is None else self._map_dir / f"{session}.npz"
+                path = None if self._map_dir is None else map_path(self._map_dir, session, self._features)
                 self._maps[session] = LocalMap.load(path) if path is not None and path.exists() else None
             return self._maps[session]
 

@@ -13,10 +13,10 @@ from toolkit.capture.depths import DepthMaps, SeenDepth, lifted
 from toolkit.capture.upright import Turns
 from toolkit.errors import ImageError, ToolkitError
 from toolkit.localizers.alignment import Alignment, align_to_map, is_trustworthy, query_pose
+from toolkit.localizers.base import PoseEstimate, Query, References, View
 from toolkit.localizers.mapping import LocalMap
-from toolkit.localizers.pnp import PoseEstimate
 from toolkit.localizers.pose_mean import robust_mean_pose
-from toolkit.localizers.prediction import Prediction, Predictor, View
+from toolkit.localizers.prediction import Prediction, Predictor
 from toolkit.localizers.references import select_references
 from toolkit.manifest import PredictorSettings
 
@@ -24,19 +24,6 @@ log = logging.getLogger(__name__)
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class VggtQuery:
-    """The C images of one query device at one instant, and what was retrieved for each."""
-
-    views: list[View]
-    rig_from_cams: Floats
-    """(C, 4, 4); the identity for a single camera."""
-    references: list[Ints]
-    """For each image the indices of map images."""
-    scores: list[Floats]
-    """Their similarities, higher is better."""
 
 
 @dataclass(frozen=True)
@@ -60,14 +47,14 @@ class CameraAnswer:
 
 
 @dataclass(frozen=True)
-class VggtAnswer:
+class FeedForwardAnswer:
     """The estimate for a query device, and how it came about."""
 
     estimate: PoseEstimate
     cameras: tuple[CameraAnswer, ...] = ()
 
 
-class VggtLocalizer:
+class FeedForwardLocalizer:
     """Localizes queries in one map by a predictor's cameras."""
 
     def __init__(
@@ -92,7 +79,22 @@ class VggtLocalizer:
         self._rows = {session.image_name(row): row for row in range(len(session.images))}
         self._turns = np.zeros(len(session.images), np.int64) if turns is None else turns.of(session)
 
-    def localize(self, queries: Sequence[VggtQuery]) -> list[VggtAnswer]:
+    @property
+    def image_names(self) -> list[str]:
+        return self.map.image_names
+
+    @property
+    def batch_size(self) -> int:
+        return self.settings.batch_size
+
+    def localize(
+        self, query: Query, references: Sequence[References], prediction: FeedForwardAnswer | None = None
+    ) -> PoseEstimate:
+        """Return the predicted pose of a query; see `Localizer`."""
+        answer = self.predict([(query, references)])[0] if prediction is None else prediction
+        return answer.estimate
+
+    def predict(self, queries: Sequence[tuple[Query, Sequence[References]]]) -> list[FeedForwardAnswer]:
         """Return an answer for each query; all go to the predictor in one call.
 
         Nothing that goes wrong with one query is raised or touches another: its answer says `failed: <reason>`.
@@ -100,32 +102,33 @@ class VggtLocalizer:
         Raises:
             ToolkitError: what no other query would do better with: no such device, other weights, too little memory.
         """
-        chosen = [[self._choose(*found) for found in zip(q.references, q.scores, strict=True)] for q in queries]
+        chosen = [[self._choose(retrieved) for retrieved in references] for _, references in queries]
         groups = {
             (number, camera): [query.views[camera], *(self.view(int(index)) for index in references)]
-            for number, query in enumerate(queries)
+            for number, (query, _) in enumerate(queries)
             for camera, references in enumerate(chosen[number])
             if len(references)
         }
         predictions = dict(zip(groups, self._predict(list(groups.values())), strict=True))
         answers = []
-        for number, query in enumerate(queries):
+        for number, (query, _) in enumerate(queries):
             cameras = tuple(
                 self._camera_answer(references, predictions.get((number, camera), "no references"))
                 for camera, references in enumerate(chosen[number])
             )
-            answers.append(VggtAnswer(_combine(query, cameras), cameras))
+            answers.append(FeedForwardAnswer(_combine(query, cameras), cameras))
         return answers
 
     def view(self, index: int) -> View:
         """Return a map image as a network is shown it."""
         name = self.map.image_names[index]
         turns = int(self._turns[self._rows[name]])
-        return View(name, self._session.path.parent / name, self.map.cameras[index], known=True, turns=turns)
+        return View(name, self._session.path.parent / name, self.map.cameras[index], in_map=True, turns=turns)
 
-    def _choose(self, references: Ints, scores: Floats) -> Ints:
+    def _choose(self, references: References) -> Ints:
         """Return the references of one query image to use."""
-        near = np.asarray(references, np.int64)[: self.settings.candidates]
+        known = references.images < len(self.map.image_names)  # further images are those of other kinds of features
+        near, scores = references.images[known][: self.settings.candidates], references.scores[known]
         if not len(near):
             return near
         points = np.concatenate([self.map.observations(int(index))[1] for index in near])
@@ -207,7 +210,7 @@ class VggtLocalizer:
         return self._depths.of(self._rows[self.map.image_names[image]])
 
 
-def _combine(query: VggtQuery, cameras: tuple[CameraAnswer, ...]) -> PoseEstimate:
+def _combine(query: Query, cameras: tuple[CameraAnswer, ...]) -> PoseEstimate:
     """Return one pose of the device from those of its cameras."""
     count = sum(len(answer.references) for answer in cameras if answer.prediction is not None)
     reasons = "; ".join(dict.fromkeys(answer.reason for answer in cameras if answer.reason))

@@ -1,0 +1,177 @@
+"""What all localizers share: a query with its references in, an estimate of its pose out."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from toolkit import geometry
+from toolkit.features.features import LocalFeatures
+from toolkit.features.matching import PairMatches
+from toolkit.localizers.correspondences import Correspondences
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+CONFIRMED = (5.0, 0.5)  # degrees, meters: further apart, two answers contradict each other
+
+NetworkMatches = Callable[[str], PairMatches]
+"""Returns the matches of a query image with a map image, given by its name, that a network made before."""
+
+
+@dataclass(frozen=True)
+class View:
+    """One photograph as a localizer sees it."""
+
+    name: str
+    """`<session>/raw_data/<path>`, as `Session.image_name` gives it; any name for a picture of no session."""
+    image: Path | NDArray[np.uint8]
+    """The file, or pixels (H, W) or (H, W, 3) RGB."""
+    camera: pycolmap.Camera
+    in_map: bool
+    """Whether it is a map image: others will ask for it again, so that its encoding is worth keeping."""
+    turns: int = 0
+    """Counter-clockwise quarter turns that bring gravity down, see `capture.upright`. A network is shown the image
+    turned; what comes back is of the image as it is stored."""
+
+
+@dataclass(frozen=True)
+class Query:
+    """The C images of one query device at one instant: those of a rig, or one."""
+
+    views: list[View]
+    rig_from_cams: Floats
+    """(C, 4, 4); the identity for a single camera."""
+    features: Sequence[list[LocalFeatures] | str] = field(default_factory=list)
+    """Of each image its local features, one a kind that the map has; or why the image has none."""
+    network_matches: Sequence[list[NetworkMatches | None]] = field(default_factory=list)
+    """Of each image and kind the matches with references that were made before; empty: none were."""
+
+    def part(self, images: Sequence[int]) -> "Query":
+        """Return the query with some of its images alone."""
+        return replace(
+            self,
+            views=[self.views[index] for index in images],
+            rig_from_cams=self.rig_from_cams[list(images)],
+            features=[self.features[index] for index in images],
+            network_matches=[self.network_matches[index] for index in images] if self.network_matches else [],
+        )
+
+
+@dataclass(frozen=True)
+class References:
+    """The map images that were retrieved for one query image, best first."""
+
+    images: Ints
+    """(k,) indices of map images."""
+    scores: Floats
+    """(k,) similarities, larger is better."""
+
+    @classmethod
+    def of(cls, images: Sequence[int], scores: Sequence[float] | None = None) -> "References":
+        """Return references; without scores, all are equally similar."""
+        return cls(np.array(images, np.int64), np.array(scores if scores is not None else [1.0] * len(images)))
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """The answer for one query device: a pose, or why there is none."""
+
+    status: str
+    """`ok`, `low_confidence`, or `failed: <reason>`."""
+    world_from_rig: Floats | None = None
+    """(4, 4); for a single camera the rig is the camera."""
+    covariance: Floats | None = None
+    """(6, 6) of a small motion of the rig in its own frame: rotation, radians, then translation, meters."""
+    num_matches: int = 0
+    """2D-3D matches found from descriptors alone."""
+    num_inliers: int = 0
+    """Of these, within `ransac_max_error_deg` of the final pose."""
+    num_guided: int = 0
+    """Matches that the final pose rests on, within `max_error_deg`."""
+    rmse_px: float = float("nan")
+    rival_support: float = 0.0
+    """Guided matches of the best clearly different pose, relative to this one's; 0 where there is none."""
+    references: tuple[int, ...] = ()
+    """Map images that the pose rests on."""
+    correspondences: Correspondences = field(default_factory=Correspondences)
+    """What the pose rests on, and what disagrees with it."""
+    found_by: str = "pnp"
+    """How the pose was found: `pnp`, `pnp+vggt` (from a prior), `lifted` (map features lifted by a capture's depth
+    maps), `lifted+vggt` (by predicted depth, too), `vggt` (a prediction), `nearest`."""
+    scale_std: float = float("nan")
+    """Relative standard deviation of a prediction's scale; inf if unknown, NaN without a prediction."""
+    rejected: tuple[int, ...] = ()
+    """References whose predicted places contradict the others'."""
+    reason: str = ""
+    """Of a prediction: what was left out or is unknown."""
+
+    @property
+    def position_std_m(self) -> float:
+        return float(np.sqrt(np.trace(self.covariance[3:, 3:]))) if self.covariance is not None else float("nan")
+
+    @property
+    def rotation_std_deg(self) -> float:
+        if self.covariance is None:
+            return float("nan")
+        return float(np.degrees(np.sqrt(np.trace(self.covariance[:3, :3]))))
+
+    @property
+    def inlier_ratio(self) -> float:
+        return self.num_inliers / self.num_matches if self.num_matches else 0.0
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A pose to look for, from elsewhere than matches."""
+
+    world_from_rig: Floats
+    """(4, 4)"""
+    images: Ints
+    """Map images that see what the query sees."""
+    radius_deg: float
+    """How far from where the pose puts a map point its feature may be."""
+
+
+class Localizer(Protocol):
+    """Localizes queries in one map. Safe to use from several threads; the map is never changed."""
+
+    @property
+    def image_names(self) -> list[str]:
+        """Names of the map images that references and estimates count through."""
+        ...
+
+    @property
+    def batch_size(self) -> int:
+        """How many queries `predict` is best given at once."""
+        ...
+
+    def predict(self, queries: Sequence[tuple[Query, Sequence[References]]]) -> list[Any]:
+        """Return what a network says of each query, or None of each where the method asks none. Not for threads.
+
+        Raises:
+            ToolkitError: what no other query would do better with: no such device, other weights, too little memory.
+        """
+        ...
+
+    def localize(self, query: Query, references: Sequence[References], prediction: Any = None) -> PoseEstimate:
+        """Return one pose for the cameras of a rig, or for a single camera.
+
+        Args:
+            query: the images of one device at one instant.
+            references: of each image.
+            prediction: what `predict` returned for the query; None: it is asked here where it is needed.
+        """
+        ...
+
+
+def agree(world_from_rig: Floats | None, other: Floats | None) -> bool:
+    """Tell whether two poses are near enough that one confirms the other."""
+    if world_from_rig is None or other is None:
+        return False
+    rotation_deg, distance_m = geometry.pose_error(world_from_rig, other)
+    return bool(rotation_deg <= CONFIRMED[0] and distance_m <= CONFIRMED[1])

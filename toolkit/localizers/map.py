@@ -1,0 +1,298 @@
+"""The map of one device: its features, its triangulated points, and the localizer that a method asks for it."""
+
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from toolkit.capture import Capture, Session
+from toolkit.capture.upright import Turns, upright_turns
+from toolkit.embedders import Embedder, create_embedder, load_embeddings
+from toolkit.embedders.search import search, unit_rows
+from toolkit.errors import ArtifactError
+from toolkit.features.features import KINDS
+from toolkit.features.matching import LocalMethod, create_local_methods
+from toolkit.features.stores import FeatureStore, extract_session
+from toolkit.files import SceneFiles, file_fingerprint, fingerprint, image_name
+from toolkit.localizers.base import Localizer, References
+from toolkit.localizers.correspondences import MAPS
+from toolkit.localizers.feed_forward import FeedForwardLocalizer
+from toolkit.localizers.hybrid import HybridLocalizer
+from toolkit.localizers.mapping import LocalMap, build_map, map_path
+from toolkit.localizers.matches import MappedFeatures
+from toolkit.localizers.nearest import NearestLocalizer
+from toolkit.localizers.pnp import PnpLocalizer
+from toolkit.localizers.prediction import Predictor
+from toolkit.localizers.predictors import create_predictor
+from toolkit.manifest import EmbedSettings, LocalizeSettings, RetrieveSettings
+
+log = logging.getLogger(__name__)
+
+SETTINGS = "settings"
+SESSIONS_ROOT = "sessions_root"
+"""Attributes of `poses/<pair>.h5`: the settings that the pair was localized with, and the capture's `sessions`."""
+
+
+@dataclass
+class Map:
+    """The map of one device, ready for queries; nothing in it changes."""
+
+    device: str
+    sessions_root: Path
+    """`<capture>/sessions`."""
+    map_dir: Path
+    """Folder of the triangulated maps."""
+    settings: LocalizeSettings
+    kinds: Sequence[LocalMethod] = ()
+    """How local features are extracted and matched; none for `nearest`."""
+    mapped: Sequence[MappedFeatures] = ()
+    """The map's features of each kind."""
+    files: SceneFiles | None = None
+    """Of the run that the map is of; None: pictures of no session cannot be localized, as they need its embedder."""
+    _localizer: Localizer | None = field(default=None, repr=False)
+
+    @classmethod
+    def build(
+        cls,
+        capture: Capture,
+        device: str,
+        settings: LocalizeSettings,
+        kinds: Sequence[LocalMethod],
+        features_dir: Path,
+        map_dir: Path,
+        workers: int = 1,
+        skip_existing: bool = True,
+    ) -> "Map":
+        """Extract the features of a map session and triangulate its points, or load what is there."""
+        session, mapped = capture[f"{device}_map"], []
+        for kind in kinds:
+            store = extract_session(session, features_dir, kind.extractor, workers=workers)
+            inputs = fingerprint([session_fingerprint(session), store.fingerprint])
+            path = map_path(map_dir, session.id, kind.name)
+            local_map = build_map(session, store, path, settings.map, settings.seed, skip_existing, inputs, workers)
+            mapped.append(MappedFeatures(local_map, store, KINDS[kind.name], kind.matcher, kind.name))
+        return cls(device, capture.path / "sessions", map_dir, settings, kinds, mapped)
+
+    @classmethod
+    def open(cls, run: str | Path, scene: str, device: str) -> "Map":
+        """Open the map of a finished run, with the settings that the run was localized with.
+
+        Args:
+            run: the run folder, `<output_root>/<manifest name>`.
+            scene: the capture's name.
+            device: `ios`, `hl`, `spot`.
+
+        Raises:
+            ArtifactError: nothing was localized in this map yet, or files of the run are missing.
+            WeightsError: the run used a network whose weights are not there any more.
+        """
+        files = SceneFiles(Path(run), scene)
+        pairs = sorted(files.poses_dir.glob(f"{scene}_map_{device}_query_*.h5"))
+        if not pairs:
+            raise ArtifactError(
+                f"{files.poses_dir}: no poses of queries in the map of {device!r}. Localize first: "
+                "python -m toolkit run MANIFEST."
+            )
+        with h5py.File(max(pairs, key=lambda path: path.stat().st_mtime_ns), "r") as file:
+            settings = LocalizeSettings.of(json.loads(file.attrs[SETTINGS]))
+            sessions_root, names = Path(file.attrs[SESSIONS_ROOT]), json.loads(file.attrs[MAPS])
+        kinds = []
+        if settings.method != "nearest":
+            kinds = create_local_methods(
+                settings.features, settings.matcher, settings.compute_device, settings.dtype_compute
+            )
+        mapped = [
+            MappedFeatures(
+                LocalMap.load(files.maps / name),
+                FeatureStore.of_session(files.features, f"{device}_map", kind.extractor.settings),
+                KINDS[kind.name],
+                kind.matcher,
+                kind.name,
+            )
+            for name, kind in zip(names, kinds, strict=True)
+        ]
+        return cls(device, sessions_root, files.maps, settings, kinds, mapped, files)
+
+    @cached_property
+    def capture(self) -> Capture:
+        return Capture.from_sessions_root(self.sessions_root)
+
+    @cached_property
+    def session(self) -> Session:
+        """The map session."""
+        return self.capture[f"{self.device}_map"]
+
+    @cached_property
+    def turns(self) -> Turns | None:
+        """What makes the capture's images upright; None where the network sees them as they are."""
+        settings = self.settings
+        show_upright = settings.predicts and settings.predictor.upright
+        return upright_turns(self.capture, settings.world_up) if show_upright else None
+
+    @cached_property
+    def localizer(self) -> Localizer:
+        """The localizer of the map's own settings."""
+        return create_localizer(self.settings, self)
+
+    @cached_property
+    def index_of(self) -> dict[str, int]:
+        """Index of a map image, as the localizer counts them, by its name."""
+        return {name: index for index, name in enumerate(self.localizer.image_names)}
+
+    @cached_property
+    def embed_settings(self) -> EmbedSettings:
+        """Those of the run."""
+        return EmbedSettings.of(_read_settings(self._run.embeddings / "settings.json"))
+
+    @cached_property
+    def retrieve_settings(self) -> RetrieveSettings:
+        """Those of the run."""
+        return RetrieveSettings.of(_read_settings(self._run.retrieval_dir / "settings.json"))
+
+    @cached_property
+    def embedder(self) -> Embedder:
+        """The embedder that the run was made with."""
+        settings = self.embed_settings
+        if settings.model == "vlad":
+            return create_embedder("vlad", vocabulary=self._run.embeddings / "vlad.npz")
+        return create_embedder(
+            settings.model,
+            checkpoint=settings.checkpoint,
+            device=settings.compute_device,
+            dtype_compute=settings.dtype_compute,
+            image_size=settings.image_size,
+        )
+
+    @property
+    def _run(self) -> SceneFiles:
+        if self.files is None:
+            raise ArtifactError("This map is of no run, which would tell how to find references. Use Map.open.")
+        return self.files
+
+    @cached_property
+    def _descriptors(self) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """Global descriptors (N, D) of map images as they are searched, and the images' indices (N,)."""
+        vectors, table = load_embeddings(self._run.embeddings / f"{self.device}_map")
+        row_of = {self.session.image_name(row): row for row in range(len(self.session.images))}
+        names = [image_name(path) for path in table["abs_path"]]
+        # As the retrieve stage: images with a pose. One without features is found, and left out of the references.
+        poses = self.session.world_from_cam(np.array([row_of[name] for name in names], np.int64))
+        posed = np.isfinite(poses).reshape(-1, 16).all(axis=1)
+        indices = np.array([self.index_of.get(name, -1) for name in names], np.int64)
+        vectors = vectors[posed]
+        return unit_rows(vectors) if self.retrieve_settings.normalize else vectors, indices[posed]
+
+    def retrieve(self, vectors: NDArray[np.float32]) -> list[References]:
+        """Return the references of query images, given by the vectors (Q, D) that the embedder gave, as the run would.
+
+        Raises:
+            ArtifactError: the map was embedded by another embedder.
+        """
+        database, indices = self._descriptors
+        if self.embed_settings.normalize:
+            vectors = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+        vectors = vectors.astype(self.embed_settings.dtype).astype(np.float32)
+        if vectors.shape[1] != database.shape[1]:
+            raise ArtifactError(
+                f"{self._run.embeddings}: the map's descriptors have {database.shape[1]} dimensions, "
+                f"{self.embedder.name} gives {vectors.shape[1]}. Embed again."
+            )
+        settings = self.retrieve_settings
+        vectors = unit_rows(vectors) if settings.normalize else vectors
+        scores, rows = search(vectors, database, settings.topk, "torch", "cpu")
+        known = indices[rows] >= 0
+        return [
+            References(indices[row[mask]], score[mask].astype(np.float64))
+            for row, score, mask in zip(rows, scores, known, strict=True)
+        ]
+
+
+def _read_settings(path: Path) -> dict[str, Any]:
+    """Return the settings that a stage left beside its results.
+
+    Raises:
+        ArtifactError: the file is missing or no settings.
+    """
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError) as error:
+        raise ArtifactError(f"{path}: the settings of the stage cannot be read ({error}). Run it again.") from None
+
+
+def session_fingerprint(session: Session) -> str:
+    """Return 16 hex digits that identify the calibration, poses and image list of a session."""
+    files = ["sensors.txt", "images.txt", "rigs.txt", "trajectories.txt"]
+    return fingerprint([file_fingerprint(session.path / name) for name in files if (session.path / name).exists()])
+
+
+def open_predictor(settings: LocalizeSettings, capture: Capture, map_dir: Path) -> Predictor:
+    """Return what predicts cameras; warn of one that looks up the answers.
+
+    Raises:
+        ManifestError: no such device or precision.
+        WeightsError: no weights; says what to do.
+    """
+    name = settings.predictor.name
+    predictor = create_predictor(
+        name,
+        sessions=[capture[key] for key in capture.session_ids] if name == "simulated" else (),
+        map_dir=map_dir,
+        features=settings.features.kinds[0],
+        checkpoint=settings.predictor.checkpoint,
+        compute_device=settings.compute_device,
+        dtype_compute=settings.dtype_compute,
+        seed=settings.seed,
+    )
+    if predictor.simulated:
+        log.warning("predictor: %s looks up the true poses of the queries. What comes out is no result.", name)
+    return predictor
+
+
+def create_localizer(settings: LocalizeSettings, map: Map, predictor: Predictor | None = None) -> Localizer:  # noqa: A002
+    """Return what localizes queries in a map by `settings.method`.
+
+    Args:
+        settings: those that the map was built or opened with, or others that need the same features.
+        map: the map.
+        predictor: of `vggt` and `hybrid`; None: opened as the settings say.
+
+    Raises:
+        WeightsError: the network has no weights.
+    """
+    if settings.method == "nearest":
+        session = map.session
+        rows = session.camera_rows
+        poses = session.world_from_cam(rows)
+        posed = np.isfinite(poses).reshape(-1, 16).all(axis=1)
+        return NearestLocalizer([session.image_name(int(row)) for row in rows[posed]], poses[posed])
+    pnp = PnpLocalizer(map.mapped, settings.pnp, settings.seed)
+    if not settings.predicts:
+        return pnp
+    predictor = predictor or open_predictor(settings, map.capture, map.map_dir)
+    local_map = map.mapped[0].map
+    feed_forward = FeedForwardLocalizer(local_map, map.session, predictor, settings.predictor, map.turns)
+    return feed_forward if settings.method == "vggt" else HybridLocalizer(pnp, feed_forward)
+
+
+def label(settings: LocalizeSettings, found_by: str) -> str:
+    """Return what tables say of how a pose was found, or of a method that found none."""
+    if settings.predicts and settings.predictor.name == "simulated":
+        return f"{settings.method}:simulated" + (f"/{found_by}" if found_by else "")
+    return found_by or settings.method
+
+
+def attributes(map: Map) -> dict[str, Any]:  # noqa: A002
+    """Return what `Map.open` reads from the file of correspondences."""
+    names = [map_path(map.map_dir, f"{map.device}_map", kind.name).name for kind in map.kinds]
+    return {
+        MAPS: json.dumps(names),
+        SETTINGS: map.settings.model_dump_json(),
+        SESSIONS_ROOT: str(map.sessions_root),
+    }

@@ -1,0 +1,251 @@
+"""Match the images of a query with the points of a map: by descriptors alone, and near where a pose puts them."""
+
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from threading import Lock
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from toolkit import geometry
+from toolkit.capture.cameras import in_view
+from toolkit.features.features import KINDS, FeatureKind, LocalFeatures
+from toolkit.features.matching import Matcher, MutualMatcher, unit_descriptors
+from toolkit.localizers.base import NetworkMatches, References
+from toolkit.localizers.mapping import LocalMap
+from toolkit.localizers.rig import Matches, RigQuery
+from toolkit.manifest import PnpSettings
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+CACHED_IMAGES = 256
+"""Map images whose features are kept in memory."""
+
+
+@dataclass(frozen=True)
+class MapImage:
+    """The features of a map image that see a point, longest tracks first."""
+
+    features: LocalFeatures
+    points: Ints
+    """(N,) the map point that each sees."""
+
+
+class MappedFeatures:
+    """One kind of local features of a map. Safe to use from several threads; the map is never changed."""
+
+    def __init__(
+        self,
+        local_map: LocalMap,
+        features: Mapping[str, LocalFeatures],
+        kind: FeatureKind = KINDS["sift"],
+        matcher: Matcher | None = None,
+        name: str = "sift",
+    ):
+        """
+        Args:
+            local_map: triangulated from these features.
+            features: of the map's images, by name.
+            kind: what is peculiar to these features.
+            matcher: of a query image with a reference; None: mutual nearest neighbors, as suits the kind.
+            name: of the kind.
+        """
+        self.map = local_map
+        self.features = features
+        self.kind = kind
+        self.matcher = matcher or MutualMatcher(kind.ratio, kind.min_score)
+        self.name = name
+        self._cache: OrderedDict[tuple[int, int], MapImage] = OrderedDict()
+        self._lock = Lock()
+        self._network = Lock()
+
+    def match(
+        self,
+        query: LocalFeatures,
+        references: Sequence[int],
+        settings: PnpSettings,
+        network_matches: NetworkMatches | None = None,
+    ) -> tuple[Ints, Ints]:
+        """Match a query image with references; returns keypoints of the query and map points, each (K,).
+
+        Args:
+            query: its features.
+            references: indices of this map's images.
+            settings: how many features `mutual` is given.
+            network_matches: matches that a network made before.
+        """
+        if isinstance(self.matcher, MutualMatcher):
+            query = query.take(slice(settings.max_query_features))
+            images = [self.image(index, settings.max_map_features) for index in references]
+            pairs = self.matcher.match([(query, image.features) for image in images])
+            points = [image.points for image in images]
+        else:  # a network looks at a feature among its neighbors, those without a point too
+            names = [self.map.image_names[index] for index in references]
+            if network_matches is not None:
+                pairs = [network_matches(name) for name in names]
+            else:
+                with self._network:
+                    pairs = self.matcher.match([(query, self.features[name]) for name in names])
+            points = [self._point_of_each_feature(index) for index in references]
+        nothing = np.zeros(0, np.int64)
+        keypoint = np.concatenate([nothing, *(pair.indices[:, 0] for pair in pairs)])
+        point = np.concatenate([nothing, *(of[pair.indices[:, 1]] for of, pair in zip(points, pairs, strict=True))])
+        return keypoint[point >= 0], point[point >= 0]
+
+    def image(self, index: int, max_features: int) -> MapImage:
+        """Return the features of a map image that see points, those of the longest tracks."""
+        key = (index, max_features)
+        with self._lock:
+            if key in self._cache:
+                self._cache.move_to_end(key)
+                return self._cache[key]
+        keypoint, point = self.map.observations(index)
+        order = np.argsort(-self.map.track_lengths[point], kind="stable")[:max_features]
+        image = MapImage(self.features[self.map.image_names[index]].take(keypoint[order]), point[order])
+        with self._lock:
+            self._cache[key] = image
+            if len(self._cache) > CACHED_IMAGES:
+                self._cache.popitem(last=False)
+        return image
+
+    def _point_of_each_feature(self, index: int) -> Ints:
+        """Return the point that each feature of a map image sees, -1 for none."""
+        keypoint, point = self.map.observations(index)
+        points = np.full(len(self.features[self.map.image_names[index]]), -1, np.int64)
+        points[keypoint] = point
+        return points
+
+    def match_guided(
+        self,
+        query: RigQuery,
+        kind: int,
+        rig_from_world: Floats,
+        references: Sequence[int],
+        radius_deg: float,
+        settings: PnpSettings,
+    ) -> Iterator[Matches]:
+        """Yield, for each query image, the matches of map points near where a pose puts them.
+
+        Args:
+            query: the query's cameras and features.
+            kind: which of the query's features are of this kind.
+            rig_from_world: the pose, (4, 4).
+            references: indices of this map's images, whose points are projected.
+            radius_deg: largest distance of a keypoint from the projection.
+            settings: how many features and matches.
+        """
+        if not len(references):
+            return
+        images = [self.image(index, settings.max_map_features) for index in references]
+        point = np.concatenate([image.points for image in images])
+        image_of = np.concatenate([np.full(len(m.points), i) for m, i in zip(images, references, strict=True)])
+        descriptors = np.concatenate([image.features.descriptors for image in images])
+        depth = np.einsum("oj,oj->o", self.map.cams_from_world[image_of, 2, :3], self.map.points[point])
+        depth += self.map.cams_from_world[image_of, 2, 3]
+        # Size of the feature on the surface, meters: it looks that large from everywhere.
+        size = np.concatenate([image.features.scales for image in images]) * depth / self.map.focals_px[image_of]
+        for camera, kinds in enumerate(query.features):
+            features = kinds[kind]
+            radius = np.tan(np.radians(radius_deg)) * query.focals_px[camera]
+            cam_from_world = geometry.invert(query.rig_from_cams[camera]) @ rig_from_world
+            in_cam = geometry.transform(cam_from_world, self.map.points[point])
+            visible = np.flatnonzero(in_view(in_cam[None], query.bounds[camera][None])[0])
+            if not len(visible) or not len(features):
+                continue
+            projected = np.asarray(query.cameras[camera].img_from_cam(in_cam[visible]))
+            finite = np.isfinite(projected).all(axis=1)
+            visible, projected = visible[finite], projected[finite]
+            tree = query.trees[camera][kind]
+            near = KDTree(projected).sparse_distance_matrix(tree, radius, output_type="ndarray")
+            order = np.lexsort((near["j"], near["i"]))
+            observed, keypoint = visible[near["i"][order]], near["j"][order]
+            expected = size[observed] * query.focals_px[camera] / in_cam[observed, 2]
+            octaves = np.abs(np.log2(features.scales[keypoint] / np.maximum(expected, 1e-6)))
+            similar = octaves < self.kind.scale_octaves
+            observed, keypoint = observed[similar], keypoint[similar]
+            score = np.einsum(
+                "od,od->o",
+                unit_descriptors(descriptors[observed]),
+                unit_descriptors(features.descriptors[keypoint]),
+            )
+            order = np.argsort(-score, kind="stable")
+            order = order[score[order] > self.kind.guided_min_score]
+            candidate, keypoint = point[observed[order]], keypoint[order]
+            # Best first: the first of each keypoint and of each point, where they are the same match.
+            first_of_keypoint = np.unique(keypoint, return_index=True)[1]
+            first_of_point = np.unique(candidate, return_index=True)[1]
+            mutual = np.intersect1d(first_of_keypoint, first_of_point)[: settings.max_guided_matches]
+            pixels = features.keypoints[keypoint[mutual]].astype(np.float64)
+            yield Matches(np.full(len(mutual), camera), pixels, candidate[mutual])
+
+
+class MapMatcher:
+    """Matches queries with a map of one or several kinds of features; the matches of all kinds are pooled."""
+
+    def __init__(self, mapped: Sequence[MappedFeatures], settings: PnpSettings) -> None:
+        self.mapped = list(mapped)
+        self.settings = settings
+        self.map = LocalMap.pooled([features.map for features in mapped])
+        """The points of all kinds, one kind after the other."""
+        self._first_point = np.cumsum([0, *(len(features.map.points) for features in mapped)])
+        self._index_in = [
+            [features.map.index_of.get(name, -1) for name in self.map.image_names] for features in mapped
+        ]  # of each kind, the index of each image; -1: that kind has it not
+
+    def by_descriptors(
+        self,
+        query: RigQuery,
+        references: Sequence[References],
+        network_matches: Sequence[Sequence[NetworkMatches | None]] = (),
+    ) -> Matches:
+        """Match each query image with its references by descriptors, those of each kind alone."""
+        parts = []
+        for kind, features in enumerate(self.mapped):
+            rows = []
+            for camera, retrieved in enumerate(references):
+                before = network_matches[camera][kind] if network_matches else None
+                images = self._of_kind(kind, retrieved.images)
+                keypoint, point = features.match(query.features[camera][kind], images, self.settings, before)
+                rows.append(np.column_stack([np.full(len(point), camera), keypoint, point + self._first_point[kind]]))
+            camera_index, keypoint, point = np.unique(np.concatenate(rows), axis=0).T
+            parts.append(Matches(camera_index, query.pixels(camera_index, keypoint, kind), point))
+        return Matches.pooled(parts)
+
+    def guided(self, query: RigQuery, rig_from_world: Floats, images: Ints, radius_deg: float) -> Matches:
+        """Match the points of map images near where the pose puts them, those of each kind alone."""
+        return Matches.pooled([
+            Matches(part.camera, part.pixels, part.point + int(self._first_point[kind]))
+            for kind, features in enumerate(self.mapped)
+            for part in features.match_guided(
+                query, kind, rig_from_world, self._of_kind(kind, images), radius_deg, self.settings
+            )
+        ])  # fmt: skip
+
+    def covisible(self, points: Ints) -> Ints:
+        """Return the map images that see the most of the points, in a fixed order."""
+        seen = self.map.images_seeing(points)
+        order = np.argsort(-seen, kind="stable")[: self.settings.guided_images]
+        return order[seen[order] > 0]
+
+    def kind_names(self, points: Ints) -> NDArray[np.str_]:
+        """Return the name of the kind of features that each point is of."""
+        names = np.array([features.name for features in self.mapped])
+        return names[np.searchsorted(self._first_point, points, side="right") - 1]
+
+    def keypoints(self, image: int, points: Ints) -> tuple[Ints, Floats]:
+        """Return which of the points a map image sees, as indices into `points`, and where, (n, 2) pixels."""
+        keypoint, seen = self.map.observations(image)
+        _, at, where = np.intersect1d(points, seen, return_indices=True)
+        pixels = np.zeros((len(at), 2))
+        kinds = np.searchsorted(self._first_point, points[at], side="right") - 1
+        for kind in np.unique(kinds):
+            features = self.mapped[kind].features[self.map.image_names[image]]
+            pixels[kinds == kind] = features.keypoints[keypoint[where[kinds == kind]]]
+        return at, pixels
+
+    def _of_kind(self, kind: int, images: Ints | Sequence[int]) -> list[int]:
+        """Return the indices of images in the map of one kind; those that it does not have are left out."""
+        return [index for image in images if (index := self._index_in[kind][int(image)]) >= 0]

@@ -1,0 +1,245 @@
+"""The geometry of a query: one camera, or several that are rigidly mounted together, and matches with map points."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from threading import Lock
+
+import numpy as np
+import poselib
+import pycolmap
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from toolkit import geometry
+from toolkit.capture.cameras import projection_jacobian, view_bounds
+from toolkit.features.features import LocalFeatures
+from toolkit.manifest import PnpSettings
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+RANSAC_CONFIDENCE = 0.9999
+
+# PoseLib's solver for rigs draws from the C library's generator, which threads share: without a seed of its own, or two
+# at once, equal seeds would give poses that are unequal in their last digits.
+_RIG_RANSAC = Lock()
+
+
+@dataclass(frozen=True)
+class Matches:
+    """K matches of query pixels to map points."""
+
+    camera: Ints
+    """(K,) index of the query image."""
+    pixels: Floats
+    """(K, 2) in it."""
+    point: Ints
+    """(K,) index of the map point."""
+
+    @classmethod
+    def pooled(cls, parts: "Sequence[Matches]") -> "Matches":
+        """Return the matches of all parts."""
+        return cls(
+            np.concatenate([np.zeros(0, np.int64), *(part.camera for part in parts)]),
+            np.concatenate([np.zeros((0, 2)), *(part.pixels for part in parts)]),
+            np.concatenate([np.zeros(0, np.int64), *(part.point for part in parts)]),
+        )
+
+    def rows(self) -> NDArray[np.void]:
+        """Return the matches (K,) as values that can be compared."""
+        rows = np.ascontiguousarray(np.column_stack([self.camera, self.point, self.pixels]))
+        return rows.view([("", rows.dtype)] * rows.shape[1])[:, 0]
+
+    def __len__(self) -> int:
+        return len(self.point)
+
+    def __getitem__(self, part: NDArray[np.bool_]) -> "Matches":
+        return Matches(self.camera[part], self.pixels[part], self.point[part])
+
+
+class RigQuery:
+    """The cameras of a query device and their features: projections, errors and poses from matches.
+
+    A single camera is a rig of one.
+    """
+
+    def __init__(self, cameras: list[pycolmap.Camera], rig_from_cams: Floats, features: list[list[LocalFeatures]]):
+        self.cameras = cameras
+        self.rig_from_cams = rig_from_cams
+        self.features = features  # of each camera, of each kind
+        self.cams_from_rig = [pycolmap.Rigid3d(pose[:3]) for pose in geometry.invert(rig_from_cams)]
+        self.focals_px = np.array([camera.mean_focal_length() for camera in cameras])
+        self.bounds = np.stack([view_bounds(camera) for camera in cameras])
+        self.trees = [
+            [KDTree(f.keypoints) if len(f) else KDTree(np.zeros((1, 2)) - 1e9) for f in kinds] for kinds in features
+        ]
+
+    def pixels(self, camera: Ints, keypoint: Ints, kind: int) -> Floats:
+        """Return the places (K, 2) of keypoints of one kind."""
+        pixels = np.zeros((len(camera), 2))
+        for index, kinds in enumerate(self.features):
+            pixels[camera == index] = kinds[kind].keypoints[keypoint[camera == index]]
+        return pixels
+
+    def ransac(
+        self,
+        matches: Matches,
+        points: Floats,
+        max_error_deg: float,
+        settings: PnpSettings,
+        seed: int,
+        least_inliers: int = 0,
+    ) -> Floats | None:
+        """Return the pose rig_from_world (4, 4) that the most matches agree with, by LO-RANSAC (PoseLib), or None.
+
+        Errors are those on the plane at depth 1, where no lens bends anything, times one focal length.
+
+        Args:
+            matches: K matches.
+            points: (P, 3) the map points.
+            max_error_deg: largest error of an inlier, as an angle.
+            settings: how much is drawn.
+            seed: of the draws.
+            least_inliers: a pose with fewer may be missed.
+        """
+        if len(np.unique(matches.point)) < 4:
+            return None
+        if len(matches) > settings.max_ransac_matches:
+            chosen = np.random.default_rng(seed).permutation(len(matches))
+            kept = np.zeros(len(matches), bool)
+            kept[chosen[: settings.max_ransac_matches]] = True
+            least_inliers = least_inliers * settings.max_ransac_matches // len(matches)
+            matches = matches[kept]
+        least_share = np.clip(least_inliers / len(matches), 1e-3, 0.99)
+        trials = np.log(1 - RANSAC_CONFIDENCE) / np.log1p(-(least_share**3))  # to draw three inliers once
+        focal_px = float(self.focals_px.mean())
+        options = {
+            "success_prob": RANSAC_CONFIDENCE,
+            "dyn_num_trials_mult": 1.0,
+            "min_iterations": 100,
+            "max_iterations": int(np.clip(trials, 100, settings.ransac_max_trials)),
+            "seed": seed,
+            "max_reproj_error": float(np.tan(np.radians(max_error_deg)) * focal_px),
+        }
+        plane, seen, cameras = [], [], []
+        for index, camera in enumerate(self.cameras):
+            part = matches.camera == index
+            xy = np.asarray(camera.cam_from_img(matches.pixels[part])).reshape(-1, 2)
+            finite = np.isfinite(xy).all(axis=1)
+            plane.append(focal_px * xy[finite])
+            seen.append(points[matches.point[part][finite]])
+            params = [focal_px, 0.0, 0.0]
+            cameras.append(
+                {"model": "SIMPLE_PINHOLE", "width": camera.width, "height": camera.height, "params": params}
+            )
+        if sum(map(len, seen)) < 4:
+            return None
+        if len(self.cameras) == 1:
+            found, info = poselib.estimate_absolute_pose(plane[0], seen[0], cameras[0], options)
+        else:
+            places = [poselib.CameraPose() for _ in self.cameras]
+            for place, cam_from_rig in zip(places, self.cams_from_rig, strict=True):
+                place.Rt = cam_from_rig.matrix()
+            with _RIG_RANSAC:
+                pycolmap.set_random_seed(seed)  # that of the C library, too
+                found, info = poselib.estimate_generalized_absolute_pose(plane, seen, places, cameras, options)
+        if info["num_inliers"] < 4 or not np.isfinite(found.Rt).all():
+            return None
+        pose = np.vstack([found.Rt, [0.0, 0.0, 0.0, 1.0]])
+        return np.asarray(self.rig_from_cams[0] @ pose if len(self.cameras) == 1 else pose, np.float64)
+
+    def refine(self, rig_from_world: Floats, matches: Matches, points: Floats) -> Floats | None:
+        """Minimize the reprojection error of all matches to points (P, 3), robustly (Cauchy, 1 px)."""
+        options = pycolmap.AbsolutePoseRefinementOptions()
+        matched, mask = points[matches.point], np.ones(len(matches), bool)
+        if len(self.cameras) == 1:
+            start = pycolmap.Rigid3d((geometry.invert(self.rig_from_cams[0]) @ rig_from_world)[:3])
+            answer = pycolmap.refine_absolute_pose(start, matches.pixels, matched, mask, self.cameras[0], options)
+            return None if answer is None else self.rig_from_cams[0] @ _matrix(answer["cam_from_world"])
+        answer = pycolmap.refine_generalized_absolute_pose(
+            pycolmap.Rigid3d(rig_from_world[:3]),
+            matches.pixels,
+            matched,
+            mask,
+            matches.camera.tolist(),
+            self.cams_from_rig,
+            self.cameras,
+            options,
+        )
+        return None if answer is None else _matrix(answer["rig_from_world"])
+
+    def errors_px(self, rig_from_world: Floats, matches: Matches, points: Floats) -> Floats:
+        """Return the reprojection errors (K,) of matches to points (P, 3), inf behind a camera."""
+        errors = np.full(len(matches), np.inf)
+        for index in np.unique(matches.camera):
+            part = matches.camera == index
+            cam_from_world = geometry.invert(self.rig_from_cams[index]) @ rig_from_world
+            in_cam = geometry.transform(cam_from_world, points[matches.point[part]])
+            projected = np.asarray(self.cameras[index].img_from_cam(in_cam))
+            error = np.linalg.norm(projected - matches.pixels[part], axis=1)
+            errors[part] = np.where((in_cam[:, 2] > 1e-3) & np.isfinite(error), error, np.inf)
+        return errors
+
+    def errors_deg(self, rig_from_world: Floats, matches: Matches, points: Floats) -> Floats:
+        """Return the reprojection errors (K,) as angles."""
+        errors = self.errors_px(rig_from_world, matches, points)
+        return np.degrees(np.arctan(errors / self.focals_px[matches.camera]))
+
+    def jacobians(self, rig_from_world: Floats, matches: Matches, points: Floats) -> tuple[Floats, Floats]:
+        """Return how the projections of matches move, in pixels.
+
+        With a small motion d of the rig: (K, 2, 6), d = rotation (radians), translation (meters) in the rig's frame,
+        world_from_rig @ Exp(d), as the benchmark's covariances have it; with a motion of the point in the world:
+        (K, 2, 3).
+        """
+        of_pose, of_point = np.zeros((len(matches), 2, 6)), np.zeros((len(matches), 2, 3))
+        for index in np.unique(matches.camera):
+            part = matches.camera == index
+            cam_from_rig = geometry.invert(self.rig_from_cams[index])
+            in_rig = geometry.transform(rig_from_world, points[matches.point[part]])
+            in_cam = geometry.transform(cam_from_rig, in_rig)
+            # A motion d of the rig moves a point in it by -(rotation x point) - translation.
+            x, y, z = in_rig.T
+            zero = np.zeros_like(x)
+            skew = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
+            moved = np.concatenate([skew, np.broadcast_to(-np.eye(3), skew.shape)], axis=2)
+            projection = projection_jacobian(in_cam, np.full(len(in_cam), self.focals_px[index]))
+            of_pose[part] = projection @ (cam_from_rig[:3, :3] @ moved)
+            of_point[part] = projection @ (cam_from_rig[:3, :3] @ rig_from_world[:3, :3])
+        return of_pose, of_point
+
+
+def least_squares_covariance(
+    of_unknowns: Floats, errors_px: Floats, noise_px2: Floats, known: Floats | None = None
+) -> Floats | None:
+    """Return the covariance (U, U) of unknowns that least squares found from K projections; None where undefined.
+
+    The sandwich N^-1 M N^-1 (Huber 1967): N is how well unit noise would determine the unknowns, M the noise that there
+    is: the spread of the errors, and `noise_px2`. The spread holds a part of the latter already; that it counts twice
+    stands for what is not known, as the errors of the map's poses.
+
+    Args:
+        of_unknowns: (K, 2, U), how projections move with the unknowns.
+        errors_px: (K,).
+        noise_px2: (K, 2, 2), covariance of each projection that comes from its point; not finite: the point tells
+            nothing.
+        known: (U, U), information on the unknowns from elsewhere.
+    """
+    told = np.isfinite(noise_px2).all(axis=(1, 2))
+    of_unknowns, errors_px, noise_px2 = of_unknowns[told], errors_px[told], noise_px2[told]
+    if len(errors_px) < 4:
+        return None
+    # Two coordinates a point, six parameters of the pose.
+    variance = float((errors_px**2).sum()) / max(2 * len(errors_px) - 6, 1)
+    known = np.zeros((of_unknowns.shape[2],) * 2) if known is None else known
+    information = np.einsum("oki,okj->ij", of_unknowns, of_unknowns) + variance * known
+    if not np.isfinite(information).all() or np.linalg.cond(information) > 1e14:
+        return None
+    noise = noise_px2 + variance * np.eye(2)
+    middle = np.einsum("oki,okl,olj->ij", of_unknowns, noise, of_unknowns) + variance**2 * known
+    inverse = np.linalg.inv(information)
+    return np.asarray(inverse @ middle @ inverse, np.float64)
+
+
+def _matrix(rigid: pycolmap.Rigid3d) -> Floats:
+    return np.vstack([rigid.matrix(), [0.0, 0.0, 0.0, 1.0]])
