@@ -9,7 +9,8 @@ import logging
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -37,12 +38,10 @@ from toolkit.files import (
     read_references,
     write_sidecar,
     write_text,
-)
+)  # fmt: skip
 from toolkit.manifest import RerankSettings
 
 log = logging.getLogger(__name__)
-
-Floats = NDArray[np.float64]
 
 MAP_IMAGES_KEPT = 256
 """Map images whose features stay in memory: some 60 MB."""
@@ -63,9 +62,9 @@ def rerank_pairs(
     """Write, for every pair of devices, the retrieved map images of each query image in order of verified inliers.
 
     The files have the retrieval stage's format. `score` is the number of inliers, 0 where chance would give as many;
-    equal ones keep the order of retrieval. Beside it stand `retrieval_score` and `retrieval_rank`, and
-    `num_matches`, of which the inliers are. A query image that cannot be verified keeps the order of retrieval, and its
-    `reason` says why. Every image of a rig is looked at on its own.
+    references with the same score keep the order of retrieval. They have in addition `retrieval_score`,
+    `retrieval_rank`, and `num_matches`, the matches among which the inliers are. A query image that cannot be verified
+    keeps the order of retrieval, and its `reason` says why. Every image of a rig is verified on its own.
 
     Args:
         sessions_root: `<capture>/sessions`.
@@ -89,29 +88,30 @@ def rerank_pairs(
     """
     settings = RerankSettings.of(settings)
     capture = Capture.from_sessions_root(sessions_root)
-    method = create_local_methods(
+    (method,) = create_local_methods(
         settings.features, settings.matcher, settings.compute_device, settings.dtype_compute
-    )[0]
+    )
     workers = workers or default_workers()
     table = []
     cv2_threads = cv2.getNumThreads()
     cv2.setNumThreads(1)  # queries are the parallel dimension, and sums stay in one order
     try:
         with threadpool_limits(1, "blas"):
-            for mapped in capture.devices_with("map", map_device):
-                for asked in capture.devices_with("query", query_device):
-                    started = time.perf_counter()
-                    pair = _Pair(capture, mapped, asked, Path(retrieval_dir), Path(out_dir))
-                    record = pair.record(settings, method)
-                    skipped = skip_existing and is_current(pair.path, record)
-                    if not skipped:
-                        _rerank_pair(pair, settings, method, Path(features_dir), record, workers, skip_existing)
-                    table.append(
-                        {"map_device": mapped, "query_device": asked}
-                        | _counts(read_references(pair.path))
-                        | {"seconds": round(time.perf_counter() - started, 2)}
-                        | {"skipped": skipped, "path": str(pair.path)}
-                    )
+            for devices in product(
+                capture.devices_with("map", map_device), capture.devices_with("query", query_device)
+            ):
+                started = time.perf_counter()
+                sessions = capture[f"{devices[0]}_map"], capture[f"{devices[1]}_query"]
+                name = f"{pair_name(capture.name, *devices)}.jsonl"
+                pair = _Pair(*sessions, Path(retrieval_dir) / name, Path(out_dir) / name, method, settings)
+                skipped = skip_existing and is_current(pair.path, pair.record)
+                if not skipped:
+                    pair.rerank(Path(features_dir), workers, skip_existing)
+                table.append(
+                    {"map_device": devices[0], "query_device": devices[1]}
+                    | _counts(read_references(pair.path))
+                    | {"seconds": round(time.perf_counter() - started, 2), "skipped": skipped, "path": str(pair.path)}
+                )
     finally:
         cv2.setNumThreads(cv2_threads)
     return pd.DataFrame(table)
@@ -246,118 +246,106 @@ def _chance(camera: pycolmap.Camera, threshold: float) -> float:
 
 @dataclass(frozen=True)
 class _Pair:
-    """One map device x query device: where its files are."""
+    """A map session and a query session, the files of both, and how their images are compared."""
 
-    capture: Capture
-    map_device: str
-    query_device: str
-    retrieval_dir: Path
-    out_dir: Path
+    map_session: Session
+    query_session: Session
+    retrieval: Path
+    path: Path
+    """The reranked file."""
+    method: LocalMethod
+    settings: RerankSettings
 
-    @property
-    def retrieval(self) -> Path:
-        return self.retrieval_dir / f"{pair_name(self.capture.name, self.map_device, self.query_device)}.jsonl"
-
-    @property
-    def path(self) -> Path:
-        return self.out_dir / self.retrieval.name
-
-    @property
-    def sessions(self) -> tuple[Session, Session]:
-        return self.capture[f"{self.map_device}_map"], self.capture[f"{self.query_device}_query"]
-
-    def record(self, settings: RerankSettings, method: LocalMethod) -> dict[str, Any]:
-        """Return what the reranked file depends on."""
+    @cached_property
+    def record(self) -> dict[str, Any]:
+        """What the reranked file depends on."""
         if not self.retrieval.exists():
             read_references(self.retrieval)  # says what is missing
+        sessions = self.map_session, self.query_session
         return {
             "retrieval": file_fingerprint(self.retrieval),
-            "features": method.extractor.settings,
-            "matcher": method.matcher.settings,
-            **settings.model_dump(
-                exclude={"features", "matcher", "compute_device", "dtype_compute"}  # told by the two below
-            ),
-            "images": [session.files_fingerprint for session in self.sessions],
-            "sensors": [file_fingerprint(session.path / "sensors.txt") for session in self.sessions],
+            "features": self.method.extractor.settings,
+            "matcher": self.method.matcher.settings,
+            **self.settings.model_dump(exclude={"features", "matcher", "compute_device", "dtype_compute"}),
+            "images": [session.files_fingerprint for session in sessions],
+            "sensors": [file_fingerprint(session.path / "sensors.txt") for session in sessions],
         }
 
+    def rerank(self, features_dir: Path, workers: int, skip_existing: bool) -> None:
+        """Write the reranked file; take over the rows that a stopped run finished."""
+        queries = read_references(self.retrieval, "path")
+        references = [reference for query in queries for reference in query["topk"][: self.settings.topn]]
+        stores = [
+            extract_session(session, features_dir, self.method.extractor, self._rows(session, images), workers)
+            for session, images in ((self.map_session, references), (self.query_session, queries))
+        ]
+        verifier = Verifier(self.settings, self.method.matcher, stores[0])
 
-def _rerank_pair(
-    pair: _Pair,
-    settings: RerankSettings,
-    method: LocalMethod,
-    features_dir: Path,
-    record: dict[str, Any],
-    workers: int,
-    skip_existing: bool,
-) -> None:
-    """Write the reranked file of a pair; rows that a stopped run finished are taken over."""
-    queries = read_references(pair.retrieval, "path")
-    map_session, query_session = pair.sessions
-    query_rows = _rows_of(query_session, [_name(query) for query in queries], pair.retrieval)
-    names = list(dict.fromkeys(_name(reference) for query in queries for reference in query["topk"][: settings.topn]))
-    map_rows = _rows_of(map_session, names, pair.retrieval)
-    query_store = extract_session(query_session, features_dir, method.extractor, query_rows, workers)
-    map_store = extract_session(map_session, features_dir, method.extractor, map_rows, workers)
-    verifier = Verifier(settings, method.matcher, map_store)
+        def rerank(index: int) -> tuple[int, dict[str, Any]]:
+            try:
+                return index, self._reranked(queries[index], verifier, *stores)
+            except Exception as error:  # one bad query never ends a run
+                log.exception("reranking %s", queries[index]["path"])
+                return index, self._kept(queries[index], f"{type(error).__name__}: {error}")
 
-    def rerank(index: int) -> tuple[int, dict[str, Any]]:
-        query = queries[index]
-        try:
-            return index, _reranked(query, verifier, query_session, query_store, map_session, map_store)
-        except Exception as error:  # one bad query never ends a run
-            log.exception("reranking %s", query["path"])
-            return index, _kept(query, settings.topk, f"{type(error).__name__}: {error}")
-
-    with GroupWriter(pair.path, record) as progress:
-        if not skip_existing:
+        with GroupWriter(self.path, self.record) as progress:
+            if not skip_existing:
+                progress.discard()
+            todo = [index for index in range(len(queries)) if str(index) not in progress.notes()]
+            # Queries with the same best reference follow each other: what they share is read once.
+            todo.sort(key=lambda index: _name(queries[index]["topk"][0]) if queries[index]["topk"] else "")
+            label = f"rerank {self.query_session.device} in {self.map_session.device}"
+            # A network matches the references of one query as a batch, and keeps the device busy by that.
+            threads = workers if self.method.extractor.threaded else 1
+            for index, row in tqdm(prefetch(rerank, todo, threads), total=len(todo), desc=label, unit="image"):
+                progress.add(str(index), note=row)
+            rows = progress.notes()
+            write_text(self.path, "".join(json.dumps(rows[str(index)]) + "\n" for index in range(len(queries))))
+            write_sidecar(self.path, self.record)
             progress.discard()
-        todo = [index for index in range(len(queries)) if str(index) not in progress.notes()]
-        # Queries with the same best reference follow each other: what they share is read once.
-        todo.sort(key=lambda index: _name(queries[index]["topk"][0]) if queries[index]["topk"] else "")
-        label = f"rerank {pair.query_device} in {pair.map_device}"
-        # A network matches the references of one query as a batch, and keeps the device busy by that.
-        threads = workers if method.extractor.threaded else 1
-        for index, row in tqdm(prefetch(rerank, todo, threads), total=len(todo), desc=label, unit="image"):
-            progress.add(str(index), note=row)
-        rows = progress.notes()
-        write_text(pair.path, "".join(json.dumps(rows[str(index)]) + "\n" for index in range(len(queries))))
-        write_sidecar(pair.path, record)
-        progress.discard()
 
+    def _rows(self, session: Session, images: Sequence[dict[str, Any]]) -> NDArray[np.int64]:
+        """Return the rows of `session.images` of images in the retrieval file.
 
-def _reranked(
-    query: dict[str, Any],
-    verifier: Verifier,
-    query_session: Session,
-    query_store: FeatureStore,
-    map_session: Session,
-    map_store: FeatureStore,
-) -> dict[str, Any]:
-    topn, topk = verifier.settings.topn, verifier.settings.topk
-    if _name(query) not in query_store:
-        return _kept(query, topk, query_store.failed.get(_name(query), "no local features of the query image"))
-    found = query["topk"][:topn]
-    readable = [reference for reference in found if _name(reference) in map_store]
-    if not readable:
-        return _kept(query, topk, "no reference has local features")
-    inliers, matches = verifier.verify(
-        query_store[_name(query)],
-        query_session.camera(query["sensor_id"]),
-        [_name(reference) for reference in readable],
-        [map_session.camera(reference["sensor_id"]) for reference in readable],
-    )
-    if not any(inliers):
-        return _kept(query, topk, "no reference agrees with the query by more than chance")
-    counted = {_name(ref): pair for ref, pair in zip(readable, zip(inliers, matches, strict=True), strict=True)}
-    rows = [_entry(reference, *counted.get(_name(reference), (0, 0))) for reference in found]
-    rows.sort(key=lambda row: (-row["score"], row["retrieval_rank"]))
-    return _row(query, rows[:topk], "")
+        Raises:
+            ArtifactError: an image is not in the session.
+        """
+        prefix = f"{session.id}/raw_data/"
+        names = list(dict.fromkeys(_name(image) for image in images))
+        rows = pd.Index(session.images["path"]).get_indexer([name.removeprefix(prefix) for name in names])
+        if (rows < 0).any():
+            raise ArtifactError(
+                f"{self.retrieval}: {(rows < 0).sum()} images are not in {session.path / 'images.txt'}, first "
+                f"{names[int(np.argmax(rows < 0))]}. The file is of another capture: retrieve again."
+            )
+        return np.asarray(rows, np.int64)
 
+    def _reranked(
+        self, query: dict[str, Any], verifier: Verifier, map_store: FeatureStore, query_store: FeatureStore
+    ) -> dict[str, Any]:
+        """Return a query image's row in the order of verified inliers."""
+        name, references = _name(query), query["topk"][: self.settings.topn]
+        if name not in query_store:
+            return self._kept(query, query_store.failed.get(name, "no local features of the query image"))
+        readable = [reference for reference in references if _name(reference) in map_store]
+        if not readable:
+            return self._kept(query, "no reference has local features")
+        inliers, matches = verifier.verify(
+            query_store[name],
+            self.query_session.camera(query["sensor_id"]),
+            [_name(reference) for reference in readable],
+            [self.map_session.camera(reference["sensor_id"]) for reference in readable],
+        )
+        if not any(inliers):
+            return self._kept(query, "no reference agrees with the query by more than chance")
+        counted = dict(zip(map(_name, readable), zip(inliers, matches, strict=True), strict=True))
+        rows = [_entry(reference, *counted.get(_name(reference), (0, 0))) for reference in references]
+        rows.sort(key=lambda row: (-row["score"], row["retrieval_rank"]))
+        return _row(query, rows[: self.settings.topk], "")
 
-def _kept(query: dict[str, Any], topk: int, reason: str) -> dict[str, Any]:
-    """Return a query image's row in the order of retrieval."""
-    return _row(query, [_entry(reference, 0, 0) for reference in query["topk"][:topk]], reason)
+    def _kept(self, query: dict[str, Any], reason: str) -> dict[str, Any]:
+        """Return a query image's row in the order of retrieval."""
+        return _row(query, [_entry(reference, 0, 0) for reference in query["topk"][: self.settings.topk]], reason)
 
 
 def _entry(reference: dict[str, Any], inliers: int, matches: int) -> dict[str, Any]:
@@ -377,21 +365,5 @@ def _counts(rows: list[dict[str, Any]]) -> dict[str, int]:
 
 
 def _name(entry: dict[str, Any]) -> str:
-    """Return the name of a retrieved or asked image."""
+    """Return the name of an image in the retrieval file."""
     return image_name(str(entry["path"]))
-
-
-def _rows_of(session: Session, names: Sequence[str], path: Path) -> NDArray[np.int64]:
-    """Return the rows of `session.images` of image names.
-
-    Raises:
-        ArtifactError: an image is not in the session.
-    """
-    prefix = f"{session.id}/raw_data/"
-    rows = pd.Index(session.images["path"]).get_indexer([name.removeprefix(prefix) for name in names])
-    if (rows < 0).any():
-        raise ArtifactError(
-            f"{path}: {(rows < 0).sum()} images are not in {session.path / 'images.txt'}, first "
-            f"{names[int(np.argmax(rows < 0))]}. The file is of another capture: retrieve again."
-        )
-    return np.asarray(rows, np.int64)
