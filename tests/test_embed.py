@@ -258,7 +258,7 @@ def test_an_embedder_that_gives_other_vectors_is_refused(
 ) -> None:
     monkeypatch.setattr(MegaLocEmbedder, "embed", lambda self, inputs: np.zeros((len(inputs), 3), np.float32))
     with pytest.raises(ValueError, match=r"megaloc gave \(4, 3\)"):
-        embed_sessions(tiny / "sessions", tmp_path / "e", **megaloc)  # type: ignore[arg-type]
+        call(embed_sessions, tiny / "sessions", tmp_path / "e", **megaloc)  # type: ignore[arg-type]
 
 
 @pytest.mark.usefixtures("no_hub")

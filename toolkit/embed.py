@@ -3,7 +3,7 @@
 import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -77,30 +77,30 @@ def embed_sessions(
     out_dir = Path(out_dir)
     features_dir = Path(features_dir) if features_dir is not None else out_dir.parent / "features"
     capture = Capture.from_sessions_root(sessions_root)
-    jobs = _jobs(capture, device, subsession)
+    parts = _subsessions(capture, device, subsession)
     embedder = _open_embedder(capture, settings, out_dir, features_dir, skip_existing)
-    turns = _turns(capture, embedder, settings)
+    if (turns := _turns(capture, embedder, settings)) is not None:
+        parts = [replace(part, turns=turns.of(part.session, part.rows)) for part in parts]
     if subsession == "all":
-        _remove_former(out_dir, _session_names(capture, device), jobs)
+        _remove_former(out_dir, _session_names(capture, device), parts)
 
     @cache
     def store_of(session_id: str) -> FeatureStore:
         """Return the features of all that is embedded of a session: its file is then written once."""
-        rows = [rows for session, _, rows in jobs if session.id == session_id]
+        rows = [part.rows for part in parts if part.session.id == session_id]
         return extract_session(capture[session_id], features_dir, rows=np.concatenate(rows))
 
     table = []
-    for session, part, rows in jobs:
+    for part in parts:
         started = time.perf_counter()
-        job = _Job(session, part, rows, np.zeros(len(rows), np.int64) if turns is None else turns.of(session, rows))
-        folder = out_dir / session.id / part
-        matrix_path = folder / f"{Path(part).name}.npy"
+        folder = out_dir / part.session.id / part.name
+        matrix_path = folder / f"{Path(part.name).name}.npy"
         record = {
             "embedder": embedder.settings,
             "features": SiftExtractor().settings if embedder.inputs == "features" else None,
-            "images": _images_fingerprint(session, rows),
-            "sensors": file_fingerprint(session.path / "sensors.txt"),
-            "turns": fingerprint(job.turns.tolist()) if job.turns.any() else None,
+            "images": _images_fingerprint(part.session, part.rows),
+            "sensors": file_fingerprint(part.session.path / "sensors.txt"),
+            "turns": fingerprint(part.turns.tolist()) if part.turns.any() else None,
             "normalize": settings.normalize,
             "dtype": settings.dtype,
         }
@@ -109,27 +109,23 @@ def embed_sessions(
             embedded = len(np.load(matrix_path, mmap_mode="r"))
         else:
             # The same images in batches of another size are the same up to rounding.
-            identity = {**record, "batch_size": settings.batch_size}
-            with GroupWriter(matrix_path, identity) as batches:
+            with GroupWriter(matrix_path, {**record, "batch_size": settings.batch_size}) as batches:
                 if not skip_existing:
                     batches.discard()
-                failed = _embed_job(embedder, job, batches, settings.batch_size, settings.normalize, store_of)
-                embedded = len(rows) - len(failed)
-                _write_tables(folder, _manifest(capture, session, rows, failed), failed)
+                failed = _embed(embedder, part, batches, settings, store_of)
+                embedded = len(part.rows) - len(failed)
+                _write_tables(folder, capture.name, part, failed)
                 write_matrix(matrix_path, batches, embedded, embedder.dim, settings.dtype)
                 write_sidecar(matrix_path, record)
                 batches.discard()
-            if failed:
-                log.warning("%s/%s: %d of %d images cannot be read, see %s",
-                            session.id, part, len(failed), len(rows), folder / "failed.csv")  # fmt: skip
         table.append(
             {
-                "session": session.id,
-                "subsession": part,
-                "images": len(rows),
+                "session": part.session.id,
+                "subsession": part.name,
+                "images": len(part.rows),
                 "embedded": embedded,
-                "unreadable": len(rows) - embedded,
-                "turned": int(np.count_nonzero(job.turns)),
+                "unreadable": len(part.rows) - embedded,
+                "turned": int(np.count_nonzero(part.turns)),
                 "seconds": round(time.perf_counter() - started, 3),
                 "skipped": skipped,
                 "model": embedder.name,
@@ -142,13 +138,15 @@ def embed_sessions(
 
 
 @dataclass(frozen=True)
-class _Job:
-    """One subsession: its images, and how each is turned for the embedder."""
+class _Subsession:
+    """A subsession to embed."""
 
     session: Session
-    part: str
+    name: str
     rows: NDArray[np.intp]
+    """(N,) its images, rows of `session.images`."""
     turns: NDArray[np.int64]
+    """(N,) counter-clockwise quarter turns that make each image upright for the embedder."""
 
 
 def _open_embedder(
@@ -182,41 +180,36 @@ def _session_names(capture: Capture, device: str) -> list[str]:
     return [name for name in names if name in capture]
 
 
-def _jobs(capture: Capture, device: str, subsession: str) -> list[tuple[Session, str, NDArray[np.intp]]]:
-    """Return the subsessions to embed: session, subsession, image rows."""
+def _subsessions(capture: Capture, device: str, subsession: str) -> list[_Subsession]:
+    """Return the subsessions to embed, whose images are not turned."""
     if device not in ("auto", "all", *capture.devices):
-        raise ManifestError(
-            f"device is {device!r}; {capture.name} has {', '.join(capture.devices)} (or `auto`)."
-        )
+        raise ManifestError(f"device is {device!r}; {capture.name} has {', '.join(capture.devices)} (or `auto`).")
     names = _session_names(capture, device)
-    jobs, known = [], []
+    parts = []
     for session in (capture[name] for name in names):
         rows = session.camera_rows
-        parts = session.subsession_of(rows)
+        of_row = session.subsession_of(rows)
         # Images outside every listed subsession are embedded too, under the session's name.
-        parts = np.where(parts == "", session.id, parts)
-        for part in dict.fromkeys(parts.tolist()):
-            known.append(part)
-            if subsession in ("all", part):
-                jobs.append((session, part, rows[parts == part]))
-    if not jobs:
-        raise ManifestError(
-            f"No images of subsession {subsession!r} in {', '.join(names)}; known: {', '.join(known)}."
-        )
-    return jobs
+        of_row = np.where(of_row == "", session.id, of_row)
+        for name in dict.fromkeys(of_row.tolist()):
+            members = rows[of_row == name]
+            parts.append(_Subsession(session, name, members, np.zeros(len(members), np.int64)))
+    chosen = [part for part in parts if subsession in ("all", part.name)]
+    if not chosen:
+        known = ", ".join(part.name for part in parts)
+        raise ManifestError(f"No images of subsession {subsession!r} in {', '.join(names)}; known: {known}.")
+    return chosen
 
 
-def _remove_former(
-    out_dir: Path, names: list[str], jobs: list[tuple[Session, str, NDArray[np.intp]]]
-) -> None:
+def _remove_former(out_dir: Path, names: list[str], parts: list[_Subsession]) -> None:
     """Remove the embeddings of subsessions that these sessions no longer have: whoever reads a session reads all."""
-    parts = {out_dir / session.id / part for session, part, _ in jobs}
+    folders = {out_dir / part.session.id / part.name for part in parts}
     for name in names:
         for manifest in sorted((out_dir / name).rglob("manifest.csv")):
-            if manifest.parent not in parts:
+            if manifest.parent not in folders:
                 log.warning("%s: no such subsession any more, removed", manifest.parent)
-                stem = manifest.parent / f"{manifest.parent.name}.npy"
-                for path in (manifest, stem, sidecar_path(stem), manifest.parent / "failed.csv"):
+                matrix = manifest.parent / f"{manifest.parent.name}.npy"
+                for path in (manifest, matrix, sidecar_path(matrix), manifest.parent / "failed.csv"):
                     path.unlink(missing_ok=True)
 
 
@@ -232,9 +225,9 @@ def _vocabulary(
             f"{capture.path}/sessions has no <device>_map session; `vlad` learns its vocabulary from the map."
         )
     every = [(session.id, int(row)) for session in maps for row in session.camera_rows]
-    picked = np.linspace(0, len(every) - 1, min(len(every), VOCABULARY_IMAGES)).astype(int).tolist()
     chosen: dict[str, list[int]] = {}
-    for name, row in (every[index] for index in picked):
+    for index in np.linspace(0, len(every) - 1, min(len(every), VOCABULARY_IMAGES)).astype(int).tolist():
+        name, row = every[index]
         chosen.setdefault(name, []).append(row)
     record = {
         "vlad": settings.vlad.model_dump(),
@@ -245,10 +238,7 @@ def _vocabulary(
     path = out_dir / "vlad.npz"
     if skip_existing and is_current(path, record):
         return path
-    stores = {
-        name: extract_session(capture[name], features_dir, rows=np.array(rows))
-        for name, rows in chosen.items()
-    }
+    stores = {name: extract_session(capture[name], features_dir, rows=np.array(rows)) for name, rows in chosen.items()}
     keys = [(name, capture[name].image_name(row)) for name, rows in chosen.items() for row in rows]
     keys = [(name, image) for name, image in keys if image in stores[name]]
 
@@ -262,12 +252,11 @@ def _vocabulary(
     return path
 
 
-def _embed_job(
+def _embed(
     embedder: Embedder,
-    job: _Job,
+    part: _Subsession,
     batches: GroupWriter,
-    batch_size: int,
-    normalize: bool,
+    settings: EmbedSettings,
     store_of: Callable[[str], FeatureStore],
 ) -> dict[int, str]:
     """Add the vectors of the readable images, in order; return why the others (by row) have none."""
@@ -276,15 +265,14 @@ def _embed_job(
     for note in finished.values():  # what a stopped run had done
         done = note["done"]
         failed |= dict(note["failed"])
-    source = _features if embedder.inputs == "features" else _images
-    inputs = source(embedder, job, done, batch_size, store_of)
-    label = f"embed {job.session.id}/{job.part}"
-    with tqdm(total=len(job.rows), initial=done, desc=label, unit="image") as bar:
-        for number, (batch, unreadable) in enumerate(_batches(inputs, batch_size), start=len(finished)):
+    inputs = _inputs(embedder, part, done, settings.batch_size, store_of)
+    label = f"embed {part.session.id}/{part.name}"
+    with tqdm(total=len(part.rows), initial=done, desc=label, unit="image") as bar:
+        for number, (batch, unreadable) in enumerate(_batches(inputs, settings.batch_size), start=len(finished)):
             vectors = embedder.embed(batch)
             if vectors.shape != (len(batch), embedder.dim):
                 raise ValueError(f"{embedder.name} gave {vectors.shape}; expected {(len(batch), embedder.dim)}.")
-            if normalize:
+            if settings.normalize:
                 vectors = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
             failed |= unreadable
             done += len(batch) + len(unreadable)
@@ -303,36 +291,31 @@ def write_matrix(path: Path, batches: GroupWriter, rows: int, dim: int, dtype: s
             stream.write(np.ascontiguousarray(arrays[VECTORS], dtype).tobytes())
 
 
-def _features(
-    embedder: Embedder, job: _Job, done: int, batch_size: int, store_of: Callable[[str], FeatureStore]
-) -> Iterator[tuple[int, LocalFeatures | str]]:
-    """Yield row and local features of the images after the first `done`, or why there are none."""
-    store = store_of(job.session.id)
-    for row in job.rows[done:].tolist():
-        name = job.session.image_name(row)
-        yield row, store[name] if name in store else store.failed.get(name, "no local features were extracted")
-
-
-def _images(
-    embedder: Embedder, job: _Job, done: int, batch_size: int, store_of: Callable[[str], FeatureStore]
-) -> Iterator[tuple[int, NDArray[np.uint8] | str]]:
-    """Yield row and prepared image of the images after the first `done`, or why it cannot be read."""
+def _inputs(
+    embedder: Embedder, part: _Subsession, done: int, batch_size: int, store_of: Callable[[str], FeatureStore]
+) -> Iterator[tuple[int, Any | str]]:
+    """Yield row and input (features or a prepared image) of the images after the first `done`, or why it has none."""
+    session = part.session
+    if embedder.inputs == "features":
+        store = store_of(session.id)
+        for row in part.rows[done:].tolist():
+            name = session.image_name(row)
+            yield row, store[name] if name in store else store.failed.get(name, "no local features were extracted")
+        return
 
     def read(item: tuple[int, int]) -> tuple[int, NDArray[np.uint8] | str]:
         row, turns = item
         try:
-            image = read_image(job.session.image_path(row))
+            image = read_image(session.image_path(row))
         except ImageError as error:
             return row, str(error)
         return row, embedder.prepare(turn_image(image, turns))
 
-    items = zip(job.rows[done:].tolist(), job.turns[done:].tolist(), strict=True)
-    return prefetch(read, items, workers=default_workers(), ahead=2 * batch_size)
+    items = zip(part.rows[done:].tolist(), part.turns[done:].tolist(), strict=True)
+    yield from prefetch(read, items, workers=default_workers(), ahead=2 * batch_size)
 
 
-def _batches(
-    items: Iterable[tuple[int, Any | str]], size: int
-) -> Iterator[tuple[list[Any], dict[int, str]]]:
+def _batches(items: Iterable[tuple[int, Any | str]], size: int) -> Iterator[tuple[list[Any], dict[int, str]]]:
     """Yield up to `size` inputs, and the reasons (by row) of those that are none, in order."""
     batch: list[Any] = []
     unreadable: dict[int, str] = {}
@@ -356,29 +339,26 @@ def _images_fingerprint(session: Session, rows: NDArray[np.intp]) -> str:
     return fingerprint([keys, session.device_ids[rows].tolist(), files])
 
 
-def _manifest(
-    capture: Capture, session: Session, rows: NDArray[np.intp], failed: dict[int, str]
-) -> pd.DataFrame:
-    table = session.images.iloc[rows]
-    manifest = pd.DataFrame(
+def _write_tables(folder: Path, capture: str, part: _Subsession, failed: dict[int, str]) -> None:
+    """Write the manifest of the embedded images, and the table of the unreadable ones where there are any."""
+    session, images = part.session, part.session.images.iloc[part.rows]
+    table = pd.DataFrame(
         {
-            "device_id": session.device_ids[rows],
-            "sensor_id": table["sensor_id"].to_numpy(),
-            "timestamp": table["timestamp"].to_numpy(),
-            "abs_path": [f"{capture.name}/sessions/{session.image_name(int(row))}" for row in rows],
+            "device_id": session.device_ids[part.rows],
+            "sensor_id": images["sensor_id"].to_numpy(),
+            "timestamp": images["timestamp"].to_numpy(),
+            "abs_path": [f"{capture}/sessions/{session.image_name(int(row))}" for row in part.rows],
+            "reason": [failed.get(int(row), "") for row in part.rows],
         }
     )
-    manifest["reason"] = [failed.get(int(row), "") for row in rows]
-    return manifest
-
-
-def _write_tables(folder: Path, manifest: pd.DataFrame, failed: dict[int, str]) -> None:
-    missing = folder / "failed.csv"
+    unreadable = folder / "failed.csv"
     if failed:
-        with write_atomic(missing) as temporary:
-            manifest[manifest["reason"] != ""].to_csv(temporary, index=False)
+        log.warning("%s/%s: %d of %d images cannot be read, see %s",
+                    session.id, part.name, len(failed), len(table), unreadable)  # fmt: skip
+        with write_atomic(unreadable) as temporary:
+            table[table["reason"] != ""].to_csv(temporary, index=False)
     else:
-        missing.unlink(missing_ok=True)
-    embedded = manifest[manifest["reason"] == ""].drop(columns="reason").reset_index(drop=True)
+        unreadable.unlink(missing_ok=True)
+    embedded = table[table["reason"] == ""].drop(columns="reason").reset_index(drop=True)
     with write_atomic(folder / "manifest.csv") as temporary:
         embedded.to_csv(temporary, index_label="row_index")

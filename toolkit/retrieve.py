@@ -4,7 +4,7 @@ import json
 import logging
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
 from toolkit.embedders import load_embeddings
-from toolkit.embedders.search import search, unit_rows
+from toolkit.embedders.search import Backend, search, unit_rows
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError
 from toolkit.files import (
     file_fingerprint,
@@ -26,12 +26,13 @@ from toolkit.files import (
     write_atomic,
     write_sidecar,
     write_text,
-)
+)  # fmt: skip
 from toolkit.manifest import RetrieveSettings
 
 __all__ = ["retrieve_pairs", "search"]
 
 log = logging.getLogger(__name__)
+
 
 
 def retrieve_pairs(
@@ -66,26 +67,22 @@ def retrieve_pairs(
     """
     settings = RetrieveSettings.of(settings)
     capture = Capture.from_sessions_root(sessions_root)
-    maps = capture.devices_with("map", map_device)
-    askers = capture.devices_with("query", query_device)
+    map_devices = capture.devices_with("map", map_device)
+    query_devices = capture.devices_with("query", query_device)
     embeddings = Path(map_feats_root)
     out = Path(out_jsonl) if out_jsonl is not None else embeddings.parent / "retrieval"
-    if out.suffix == ".jsonl" and len(maps) * len(askers) != 1:
-        raise ManifestError(
-            f"out_jsonl is one file ({out}) for {len(maps) * len(askers)} pairs; give a folder."
-        )
-    asked = [_load_queries(capture[f"{device}_query"], embeddings, queries) for device in askers]
+    pairs = len(map_devices) * len(query_devices)
+    if out.suffix == ".jsonl" and pairs != 1:
+        raise ManifestError(f"out_jsonl is one file ({out}) for {pairs} pairs; give a folder.")
+    loaded_queries = [_load_queries(capture[f"{device}_query"], embeddings, queries) for device in query_devices]
     table = []
-    for device in maps:
-        database: _Images | None = None
-        for query in asked:
+    for device in map_devices:
+        session = capture[f"{device}_map"]
+        database = _load_database(session, embeddings)
+        for query in loaded_queries:
             started = time.perf_counter()
-            path = (
-                out
-                if out.suffix == ".jsonl"
-                else out / f"{pair_name(capture.name, device, query.session.device)}.jsonl"
-            )
-            session = capture[f"{device}_map"]
+            name = f"{pair_name(capture.name, device, query.session.device)}.jsonl"
+            path = out if out.suffix == ".jsonl" else out / name
             record = {
                 "map": _inputs(session, embeddings),
                 "query": _inputs(query.session, embeddings),
@@ -94,8 +91,6 @@ def retrieve_pairs(
                 "normalize": settings.normalize,
             }
             skipped = skip_existing and is_current(path, record)
-            if database is None:
-                database = _load_database(session, embeddings)
             if not skipped:
                 _write_pair(path, query, database, settings)
                 write_sidecar(path, record)
@@ -121,7 +116,7 @@ def retrieve_pairs(
 
 @dataclass(frozen=True)
 class _Images:
-    """Embedded images of a session: rows of `session.images` with their vectors and lines of manifest."""
+    """Embedded images of a session: rows of `session.images`, their vectors and their lines of the manifests."""
 
     session: Session
     rows: NDArray[np.int64]
@@ -131,6 +126,10 @@ class _Images:
     keyframes_missing: int = 0
     images_missing: int = 0
     unposed: int = 0
+
+    def take(self, chosen: NDArray[np.int64]) -> "_Images":
+        table = self.table.iloc[chosen].reset_index(drop=True)
+        return replace(self, rows=self.rows[chosen], vectors=self.vectors[chosen], table=table)
 
 
 def _load(session: Session, embeddings: Path) -> _Images:
@@ -150,99 +149,65 @@ def _load_database(session: Session, embeddings: Path) -> _Images:
     images = _load(session, embeddings)
     posed = np.isfinite(session.world_from_cam(images.rows)).reshape(-1, 16).all(axis=1)
     if not posed.any():
-        raise ToolkitError(
-            f"No embedded image of {session.id} has a pose ({session.path / 'trajectories.txt'})."
-        )
+        raise ToolkitError(f"No embedded image of {session.id} has a pose ({session.path / 'trajectories.txt'}).")
     if not posed.all():
-        log.warning(
-            "%s: %d of %d images have no pose and are left out", session.id, np.sum(~posed), posed.size
-        )
-    return _Images(
-        session, images.rows[posed], images.vectors[posed], images.table[posed].reset_index(drop=True),
-        unposed=int(np.sum(~posed)),
-    )  # fmt: skip
+        log.warning("%s: %d of %d images have no pose and are left out", session.id, np.sum(~posed), posed.size)
+    return replace(images.take(np.flatnonzero(posed)), unposed=int(np.sum(~posed)))
 
 
 def _load_queries(session: Session, embeddings: Path, queries: str) -> _Images:
     keyframes = session.keyframes(queries)
     images = _load(session, embeddings)
-    wanted = session.rows_of_keyframes(keyframes)
+    rows_of_each = session.rows_of_keyframes(keyframes)
     position = np.full(len(session.images), -1)
     position[images.rows] = np.arange(len(images.rows))
-    missing = [index for index, rows in enumerate(wanted) if not (position[rows] >= 0).any()]
+    missing = [index for index, rows in enumerate(rows_of_each) if not (position[rows] >= 0).any()]
     if missing:
         first = keyframes.iloc[missing[0]]
         log.warning(
             "%s: %d of %d keyframes have no embedded image and are not searched for, first (%s, %s)",
             session.id, len(missing), len(keyframes), first["timestamp"], first["device_id"],
         )  # fmt: skip
-    rows = np.unique(np.concatenate([np.zeros(0, np.int64), *wanted]))
+    rows = np.unique(np.concatenate([np.zeros(0, np.int64), *rows_of_each]))
     chosen = position[rows][position[rows] >= 0]
-    return _Images(
-        session,
-        images.rows[chosen],
-        images.vectors[chosen],
-        images.table.iloc[chosen].reset_index(drop=True),
-        keyframes=len(keyframes),
-        keyframes_missing=len(missing),
-        images_missing=len(rows) - len(chosen),
+    lost = len(rows) - len(chosen)
+    return replace(
+        images.take(chosen), keyframes=len(keyframes), keyframes_missing=len(missing), images_missing=lost
     )
 
 
-def _write_pair(
-    path: Path,
-    query: _Images,
-    database: _Images,
-    settings: RetrieveSettings,
-) -> None:
+def _write_pair(path: Path, query: _Images, database: _Images, settings: RetrieveSettings) -> None:
     pair = f"map {database.session.id}, query {query.session.id}"
     if query.vectors.shape[1] != database.vectors.shape[1]:
         raise ArtifactError(
             f"{pair}: the map's embeddings have {database.vectors.shape[1]} dimensions, the query's "
             f"{query.vectors.shape[1]}. They are of different models: embed both again with one."
         )
-    asked, known = (unit_rows(part.vectors) if settings.normalize else part.vectors for part in (query, database))
+    queries, references = (unit_rows(each.vectors) if settings.normalize else each.vectors for each in (query, database))
+    backend: Backend = "faiss" if settings.use_faiss else "torch"
     try:
         scores, indices = search(
-            asked,
-            known,
-            settings.topk,
-            "faiss" if settings.use_faiss else "torch",
-            settings.compute_device,
-            settings.faiss_gpu,
+            queries, references, settings.topk, backend, settings.compute_device, settings.faiss_gpu
         )
     except ValueError as error:
         raise ArtifactError(f"{pair}: {error}") from error
     world_from_sensor = database.session.world_from_cam(database.rows).tolist()
     rig_from_sensor = query.session.rig_from_cam(query.rows).tolist()
-    references = _records(database.table)
+    map_images = _records(database.table, "subsession", "timestamp", "sensor_id", "path")
+    query_images = _records(query.table, "path", "subsession", "device_id", "sensor_id", "timestamp")
     with write_atomic(path) as temporary, open(temporary, "w", encoding="utf-8") as stream:
-        lines = zip(_records(query.table), rig_from_sensor, scores.tolist(), indices.tolist(), strict=True)
-        for image, pose, row_scores, row_indices in tqdm(
-            lines, total=len(scores), desc=f"retrieve {path.stem}"
-        ):
-            record = {
-                key: image[key] for key in ("path", "subsession", "device_id", "sensor_id", "timestamp")
-            }
-            record["Trs"] = pose
-            record["topk"] = [
-                {
-                    "rank": rank,
-                    "score": score,
-                    **{
-                        key: references[index][key]
-                        for key in ("subsession", "timestamp", "sensor_id", "path")
-                    },
-                    "Tws": world_from_sensor[index],
-                }
-                for rank, (score, index) in enumerate(zip(row_scores, row_indices, strict=True), start=1)
+        lines = zip(query_images, rig_from_sensor, scores.tolist(), indices.tolist(), strict=True)
+        for image, pose, image_scores, best in tqdm(lines, total=len(query_images), desc=f"retrieve {path.stem}"):
+            topk = [
+                {"rank": rank, "score": score, **map_images[index], "Tws": world_from_sensor[index]}
+                for rank, (score, index) in enumerate(zip(image_scores, best, strict=True), start=1)
             ]
-            stream.write(json.dumps(record) + "\n")
+            stream.write(json.dumps({**image, "Trs": pose, "topk": topk}) + "\n")
 
 
-def _records(table: pd.DataFrame) -> list[dict[str, Any]]:
+def _records(table: pd.DataFrame, *columns: str) -> list[dict[str, Any]]:
     strings = table.assign(timestamp=table["timestamp"].astype(str)).rename(columns={"abs_path": "path"})
-    return strings.to_dict("records")
+    return strings[list(columns)].to_dict("records")
 
 
 def _inputs(session: Session, embeddings: Path) -> list[Any]:
@@ -251,9 +216,7 @@ def _inputs(session: Session, embeddings: Path) -> list[Any]:
     texts = [session.path / name for name in ("images.txt", "trajectories.txt", "rigs.txt")]
     return [
         # The record beside a matrix says what it was made from, and is small; a foreign matrix may have none.
-        [
-            [path.name, file_fingerprint(sidecar_path(path) if sidecar_path(path).exists() else path)]
-            for path in matrices
-        ],
+        [[path.name, file_fingerprint(record if record.exists() else path)]
+         for path, record in zip(matrices, map(sidecar_path, matrices), strict=True)],
         [file_fingerprint(path) for path in texts if path.exists()],
     ]

@@ -53,16 +53,14 @@ def search(
     tolerance = 1e-5 * norm * np.linalg.norm(query, axis=1)
     pending, width = np.arange(len(query)), min(count, k + 16)
     while len(pending):
-        found, candidates = _candidates(query[pending], database, width, backend, compute_device, faiss_gpu)
+        rough, candidates = _candidates(query[pending], database, width, backend, compute_device, faiss_gpu)
         # Rounding in the backend cuts nothing off once the last candidate is clearly below rank k.
-        done = (found[:, -1] < found[:, k - 1] - tolerance[pending]) | (width == count)
+        done = (rough[:, -1] < rough[:, k - 1] - tolerance[pending]) | (width == count)
         rows = pending[done]
         step = max(1, _BLOCK_BYTES // (8 * width * query.shape[1]))
         for start in range(0, len(rows), step):
             part, chosen = rows[start : start + step], np.sort(candidates[done][start : start + step], axis=1)
-            exact = np.einsum(
-                "qd,qkd->qk", query[part].astype(np.float64), database[chosen].astype(np.float64)
-            )
+            exact = np.einsum("qd,qkd->qk", query[part].astype(np.float64), database[chosen].astype(np.float64))
             exact = exact.astype(np.float32)
             order = np.argsort(-exact, axis=1, kind="stable")[:, :k]
             scores[part] = np.take_along_axis(exact, order, axis=1)
@@ -77,9 +75,7 @@ def _matrix(values: ArrayLike, name: str) -> NDArray[np.float32]:
         raise ValueError(f"{name} has shape {matrix.shape}; expected two dimensions, one row a vector.")
     bad = ~np.isfinite(matrix).all(axis=1)
     if bad.any():
-        raise ValueError(
-            f"{name} has {bad.sum()} rows with NaN or infinite values, first row {int(bad.argmax())}."
-        )
+        raise ValueError(f"{name} has {bad.sum()} rows with NaN or infinite values, first row {int(bad.argmax())}.")
     return matrix
 
 
