@@ -51,7 +51,7 @@ def small_capture(made_once: Callable[[str, Callable[[Path], object]], Path]) ->
 def small_features(small_capture: Path, made_once: Callable[[str, Callable[[Path], object]], Path]) -> Path:
     """A features folder with the SIFT features (default settings) of all sessions of `small_capture`; copy it."""
     from toolkit.capture import Capture
-    from toolkit.features.features import extract_session
+    from toolkit.features.stores import extract_session
 
     def make(folder: Path) -> None:
         capture = Capture.open(small_capture)

@@ -301,6 +301,16 @@ def test_an_image_without_features_is_named(small_capture: Path, files: SceneFil
     assert found[1]["reason"] == ""
 
 
+def test_sessions_may_have_the_names_of_lamar(small_capture: Path, files: SceneFiles, tmp_path: Path) -> None:
+    capture = Path(shutil.copytree(small_capture, tmp_path / "data" / small_capture.name))
+    (capture / "sessions" / "hl_query").rename(capture / "sessions" / "query_hololens")
+    path = files.retrieval("ios", "hl")
+    path.write_text(path.read_text().replace("/hl_query/", "/query_hololens/"))
+    expected = reranked(files).read_text().replace("/hl_query/", "/query_hololens/")
+    run(capture, files)
+    assert reranked(files).read_text() == expected
+
+
 def test_wrong_settings_and_files_are_refused(small_capture: Path, files: SceneFiles) -> None:
     with pytest.raises(ManifestError, match="topk is 7"):
         run(small_capture, files, topk=7)

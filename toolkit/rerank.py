@@ -310,7 +310,7 @@ class _Pair:
         Raises:
             ArtifactError: an image is not in the session.
         """
-        prefix = f"{session.id}/raw_data/"
+        prefix = f"{session.path.name}/raw_data/"
         names = list(dict.fromkeys(_name(image) for image in images))
         rows = pd.Index(session.images["path"]).get_indexer([name.removeprefix(prefix) for name in names])
         if (rows < 0).any():
