@@ -69,9 +69,9 @@ class Vlad:
         """Learn vocabulary and projection from `count` map images; the same input gives the same bytes.
 
         Args:
-            features: yields the features of the same images in the same order each time it is called (it is
-                called twice: memory does not grow with the number of local features).
-            count: how many images it yields.
+            features: yields the features of the same images in the same order each time it is called. It is called
+                twice, so that memory does not grow with the number of local features.
+            count: number of these images.
 
         Raises:
             ToolkitError: the images have no local features.
@@ -92,7 +92,7 @@ class Vlad:
         mean = sample.mean(axis=0)
         variance, directions = np.linalg.eigh(np.cov((sample - mean).T.astype(np.float64)))
         keep = np.argsort(-variance, kind="stable")[: min(settings.local_dim, len(sample) - 1)]
-        # An almost constant direction would be blown up to noise.
+        # An almost constant direction would be amplified to noise.
         scale = np.sqrt(np.maximum(variance[keep], 1e-4 * variance.max() + 1e-12))
         arrays: dict[str, Floats] = {
             "local_mean": mean.astype(np.float32),
@@ -118,21 +118,14 @@ class Vlad:
         except FileNotFoundError:
             raise ArtifactError(f"No VLAD vocabulary {vocabulary}; run the embed stage first.") from None
         except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
-            raise ArtifactError(
-                f"Not a VLAD vocabulary: {vocabulary} ({error}). Delete it and embed again."
-            ) from error
+            raise ArtifactError(f"Not a VLAD vocabulary: {vocabulary} ({error}). Delete it and embed again.") from error
 
     def save(self, path: str | Path) -> None:
-        """Write the vocabulary, .npz, and take its bytes as identity."""
-        arrays = {
-            "settings": np.array(json.dumps(self._settings.model_dump())),
-            "local_mean": self.local_mean,
-            "local_projection": self.local_projection,
-            "centroids": self.centroids,
-            "projection": self.projection,
-        }
+        """Write the vocabulary, .npz; its bytes identify it from then on."""
+        arrays = {name: getattr(self, name) for name in ("local_mean", "local_projection", "centroids", "projection")}
+        settings = np.array(json.dumps(self._settings.model_dump()))
         with write_atomic(path) as temporary, open(temporary, "wb") as stream:
-            np.savez(stream, allow_pickle=False, **arrays)
+            np.savez(stream, allow_pickle=False, settings=settings, **arrays)
         self._fingerprint = file_fingerprint(path)
 
     def _aggregate(self, images: Sequence[LocalFeatures]) -> Floats:
@@ -198,6 +191,6 @@ def _principal_projection(vectors: Floats, settings: VladSettings) -> Floats:
     energy = energy[order]
     basis = vectors.T @ (weights[:, order] / np.sqrt(energy)).astype(np.float32)
     mean_energy = energy.mean()
-    # The posterior of the energies under a prior of `prior_images` images that say: all alike.
+    # The posterior of the energies under a prior of `prior_images` images whose energies are all equal.
     shrunk = (count * energy + settings.prior_images * mean_energy) / (count + settings.prior_images)
     return (basis * np.sqrt(mean_energy / shrunk)).astype(np.float32)

@@ -17,7 +17,7 @@ from toolkit.features.features import (
     LocalFeatures,
     create_extractor,
     feature_kind,
-)
+)  # fmt: skip
 from toolkit.manifest import FeaturesSettings, MatcherSettings
 from toolkit.models.weights import LIGHTGLUE, SUPERPOINT, WeightsSource
 
@@ -38,7 +38,7 @@ class PairMatches:
 
 
 class Matcher(Protocol):
-    """What matches the features of images whose poses are not known."""
+    """What matches the features of images without known poses."""
 
     batch_size: int
     """The number of pairs in a call that is quickest."""
@@ -67,11 +67,11 @@ def create_matcher(name: str, **options: Any) -> Matcher:
 
     Args:
         name: a key of `MATCHERS`.
-        options: the matcher's own: `ratio` and `min_score` of `mutual`; `checkpoint`, `device`, `dtype` and others
-            of a network.
+        options: arguments of the matcher: `ratio` and `min_score` of `mutual`; `checkpoint`, `device`, `dtype` and
+            others of a network.
 
     Raises:
-        ManifestError: it is not known.
+        ManifestError: unknown matcher.
         WeightsError: the network has no weights.
     """
     if name not in MATCHERS:
