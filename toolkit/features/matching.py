@@ -84,10 +84,8 @@ def matchers_of(features: Sequence[str], matcher: str | None = None) -> dict[str
     """Return the matcher of each kind of features.
 
     Raises:
-        ManifestError: no features, unknown ones, or a matcher that suits none of them.
+        ManifestError: unknown features, or a matcher that suits none of them.
     """
-    if isinstance(features, str) or not len(features):
-        raise ManifestError(f"features is {features!r}; expected a list of one or more of {', '.join(KINDS)}.")
     suited = {name: feature_kind(name).matchers for name in features}
     if matcher is not None and not any(matcher in known for known in suited.values()):
         text = "; ".join(f"{name}: {', '.join(known)}" for name, known in suited.items())
