@@ -183,7 +183,9 @@ def _write_pair(path: Path, query: _Images, database: _Images, settings: Retriev
             f"{pair}: the map's embeddings have {database.vectors.shape[1]} dimensions, the query's "
             f"{query.vectors.shape[1]}. They are of different models: embed both again with one."
         )
-    queries, references = (unit_rows(each.vectors) if settings.normalize else each.vectors for each in (query, database))
+    queries, references = query.vectors, database.vectors
+    if settings.normalize:
+        queries, references = unit_rows(queries), unit_rows(references)
     backend: Backend = "faiss" if settings.use_faiss else "torch"
     try:
         scores, indices = search(
