@@ -26,7 +26,7 @@ from tests.fake_hub import FakeHub, serving, use_hub
 from toolkit import pipeline
 from toolkit.capture import Capture
 from toolkit.errors import CaptureError, DownloadError, ManifestError
-from toolkit.exchange import archives
+from toolkit.exchange import archives, transfer
 from toolkit.exchange import download as module
 from toolkit.exchange.archives import unpack
 from toolkit.exchange.datasets import arrange
@@ -53,7 +53,7 @@ dataset:
 @pytest.fixture
 def hub(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[FakeHub]:
     """A hub on this machine in place of the real one."""
-    monkeypatch.setattr(module, "_WAITS_S", (0.0, 0.0, 0.0))
+    monkeypatch.setattr(transfer, "_WAITS_S", (0.0, 0.0, 0.0))
     with serving(FakeHub()) as server:
         use_hub(monkeypatch, server.url, tmp_path)
         server.datasets[REPO] = published()
@@ -325,7 +325,7 @@ def test_a_server_that_is_busy_is_asked_again(hub: FakeHub, manifest: Path) -> N
     ],
 )
 def test_a_server_says_how_long_to_wait(headers: dict[str, str], seconds: int) -> None:
-    assert module._asked_wait(SimpleNamespace(headers=headers)) == seconds  # type: ignore[arg-type]
+    assert transfer._requested_wait_s(SimpleNamespace(headers=headers)) == seconds  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("status", [401, 404])
@@ -414,7 +414,7 @@ def test_parts_of_another_version_are_not_put_together(hub: FakeHub, manifest: P
 def test_a_large_file_is_asked_for_in_parts(
     hub: FakeHub, manifest: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "_PART", 300_000)
+    monkeypatch.setattr(transfer, "_RANGE_BYTES", 300_000)
     download(manifest, ["ios_query"])
     assert found(manifest.parent) == session("ios_query")
     asked = [asked for _, asked in hub.requests if asked]
@@ -541,7 +541,7 @@ def test_a_disk_that_fills_up(hub: FakeHub, manifest: Path, monkeypatch: pytest.
         raise OSError(errno.ENOSPC, "No space left on device", "somewhere")
 
     with monkeypatch.context() as patch:
-        patch.setattr(module._Fetch, "_continue", full)
+        patch.setattr(transfer.Transfer, "_fetch_more", full)
         message = failure(manifest)
     assert "somewhere: the disk is full" in message
     assert "run the same command" in message
