@@ -2,8 +2,10 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pycolmap
 import pytest
@@ -15,8 +17,16 @@ from toolkit.errors import ArtifactError, ManifestError
 from toolkit.exchange.export import export_colmap, export_pairs, export_table
 from toolkit.exchange.interchange import import_colmap, import_images
 from toolkit.features.stores import FeatureStore, extract_session
-from toolkit.files import SceneFiles
+from toolkit.files import SceneFiles, pair_name
+from toolkit.localizers.correspondences import MAPS
 from toolkit.localizers.mapping import LocalMap, build_map
+
+
+def write_localization(files: SceneFiles, map_device: str, query_device: str, maps: list[str]) -> None:
+    """Write what the localize stage says of the maps that a pair was localized in."""
+    files.poses_dir.mkdir(parents=True, exist_ok=True)
+    with h5py.File(files.poses_dir / f"{pair_name(files.scene, map_device, query_device)}.h5", "w") as file:
+        file.attrs[MAPS] = json.dumps(maps)
 
 
 @pytest.fixture(scope="module")
@@ -27,6 +37,8 @@ def run(small_capture: Path, small_features: Path, tmp_path_factory: pytest.Temp
     shutil.copytree(small_features, files.features)
     store = extract_session(session, files.features, workers=1, progress=False)
     build_map(session, store, files.maps / "hl_map.npz")
+    write_localization(files, "hl", "hl", [])  # `nearest` uses no map
+    write_localization(files, "hl", "ios", ["hl_map.npz"])
     return files
 
 
@@ -79,6 +91,38 @@ def test_points_have_their_tracks_colors_and_pixels(model: Path, run: SceneFiles
     assert read.compute_mean_reprojection_error() < 0.8
 
 
+def test_the_map_is_that_of_the_features_that_the_run_localized_with(
+    run: SceneFiles, small_capture: Path, tmp_path: Path
+) -> None:
+    """A run with SuperPoint has no `hl_map.npz`; one with two kinds of features has two maps."""
+    local_map = LocalMap.load(run.maps / "hl_map.npz")
+    (features,) = (run.features / "hl_map").glob("sift-*.h5")
+    store, names = FeatureStore.open(features), local_map.image_names
+    files = SceneFiles(tmp_path / "run", run.scene)
+    for kind in ("sift", "superpoint"):
+        copy = files.features / "hl_map" / features.name.replace("sift", kind)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(features, copy)
+    replace(local_map, points=local_map.points + 1).save(files.maps / "hl_map-superpoint.npz")
+    write_localization(files, "hl", "spot", ["hl_map-superpoint.npz"])
+    one = export_colmap(files.run, files.scene, "hl", tmp_path / "one", small_capture)
+    np.testing.assert_array_equal([one.points3D[key].xyz for key in sorted(one.points3D)], local_map.points + 1)
+    local_map.save(files.maps / "hl_map.npz")
+    write_localization(files, "hl", "spot", ["hl_map.npz", "hl_map-superpoint.npz"])
+    both = export_colmap(files.run, files.scene, "hl", tmp_path / "both", small_capture)
+    points = [both.points3D[key].xyz for key in sorted(both.points3D)]
+    np.testing.assert_array_equal(points, np.concatenate([local_map.points, local_map.points + 1]))
+    for index, name in enumerate(names):
+        image, count = both.find_image_with_name(name), len(store[name].keypoints)
+        np.testing.assert_array_equal([p.xy for p in image.points2D[count:]], store[name].keypoints.astype(float))
+        seen = np.flatnonzero([p.has_point3D() for p in image.points2D])
+        keypoints = np.unique(local_map.observations(index)[0])
+        np.testing.assert_array_equal(seen, np.concatenate([keypoints, keypoints + count]))
+    shutil.copyfile(features, copy.with_name("superpoint-0.h5"))  # of other settings
+    with pytest.raises(ArtifactError, match="2 files of superpoint features"):
+        export_colmap(files.run, files.scene, "hl", tmp_path / "third", small_capture)
+
+
 def test_there_and_back_again(model: Path, small_capture: Path, tmp_path: Path) -> None:
     import_colmap(model, small_capture / "sessions", tmp_path / "BACK", "hl")
     back, session = session_of(tmp_path / "BACK"), session_of(small_capture)
@@ -96,7 +140,7 @@ def test_nothing_is_overwritten_and_what_is_missing_is_named(
         export_colmap(run.run, run.scene, "hl", model, small_capture)
     with pytest.raises(ManifestError, match="--capture PATH/SMALL"):
         export_colmap(run.run, run.scene, "hl", tmp_path / "model")
-    with pytest.raises(ArtifactError):
+    with pytest.raises(ArtifactError, match=r"toolkit run MANIFEST --only localize"):
         export_colmap(run.run, run.scene, "ios", tmp_path / "model", small_capture)
     changed = Path(shutil.copytree(small_capture, tmp_path / small_capture.name))
     images = changed / "sessions" / "hl_map" / "images.txt"

@@ -1,6 +1,9 @@
-"""What other tools read: the map as a COLMAP model, retrieval as a list of pairs for hloc."""
+"""What other tools read: the map as a COLMAP model, retrieval as a list of pairs for hloc, poses as a table."""
 
 import tempfile
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,19 +15,23 @@ from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import ArtifactError, ManifestError
 from toolkit.exchange.submission import Captures
 from toolkit.features.stores import FeatureStore
-from toolkit.files import SceneFiles, image_name, read_references, write_atomic, write_text
+from toolkit.files import SceneFiles, image_name, pair_name, read_references, write_atomic, write_text
 from toolkit.geometry import invert, qt_from_pose
+from toolkit.localizers.correspondences import LocalizedQueries
 from toolkit.localizers.mapping import LocalMap
+
+Keypoints = Mapping[str, NDArray[np.floating]]
 
 
 def export_colmap(
     run: str | Path, scene: str, device: str, out: str | Path, capture: str | Path | None = None
 ) -> pycolmap.Reconstruction:
-    """Write the triangulated map of a run as a COLMAP model, binary.
+    """Write the triangulated map that a run localized with as a COLMAP model, binary.
 
     Image names are relative to the capture's folder `sessions`. All keypoints are written, also those that see no
-    point, in COLMAP's pixels, which are ours: the center of the top-left pixel is (0.5, 0.5). A rig's frame is that of
-    its first camera, as COLMAP wants it; rigs with the same cameras at the same places are one rig.
+    point, in COLMAP's pixels, which are ours: the center of the top-left pixel is (0.5, 0.5). Where the run has used
+    several kinds of features, the keypoints and points of one kind follow those of the kind before. A rig's frame is
+    that of its first camera, as COLMAP wants it; rigs with the same cameras at the same places are one rig.
 
     Args:
         run: the run folder.
@@ -34,15 +41,17 @@ def export_colmap(
         capture: the capture, where it is no longer where the run found it.
 
     Raises:
-        ArtifactError: the run has no such map.
+        ArtifactError: the run has not localized in such a map.
         ManifestError: there are files in `out`, or the capture is not found.
     """
     files, session_id, out = SceneFiles(Path(run), scene), f"{device}_map", Path(out)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ManifestError(f"{out}: there are files already. Give an empty or new folder.")
     session = Captures([Path(run)], [] if capture is None else [capture], [scene])[scene][session_id]
-    local_map = LocalMap.load(files.maps / f"{session_id}.npz")
-    model = colmap_model(local_map, session, FeatureStore.of_session(files.features, session_id))
+    paths = _maps_of(files, device)
+    stores = [_features_of(files, session_id, path) for path in paths]
+    local_map, keypoints = _pooled([LocalMap.load(path) for path in paths], stores)
+    model = colmap_model(local_map, session, keypoints)
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as folder:
         part = Path(folder) / "model"
@@ -54,13 +63,51 @@ def export_colmap(
     return model
 
 
-def colmap_model(local_map: LocalMap, session: Session, store: FeatureStore) -> pycolmap.Reconstruction:
+def _maps_of(files: SceneFiles, device: str) -> list[Path]:
+    """Return the files of the triangulated maps that a run has localized with, one a kind of features."""
+    for path in sorted(files.poses_dir.glob(f"{pair_name(files.scene, device, '*')}.h5")):
+        with closing(LocalizedQueries(path)) as queries:
+            if queries.maps:
+                return [files.maps / name for name in queries.maps]
+    raise ArtifactError(
+        f"{files.poses_dir}: no query has been localized in a triangulated map of {device}. Run the localize stage "
+        "with a method that uses one (python -m toolkit run MANIFEST --only localize)."
+    )
+
+
+def _features_of(files: SceneFiles, session_id: str, map_file: Path) -> FeatureStore:
+    """Open the local features that a map was triangulated from."""
+    kind = map_file.stem.removeprefix(session_id).removeprefix("-") or "sift"  # as `mapping.map_path` names maps
+    found = sorted((files.features / session_id).glob(f"{kind}-*.h5"))
+    if len(found) != 1:
+        raise ArtifactError(
+            f"{files.features / session_id}: {len(found)} files of {kind} features, expected the one that {map_file} "
+            "was triangulated from. Delete this folder and run the localize stage again."
+        )
+    return FeatureStore.open(found[0])
+
+
+def _pooled(maps: Sequence[LocalMap], stores: Sequence[FeatureStore]) -> tuple[LocalMap, Keypoints]:
+    """Return one map of several, and the keypoints that its observations count through: in each image those of one kind
+    of features after those of the kind before."""
+    keypoints: dict[str, NDArray[np.floating]] = {}
+    shifted = []
+    for local_map, store in zip(maps, stores, strict=True):
+        before = [keypoints.get(name, np.zeros((0, 2))) for name in local_map.image_names]
+        starts = np.array([len(xy) for xy in before], np.int64)
+        shifted.append(replace(local_map, obs_keypoint=local_map.obs_keypoint + starts[local_map.obs_image]))
+        for name, xy in zip(local_map.image_names, before, strict=True):
+            keypoints[name] = np.concatenate([xy, store[name].keypoints])
+    return LocalMap.pooled(shifted), keypoints
+
+
+def colmap_model(local_map: LocalMap, session: Session, keypoints: Keypoints) -> pycolmap.Reconstruction:
     """Return a map as a COLMAP model.
 
     Args:
         local_map: the map of the session.
         session: what the images were taken with.
-        store: local features of its images.
+        keypoints: by image name, (n, 2) pixels that the map's observations count through.
 
     Raises:
         ArtifactError: the session does not list an image of the map.
@@ -71,26 +118,25 @@ def colmap_model(local_map: LocalMap, session: Session, store: FeatureStore) -> 
         raise ArtifactError(f"{session.path}: image {unknown[0]} of the map is not in it. Run the map's stages again.")
     rows = np.array([row_of[name] for name in local_map.image_names], np.int64)
     sensors = session.images["sensor_id"].to_numpy(str)[rows]
-    frames = _frames(session, rows)
     model = pycolmap.Reconstruction()
-    builder = _Builder(model)
-    for frame_id, members in enumerate(frames, start=1):
+    rigs: dict[object, tuple[int, list[int]]] = {}  # ids of each rig and of its cameras
+    for frame_id, members in enumerate(_frames(session, rows), start=1):
         # Rig ids are often made anew for each frame; the cameras and their places say which rig it is.
         rig_from_cams = session.rig_from_cam(rows[members])
-        rig_id, camera_ids = builder.rig(
-            [str(sensor) for sensor in sensors[members]], [local_map.cameras[i] for i in members], rig_from_cams
-        )
+        first_from_cams = invert(rig_from_cams[0]) @ rig_from_cams
+        key = (tuple(sensors[members]), tuple(np.round(first_from_cams, 12).ravel()))
+        if key not in rigs:
+            rigs[key] = _add_rig(model, [local_map.cameras[i] for i in members], first_from_cams)
+        rig_id, camera_ids = rigs[key]
         frame = pycolmap.Frame()
         frame.frame_id, frame.rig_id = frame_id, rig_id
         for member, camera_id in zip(members, camera_ids, strict=True):
-            frame.add_data_id(pycolmap.data_t(model.camera(camera_id).sensor_id, int(member) + 1))
+            frame.add_data_id(pycolmap.data_t(model.camera(camera_id).sensor_id, member + 1))
         frame.rig_from_world = _rigid(local_map.cams_from_world[members[0]])
         model.add_frame(frame)
         for member, camera_id in zip(members, camera_ids, strict=True):
-            keypoints = store[local_map.image_names[member]].keypoints.astype(np.float64)
-            image = pycolmap.Image(
-                name=local_map.image_names[member], keypoints=keypoints, camera_id=camera_id, image_id=int(member) + 1
-            )
+            name = local_map.image_names[member]
+            image = pycolmap.Image(name, keypoints[name].astype(np.float64), camera_id, member + 1)
             image.frame_id = frame_id
             model.add_image(image)
     order = np.argsort(local_map.obs_point, kind="stable")
@@ -102,6 +148,36 @@ def colmap_model(local_map: LocalMap, session: Session, store: FeatureStore) -> 
         model.add_point3D(xyz, track, color)
     model.update_point_3d_errors()
     return model
+
+
+def _frames(session: Session, rows: NDArray[np.int64]) -> list[list[int]]:
+    """Return the positions in `rows` of the images of each device at each time, cameras in order of their ids."""
+    images = session.images.iloc[rows][["timestamp", "sensor_id"]].assign(device=session.device_ids[rows])
+    by_frame = images.reset_index(drop=True).sort_values("sensor_id", kind="stable").groupby(["timestamp", "device"])
+    return [group.index.tolist() for _, group in by_frame]
+
+
+def _add_rig(
+    model: pycolmap.Reconstruction, cameras: Sequence[pycolmap.Camera], first_from_cams: NDArray[np.float64]
+) -> tuple[int, list[int]]:
+    """Add a rig and its cameras to a model; return their ids."""
+    rig, camera_ids = pycolmap.Rig(), list[int]()
+    rig.rig_id = model.num_rigs() + 1
+    for camera, first_from_cam in zip(cameras, first_from_cams, strict=True):
+        camera = pycolmap.Camera(camera.todict())
+        camera.camera_id = model.num_cameras() + 1  # a new camera, for COLMAP lets one be in one rig only
+        model.add_camera(camera)
+        if camera_ids:
+            rig.add_sensor(camera.sensor_id, _rigid(invert(first_from_cam)))
+        else:
+            rig.add_ref_sensor(camera.sensor_id)
+        camera_ids.append(camera.camera_id)
+    model.add_rig(rig)
+    return rig.rig_id, camera_ids
+
+
+def _rigid(pose: NDArray[np.float64]) -> pycolmap.Rigid3d:
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:3, :3]), pose[:3, 3])
 
 
 def export_table(session: Session, out: str | Path, ground_truth: bool = False) -> Path:
@@ -162,48 +238,3 @@ def export_pairs(
         pairs += [f"{names[0]} {name}" for name in names[1:]]
     write_text(out, "".join(f"{pair}\n" for pair in pairs))
     return len(pairs)
-
-
-class _Builder:
-    """Adds cameras and rigs to a model, each once."""
-
-    def __init__(self, model: pycolmap.Reconstruction) -> None:
-        self._model = model
-        self._rigs: dict[object, tuple[int, dict[str, int]]] = {}
-
-    def rig(
-        self, sensors: list[str], cameras: list[pycolmap.Camera], rig_from_cams: NDArray[np.float64]
-    ) -> tuple[int, list[int]]:
-        """Return the id of the rig of these cameras, and those of its cameras."""
-        places = tuple(np.round(invert(rig_from_cams[0]) @ rig_from_cams, 12).ravel().tolist())
-        key = (tuple(sensors), places)
-        if key not in self._rigs:
-            rig, camera_ids = pycolmap.Rig(), {}
-            rig.rig_id = len(self._rigs) + 1
-            for index, (sensor, known) in enumerate(zip(sensors, cameras, strict=True)):
-                camera = pycolmap.Camera(known.todict())
-                # COLMAP lets a camera be in one rig only.
-                camera.camera_id = camera_ids[sensor] = self._model.num_cameras() + 1
-                self._model.add_camera(camera)
-                if index == 0:
-                    rig.add_ref_sensor(camera.sensor_id)
-                else:
-                    rig.add_sensor(camera.sensor_id, _rigid(invert(rig_from_cams[index]) @ rig_from_cams[0]))
-            self._model.add_rig(rig)
-            self._rigs[key] = rig.rig_id, camera_ids
-        rig_id, camera_ids = self._rigs[key]
-        return rig_id, [camera_ids[sensor] for sensor in sensors]
-
-
-def _frames(session: Session, rows: NDArray[np.int64]) -> list[list[int]]:
-    """Return the positions in `rows` of the images of each device at each time, cameras in order of their ids."""
-    images = session.images.iloc[rows]
-    keys = zip(images["timestamp"].tolist(), session.device_ids[rows], images["sensor_id"], strict=True)
-    frames: dict[tuple[int, str], list[tuple[str, int]]] = {}
-    for position, (time, device, sensor) in enumerate(keys):
-        frames.setdefault((time, device), []).append((sensor, position))
-    return [[position for _, position in sorted(members)] for _, members in sorted(frames.items())]
-
-
-def _rigid(pose: NDArray[np.float64]) -> pycolmap.Rigid3d:
-    return pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:3, :3]), pose[:3, 3])
