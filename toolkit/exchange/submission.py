@@ -1,10 +1,12 @@
-"""The zip file that a benchmark takes: the poses of finished runs, checked, under the names it expects.
+"""Make the zip file that a benchmark takes: the poses of finished runs, checked, under the names that it expects.
 
 Names and contents are those of the benchmarks' own combine scripts: `description.txt`, and for each pair a text file in
 the trajectories format without covariances. Equal runs and options give equal bytes.
 """
 
+import itertools
 import json
+import os
 import tempfile
 import zipfile
 from collections import Counter
@@ -33,17 +35,16 @@ Key = tuple[int, str]
 class Challenge:
     """What one benchmark wants in its zip file."""
 
-    name: str
-    scenes: dict[str, str]
-    """The captures, and what each is called in file names."""
     pairs: tuple[tuple[str, str], ...]
     """Map and query devices."""
-    file: str
-    """Name of a pair's file, of {scene}, {map} and {query}."""
+    scenes: dict[str, str] = field(default_factory=dict)
+    """The captures, and what each is called in file names."""
+    file: str = "{scene}_map_{map}_query_{query}.txt"
+    """Name of a pair's file."""
     queries: str = "keyframes_pruned_subsampled"
-    """The keyframe list that is asked."""
+    """The list of query keyframes to answer."""
     devices: dict[str, str] = field(default_factory=dict)
-    """What the benchmark calls devices that it does not call as we do."""
+    """The benchmark's names of devices that have another name here."""
 
     def file_name(self, scene: str, map_device: str, query_device: str) -> str:
         """Return the name of a pair's file in the zip."""
@@ -51,22 +52,16 @@ class Challenge:
         return self.file.format(scene=self.scenes.get(scene, scene), map=map_device, query=query_device)
 
 
-_PAIR_FILE = "{scene}_map_{map}_query_{query}.txt"
-CHALLENGES = (
-    Challenge(
-        "LaMAR",
-        {"CAB": "CAB", "HGE": "HGE", "LIN": "LIN"},
-        (("mixed", "ios"), ("mixed", "hl")),
-        "{scene}_query_{query}.txt",
-        "queries",
-        {"ios": "phone", "hl": "hololens"},
-    ),
-    Challenge(
-        "CroCoDL",
-        {"HYDRO": "HYDRO", "SUCCULENT": "SUCCU"},
-        tuple((m, q) for m in ("ios", "hl", "spot") for q in ("ios", "hl", "spot")),
-        _PAIR_FILE,
-    ),
+LAMAR = Challenge(
+    pairs=(("mixed", "ios"), ("mixed", "hl")),
+    scenes={"CAB": "CAB", "HGE": "HGE", "LIN": "LIN"},
+    file="{scene}_query_{query}.txt",
+    queries="queries",
+    devices={"ios": "phone", "hl": "hololens"},
+)
+CROCODL = Challenge(
+    pairs=tuple(itertools.product(("ios", "hl", "spot"), ("ios", "hl", "spot"))),
+    scenes={"HYDRO": "HYDRO", "SUCCULENT": "SUCCU"},
 )
 
 
@@ -84,22 +79,16 @@ class Entry:
     poses: Trajectory | None = None
     """What is written; None: the pair is missing."""
     queries: pd.DataFrame = field(default_factory=pd.DataFrame)
-    """One row a query asked: timestamp, device_id, pose (`ok`, `low_confidence`, `nearest`, `left out`), reason."""
+    """One row a query: timestamp, device_id, pose (`ok`, `low_confidence`, `nearest`, `left out`), reason."""
     not_asked: int = 0
-    """Poses of the run that the list does not ask for; they are not written."""
+    """Poses of the run whose query is not in the list; they are not written."""
 
     def counts(self) -> dict[str, int]:
         """Return what the table says of the pair, by the names of `COUNTS`."""
-        found = Counter(self.queries["pose"]) if len(self.queries) else Counter()
-        return {
-            "asked": len(self.queries),
-            "written": 0 if self.poses is None else len(self.poses),
-            "ok": found["ok"],
-            "low_confidence": found["low_confidence"],
-            "filled": found[FILLED],
-            "left_out": found[LEFT_OUT],
-            "not_asked": self.not_asked,
-        }
+        poses = Counter(self.queries.get("pose", ()))
+        written = 0 if self.poses is None else len(self.poses)
+        by_kind = [poses[kind] for kind in ("ok", "low_confidence", FILLED, LEFT_OUT)]
+        return dict(zip(COUNTS, [len(self.queries), written, *by_kind, self.not_asked], strict=True))
 
 
 @dataclass
@@ -124,35 +113,37 @@ class Submission:
         return pd.DataFrame(rows, columns=["file", *COUNTS, "state"])
 
     def text(self) -> str:
-        """Return the table and what to know of it, as text."""
+        """Return the table, its sums and the missing pairs, as text."""
         table = self.table()
         total = table[COUNTS].sum()
-        lines = [table.to_string(index=False, justify="left"), ""]
-        lines.append(
+        sums = (
             f"{len(table) - len(self.missing)} of {len(table)} pairs, {total['written']} poses for {total['asked']} "
             f"queries: {total['ok']} ok, {total['low_confidence']} of low confidence, {total['filled']} filled with "
             f"the pose of the nearest reference, {total['left_out']} left out."
         )
-        if self.missing:
-            lines.append(f"Missing: {', '.join(entry.name for entry in self.missing)}.")
-        return "\n".join(lines)
+        missing = f"\nMissing: {', '.join(entry.name for entry in self.missing)}." if self.missing else ""
+        return f"{table.to_string(index=False, justify='left')}\n\n{sums}{missing}"
 
     def write(self) -> Path:
-        """Write the zip file, and beside it a CSV that says of each query where its pose is from.
+        """Write the zip file, and beside it a CSV file with the origin of each query's pose.
 
         Raises:
             ToolkitError: there is not one pair to write.
         """
-        written = [entry for entry in self.entries if entry.poses is not None]
-        if not written:
+        with tempfile.TemporaryDirectory() as folder:
+            files = {"description.txt": self.description.encode()}
+            for entry in self.entries:
+                if entry.poses is not None:
+                    entry.poses.write(Path(folder) / entry.name)
+                    files[entry.name] = (Path(folder) / entry.name).read_bytes()
+        if len(files) == 1:
             raise ToolkitError(f"Nothing to submit: none of the {len(self.entries)} pairs has poses.\n{self.text()}")
         with write_atomic(self.path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-            _add(archive, "description.txt", self.description.encode())
-            with tempfile.TemporaryDirectory() as folder:
-                for entry in written:
-                    assert entry.poses is not None
-                    entry.poses.write(Path(folder) / entry.name)
-                    _add(archive, entry.name, (Path(folder) / entry.name).read_bytes())
+            for name, content in files.items():
+                # A fixed time, system and mode: the same poses give the same bytes.
+                info = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
+                info.compress_type, info.create_system, info.external_attr = zipfile.ZIP_DEFLATED, 3, 0o644 << 16
+                archive.writestr(info, content)
         write_sidecar(self.path, {"sources": self.sources, "failed": self.failed, "description": self.description})
         rows = [entry.queries.assign(file=entry.name) for entry in self.entries if len(entry.queries)]
         with write_atomic(self.path.with_suffix(".csv")) as temporary:
@@ -172,22 +163,22 @@ def collect(
 ) -> Submission:
     """Gather and check the poses of runs for submission; `.write()` then writes the zip file.
 
-    Where the runs hold a scene of a challenge, all its scenes and pairs are expected, and those that are not there are
-    listed as missing. Otherwise all scenes of the runs are taken, with the pairs that their captures have.
+    If the runs hold a scene of a challenge, all scenes and pairs of the challenge are expected, and those without poses
+    are listed as missing. Otherwise all scenes of the runs are taken, with the pairs that their captures have.
 
     Args:
         runs: run folders, `<output_root>/<manifest name>`; scenes and pairs may be spread over several.
         description: a text, or the name of a file that holds it.
         out: the zip file; None: `submission.zip` in the first run folder.
-        failed: what stands for a query without a pose: `nearest`, the pose of the best retrieved reference, or
+        failed: what is written for a query without a pose: `nearest`, the pose of the best retrieved reference, or
             `leave-out`, nothing.
-        queries: the keyframe list that must be answered, of the query session's `proc/`; None: the challenge's.
+        queries: the list of query keyframes to answer, in the query session's `proc/`; None: the challenge's.
         scenes: only these; none: see above.
-        captures: capture folders, where they are no longer where the runs found them.
+        captures: folders of captures that have moved since the runs.
 
     Raises:
         ManifestError: an unknown value, no such run, or a file that cannot be read as a description.
-        ArtifactError: a pair is in two runs, or a poses file has a key twice or a quaternion that is none.
+        ArtifactError: a pair is in two runs, or a poses file has a key twice or a quaternion that is not unit.
         CaptureError: a malformed poses file, or no such keyframe list; names file and line.
     """
     if failed not in FAILED:
@@ -199,42 +190,43 @@ def collect(
     present = {path.parent.name for folder in folders for path in sorted(folder.glob("*/poses"))}
     if not present:
         raise ManifestError(f"{', '.join(map(str, folders))}: no poses in it. Run the manifest first.")
-    found = [challenge for challenge in CHALLENGES if present & set(challenge.scenes)]
-    challenge = found[0] if found else None
-    places = Captures(folders, captures, sorted(present.union(scenes, challenge.scenes if challenge else ())))
-    submission = Submission(
-        _description(description), [], {}, failed, Path(out) if out else folders[0] / "submission.zip"
-    )
-    for scene in scenes or (challenge.scenes if challenge else sorted(present)):
-        rules = challenge if challenge and scene in challenge.scenes else _rules_of(scene, places)
+    challenge = next((rules for rules in (LAMAR, CROCODL) if present & rules.scenes.keys()), None)
+    expected = challenge.scenes if challenge else {}
+    places = Captures(folders, captures, sorted(present.union(scenes, expected)))
+    out = Path(out) if out else folders[0] / "submission.zip"
+    submission = Submission(_description(description), [], {}, failed, out)
+    for scene in scenes or expected or sorted(present):
+        if challenge and scene in expected:
+            rules = challenge
+        else:  # of no challenge: every pair that the capture has
+            devices = places[scene].devices_with("map"), places[scene].devices_with("query")
+            rules = Challenge(tuple(itertools.product(*devices)))
         for map_device, query_device in rules.pairs:
             entry = Entry(scene, map_device, query_device, rules.file_name(scene, map_device, query_device))
             submission.entries.append(entry)
             _fill_entry(entry, folders, places, queries or rules.queries, failed, submission.sources)
-    filled = sum(entry.counts()["filled"] for entry in submission.entries)
-    if filled:
-        asked = sum(entry.counts()["asked"] for entry in submission.entries)
+    total = submission.table()[COUNTS].sum()
+    if total["filled"]:
         submission.description += (
-            f"{filled} of {asked} queries were not localized and have the pose of their nearest reference image.\n"
+            f"{total['filled']} of {total['asked']} queries were not localized and have the pose of their nearest "
+            "reference image.\n"
         )
     return submission
 
 
-def _rules_of(scene: str, captures: "Captures") -> Challenge:
-    """Return what is expected of a scene that is in no challenge: every pair that its capture has."""
-    capture = captures[scene]
-    maps, queries = capture.devices_with("map"), capture.devices_with("query")
-    return Challenge("", {}, tuple((m, q) for m in maps for q in queries), _PAIR_FILE)
-
-
 class Captures:
-    """The capture of each scene: a folder that was given, else where the runs found it. Each is opened once.
-
-    Raises:
-        ManifestError: a folder that was given is not named after one of the scenes, or holds no capture.
-    """
+    """The capture of each scene, by name: in the folder that the user gives, else where the runs found it."""
 
     def __init__(self, runs: Iterable[Path], given: Iterable[str | Path], scenes: Sequence[str]) -> None:
+        """
+        Args:
+            runs: run folders.
+            given: capture folders that the user gives.
+            scenes: names that the folders may have.
+
+        Raises:
+            ManifestError: a given folder does not have the name of a scene.
+        """
         self._places: dict[str, Path] = {}
         self._open: dict[str, Capture] = {}
         for run in runs:
@@ -262,11 +254,7 @@ class Captures:
 def _description(text: str) -> str:
     """Return the text, or the content of the file of that name."""
     path = Path(text)
-    try:
-        is_file = path.is_file()
-    except OSError:  # a long text is no file name
-        is_file = False
-    if is_file:
+    if os.path.isfile(text):  # noqa: PTH113 - a long text is no file name, and no error
         try:
             text = path.read_text(encoding="utf-8")
         except UnicodeDecodeError as error:
@@ -279,64 +267,59 @@ def _description(text: str) -> str:
 def _fill_entry(
     entry: Entry, runs: Sequence[Path], captures: Captures, queries: str, failed: str, sources: dict[str, str]
 ) -> None:
-    """Read the poses of a pair, and set what is written of it."""
+    """Read the poses of a pair from the run that has them, and set what is written for each query of the list."""
     pair = (entry.map_device, entry.query_device)
-    found = [files for run in runs if (files := SceneFiles(run, entry.scene)).poses_txt(*pair).is_file()]
-    if not found:
+    with_poses = [files for run in runs if (files := SceneFiles(run, entry.scene)).poses_txt(*pair).is_file()]
+    if not with_poses:
         entry.state = "missing: no poses in " + ", ".join(str(run / entry.scene / "poses") for run in runs)
         return
-    if len(found) > 1:
-        both = " and ".join(str(files.poses_txt(*pair)) for files in found)
+    if len(with_poses) > 1:
+        both = " and ".join(str(files.poses_txt(*pair)) for files in with_poses)
         raise ArtifactError(f"Two runs have poses of the same pair: {both}. Give one of the two runs.")
-    files = found[0]
-    asked = _asked(captures[entry.scene], entry.query_device, queries)
-    keys = list(zip(asked["timestamp"].tolist(), asked["device_id"].tolist(), strict=True))
+    files = with_poses[0]
+    keyframes = _read_keyframes(captures[entry.scene], entry.query_device, queries)
+    timestamps, device_ids = keyframes["timestamp"].to_numpy(np.int64), keyframes["device_id"]
     poses = _read_poses(files.poses_txt(*pair))
     statuses, sources[entry.name] = _statuses(files.poses_csv(*pair)), file_fingerprint(files.poses_txt(*pair))
-    rows = poses.index.find(asked["timestamp"].to_numpy(np.int64), asked["device_id"])
+    rows = poses.index.find(timestamps, device_ids)
     entry.not_asked = len(poses) - int(np.sum(rows >= 0))
-    nearest: dict[Key, np.ndarray] = {}
-    reason = "not localized"
+    nearest, why_not = dict[Key, np.ndarray](), "not localized"
     if failed == "nearest" and np.any(rows < 0):
-        nearest, reason = _nearest_references(files.retrieval(*pair))
-    qt, table = [], []
-    for key, row in zip(keys, rows, strict=True):
-        status = statuses.get(key, "")
+        nearest, why_not = _nearest_references(files.retrieval(*pair))
+    qt, origins, reasons = np.full((len(rows), 7), np.nan), [LEFT_OUT] * len(rows), [""] * len(rows)
+    for index, (key, row) in enumerate(zip(zip(timestamps.tolist(), device_ids, strict=True), rows, strict=True)):
+        status = statuses.get(key, "no row in the run's table")
         if row >= 0:
-            qt.append(poses.qt[row])
-            table.append(("low_confidence" if status == "low_confidence" else "ok", ""))
+            qt[index], origins[index] = poses.qt[row], "low_confidence" if status == "low_confidence" else "ok"
         elif key in nearest:
-            qt.append(qt_from_pose(nearest[key]))
-            table.append((FILLED, status or "no row in the run's table"))
+            qt[index], origins[index], reasons[index] = qt_from_pose(nearest[key]), FILLED, status
         else:
-            qt.append(np.full(7, np.nan))
-            table.append((LEFT_OUT, "; ".join(filter(None, [status or "no row in the run's table", reason]))))
-    entry.queries = asked.assign(pose=[pose for pose, _ in table], reason=[why for _, why in table])
-    values = np.array(qt, np.float64).reshape(-1, 7)
-    known = np.isfinite(values).all(axis=1)
-    values[:, :4] /= np.linalg.norm(values[:, :4], axis=1, keepdims=True)
-    entry.poses = Trajectory(asked["timestamp"].to_numpy(np.int64)[known], asked["device_id"][known], values[known])
+            reasons[index] = f"{status}; {why_not}"
+    entry.queries = keyframes.assign(pose=origins, reason=reasons)
+    posed = np.isfinite(qt).all(axis=1)
+    qt[:, :4] /= np.linalg.norm(qt[:, :4], axis=1, keepdims=True)
+    entry.poses = Trajectory(timestamps[posed], device_ids[posed], qt[posed])
     counts = entry.counts()
     notes = {"left_out": "left out", "filled": "filled", "not_asked": "not asked"}
     entry.state = ", ".join(f"{counts[name]} {what}" for name, what in notes.items() if counts[name]) or "complete"
 
 
-def _asked(capture: Capture, device: str, queries: str) -> pd.DataFrame:
-    """Return the keyframe list that must be answered, each key once."""
+def _read_keyframes(capture: Capture, device: str, queries: str) -> pd.DataFrame:
+    """Read the list of query keyframes to answer; refuses one that has a key twice."""
     session = capture[f"{device}_query"]
-    asked = session.keyframes(queries)
-    repeated = KeyIndex(asked["timestamp"].to_numpy(np.int64), asked["device_id"]).repeated()
+    keyframes = session.keyframes(queries)
+    repeated = KeyIndex(keyframes["timestamp"].to_numpy(np.int64), keyframes["device_id"]).repeated()
     if len(repeated):
-        time, name = asked.iloc[repeated[0]][["timestamp", "device_id"]]
+        time, name = keyframes.iloc[repeated[0]][["timestamp", "device_id"]]
         raise CaptureError(
             f"{session.path}: list {queries!r} has the key (timestamp {time}, device {name!r}) twice; expected once. "
             "`python -m toolkit check CAPTURE` names the lines."
         )
-    return asked
+    return keyframes
 
 
 def _read_poses(path: Path) -> Trajectory:
-    """Read a poses file; refuses a key that is there twice and a quaternion that is no rotation."""
+    """Read a poses file; refuses one that has a key twice or a quaternion that is not unit."""
     table = read_table(path, COLUMNS["trajectories.txt"])
     poses = Trajectory.from_table(table)
     repeated = poses.index.repeated()
@@ -350,7 +333,7 @@ def _read_poses(path: Path) -> Trajectory:
 
 
 def _statuses(path: Path) -> dict[Key, str]:
-    """Return the status of each query, where the run has a table of them."""
+    """Return the status of each query in a run's table of a pair; none where the run has no table."""
     if not path.is_file():
         return {}
     table = read_query_table(path, ["status"])
@@ -358,12 +341,15 @@ def _statuses(path: Path) -> dict[Key, str]:
 
 
 def _nearest_references(path: Path) -> tuple[dict[Key, np.ndarray], str]:
-    """Return for each query device the pose, world_from_device (4, 4), that puts its camera with the best score at its
-    first reference; and what to say of devices that have none."""
+    """Return for each query a pose that stands in for its own, and what to say of queries that have none.
+
+    The pose, world_from_device (4, 4), puts the camera whose first reference has the best score of all at the place of
+    that reference.
+    """
     if not path.is_file():
         return {}, f"no retrieval to fill it from: {path} is missing"
     best: dict[Key, tuple[float, np.ndarray]] = {}
-    for row in read_references(path):
+    for row in read_references(path, "device_id", "Trs"):
         try:
             key = int(row["timestamp"]), str(row["device_id"])
             for reference in row["topk"][:1]:
@@ -372,13 +358,6 @@ def _nearest_references(path: Path) -> tuple[dict[Key, np.ndarray], str]:
                 if key not in best or score > best[key][0]:
                     best[key] = score, world_from_rig
         except (ValueError, KeyError, TypeError) as error:
-            found = f"{path}, query of {row['timestamp']}: not a retrieval row"
-            raise ArtifactError(f"{found} ({error!r}). Retrieve again.") from None
+            where = f"{path}, query of {row['timestamp']}"
+            raise ArtifactError(f"{where}: not a retrieval row ({error!r}). Retrieve again.") from None
     return {key: pose for key, (_, pose) in best.items()}, "no reference was retrieved"
-
-
-def _add(archive: zipfile.ZipFile, name: str, content: bytes) -> None:
-    # A fixed time, system and mode: the same poses give the same bytes.
-    info = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
-    info.compress_type, info.create_system, info.external_attr = zipfile.ZIP_DEFLATED, 3, 0o644 << 16
-    archive.writestr(info, content)
