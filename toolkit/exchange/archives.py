@@ -18,21 +18,20 @@ class FileError(DownloadError):
 
 
 def unpack(archive: Path, target: Path, place: Callable[[list[str]], str | None], name: str = "") -> int:
-    """Unpack a zip archive into an empty folder, and refuse one that would write anywhere else.
+    """Unpack a zip archive into a new folder, and refuse one that would write anywhere else.
 
     Args:
         archive: the zip file.
-        target: folder to make; nothing else may be in it.
-        place: for a member's path, in parts, where in the folder it goes (with `/`), or None to leave it out.
-        name: of the archive, for messages and the bar; its file name when not given.
+        target: folder to make.
+        place: returns the path in the folder (with `/`) for the parts of a member's path, or None to leave it out.
+        name: of the archive, for messages and the progress bar; its file name when not given.
 
     Returns:
         How many files were written.
 
     Raises:
-        DownloadError: a member's path leads out of the folder; a member is a link or something else that is no file, is
-            encrypted, or is there twice; the archive is damaged; or there is no room for it. Nothing outside of
-            `target` was written.
+        DownloadError: a member's path leads out of the folder; a member is not a file, is encrypted, or is there twice;
+            the archive is damaged; or the disk has no room for it. Nothing outside of `target` was written.
     """
     from tqdm.auto import tqdm
 
@@ -40,18 +39,17 @@ def unpack(archive: Path, target: Path, place: Callable[[list[str]], str | None]
     try:
         with zipfile.ZipFile(archive) as zipped:
             members = _members(zipped, place, name)
-            size = sum(member.file_size for member, _ in members)
+            size = sum(member.file_size for member in members.values())
             target.mkdir(parents=True)
             require_space(target, size, "unpack fewer sessions (--sessions)")
             with tqdm(total=size, desc=f"unpack {PurePosixPath(name).name}", unit="B", unit_scale=True) as bar:
-                for member, path in members:
+                for path, member in members.items():
                     file = target / path
                     file.parent.mkdir(parents=True, exist_ok=True)
                     # Reading stops at the size that the archive states, and compares the checksum.
                     with zipped.open(member) as source, open(file, "xb") as out:
                         while piece := source.read(1 << 20):
-                            out.write(piece)
-                            bar.update(len(piece))
+                            bar.update(out.write(piece))
     except (zipfile.BadZipFile, zlib.error, EOFError) as error:
         raise FileError(
             f"{name}: not a whole zip archive: {first_line(error)}. Nothing of it was used. Run the same command "
@@ -70,9 +68,9 @@ def unpack(archive: Path, target: Path, place: Callable[[list[str]], str | None]
 
 def _members(
     zipped: zipfile.ZipFile, place: Callable[[list[str]], str | None], name: str
-) -> list[tuple[zipfile.ZipInfo, str]]:
-    members = []
-    seen: set[str] = set()
+) -> dict[str, zipfile.ZipInfo]:
+    """Return the members to unpack by their paths in the folder; refuse what a capture has no use for."""
+    members: dict[str, zipfile.ZipInfo] = {}
     for member in zipped.infolist():
         parts = safe_parts(member.filename, name)  # also of what is left out: such an archive is not to be trusted
         if member.is_dir() or (path := place(parts)) is None:
@@ -85,10 +83,9 @@ def _members(
             )
         if member.flag_bits & 1:
             raise FileError(f"{name}: {member.filename!r} is encrypted. Unpack it yourself with its password.")
-        if path in seen:
+        if path in members:
             raise FileError(f"{name}: holds {path} twice. Nothing of it was used. Tell those who publish it.")
-        seen.add(path)
-        members.append((member, path))
+        members[path] = member
     return members
 
 
@@ -112,7 +109,7 @@ def safe_parts(name: str, where: str | Path) -> list[str]:
 
 
 def require_space(place: Path, needed: int, otherwise: str) -> None:
-    """Raise DownloadError if so many bytes do not fit on the disk of a folder; say what else could be done."""
+    """Raise DownloadError if `needed` bytes do not fit on the disk of a folder; `otherwise` is another way out."""
     free = shutil.disk_usage(place).free
     if needed * _SPARE > free:
         raise DownloadError(
@@ -122,13 +119,11 @@ def require_space(place: Path, needed: int, otherwise: str) -> None:
 
 
 def size_text(count: int | None) -> str:
-    """Return a number of bytes as people read it."""
-    if count is None:
-        return "?"
+    """Return a number of bytes as people read it; `?` for None."""
     for unit, scale in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if count >= scale:
+        if count is not None and count >= scale:
             return f"{count / scale:.1f} {unit}"
-    return f"{count} B"
+    return "?" if count is None else f"{count} B"
 
 
 def first_line(error: BaseException) -> str:

@@ -135,7 +135,6 @@ class _CaptureDownload:
         hub = self.source.hub
         self.origin = f"dataset {hub}" if hub else ", ".join(self.source.urls)
         self.page = f"https://huggingface.co/datasets/{hub}" if hub else self.dataset.page
-        self.headers: dict[str, str] = {}
         self.lock = threading.Lock()
         self.done = self._read_done()
         self.bar: Any = None
@@ -176,7 +175,6 @@ class _CaptureDownload:
                 f"{failure_reason(error, self.page)}.\n{self._access if refused else NETWORK}"
             ) from error
         self.origin += f" ({revision}, commit {commit[:7]})"
-        self.headers = huggingface_hub.utils.build_hf_headers()
         return files
 
     def _list_urls(self) -> list[RemoteFile]:
@@ -293,14 +291,16 @@ class _CaptureDownload:
                 ) from None
 
     def _run(self) -> None:
+        from huggingface_hub.utils import build_hf_headers
         from tqdm.auto import tqdm
 
+        headers = build_hf_headers() if self.source.hub else {}  # the token
         files = [file for file in self.files if not self.is_done(file)]
         self._set_unfinished(True)
         total = sum(file.size or 0 for file in self.files)
         have = total - sum((file.size or 0) - self.count_fetched(file) for file in files)
         with tqdm(total=total, initial=have, desc=self.folder.name, unit="B", unit_scale=True) as self.bar:
-            transfer = Transfer(self.headers, self._access, self._advance)
+            transfer = Transfer(headers, self._access, self._advance)
             failures = self._fetch_loose(transfer, [file for file in files if not file.is_archive])
             for file in files:
                 try:
@@ -364,10 +364,10 @@ class _CaptureDownload:
             transfer.fetch(file, self._partial(file), archive)
         aside = self.state / "unpacked" / archive.stem
         shutil.rmtree(aside, ignore_errors=True)
-        above = [] if file.is_whole_capture else file.path.split("/")[:-1]
+        above = file.path.split("/")[:-1]
 
         def place(parts: list[str]) -> str | None:
-            if file.is_whole_capture and "sessions" in parts[:2]:
+            if not above and "sessions" in parts[:2]:
                 parts = parts[parts.index("sessions") :]  # a folder of the capture's name may stand above
             path = "/".join([*above, *parts])
             return path if self._wants(path) else None

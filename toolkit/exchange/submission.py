@@ -214,21 +214,19 @@ def collect(
     return submission
 
 
-class Captures:
+class Captures(dict[str, Capture]):
     """The capture of each scene, by name: in the folder that the user gives, else where the runs found it."""
 
     def __init__(self, runs: Iterable[Path], given: Iterable[str | Path], scenes: Sequence[str]) -> None:
         """
         Args:
             runs: run folders.
-            given: capture folders that the user gives.
-            scenes: names that the folders may have.
+            given: capture folders that the user gives; each has the name of one of the `scenes`.
 
         Raises:
-            ManifestError: a given folder does not have the name of a scene.
+            ManifestError: a given folder has another name.
         """
         self._places: dict[str, Path] = {}
-        self._open: dict[str, Capture] = {}
         for run in runs:
             try:
                 rows = json.loads((run / "run.json").read_text(encoding="utf-8"))["stages"]
@@ -240,15 +238,14 @@ class Captures:
                 raise ManifestError(f"{path}: a capture of another name than the scene. Expected {', '.join(scenes)}.")
             self._places[path.resolve().name] = path.resolve()
 
-    def __getitem__(self, scene: str) -> Capture:
+    def __missing__(self, scene: str) -> Capture:
         if scene not in self._places:
             raise ManifestError(f"{scene}: the runs do not say where this capture is. Give it: --capture PATH/{scene}.")
-        if scene not in self._open:
-            try:
-                self._open[scene] = Capture.open(self._places[scene])
-            except CaptureError as error:
-                raise ManifestError(f"{scene}: {error} Give the folder: --capture PATH/{scene}.") from None
-        return self._open[scene]
+        try:
+            self[scene] = Capture.open(self._places[scene])
+        except CaptureError as error:
+            raise ManifestError(f"{scene}: {error} Give the folder: --capture PATH/{scene}.") from None
+        return self[scene]
 
 
 def _description(text: str) -> str:

@@ -51,11 +51,6 @@ class RemoteFile:
     def is_archive(self) -> bool:
         return self.path.lower().endswith(".zip")
 
-    @property
-    def is_whole_capture(self) -> bool:
-        """Whether it is an archive that stands above `sessions/`."""
-        return self.is_archive and "/" not in self.path
-
     def matches(self, local: Path) -> bool:
         """Tell whether a local file has the checksum of this file; True where no checksum is known."""
         kind, _, expected = self.version.partition(":")
@@ -66,10 +61,6 @@ class RemoteFile:
         with open(local, "rb") as stream:
             digest = hashlib.file_digest(stream, lambda: hashlib.sha1(header) if kind == "git" else hashlib.sha256())
         return digest.hexdigest() == expected
-
-
-class StoppedError(Exception):
-    """The failure of another file, or the user, ends this download."""
 
 
 class _TryAgainError(Exception):
@@ -119,8 +110,8 @@ class Transfer:
 
         Raises:
             FileError: this file cannot be had, or is not what was promised; others may be.
-            DownloadError: the server refuses, or the connection breaks again and again; `partial` stays.
-            StoppedError: `stop` was set.
+            DownloadError: the server refuses, the connection breaks again and again, or `stop` was set: because another
+                file failed for all, or by the user. `partial` stays.
         """
         partial.parent.mkdir(parents=True, exist_ok=True)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -141,7 +132,7 @@ class Transfer:
                         f"{file.path}: {file.url}: {reason}, {in_vain} times in a row.\n{NETWORK}"
                     ) from again
                 if self.stop.wait(wait_s or _WAITS_S[max(in_vain, 1) - 1]):
-                    raise StoppedError from None
+                    raise DownloadError("The download was stopped.") from None
         if not file.matches(partial):
             partial.unlink()
             raise FileError(
@@ -172,7 +163,7 @@ class Transfer:
                 with open(partial, "ab" if continues else "wb") as out:
                     for piece in response.iter_content(_PIECE_BYTES):
                         if self.stop.is_set():
-                            raise StoppedError
+                            raise DownloadError("The download was stopped.")
                         out.write(piece)
                         self._advance(len(piece))
         except requests.RequestException as error:  # before OSError, of which it is one
