@@ -136,7 +136,7 @@ def test_there_and_back_again(model: Path, small_capture: Path, tmp_path: Path) 
 def test_nothing_is_overwritten_and_what_is_missing_is_named(
     model: Path, run: SceneFiles, small_capture: Path, tmp_path: Path
 ) -> None:
-    with pytest.raises(ManifestError, match="there are files already"):
+    with pytest.raises(ManifestError, match="model: "):
         export_colmap(run.run, run.scene, "hl", model, small_capture)
     with pytest.raises(ManifestError, match="--capture PATH/SMALL"):
         export_colmap(run.run, run.scene, "hl", tmp_path / "model")
@@ -145,7 +145,7 @@ def test_nothing_is_overwritten_and_what_is_missing_is_named(
     changed = Path(shutil.copytree(small_capture, tmp_path / small_capture.name))
     images = changed / "sessions" / "hl_map" / "images.txt"
     images.write_text("\n".join(images.read_text().splitlines()[:-1]) + "\n")
-    with pytest.raises(ArtifactError, match="of the map is not in it"):
+    with pytest.raises(ArtifactError, match=r"hl_map: image hl_map/raw_data/"):
         export_colmap(run.run, run.scene, "hl", tmp_path / "model", changed)
     assert not (tmp_path / "model").exists()
 
@@ -168,15 +168,15 @@ def test_retrieval_becomes_a_list_of_pairs(tmp_path: Path) -> None:
     assert CliRunner().invoke(app, command).exit_code == 0
     assert (tmp_path / "p.txt").read_text() == lines[0]
     path.write_text(json.dumps(row | {"path": "PLACE/sessions/hl query/1.jpg"}))
-    with pytest.raises(ArtifactError, match=r"hloc's lists cannot hold the space in 'hl query/1\.jpg'"):
+    with pytest.raises(ArtifactError, match=r"_query_hl\.jsonl: .*'hl query/1\.jpg'"):
         export_pairs(tmp_path, "PLACE", "ios", "hl", tmp_path / "pairs.txt")
     path.write_text("{}\n")
-    with pytest.raises(ArtifactError, match=r"_query_hl\.jsonl, line 1: not a retrieval row"):
+    with pytest.raises(ArtifactError, match=r"_query_hl\.jsonl, line 1: "):
         export_pairs(tmp_path, "PLACE", "ios", "hl", tmp_path / "pairs.txt")
     path.write_text(json.dumps(row | {"path": "hl_query/1.jpg"}) + "\n")
-    with pytest.raises(ArtifactError, match=r"expected images as SCENE/sessions/.*found 'hl_query/1\.jpg'"):
+    with pytest.raises(ArtifactError, match=r"_query_hl\.jsonl: .*'hl_query/1\.jpg'"):
         export_pairs(tmp_path, "PLACE", "ios", "hl", tmp_path / "pairs.txt")
-    with pytest.raises(ArtifactError, match=r"No references: .* is missing"):
+    with pytest.raises(ArtifactError, match=r"_map_hl_query_hl\.jsonl"):
         export_pairs(tmp_path, "PLACE", "hl", "hl", tmp_path / "pairs.txt")
 
 

@@ -142,13 +142,13 @@ def test_images_of_a_model_that_cannot_be_used_are_rows(model: Path, tmp_path: P
     assert len((session / "proc" / "import.csv").read_text().splitlines()) == 6
     assert check_capture(tmp_path / "PLACE").ok
     (photos / "rig" / "5.jpg").unlink()
-    with pytest.raises(CaptureError, match=r"none of 5 images can be imported\. First: phone/1\.jpg: no such file"):
+    with pytest.raises(CaptureError, match=r"phone/1\.jpg: no such file"):
         import_colmap(model, photos, tmp_path / "OTHER")
     assert not list((tmp_path / "OTHER").rglob("*"))
 
 
 def test_a_folder_without_a_model_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(CaptureError, match="no COLMAP model can be read here"):
+    with pytest.raises(CaptureError, match=f"^{tmp_path}: "):
         import_colmap(tmp_path, tmp_path, tmp_path / "PLACE")
 
 
@@ -156,7 +156,7 @@ def test_a_model_with_an_empty_file_is_refused(model: Path, tmp_path: Path) -> N
     (tmp_path / "binary").mkdir()
     pycolmap.Reconstruction(str(model)).write_binary(str(tmp_path / "binary"))
     (tmp_path / "binary" / "points3D.bin").write_bytes(b"")
-    with pytest.raises(CaptureError, match="no COLMAP model can be read here"):
+    with pytest.raises(CaptureError, match=r"points3D\.bin"):
         import_colmap(tmp_path / "binary", tmp_path / "photos", tmp_path / "PLACE")
 
 
@@ -208,15 +208,15 @@ def test_cameras_come_from_a_file_or_the_table(folder: Path, tmp_path: Path) -> 
     cams = report.images.set_index("image")["camera"]
     assert cams["a/2.jpg"] == cams["a/10.png"] == "SIMPLE_RADIAL, 64, 48, 40.0, 32.0, 24.0, 0.01"
     assert report.images["sensor_id"].nunique() == 2
-    with pytest.raises(CaptureError, match=r"cameras\.txt has 2 cameras; give a table"):
+    with pytest.raises(CaptureError, match=r"cameras\.txt has 2 cameras"):
         import_images(folder, tmp_path / "TWO", cameras=cameras)
     table.write_text("image,camera_id\na/2.jpg,9\n")
-    with pytest.raises(CaptureError, match=r"t\.csv, line 2: camera_id '9' is not in cameras\.txt \(there: 3, 8\)"):
+    with pytest.raises(CaptureError, match=r"t\.csv, line 2: camera_id '9' .*3, 8"):
         import_images(folder, tmp_path / "TWO", table=table, cameras=cameras)
     table.write_text("image,model,width,height,params\na/2.jpg,PINHOLE,64,48,50 51 32 24\n")
     assert len(import_images(folder, tmp_path / "TWO", table=table).images) == 1
     table.write_text("image,model,width,height,params\n\na/2.jpg,PINHOLE,64,48,50 51 32\n")
-    with pytest.raises(CaptureError, match=r"t\.csv, line 3: found 3 parameters for model PINHOLE"):
+    with pytest.raises(CaptureError, match=r"t\.csv, line 3: "):
         import_images(folder, tmp_path / "THREE", table=table)
     cameras.write_text("1 PINHOLE 64 48 x 51 32 24\n")
     with pytest.raises(CaptureError, match=r"cameras\.txt, line 1: "):
@@ -299,14 +299,14 @@ def test_names_that_the_format_cannot_hold_are_left_out(folder: Path, tmp_path: 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("name,qw\n", r"unknown column 'name'"),
-        ("image,qw,qx,qy,qz,tx,ty\n", r"column 'tz' is missing"),
-        ("qw,qx,qy,qz,tx,ty,tz\n", r"column 'image' is missing"),
-        ("image,qw,qx,qy,qz,tx,ty,tz\n\na/2.jpg,1,0,0,0,0,0,nan\n", r"t\.csv, line 3: found the pose 1, 0.* nan"),
-        ("image,qw,qx,qy,qz,tx,ty,tz\na/2.jpg,1,1,0,0,0,0,0\n", r"line 2: found the pose .*length 1"),
-        ("image\na/2.jpg\na/2.jpg\n", r"line 3: image 'a/2\.jpg' again"),
-        ("image\na/2.jpg\n", r"A map needs poses"),
-        ("", r"cannot be read as a CSV table"),
+        ("name,qw\n", r"t\.csv: .*'name'"),
+        ("image,qw,qx,qy,qz,tx,ty\n", r"t\.csv: .*'tz'"),
+        ("qw,qx,qy,qz,tx,ty,tz\n", r"t\.csv: .*'image'"),
+        ("image,qw,qx,qy,qz,tx,ty,tz\n\na/2.jpg,1,0,0,0,0,0,nan\n", r"t\.csv, line 3: .* nan"),
+        ("image,qw,qx,qy,qz,tx,ty,tz\na/2.jpg,1,1,0,0,0,0,0\n", r"t\.csv, line 2: "),
+        ("image\na/2.jpg\na/2.jpg\n", r"t\.csv, line 3: .*'a/2\.jpg'"),
+        ("image\na/2.jpg\n", r"qw, qx, qy, qz, tx, ty, tz"),
+        ("", r"t\.csv: "),
     ],
 )
 def test_malformed_tables_are_refused(folder: Path, tmp_path: Path, text: str, message: str) -> None:
@@ -321,16 +321,16 @@ def test_wrong_choices_name_the_known_ones_and_nothing_is_overwritten(folder: Pa
         with pytest.raises(ManifestError, match="Known: "):
             import_images(folder, tmp_path / "PLACE", camera=CAMERA, **options)
     for device in ("../drone", "", "my drone", "a/b"):
-        with pytest.raises(ManifestError, match="expected small letters, digits"):
+        with pytest.raises(ManifestError, match="device: "):
             import_images(folder, tmp_path / "PLACE", device=device, camera=CAMERA)
     assert not (tmp_path / "PLACE").exists()
     import_images(folder, tmp_path / "PLACE", camera=CAMERA)
-    with pytest.raises(CaptureError, match="ios_query exists already"):
+    with pytest.raises(CaptureError, match="ios_query"):
         import_images(folder, tmp_path / "PLACE", camera=CAMERA)
-    with pytest.raises(CaptureError, match="no such folder of images"):
+    with pytest.raises(CaptureError, match="nowhere: "):
         import_images(tmp_path / "nowhere", tmp_path / "OTHER")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(CaptureError, match="no image in or below it"):
+    with pytest.raises(CaptureError, match="empty: "):
         import_images(tmp_path / "empty", tmp_path / "OTHER")
 
 

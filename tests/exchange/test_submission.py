@@ -174,7 +174,7 @@ def test_scenes_may_be_in_several_runs(run: Path, tmp_path: Path, captures: list
     assert len(submission.missing) == 9  # the challenge's second scene is expected, though no run has it
     assert not collect([run, other], "Ours.").missing
     make_poses(other, "HYDRO", "ios", "ios")
-    with pytest.raises(ArtifactError, match=r"Two runs .*run/HYDRO/.*_ios\.txt and .*other/HYDRO/.*Give one"):
+    with pytest.raises(ArtifactError, match=r"run/HYDRO/.*_ios\.txt .*other/HYDRO/"):
         collect([run, other])
 
 
@@ -184,9 +184,9 @@ def test_another_scene_has_the_pairs_of_its_capture(tmp_path: Path) -> None:
     submission = collect([tmp_path / "run"], captures=[capture])
     assert len(submission.entries) == 9
     assert len(submission.missing) == 8
-    with pytest.raises(ManifestError, match=r"HOME: the runs do not say where .*--capture PATH/HOME"):
+    with pytest.raises(ManifestError, match=r"HOME: .*--capture PATH/HOME"):
         collect([tmp_path / "run"])
-    with pytest.raises(ManifestError, match=r"No such capture folder.*--capture PATH/HOME"):
+    with pytest.raises(ManifestError, match=r"moved/HOME.*--capture PATH/HOME"):
         collect([tmp_path / "run"], captures=[tmp_path / "moved" / "HOME"])
 
 
@@ -202,10 +202,10 @@ def test_poses_that_nobody_asked_for_are_not_written(run: Path, tmp_path: Path, 
 @pytest.mark.parametrize(
     ("lines", "error", "message"),
     [
-        (["100, s/phone, 1, 0, 0, 0, nan, 0, 0"], CaptureError, r"_query_ios\.txt, line 1: found tx = 'nan'"),
-        (["100, s/phone, 1, 0, 0"], CaptureError, r"line 1: found 5 values"),
-        (["100, s/phone, 1, 1, 0, 0, 0, 0, 0"], ArtifactError, r"line 1: \(timestamp 100, device 's/phone'\) has a"),
-        (["# x", *["100, s/phone, 1, 0, 0, 0, 0, 0, 0"] * 2], ArtifactError, r"line 3: .*100.* is there twice"),
+        (["100, s/phone, 1, 0, 0, 0, nan, 0, 0"], CaptureError, r"_query_ios\.txt, line 1: .*tx = 'nan'"),
+        (["100, s/phone, 1, 0, 0"], CaptureError, r"_query_ios\.txt, line 1: "),
+        (["100, s/phone, 1, 1, 0, 0, 0, 0, 0"], ArtifactError, r"line 1: .*100, device 's/phone'"),
+        (["# x", *["100, s/phone, 1, 0, 0, 0, 0, 0, 0"] * 2], ArtifactError, r"_query_ios\.txt, line 3: .*100"),
     ],
 )
 def test_malformed_poses_are_refused_with_file_line_and_key(
@@ -220,20 +220,20 @@ def test_malformed_poses_are_refused_with_file_line_and_key(
 def test_a_list_with_a_key_twice_is_refused(run: Path, captures: list[Path]) -> None:
     path = captures[0] / "sessions" / "ios_query" / "proc" / f"{LIST}.txt"
     path.write_text("100, s/phone\n100, s/phone\n")
-    with pytest.raises(CaptureError, match=r"ios_query: list .* \(timestamp 100, device 's/phone'\) twice"):
+    with pytest.raises(CaptureError, match=r"ios_query: .*\(timestamp 100, device 's/phone'\)"):
         collect([run])
 
 
 def test_wrong_values_name_the_known_ones(run: Path, tmp_path: Path) -> None:
-    with pytest.raises(ManifestError, match=r"unknown choice 'guess'\. Known: nearest, leave-out"):
+    with pytest.raises(ManifestError, match=r"'guess'.* nearest, leave-out"):
         collect([run], failed="guess")
-    with pytest.raises(ManifestError, match="nowhere: no such run folder"):
+    with pytest.raises(ManifestError, match="nowhere: "):
         collect([tmp_path / "nowhere"])
-    with pytest.raises(ManifestError, match="no poses in it"):
+    with pytest.raises(ManifestError, match="data: "):
         collect([tmp_path / "data"])
-    with pytest.raises(CaptureError, match="no keyframe list 'few'; available: pruned_subsampled, all"):
+    with pytest.raises(CaptureError, match=r"'few'.* pruned_subsampled, all"):
         collect([run], queries="few")
-    with pytest.raises(ManifestError, match=r"desc\.txt: no such file"):
+    with pytest.raises(ManifestError, match=r"desc\.txt: "):
         collect([run], str(tmp_path / "desc.txt"))
 
 
@@ -246,7 +246,7 @@ def test_a_damaged_table_of_queries_is_named(run: Path, text: str) -> None:
 
 
 def test_a_capture_that_is_of_no_scene_is_refused(run: Path, tmp_path: Path) -> None:
-    with pytest.raises(ManifestError, match=r"HYDRA: a capture of another name than the scene\. Expected HYDRO, SUCC"):
+    with pytest.raises(ManifestError, match=r"HYDRA: .* HYDRO, SUCC"):
         collect([run], captures=[tmp_path / "HYDRA"])
 
 
@@ -264,7 +264,7 @@ def test_a_place_that_cannot_be_written_is_one_paragraph(
 def test_nothing_to_submit_is_an_error(run: Path) -> None:
     for path in run.glob("*/poses/*.txt"):
         path.unlink()
-    with pytest.raises(ToolkitError, match="none of the 18 pairs has poses"):
+    with pytest.raises(ToolkitError, match="18 pairs"):
         collect([run], "Ours.").write()
 
 
