@@ -1,4 +1,4 @@
-"""Sessions as other data sets name them, brought into the names and the split by device of the capture format.
+"""Rename and split the sessions of other data sets as the capture format has them.
 
 LaMAR (Sarlin, Dusmanu et al., ECCV 2022) has one session `map` of phones and headsets together, and lists its queries
 in `queries.txt`; here a session is of one device, and lists of queries are `proc/keyframes_*.txt`.
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from toolkit.errors import CaptureError
 
-# Files of a session, with the column that begins with the subsession: `<subsession>/<sensor>`.
+# Files of a session, with the column whose values begin with the subsession: `<subsession>/<sensor>`.
 _KEY_COLUMNS = {
     "sensors.txt": 0,
     "rigs.txt": 0,
@@ -27,14 +27,14 @@ _KEY_COLUMNS = {
 
 
 def arrange(sessions: str | Path, names: Mapping[str, str]) -> list[str]:
-    """Give sessions the names that they have here, and split one that several devices share.
+    """Rename the sessions of a data set, and split by device a session that several names stand for.
 
-    A session that is named for several is split by its subsessions, whose names begin with `<device>_`. A list
-    `queries.txt` becomes `proc/keyframes_original.txt`. Images are moved, not copied.
+    A session is split by its subsessions, whose names begin with `<device>_`. A list `queries.txt` becomes
+    `proc/keyframes_original.txt`. Images are moved, not copied.
 
     Args:
-        sessions: folder of the sessions; changed in place. What `names` does not have stays.
-        names: for each session's name here, `<device>_<map or query>`, its name there.
+        sessions: folder of the sessions; changed in place. A session that `names` does not have stays as it is.
+        names: for each new name, `<device>_<map or query>`, the session's name in the data set.
 
     Returns:
         What was left out, in words.
@@ -44,45 +44,43 @@ def arrange(sessions: str | Path, names: Mapping[str, str]) -> list[str]:
     """
     sessions = Path(sessions)
     notes = []
-    for there in dict.fromkeys(names.values()):
-        old = sessions / there
-        heirs = [name for name, source in names.items() if source == there]
-        if not old.is_dir() or heirs == [there]:
+    for old_name in dict.fromkeys(names.values()):
+        old = sessions / old_name
+        new = [sessions / name for name, source in names.items() if source == old_name]
+        if not old.is_dir() or new == [old]:
             continue
-        if len(heirs) == 1:
-            old.rename(sessions / heirs[0])
+        if len(new) == 1:
+            old.rename(new[0])
         else:
-            notes += _split(old, [sessions / heir for heir in heirs])
-        for heir in heirs:
-            queries = sessions / heir / "queries.txt"
-            if queries.is_file():
-                keyframes = sessions / heir / "proc" / "keyframes_original.txt"
-                keyframes.parent.mkdir(exist_ok=True)
-                shutil.copyfile(queries, keyframes)
+            notes += _split(old, new)
+        for session in new:
+            if (session / "queries.txt").is_file():
+                (session / "proc").mkdir(exist_ok=True)
+                shutil.copyfile(session / "queries.txt", session / "proc" / "keyframes_original.txt")
     return notes
 
 
-def _split(old: Path, heirs: list[Path]) -> list[str]:
-    subsessions = _subsessions(old)
-    unclaimed = set(subsessions)
-    for heir in heirs:
-        device = heir.name.rpartition("_")[0]
+def _split(old: Path, new: list[Path]) -> list[str]:
+    """Split a session into one of each device; return what was left out."""
+    unclaimed = subsessions = set(_subsessions(old))
+    for session in new:
+        device = session.name.rpartition("_")[0]
         own = {name for name in subsessions if name.startswith(f"{device}_")}
         if not own:
             raise CaptureError(
                 f"{old.name}: has no subsession of device {device!r}, whose names begin with {device}_; found "
-                f"{', '.join(subsessions[:3]) or 'none'}. Take {heir.name} out of dataset.sessions."
+                f"{', '.join(sorted(subsessions)[:3]) or 'none'}. Take {session.name} out of dataset.sessions."
             )
-        unclaimed -= own
+        unclaimed = unclaimed - own
         for file, column in _KEY_COLUMNS.items():
             if (old / file).is_file():
-                _copy_rows(old / file, heir / file, column, own)
-        for name in sorted(own):
+                _copy_rows(old / file, session / file, column, own)
+        for name in own:
             if (old / "raw_data" / name).is_dir():
-                (heir / "raw_data").mkdir(parents=True, exist_ok=True)
-                (old / "raw_data" / name).rename(heir / "raw_data" / name)
-    known = {old / file for file in _KEY_COLUMNS}
-    others = [path for path in old.rglob("*") if path.is_file() and path not in known]
+                (session / "raw_data").mkdir(parents=True, exist_ok=True)
+                (old / "raw_data" / name).rename(session / "raw_data" / name)
+    split = {old / file for file in _KEY_COLUMNS}
+    others = [path for path in old.rglob("*") if path.is_file() and path not in split]
     shutil.rmtree(old)
     notes = []
     if unclaimed:

@@ -55,18 +55,18 @@ def download(
 
     Args:
         manifest_path: YAML file with `captures` and a section `dataset`, see `toolkit.manifest`.
-        sessions: only these, of those of the manifest.
+        sessions: only these of the manifest's sessions.
         keep_archives: keep archives in `<capture>/.download/archives` after they are unpacked.
         dry_run: list what would be fetched, and write nothing.
-        overrides: `key=value` or `section.key=value`, replacing what the manifest says.
-        say: takes the lines of the report; called like `print`.
+        overrides: `key=value` or `section.key=value`, in place of the manifest's values.
+        say: called with each line of the report, like `print`.
 
     Returns:
-        For each capture, what the check found; nothing on a dry run.
+        For each capture, the report of the check; nothing on a dry run.
 
     Raises:
         ManifestError: the manifest does not say where its captures are, or has no such session.
-        DownloadError: what is wrong, and what to do. The same command then goes on where it was.
+        DownloadError: something cannot be fetched, unpacked or stored. The same command goes on where it was.
     """
     manifest = load_manifest(manifest_path, overrides)
     dataset = manifest.dataset
@@ -78,7 +78,7 @@ def download(
     for name in sessions:
         if name not in dataset.session_names:
             raise ManifestError(f"--sessions {name}: no such session. {nearest(name, dataset.session_names)}")
-    names = {name: there for name, there in dataset.session_names.items() if not sessions or name in sessions}
+    names = {name: source for name, source in dataset.session_names.items() if not sessions or name in sessions}
     folders = {Path(capture).name: Path(capture) for capture in manifest.captures}
     if without := [name for name in folders if name not in dataset.sources]:
         if len(without) == len(folders):
@@ -117,7 +117,7 @@ def is_unfinished(capture: Path) -> bool:
 
 @dataclass
 class _CaptureDownload:
-    """The download of one capture: what there is to fetch, what is here already, and the way from one to the other."""
+    """The download of one capture: the files of its source, those that are here already, and the steps between."""
 
     folder: Path
     """The capture's folder."""
@@ -142,14 +142,14 @@ class _CaptureDownload:
     # What there is to fetch
 
     def list_files(self) -> None:
-        """Ask the source for its files, and choose those that are wanted."""
+        """Ask the source for its files, and choose those of the wanted sessions."""
         for file in self._list_hub(self.source.hub) if self.source.hub else self._list_urls():
             (self.files if self.source.urls or self._wants(file.path) else self.left_out).append(file)
         if not self.files:
-            there = {_session_of(file.path, ()) or file.path.partition("/")[0] for file in self.left_out}
+            listed = {_session_of(file.path, ()) or file.path.partition("/")[0] for file in self.left_out}
             raise DownloadError(
                 f"{self.folder.name}: {self.origin} has no file for {', '.join(self.names.values())}. Found there: "
-                f"{', '.join(sorted(there)[:20]) or 'nothing'}. Correct `dataset.sessions` or `dataset.into`."
+                f"{', '.join(sorted(listed)[:20]) or 'nothing'}. Correct `dataset.sessions` or `dataset.into`."
             )
 
     def _list_hub(self, repo: str) -> list[RemoteFile]:
@@ -191,7 +191,7 @@ class _CaptureDownload:
 
     @property
     def _access(self) -> str:
-        """What to do where the server does not let one in."""
+        """What to do if the server refuses access."""
         if self.source.hub:
             return (
                 f"Look at {self.page} in a browser: accept the terms if it has some, make a token (Settings, Access "
@@ -205,13 +205,13 @@ class _CaptureDownload:
         )
 
     def _wants(self, path: str) -> bool:
-        """Tell whether a file with this path in the capture is to be fetched, or to be taken from an archive."""
+        """Tell whether the download needs the file with this path in the capture."""
         return _session_of(path, self.names.values()) in self.names.values() or any(
             fnmatch.fnmatchcase(path, pattern) for pattern in self.dataset.include
         )
 
     def describe(self, in_full: bool) -> None:
-        """Say what is fetched from where, under which license; `in_full` lists each file."""
+        """Say what is fetched, from where, and under which license; `in_full` lists each file."""
         self.say(f"{self.folder.name}: {self.origin}\n  to        {self.folder}\n  license   {self.dataset.license}")
         if self.dataset.citation:
             self.say(f"  cite      {self.dataset.citation}")
@@ -227,7 +227,7 @@ class _CaptureDownload:
         for file in self.files if in_full else ():
             self.say(f"    {size_text(file.size):>9}  {file.path}")
 
-    # What is here already
+    # What has been fetched before
 
     def _read_done(self) -> dict[str, dict[str, Any]]:
         done: dict[str, dict[str, Any]] = {}
@@ -239,7 +239,7 @@ class _CaptureDownload:
             try:
                 row = json.loads(line)
             except ValueError:
-                continue  # a kill tore the last line: what it said is looked at again
+                continue  # a kill tore this line: its file counts as not done, and is looked at again
             done[row["path"]] = row
         return done
 
@@ -249,7 +249,7 @@ class _CaptureDownload:
             stream.write("\n" + json.dumps(row))  # the break comes first: a kill may have torn the line above
 
     def is_done(self, file: RemoteFile) -> bool:
-        """Tell whether a file has been fetched before, and it, or what came out of it, is still there."""
+        """Tell whether a file has been fetched before, and is still there; of an archive, what was unpacked from it."""
         row = self.done.get(file.path, {})
         if row.get("version") != file.version:
             return False
@@ -263,12 +263,12 @@ class _CaptureDownload:
         return _file_size(self._archive(file)) or _file_size(self._partial(file)) or 0
 
     def _sessions_in(self, archive: RemoteFile) -> list[str]:
-        """Return the wanted sessions, by their names here, that an archive may hold."""
-        own = _session_of(archive.path, self.names.values())
-        return sorted(name for name, there in self.names.items() if own in (None, there))
+        """Return the wanted sessions, by their names in the capture, that an archive may hold."""
+        session = _session_of(archive.path, self.names.values())
+        return sorted(name for name, name_in_source in self.names.items() if session in (None, name_in_source))
 
     def _partial(self, file: RemoteFile) -> Path:
-        # Another version has another name, so that no file is put together from two.
+        # Another version has another name, so that no file is put together from two versions.
         return self.state / "partial" / fingerprint([file.path, file.version])
 
     def _archive(self, file: RemoteFile) -> Path:
@@ -398,7 +398,7 @@ class _CaptureDownload:
             archive.unlink()
 
     def check(self) -> "CheckReport":
-        """Check the capture, say what was found, and raise if a wanted session is not in it."""
+        """Check the capture, report the result, and raise if a wanted session is not in it."""
         from toolkit.capture.check import check_capture
 
         report = check_capture(self.folder)
@@ -413,7 +413,7 @@ class _CaptureDownload:
 
 
 def _require_space_for(captures: list[_CaptureDownload]) -> None:
-    """Refuse, before anything is fetched, what the disks cannot hold: archives are there packed and unpacked."""
+    """Refuse, before anything is fetched, what the disks cannot hold: archives take space packed and unpacked."""
     needed: Counter[int] = Counter()
     places: dict[int, Path] = {}
     for capture in captures:
@@ -422,14 +422,14 @@ def _require_space_for(captures: list[_CaptureDownload]) -> None:
         places.setdefault(disk, place)
         missing = [file for file in capture.files if not capture.is_done(file)]
         packed = [file.size or 0 for file in missing if file.is_archive]
-        # Photographs hardly shrink in an archive; what one really takes is looked at before it is unpacked.
+        # Photographs hardly shrink in an archive. The true size is compared with the disk before it is unpacked.
         needed[disk] += sum(packed) if capture.keep_archives else max(packed, default=0)
         needed[disk] += sum((file.size or 0) - capture.count_fetched(file) for file in missing)
     for disk, count in needed.items():
         require_space(places[disk], count, "fetch fewer sessions at once (--sessions)")
 
 
-def _session_of(path: str, known: Iterable[str]) -> str | None:
+def _session_of(path: str, sessions: Iterable[str]) -> str | None:
     """Return the session in whose folder a file lies, or whose name an archive in `sessions/` begins with."""
     parts = path.split("/")
     if parts[0] != "sessions" or len(parts) < 2:
@@ -437,7 +437,7 @@ def _session_of(path: str, known: Iterable[str]) -> str | None:
     if len(parts) > 2:
         return parts[1]
     stem = parts[1][:-4] if parts[1].lower().endswith(".zip") else ""
-    return next((name for name in known if re.match(re.escape(name) + r"([._-]|$)", stem)), stem or None)
+    return next((name for name in sessions if re.match(re.escape(name) + r"([._-]|$)", stem)), stem or None)
 
 
 def _move_into(source: Path, target: Path) -> list[str]:
@@ -453,7 +453,7 @@ def _move_into(source: Path, target: Path) -> list[str]:
 
 @contextmanager
 def _disk_errors(folder: Path) -> Iterator[None]:
-    """Say what to do about a disk that is full, or that cannot be written."""
+    """Turn errors of the disk into a message that says what to do."""
     try:
         yield
     except OSError as error:
