@@ -221,7 +221,7 @@ def test_the_token_goes_to_the_hub_alone(hub: FakeHub, manifest: Path, monkeypat
     assert set(hub.tokens) == {"Bearer hf_made_up"}
     hub.healthy()
     hub.plain["/place/PLACE.zip"] = zipped({f"PLACE/sessions/{path}": body for path, body in capture_files().items()})
-    elsewhere = f"dataset.sources.PLACE={{urls: ['{hub.url}/place/PLACE.zip']}}"
+    elsewhere = f"dataset.sources.PLACE={{hub: null, urls: ['{hub.url}/place/PLACE.zip']}}"
     shutil.rmtree(manifest.parent / "captures")
     download(manifest, overrides=[elsewhere])
     assert found(manifest.parent) == capture_files()
@@ -332,7 +332,7 @@ def test_a_server_says_how_long_to_wait(headers: dict[str, str], seconds: int) -
 def test_archives_elsewhere_that_are_not_open_to_all(hub: FakeHub, manifest: Path, status: int) -> None:
     hub.plain["/place/PLACE.zip"] = b""
     hub.statuses["PLACE.zip"] = [status]
-    message = failure(manifest, overrides=[f"dataset.sources.PLACE={{urls: ['{hub.url}/place/PLACE.zip']}}"])
+    message = failure(manifest, overrides=[f"dataset.sources.PLACE={{hub: null, urls: ['{hub.url}/place/PLACE.zip']}}"])
     assert f"HTTP {status}. See https://example.org/place for how to get access" in message
     assert "`dataset.sources.PLACE.urls`" in message
 
@@ -656,14 +656,14 @@ def test_a_listing_that_leads_out(hub: FakeHub, manifest: Path) -> None:
 def test_a_damaged_archive_elsewhere_is_fetched_again(hub: FakeHub, manifest: Path) -> None:
     right = zipped({f"sessions/{path}": body for path, body in capture_files().items()})
     hub.plain["/PLACE.zip"] = right[:-30] + bytes(30)
-    options = [f"dataset.sources.PLACE={{urls: ['{hub.url}/PLACE.zip']}}"]
+    options = [f"dataset.sources.PLACE={{hub: null, urls: ['{hub.url}/PLACE.zip']}}"]
     assert "not a whole zip archive" in failure(manifest, overrides=options)
     hub.plain["/PLACE.zip"] = right
     download(manifest, overrides=options)
     assert found(manifest.parent) == capture_files()
     shutil.rmtree(manifest.parent / "captures")
-    source = f"dataset.sources.PLACE={{urls: ['{hub.url}/PLACE.zip'], sha256: {{PLACE.zip: '{'0' * 64}'}}}}"
-    assert "wrong checksum, expected sha256:0000" in failure(manifest, overrides=[source])
+    options += [f"dataset.sources.PLACE.sha256={{PLACE.zip: '{'0' * 64}'}}"]
+    assert "wrong checksum, expected sha256:0000" in failure(manifest, overrides=options)
 
 
 # LaMAR
