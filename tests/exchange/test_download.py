@@ -314,20 +314,6 @@ def test_a_server_that_is_busy_is_asked_again(hub: FakeHub, manifest: Path) -> N
     assert_recovers(hub, manifest)
 
 
-@pytest.mark.parametrize(
-    ("headers", "seconds"),
-    [
-        ({"Retry-After": "17"}, 17),
-        ({"RateLimit": '"resolvers";r=0;t=123'}, 123),
-        ({"Retry-After": "99999"}, 330),
-        ({"Retry-After": "Wed, 21 Oct 2026 07:28:00 GMT"}, 0),
-        ({}, 0),
-    ],
-)
-def test_a_server_says_how_long_to_wait(headers: dict[str, str], seconds: int) -> None:
-    assert transfer._requested_wait_s(SimpleNamespace(headers=headers)) == seconds  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize("status", [401, 404])
 def test_archives_elsewhere_that_are_not_open_to_all(hub: FakeHub, manifest: Path, status: int) -> None:
     hub.plain["/place/PLACE.zip"] = b""
