@@ -6,18 +6,16 @@ import pyarrow as pa
 import pycolmap
 import pytest
 
+from tests.localized import write_queries
 from toolkit.capture import Capture, Trajectory, write_depth, write_session
 from toolkit.errors import ArtifactError, CaptureError
 from toolkit.geometry import make_pose, quaternion_to_rotation
+from toolkit.localizers.correspondences import LocalizedQuery
 from toolkit.localizers.mapping import LocalMap
-from toolkit.show.localization_view import Localizations, QueryDetails, ShownImage, record_localizations
-from toolkit.show.recordings import (
-    record_session,
-    session_tracks,
-    shown_intrinsics,
-    small_jpeg,
-    spawn_viewer,
-)
+from toolkit.show.localization_view import record_localizations
+from toolkit.show.localized import Localizations, QueryDetails, ShownImage
+from toolkit.show.recordings import record_session, session_tracks
+from toolkit.show.viewer import shown_intrinsics, small_jpeg, spawn_viewer
 
 START = 93_003_175_602  # microseconds, as captures count them
 
@@ -128,7 +126,7 @@ def map_dir(tmp_path_factory):
     local_map = LocalMap(
         ["a", "b", "c"], [camera] * 3, poses, points, colors, images, keypoints, observed, noise_px
     )
-    local_map.save(folder / "hl_map.npz")
+    local_map.save(folder / "hl_map-superpoint.npz")
     return folder
 
 
@@ -210,9 +208,9 @@ def test_queries_stand_where_a_trajectories_file_says(capture, map_dir, tmp_path
     file = tmp_path / "PLACE_map_hl_query_hl.txt"
     Trajectory.from_poses(truth.timestamps[1:3], truth.device_ids[1:3], estimated).write(file)
     names = [Capture.open(capture)["hl_map"].image_name(row) for row in (0, 4)]
-    table = pd.DataFrame({"timestamp": truth.timestamps[1:3], "device_id": truth.device_ids[1:3]})
-    table["references"] = [";".join(names), ""]
-    table.to_csv(file.with_suffix(".csv"), index=False)
+    keys = zip(truth.timestamps[1:3].tolist(), truth.device_ids[1:3].tolist(), strict=True)
+    queries = dict(zip(keys, [LocalizedQuery(references=names), LocalizedQuery()], strict=True))
+    write_queries(file.with_suffix(".h5"), queries, ["hl_map-superpoint.npz"])
     asked = {"queries_pose": file, "vis_retrieve_queries": True, "map_dir": map_dir, "progress": False}
     done = record_session(capture, "query", "hl", out=tmp_path / "query.rrd", **asked)
     assert (done.images, done.unposed, done.points) == (8, 4, 1)
@@ -250,7 +248,7 @@ def test_a_folder_without_the_map_is_said(capture, tmp_path):
 
 def test_the_viewer_is_opened_when_asked_for(capture, tmp_path, monkeypatch):
     opened = []
-    monkeypatch.setattr("toolkit.show.recordings.subprocess.Popen", lambda command, **_: opened.append(command))
+    monkeypatch.setattr("toolkit.show.viewer.subprocess.Popen", lambda command, **_: opened.append(command))
     record_session(capture, "map", "ios", spawn=True, out=tmp_path / "a.rrd", progress=False)
     spawn_viewer("b.rrd")
     assert [command[-1] for command in opened] == [str(tmp_path / "a.rrd"), "b.rrd"]
@@ -280,12 +278,15 @@ def test_a_localization_view_holds_the_queries(capture, tmp_path):
     true[3] = np.nan
     references = np.full((4, 3), np.nan)
     references[2] = [7, 8, 9]
-    queries = Localizations(list("abcd"), ["ok", "ok", "failed: dark", "ok"], estimated, true, [9, 8, 0, 7], references)
+    table = pd.DataFrame({"status": ["ok", "ok", "failed: dark", "ok"], "num_inliers": [9, 8, 0, 7]})
+    queries = Localizations(list("abcd"), table, estimated, true, references)
     assert queries.worst_first().tolist() == [2, 1, 0, 3]
     points = rng.uniform([-0.3, -0.3, 2], [0.3, 0.3, 4], (6, 3))
     pixels = rng.uniform(0, 90, (6, 2))
-    shown = ShownImage("b.jpg", file, camera, estimated[1], pixels, points + estimated[1, :3, 3], np.arange(6))
-    reference = ShownImage("r.jpg", file, camera, map_poses[0], pixels[:2], shown.points[:2], np.arange(2))
+    inlier = np.arange(6) < 5
+    placed = points + estimated[1, :3, 3]
+    shown = ShownImage("b.jpg", file, camera, estimated[1], pixels, placed, np.arange(6), inlier, true[1])
+    reference = ShownImage("r.jpg", file, camera, map_poses[0], pixels[:2], placed[:2], np.arange(2), inlier[:2])
     lost = ShownImage("c.jpg", file, camera, np.full((4, 4), np.nan))
     details = [(1, QueryDetails([shown], [reference])), (2, QueryDetails([lost], [reference]))]
     path = record_localizations(
@@ -307,10 +308,16 @@ def test_a_localization_view_holds_the_queries(capture, tmp_path):
     assert [row[0] for row in images] == [1, 2]
     (index, _, marks), (_, _, none) = logged(found["/world/chosen/camera_0/marks/reprojected"], "Points2D:positions")
     assert (index, none) == (1, [])  # nothing of the last query stays on a failed one
-    wanted = camera.img_from_cam(points) / 2
+    wanted = camera.img_from_cam(points[:5]) / 2
     np.testing.assert_allclose(marks, wanted, atol=1e-4)
     (_, _, measured), _ = logged(found["/world/chosen/camera_0/marks/measured"], "Points2D:positions")
-    np.testing.assert_allclose(measured, pixels / 2, atol=1e-5)
+    np.testing.assert_allclose(measured, pixels[:5] / 2, atol=1e-5)
+    (_, _, rejected), _ = logged(found["/world/chosen/camera_0/marks/rejected"], "Points2D:positions")
+    np.testing.assert_allclose(rejected, pixels[5:] / 2, atol=1e-5)
+    (_, _, dots), _ = logged(found["/world/chosen_points"], "Points3D:positions")
+    np.testing.assert_allclose(dots, placed[:5], atol=1e-5)
+    (_, _, at), *_ = logged(found["/world/truth/camera_0"], "Transform3D:translation")
+    np.testing.assert_allclose(at, [true[1, :3, 3]])
     assert [row[0] for row in logged(found["/world/references/1/image"], "EncodedImage:blob")] == [1, 2]
     text = logged(found["/about"], "TextDocument:text")
     assert text[1][2][0].startswith("**query 2: c, failed: dark")
@@ -318,5 +325,5 @@ def test_a_localization_view_holds_the_queries(capture, tmp_path):
 
 def test_a_view_without_queries_points_or_map(tmp_path):
     none = np.zeros((0, 4, 4))
-    queries = Localizations([], [], none, none)
+    queries = Localizations([], pd.DataFrame({"status": np.array([], str)}), none, none)
     assert record_localizations(tmp_path / "e.rrd", "e", none, np.zeros((0, 3)), None, queries).stat().st_size > 0

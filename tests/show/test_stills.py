@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pycolmap
 import pytest
@@ -6,7 +8,7 @@ from PIL import Image
 from toolkit.capture.upright import up_of_cameras
 from toolkit.geometry import make_pose, project
 from toolkit.show.figures import error_colors
-from toolkit.show.localization_view import ShownImage
+from toolkit.show.localized import QueryDetails, ShownImage
 from toolkit.show.stills import WorstQuery, draw_localization, draw_scene_png, draw_worst
 
 CAMERA = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=[50, 50, 32, 24])
@@ -77,62 +79,62 @@ def test_scene_picture(scene, tmp_path):
 
 def test_scene_picture_without_points_truth_or_queries(scene):
     _, _, poses, estimated, _ = scene
-    assert draw_scene_png(np.zeros((0, 3)), None, poses, estimated, None, up=[0, 0, 1])
-    assert draw_scene_png(np.zeros((0, 3)), None, poses[:1], np.zeros((0, 4, 4)), None)
+    no_truth, no_queries = np.full_like(estimated, np.nan), np.zeros((0, 4, 4))
+    assert draw_scene_png(np.zeros((0, 3)), None, poses, estimated, no_truth, up=[0, 0, 1])
+    assert draw_scene_png(np.zeros((0, 3)), None, poses[:1], no_queries, no_queries)
 
 
-def test_localization_pictures_of_success_and_failure(tmp_path):
-    rng = np.random.default_rng(0)
-    image = rng.integers(0, 255, (48, 64, 3), np.uint8)
-    points = rng.uniform([-1, -1, 3], [1, 1, 6], (20, 3))
-    keypoints, _ = project(points, CAMERA, np.eye(4))
-    inliers = np.arange(20) < 15
-    references = [(image, "reference 1"), (image[:, :30], "reference 2"), (image[..., 0], "reference 3")]
-    true = make_pose(np.eye(3), [0.02, 0, 0])
-    done = draw_localization(
-        image,
-        CAMERA,
-        np.eye(4),
-        points,
-        references,
-        tmp_path / "done.png",
-        "query 7: ok",
-        keypoints,
-        inliers,
-        true,
-    )
-    assert done.get_suptitle() == "query 7: ok · off by 0°, 2 cm"
-    assert done.axes[0].get_title() == "query: 15 of 20 map points agree"
-    for missing in (None, np.full((4, 4), np.nan)):
-        failed = draw_localization(image, CAMERA, missing, np.zeros((0, 3)), [], tmp_path / "failed.png", "query 8")
-        assert failed.axes[0].get_title() == "query: not localized"
-    assert (tmp_path / "failed.png").is_file()
-
-
-def test_the_worst_queries_are_drawn_with_the_matches_they_share_with_a_reference(tmp_path):
+@pytest.fixture
+def images(tmp_path):
+    """A query image with five matches, of which one is rejected, and a reference twice as high that sees two."""
     rng = np.random.default_rng(0)
     files = [tmp_path / "query.jpg", tmp_path / "reference.jpg"]
     Image.fromarray(rng.integers(0, 255, (48, 64, 3), np.uint8)).save(files[0])
     Image.fromarray(rng.integers(0, 255, (96, 64, 3), np.uint8)).save(files[1])
-    pixels, points = rng.uniform(0, 48, (5, 2)), rng.normal(size=(5, 3))
-    query = ShownImage("q", files[0], CAMERA, np.eye(4), pixels, points, np.array([4, 7, 1, 2, 9]))
-    reference = ShownImage("r", files[1], CAMERA, np.eye(4), pixels[:3], points[:3], np.array([9, 4, 3]))
+    points = rng.uniform([-1, -1, 3], [1, 1, 6], (5, 3))
+    pixels, _ = project(points, CAMERA, np.eye(4))
+    inlier, matches = np.array([True, True, False, True, True]), np.array([4, 7, 1, 2, 9])
+    true = make_pose(np.eye(3), [0.02, 0, 0])
+    query = ShownImage("q", files[0], CAMERA, np.eye(4), pixels, points, matches, inlier, true)
+    seen = [4, 0, 2]
+    reference = ShownImage("r", files[1], CAMERA, np.eye(4), pixels[:3], points[seen], matches[seen], inlier[seen])
+    return query, reference
+
+
+def test_localization_pictures_of_success_and_failure(images, tmp_path):
+    query, reference = images
+    references = [reference, replace(reference, name="r2")]
+    done = draw_localization(QueryDetails([query], references, references[:1]), tmp_path / "done.png", "query 7: ok")
+    assert done.get_suptitle() == "query 7: ok · off by 0°, 2 cm"
+    titles = ["query: 4 of 5 map points agree", *(f"reference {k}: 2 inliers" for k in (1, 2))]
+    assert [axis.get_title() for axis in done.axes] == [*titles, "rejected: contradicts the others"]
+    lost = QueryDetails([ShownImage("q", query.path, CAMERA, np.full((4, 4), np.nan))])
+    failed = draw_localization(lost, tmp_path / "failed.png", "query 8")
+    assert failed.axes[0].get_title() == "query: not localized"
+    assert (tmp_path / "failed.png").is_file()
+
+
+def test_the_worst_queries_are_drawn_with_the_matches_they_share_with_a_reference(images, tmp_path):
+    query, reference = images
+    gone = ShownImage("x", tmp_path / "gone.jpg", CAMERA, np.eye(4))
+    unmatched = ShownImage("q", query.path, CAMERA, np.eye(4))
     worst = [
-        WorstQuery("hl in the ios map", "failed: too few matches, 3 matches", query, None),
-        WorstQuery("hl in the ios map", "ok, 5 matches", query, reference, 2.0, 0.5),
-        WorstQuery(
-            "hl in the ios map", "ok", query, ShownImage("x", tmp_path / "gone.jpg", CAMERA, np.eye(4)), 1.0, 0.1
-        ),
+        WorstQuery("hl in the ios map", "failed: too few matches, 3 matches", QueryDetails([query])),
+        WorstQuery("hl in the ios map", "ok, 5 matches", QueryDetails([query], [reference]), 2.0, 0.5),
+        WorstQuery("hl in the ios map", "ok", QueryDetails([query], [gone]), 1.0, 0.1),
+        WorstQuery("hl in the ios map", "ok", QueryDetails([unmatched], [], [reference])),
     ]
     figure = draw_worst(worst, tmp_path / "worst.png", "the worst")
-    first, second, third = figure.axes[:3]
+    first, second, third, fourth = figure.axes[:4]
     assert first.get_title(loc="left").startswith("1. hl in the ios map: failed: too few matches")
     assert second.get_title(loc="left") == "2. hl in the ios map: off by 2°, 50 cm; ok, 5 matches"
-    lines = second.collections[0].get_segments()
-    # Points 4 and 9 are in both; the reference, twice as high, is drawn at half its size beside the query.
-    np.testing.assert_allclose([line[0] for line in lines], pixels[[0, 4]])
-    np.testing.assert_allclose([line[1] for line in lines], pixels[[1, 0]] / 2 + [64 * 1.03, 0])
+    rejected, agreeing = (c.get_segments() for c in second.collections if hasattr(c, "get_segments"))
+    # The reference, twice as high, is drawn at half its size beside the query.
+    np.testing.assert_allclose([line[0] for line in agreeing], query.pixels[[0, 4]])
+    np.testing.assert_allclose([line[1] for line in agreeing], reference.pixels[[1, 0]] / 2 + [64 * 1.03, 0])
+    np.testing.assert_allclose([line[0] for line in rejected], query.pixels[[2]])
     assert [text.get_text() for text in third.texts] == ["no common inliers"]
+    assert [text.get_text() for text in fourth.texts] == ["rejected: contradicts the others"]
     with Image.open(tmp_path / "worst.png") as image:
         assert image.text["Description"] == "the worst"
     assert draw_worst([])
@@ -146,6 +148,6 @@ def test_errors_have_the_colors_of_the_legend_and_styles_stay_where_they_are():
     assert (colors[0] == colors[1]).all()
     assert (colors[3] == colors[4]).all()
     assert len(np.unique(colors, axis=0)) == 4
-    figure = draw_scene_png(np.zeros((0, 3)), None, looking([80, 90]), looking([80, 90]), None)
+    figure = draw_scene_png(np.zeros((0, 3)), None, looking([80, 90]), looking([80, 90]), looking([80, 90]))
     assert figure._suptitle.get_fontweight() == "bold"
     assert mpl.rcParams["figure.titleweight"] == before != "bold"

@@ -1,6 +1,7 @@
 """What the figures of all stages share: one style, colors, a figure without global state, files with a caption."""
 
 import io
+import math
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
@@ -101,3 +102,15 @@ def draw_error_legend() -> bytes:
     stream = io.BytesIO()
     figure.savefig(stream, format="png", metadata={"Software": None})
     return stream.getvalue()
+
+
+def percent(share: float) -> str:
+    """Return a share, 0 to 1, in percent without the sign."""
+    return "–" if math.isnan(share) else f"{100 * share:.1f}".removesuffix(".0")
+
+
+def number(value: float) -> str:
+    """Return an error for a table: two or three digits that count."""
+    if not math.isfinite(value):
+        return "∞" if math.isinf(value) else "–"
+    return f"{value:.3f}" if value < 0.1 else f"{value:.2f}" if value < 10 else f"{value:.0f}"

@@ -1,14 +1,7 @@
-"""Rerun recordings of sessions to walk around in: images on a timeline, cameras where they stood, points, depth.
-
-What all recordings share is here too: pictures made small, cameras, the viewer's layout, the command that opens a file.
-"""
+"""Rerun recordings of sessions to walk around in: images on a timeline, cameras where they stood, points, depth."""
 
 import logging
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,186 +15,42 @@ from tqdm.auto import tqdm
 from toolkit.capture import DEPTH_SCALE, Capture, Session, Trajectory
 from toolkit.capture.devices import color_of
 from toolkit.capture.images import default_workers, prefetch, read_for_display, read_image
-from toolkit.capture.tables import read_query_table
 from toolkit.capture.upright import up_of_cameras
 from toolkit.errors import ArtifactError, CaptureError, ImageError
-from toolkit.files import file_fingerprint, files_fingerprint, write_atomic, write_sidecar
-from toolkit.geometry import rotation_to_quaternion
-from toolkit.localizers.mapping import LocalMap
-from toolkit.show.figures import GRAY, ORANGE
-from toolkit.show.top_view import places_of
+from toolkit.files import file_fingerprint, files_fingerprint, write_sidecar
+from toolkit.localizers.correspondences import LocalizedQueries, LocalizedQuery
+from toolkit.show.figures import ORANGE
+from toolkit.show.localized import load_maps, map_files, sure_points
+from toolkit.show.metrics import is_posed
+from toolkit.show.viewer import (
+    HIDDEN_M,
+    camera_depth_m,
+    entity,
+    jpeg_of,
+    log_points,
+    open_command,
+    open_recording,
+    pinhole_of,
+    rgb,
+    scene_view,
+    shown_intrinsics,
+    small_jpeg,
+    spawn_viewer,
+    transform_of,
+    world_axes,
+)
 
 if TYPE_CHECKING:
-    import pycolmap
     import rerun as rr
 
 logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
-APPLICATION = "visual-localization"
 FRAME, CAPTURE_TIME = "frame", "capture_time"
 """Timelines: index of the frame in its session, and the timestamp of the files as a duration (microseconds)."""
-POINT_COLOR = GRAY
 MAX_TABS = 12
-HIDDEN_M = 1e-3
-"""Depth of a camera that is not there now: too small to be seen."""
-
-
-# What all recordings share
-
-
-@contextmanager
-def open_recording(out: str | Path, name: str, blueprint: Any) -> "Iterator[rr.RecordingStream]":
-    """Yield a stream whose entries go to the file `out`, which stands whole when the block ends, or not at all."""
-    import rerun as rr
-
-    with write_atomic(out) as temporary:
-        # A fixed id: opened again after another run, it replaces the old one in the viewer.
-        stream = rr.RecordingStream(APPLICATION, recording_id=name)
-        # Only the timelines that mean something; the time of writing would make every file differ.
-        stream.set_log_time_enabled(False)
-        stream.set_log_tick_enabled(False)
-        try:
-            # Before the first entry: batches are handed to the file as they fill.
-            stream.save(temporary, default_blueprint=blueprint)
-            stream.send_recording_name(name)
-            yield stream
-            stream.flush()
-        finally:
-            stream.disconnect()
-
-
-def open_command(path: str | Path) -> str:
-    """Return the command that opens a recording in the viewer."""
-    return f"rerun {path}"
-
-
-def spawn_viewer(path: str | Path) -> None:
-    """Open a recording in a viewer of its own, which stays when this process ends."""
-    subprocess.Popen(
-        [sys.executable, "-m", "rerun_cli", str(path)],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
-
-
-def entity(*parts: str) -> str:
-    """Return the path of an entity; parts may hold any character."""
-    import rerun as rr
-
-    return "/".join(rr.escape_entity_path_part(part) for part in parts)
-
-
-def small_jpeg(image: Image, size: int, quality: int = 75) -> tuple[bytes, tuple[int, int]]:
-    """Return an image, (H, W, 3) RGB or (H, W), reduced to `size` pixels on its longer side, as JPEG; and (w, h)."""
-    scale = min(1.0, size / max(image.shape[:2]))
-    width, height = (max(1, round(scale * side)) for side in image.shape[1::-1])
-    small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA) if scale < 1 else image
-    bgr = np.ascontiguousarray(small[..., ::-1]) if small.ndim == 3 else small
-    _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return data.tobytes(), (width, height)
-
-
-def shown_intrinsics(camera: "pycolmap.Camera", shown: tuple[int, int]) -> Array:
-    """Return the matrix (3, 3) of a camera for its image at another size (w, h), pixels.
-
-    The top-left corner of the image is (0, 0) at every size, so the matrix scales by rows. Distortion is left out:
-    the viewer draws pinholes, and at this size it hardly shows.
-    """
-    return np.diag([shown[0] / camera.width, shown[1] / camera.height, 1.0]) @ camera.calibration_matrix()
-
-
-def pinhole_of(camera: "pycolmap.Camera", shown: tuple[int, int], depth_m: float, color: str) -> "rr.Pinhole":
-    """Return a pinhole for the image of a camera at the size shown, drawn `depth_m` deep."""
-    import rerun as rr
-
-    return rr.Pinhole(
-        image_from_camera=shown_intrinsics(camera, shown),
-        resolution=shown,
-        camera_xyz=rr.ViewCoordinates.RDF,
-        image_plane_distance=depth_m,
-        color=rgb(color),
-    )
-
-
-def transform_of(parent_from_child: ArrayLike) -> "rr.Transform3D":
-    """Return the pose (4, 4) of an entity in its parent."""
-    import rerun as rr
-
-    pose = np.asarray(parent_from_child, np.float64)
-    w, x, y, z = rotation_to_quaternion(pose[:3, :3])
-    return rr.Transform3D(translation=pose[:3, 3], quaternion=rr.Quaternion(xyzw=[x, y, z, w]))
-
-
-def jpeg_of(data: bytes) -> "rr.EncodedImage":
-    """Return a JPEG as the viewer takes it."""
-    import rerun as rr
-
-    return rr.EncodedImage(contents=data, media_type="image/jpeg")
-
-
-def world_axes(up: Array) -> Any:
-    """Return the viewer's coordinates for the world axis that is nearest to `up`."""
-    import rerun as rr
-
-    axis = int(np.argmax(np.abs(up)))
-    return getattr(rr.ViewCoordinates, f"RIGHT_HAND_{'XYZ'[axis]}_{'UP' if up[axis] > 0 else 'DOWN'}")
-
-
-def scene_view(poses: Array, up: Array, name: str) -> Any:
-    """Return the view of the 3D scene: from behind and above the place with the most cameras (N, 4, 4)."""
-    import rerun.blueprint as rrb
-
-    eye = None
-    if len(poses):
-        place = places_of(poses[:, :3, 3])
-        here = poses[place == np.bincount(place).argmax()]
-        center, view = here[:, :3, 3].mean(0), here[:, :3, 2].mean(0)
-        view -= up * (view @ up)
-        reach = max(3.0, float(np.linalg.norm(np.ptp(here[:, :3, 3], axis=0))))
-        target = center + 0.3 * reach * view
-        eye = rrb.EyeControls3D(position=target - reach * view + 0.7 * reach * up, look_target=target, eye_up=up)
-    return rrb.Spatial3DView(origin="world", name=name, eye_controls=eye)
-
-
-def camera_depth_m(centers: Array) -> float:
-    """Return how deep to draw the cameras at (N, 3): about half the usual step between neighbors."""
-    from scipy.spatial import cKDTree
-
-    spots = np.unique(np.round(centers, 2), axis=0)
-    if len(spots) < 2:
-        return 0.3
-    return float(np.clip(np.median(cKDTree(spots).query(spots, k=2)[0][:, 1]) / 2, 0.05, 1.0))
-
-
-def log_points(stream: "rr.RecordingStream", points: ArrayLike, colors: NDArray[np.uint8] | None) -> None:
-    """Log the map's points (P, 3), colors (P, 3) RGB or None, as `world/points`."""
-    import rerun as rr
-
-    cloud = rr.Points3D(points, colors=rgb(POINT_COLOR) if colors is None else colors, radii=rr.Radius.ui_points(1.5))
-    stream.log("world/points", cloud, static=True)
-
-
-def sure_points(local_map: LocalMap) -> tuple[Array, NDArray[np.uint8]]:
-    """Return the points that at least three images see, (P, 3), and their colors (P, 3); the rest is noisy."""
-    sure = local_map.track_lengths >= 3
-    return local_map.points[sure], local_map.colors[sure]
-
-
-def posed(poses: Array) -> NDArray[np.bool_]:
-    """Return which of poses (N, 4, 4) are finite."""
-    return np.asarray(np.isfinite(poses).all((1, 2)), bool)
-
-
-def rgb(color: str) -> list[int]:
-    """Return the three numbers of `#rrggbb`."""
-    return [int(color[k : k + 2], 16) for k in (1, 3, 5)]
-
-
-# A session
+"""Subsessions whose cameras have a tab beside the scene."""
 
 
 @dataclass(frozen=True)
@@ -271,12 +120,14 @@ def record_session(
         keyframes_only: only frames in the session's keyframe list `queries`.
         every: every so many frames (after `keyframes_only`).
         spawn: open the viewer when done.
-        vis_retrieve_queries: with `queries_pose`, join each query with the references that it was localized by.
+        vis_retrieve_queries: with `queries_pose`, join each query with the references that it was localized by; they
+            are read from the `.h5` file beside it.
         queries_pose: trajectories file, world_from_device of queries. In a query session, cameras stand where it
             says (else: at the ground truth); in a map session, its poses are drawn in the map.
         out: file to write; None: `<scene>_<device>_<split>.rrd` in the working directory.
         map_dir: folder of triangulated maps: the points of the session's map are shown; of a query session, the
-            points of the map that `queries_pose` is named after.
+            points of the map that `queries_pose` is named after. With `queries_pose`, of the maps that it was found
+            with; else of all of the session.
         queries: keyframe list.
         image_size: longer side of the images shown, pixels; depth maps have half of it.
         quality: of JPEG, 1 to 100.
@@ -286,7 +137,7 @@ def record_session(
 
     Raises:
         CaptureError: unknown session, subsession or keyframe list.
-        ArtifactError: `vis_retrieve_queries` without the csv of `queries_pose`, or for another session.
+        ArtifactError: `vis_retrieve_queries` without the h5 of `queries_pose`, or for another session.
     """
     started = time.perf_counter()
     if every < 1:
@@ -294,38 +145,41 @@ def record_session(
     capture = Capture.open(scene)
     session = capture[f"{device}_{split}"]
     path = Path(out) if out is not None else Path(f"{capture.name}_{session.id}.rrd")
-    asked = None if queries_pose is None else _Queries.read(Path(queries_pose), capture, session, vis_retrieve_queries)
-    if asked is None and vis_retrieve_queries:
+    if queries_pose is None and vis_retrieve_queries:
         raise ArtifactError("vis_retrieve_queries shows what `queries_pose` was localized by; give that file too.")
-    points_file = _points_file(session, asked, map_dir)
+    poses = None if queries_pose is None else Path(queries_pose)
+    localized = None if poses is None else _QueryPoses.read(poses, capture, session, vis_retrieve_queries)
+    map_device = device if split == "map" else "" if localized is None else localized.map_device
+    maps = map_files(map_dir, f"{map_device}_map", poses) if map_device else ()
     settings = {
         "images": session.files_fingerprint, "subsession": subsession,
         "session": files_fingerprint([*sorted(session.path.glob("*.txt")), *sorted(session.path.glob("proc/*.txt"))]),
         "keyframes": queries if keyframes_only else "", "every": every, "image_size": image_size, "quality": quality,
-        "queries_pose": "" if queries_pose is None else file_fingerprint(queries_pose),
-        "retrieve": vis_retrieve_queries, "points": "" if points_file is None else file_fingerprint(points_file),
+        "queries_pose": "" if poses is None else file_fingerprint(poses), "retrieve": vis_retrieve_queries,
+        "points": files_fingerprint(list(maps)),
         "world_up": None if world_up is None else np.asarray(world_up, float).tolist(),
     }  # fmt: skip
-    plan = _Plan.of(session, subsession, queries if keyframes_only else None, every, asked)
-    finite = plan.all_poses[posed(plan.all_poses)]
-    up = np.asarray(up_of_cameras(finite) if world_up is None else world_up, np.float64)
-    without = []
-    if map_dir is not None and points_file is None:
-        without = [f"{map_dir}: holds no map for this recording, so no points are shown."]
-    unposed = [] if len(finite) else [f"{session.id}: no frame has a pose; images are shown without a place."]
-    messages = [*unposed, *without]
+    plan = _Plan.of(session, subsession, queries if keyframes_only else None, every, localized)
+    placed = plan.all_poses[is_posed(plan.all_poses)]
+    up = np.asarray(up_of_cameras(placed) if world_up is None else world_up, np.float64)
+    local_map = load_maps(maps)
+    messages = []
+    if not len(placed):
+        messages.append(f"{session.id}: no frame has a pose; images are shown without a place.")
+    if map_dir is not None and local_map is None:
+        messages.append(f"{map_dir}: holds no map for this recording, so no points are shown.")
     counts: dict[str, int] = {"frames": len(plan.frames), "images": 0, "unreadable": 0, "unposed": 0, "depth_maps": 0}
-    with open_recording(path, f"{capture.name}_{session.id}", _session_layout(plan, finite, up)) as stream:
+    with open_recording(path, f"{capture.name}_{session.id}", _session_layout(plan, placed, up)) as stream:
         stream.log("world", world_axes(up), static=True)
-        if points_file is not None:
-            points, colors = sure_points(LocalMap.load(points_file))
+        if local_map is not None:
+            points, colors = sure_points(local_map)
             log_points(stream, points, colors)
             counts["points"] = len(points)
         _log_trajectories(stream, plan, session.device)
-        if asked is not None:
-            counts["queries"] = _log_asked(stream, asked, session)
-        size = camera_depth_m(finite[:, :3, 3])
-        writer = _FrameWriter(stream, session, size, color_of(session.device))
+        if localized is not None:
+            _log_queries(stream, localized, session)
+            counts["queries"] = len(localized.poses)
+        writer = _FrameWriter(stream, session, camera_depth_m(placed[:, :3, 3]), color_of(session.device))
         writer.announce(plan.frames)
 
         def load(number: int) -> list["_Loaded"]:
@@ -392,6 +246,17 @@ class _Frame:
     rows: NDArray[np.int64]
     """Of the session's images."""
     slots: tuple[str, ...]
+    """Names of their cameras in the recording."""
+
+    @property
+    def posed(self) -> bool:
+        return bool(is_posed(self.world_from_device))
+
+    @property
+    def entity(self) -> str:
+        """Path of the device, or of the subsession for a camera without one."""
+        parts = ["world" if self.posed else "unposed", self.subsession, *([self.device] if self.device else [])]
+        return entity(*parts)
 
 
 @dataclass
@@ -410,7 +275,7 @@ class _Plan:
 
     @classmethod
     def of(
-        cls, session: Session, subsession: str, keyframes: str | None, every: int, asked: "_Queries | None"
+        cls, session: Session, subsession: str, keyframes: str | None, every: int, localized: "_QueryPoses | None"
     ) -> "_Plan":
         if subsession != "all" and subsession not in session.subsessions:
             raise CaptureError(
@@ -420,8 +285,8 @@ class _Plan:
         if subsession != "all":
             table = table[table["subsession"] == subsession]
         trajectory = session.ground_truth if session.split == "query" else session.trajectory
-        if asked is not None and session.split == "query":
-            trajectory = asked.poses
+        if localized is not None and session.split == "query":
+            trajectory = localized.poses
         groups = table.groupby(["index", "device_slot"], sort=False)
         first = table.loc[groups.head(1).index]
         poses = np.full((len(first), 4, 4), np.nan)
@@ -430,9 +295,8 @@ class _Plan:
         tracks = _tracks(first, poses)
         shown = np.ones(len(first), bool)
         if keyframes is not None:
-            wanted = set(session.keyframes(keyframes).itertuples(index=False, name=None))
-            keys = zip(first["timestamp"], first["device_id"], strict=True)
-            shown = np.array([key in wanted for key in keys], bool)
+            listed = pd.MultiIndex.from_frame(session.keyframes(keyframes)[["timestamp", "device_id"]].astype(object))
+            shown = pd.MultiIndex.from_frame(first[["timestamp", "device_id"]].astype(object)).isin(listed)
         kept = np.unique(first["index"].to_numpy()[shown])[::every]
         shown &= np.isin(first["index"], kept)
         rows_of = groups.indices
@@ -584,12 +448,10 @@ class _FrameWriter:
             self.finish()
         self._now = frame
         self._set_time(frame.index, frame.timestamp)
-        known = bool(np.isfinite(frame.world_from_device).all())
-        parts = ["world" if known else "unposed", frame.subsession, *([frame.device] if frame.device else [])]
-        root = entity(*parts)
+        root, posed = frame.entity, frame.posed
         shown: dict[str, _Loaded] = {}
         # A camera without a rig carries its pose itself.
-        if known and frame.device:
+        if posed and frame.device:
             self._stream.log(root, transform_of(frame.world_from_device))
         counts = {"images": 0, "unreadable": 0, "unposed": 0, "depth_maps": 0}
         for loaded in shots:
@@ -599,9 +461,9 @@ class _FrameWriter:
                 counts["unreadable"] += 1
                 continue
             shown[path] = loaded
-            if known and not frame.device:
+            if posed and not frame.device:
                 self._stream.log(path, transform_of(frame.world_from_device))
-            elif known and shot.rig_from_sensor is not None:
+            elif posed and shot.rig_from_sensor is not None:
                 self._log_changed(path, "pose", shot.rig_from_sensor, lambda s=shot: transform_of(s.rig_from_sensor))
             self._log_intrinsics(path, loaded)
             if shot.is_depth:
@@ -612,7 +474,7 @@ class _FrameWriter:
             self._stream.log(f"{path}/image", jpeg_of(loaded.data))
             counts["images"] += 1
             counts["unreadable"] += not loaded.readable
-            counts["unposed"] += not known
+            counts["unposed"] += not posed
         # What this device showed before and does not now would hang on at its old place.
         device = (frame.subsession, frame.device or frame.slots[0])
         self._hide({path: last for path, last in self._alive.get(device, {}).items() if path not in shown})
@@ -628,10 +490,8 @@ class _FrameWriter:
         self._set_time(frames[0].index, min(frame.timestamp for frame in frames))
         begin: dict[str, int] = {}
         for frame in frames:
-            if np.isfinite(frame.world_from_device).all():
-                parts = ["world", frame.subsession, *([frame.device] if frame.device else [])]
-                for slot in frame.slots:
-                    begin.setdefault(entity(*parts, slot), frame.index)
+            for slot in frame.slots if frame.posed else ():
+                begin.setdefault(f"{frame.entity}/{entity(slot)}", frame.index)
         for path in [path for path, index in begin.items() if index > frames[0].index]:
             self._stream.log(path, rr.Pinhole(focal_length=1, width=1, height=1, image_plane_distance=HIDDEN_M))
 
@@ -672,10 +532,8 @@ def _session_layout(plan: _Plan, poses: Array, up: Array) -> Any:
 
     tabs: dict[str, dict[str, str]] = {}
     for frame in plan.frames:
-        known = bool(np.isfinite(frame.world_from_device).all())
-        parts = ["world" if known else "unposed", frame.subsession, *([frame.device] if frame.device else [])]
         for slot in frame.slots:
-            tabs.setdefault(frame.subsession, {})[entity(*parts, slot)] = slot
+            tabs.setdefault(frame.subsession, {})[f"{frame.entity}/{entity(slot)}"] = slot
     views = [
         rrb.Grid(*[rrb.Spatial2DView(origin=path, name=slot) for path, slot in cameras.items()], name=name)
         for name, cameras in list(tabs.items())[:MAX_TABS]
@@ -696,24 +554,19 @@ def _log_trajectories(stream: "rr.RecordingStream", plan: _Plan, device: str) ->
         stream.log(f"world/{entity(name)}/trajectory", lines, static=True)
 
 
-# Queries in a session's recording
-
-
 @dataclass(frozen=True)
-class _Queries:
+class _QueryPoses:
     """Poses of queries from a trajectories file, and what they were localized by."""
 
     poses: Trajectory
     map_device: str
     """Of the pair that the file is named after; empty where its name says none."""
     query_device: str
-    references: dict[tuple[int, str], list[str]]
-    """Names of map images of a query; empty where they are not asked for."""
-    centers: dict[str, Array]
-    """World positions (3,) of the references."""
+    lines: list[Array]
+    """Positions (2, 3) of a query and of a reference that it was localized by; none where they are not wanted."""
 
     @classmethod
-    def read(cls, path: Path, capture: Capture, session: Session, with_references: bool) -> "_Queries":
+    def read(cls, path: Path, capture: Capture, session: Session, with_references: bool) -> "_QueryPoses":
         poses = Trajectory.read(path)
         prefix = f"{capture.name}_map_"
         named = path.stem.startswith(prefix) and "_query_" in path.stem
@@ -724,53 +577,36 @@ class _Queries:
                 f"{path.name} holds {query_device} queries in the {map_device} map, which has nothing to do with "
                 f"session {session.id}. Expected a file for that device."
             )
-        references: dict[tuple[int, str], list[str]] = {}
-        centers: dict[str, Array] = {}
-        if with_references:
-            table = path.with_suffix(".csv")
-            if not named or not table.is_file():
-                raise ArtifactError(
-                    f"{path}: which references a query was localized by stands in the table beside it, "
-                    f"{prefix}<M>_query_<Q>.csv; not found. Localize again, or leave vis_retrieve_queries out."
-                )
-            rows = read_query_table(table, ["references"])
-            for row in rows.itertuples():
-                if isinstance(row.references, str) and row.references:
-                    references[int(row.timestamp), str(row.device_id)] = row.references.split(";")
-            map_session = capture[f"{map_device}_map"]
-            wanted = {name for names in references.values() for name in names}
-            images = [k for k in range(len(map_session)) if map_session.image_name(k) in wanted]
-            found = map_session.world_from_cam(np.array(images, np.int64))
-            centers = {map_session.image_name(k): pose[:3, 3] for k, pose in zip(images, found, strict=True)}
-        return cls(poses, map_device, query_device, references, centers)
+        if not with_references:
+            return cls(poses, map_device, query_device, [])
+        if not named:
+            raise ArtifactError(
+                f"{path}: which references a query was localized by stands in the file of a pair, "
+                f"{prefix}<M>_query_<Q>.h5. Name such a pair's poses, or leave vis_retrieve_queries out."
+            )
+        queries, map_session = LocalizedQueries(path.with_suffix(".h5")), capture[f"{map_device}_map"]
+        centers = map_session.world_from_cam()[:, :3, 3]
+        center_of = {map_session.image_name(row): center for row, center in enumerate(centers)}
+        keys = zip(poses.timestamps.tolist(), poses.device_ids.tolist(), strict=True)
+        lines = [
+            np.stack([pose[:3, 3], center_of[name]])
+            for key, pose in zip(keys, poses.world_from_device, strict=True)
+            for name in queries.get(key, LocalizedQuery()).references
+            if name in center_of
+        ]
+        queries.close()
+        return cls(poses, map_device, query_device, lines)
 
 
-def _points_file(session: Session, asked: _Queries | None, map_dir: str | Path | None) -> Path | None:
-    """Return the map file whose points belong into a session's recording, None if there is none."""
-    device = session.device if session.split == "map" else (asked.map_device if asked is not None else "")
-    path = None if map_dir is None or not device else Path(map_dir) / f"{device}_map.npz"
-    return path if path is not None and path.is_file() else None
-
-
-def _log_asked(stream: "rr.RecordingStream", asked: _Queries, session: Session) -> int:
-    """Log where queries are, joined with their references; return how many. In a query session, lines only."""
+def _log_queries(stream: "rr.RecordingStream", queries: _QueryPoses, session: Session) -> None:
+    """Log where queries are, joined with their references. In a query session, lines only."""
     import rerun as rr
 
-    poses = asked.poses.world_from_device
-    keys = list(zip(asked.poses.timestamps.tolist(), asked.poses.device_ids.tolist(), strict=True))
-    kept = np.flatnonzero(posed(poses))
+    poses = queries.poses
     if session.split == "map":
-        color = rgb(color_of(asked.query_device))
-        labels = [f"{time} {device}" for time, device in (keys[k] for k in kept)]
-        dots = rr.Points3D(poses[kept, :3, 3], colors=color, radii=rr.Radius.ui_points(4), labels=labels,
-                           show_labels=False)  # fmt: skip
+        labels = [f"{time} {device}" for time, device in zip(poses.timestamps, poses.device_ids, strict=True)]
+        dots = rr.Points3D(poses.world_from_device[:, :3, 3], colors=rgb(color_of(queries.query_device)),
+                           radii=rr.Radius.ui_points(4), labels=labels, show_labels=False)  # fmt: skip
         stream.log("world/queries/poses", dots, static=True)
-    lines = [
-        np.stack([poses[k, :3, 3], asked.centers[name]])
-        for k in kept
-        for name in asked.references.get(keys[k], [])
-        if name in asked.centers
-    ]
-    if lines:
-        stream.log("world/queries/references", rr.LineStrips3D(lines, colors=rgb(ORANGE)), static=True)
-    return len(kept)
+    if queries.lines:
+        stream.log("world/queries/references", rr.LineStrips3D(queries.lines, colors=rgb(ORANGE)), static=True)

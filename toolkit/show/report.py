@@ -5,22 +5,28 @@ import io
 import json
 import math
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import numpy as np
 import pandas as pd
 
 from toolkit.errors import ArtifactError
 from toolkit.files import SceneFiles, sidecar_path, write_text
+from toolkit.show.figures import number, percent
+from toolkit.show.metrics import REASONS, THRESHOLDS, parse_threshold, worst_first
 
 # All pictures of a page together, before base64 makes them a third larger: the page stays below 10 MB.
 PICTURE_BUDGET = 7_000_000
 MAX_WIDTH = 1600
 WORST, MOST_REASONS = 10, 12
 """Rows listed of a scene: the worst queries, and the reasons of queries without a pose."""
+MEDIANS = (
+    ("median_rotation_deg", "Median rotation error [°]", 1.0),
+    ("median_translation_m", "Median translation error [cm]", 100.0),
+)
 # Figures that say more than the page's own tables: a heading, and how to read it.
 EVALUATION_FIGURES = {
     "error_curves": (
@@ -34,7 +40,6 @@ EVALUATION_FIGURES = {
         "image near the true camera; no pose: too few matches agreed; wrong pose: beyond the threshold.",
     ),
 }
-REASONS = ("no good reference", "no pose", "wrong pose")
 
 
 @dataclass
@@ -161,9 +166,7 @@ def _read_run(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise ArtifactError(
-            f"No run at {path.parent}: {path.name} is missing. Run a manifest first."
-        ) from None
+        raise ArtifactError(f"No run at {path.parent}: {path.name} is missing. Run a manifest first.") from None
     except ValueError as error:
         raise ArtifactError(f"{path} is not whole JSON ({error}). Run the manifest again.") from None
     if not isinstance(content, dict):
@@ -171,9 +174,7 @@ def _read_run(path: Path) -> dict[str, Any]:
     empty = {"name": path.parent.name, "created": "", "status": "", "error": None, "total_seconds": None}
     lists: dict[str, Any] = {"manifest": {}, "versions": {}, "machine": {}, "inputs": {}, "scenes": [], "stages": []}
     run = {**empty, "peak_memory_mb": None, "work_seconds": None, "code": "", **lists, **content}
-    run["scenes"] = run["scenes"] or list(
-        dict.fromkeys(row["scene"] for row in run["stages"] if row.get("scene"))
-    )
+    run["scenes"] = run["scenes"] or list(dict.fromkeys(row["scene"] for row in run["stages"] if row.get("scene")))
     return run
 
 
@@ -193,8 +194,9 @@ def _summary(run: dict[str, Any]) -> list[tuple[str, str]]:
     if run["peak_memory_mb"]:
         parts.append(("peak memory", f"{run['peak_memory_mb'] / 1000:.2f} GB"))
     # Python's version stands among the versions.
-    known = [(key, value) for key, value in run["machine"].items() if key != "python"]
-    machine = ", ".join(f"{value} {key}" if key == "cores" else str(value) for key, value in known)
+    machine = ", ".join(
+        f"{value} {key}" if key == "cores" else str(value) for key, value in run["machine"].items() if key != "python"
+    )
     return [*parts, ("machine", machine)] if machine else parts
 
 
@@ -208,9 +210,7 @@ def _stages(run: dict[str, Any], run_dir: Path) -> Table:
     largest = max((float(row.get("peak_memory_mb") or 0) for row in run["stages"]), default=0.0)
     for row in run["stages"]:
         seconds, work = row.get("seconds"), row.get("work_seconds", row.get("kernel_seconds"))
-        counts = ", ".join(
-            f"{value} {key.replace('_', ' ')}" for key, value in (row.get("counts") or {}).items()
-        )
+        counts = ", ".join(f"{value} {key.replace('_', ' ')}" for key, value in (row.get("counts") or {}).items())
         memory = row.get("peak_memory_mb")
         notebook = run_dir / str(row.get("notebook") or "")
         name = " ".join(str(part) for part in (row.get("stage", ""), row.get("part")) if part)
@@ -232,30 +232,24 @@ def _stages(run: dict[str, Any], run_dir: Path) -> Table:
 
 def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> Scene:
     scene = Scene(files.scene, fingerprint)
-    tables = {
-        name: _read_table(files.evaluation / f"{name}.csv", scene.messages)
+    recall, errors, losses, retrieval = (
+        _read_table(files.evaluation / f"{name}.csv", scene.messages)
         for name in ("recall", "errors", "losses", "retrieval")
-    }
-    recall, errors, losses = tables["recall"], tables["errors"], tables["losses"]
+    )
     thresholds = [column for column in recall.columns if column.startswith("recall@")]
     statuses = _read_statuses(files, scene.messages)
     _verdict(scene, recall, errors, statuses, thresholds)
-    if thresholds:
-        for column in thresholds:
-            title = f"Recall at {_threshold(column)} [%]"
-            scene.recall.append(_matrix(recall, column, title, _percent, lambda v: 0.9 * v))
-        for column, title, factor in (
-            ("median_rotation_deg", "Median rotation error [°]", 1.0),
-            ("median_translation_m", "Median translation error [cm]", 100.0),
-        ):
-            scene.medians.append(_matrix(recall, column, title, lambda v, f=factor: _number(v * f)))
+    for column in thresholds:
+        scene.recall.append(_matrix(recall, column, f"Recall at {_threshold(column)} [%]", percent, lambda v: 0.9 * v))
+    for column, title, factor in MEDIANS if thresholds else ():
+        scene.medians.append(_matrix(recall, column, title, lambda v, f=factor: number(v * f)))
     if len(recall):
         scene.pairs = _pairs(recall, thresholds)
         scene.messages += _messages(files.evaluation / "recall.csv")
     scene.losses, scene.missed = _losses(losses), int(losses.get("missed", pd.Series(dtype=float)).sum())
     scene.failures = _failures(statuses)
     scene.worst = _worst(errors if len(errors) else statuses, thresholds)
-    scene.retrieval, scene.retrieval_note = _retrieval(tables["retrieval"], scene.headlines)
+    scene.retrieval, scene.retrieval_note = _retrieval(retrieval, scene.headlines)
     stills = sorted(files.visualization.glob("*.png"), key=_natural)
     worst = [path for path in stills if path.name.startswith("worst")]
     samples = [path for path in stills if path.name.startswith("localization")]
@@ -266,12 +260,9 @@ def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> Scene:
             scene.figures.append(album.picture(path, title, caption))
     scene.maps = [album.picture(path) for path in stills if path not in worst and path not in samples]
     scene.samples = [album.picture(path) for path in samples]
-    recordings = sorted(files.visualization.glob("*.rrd"))
-    scene.recordings = [Cell(path.name, link=_link(files.run, path)) for path in recordings]
+    scene.recordings = _linked(files.run, files.visualization.glob("*.rrd"))
     scene.files = _files(files)
-    scene.others = [
-        Cell(path.name, link=_link(files.run, path)) for path in sorted(files.evaluation.glob("*.csv"))
-    ]
+    scene.others = _linked(files.run, files.evaluation.glob("*.csv"))
     return scene
 
 
@@ -292,7 +283,7 @@ def _read_statuses(files: SceneFiles, messages: list[str]) -> pd.DataFrame:
     for (map_device, query_device), stem in _pairs_of(files).items():
         table = _read_table(stem.with_name(f"{stem.name}.csv"), messages)
         if "status" in table:
-            table = table.reindex(columns=["timestamp", "device_id", "status", "num_inliers"])
+            table = table.reindex(columns=["timestamp", "device_id", "status", "num_inliers", "position_std_m"])
             tables.append(table.assign(map_device=map_device, query_device=query_device))
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
@@ -301,9 +292,8 @@ def _pairs_of(files: SceneFiles) -> dict[tuple[str, str], Path]:
     """Return the path, without suffix, of the results of each pair that has any."""
     pairs = {}
     for path in sorted([*files.poses_dir.glob("*.csv"), *files.poses_dir.glob("*.txt")]):
-        found = re.fullmatch(f"{re.escape(files.scene)}_map_(.+)_query_(.+)", path.stem)
-        if found:
-            pairs[found[1], found[2]] = path.with_suffix("")
+        if devices := re.fullmatch(f"{re.escape(files.scene)}_map_(.+)_query_(.+)", path.stem):
+            pairs[devices[1], devices[2]] = path.with_suffix("")
     return pairs
 
 
@@ -330,26 +320,24 @@ def _verdict(
     if not len(done):
         return
     for column in thresholds:
-        scene.headlines.append((f"{_percent(done[column].mean())} %", f"mean recall at {_threshold(column)}"))
+        scene.headlines.append((f"{percent(done[column].mean())} %", f"mean recall at {_threshold(column)}"))
     if len(errors):
         medians = errors[["rotation_error_deg", "translation_error_m"]].median()
-        text = f"median error of position; {_number(medians.iloc[0])}° of rotation"
+        text = f"median error of position; {number(medians.iloc[0])}° of rotation"
         scene.headlines.append((_length(medians.iloc[1]), text))
     strict = thresholds[0]
     weakest = done.loc[done[strict].idxmin()]
     if weakest[strict] == done[strict].max():
-        scene.verdict.append(f"Every pair has {_percent(weakest[strict])} % at {_threshold(strict)}.")
+        scene.verdict.append(f"Every pair has {percent(weakest[strict])} % at {_threshold(strict)}.")
     else:
         pair = f"{weakest['query_device']} queries in the {weakest['map_device']} map"
-        scene.verdict.append(f"Weakest pair at {_threshold(strict)}: {pair}, {_percent(weakest[strict])} %.")
+        scene.verdict.append(f"Weakest pair at {_threshold(strict)}: {pair}, {percent(weakest[strict])} %.")
     if "ok_wrong" in done:
         wrong = float((done["ok_wrong"] * done["queries"]).sum() / done["queries"].sum())
-        scene.headlines.append((f"{_percent(wrong)} %", "called ok, but beyond 5°, 0.5 m"))
+        scene.headlines.append((f"{percent(wrong)} %", "called ok, but beyond 5°, 0.5 m"))
 
 
-def _matrix(
-    table: pd.DataFrame, column: str, title: str, text: Any, shade: Any = lambda value: None
-) -> Matrix:
+def _matrix(table: pd.DataFrame, column: str, title: str, text: Any, shade: Any = lambda value: None) -> Matrix:
     queries = list(dict.fromkeys(table["query_device"]))
     values = table.set_index(["map_device", "query_device"])[column].to_dict()
     rows = []
@@ -360,44 +348,36 @@ def _matrix(
 
 
 def _pairs(recall: pd.DataFrame, thresholds: list[str]) -> Table:
-    counts = [c for c in ("queries", "localized", "ok", "low_confidence", "failed") if c in recall]
-    columns = ["map", "query", *(c.replace("_", " ") for c in counts)]
-    columns += [f"recall {_threshold(c)}" for c in thresholds]
-    titles = {
-        "median_rotation_deg": "median [°]",
-        "median_translation_m": "median [cm]",
-        "ok_wrong": "ok but wrong",
-    }
-    errors = [c for c in titles if c in recall]
-    columns += [titles[c] for c in errors]
-    factors = {"median_rotation_deg": 1.0, "median_translation_m": 100.0}
+    columns: dict[str, tuple[str, Any]] = {"map_device": ("map", str), "query_device": ("query", str)}
+    for name in ("queries", "localized", "ok", "low_confidence", "failed"):
+        columns[name] = name.replace("_", " "), lambda count: "–" if pd.isna(count) else f"{count:.0f}"
+    columns |= {name: (f"recall {_threshold(name)}", _share) for name in thresholds}
+    columns["median_rotation_deg"] = "median [°]", number
+    columns["median_translation_m"] = "median [cm]", lambda meters: number(100 * meters)
+    columns["ok_wrong"] = "ok but wrong", lambda share: _share(share).text
+    columns["state"] = "note", lambda state: "" if state == "evaluated" else str(state)
+    shown = {name: column for name, column in columns.items() if name in recall}
     rows = []
     for row in recall.to_dict("records"):
-        cells = [Cell(str(row["map_device"])), Cell(str(row["query_device"]))]
-        cells += [Cell("–" if pd.isna(row[c]) else f"{row[c]:.0f}") for c in counts]
-        cells += [_share(row[c]) for c in thresholds]
-        cells += [
-            Cell(_number(row[c] * factors[c])) if c in factors else Cell(_share(row[c]).text) for c in errors
-        ]
-        state = str(row.get("state", "evaluated"))
-        rows.append([*cells, Cell("" if state == "evaluated" else state)])
-    return Table("Counts of queries, recall and median errors of every pair", [*columns, "note"], rows)
+        texts = [write(row[name]) for name, (_, write) in shown.items()]
+        rows.append([text if isinstance(text, Cell) else Cell(text) for text in texts])
+    titles = [title for title, _ in shown.values()]
+    return Table("Counts of queries, recall and median errors of every pair", titles, rows)
 
 
 def _losses(losses: pd.DataFrame) -> Table | None:
     """Sum over the pairs of each map device, and of all."""
     if "threshold" not in losses or losses["threshold"].isna().all():
         return None
-    known = losses.dropna(subset=["threshold"])
     rows = []
-    for threshold, group in known.groupby("threshold", sort=False):
+    for threshold, group in losses.dropna(subset=["threshold"]).groupby("threshold", sort=False):
         parts = [(str(m), part) for m, part in group.groupby("map_device", sort=False)]
         for name, part in [*parts, ("all", group)]:
             queries = part["queries"].sum()
             shares = [part[reason].sum() / queries for reason in REASONS]
             label = _threshold(str(threshold)) if name == parts[0][0] else ""
             cells = [Cell(label), Cell(name), Cell(f"{queries:.0f}"), Cell(f"{part['missed'].sum():.0f}")]
-            rows.append(cells + [Cell(f"{_percent(share)} %", 1.2 * share) for share in shares])
+            rows.append(cells + [Cell(f"{percent(share)} %", 1.2 * share) for share in shares])
     caption = "Queries missed at each threshold, and the share of all queries that each reason costs"
     return Table(caption, ["threshold", "map", "queries", "missed", *REASONS], rows)
 
@@ -426,27 +406,23 @@ def _worst(queries: pd.DataFrame, thresholds: list[str]) -> Table | None:
     """List the queries farthest from the truth or, where it is not known, with the least support."""
     if not len(queries):
         return None
-    known = "rotation_error_deg" in queries
-    if known:
-        degrees, meters = _parse_threshold(thresholds[0]) if thresholds else (1.0, 0.1)
-        rotation, translation = queries["rotation_error_deg"] / degrees, queries["translation_error_m"] / meters
-        off = np.maximum(rotation, translation)
-        caption = f"The {min(WORST, len(queries))} worst, by the larger of rotation error / {degrees:g}° and "
-        caption += f"translation error / {meters:g} m"
+    has_truth = "rotation_error_deg" in queries
+    threshold = parse_threshold(thresholds[0]) if thresholds else THRESHOLDS[0]
+    worst = queries.iloc[worst_first(queries, threshold)[:WORST]]
+    if has_truth:
+        caption = f"The {len(worst)} worst, by the larger of rotation error / {threshold[0]:g}° and "
+        caption += f"translation error / {threshold[1]:g} m"
     else:
-        status = queries["status"]
-        off = 2 * status.str.startswith("failed").astype(int) + (status == "low_confidence").astype(int)
-        caption = f"The {min(WORST, len(queries))} least supported; there is no ground truth to compare with"
-    table = queries.assign(off=off).sort_values(["off", "num_inliers"], ascending=[False, True], kind="stable")
-    columns = ["query", *(["off by", "why"] if known else []), "status", "inliers", "device", "timestamp [µs]"]
+        caption = f"The {len(worst)} least supported; there is no ground truth to compare with"
+    columns = ["query", *(["off by", "why"] if has_truth else []), "status", "inliers", "device", "timestamp [µs]"]
     rows = []
-    for row in table.head(WORST).to_dict("records"):
-        inliers = "–" if pd.isna(row["num_inliers"]) else f"{row['num_inliers']:.0f}"
+    for row in worst.to_dict("records"):
         texts = [f"{row['query_device']} in {row['map_device']} map"]
-        if known:
+        if has_truth:
             rotation_deg, translation_m = row["rotation_error_deg"], row["translation_error_m"]
             located = math.isfinite(rotation_deg)
-            texts += [f"{_number(rotation_deg)}°, {_length(translation_m)}" if located else "no pose", _why(row)]
+            texts += [f"{number(rotation_deg)}°, {_length(translation_m)}" if located else "no pose", _why(row)]
+        inliers = "–" if pd.isna(row["num_inliers"]) else f"{row['num_inliers']:.0f}"
         texts += [str(row["status"]).replace("_", " "), inliers, str(row["device_id"]), str(row["timestamp"])]
         rows.append([Cell(text) for text in texts])
     return Table(caption, columns, rows)
@@ -455,26 +431,22 @@ def _worst(queries: pd.DataFrame, thresholds: list[str]) -> Table | None:
 def _why(row: dict[str, Any]) -> str:
     """Return what a query was lost by, at the widest threshold that it misses."""
     losses = {name: reason for name, reason in row.items() if name.startswith("loss@")}
-    missed = {name: reason for name, reason in losses.items() if isinstance(reason, str) and reason}
-    if not missed:
-        return "within every threshold" if losses else ""
-    widest = list(missed)[-1]
-    return f"{missed[widest]} at {_threshold(widest)}"
+    missed = [f"{reason} at {_threshold(name)}" for name, reason in losses.items() if reason in REASONS]
+    return missed[-1] if missed else "within every threshold" if losses else ""
 
 
 def _retrieval(retrieval: pd.DataFrame, headlines: list[tuple[str, str]]) -> tuple[list[Matrix], str]:
     ks = [column for column in retrieval.columns if column.startswith("recall@")]
-    known = retrieval.dropna(subset=ks) if ks else retrieval.iloc[:0]
-    if not len(known):
+    done = retrieval.dropna(subset=ks) if ks else retrieval.iloc[:0]
+    if not len(done):
         return [], ""
     titles = {k: f"In the first {k.removeprefix('recall@')} [%]" for k in ks}
     titles["in_map"] = "Anywhere in the map [%]"
-    matrices = [_matrix(retrieval, c, titles[c], _percent, lambda v: 0.9 * v) for c in titles if c in known]
+    matrices = [_matrix(retrieval, c, titles[c], percent, lambda v: 0.9 * v) for c in titles if c in done]
     first = ks[-1].removeprefix("recall@")
-    headlines.append((f"{_percent(known[ks[-1]].mean())} %", f"have a good reference in the first {first}"))
-    radius_m, angle_deg = known["radius_m"].iloc[0], known["angle_deg"].iloc[0]
-    note = f"A good reference stands within {radius_m:g} m of the query's true camera and looks the same way "
-    return matrices, f"{note}to within {angle_deg:g}°."
+    headlines.append((f"{percent(done[ks[-1]].mean())} %", f"have a good reference in the first {first}"))
+    note = f"A good reference stands within {done['radius_m'].iloc[0]:g} m of the query's true camera and looks the "
+    return matrices, f"{note}same way to within {done['angle_deg'].iloc[0]:g}°."
 
 
 def _files(files: SceneFiles) -> Table | None:
@@ -502,6 +474,10 @@ def _link(run_dir: Path, path: Path) -> str:
     return quote(path.relative_to(run_dir).as_posix())
 
 
+def _linked(run_dir: Path, paths: Iterable[Path]) -> list[Cell]:
+    return [Cell(path.name, link=_link(run_dir, path)) for path in sorted(paths)]
+
+
 def _natural(path: Path) -> list[Any]:
     """Sort key that puts 10 after 9."""
     return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
@@ -512,21 +488,11 @@ def _plural(count: int, noun: str) -> str:
 
 
 def _share(share: float) -> Cell:
-    return Cell("–") if math.isnan(share) else Cell(f"{_percent(share)} %", 0.9 * share)
-
-
-def _percent(share: float) -> str:
-    return "–" if math.isnan(share) else f"{100 * share:.1f}".removesuffix(".0")
-
-
-def _number(value: float) -> str:
-    if not math.isfinite(value):
-        return "∞" if math.isinf(value) else "–"
-    return f"{value:.3f}" if value < 0.1 else f"{value:.2f}" if value < 10 else f"{value:.0f}"
+    return Cell("–") if math.isnan(share) else Cell(f"{percent(share)} %", 0.9 * share)
 
 
 def _length(meters: float) -> str:
-    return f"{_number(100 * meters)} cm" if meters < 1 else f"{_number(meters)} m" if meters < math.inf else "∞"
+    return f"{number(100 * meters)} cm" if meters < 1 else f"{number(meters)} m" if meters < math.inf else "∞"
 
 
 def _seconds(seconds: float | None) -> str:
@@ -537,14 +503,8 @@ def _seconds(seconds: float | None) -> str:
     return f"{int(seconds) // 60} min {int(seconds) % 60} s"
 
 
-def _parse_threshold(name: str) -> tuple[float, float]:
-    """Return degrees and meters of a column such as `recall@(5deg,0.5m)`."""
-    degrees, _, meters = name.rpartition("@")[2].strip("()").partition(",")
-    return float(degrees.removesuffix("deg")), float(meters.removesuffix("m"))
-
-
 def _threshold(name: str) -> str:
-    degrees, meters = _parse_threshold(name)
+    degrees, meters = parse_threshold(name)
     return f"{degrees:g}°, {meters:g}\N{NO-BREAK SPACE}m"
 
 

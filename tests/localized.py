@@ -1,0 +1,69 @@
+"""What the localize stage leaves of a pair, written by hand: poses, the table of queries, and correspondences."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pandas as pd
+
+from toolkit.capture import Capture, Trajectory
+from toolkit.files import pair_name, write_atomic
+from toolkit.localizers.correspondences import MAPS, Correspondences, LocalizedQuery, query_group
+
+
+def write_queries(path: Path, queries: Mapping[tuple[int, str], LocalizedQuery], maps: Sequence[str] = ()) -> None:
+    """Write the correspondences of a pair."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with write_atomic(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs[MAPS] = json.dumps(list(maps))
+        for key, query in queries.items():
+            group = file.create_group(query_group(*key))
+            for name, array in query.arrays().items():
+                group[name] = array
+
+
+def write_pair(
+    capture: Capture,
+    folder: Path,
+    map_device: str,
+    query_device: str,
+    queries: Sequence[LocalizedQuery],
+    maps: Sequence[str] = (),
+    **columns: Sequence[object],
+) -> Path:
+    """Write poses (the true ones, off by the column `off_m`), table and correspondences of the first keyframes."""
+    session, stem = capture[f"{query_device}_query"], folder / pair_name(capture.name, map_device, query_device)
+    keys = session.keyframes()[: len(queries)]
+    table = keys.assign(**{"status": "ok", "method": "pnp", "num_inliers": 10, "off_m": 0.0, **columns})
+    poses = session.trajectory if session.ground_truth is None else session.ground_truth
+    posed = ~table["status"].str.startswith("failed").to_numpy(bool)
+    world_from_rig = poses.lookup(keys["timestamp"], keys["device_id"]) if poses is not None else np.eye(4)[None]
+    world_from_rig = np.broadcast_to(world_from_rig, (len(keys), 4, 4)).copy()
+    world_from_rig[:, 0, 3] += table["off_m"]
+    times, devices = keys["timestamp"].to_numpy()[posed], keys["device_id"].to_numpy(str)[posed]
+    Trajectory.from_poses(times, devices, world_from_rig[posed]).write(f"{stem}.txt")
+    pd.DataFrame(table).to_csv(f"{stem}.csv", index=False)
+    keys_of = zip(keys["timestamp"].tolist(), keys["device_id"].astype(str).tolist(), strict=True)
+    write_queries(Path(f"{stem}.h5"), dict(zip(keys_of, queries, strict=True)), maps)
+    return stem
+
+
+def some_correspondences(
+    cameras: Sequence[int], inliers: Sequence[bool], references: int = 2, point_index: int | None = None
+) -> Correspondences:
+    """Return correspondences of given images, each seen by the references whose number divides it."""
+    count, rng = len(cameras), np.random.default_rng(0)
+    views = np.array([(k, r) for k in range(count) for r in range(references) if k % (r + 1) == 0], int).reshape(-1, 2)
+    return Correspondences(
+        camera=np.array(cameras, np.int64),
+        pixels=np.round(rng.uniform(20, 100, (count, 2))),
+        points=rng.normal(size=(count, 3)),
+        point_index=np.arange(count) if point_index is None else np.full(count, point_index),
+        inlier=np.array(inliers, bool),
+        found_by=np.array(["sift/descriptors" if point_index is None else "sift/lifted"] * count, np.str_),
+        view_of=views[:, 0],
+        view_reference=views[:, 1],
+        view_pixels=np.round(rng.uniform(20, 100, (len(views), 2))),
+    )

@@ -1,0 +1,155 @@
+"""Each method's pictures show what its poses rest on: its own inliers, points and references."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.localized import some_correspondences, write_pair, write_queries
+from toolkit.capture import Capture
+from toolkit.errors import ArtifactError
+from toolkit.localizers.correspondences import LocalizedQuery
+from toolkit.localizers.mapping import LocalMap
+from toolkit.show.localized import LocalizedPair, load_maps, map_files
+from toolkit.show.stills import draw_localization
+
+INLIERS = [True, False, True, True, False, True]
+
+
+@pytest.fixture
+def capture(small_capture):
+    return Capture.open(small_capture)
+
+
+@pytest.fixture
+def open_pair(capture, tmp_path):
+    """Write one localized query of a device in the phone's map, and open the pair."""
+
+    def write_and_open(query_device, query, **columns):
+        write_pair(capture, tmp_path, "ios", query_device, [query], **{k: [v] for k, v in columns.items()})
+        return LocalizedPair.open(capture, "ios", query_device, tmp_path, None)
+
+    return write_and_open
+
+
+def names(session, count):
+    return [session.image_name(row) for row in range(count)]
+
+
+def query_images(capture, device):
+    session = capture[f"{device}_query"]
+    return [session.image_name(int(row)) for row in session.rows_of_keyframes(session.keyframes()[:1])[0]]
+
+
+def drawn(axis):
+    """Return the positions of the dots of an axis, in the file's pixels, a list a color."""
+    dots = [c.get_offsets() + 0.5 for c in axis.collections if not hasattr(c, "get_segments")]
+    return [np.asarray(xy) for xy in dots]
+
+
+def test_a_single_camera_shows_its_inliers_and_where_its_references_see_them(capture, open_pair):
+    found = some_correspondences([0] * 6, INLIERS)
+    query = LocalizedQuery(query_images(capture, "ios"), names(capture["ios_map"], 2), [], found)
+    details = open_pair("ios", query).details(0)
+    (camera,) = details.cameras
+    np.testing.assert_array_equal(camera.pixels, found.pixels)
+    np.testing.assert_allclose(camera.points, found.points)
+    assert camera.inlier.tolist() == INLIERS
+    assert [image.name for image in details.references] == query.references
+    second = details.references[1]
+    assert second.matches.tolist() == [0, 2, 4]
+    np.testing.assert_array_equal(second.pixels, found.view_pixels[found.view_reference == 1])
+    figure = draw_localization(details)
+    rejected, _ = drawn(figure.axes[0])
+    np.testing.assert_allclose(rejected, found.pixels[~found.inlier])
+    assert figure.axes[0].get_title() == "query: 4 of 6 map points agree"
+    assert [axis.get_title() for axis in figure.axes[1:]] == ["reference 1: 4 inliers", "reference 2: 2 inliers"]
+    rejected, agreeing = drawn(figure.axes[2])
+    np.testing.assert_allclose(agreeing, second.pixels[:2])
+    np.testing.assert_allclose(rejected, second.pixels[2:])
+
+
+def test_a_rig_shows_the_camera_with_the_most_inliers_first(capture, open_pair):
+    images = query_images(capture, "hl")
+    found = some_correspondences([0, 0, 0, 1, 1, 1], [True, False, False, True, True, True])
+    details = open_pair("hl", LocalizedQuery(images[::-1], names(capture["ios_map"], 1), [], found)).details(0)
+    assert [camera.name for camera in details.cameras[:2]] == [images[-2], images[-1]]
+    assert [camera.num_inliers for camera in details.cameras[:2]] == [3, 1]
+    np.testing.assert_array_equal(details.cameras[0].pixels, found.pixels[3:])
+    # Its true pose is its own, not that of the rig's first camera.
+    session = capture["hl_query"]
+    row = names(session, len(session)).index(images[-2])
+    np.testing.assert_allclose(details.cameras[0].world_from_cam_true, session.world_from_cam([row], True)[0])
+    np.testing.assert_allclose(details.cameras[0].world_from_cam, details.cameras[0].world_from_cam_true)
+
+
+def test_lifted_points_are_shown_although_no_map_holds_them(capture, open_pair):
+    found = some_correspondences([0] * 6, INLIERS, point_index=-1)
+    query = LocalizedQuery(query_images(capture, "ios"), names(capture["ios_map"], 2), [], found)
+    details = open_pair("ios", query, method="hybrid").details(0)
+    np.testing.assert_allclose(details.cameras[0].points, found.points)
+    assert [image.num_inliers for image in details.references] == [4, 2]
+
+
+def test_a_network_shows_consistent_and_rejected_references_and_claims_no_matches(capture, open_pair):
+    images = names(capture["ios_map"], 4)
+    query = LocalizedQuery(query_images(capture, "ios"), images[:2], images[2:])
+    details = open_pair("ios", query, method="vggt:simulated/vggt", num_inliers=2).details(0)
+    assert [image.name for image in details.references] == images[:2]
+    assert [image.name for image in details.rejected] == images[2:]
+    figure = draw_localization(details)
+    assert figure.axes[0].get_title() == "query: no matches, the pose rests on the references"
+    captions = [axis.get_title() for axis in figure.axes[1:]]
+    assert captions == ["reference 1", "reference 2", *["rejected: contradicts the others"] * 2]
+    assert not any(len(xy) for axis in figure.axes for xy in drawn(axis))
+
+
+def test_the_nearest_reference_is_shown(capture, open_pair):
+    image = capture["ios_map"].image_name(3)
+    query = LocalizedQuery(query_images(capture, "ios"), [image])
+    details = open_pair("ios", query, method="nearest", status="low_confidence").details(0)
+    assert [reference.name for reference in details.references] == [image]
+    assert not details.has_matches
+
+
+def test_a_failed_query_shows_its_matches_and_stands_at_its_first_reference(capture, open_pair):
+    found = some_correspondences([0] * 4, [False] * 4)
+    query = LocalizedQuery(query_images(capture, "ios"), ["gone.jpg", *names(capture["ios_map"], 2)], [], found)
+    pair = open_pair("ios", query, status="failed: too few inliers")
+    center = capture["ios_map"].world_from_cam([0])[0, :3, 3]
+    np.testing.assert_allclose(pair.localizations.nearest_reference, [center])
+    figure = draw_localization(pair.details(0))
+    assert figure.axes[0].get_title() == "query: not localized, 4 matches"
+    np.testing.assert_allclose(drawn(figure.axes[0])[0], found.pixels)
+    # References keep their numbers where one is no longer in the capture.
+    assert pair.details(0).references[0].matches.tolist() == [0, 2]
+
+
+def test_a_query_that_the_stage_could_not_begin_has_its_images(capture, open_pair):
+    pair = open_pair("ios", LocalizedQuery(), status="failed: no readable image")
+    (camera,) = pair.details(0).cameras
+    assert camera.name == query_images(capture, "ios")[0]
+    assert not len(camera.pixels)
+
+
+def test_poses_without_their_correspondences_are_an_error(capture, tmp_path):
+    stem = write_pair(capture, tmp_path, "ios", "ios", [LocalizedQuery()])
+    stem.with_name(f"{stem.name}.h5").unlink()
+    with pytest.raises(ArtifactError, match=r"\.h5"):
+        LocalizedPair.open(capture, "ios", "ios", tmp_path, None)
+
+
+def test_maps_are_those_that_the_poses_were_found_with(tmp_path):
+    empty = {"points": np.zeros((1, 3)), "colors": np.zeros((1, 3), np.uint8), "noise_px": np.ones(1, np.float32)}
+    index = np.zeros(1, np.int64)
+    local_map = LocalMap(["a"], [], np.eye(4)[None], obs_image=index, obs_keypoint=index, obs_point=index, **empty)
+    poses = tmp_path / "PLACE_map_ios_query_hl"
+    for name in ("ios_map.npz", "ios_map-superpoint.npz", "ios_map-other.npz"):
+        replace(local_map, cameras=[]).save(tmp_path / name)
+    (tmp_path / "ios_map-other.npz").write_bytes(b"no map")
+    assert len(map_files(tmp_path, "ios_map")) == 3
+    assert map_files(None, "ios_map") == ()
+    assert map_files(tmp_path, "hl_map") == ()
+    write_queries(tmp_path / f"{poses.name}.h5", {}, ["ios_map-superpoint.npz", "ios_map-gone.npz"])
+    assert [path.name for path in map_files(tmp_path, "ios_map", poses)] == ["ios_map-superpoint.npz"]
+    assert load_maps([tmp_path / "ios_map-other.npz"]) is None

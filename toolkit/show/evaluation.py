@@ -1,0 +1,189 @@
+"""Tables of an evaluation, and their figures."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+
+from toolkit.capture.devices import color_of, in_order
+from toolkit.show.figures import ORANGE, SKY, VERMILLION, new_figure, number, percent, styled
+from toolkit.show.metrics import REASONS, THRESHOLDS, Threshold, parse_threshold, threshold_name
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass
+class Evaluation:
+    """The tables of a scene; rows for every pair, also those that could not be evaluated (column `state`)."""
+
+    recall: pd.DataFrame
+    """One row a pair: counts, recall, medians over all queries (a missing pose is infinite), `ok_wrong`."""
+    errors: pd.DataFrame
+    """One row a query of a pair: errors, status, inliers, and why it misses each threshold."""
+    retrieval: pd.DataFrame
+    """One row a pair: share of queries with a good reference among the first K, and in the map at all."""
+    losses: pd.DataFrame
+    """One row a pair and threshold: queries missed, by reason."""
+    overlap: pd.DataFrame
+    """One row a pair: query images, and the share of them whose first reference overlaps with them in view."""
+    thresholds: tuple[Threshold, ...] = THRESHOLDS
+    messages: list[str] = field(default_factory=list)
+    """What was not evaluated, and why; empty where all was."""
+
+
+@styled
+def draw_evaluation(evaluation: Evaluation) -> dict[str, "Figure"]:
+    """Return the figures of an evaluation by name; those for which there is nothing to draw are left out."""
+    figures: dict[str, Figure] = {}
+    done = evaluation.recall
+    done = done.dropna(subset=["localized"]) if "localized" in done else done.iloc[:0]
+    if len(done):
+        columns = [(f"recall@{threshold_name(t)}", f"recall @ {t[0]:g}°, {t[1]:g} m", 100.0, "%")
+                   for t in evaluation.thresholds]  # fmt: skip
+        figures["recall"] = draw_matrices(
+            done, columns, "Share of queries localized within the threshold", "higher", (0, 100)
+        )
+        figures["median_errors"] = draw_matrices(
+            done,
+            [("median_rotation_deg", "median rotation error", 1.0, "°"),
+             ("median_translation_m", "median translation error", 100.0, "cm")],
+            "Median errors over all queries (∞: half of them have no pose)", "lower",
+        )  # fmt: skip
+        figures["error_curves"] = draw_error_curves(evaluation.errors, evaluation.thresholds)
+        if evaluation.losses["missed"].sum():
+            figures["losses"] = draw_losses(evaluation.losses)
+    retrieval = evaluation.retrieval
+    ks = [c for c in retrieval.columns if c.startswith("recall@")]
+    if ks:
+        evaluated = retrieval.dropna(subset=ks)
+        radius, angle = evaluated["radius_m"].iloc[0], evaluated["angle_deg"].iloc[0]
+        figures["retrieval"] = draw_matrices(
+            evaluated, [(k, f"in the first {k.removeprefix('recall@')}", 100.0, "%") for k in ks]
+            + [("in_map", "anywhere in the map", 100.0, "%")],
+            f"Share of queries with a reference within {radius:g} m and {angle:g}°", "higher", (0, 100),
+        )  # fmt: skip
+    return figures
+
+
+@styled
+def draw_matrices(
+    table: pd.DataFrame,
+    columns: Sequence[tuple[str, str, float, str]],
+    title: str,
+    better: str,
+    limits: tuple[float, float] | None = None,
+) -> "Figure":
+    """Draw map device x query device matrices side by side.
+
+    Args:
+        table: one row a pair.
+        columns: for each panel a column's name, title, factor and unit.
+        title: of the figure.
+        better: `higher` or `lower`: which values are good, shown light to dark.
+        limits: range of the colors after the factor; None: of the values.
+    """
+    figure = new_figure(3.1 * len(columns) + 0.4, 3.35)
+    maps, queries = (in_order(table[c]) for c in ("map_device", "query_device"))
+    axes = figure.subplots(1, len(columns), squeeze=False)[0]
+    for axis, (column, name, factor, unit) in zip(axes, columns, strict=True):
+        values = np.full((len(maps), len(queries)), np.nan)
+        for row in table.itertuples():
+            i, j = maps.index(row.map_device), queries.index(row.query_device)
+            values[i, j] = factor * float(table.at[row.Index, column])
+        finite = values[np.isfinite(values)]
+        # Values that hardly differ stay pale: dark is what stands out among them.
+        widest = max(float(finite.max()), 3 * float(np.median(finite)), 1e-9) if len(finite) else 1.0
+        low, high = limits or (0.0, widest)
+        shade = (np.clip(values, low, high) - low) / (high - low)
+        axis.imshow(shade, cmap="Blues" if better == "higher" else "Oranges", vmin=-0.08, vmax=1.25)
+        for (i, j), value in np.ndenumerate(values):
+            text = percent(value / 100) if unit == "%" else number(value)
+            axis.text(j, i, text, ha="center", va="center", fontsize=12,
+                      color="white" if shade[i, j] > 0.6 else "black")  # fmt: skip
+        axis.set_xticks(range(len(queries)), queries)
+        axis.set_yticks(range(len(maps)), maps)
+        axis.set_xlabel("query")
+        axis.set_title(f"{name} [{unit}]", fontsize=10)
+        axis.tick_params(which="both", length=0)
+        axis.set_xticks(np.arange(len(queries) - 1) + 0.5, minor=True)
+        axis.set_yticks(np.arange(len(maps) - 1) + 0.5, minor=True)
+        axis.grid(which="minor", color="white", lw=2)
+        axis.spines[:].set_visible(False)
+    axes[0].set_ylabel("map")
+    figure.suptitle(title)
+    return figure
+
+
+@styled
+def draw_error_curves(errors: pd.DataFrame, thresholds: Sequence[Threshold] = THRESHOLDS) -> "Figure":
+    """Draw cumulative distributions of the errors: a column a query device, a line a map device.
+
+    A curve ends at the share of queries that have a pose. Dotted lines are the recall thresholds.
+    """
+    queries, maps = in_order(errors["query_device"]), in_order(errors["map_device"])
+    figure = new_figure(3.6 * len(queries) + 0.8, 6.0)
+    axes = figure.subplots(2, len(queries), squeeze=False, sharey=True, sharex="row")
+    quantities = [
+        ("translation_error_m", "translation error [m]", 1),
+        ("rotation_error_deg", "rotation error [°]", 0),
+    ]
+    for row, (column, label, part) in enumerate(quantities):
+        finite = errors[column].to_numpy(float)
+        finite = np.maximum(finite[np.isfinite(finite)], 1e-4)
+        marks = sorted({t[part] for t in thresholds})
+        low, high = min([*finite, *marks]), max([*finite, *marks])
+        for axis, query in zip(axes[row], queries, strict=True):
+            for map_ in maps:
+                values = errors.loc[(errors.query_device == query) & (errors.map_device == map_), column]
+                if not len(values):
+                    continue
+                ascending = np.sort(values[np.isfinite(values)].to_numpy(float).clip(1e-4))
+                share = 100 * np.arange(len(ascending) + 1) / len(values)
+                axis.step([low / 2, *ascending, high * 2], [*share, share[-1]], where="post", lw=1.8,
+                          color=color_of(map_), label=f"{map_} map")  # fmt: skip
+            for mark in marks:
+                axis.axvline(mark, color="0.45", lw=0.9, ls=":")
+            axis.set_xscale("log")
+            axis.set_xlim(low / 1.5, high * 1.5)
+            axis.set_ylim(0, 102)
+            axis.set_xlabel(label)
+            axis.grid(alpha=0.25)
+            if row == 0:
+                axis.set_title(f"{query} queries", fontsize=10)
+        axes[row, 0].set_ylabel("queries below [%]")
+    axes[0, 0].legend(frameon=False, fontsize=9)
+    figure.suptitle("How many queries have an error below x")
+    return figure
+
+
+@styled
+def draw_losses(losses: pd.DataFrame) -> "Figure":
+    """Draw for each pair, a panel a threshold, the share of queries missed, by reason."""
+    losses = losses.dropna(subset=["threshold"])
+    thresholds = list(dict.fromkeys(losses["threshold"]))
+    pairs = list(dict.fromkeys(zip(losses["map_device"], losses["query_device"], strict=True)))
+    widest = max(10.0, 115 * float((losses["missed"] / losses["queries"]).max()))
+    figure = new_figure(3.3 * len(thresholds) + 1.2, 0.3 * len(pairs) + 1.7)
+    axes = figure.subplots(1, len(thresholds), squeeze=False, sharey=True, sharex=True)[0]
+    for axis, threshold in zip(axes, thresholds, strict=True):
+        rows = losses[losses["threshold"] == threshold].set_index(["map_device", "query_device"]).loc[pairs]
+        left = np.zeros(len(rows))
+        for reason, color in zip(REASONS, (SKY, ORANGE, VERMILLION), strict=True):
+            share = 100 * (rows[reason] / rows["queries"]).to_numpy(float)
+            axis.barh(range(len(rows)), share, left=left, color=color, label=reason, height=0.72)
+            left += share
+        for y, value in enumerate(left):
+            axis.text(value + 0.012 * widest, y, f"{value:.0f}", va="center", fontsize=8, color="0.3")
+        axis.set_xlim(0, widest)
+        axis.set_title("missed @ {:g}°, {:g} m".format(*parse_threshold(threshold)), fontsize=10)
+        axis.set_xlabel("queries [%]")
+        axis.grid(axis="x", alpha=0.25)
+    axes[0].set_yticks(range(len(pairs)), [f"{q} in {m} map" for m, q in pairs])
+    axes[0].invert_yaxis()
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    figure.suptitle("Where accuracy was lost")
+    return figure

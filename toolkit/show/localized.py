@@ -1,0 +1,253 @@
+"""The queries of a pair as the localize stage left them: poses, errors, and the correspondences that poses rest on."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from toolkit.capture import Capture, Session, Trajectory
+from toolkit.capture.tables import read_query_table
+from toolkit.errors import ArtifactError
+from toolkit.files import pair_name
+from toolkit.localizers.correspondences import Correspondences, LocalizedQueries, LocalizedQuery
+from toolkit.localizers.mapping import LocalMap
+from toolkit.show.metrics import is_posed, pose_errors, worst_first
+
+if TYPE_CHECKING:
+    import pycolmap
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+REFERENCES = 4
+"""References shown of a query, at most."""
+
+
+def map_files(map_dir: str | Path | None, session_id: str, poses: Path | None = None) -> tuple[Path, ...]:
+    """Return the triangulated maps of a session that are there, one a kind of features.
+
+    Args:
+        map_dir: folder of the maps; None: there are none.
+        session_id: of the map session.
+        poses: poses of a pair, with or without a suffix; the maps are those that the poses were found with. None,
+            or poses that do not tell: every map of the session in the folder.
+    """
+    if map_dir is None:
+        return ()
+    record, names = None if poses is None else poses.with_name(f"{poses.stem}.h5"), list[str]()
+    if record is not None and record.is_file():
+        queries = LocalizedQueries(record)
+        names = queries.maps
+        queries.close()
+    paths = [Path(map_dir) / name for name in names] or sorted(Path(map_dir).glob(f"{session_id}*.npz"))
+    return tuple(path for path in paths if path.is_file())
+
+
+def load_maps(paths: Sequence[Path]) -> LocalMap | None:
+    """Return the maps of one session as one; files that are no maps are passed over. None: there is no map."""
+    maps = []
+    for path in paths:
+        with suppress(ArtifactError):
+            maps.append(LocalMap.load(path))
+    return LocalMap.pooled(maps) if maps else None
+
+
+def sure_points(local_map: LocalMap | None) -> tuple[Array, NDArray[np.uint8] | None]:
+    """Return the points that at least three images see, (P, 3), and their colors (P, 3) RGB; the rest is noisy."""
+    if local_map is None:
+        return np.zeros((0, 3)), None
+    sure = local_map.track_lengths >= 3
+    return local_map.points[sure], local_map.colors[sure]
+
+
+@dataclass(frozen=True)
+class ShownImage:
+    """A posed photograph, and the correspondences that are seen in it."""
+
+    name: str
+    path: Path
+    camera: "pycolmap.Camera"
+    world_from_cam: Array
+    """(4, 4); NaN where it is not known."""
+    pixels: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    """(n, 2) where the points were measured, in the full image."""
+    points: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    """(n, 3) the points, meters; projecting them gives what the pose predicts."""
+    matches: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(n,) numbers of the correspondences: the same number in two images joins their pixels."""
+    inlier: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
+    """(n,) whether the pose agrees with it."""
+    world_from_cam_true: Array = field(default_factory=lambda: np.full((4, 4), np.nan))
+    """(4, 4); NaN where it is not known."""
+
+    @property
+    def num_inliers(self) -> int:
+        return int(self.inlier.sum())
+
+
+@dataclass(frozen=True)
+class QueryDetails:
+    """What is shown of one query when it is chosen."""
+
+    cameras: Sequence[ShownImage]
+    """Its images, at the estimated pose; the one with the most inliers first."""
+    references: Sequence[ShownImage] = ()
+    """Map images that it was localized by, best first."""
+    rejected: Sequence[ShownImage] = ()
+    """References that contradict the others."""
+
+    @property
+    def has_matches(self) -> bool:
+        """Whether the pose was sought by matching pixels, not by the references as a whole."""
+        return any(len(camera.matches) for camera in self.cameras)
+
+    def captioned_references(self) -> list[tuple[ShownImage, str]]:
+        """Return the references that are shown, at most `REFERENCES`, each with what can be said of it."""
+        agree = [
+            (image, f"reference {rank}" + (f": {image.num_inliers} inliers" if self.has_matches else ""))
+            for rank, image in enumerate(self.references, start=1)
+        ]
+        return [*agree, *((image, "rejected: contradicts the others") for image in self.rejected)][:REFERENCES]
+
+
+def support_of(row: pd.Series) -> str:
+    """Return what a row of a pair's csv says that its pose rests on, such as `120 inliers`."""
+    by_network = str(row.get("method", "")).rpartition("/")[2].startswith("vggt")
+    return f"{row['num_inliers']:.0f} {'consistent references' if by_network else 'inliers'}"
+
+
+@dataclass(frozen=True)
+class Localizations:
+    """The queries of a pair, one row each; the first image of a rig stands for it."""
+
+    names: Sequence[str]
+    table: pd.DataFrame
+    """Columns status and num_inliers, and others of the pair's csv."""
+    estimated: Array
+    """world_from_cam (Q, 4, 4), NaN where there is no pose."""
+    true: Array
+    """The same, true; NaN where it is not known."""
+    nearest_reference: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    """World position (Q, 3) of the first reference of queries without a pose; NaN where there is none."""
+
+    @cached_property
+    def ranked(self) -> pd.DataFrame:
+        """The table with the errors: `rotation_error_deg`, `translation_error_m`; infinite without a pose."""
+        rotation_deg, translation_m = pose_errors(self.estimated, self.true)
+        return self.table.assign(rotation_error_deg=rotation_deg, translation_error_m=translation_m)
+
+    def worst_first(self) -> Ints:
+        """Return the rows from the worst to the best (`metrics.worst_first`)."""
+        return worst_first(self.ranked)
+
+
+@dataclass
+class LocalizedPair:
+    """The queries of a pair in their map. What a picture needs of one query is read when it is asked for."""
+
+    name: str
+    map_session: Session
+    query_session: Session
+    table: pd.DataFrame
+    """The pair's csv: a row for each query that has an image."""
+    rows: list[Ints]
+    """Rows of the session's images of each query."""
+    world_from_rig: Array
+    """(Q, 4, 4), NaN where there is no pose."""
+    queries: LocalizedQueries
+    local_map: LocalMap | None
+    """The triangulated maps that the run used, pooled."""
+
+    @classmethod
+    def open(
+        cls, capture: Capture, map_device: str, query_device: str, poses_dir: str | Path, map_dir: str | Path | None
+    ) -> "LocalizedPair":
+        """Read what the localize stage left of a pair.
+
+        Raises:
+            ArtifactError: the poses, their table or their correspondences are missing or torn.
+        """
+        name = pair_name(capture.name, map_device, query_device)
+        session, stem = capture[f"{query_device}_query"], Path(poses_dir) / name
+        table = read_query_table(Path(f"{stem}.csv"), ["status"])
+        rows = session.rows_of_keyframes(table)
+        has_image = np.array([len(images) > 0 for images in rows], bool)
+        table, rows = table[has_image].reset_index(drop=True), [images for images in rows if len(images)]
+        poses = Trajectory.read(Path(f"{stem}.txt")).lookup(table["timestamp"].to_numpy(), table["device_id"])
+        local_map = load_maps(map_files(map_dir, f"{map_device}_map", stem))
+        queries = LocalizedQueries(Path(f"{stem}.h5"))
+        return cls(name, capture[f"{map_device}_map"], session, table, rows, poses, queries, local_map)
+
+    @cached_property
+    def _map_rows(self) -> dict[str, int]:
+        """Row of a map image by its name."""
+        return {self.map_session.image_name(row): row for row in range(len(self.map_session))}
+
+    def localized(self, k: int) -> LocalizedQuery:
+        """Return what the pose of query k rests on; nothing where the stage could not even begin."""
+        key = int(self.table["timestamp"].iloc[k]), str(self.table["device_id"].iloc[k])
+        return self.queries.get(key, LocalizedQuery())
+
+    @cached_property
+    def localizations(self) -> Localizations:
+        """All queries."""
+        session = self.query_session
+        first = np.array([rows[0] for rows in self.rows], np.int64)
+        estimated = self.world_from_rig @ session.rig_from_cam(first)
+        centers = np.full((len(first), 3), np.nan)
+        for k in np.flatnonzero(~is_posed(estimated)):
+            names = [name for name in self.localized(int(k)).references if name in self._map_rows]
+            if names:
+                centers[k] = self.map_session.world_from_cam([self._map_rows[names[0]]])[0, :3, 3]
+        names = [session.image_name(int(row)) for row in first]
+        return Localizations(names, self.table, estimated, session.world_from_cam(first, ground_truth=True), centers)
+
+    def details(self, k: int) -> QueryDetails:
+        """Return images, correspondences and references of query k."""
+        session, rows, query = self.query_session, self.rows[k], self.localized(k)
+        poses = self.world_from_rig[k] @ session.rig_from_cam(rows)
+        cameras = []
+        for row, pose in zip(rows.tolist(), poses, strict=True):
+            name = session.image_name(row)
+            matches = query.correspondences.in_camera(query.images.index(name) if name in query.images else -1)
+            pixels = query.correspondences.pixels[matches]
+            cameras.append(_shown_image(session, row, pose, query.correspondences, matches, pixels))
+        cameras.sort(key=lambda camera: -camera.num_inliers)
+        references = [self._reference(name, query, number) for number, name in enumerate(query.references)]
+        rejected = [self._reference(name, query) for name in query.rejected]
+        return QueryDetails(
+            cameras,
+            [image for image in references if image is not None][:REFERENCES],
+            [image for image in rejected if image is not None][:REFERENCES],
+        )
+
+    def _reference(self, name: str, query: LocalizedQuery, number: int = -1) -> ShownImage | None:
+        """Return a map image with the correspondences that it sees as reference `number`; None: no such image."""
+        row, found = self._map_rows.get(name), query.correspondences
+        if row is None:
+            return None
+        views = np.flatnonzero(found.view_reference == number)
+        pose = self.map_session.world_from_cam([row])[0]
+        return _shown_image(self.map_session, row, pose, found, found.view_of[views], found.view_pixels[views])
+
+
+def _shown_image(
+    session: Session, row: int, pose: Array, found: Correspondences, matches: Ints, pixels: Array
+) -> ShownImage:
+    return ShownImage(
+        session.image_name(row),
+        session.image_path(row),
+        session.camera(str(session.images["sensor_id"].iloc[row])),
+        pose,
+        pixels,
+        found.points[matches],
+        matches,
+        found.inlier[matches],
+        session.world_from_cam([row], ground_truth=True)[0],
+    )

@@ -1,0 +1,117 @@
+"""How good poses are: errors, recall, why queries are lost, and which queries are the worst."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from toolkit.geometry import pose_error
+
+if TYPE_CHECKING:
+    from toolkit.capture import Trajectory
+
+Array = NDArray[np.float64]
+Threshold = tuple[float, float]
+"""Degrees and meters."""
+
+THRESHOLDS: tuple[Threshold, ...] = ((1, 0.1), (5, 0.5), (5, 1.0))
+WRONG: Threshold = (5, 0.5)
+"""An `ok` pose beyond this is a false promise: downstream users ask for the share of those."""
+NO_REFERENCE, NO_POSE, WRONG_POSE = REASONS = ("no good reference", "no pose", "wrong pose")
+"""Why a query misses a threshold."""
+
+
+def pose_errors(
+    estimated: "Trajectory | Array", truth: "Trajectory | Array", keys: pd.DataFrame | None = None
+) -> tuple[Array, Array]:
+    """Return the rotation error, degrees, and the translation error, meters, of each query, (N,) each.
+
+    As the LaMAR benchmark defines them: angle and length of inverse(estimated) @ true. A query without an
+    estimate has infinite errors; one without a true pose, NaN.
+
+    Args:
+        estimated: world_from_device of the queries, a trajectory, or (N, 4, 4) with NaN where there is none.
+        truth: the same, true.
+        keys: the queries, columns `timestamp` and `device_id`; needed where a trajectory is given.
+    """
+    estimates, truths = poses_of(estimated, keys), poses_of(truth, keys)
+    if estimates.shape != truths.shape:
+        raise ValueError(f"Expected one true pose an estimate, got {truths.shape} for {estimates.shape}.")
+    has_truth, has_estimate = is_posed(truths), is_posed(estimates)
+    rotation_deg = np.where(has_truth, np.inf, np.nan)
+    translation_m = rotation_deg.copy()
+    both = has_truth & has_estimate
+    if both.any():
+        rotation_deg[both], translation_m[both] = pose_error(estimates[both], truths[both])
+    return rotation_deg, translation_m
+
+
+def poses_of(poses: "Trajectory | Array", keys: pd.DataFrame | None) -> Array:
+    """Return world_from_device (N, 4, 4) of queries (columns timestamp, device_id); NaN where there is no pose."""
+    if isinstance(poses, np.ndarray):
+        return poses
+    if keys is None:
+        raise ValueError("A trajectory needs `keys`: which queries, columns timestamp and device_id.")
+    return poses.lookup(keys["timestamp"].to_numpy(np.int64), keys["device_id"].to_numpy(str))
+
+
+def is_posed(poses: Array) -> NDArray[np.bool_]:
+    """Return which of poses (..., 4, 4) are finite."""
+    return np.asarray(np.isfinite(poses).all((-1, -2)), bool)
+
+
+def recall(
+    rotation_deg: Array, translation_m: Array, thresholds: Sequence[Threshold] = THRESHOLDS
+) -> NDArray[np.float64]:
+    """Return the share of queries, 0 to 1, with both errors strictly below each (degrees, meters) pair.
+
+    All queries count; one without a pose has infinite errors and is a miss. NaN where there is no query.
+    """
+    rotation_deg, translation_m = np.asarray(rotation_deg), np.asarray(translation_m)
+    if not len(rotation_deg):
+        return np.full(len(thresholds), np.nan)
+    return np.array([np.mean(is_below(rotation_deg, translation_m, threshold)) for threshold in thresholds])
+
+
+def is_below(rotation_deg: Array, translation_m: Array, threshold: Threshold) -> NDArray[np.bool_]:
+    """Return which queries have both errors strictly below a threshold."""
+    return (rotation_deg < threshold[0]) & (translation_m < threshold[1])
+
+
+def threshold_name(threshold: Threshold) -> str:
+    """Return `(1deg,0.1m)`, the name of a threshold in tables."""
+    return f"({threshold[0]:g}deg,{threshold[1]:g}m)"
+
+
+def parse_threshold(name: str) -> Threshold:
+    """Return the threshold of a name such as `(5deg,0.5m)` or `recall@(5deg,0.5m)`."""
+    degrees, _, meters = name.rpartition("@")[2].strip("()").partition(",")
+    return float(degrees.removesuffix("deg")), float(meters.removesuffix("m"))
+
+
+def worst_first(queries: pd.DataFrame, threshold: Threshold = THRESHOLDS[0]) -> NDArray[np.int64]:
+    """Return the positions of queries in order from the worst to the best.
+
+    Failed queries come first. Then, where the truth is known, queries by their error: the larger of the rotation and
+    the translation error, in units of `threshold`. Where it is not known, low confidence comes before ok, then few
+    inliers before many, then a large stated deviation before a small one.
+
+    Args:
+        queries: one row a query. Column `status`; and, NaN or absent where not known, `rotation_error_deg`,
+            `translation_error_m`, `num_inliers` and `position_std_m`.
+        threshold: degrees and meters that weigh alike.
+    """
+
+    def column(name: str, unknown: float) -> Array:
+        values: Any = queries[name] if name in queries else np.full(len(queries), np.nan)
+        values = np.asarray(values, np.float64)
+        return np.where(np.isnan(values), unknown, values)
+
+    ok = ~queries["status"].str.startswith("failed").to_numpy(bool)
+    sure = (queries["status"] != "low_confidence").to_numpy(bool)
+    rotation, translation = column("rotation_error_deg", -1) / threshold[0], column("translation_error_m", -1)
+    error = np.maximum(rotation, translation / threshold[1])
+    # The last key counts most.
+    return np.lexsort((-column("position_std_m", np.inf), column("num_inliers", 0), sure, -error, ok))
