@@ -2,7 +2,8 @@
 
 import logging
 import time
-from dataclasses import dataclass, field
+from collections import Counter
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,6 +42,7 @@ from toolkit.show.viewer import (
 )
 
 if TYPE_CHECKING:
+    import pycolmap
     import rerun as rr
 
 logger = logging.getLogger(__name__)
@@ -168,7 +170,7 @@ def record_session(
         messages.append(f"{session.id}: no frame has a pose; images are shown without a place.")
     if map_dir is not None and local_map is None:
         messages.append(f"{map_dir}: holds no map for this recording, so no points are shown.")
-    counts: dict[str, int] = {"frames": len(plan.frames), "images": 0, "unreadable": 0, "unposed": 0, "depth_maps": 0}
+    counts = Counter(frames=len(plan.frames))
     with open_recording(path, f"{capture.name}_{session.id}", _session_layout(plan, placed, up)) as stream:
         stream.log("world", world_axes(up), static=True)
         if local_map is not None:
@@ -179,25 +181,22 @@ def record_session(
         if localized is not None:
             _log_queries(stream, localized, session)
             counts["queries"] = len(localized.poses)
-        writer = _FrameWriter(stream, session, camera_depth_m(placed[:, :3, 3]), color_of(session.device))
+        writer = _FrameWriter(stream, camera_depth_m(placed[:, :3, 3]), color_of(session.device))
         writer.announce(plan.frames)
 
-        def load(number: int) -> list["_Loaded"]:
-            return [_load(session, shot, image_size, quality) for shot in plan.shots(number)]
+        def load(number: int) -> list[_Shot]:
+            return [_load(shot, image_size, quality) for shot in plan.shots(number)]
 
         loaded = prefetch(load, range(len(plan.frames)), workers or default_workers())
-        for number, shots in enumerate(
-            tqdm(loaded, total=len(plan.frames), desc=session.id, unit="frame", disable=not progress)
-        ):
-            for name, value in writer.write(plan.frames[number], shots).items():
-                counts[name] += value
+        bar = tqdm(loaded, total=len(plan.frames), desc=session.id, unit="frame", disable=not progress)
+        for frame, shots in zip(plan.frames, bar, strict=True):
+            counts.update(writer.write(frame, shots))
         writer.finish()
     if counts["unreadable"]:
         messages.append(f"{session.id}: {counts['unreadable']} images or depth maps cannot be read.")
     seconds, size_bytes = round(time.perf_counter() - started, 2), path.stat().st_size
-    holds = {**counts, "seconds": seconds, "bytes": size_bytes, "messages": messages}
     write_sidecar(path, settings)
-    recording = SessionRecording(path, **holds)  # type: ignore[arg-type]
+    recording = SessionRecording(path, **counts, seconds=seconds, bytes=size_bytes, messages=messages)
     logger.info("%s: %d frames, %d images in %.0f s, %.1f MB", path, recording.frames, recording.images, seconds,
                 size_bytes / 1e6)  # fmt: skip
     if spawn:
@@ -207,27 +206,20 @@ def record_session(
 
 @dataclass(frozen=True)
 class _Shot:
-    """A picture or depth map of a frame: what to read, and where it goes."""
+    """A picture or depth map of a frame: what to read and where it goes; and, once read, what is shown."""
 
     slot: str
     """Name of its camera in the recording, the same from frame to frame."""
-    sensor_id: str
-    rig_from_sensor: Array | None
-    """(4, 4); None for a camera without a rig."""
+    camera: "pycolmap.Camera"
+    parent_from_sensor: Array
+    """(4, 4) in the rig; of a camera without one, in the world; NaN where it has no pose."""
     path: Path
     is_depth: bool = False
-
-
-@dataclass(frozen=True)
-class _Loaded:
-    """A shot, read and made small."""
-
-    shot: _Shot
-    data: bytes
+    data: bytes = b""
     """JPEG, or 16-bit PNG of millimeters; empty where a depth map cannot be read."""
-    size: tuple[int, int]
+    size: tuple[int, int] = (0, 0)
     """Width and height shown."""
-    readable: bool
+    readable: bool = False
 
 
 @dataclass(frozen=True)
@@ -292,7 +284,6 @@ class _Plan:
         poses = np.full((len(first), 4, 4), np.nan)
         if trajectory is not None:
             poses = trajectory.lookup(first["timestamp"].to_numpy(), first["device_id"].to_numpy(str))
-        tracks = _tracks(first, poses)
         shown = np.ones(len(first), bool)
         if keyframes is not None:
             listed = pd.MultiIndex.from_frame(session.keyframes(keyframes)[["timestamp", "device_id"]].astype(object))
@@ -318,26 +309,24 @@ class _Plan:
             devices, rig_from_depth = session.devices_of(times, session.depths["sensor_id"])
             for row, key in enumerate(zip(times.tolist(), devices.tolist(), strict=True)):
                 depths.setdefault(key, []).append(row)
-        return cls(session, frames, tracks, cameras, depths, rig_from_depth)
+        return cls(session, frames, _tracks(first, poses), cameras, depths, rig_from_depth)
 
     def shots(self, number: int) -> list[_Shot]:
         """Return what is to be read for a frame."""
         frame, session = self.frames[number], self.session
-        sensors = session.images["sensor_id"].iloc[frame.rows].tolist()
         in_rig = frame.device != ""
-        poses = session.rig_from_cam(frame.rows)
+        sensors, poses = session.images["sensor_id"].iloc[frame.rows].tolist(), session.rig_from_cam(frame.rows)
         shots = [
-            _Shot(slot, sensor, pose if in_rig else None, session.image_path(int(row)))
-            for slot, sensor, pose, row in zip(frame.slots, sensors, poses, frame.rows, strict=True)
+            _Shot(slot, session.camera(sensor), pose if in_rig else frame.world_from_device, session.image_path(row))
+            for slot, sensor, pose, row in zip(frame.slots, sensors, poses, frame.rows.tolist(), strict=True)
         ]
         slot_of = dict(zip(sensors, frame.slots, strict=True))
         for rank, row in enumerate(self.depths.get((frame.timestamp, frame.device_id), [])):
             sensor = str(session.depths["sensor_id"].iloc[row])  # type: ignore[index]
             path = session.depth_path(frame.timestamp, sensor)
             if path is not None:
-                pose = self.rig_from_depth[row] if in_rig else None
-                slot = f"{slot_of.get(sensor, rank)}_depth"
-                shots.append(_Shot(slot, sensor, pose, path, is_depth=True))
+                pose, slot = self.rig_from_depth[row] if in_rig else frame.world_from_device, slot_of.get(sensor, rank)
+                shots.append(_Shot(f"{slot}_depth", session.camera(sensor), pose, path, is_depth=True))
         return shots
 
 
@@ -408,39 +397,39 @@ def _names(table: pd.DataFrame, column: str, frame: list[str], kind: str) -> pd.
     return names
 
 
-def _load(session: Session, shot: _Shot, image_size: int, quality: int) -> _Loaded:
+def _load(shot: _Shot, image_size: int, quality: int) -> _Shot:
     """Read a picture or depth map and make it small; in a thread."""
     if shot.is_depth:
         depth = cv2.imread(str(shot.path), cv2.IMREAD_UNCHANGED)
         if depth is None or depth.dtype != np.uint16 or depth.ndim != 2:
-            return _Loaded(shot, b"", (0, 0), False)
+            return shot
         scale = min(1.0, image_size / 2 / max(depth.shape))
         width, height = (max(1, round(scale * side)) for side in depth.shape[::-1])
         # Nearest: means across edges would hang in the air.
         small = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST)
-        return _Loaded(shot, cv2.imencode(".png", small)[1].tobytes(), (width, height), True)
+        data = cv2.imencode(".png", small)[1].tobytes()
+        return replace(shot, data=data, size=(width, height), readable=True)
     try:
         image, readable = read_image(shot.path), True
     except ImageError:
-        camera = session.camera(shot.sensor_id)
-        blank = read_for_display(shot.path)
-        image, readable = np.asarray(cv2.resize(blank, (camera.width, camera.height)), np.uint8), False
+        blank = cv2.resize(read_for_display(shot.path), (shot.camera.width, shot.camera.height))
+        image, readable = np.asarray(blank, np.uint8), False
     data, size = small_jpeg(image, image_size, quality)
-    return _Loaded(shot, data, size, readable)
+    return replace(shot, data=data, size=size, readable=readable)
 
 
 class _FrameWriter:
     """Logs frames in order; what has not changed since the last frame is not logged again."""
 
-    def __init__(self, stream: "rr.RecordingStream", session: Session, size: float, color: str) -> None:
-        self._stream, self._session, self._size, self._color = stream, session, size, color
-        self._last: dict[str, tuple[float, ...]] = {}
+    def __init__(self, stream: "rr.RecordingStream", size: float, color: str) -> None:
+        self._stream, self._size, self._color = stream, size, color
+        self._last: dict[tuple[str, str], tuple[float, ...]] = {}
         """Numbers last logged, by entity and kind."""
-        self._alive: dict[tuple[str, str], dict[str, _Loaded]] = {}
+        self._alive: dict[tuple[str, str], dict[str, _Shot]] = {}
         """Entities of cameras that show something, and what, by subsession and device."""
         self._now: _Frame | None = None
 
-    def write(self, frame: _Frame, shots: list[_Loaded]) -> dict[str, int]:
+    def write(self, frame: _Frame, shots: list[_Shot]) -> Counter[str]:
         """Log a frame; return how many of what it held."""
         import rerun as rr
 
@@ -448,33 +437,29 @@ class _FrameWriter:
             self.finish()
         self._now = frame
         self._set_time(frame.index, frame.timestamp)
-        root, posed = frame.entity, frame.posed
-        shown: dict[str, _Loaded] = {}
-        # A camera without a rig carries its pose itself.
-        if posed and frame.device:
-            self._stream.log(root, transform_of(frame.world_from_device))
-        counts = {"images": 0, "unreadable": 0, "unposed": 0, "depth_maps": 0}
-        for loaded in shots:
-            shot = loaded.shot
-            path = f"{root}/{entity(shot.slot)}"
-            if shot.is_depth and not loaded.readable:
-                counts["unreadable"] += 1
+        if frame.posed and frame.device:
+            self._stream.log(frame.entity, transform_of(frame.world_from_device))
+        shown: dict[str, _Shot] = {}
+        counts: Counter[str] = Counter()
+        for shot in shots:
+            counts["unreadable"] += not shot.readable
+            if not shot.data:
                 continue
-            shown[path] = loaded
-            if posed and not frame.device:
-                self._stream.log(path, transform_of(frame.world_from_device))
-            elif posed and shot.rig_from_sensor is not None:
-                self._log_changed(path, "pose", shot.rig_from_sensor, lambda s=shot: transform_of(s.rig_from_sensor))
-            self._log_intrinsics(path, loaded)
+            path = f"{frame.entity}/{entity(shot.slot)}"
+            shown[path] = shot
+            if frame.posed:
+                pose = shot.parent_from_sensor
+                self._log_changed(path, "pose", pose, lambda pose=pose: transform_of(pose))
+            numbers = [*shown_intrinsics(shot.camera, shot.size).ravel(), *shot.size]
+            self._log_changed(path, "pinhole", numbers, lambda s=shot: self._pinhole(s, self._size))
             if shot.is_depth:
-                depth = rr.EncodedDepthImage(loaded.data, media_type="image/png", meter=DEPTH_SCALE)
+                depth = rr.EncodedDepthImage(shot.data, media_type="image/png", meter=DEPTH_SCALE)
                 self._stream.log(f"{path}/depth", depth)
                 counts["depth_maps"] += 1
-                continue
-            self._stream.log(f"{path}/image", jpeg_of(loaded.data))
-            counts["images"] += 1
-            counts["unreadable"] += not loaded.readable
-            counts["unposed"] += not posed
+            else:
+                self._stream.log(f"{path}/image", jpeg_of(shot.data))
+                counts["images"] += 1
+                counts["unposed"] += not frame.posed
         # What this device showed before and does not now would hang on at its old place.
         device = (frame.subsession, frame.device or frame.slots[0])
         self._hide({path: last for path, last in self._alive.get(device, {}).items() if path not in shown})
@@ -508,22 +493,19 @@ class _FrameWriter:
         self._stream.set_time(FRAME, sequence=index)
         self._stream.set_time(CAPTURE_TIME, duration=np.timedelta64(timestamp, "us"))
 
-    def _hide(self, cameras: dict[str, _Loaded]) -> None:
-        for path, last in cameras.items():
-            camera = self._session.camera(last.shot.sensor_id)
-            self._stream.log(path, pinhole_of(camera, last.size, HIDDEN_M, self._color))
-            self._last.pop(f"{path}|pinhole", None)
+    def _pinhole(self, shot: _Shot, depth_m: float) -> "rr.Pinhole":
+        return pinhole_of(shot.camera, shot.size, depth_m, self._color)
+
+    def _hide(self, cameras: dict[str, _Shot]) -> None:
+        for path, shot in cameras.items():
+            self._stream.log(path, self._pinhole(shot, HIDDEN_M))
+            self._last.pop((path, "pinhole"), None)
 
     def _log_changed(self, path: str, kind: str, numbers: ArrayLike, make: Any) -> None:
         values = tuple(np.ravel(numbers).tolist())
-        if self._last.get(f"{path}|{kind}") != values:
+        if self._last.get((path, kind)) != values:
             self._stream.log(path, make())
-            self._last[f"{path}|{kind}"] = values
-
-    def _log_intrinsics(self, path: str, loaded: _Loaded) -> None:
-        camera = self._session.camera(loaded.shot.sensor_id)
-        numbers = [*shown_intrinsics(camera, loaded.size).ravel(), *loaded.size]
-        self._log_changed(path, "pinhole", numbers, lambda: pinhole_of(camera, loaded.size, self._size, self._color))
+            self._last[path, kind] = values
 
 
 def _session_layout(plan: _Plan, poses: Array, up: Array) -> Any:

@@ -6,7 +6,7 @@ import json
 import math
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -16,7 +16,7 @@ import pandas as pd
 from toolkit.errors import ArtifactError
 from toolkit.files import SceneFiles, sidecar_path, write_text
 from toolkit.show.figures import number, percent
-from toolkit.show.metrics import REASONS, THRESHOLDS, parse_threshold, worst_first
+from toolkit.show.metrics import REASONS, THRESHOLDS, WRONG, parse_threshold, worst_first
 
 # All pictures of a page together, before base64 makes them a third larger: the page stays below 10 MB.
 PICTURE_BUDGET = 7_000_000
@@ -90,34 +90,6 @@ class Table:
     caption: str
     columns: list[str]
     rows: list[list[Cell]]
-
-
-@dataclass
-class Scene:
-    """What the page shows of one scene."""
-
-    name: str
-    fingerprint: str = ""
-    verdict: list[str] = field(default_factory=list)
-    headlines: list[tuple[str, str]] = field(default_factory=list)
-    recall: list[Matrix] = field(default_factory=list)
-    medians: list[Matrix] = field(default_factory=list)
-    pairs: Table | None = None
-    losses: Table | None = None
-    missed: int = 0
-    failures: Table | None = None
-    worst: Table | None = None
-    worst_pictures: list[Picture] = field(default_factory=list)
-    retrieval: list[Matrix] = field(default_factory=list)
-    retrieval_note: str = ""
-    messages: list[str] = field(default_factory=list)
-    figures: list[Picture] = field(default_factory=list)
-    maps: list[Picture] = field(default_factory=list)
-    samples: list[Picture] = field(default_factory=list)
-    recordings: list[Cell] = field(default_factory=list)
-    files: Table | None = None
-    others: list[Cell] = field(default_factory=list)
-    """Files that are of no single pair."""
 
 
 def write_report(run_dir: str | Path) -> Path:
@@ -230,40 +202,52 @@ def _stages(run: dict[str, Any], run_dir: Path) -> Table:
 # A scene
 
 
-def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> Scene:
-    scene = Scene(files.scene, fingerprint)
+def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> dict[str, Any]:
+    """Return what the page shows of one scene, by the names that the template has for it."""
+    messages: list[str] = []
     recall, errors, losses, retrieval = (
-        _read_table(files.evaluation / f"{name}.csv", scene.messages)
+        _read_table(files.evaluation / f"{name}.csv", messages)
         for name in ("recall", "errors", "losses", "retrieval")
     )
     thresholds = [column for column in recall.columns if column.startswith("recall@")]
-    statuses = _read_statuses(files, scene.messages)
-    _verdict(scene, recall, errors, statuses, thresholds)
-    for column in thresholds:
-        scene.recall.append(_matrix(recall, column, f"Recall at {_threshold(column)} [%]", percent, lambda v: 0.9 * v))
-    for column, title, factor in MEDIANS if thresholds else ():
-        scene.medians.append(_matrix(recall, column, title, lambda v, f=factor: number(v * f)))
-    if len(recall):
-        scene.pairs = _pairs(recall, thresholds)
-        scene.messages += _messages(files.evaluation / "recall.csv")
-    scene.losses, scene.missed = _losses(losses), int(losses.get("missed", pd.Series(dtype=float)).sum())
-    scene.failures = _failures(statuses)
-    scene.worst = _worst(errors if len(errors) else statuses, thresholds)
-    scene.retrieval, scene.retrieval_note = _retrieval(retrieval, scene.headlines)
+    statuses = _read_statuses(files, messages)
+    messages += _messages(files.evaluation / "recall.csv") if len(recall) else []
+    verdict, headlines = _verdict(recall, errors, statuses, thresholds)
+    matrices, note = _retrieval(retrieval, headlines)
     stills = sorted(files.visualization.glob("*.png"), key=_natural)
     worst = [path for path in stills if path.name.startswith("worst")]
     samples = [path for path in stills if path.name.startswith("localization")]
-    # What fails to be understood without a picture comes first, while there is room.
-    scene.worst_pictures = [album.picture(path) for path in worst]
-    for name, (title, caption) in EVALUATION_FIGURES.items():
-        if (path := files.evaluation / f"{name}.png").is_file():
-            scene.figures.append(album.picture(path, title, caption))
-    scene.maps = [album.picture(path) for path in stills if path not in worst and path not in samples]
-    scene.samples = [album.picture(path) for path in samples]
-    scene.recordings = _linked(files.run, files.visualization.glob("*.rrd"))
-    scene.files = _files(files)
-    scene.others = _linked(files.run, files.evaluation.glob("*.csv"))
-    return scene
+    figures = {files.evaluation / f"{name}.png": texts for name, texts in EVALUATION_FIGURES.items()}
+    return {
+        "name": files.scene,
+        "fingerprint": fingerprint,
+        "verdict": verdict,
+        "headlines": headlines,
+        "messages": messages,
+        "recall": [
+            _matrix(recall, column, f"Recall at {_threshold(column)} [%]", percent, lambda v: 0.9 * v)
+            for column in thresholds
+        ],
+        "medians": [
+            _matrix(recall, column, title, lambda v, f=factor: number(v * f))
+            for column, title, factor in (MEDIANS if thresholds else ())
+        ],
+        "pairs": _pairs(recall, thresholds) if len(recall) else None,
+        "losses": _losses(losses),
+        "missed": int(losses["missed"].sum()) if "missed" in losses else 0,
+        "failures": _failures(statuses),
+        "worst": _worst(errors if len(errors) else statuses, thresholds),
+        "retrieval": matrices,
+        "retrieval_note": note,
+        # What fails to be understood without a picture comes first, while there is room.
+        "worst_pictures": [album.picture(path) for path in worst],
+        "figures": [album.picture(path, *texts) for path, texts in figures.items() if path.is_file()],
+        "maps": [album.picture(path) for path in stills if path not in worst and path not in samples],
+        "samples": [album.picture(path) for path in samples],
+        "recordings": _linked(files.run, files.visualization.glob("*.rrd")),
+        "files": _files(files),
+        "others": _linked(files.run, files.evaluation.glob("*.csv")),
+    }
 
 
 def _read_table(path: Path, messages: list[str]) -> pd.DataFrame:
@@ -306,35 +290,35 @@ def _messages(table: Path) -> list[str]:
 
 
 def _verdict(
-    scene: Scene, recall: pd.DataFrame, errors: pd.DataFrame, statuses: pd.DataFrame, thresholds: list[str]
-) -> None:
-    """Say in a few sentences and numbers how good the answers are."""
+    recall: pd.DataFrame, errors: pd.DataFrame, statuses: pd.DataFrame, thresholds: list[str]
+) -> tuple[list[str], list[tuple[str, str]]]:
+    """Return in a few sentences, and in numbers with what they mean, how good the answers are."""
+    verdict, headlines = list[str](), list[tuple[str, str]]()
     if len(statuses):
         pairs = len(statuses[["map_device", "query_device"]].drop_duplicates())
-        failed = int(statuses["status"].str.startswith("failed").sum())
-        low = int((statuses["status"] == "low_confidence").sum())
-        ok = len(statuses) - failed - low
-        counts = f"{ok} ok, {low} low confidence, {failed} failed"
-        scene.verdict.append(f"{len(statuses)} queries asked in {_plural(pairs, 'pair')} of devices: {counts}.")
+        counts = statuses["status"].str.split(":").str[0].value_counts()
+        parts = ", ".join(f"{counts.get(s, 0)} {s.replace('_', ' ')}" for s in ("ok", "low_confidence", "failed"))
+        verdict.append(f"{len(statuses)} queries asked in {pairs} pair{'s' * (pairs != 1)} of devices: {parts}.")
     done = recall.dropna(subset=thresholds) if thresholds else recall.iloc[:0]
     if not len(done):
-        return
+        return verdict, headlines
     for column in thresholds:
-        scene.headlines.append((f"{percent(done[column].mean())} %", f"mean recall at {_threshold(column)}"))
+        headlines.append((f"{percent(done[column].mean())} %", f"mean recall at {_threshold(column)}"))
     if len(errors):
-        medians = errors[["rotation_error_deg", "translation_error_m"]].median()
-        text = f"median error of position; {number(medians.iloc[0])}° of rotation"
-        scene.headlines.append((_length(medians.iloc[1]), text))
+        rotation_deg, translation_m = errors[["rotation_error_deg", "translation_error_m"]].median()
+        headlines.append((_length(translation_m), f"median error of position; {number(rotation_deg)}° of rotation"))
     strict = thresholds[0]
     weakest = done.loc[done[strict].idxmin()]
+    share, limit = percent(weakest[strict]), _threshold(strict)
     if weakest[strict] == done[strict].max():
-        scene.verdict.append(f"Every pair has {percent(weakest[strict])} % at {_threshold(strict)}.")
+        verdict.append(f"Every pair has {share} % at {limit}.")
     else:
         pair = f"{weakest['query_device']} queries in the {weakest['map_device']} map"
-        scene.verdict.append(f"Weakest pair at {_threshold(strict)}: {pair}, {percent(weakest[strict])} %.")
+        verdict.append(f"Weakest pair at {limit}: {pair}, {share} %.")
     if "ok_wrong" in done:
         wrong = float((done["ok_wrong"] * done["queries"]).sum() / done["queries"].sum())
-        scene.headlines.append((f"{percent(wrong)} %", "called ok, but beyond 5°, 0.5 m"))
+        headlines.append((f"{percent(wrong)} %", "called ok, but beyond {:g}°, {:g} m".format(*WRONG)))
+    return verdict, headlines
 
 
 def _matrix(table: pd.DataFrame, column: str, title: str, text: Any, shade: Any = lambda value: None) -> Matrix:
@@ -481,10 +465,6 @@ def _linked(run_dir: Path, paths: Iterable[Path]) -> list[Cell]:
 def _natural(path: Path) -> list[Any]:
     """Sort key that puts 10 after 9."""
     return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
-
-
-def _plural(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def _share(share: float) -> Cell:
