@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pandas as pd
 
-from toolkit.capture import Capture, Trajectory
+from toolkit.capture import Capture, Session, Trajectory
 from toolkit.files import pair_name, write_atomic
 from toolkit.localizers.correspondences import MAPS, Correspondences, LocalizedQuery, query_group
 
@@ -24,6 +24,12 @@ def write_queries(path: Path, queries: Mapping[tuple[int, str], LocalizedQuery],
                 group[name] = array
 
 
+def instants(session: Session) -> pd.DataFrame:
+    """Return what a session's devices photographed when: columns timestamp and device_id."""
+    keys = pd.DataFrame({"timestamp": session.images["timestamp"], "device_id": session.device_ids.astype(str)})
+    return keys.drop_duplicates().sort_values("timestamp", kind="stable").reset_index(drop=True)
+
+
 def write_pair(
     capture: Capture,
     folder: Path,
@@ -33,9 +39,9 @@ def write_pair(
     maps: Sequence[str] = (),
     **columns: Sequence[object],
 ) -> Path:
-    """Write poses (the true ones, off by the column `off_m`), table and correspondences of the first keyframes."""
+    """Write poses (the true ones, off by the column `off_m`), table and correspondences of the first queries."""
     session, stem = capture[f"{query_device}_query"], folder / pair_name(capture.name, map_device, query_device)
-    keys = session.keyframes()[: len(queries)]
+    keys = instants(session)[: len(queries)].reset_index(drop=True)
     table = keys.assign(**{"status": "ok", "method": "pnp", "num_inliers": 10, "off_m": 0.0, **columns})
     poses = session.trajectory if session.ground_truth is None else session.ground_truth
     posed = ~table["status"].str.startswith("failed").to_numpy(bool)

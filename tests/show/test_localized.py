@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.localized import some_correspondences, write_pair, write_queries
+from tests.localized import instants, some_correspondences, write_pair, write_queries
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError
 from toolkit.localizers.correspondences import LocalizedQuery
@@ -38,7 +38,7 @@ def names(session, count):
 
 def query_images(capture, device):
     session = capture[f"{device}_query"]
-    return [session.image_name(int(row)) for row in session.rows_of_keyframes(session.keyframes()[:1])[0]]
+    return [session.image_name(int(row)) for row in session.rows_of_keyframes(instants(session)[:1])[0]]
 
 
 def drawn(axis):

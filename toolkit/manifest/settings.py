@@ -421,7 +421,7 @@ class VisualizeSettings(Settings):
     """What is drawn and recorded."""
 
     samples: Natural = 2
-    """Queries shown of each pair, from the least to the best supported."""
+    """Queries shown of each pair, from the worst to the best."""
     recordings: bool = True
     """Write a recording of each pair for the rerun viewer."""
     matched_queries: Natural = 12

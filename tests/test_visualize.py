@@ -1,0 +1,89 @@
+"""The visualize stage on poses written by hand: what goes to drawing is what was localized, the worst first."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from tests.localized import instants, some_correspondences, write_pair
+from toolkit import visualize
+from toolkit.capture import Capture
+from toolkit.errors import ArtifactError, CaptureError
+from toolkit.localizers.correspondences import LocalizedQuery
+from toolkit.visualize import visualize_scene
+
+QUICK = {"session_recordings": False, "matched_queries": 2}
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """What the stage gives to draw: the samples, the worst, and the details in recordings."""
+    given = {"samples": [], "worst": [], "recorded": [], "clouds": []}
+    monkeypatch.setattr(visualize, "draw_localization", lambda query, *_: given["samples"].append(query))
+    monkeypatch.setattr(visualize, "draw_worst", lambda queries, *_: given["worst"].extend(queries))
+
+    def record(out, name, poses, points, colors, queries, details, **_):
+        given["clouds"].append(points)
+        given["recorded"].append(dict(details))
+
+    monkeypatch.setattr(visualize, "record_localizations", record)
+    return given
+
+
+def queries_of(capture, device, count):
+    """Return queries of a device, each with some more matches than the one before."""
+    session, image = capture[f"{device}_query"], capture["ios_map"].image_name(0)
+    rows = session.rows_of_keyframes(instants(session)[:count])
+    found = [some_correspondences([0] * (k + 2), [True] * (k + 1) + [False], references=1) for k in range(count)]
+    return [LocalizedQuery([session.image_name(rows[k][0])], [image], [], found[k]) for k in range(count)]
+
+
+def test_the_worst_come_first_by_error_and_pictures_show_their_own_inliers(small_capture, drawn, tmp_path):
+    capture = Capture.open(small_capture)
+    queries = queries_of(capture, "ios", 3)
+    write_pair(capture, tmp_path, "ios", "ios", queries, off_m=[0.0, 0.3, 0.1], num_inliers=[1, 2, 3])
+    write_pair(capture, tmp_path, "ios", "hl", queries_of(capture, "hl", 1), off_m=[0.2])
+    table = visualize_scene(small_capture / "sessions", tmp_path, tmp_path, tmp_path / "out", QUICK)
+    assert table[["map_device", "query_device", "queries", "localized"]].to_numpy().tolist() == [
+        ["ios", "ios", 3, 3],
+        ["ios", "hl", 1, 1],
+    ]
+    worst = [round(query.translation_m, 6) for query in drawn["worst"]]
+    assert worst == [0.3, 0.2, 0.1, 0.0]
+    assert drawn["worst"][0].reason == "ok, 2 inliers"
+    np.testing.assert_array_equal(drawn["worst"][0].details.cameras[0].pixels, queries[1].correspondences.pixels)
+    assert [query.cameras[0].num_inliers for query in drawn["samples"]] == [2, 1, 1]
+    assert sorted(drawn["recorded"][0]) == [1, 2]
+    np.testing.assert_allclose(drawn["recorded"][0][2].cameras[0].points, queries[2].correspondences.points)
+    assert all((tmp_path / "out").joinpath(path).is_file() for path in table["still"])
+
+
+def test_without_truth_the_weakest_are_shown_not_the_strongest(small_capture, drawn, tmp_path):
+    shutil.copytree(small_capture, tmp_path / "SMALL")
+    for name in ("trajectories.txt", "proc/alignment_trajectories.txt"):
+        (tmp_path / "SMALL" / "sessions" / "ios_query" / name).unlink(missing_ok=True)
+    capture = Capture.open(tmp_path / "SMALL")
+    poses = tmp_path / "poses"
+    poses.mkdir()
+    write_pair(
+        capture, poses, "ios", "ios", queries_of(capture, "ios", 3),
+        status=["ok", "failed: too few inliers", "low_confidence"], num_inliers=[593, 3, 20], num_matches=[900, 9, 30],
+    )  # fmt: skip
+    visualize_scene(tmp_path / "SMALL" / "sessions", poses, None, tmp_path / "out", QUICK)
+    reasons = [query.reason for query in drawn["worst"]]
+    failed = "failed: too few inliers, 9 matches, 3 inliers"
+    assert reasons == [failed, "low_confidence, 30 matches, 20 inliers", "ok, 900 matches, 593 inliers"]
+    assert sorted(drawn["recorded"][0]) == [1, 2]
+
+
+def test_only_the_pairs_asked_for_and_none_without_poses(small_capture, drawn, tmp_path):
+    capture = Capture.open(small_capture)
+    with pytest.raises(ArtifactError, match="Localize"):
+        visualize_scene(small_capture / "sessions", tmp_path, None, tmp_path / "out", QUICK)
+    with pytest.raises(CaptureError, match="drone"):
+        visualize_scene(small_capture / "sessions", tmp_path, None, tmp_path / "out", QUICK, map_device="drone")
+    for device in ("ios", "hl"):
+        write_pair(capture, tmp_path, "ios", device, queries_of(capture, device, 1))
+    pairs = [["ios", "hl"], ["hl", "hl"]]
+    table = visualize_scene(small_capture / "sessions", tmp_path, None, tmp_path / "out", QUICK, pairs=pairs)
+    assert table["query_device"].tolist() == ["hl"]
