@@ -12,8 +12,9 @@ from toolkit.capture import Capture, Session
 from toolkit.capture.devices import color_of
 from toolkit.capture.images import read_for_display
 from toolkit.capture.upright import up_of_cameras
-from toolkit.files import read_references
+from toolkit.files import image_name, read_references
 from toolkit.show.figures import GREEN, ORANGE, VERMILLION, new_figure, styled
+from toolkit.show.metrics import is_posed
 from toolkit.show.top_view import ground_axes, places_of
 
 if TYPE_CHECKING:
@@ -24,32 +25,31 @@ MAX_PLACES = 4
 
 def describe(capture: Capture, queries: str = "keyframes_pruned_subsampled") -> pd.DataFrame:
     """Return one row a session: counts of images, posed images, rigs, subsessions and queries asked."""
-    rows = []
-    for name in capture:
-        session = capture[name]
-        row: dict[str, Any] = {"session": name, "device": session.device, "split": session.split}
-        row |= {"images": len(session.images), "subsessions": len(session.subsessions)}
-        row["cameras"] = int(session.sensors["sensor_type"].eq("camera").sum())
-        row["rigs"] = 0 if session.rigs is None else session.rigs["rig_id"].nunique()
-        row["with pose"] = len(_centers(session))
-        row["queries"] = len(session.keyframes(queries)) if session.split == "query" else 0
-        rows.append(row)
+    rows = [
+        {
+            "session": session.id, "device": session.device, "split": session.split,
+            "images": len(session.images), "subsessions": len(session.subsessions),
+            "cameras": int(session.sensors["sensor_type"].eq("camera").sum()),
+            "rigs": 0 if session.rigs is None else session.rigs["rig_id"].nunique(),
+            "with pose": len(_poses(session)),
+            "queries": len(session.keyframes(queries)) if session.split == "query" else 0,
+        }
+        for session in map(capture.__getitem__, capture)
+    ]  # fmt: skip
     return pd.DataFrame(rows).set_index("session")
 
 
 @styled
 def draw_samples(capture: Capture, count: int = 4) -> "Figure":
     """Return a figure of `count` images of each session, evenly spread over the recording."""
-    names = [name for name in capture if len(capture[name].images)]
+    names = [name for name in capture if len(capture[name])]
     figure = new_figure(2.4 * count, 1.9 * len(names))
     axes = figure.subplots(len(names), count, squeeze=False)
     for line, name in zip(axes, names, strict=True):
         session = capture[name]
-        chosen = np.linspace(0, len(session.images) - 1, count).round().astype(int)
-        for axis, row in zip(line, chosen, strict=True):
+        for axis, row in zip(line, np.linspace(0, len(session) - 1, count).round().astype(int), strict=True):
             axis.imshow(read_for_display(session.image_path(row)), interpolation="antialiased")
-            axis.set_xticks([])
-            axis.set_yticks([])
+            axis.set(xticks=[], yticks=[])
         line[0].set_ylabel(name)
     return figure
 
@@ -65,23 +65,21 @@ def draw_top_view(capture: Capture, up: ArrayLike | None = None) -> "Figure":
     poses = {name: _poses(capture[name]) for name in capture}
     everything = np.concatenate(list(poses.values()))
     axes, labels = ground_axes(up_of_cameras(everything) if up is None else up)
-    seen = {name: of_session[:, :3, 3] @ axes.T for name, of_session in poses.items()}
-    place = places_of(np.concatenate(list(seen.values())))
-    sessions = np.repeat(list(seen), [len(centers) for centers in seen.values()])
-    together = np.concatenate(list(seen.values()))
+    centers = everything[:, :3, 3] @ axes.T
+    sessions = np.repeat(list(poses), [len(of_session) for of_session in poses.values()])
+    place = places_of(centers)
     count = min(place.max(initial=0) + 1, MAX_PLACES)
     figure = new_figure(4.2 * count + 1, 4.6)
-    for number, plot in enumerate(figure.subplots(1, count, squeeze=False)[0]):
-        for name in seen:
-            x, y = together[(place == number) & (sessions == name)].T
-            split, color = capture[name].split, color_of(capture[name].device)
-            marker, size = ("o", 14) if split == "map" else ("x", 36)
-            plot.scatter(x, y, s=size, c=color, marker=marker, label=name, alpha=0.8)
+    plots = figure.subplots(1, count, squeeze=False)[0]
+    for number, plot in enumerate(plots):
+        for name in poses:
+            x, y = centers[(place == number) & (sessions == name)].T
+            marker, size = ("o", 14) if capture[name].split == "map" else ("x", 36)
+            plot.scatter(x, y, s=size, c=color_of(capture[name].device), marker=marker, label=name, alpha=0.8)
         plot.set_xlabel(labels[0])
         plot.set_aspect("equal", adjustable="datalim")
-        if number == 0:
-            plot.set_ylabel(labels[1])
-            plot.legend(fontsize=8)
+    plots[0].set_ylabel(labels[1])
+    plots[0].legend(fontsize=8)
     figure.suptitle("Cameras from above: maps (dots), queries where their pose is known (crosses)")
     return figure
 
@@ -94,26 +92,23 @@ def draw_similarity(embeddings: str | Path, limit: int = 300) -> "Figure":
         embeddings: folder of the descriptors, `<device>_<split>/<subsession>/<subsession>.npy`.
         limit: at most so many images of a session, evenly spread, are shown.
     """
-    sessions = sorted(folder for folder in Path(embeddings).iterdir() if folder.is_dir())
-    queries = [folder for folder in sessions if folder.name.endswith("_query")] or sessions
-    maps = [folder for folder in sessions if folder.name.endswith("_map")] or sessions
-    query = queries[0]
-    others = [folder for folder in maps if folder.name.rpartition("_")[0] != query.name.rpartition("_")[0]]
-    map_ = (others or maps)[0]
+    sessions = {folder.name: folder for folder in sorted(Path(embeddings).iterdir()) if folder.is_dir()}
+    query = next((name for name in sessions if name.endswith("_query")), next(iter(sessions)))
+    maps = [name for name in sessions if name.endswith("_map")] or list(sessions)
+    device = query.rpartition("_")[0]
+    map_ = next((name for name in maps if name.rpartition("_")[0] != device), maps[0])
     figure = new_figure(8, 4.5)
     plot = figure.subplots()
-    values = _descriptors(query, limit) @ _descriptors(map_, limit).T
+    values = _descriptors(sessions[query], limit) @ _descriptors(sessions[map_], limit).T
     image = plot.imshow(values, aspect="auto", interpolation="nearest", cmap="viridis")
-    plot.set_xlabel(f"images of {map_.name}")
-    plot.set_ylabel(f"images of {query.name}")
+    plot.set_xlabel(f"images of {map_}")
+    plot.set_ylabel(f"images of {query}")
     figure.colorbar(image, label="cosine similarity")
     return figure
 
 
 @styled
-def draw_references(
-    sessions_root: str | Path, jsonl: str | Path, samples: int = 4, references: int = 4
-) -> "Figure":
+def draw_references(sessions_root: str | Path, jsonl: str | Path, samples: int = 4, references: int = 4) -> "Figure":
     """Return a figure of some query images of a pair, each beside its first references.
 
     Args:
@@ -152,24 +147,22 @@ def _draw_rows(
     sessions_root: str | Path, jsonl: str | Path, rows: list[list[dict[str, Any]]], references: int
 ) -> "Figure":
     """Draw a line a query: its image, then its first references as each of its rows has them."""
-    capture = Capture.from_sessions_root(sessions_root)
+    sessions_root = Path(sessions_root)
     map_device, _, query_device = Path(jsonl).stem.rpartition("_map_")[2].partition("_query_")
-    sides = {"map": capture[f"{map_device}_map"], "query": capture[f"{query_device}_query"]}
-    files = {side: _image_paths(session) for side, session in sides.items()}
     width = 1 + references * max((len(row) for row in rows), default=1)
     figure = new_figure(2.2 * width, 1.9 * len(rows))
     axes = figure.subplots(len(rows), width, squeeze=False)
     for line, row in zip(axes, rows, strict=True):
         for axis in line:
             axis.set_axis_off()
-        shown = [(line[0], "query", row[0], f"query {query_device}")]
+        shown = [(line[0], row[0], f"query {query_device}")]
         for part, query in enumerate(row):
             for axis, hit in zip(line[1 + part * references :], query["topk"][:references], strict=False):
                 verified = "retrieval_rank" in hit
                 title = f"{hit['score']} inliers, was {hit['retrieval_rank']}" if verified else f"{hit['score']:.2f}"
-                shown.append((axis, "map", hit, f"{map_device} {title}"))
-        for axis, side, entry, title in shown:
-            axis.imshow(read_for_display(files[side][int(entry["timestamp"]), entry["sensor_id"]]))
+                shown.append((axis, hit, f"{map_device} {title}"))
+        for axis, entry, title in shown:
+            axis.imshow(read_for_display(sessions_root / image_name(entry["path"])))
             axis.set_title(title, fontsize=8)
     return figure
 
@@ -210,16 +203,7 @@ def _descriptors(session: Path, limit: int) -> NDArray[np.float32]:
     return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
 
 
-def _image_paths(session: Session) -> dict[tuple[int, str], Path]:
-    keys = zip(session.images["timestamp"], session.images["sensor_id"], strict=True)
-    return {(int(time), str(sensor)): session.image_path(row) for row, (time, sensor) in enumerate(keys)}
-
-
 def _poses(session: Session) -> NDArray[np.float64]:
     """Return world_from_cam of the images that have one, (n, 4, 4)."""
     poses = session.world_from_cam(ground_truth=session.split == "query")
-    return poses[np.isfinite(poses).all((1, 2))]
-
-
-def _centers(session: Session) -> NDArray[np.float64]:
-    return _poses(session)[:, :3, 3]
+    return poses[is_posed(poses)]

@@ -39,15 +39,17 @@ def draw_prediction(
         up: direction (3,) that is up; None: estimated from the map's cameras.
         out: PNG to write; None: no file.
     """
-    shown = _most_consistent(answer) if camera is None else camera
-    found = answer.cameras[shown] if answer.cameras else CameraAnswer(np.zeros(0, np.int64))
-    views = [query.views[shown], *(localizer.view(int(index)) for index in found.references)]
-    kept = np.zeros(len(found.references), bool) if found.alignment is None else found.alignment.inliers
+    if camera is None:
+        counts = [0 if part.alignment is None else part.alignment.num_inliers for part in answer.cameras]
+        camera = int(np.argmax(counts)) if counts else 0
+    part = answer.cameras[camera] if answer.cameras else CameraAnswer(np.zeros(0, np.int64))
+    views = [query.views[camera], *(localizer.view(int(index)) for index in part.references)]
+    kept = np.zeros(len(part.references), bool) if part.alignment is None else part.alignment.inliers
     columns = 3
     rows = -(-len(views) // columns)
     figure = new_figure(14, max(5.5, 3.6 * rows))
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[1.0, 1.25])[0]
-    _draw_from_above(left.subplots(), localizer, found, kept, up)
+    _draw_from_above(left.subplots(), localizer, part, kept, up)
     panels = right.subplots(2 * rows, columns, squeeze=False)
     for axis in panels.flat:
         axis.set_axis_off()
@@ -57,13 +59,13 @@ def draw_prediction(
         if number:
             label = f"reference {number}: {'consistent' if kept[number - 1] else 'left out'}"
             color = GREEN if kept[number - 1] else VERMILLION
-        _draw_view(panels[row, column], panels[row + 1, column], view, number, found, label, color)
+        _draw_view(panels[row, column], panels[row + 1, column], view, number, part, label, color)
     simulated = localizer.predictor.simulated
     title = f"{'SIMULATED, no result: ' if simulated else ''}{localizer.predictor.name} on {views[0].name}"
     estimate = answer.estimate
-    known = f"scale known to {estimate.scale_std:.1%}" if np.isfinite(estimate.scale_std) else "scale unknown"
-    about = f"{estimate.status}; {known}" if estimate.world_from_rig is not None else estimate.status
-    more = "" if found.reason in about else f"; {found.reason}"  # a failed query's status says it
+    scale = f"scale known to {estimate.scale_std:.1%}" if np.isfinite(estimate.scale_std) else "scale unknown"
+    about = f"{estimate.status}; {scale}" if estimate.world_from_rig is not None else estimate.status
+    more = "" if part.reason in about else f"; {part.reason}"  # a failed query's status says it
     reasons = textwrap.fill(about + more, 150)
     figure.suptitle(f"{title}\n{reasons}", fontsize=10, fontweight="bold" if simulated else None)
     if out is not None:
@@ -71,25 +73,19 @@ def draw_prediction(
     return figure
 
 
-def _most_consistent(answer: VggtAnswer) -> int:
-    counts = [0 if found.alignment is None else found.alignment.num_inliers for found in answer.cameras]
-    return int(np.argmax(counts)) if counts else 0
-
-
 def _draw_view(
-    photograph: "Axes", depth: "Axes", view: View, number: int, found: CameraAnswer, label: str, color: str
+    photograph: "Axes", depth: "Axes", view: View, number: int, part: CameraAnswer, label: str, color: str
 ) -> None:
     photograph.set_axis_on()
     photograph.set(xticks=[], yticks=[])
     photograph.imshow(read_for_display(view.path))
     photograph.set_title(label, fontsize=8, color=color)
-    for spine in photograph.spines.values():
-        spine.set(color=color, linewidth=2.5, visible=True)
-    prediction = found.prediction
+    photograph.spines[:].set(color=color, linewidth=2.5, visible=True)
+    prediction = part.prediction
     if prediction is None or prediction.depth is None:
         return
-    scale = np.nan if found.alignment is None else found.alignment.world_from_model.scale
-    metric = found.alignment is not None and found.alignment.scale_known
+    scale = np.nan if part.alignment is None else part.alignment.world_from_model.scale
+    metric = part.alignment is not None and part.alignment.scale_known
     values = prediction.depth[number] * (scale if metric else 1.0)
     if not np.isfinite(values).any():
         return
@@ -105,24 +101,24 @@ def _draw_view(
 
 
 def _draw_from_above(
-    axis: "Axes", localizer: VggtLocalizer, found: CameraAnswer, kept: NDArray[np.bool_], up: ArrayLike | None
+    axis: "Axes", localizer: VggtLocalizer, part: CameraAnswer, kept: NDArray[np.bool_], up: ArrayLike | None
 ) -> None:
-    local_map, alignment = localizer.map, found.alignment
+    local_map, alignment = localizer.map, part.alignment
     axes, labels = ground_axes(up_of_cameras(local_map.world_from_cams) if up is None else up)
-    places = local_map.world_from_cams[found.references]
+    places = local_map.world_from_cams[part.references]
     marked = [places]
-    if alignment is not None and found.prediction is not None and np.isfinite(alignment.rotation_std_deg):
-        finite = np.isfinite(found.prediction.model_from_cams[1:]).all(axis=(1, 2))
-        aligned = alignment.world_from_model.apply_to_pose(found.prediction.model_from_cams[1:])
+    if alignment is not None and part.prediction is not None and np.isfinite(alignment.rotation_std_deg):
+        finite = np.isfinite(part.prediction.model_from_cams[1:]).all(axis=(1, 2))
+        aligned = alignment.world_from_model.apply_to_pose(part.prediction.model_from_cams[1:])
         marked.append(aligned[kept])
         for agreed, color, label in ((True, GREEN, "consistent"), (False, VERMILLION, "left out")):
-            part = (kept == agreed) & finite
-            _draw_cameras(axis, aligned[part], axes, color, f"predicted, {label}", "o")
-            for start, end in zip(places[part, :3, 3] @ axes.T, aligned[part, :3, 3] @ axes.T, strict=True):
+            shown = (kept == agreed) & finite
+            _draw_cameras(axis, aligned[shown], axes, color, f"predicted, {label}", "o")
+            for start, end in zip(places[shown, :3, 3] @ axes.T, aligned[shown, :3, 3] @ axes.T, strict=True):
                 axis.plot(*zip(start, end, strict=True), c=color, lw=0.8)
-    if found.world_from_cam is not None:
-        marked.append(found.world_from_cam[None])
-        _draw_cameras(axis, found.world_from_cam[None], axes, "black", "query", "*")
+    if part.world_from_cam is not None:
+        marked.append(part.world_from_cam[None])
+        _draw_cameras(axis, part.world_from_cam[None], axes, "black", "query", "*")
     _draw_cameras(axis, places, axes, BLUE, "reference in the map", "s")
     _draw_cameras(axis, local_map.world_from_cams, axes, GRAY, "map", ".")
     centers = np.concatenate(marked)[:, :3, 3] @ axes.T
