@@ -72,19 +72,19 @@ def error_colors(errors_m: ArrayLike) -> NDArray[np.uint8]:
     """Return the colors (N, 3) RGB of errors (N,), meters; what is not known, NaN, is sky blue."""
     errors = np.asarray(errors_m, np.float64)
     colors, scale = error_scale()
-    known = np.isfinite(errors)
-    rgb = np.tile(np.array([0x56, 0xB4, 0xE9], np.uint8), (len(errors), 1))
-    if known.any():
-        rgb[known] = colors(scale(np.maximum(errors[known], ERROR_RANGE_M[0])), bytes=True)[:, :3]
+    finite = np.isfinite(errors)
+    rgb = np.tile(np.array(bytearray.fromhex(SKY[1:]), np.uint8), (len(errors), 1))
+    if finite.any():
+        rgb[finite] = colors(scale(np.maximum(errors[finite], ERROR_RANGE_M[0])), bytes=True)[:, :3]
     return rgb
 
 
-def error_bar(figure: "Figure", axis: Any, **where: Any) -> None:
-    """Draw the legend of errors' colors beside an axis of a figure."""
+def error_bar(figure: "Figure", **where: Any) -> None:
+    """Draw the legend of errors' colors; `where` goes to matplotlib's `Figure.colorbar`."""
     from matplotlib.cm import ScalarMappable
 
     colors, scale = error_scale()
-    bar = figure.colorbar(ScalarMappable(scale, colors), ax=axis, extend="both", **where)
+    bar = figure.colorbar(ScalarMappable(scale, colors), extend="both", **where)
     bar.set_label("error of position [m]")
     bar.set_ticks([0.01, 0.1, 1.0], labels=["0.01", "0.1", "1"])
 
@@ -92,13 +92,8 @@ def error_bar(figure: "Figure", axis: Any, **where: Any) -> None:
 @styled
 def draw_error_legend() -> bytes:
     """Return the legend of errors' colors, PNG."""
-    from matplotlib.cm import ScalarMappable
-
-    colors, scale = error_scale()
     figure = new_figure(1.3, 2.4)
-    bar = figure.colorbar(ScalarMappable(scale, colors), cax=figure.subplots(), extend="both")
-    bar.set_label("error of position [m]")
-    bar.set_ticks([0.01, 0.1, 1.0], labels=["0.01", "0.1", "1"])
+    error_bar(figure, cax=figure.subplots())
     stream = io.BytesIO()
     figure.savefig(stream, format="png", metadata={"Software": None})
     return stream.getvalue()

@@ -128,7 +128,7 @@ def draw_scene_png(
     for row in range(rows):
         panels[row * columns].set_ylabel(labels[1])
     if (is_posed(estimated) & is_posed(true)).any():
-        error_bar(figure, list(panels[: len(shown)]), shrink=0.8)
+        error_bar(figure, ax=list(panels[: len(shown)]), shrink=0.8)
     handles: dict[str, Any] = {}
     for axis in panels:
         handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
