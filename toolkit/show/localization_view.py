@@ -172,9 +172,8 @@ class _ChosenWriter:
             self._log_image(f"world/chosen/camera_{k}", image, ESTIMATED, residuals=True)
         references = query.captioned_references()
         for rank in range(1, REFERENCES + 1):
-            image = references[rank - 1][0] if rank <= len(references) else None
-            color = SKY if rank <= len(query.references) else ORANGE
-            self._log_image(f"world/references/{rank}", image, color, residuals=False)
+            image, _, agrees = references[rank - 1] if rank <= len(references) else (None, "", True)
+            self._log_image(f"world/references/{rank}", image, SKY if agrees else ORANGE, residuals=False)
         if query.cameras:
             camera, true = query.cameras[0].camera, query.cameras[0].world_from_cam_true
             has_truth = bool(is_posed(true))
@@ -198,7 +197,7 @@ class _ChosenWriter:
                      f"{rejected} rejected matches: orange.", ""]  # fmt: skip
         elif located:
             text += ["", "No matches: the pose rests on the references as a whole.", ""]
-        text += [f"{rank}. {image.name}: {caption}" for rank, (image, caption) in enumerate(references, start=1)]
+        text += [f"{rank}. {image.name}: {caption}" for rank, (image, caption, _) in enumerate(references, start=1)]
         self._stream.log("about", rr.TextDocument("\n".join(text), media_type="text/markdown"))
 
     def _log_image(self, path: str, image: ShownImage | None, color: str, residuals: bool) -> None:

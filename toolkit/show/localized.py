@@ -107,13 +107,17 @@ class QueryDetails:
         """Whether the pose was sought by matching pixels, not by the references as a whole."""
         return any(len(camera.matches) for camera in self.cameras)
 
-    def captioned_references(self) -> list[tuple[ShownImage, str]]:
-        """Return the references that are shown, at most `REFERENCES`, each with what can be said of it."""
+    def captioned_references(self) -> list[tuple[ShownImage, str, bool]]:
+        """Return at most `REFERENCES` references: the image, what can be said of it, and whether it was not rejected.
+
+        Of the rejected ones, up to two are among them.
+        """
         agree = [
-            (image, f"reference {rank}" + (f": {image.num_inliers} inliers" if self.has_matches else ""))
+            (image, f"reference {rank}" + (f": {image.num_inliers} inliers" if self.has_matches else ""), True)
             for rank, image in enumerate(self.references, start=1)
         ]
-        return [*agree, *((image, "rejected: contradicts the others") for image in self.rejected)][:REFERENCES]
+        rejected = [(image, "rejected: contradicts the others", False) for image in self.rejected]
+        return [*agree[: REFERENCES - min(2, len(rejected))], *rejected][:REFERENCES]
 
 
 def support_of(row: pd.Series) -> str:

@@ -154,7 +154,7 @@ def draw_localization(query: QueryDetails, out: str | Path | None = None, title:
         title: of the figure; the errors are added to it where the true pose is known.
     """
     shown, references = query.cameras[0], query.captioned_references()
-    pictures = [read_for_display(image.path) for image in (shown, *(image for image, _ in references))]
+    pictures = [read_for_display(image.path) for image in (shown, *(image for image, _, _ in references))]
     height, width = pictures[0].shape[:2]
     # The query is as high as two rows of references, so that its points can be seen.
     rows = 2 if len(references) > 1 else 1
@@ -180,13 +180,13 @@ def draw_localization(query: QueryDetails, out: str | Path | None = None, title:
         caption = "query: no matches, the pose rests on the references"
     axis.set_title(caption, fontsize=9)
     _frame(axis, GREEN if located else ESTIMATED, width, height)
-    for k, ((image, text), picture) in enumerate(zip(references, pictures[1:], strict=True)):
+    for k, ((image, text, agrees), picture) in enumerate(zip(references, pictures[1:], strict=True)):
         panel = figure.add_subplot(grid[k // columns, 1 + k % columns])
         panel.imshow(picture)
         panel.set_title(text, fontsize=8)
         _dots(panel, _on(image.pixels[~image.inlier]), s=3, c=ESTIMATED, alpha=0.5, lw=0)
         _dots(panel, _on(image.pixels[image.inlier]), s=5, c=GREEN, lw=0)
-        _frame(panel, ESTIMATED if k >= len(query.references) else "0.6", picture.shape[1], picture.shape[0])
+        _frame(panel, "0.6" if agrees else ESTIMATED, picture.shape[1], picture.shape[0])
     if located and is_posed(shown.world_from_cam_true):
         rotation, meters = pose_error(shown.world_from_cam, shown.world_from_cam_true)
         title = f"{title}{' · ' if title else ''}off by {float(rotation):.2g}°, {_length(float(meters))}"
@@ -234,7 +234,7 @@ def _draw_side_by_side(axis: "Axes", query: QueryDetails) -> None:
     height, width = left.shape[:2]
     axis.imshow(left, extent=(0, width, height, 0), interpolation="antialiased")
     end = float(width)
-    for reference, caption in references:
+    for reference, caption, _ in references:
         right = read_for_display(reference.path)
         offset, scale = width * 1.03, height / right.shape[0]
         end = offset + scale * right.shape[1]
