@@ -358,27 +358,20 @@ def _slots(session: Session) -> pd.DataFrame:
     once in a recording of many instants was made for its frame; the camera is then named by its rank in it.
     """
     rows = session.camera_rows
-    subsessions = pd.Series(session.subsession_of(rows)).replace("", session.id)
     order = {name: rank for rank, name in enumerate(session.subsessions)}
-    table = pd.DataFrame(
-        {
-            "row": rows,
-            "subsession": subsessions,
-            "timestamp": session.images["timestamp"].to_numpy(np.int64)[rows],
-            "sensor_id": session.images["sensor_id"].to_numpy(str)[rows],
-            "device_id": session.device_ids[rows].astype(str),
-        }
-    )
+    table = pd.DataFrame({
+        "row": rows,
+        "subsession": pd.Series(session.subsession_of(rows)).replace("", session.id),
+        "timestamp": session.images["timestamp"].to_numpy(np.int64)[rows],
+        "sensor_id": session.images["sensor_id"].to_numpy(str)[rows],
+        "device_id": session.device_ids[rows].astype(str),
+    })  # fmt: skip
     table["rank"] = table["subsession"].map(order).fillna(len(order))
-    table = table.sort_values(["rank", "subsession", "timestamp", "device_id", "sensor_id"], kind="stable")
-    table = table.reset_index(drop=True)
+    table = table.sort_values(["rank", "subsession", "timestamp", "device_id", "sensor_id"], ignore_index=True)
     instant = ["subsession", "timestamp"]
     table["index"] = table.groupby(instant, sort=False).ngroup()
-    in_rig = (table["device_id"] != table["sensor_id"]).to_numpy(bool)
-    devices = table.drop_duplicates([*instant, "device_id"]).copy()
-    devices["name"] = _names(devices, "device_id", instant, "rig")
-    of_device = table.merge(devices[[*instant, "device_id", "name"]], on=[*instant, "device_id"], how="left")
-    table["device_slot"] = np.where(in_rig, of_device["name"], "")
+    rigs = _names(table, "device_id", instant, "rig")
+    table["device_slot"] = rigs.where(table["device_id"] != table["sensor_id"], "")
     table["slot"] = _names(table, "sensor_id", [*instant, "device_slot"], "camera")
     return table
 
@@ -387,14 +380,11 @@ def _names(table: pd.DataFrame, column: str, frame: list[str], kind: str) -> pd.
     """Return a name for each row's id, without the subsession; by rank in its `frame` where ids are made anew."""
     instants = table.groupby("subsession")["timestamp"].transform("nunique")
     anew = (table.groupby(["subsession", column])["timestamp"].transform("nunique") == 1) & (instants > 1)
-    ranks = table[anew].groupby(frame).cumcount()
-    names = pd.Series(
-        [name.removeprefix(f"{sub}/") for name, sub in zip(table[column], table["subsession"], strict=True)],
-        index=table.index,
-        dtype=object,
-    )
-    names[anew] = [f"{kind}_{rank}" for rank in ranks]
-    return names
+    codes = table[column].astype("category").cat.codes[anew].groupby([table[key][anew] for key in frame])
+    ranks = codes.rank("dense").reindex(table.index, fill_value=1)
+    ids = zip(table["subsession"], table[column], ranks, anew, strict=True)
+    names = [f"{kind}_{rank - 1:.0f}" if made else name.removeprefix(f"{sub}/") for sub, name, rank, made in ids]
+    return pd.Series(names, index=table.index, dtype=object)
 
 
 def _load(shot: _Shot, image_size: int, quality: int) -> _Shot:
