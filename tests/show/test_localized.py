@@ -76,6 +76,8 @@ def test_a_rig_shows_the_camera_with_the_most_inliers_first(capture, open_pair):
     assert [camera.name for camera in details.cameras[:2]] == [images[-2], images[-1]]
     assert [camera.num_inliers for camera in details.cameras[:2]] == [3, 1]
     np.testing.assert_array_equal(details.cameras[0].pixels, found.pixels[3:])
+    figure = draw_localization(details)
+    assert [axis.get_title() for axis in figure.axes] == ["query: 3 of 3 map points agree", "reference 1: 3 inliers"]
     # Its true pose is its own, not that of the rig's first camera.
     session = capture["hl_query"]
     row = names(session, len(session)).index(images[-2])

@@ -134,7 +134,7 @@ def test_the_worst_queries_are_drawn_with_the_matches_they_share_with_a_referenc
     np.testing.assert_allclose([line[1] for line in agreeing], reference.pixels[[1, 0]] / 2 + [64 * 1.03, 0])
     np.testing.assert_allclose([line[0] for line in rejected], query.pixels[[2]])
     assert [text.get_text() for text in third.texts] == ["no common inliers"]
-    assert [text.get_text() for text in fourth.texts] == ["rejected: contradicts the others"]
+    assert [text.get_text() for text in fourth.texts] == ["no matches; rejected: contradicts the others"]
     with Image.open(tmp_path / "worst.png") as image:
         assert image.text["Description"] == "the worst"
     assert draw_worst([])

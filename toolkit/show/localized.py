@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -91,6 +91,9 @@ class ShownImage:
         return int(self.inlier.sum())
 
 
+_OF_A_MATCH = ("pixels", "points", "matches", "inlier")
+
+
 @dataclass(frozen=True)
 class QueryDetails:
     """What is shown of one query when it is chosen."""
@@ -106,6 +109,15 @@ class QueryDetails:
     def has_matches(self) -> bool:
         """Whether the pose was sought by matching pixels, not by the references as a whole."""
         return any(len(camera.matches) for camera in self.cameras)
+
+    def of_first_camera(self) -> "QueryDetails":
+        """Return the first image alone, with what references see of its correspondences."""
+
+        def seen(image: ShownImage) -> ShownImage:
+            mine = np.isin(image.matches, self.cameras[0].matches)
+            return replace(image, **{name: getattr(image, name)[mine] for name in _OF_A_MATCH})
+
+        return QueryDetails(self.cameras[:1], list(map(seen, self.references)), self.rejected)
 
     def captioned_references(self) -> list[tuple[ShownImage, str, bool]]:
         """Return at most `REFERENCES` references: the image, what can be said of it, and whether it was not rejected.

@@ -153,6 +153,7 @@ def draw_localization(query: QueryDetails, out: str | Path | None = None, title:
         out: PNG to write; None: no file.
         title: of the figure; the errors are added to it where the true pose is known.
     """
+    query = query.of_first_camera()
     shown, references = query.cameras[0], query.captioned_references()
     pictures = [read_for_display(image.path) for image in (shown, *(image for image, _, _ in references))]
     height, width = pictures[0].shape[:2]
@@ -247,7 +248,7 @@ def _draw_side_by_side(axis: "Axes", query: QueryDetails) -> None:
             axis.add_collection(LineCollection(list(joined[::step]), colors=color, linewidths=0.5, alpha=0.8))
             _dots(axis, joined.reshape(-1, 2), s=4, c=color, lw=0)
         if not image.inlier[i].any():
-            text = "no common inliers" if query.has_matches else caption
+            text = "no common inliers" if query.has_matches else f"no matches; {caption}"
             axis.text(end / 2, height * 0.96, text, ha="center", color="white", fontsize=8,
                       bbox={"facecolor": "black", "alpha": 0.6, "lw": 0, "pad": 2})  # fmt: skip
     axis.set(xlim=(0, end), ylim=(height, 0), aspect="equal")
