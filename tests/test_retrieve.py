@@ -1,6 +1,7 @@
 """Search and the retrieve stage."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -56,11 +57,20 @@ def test_search_limits() -> None:
     assert scores.dtype == np.float32
 
 
+@pytest.fixture(scope="module")
+def embedded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a capture `TINY` and its embeddings; do not write to it."""
+    folder = tmp_path_factory.mktemp("embedded")
+    capture = write_tiny_capture(folder / "TINY")
+    embed_sessions(capture / "sessions", folder / "embeddings")
+    return folder
+
+
 @pytest.fixture
-def tiny(tmp_path: Path) -> Path:
-    capture = write_tiny_capture(tmp_path / "TINY")
-    embed_sessions(capture / "sessions", tmp_path / "embeddings")
-    return capture
+def tiny(embedded: Path, tmp_path: Path) -> Path:
+    """A copy of the capture, its embeddings beside it."""
+    shutil.copytree(embedded, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "TINY"
 
 
 def lines(path: str | Path) -> list[dict]:

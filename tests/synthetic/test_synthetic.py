@@ -23,9 +23,20 @@ from toolkit.synthetic.render import Rays, render
 from toolkit.synthetic.scene import Quad, Scene, build_room
 
 
+def coarse_room(seed: int, index: int) -> Scene:
+    """A room whose textures have few texels, so that a capture is rendered in seconds."""
+    scene = build_room(seed, index)
+    for quad in scene.quads:
+        quad.ppm /= 4
+    return scene
+
+
 @pytest.fixture(scope="module")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return render_capture(tmp_path_factory.mktemp("synthetic") / "TINY", 1, 4, seed=3, progress=False)
+def coarse(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A capture of a coarse room, two frames a session: for what does not depend on what is in the pictures."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(capture_writing, "build_room", coarse_room)
+        return render_capture(tmp_path_factory.mktemp("synthetic") / "TINY", 1, 2, seed=3, progress=False)
 
 
 def checker(rng: np.random.Generator, h: int, w: int, ppm: float) -> np.ndarray:
@@ -97,8 +108,8 @@ def test_the_nearer_rectangle_hides_the_farther() -> None:
     assert depth[row, column] == pytest.approx(middle[0, 2], abs=0.02)
 
 
-def test_two_views_agree_through_depth_and_poses(demo: Path) -> None:
-    capture = Capture.open(demo)
+def test_two_views_agree_through_depth_and_poses(small_capture: Path) -> None:
+    capture = Capture.open(small_capture)
     for name in ("ios_map", "spot_map", "hl_map"):
         session = capture[name]
         poses = session.world_from_cam()
@@ -131,12 +142,12 @@ def test_two_views_agree_through_depth_and_poses(demo: Path) -> None:
         assert np.corrcoef(warped, original)[0, 1] > 0.8
 
 
-def test_the_format_is_whole(demo: Path) -> None:
-    capture = Capture.open(demo)
+def test_the_format_is_whole(small_capture: Path) -> None:
+    capture = Capture.open(small_capture)
     assert capture.session_ids == ["hl_map", "hl_query", "ios_map", "ios_query", "spot_map", "spot_query"]
     for name in capture:
         session, (device, split) = capture[name], name.split("_")
-        frames = 4 if split == "map" else 2
+        frames = 6 if split == "map" else 3
         assert len(session.images) == frames * len(DEVICES[device].sensors)
         assert len(session.subsessions) == 2
         assert (session.trajectory is None) == (split == "query")
@@ -159,8 +170,8 @@ def test_the_format_is_whole(demo: Path) -> None:
             assert len(keys[2]) == frames
 
 
-def test_rigs_have_real_baselines_and_a_rolled_camera(demo: Path) -> None:
-    capture = Capture.open(demo)
+def test_rigs_have_real_baselines_and_a_rolled_camera(small_capture: Path) -> None:
+    capture = Capture.open(small_capture)
     for name, low, high in (("hl_map", 0.08, 0.13), ("spot_map", 0.1, 0.35)):
         session = capture[name]
         count = len(DEVICES[name.split("_")[0]].sensors)
@@ -173,7 +184,7 @@ def test_rigs_have_real_baselines_and_a_rolled_camera(demo: Path) -> None:
     ]
     assert abs(left_from_right[1, 0]) > 0.9  # the right camera's x axis points down
     focal = {tuple(capture["ios_map"].camera(s).params) for s in capture["ios_map"].images.sensor_id}
-    assert len(focal) == 4
+    assert len(focal) == 6
 
 
 def test_queries_are_away_from_the_map_but_see_it() -> None:
@@ -208,11 +219,12 @@ def digest(folder: Path) -> dict[str, str]:
 
 
 def test_same_seed_same_bytes_on_any_number_of_cores(
-    demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    coarse: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(capture_writing, "build_room", coarse_room)
     monkeypatch.setattr(capture_writing, "_cores", lambda: 3 if os.cpu_count() == 1 else 1)
-    again = render_capture(tmp_path / "AGAIN", 1, 4, seed=3, progress=False)
-    assert digest(again) == digest(demo)
+    again = render_capture(tmp_path / "AGAIN", 1, 2, seed=3, progress=False)
+    assert digest(again) == digest(coarse)
 
 
 def test_other_seeds_and_rooms_look_different() -> None:
@@ -242,24 +254,24 @@ def test_look_alikes_come_in_few_models_and_other_things_do_not() -> None:
 
 
 def test_a_complete_capture_is_left_as_it_is_and_an_incomplete_one_is_not(
-    demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    coarse: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert [p.name for p in demo.parent.iterdir()] == ["TINY"]
-    settings = json.loads((demo / "demo.json").read_text())
-    assert (settings["rooms"], settings["frames"], settings["seed"]) == (1, 4, 3)
+    assert [p.name for p in coarse.parent.iterdir()] == ["TINY"]
+    settings = json.loads((coarse / "demo.json").read_text())
+    assert (settings["rooms"], settings["frames"], settings["seed"]) == (1, 2, 3)
     out = tmp_path / "C"
-    shutil.copytree(demo, out)
+    shutil.copytree(coarse, out)
 
     def started(*_: object, **__: object) -> None:
         raise InterruptedError("renders anew")
 
     monkeypatch.setattr(capture_writing, "paint", started)
-    assert render_capture(out, 1, 4, seed=3, progress=False) == out
+    assert render_capture(out, 1, 2, seed=3, progress=False) == out
     with pytest.raises(InterruptedError):
-        render_capture(out, 1, 4, seed=4, progress=False)
+        render_capture(out, 1, 2, seed=4, progress=False)
     next(out.rglob("*.jpg")).unlink()
     with pytest.raises(InterruptedError):
-        render_capture(out, 1, 4, seed=3, progress=False)
+        render_capture(out, 1, 2, seed=3, progress=False)
     assert (out / "demo.json").exists()  # the old one stays until a new one can take its place
 
 
