@@ -6,10 +6,12 @@ RUN_MANIFEST ?= data_manifests/demo.yaml
 PIP_ARGS ?=
 INSTALLED := $(VENV)/.installed
 BIN := $(VENV)/bin
+# A worker takes up to 2 GB (slow tests: 6). Tests of a module stay together, for they share what is slow to make.
+PYTEST := $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadscope
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo run test test-slow test-browser browser-setup docs-images docs-view lab lint bench clean
+.PHONY: help demo run test test-slow test-browser test-rest browser-setup docs-images docs-view lab lint bench clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */  make \1|/' | column -t -s '|'
@@ -21,10 +23,10 @@ run: $(INSTALLED)  ## run RUN_MANIFEST=data_manifests/<yours>.yaml
 	$(BIN)/python -m toolkit run $(RUN_MANIFEST)
 
 test: $(INSTALLED)  ## the default tests, about a minute or two
-	$(BIN)/python -m pytest
+	$(PYTEST)
 
 test-slow: $(INSTALLED)  ## whole runs, and accuracy on real captures where they are present
-	$(BIN)/python -m pytest -m slow
+	$(PYTEST) -m slow
 
 # Chromium is Debian's, as Playwright's own comes from a host that many networks refuse; elsewhere, set CHROMIUM.
 browser-setup: $(INSTALLED)  ## install what the browser tests need: Chromium (apt, with sudo if not root) and Playwright (pip)
@@ -40,6 +42,9 @@ browser-setup: $(INSTALLED)  ## install what the browser tests need: Chromium (a
 
 test-browser: $(INSTALLED)  ## the report and the notebooks' viewer in a real browser; first: make browser-setup
 	$(BIN)/python -m pytest -m browser -rs
+
+test-rest: $(INSTALLED)  ## the browser tests and the slow ones together, for they share a finished run
+	$(PYTEST) -m "browser or slow" -rs
 
 docs-images: $(INSTALLED)  ## draw the README's pictures anew from a demo run; first: make browser-setup
 	$(BIN)/python -m docs.make_images

@@ -1,4 +1,4 @@
-"""What several tests share: a small rendered capture and its features, and real captures where they are present.
+"""What several tests share: a small rendered capture, its features, a run of it; real captures where they are present.
 
 What takes long to make is made once, also where pytest-xdist has several workers: the first makes it, the others wait.
 """
@@ -59,6 +59,23 @@ def small_features(small_capture: Path, made_once: Callable[[str, Callable[[Path
             extract_session(capture[session_id], folder / "features", progress=False)
 
     return made_once("features", make) / "features"
+
+
+@pytest.fixture(scope="session")
+def small_run(small_capture: Path, made_once: Callable[[str, Callable[[Path], object]], Path]) -> Path:
+    """The run folder of `small_capture`, all notebooks executed by the pipeline with defaults; do not write to it.
+
+    For slow and browser tests: it takes a minute.
+    """
+    from toolkit import pipeline
+
+    def make(folder: Path) -> None:
+        manifest = folder / "small.yaml"
+        manifest.write_text(f"description: a small run\ncaptures: ['{small_capture}']\n")
+        overrides = [f"output_root={folder}", "visualize.samples=1"]
+        pipeline.run(manifest, overrides=overrides, say=lambda *a, **k: None)
+
+    return made_once("run", make) / "small"
 
 
 @pytest.fixture(scope="session")

@@ -1,12 +1,16 @@
 """Real photographs: how accurate the poses are, against the numbers of hloc + SIFT. Minutes; see CONTRIBUTING."""
 
+import json
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from toolkit.capture import Capture
 from toolkit.embed import embed_sessions
 from toolkit.evaluate import Evaluation, evaluate_scene
 from toolkit.files import SceneFiles
@@ -28,33 +32,39 @@ HLOC = {
 HLOC_REPAIRED = (0.033, 0.8)
 
 
-def run_all(name: str, root: Path, run: Path) -> Evaluation:
-    """Run the stages on a capture, all nine pairs; skip where the capture is absent."""
-    sessions = root / name / "sessions"
-    if not sessions.is_dir():
-        pytest.skip(f"needs the capture {name}: no folder {sessions}")
-    files = SceneFiles(run, name)
+@dataclass(frozen=True)
+class Run:
+    """A capture, what the stages made of all nine pairs, and how good that is."""
+
+    capture: Capture
+    files: SceneFiles
+    evaluation: Evaluation
+
+
+def run_stages(sessions: Path, files: SceneFiles) -> Run:
     embed_sessions(sessions, files.embeddings, features_dir=files.features)
     retrieve_pairs(sessions, files.embeddings, out_jsonl=files.retrieval_dir)
     localize_pairs(sessions, files.retrieval_dir, files.poses_dir, files.features, files.maps)
-    return evaluate_scene(sessions, files.poses_dir, files.retrieval_dir, files.evaluation)
+    evaluation = evaluate_scene(sessions, files.poses_dir, files.retrieval_dir, files.evaluation)
+    return Run(Capture.from_sessions_root(sessions), files, evaluation)
 
 
 @pytest.fixture(scope="module")
-def evaluation_of(captures_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Evaluation]:
-    """Evaluate a capture by name, once."""
-    done: dict[str, Evaluation] = {}
+def run_of(captures_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Run]:
+    """Run the stages on a capture by name, once; skip where the capture is absent."""
 
-    def of(name: str) -> Evaluation:
-        if name not in done:
-            done[name] = run_all(name, captures_root, tmp_path_factory.mktemp(name))
-        return done[name]
+    @cache
+    def of(name: str) -> Run:
+        sessions = captures_root / name / "sessions"
+        if not sessions.is_dir():
+            pytest.skip(f"needs the capture {name}: no folder {sessions}")
+        return run_stages(sessions, SceneFiles(tmp_path_factory.mktemp(name), name))
 
     return of
 
 
-def test_strecha_is_solved(evaluation_of: Callable[[str], Evaluation]) -> None:
-    table = evaluation_of("STRECHA").recall
+def test_strecha_is_solved(run_of: Callable[[str], Run]) -> None:
+    table = run_of("STRECHA").evaluation.recall
     assert len(table) == 9
     assert (table["state"] == "evaluated").all()
     assert (table["queries"] > 0).all()
@@ -66,32 +76,47 @@ def test_strecha_is_solved(evaluation_of: Callable[[str], Evaluation]) -> None:
 @pytest.mark.parametrize("mapped", DEVICES)
 @pytest.mark.parametrize("query", DEVICES)
 def test_no_pair_of_strecha_is_less_accurate_than_hloc(
-    evaluation_of: Callable[[str], Evaluation], mapped: str, query: str
+    run_of: Callable[[str], Run], mapped: str, query: str
 ) -> None:
-    table = evaluation_of("STRECHA").recall.set_index(["map_device", "query_device"])
+    table = run_of("STRECHA").evaluation.recall.set_index(["map_device", "query_device"])
     row, (degrees, centimeters) = table.loc[(mapped, query)], HLOC[mapped][DEVICES.index(query)]
     # To the digits in which hloc's numbers are known.
     assert round(row["median_rotation_deg"], 2) <= degrees
     assert round(100 * row["median_translation_m"], 1) <= centimeters
 
 
-def test_the_medians_over_all_of_strecha_are_close_to_repaired_hloc(
-    evaluation_of: Callable[[str], Evaluation],
-) -> None:
-    errors = evaluation_of("STRECHA").errors
+def test_the_medians_over_all_of_strecha_are_close_to_repaired_hloc(run_of: Callable[[str], Run]) -> None:
+    errors = run_of("STRECHA").evaluation.errors
     assert errors[["map_device", "query_device"]].drop_duplicates().shape[0] == 9
     assert np.median(errors["rotation_error_deg"]) <= 1.2 * HLOC_REPAIRED[0]
     assert 100 * np.median(errors["translation_error_m"]) <= 1.2 * HLOC_REPAIRED[1]
 
 
-def test_hard_strecha_reaches_its_recall(evaluation_of: Callable[[str], Evaluation]) -> None:
-    table = evaluation_of("STRECHA_HARD").recall
+def test_hard_strecha_reaches_its_recall(run_of: Callable[[str], Run]) -> None:
+    table = run_of("STRECHA_HARD").evaluation.recall
     assert len(table) == 9
     means = table[[STRICT, FINE, COARSE]].mean()
     assert (means >= pd.Series([0.60, 0.78, 0.80], index=[STRICT, FINE, COARSE])).all(), table
 
 
-def test_few_poses_of_hard_strecha_are_ok_and_wrong(evaluation_of: Callable[[str], Evaluation]) -> None:
-    errors = evaluation_of("STRECHA_HARD").errors
+def test_few_poses_of_hard_strecha_are_ok_and_wrong(run_of: Callable[[str], Run]) -> None:
+    errors = run_of("STRECHA_HARD").evaluation.errors
     wrong = (errors["rotation_error_deg"] > 5) | (errors["translation_error_m"] > 0.5)
     assert ((errors["status"] == "ok") & wrong).mean() <= 0.02
+
+
+@pytest.mark.parametrize("scene", ["STRECHA", "STRECHA_HARD"])
+def test_retrieval_finds_views_of_the_same_place(run_of: Callable[[str], Run], scene: str) -> None:
+    run = run_of(scene)
+    for path in sorted(run.files.retrieval_dir.glob("*.jsonl")):
+        session = run.capture[f"{path.stem.rpartition('_')[2]}_query"]
+        names = [f"{scene}/sessions/{session.image_name(index)}" for index in range(len(session.images))]
+        true = dict(zip(names, session.world_from_cam(ground_truth=True), strict=True))
+        hits = []
+        for record in map(json.loads, path.read_text().splitlines()):
+            world_from_query = true[record["path"]]
+            poses = np.array([reference["Tws"] for reference in record["topk"]])
+            distance_m = np.linalg.norm(poses[:, :3, 3] - world_from_query[:3, 3], axis=1)
+            hits.append((distance_m < 8) & (poses[:, :3, 2] @ world_from_query[:3, 2] > np.cos(np.radians(45))))
+        assert np.mean(np.any(hits, axis=1)) == 1, path.stem
+        assert np.mean(np.any(np.array(hits)[:, :5], axis=1)) >= 0.95, path.stem

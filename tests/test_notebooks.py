@@ -3,6 +3,7 @@
 import importlib
 import inspect
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,6 +13,7 @@ from typing import Any
 import nbformat
 import pytest
 
+from toolkit import pipeline
 from toolkit.manifest import OPTIONAL, STAGES, Manifest
 from toolkit.notebook import notebook_parameters, notebook_path
 
@@ -87,32 +89,27 @@ def test_parameters_of_the_run_are_arguments_of_the_stage(stage: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_capture_goes_from_files_to_a_report(small_capture: Path, tmp_path: Path) -> None:
+def test_a_capture_goes_from_files_to_a_report(small_run: Path) -> None:
+    assert (small_run / "report.html").is_file()
+    record = json.loads((small_run / "run.json").read_text())
+    assert [row["stage"] for row in record["stages"]] == [stage for stage in STAGES if stage not in OPTIONAL]
+    assert {row["status"] for row in record["stages"]} == {"done"}
+    counts = {row["stage"]: row["counts"] for row in record["stages"]}
+    assert counts["embed"]["images"] == counts["embed"]["embedded"] + counts["embed"]["unreadable"]
+    assert len(list((small_run / "SMALL" / "poses").glob("*.txt"))) == 9
+
+
+@pytest.mark.slow
+def test_a_run_with_reranking_is_reused_and_repeated(small_capture: Path, small_run: Path, tmp_path: Path) -> None:
     manifest = tmp_path / "small.yaml"
-    manifest.write_text(f"captures: ['{small_capture}']\noutput_root: runs\n")
+    sections = "rerank: {}\nvisualize: {samples: 1}\n"
+    manifest.write_text(f"captures: ['{small_capture}']\noutput_root: runs\n{sections}")
+    run = tmp_path / "runs" / "small"
+    # What the stages have made is taken over, but for what reranking changes.
+    shutil.copytree(small_run / "SMALL", run / "SMALL", ignore=shutil.ignore_patterns(".stages"))
     command = [sys.executable, "-m", "toolkit", "run", str(manifest)]
     first = subprocess.run(command, capture_output=True, text=True)
     assert first.returncode == 0, first.stdout + first.stderr
-    run = tmp_path / "runs" / "small"
-    assert (run / "report.html").is_file()
-    record = json.loads((run / "run.json").read_text())
-    default = [stage for stage in STAGES if stage not in OPTIONAL]
-    assert [row["stage"] for row in record["stages"]] == default
-    counts = {row["stage"]: row["counts"] for row in record["stages"]}
-    assert counts["embed"]["images"] == counts["embed"]["embedded"] + counts["embed"]["unreadable"]
-    poses = sorted((run / "SMALL" / "poses").glob("*.txt"))
-    assert len(poses) == 9
-    before = {path.name: path.read_bytes() for path in poses}
-
-    again = subprocess.run(command, capture_output=True, text=True)
-    assert again.stdout.count("reused") == len(default), again.stdout + again.stderr
-
-    forced = subprocess.run([*command, "--force", "--only", "localize"], capture_output=True, text=True)
-    assert forced.returncode == 0, forced.stdout + forced.stderr
-    assert {path.name: path.read_bytes() for path in poses} == before, "the same seed gives the same poses"
-
-    more = subprocess.run([*command, "--set", "rerank=true"], capture_output=True, text=True)
-    assert more.returncode == 0, more.stdout + more.stderr
     rows = {row["stage"]: row for row in json.loads((run / "run.json").read_text())["stages"]}
     assert list(rows) == list(STAGES)
     assert rows["retrieve"]["parameters"]["topk"] == rows["rerank"]["parameters"].get("topn", 30)
@@ -120,3 +117,16 @@ def test_a_capture_goes_from_files_to_a_report(small_capture: Path, tmp_path: Pa
     assert rows["rerank"]["counts"]["pairs"] == 9
     table = (run / "SMALL" / "evaluation" / "overlap.csv").read_text()
     assert "reranked_mean" in table
+    poses = sorted((run / "SMALL" / "poses").glob("*.txt"))
+    before = {path.name: path.read_bytes() for path in poses}
+    assert len(before) == 9
+
+    again = subprocess.run(command, capture_output=True, text=True)
+    assert again.stdout.count("reused") == len(STAGES), again.stdout + again.stderr
+
+    pipeline.run(manifest, only="localize", force=True)
+    record = json.loads((run / "run.json").read_text())
+    assert {row["stage"]: row["status"] for row in record["stages"]} == {
+        stage: "done" if stage == "localize" else "reused" for stage in STAGES
+    }
+    assert {path.name: path.read_bytes() for path in poses} == before, "the same seed gives the same poses"

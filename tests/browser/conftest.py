@@ -21,12 +21,7 @@ def browser() -> "Iterator[Browser]":
 
 
 @pytest.fixture(scope="session")
-def finished_run(browser: "Browser", small_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Run folder of the small capture; the browser is asked for first, as without one this is work for nothing."""
-    from toolkit import pipeline
-
-    folder = tmp_path_factory.mktemp("run")
-    manifest = folder / "small.yaml"
-    manifest.write_text(f"description: a small run\ncaptures: ['{small_capture}']\n")
-    overrides = [f"output_root={folder}", "visualize.samples=1"]
-    return pipeline.run(manifest, overrides=overrides, say=lambda *a, **k: None)
+def finished_run(browser: "Browser", request: pytest.FixtureRequest) -> Path:
+    """`small_run`; the browser is asked for first, as without one the run is work for nothing."""
+    folder: Path = request.getfixturevalue("small_run")
+    return folder
