@@ -17,26 +17,15 @@ def _blocked(scene: Scene, start: Image, way: Image) -> NDArray[np.bool_]:
     hit = np.zeros(len(start), bool)
     if not len(start):
         return hit
-    start, way = np.ascontiguousarray(start.T), np.ascontiguousarray(way.T)
-    end = start + way
-    low, high = np.minimum(start, end), np.maximum(start, end)
-    # A margin keeps rounding from leaving out a segment that the slab test would find cut.
-    lowest, highest = low.min(1) - 1e-3, high.max(1) + 1e-3
-    for center, half, yaw in scene.blockers:
-        reach = np.array([*[np.hypot(half[0], half[1])] * 2, half[2]])
-        if (center + reach < lowest).any() or (center - reach > highest).any():
-            continue
-        near_low, near_high = (center - reach - 1e-3).astype(np.float32), (center + reach + 1e-3).astype(np.float32)
-        near = ~hit
-        for axis in range(3):
-            near &= (low[axis] < near_high[axis]) & (high[axis] > near_low[axis])
-        chosen = np.flatnonzero(near)
-        if not len(chosen):
-            continue
+    ends = np.concatenate([start, start + way])
+    lows, highs = scene.blocker_bounds
+    near = ((highs >= ends.min(0)) & (lows <= ends.max(0))).all(1)
+    for k in np.flatnonzero(near):
+        center, half, yaw = scene.blockers[k]
         c, s = np.float32(np.cos(yaw)), np.float32(np.sin(yaw))
-        px, py, pz = start[:, chosen] - center.astype(np.float32)[:, None]
-        vx, vy, vz = way[:, chosen]
-        enter, leave = np.zeros(len(chosen), np.float32), np.ones(len(chosen), np.float32)
+        px, py, pz = (start - center.astype(np.float32)).T
+        vx, vy, vz = way.T
+        enter, leave = np.zeros(len(start), np.float32), np.ones(len(start), np.float32)
         for origin, along, side in (
             (c * px + s * py, c * vx + s * vy, half[0]), (c * py - s * px, c * vy - s * vx, half[1]),
             (pz, vz, half[2]),
@@ -45,7 +34,7 @@ def _blocked(scene: Scene, start: Image, way: Image) -> NDArray[np.bool_]:
             middle, spread = -origin * inverse, np.abs(np.float32(side) * inverse)
             np.maximum(enter, middle - spread, out=enter)
             np.minimum(leave, middle + spread, out=leave)
-        hit[chosen] = enter < leave
+        hit |= enter < leave
     return hit
 
 

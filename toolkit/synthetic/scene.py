@@ -61,6 +61,15 @@ class Scene:
     blockers: list[tuple[Array, Array, float]] = field(default_factory=list)  # center, half sizes, yaw
     lamps: list[Array] = field(default_factory=list)
 
+    @cached_property
+    def blocker_bounds(self) -> tuple[Array, Array]:
+        """The lowest and the highest corners (N, 3) of upright boxes around the blockers, for a scene that is built."""
+        centers = np.array([center for center, _, _ in self.blockers]).reshape(-1, 3)
+        halves = np.array([half for _, half, _ in self.blockers]).reshape(-1, 3)
+        across = np.hypot(halves[:, 0], halves[:, 1])  # whatever the yaw
+        reach = np.stack([across, across, halves[:, 2]], -1)
+        return centers - reach, centers + reach
+
     def plate(
         self, corner: Any, right: Any, down: Any, width: float, height: float, material: Material,
         ppm: float = 300.0, lit: bool = True,

@@ -120,8 +120,8 @@ def plaster(rng: Rng, h: int, w: int, ppm: float, color: Any = (190, 205, 210), 
 
 def _grain(rng: Rng, image: Image, strength: float) -> Image:
     h, w = image.shape[:2]
-    grain = _noise(rng, h, w, (2, 5))[..., None] * strength * 255
-    return np.clip(image + grain, 0, 255).astype(np.uint8)
+    noisy = image + _noise(rng, h, w, (2, 5))[..., None] * strength * 255
+    return noisy.clip(0, 255, out=noisy).astype(np.uint8)
 
 
 def cells(
@@ -138,10 +138,11 @@ def cells(
     tone = _f(colors)[rng.integers(0, len(colors), (rows, columns))]
     tone = tone * (1 + jitter * rng.standard_normal((rows, columns, 1), dtype=np.float32))
     streaks = 6 if stagger == "random" else 1
-    image = tone[row[:, None], column] * (1 + 0.07 * _noise(rng, h, w, (3, 9), streaks)[..., None])
+    image = tone[row[:, None], column]
+    image *= 1 + 0.07 * _noise(rng, h, w, (3, 9), streaks)[..., None]
     gap = max(1, round(0.008 * ppm))
     image[((y % ch) < gap)[:, None] | ((x % cw) < gap)] = joint
-    image = image.clip(0, 255).astype(np.uint8)
+    image = image.clip(0, 255, out=image).astype(np.uint8)
     if motifs:
         for r in range(rows):
             for c in range(columns):
