@@ -36,9 +36,13 @@ class Rays:
     def of(cls, camera: "pycolmap.Camera") -> "Rays":
         """Unproject the sample grid; the center of the top-left pixel is (0.5, 0.5)."""
         u, v = ((np.arange(SAMPLES * n) + 0.5) / SAMPLES for n in (camera.width, camera.height))
-        pixels = np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
-        shape = (SAMPLES * camera.height, SAMPLES * camera.width)
-        x, y = np.asarray(camera.cam_from_img(pixels)).T.astype(np.float32).reshape(2, *shape)
+        if camera.model.name == "PINHOLE":  # x depends on u alone, and y on v
+            x = np.asarray(camera.cam_from_img(np.stack([u, 0 * u], -1)))[:, 0]
+            y = np.asarray(camera.cam_from_img(np.stack([0 * v, v], -1)))[:, 1]
+            x, y = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
+        else:
+            pixels = np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
+            x, y = np.asarray(camera.cam_from_img(pixels)).T.astype(np.float32).reshape(2, len(v), len(u))
         planes = np.array([
             [0, 0, 1, -NEAR_M], [1, 0, -x.min(), 0], [-1, 0, x.max(), 0],
             [0, 1, -y.min(), 0], [0, -1, y.max(), 0],
