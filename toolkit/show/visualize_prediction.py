@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.images import read_for_display
 from toolkit.capture.upright import up_of_cameras
-from toolkit.localizers.prediction import View
-from toolkit.localizers.vggt import CameraAnswer, VggtAnswer, VggtLocalizer, VggtQuery
+from toolkit.localizers.base import Query, View
+from toolkit.localizers.feed_forward import CameraAnswer, FeedForwardAnswer, FeedForwardLocalizer
 from toolkit.show.figures import BLUE, GRAY, GREEN, VERMILLION, new_figure, save_figure, styled
 from toolkit.show.top_view import ground_axes
 
@@ -23,9 +23,9 @@ Array = NDArray[np.float64]
 
 @styled
 def draw_prediction(
-    localizer: VggtLocalizer,
-    query: VggtQuery,
-    answer: VggtAnswer,
+    localizer: FeedForwardLocalizer,
+    query: Query,
+    answer: FeedForwardAnswer,
     camera: int | None = None,
     up: ArrayLike | None = None,
     out: str | Path | None = None,
@@ -78,7 +78,7 @@ def _draw_view(
 ) -> None:
     photograph.set_axis_on()
     photograph.set(xticks=[], yticks=[])
-    photograph.imshow(read_for_display(view.path))
+    photograph.imshow(read_for_display(view.image) if isinstance(view.image, Path) else view.image)
     photograph.set_title(label, fontsize=8, color=color)
     photograph.spines[:].set(color=color, linewidth=2.5, visible=True)
     prediction = part.prediction
@@ -101,7 +101,7 @@ def _draw_view(
 
 
 def _draw_from_above(
-    axis: "Axes", localizer: VggtLocalizer, part: CameraAnswer, kept: NDArray[np.bool_], up: ArrayLike | None
+    axis: "Axes", localizer: FeedForwardLocalizer, part: CameraAnswer, kept: NDArray[np.bool_], up: ArrayLike | None
 ) -> None:
     local_map, alignment = localizer.map, part.alignment
     axes, labels = ground_axes(up_of_cameras(local_map.world_from_cams) if up is None else up)
