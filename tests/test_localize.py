@@ -24,8 +24,14 @@ from toolkit.features.matching import MATCHERS, MutualMatcher, unit_descriptors
 from toolkit.features.stores import extract_session
 from toolkit.files import SceneFiles, sidecar_path
 from toolkit.localize import COLUMNS, Map, localize_image, localize_pairs
+from toolkit.localizers import map as maps
+from toolkit.localizers.base import PoseEstimate, View
+from toolkit.localizers.correspondences import LocalizedQueries
 from toolkit.localizers.mapping import LocalMap
-from toolkit.localizers.pnp import PnpLocalizer, PoseEstimate
+from toolkit.localizers.pnp import PnpLocalizer
+from toolkit.localizers.prediction import Prediction
+from toolkit.localizers.simulated import SimulatedPredictor
+from toolkit.manifest import LocalizeSettings
 from toolkit.retrieve import retrieve_pairs
 
 LIST = "keyframes_original"
@@ -129,7 +135,7 @@ def test_rows_say_how_a_pose_came_about(finished: tuple[SceneFiles, pd.DataFrame
 def test_a_finished_run_leaves_no_partial_files(finished: tuple[SceneFiles, pd.DataFrame]) -> None:
     names = {path.name for path in finished[0].poses_dir.iterdir()}
     stems = [finished[0].poses_txt("ios", device).stem for device in DEVICES]
-    assert names == {stem + end for stem in stems for end in (".txt", ".csv", ".txt.meta.json")}
+    assert names == {stem + end for stem in stems for end in (".txt", ".csv", ".h5", ".txt.meta.json", ".h5.meta.json")}
 
 
 def test_nearest_is_the_pose_of_the_best_reference_and_labeled(small_capture: Path, run: SceneFiles) -> None:
@@ -162,7 +168,7 @@ def test_nearest_is_the_pose_of_the_best_reference_and_labeled(small_capture: Pa
 @pytest.mark.parametrize(
     ("wrong", "error", "message"),
     [
-        ({"method": "magic"}, ManifestError, r"Unknown method 'magic'. Known: pnp, nearest"),
+        ({"method": "magic"}, ManifestError, r"method: found 'magic'.*'pnp', 'nearest'"),
         ({"map_device": "drone"}, ToolkitError, r"drone.*ios, hl, spot"),
         ({"query_device": "drone"}, ToolkitError, r"drone.*ios, hl, spot"),
         ({"queries": "keyframes_best"}, CaptureError, "original"),
@@ -182,9 +188,9 @@ def test_a_pose_without_covariance_leaves_the_others_theirs(tmp_path: Path) -> N
         {"timestamp": time, "device_id": "a", "qt": [1.0, 0, 0, 0, 0, 0, 0], "covariance": covariance}
         for time, covariance in ((1, np.eye(6).ravel().tolist()), (2, None))
     ]
-    pair = SimpleNamespace(name="pair", out_dir=tmp_path, csv=tmp_path / "pair.csv", txt=tmp_path / "pair.txt")
-    localize._write_poses(pair, rows, ["timestamp", "device_id"])  # type: ignore[arg-type]
-    np.testing.assert_array_equal(Trajectory.read(pair.txt).covariances, [np.eye(6), np.full((6, 6), np.nan)])
+    pair = SimpleNamespace(file=lambda suffix: tmp_path / f"pair.{suffix}")
+    localize._write_poses(pair, rows, LocalizeSettings())  # type: ignore[arg-type]
+    np.testing.assert_array_equal(Trajectory.read(pair.file("txt")).covariances, [np.eye(6), np.full((6, 6), np.nan)])
 
 
 def test_a_map_of_an_older_format_is_built_anew(small_capture: Path, run: SceneFiles) -> None:
@@ -309,24 +315,21 @@ def test_a_killed_run_goes_on_where_it_was(
     assert without_times(run, device) == without_times(finished[0], device)
 
 
-@pytest.mark.parametrize("tail", [b'{"timestamp": 17145', b"\0" * 50, b"\n", b'"'])
-def test_a_torn_progress_file_costs_at_most_its_last_line(
+def test_a_torn_part_costs_at_most_what_it_held(
     small_capture: Path,
     run: SceneFiles,
     finished: tuple[SceneFiles, pd.DataFrame],
     monkeypatch: pytest.MonkeyPatch,
-    tail: bytes,
 ) -> None:
     with pytest.MonkeyPatch.context() as patch:
         spy(patch, fail_at=2, error=KeyboardInterrupt())
         with pytest.raises(KeyboardInterrupt):
             run_stage(small_capture, run, query_device="ios")
-    (progress,) = run.poses_dir.glob(".*.partial.jsonl")
-    with open(progress, "ab") as stream:
-        stream.write(tail)
+    (part,) = run.poses_dir.glob(".*.parts/*.h5")
+    part.write_bytes(part.read_bytes()[:-100])
     calls = spy(monkeypatch)
     run_stage(small_capture, run, query_device="ios")
-    assert len(calls) <= 1
+    assert len(calls) == 3
     assert run.poses_txt("ios", "ios").read_bytes() == finished[0].poses_txt("ios", "ios").read_bytes()
 
 
@@ -456,7 +459,7 @@ def test_a_picture_of_another_size_than_its_camera_is_refused(small_capture: Pat
 
 
 def test_the_map_of_an_unfinished_run(finished: tuple[SceneFiles, pd.DataFrame]) -> None:
-    with pytest.raises(ArtifactError, match="hl_map"):
+    with pytest.raises(ArtifactError, match="'hl'"):
         Map.open(finished[0].run, finished[0].scene, "hl")
 
 
@@ -471,27 +474,83 @@ class Learned:
         self.dim = len(vector)
         self.seen: list[tuple[int, ...]] = []
 
+    def prepare(self, image: np.ndarray) -> np.ndarray:
+        return image
+
     def embed(self, inputs: Sequence[np.ndarray]) -> np.ndarray:
         self.seen += [image.shape for image in inputs]
         return np.repeat(self.vector[None], len(inputs), axis=0)
 
 
-def test_a_map_with_the_embedder_it_was_made_with(
-    small_capture: Path, finished: tuple[SceneFiles, pd.DataFrame]
-) -> None:
+def test_a_learned_embedder_is_given_colors(small_capture: Path, finished: tuple[SceneFiles, pd.DataFrame]) -> None:
     files = finished[0]
-    with pytest.raises(ArtifactError, match="but `learned` makes 7"):
-        Map.open(files.run, files.scene, "ios", embedder=Learned(np.zeros(7, np.float32)))
     session = Capture.open(small_capture)["ios_query"]
     path, camera = session.image_path(0), session.camera(session.images["sensor_id"].iloc[0])
-    vlad = Map.open(files.run, files.scene, "ios")
+    place = Map.open(files.run, files.scene, "ios")
+    expected = localize_image(place, path, camera)
     store = extract_session(session, files.features)
-    learned = Learned(vlad.embedder.embed([store[session.image_name(0)]])[0])
-    opened = Map.open(files.run, files.scene, "ios", embedder=learned)
-    expected = localize_image(vlad, path, camera)
-    answer = localize_image(opened, path, camera)
-    np.testing.assert_allclose(answer.world_from_rig, expected.world_from_rig, atol=1e-9)
-    assert learned.seen == [(camera.height, camera.width, 3)], "it is given colors"
+    learned = Learned(place.embedder.embed([store[session.image_name(0)]])[0])
+    place.embedder = learned  # type: ignore[misc]
+    np.testing.assert_array_equal(localize_image(place, path, camera).world_from_rig, expected.world_from_rig)
+    assert learned.seen == [(camera.height, camera.width, 3)]
+    place.embedder = Learned(np.zeros(7, np.float32))  # type: ignore[misc]
+    with pytest.raises(ArtifactError, match="learned gives 7"):
+        localize_image(place, path, camera)
+
+
+class ByContent:
+    """A predictor that knows a photograph by its pixels, wherever they come from, and looks up its true pose."""
+
+    def __init__(self, capture: Capture, map_dir: Path) -> None:
+        sessions = [capture[key] for key in capture.session_ids]
+        self.simulated_predictor = SimulatedPredictor(sessions, map_dir)
+        self.name, self.simulated = "by content", False
+        self.settings: dict[str, object] = {}
+        self.names = {
+            read_image(session.image_path(row)).tobytes(): session.image_name(row)
+            for session in sessions
+            for row in session.camera_rows.tolist()
+        }
+
+    def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
+        def named(view: View) -> View:
+            pixels = read_image(view.image) if isinstance(view.image, Path) else view.image
+            return replace(view, name=self.names[pixels.tobytes()])
+
+        return self.simulated_predictor.predict([[named(view) for view in group] for group in groups])
+
+
+@pytest.mark.parametrize("device", ["ios", "spot"])
+@pytest.mark.parametrize("method", ["pnp", "nearest", "vggt", "hybrid"])
+def test_pictures_get_the_pose_of_the_run_byte_for_byte(
+    small_capture: Path, run: SceneFiles, monkeypatch: pytest.MonkeyPatch, method: str, device: str
+) -> None:
+    predictor = ByContent(Capture.open(small_capture), run.maps)
+    monkeypatch.setattr(maps, "create_predictor", lambda *_, **__: predictor)
+    settings = {"method": method, "seed": 3, "pnp": {"min_inliers": 11}, "predictor": {"num_references": 3}}
+    run_stage(small_capture, run, query_device=device, **settings)
+    place = Map.open(run.run, run.scene, "ios")
+    assert place.settings == LocalizeSettings.of(settings), "the run's own settings"
+    session = Capture.open(small_capture)[f"{device}_query"]
+    keyframes = session.keyframes(LIST)
+    lines = run.poses_txt("ios", device).read_text().splitlines()[1:]
+    localized = LocalizedQueries(run.poses_dir / f"{run.poses_txt('ios', device).stem}.h5")
+    for line, rows, key in zip(
+        lines, session.rows_of_keyframes(keyframes), keyframes.itertuples(index=False), strict=True
+    ):
+        paths = [session.image_path(int(row)) for row in rows]
+        cameras = [session.camera(sensor) for sensor in session.images["sensor_id"].iloc[rows]]
+        rig = session.rig_from_cam(rows)
+        estimate = (
+            localize_image(place, paths[0], cameras[0])
+            if device == "ios"
+            else localize_image(place, paths, cameras, rig)
+        )
+        text = ", ".join(repr(float(number)) for number in geometry.qt_from_pose(estimate.world_from_rig))
+        assert text in line, f"{key.timestamp}"
+        before = localized[key.timestamp, key.device_id].correspondences
+        np.testing.assert_array_equal(before.point_index, estimate.correspondences.point_index)
+        np.testing.assert_array_equal(before.inlier, estimate.correspondences.inlier)
 
 
 # ------------------------------------------------------------------------------------- other features, and several
@@ -502,7 +561,7 @@ class OtherFeatures(SiftExtractor):
 
     threaded, batch_size = False, 3
 
-    def __init__(self, **of_networks: object) -> None:
+    def __init__(self, *_: object, **of_networks: object) -> None:
         super().__init__(SiftSettings(min_long_side=0, max_long_side=448))
 
     @property
@@ -521,7 +580,7 @@ class OtherMatcher(MutualMatcher):
 
     asked = 0
 
-    def __init__(self, **of_networks: object) -> None:
+    def __init__(self, *_: object, **of_networks: object) -> None:
         super().__init__(ratio=0.85)
 
     def match(self, pairs):  # type: ignore[no-untyped-def]
@@ -535,7 +594,7 @@ class Wrapped:
     batch_size = 5
     settings = {"name": "network"}  # noqa: RUF012
 
-    def __init__(self, **of_networks: object) -> None:
+    def __init__(self, *_: object, **of_networks: object) -> None:
         self.match = OtherMatcher().match
 
 
@@ -585,7 +644,7 @@ def test_what_a_network_has_matched_is_kept(small_capture: Path, run: SceneFiles
     ("options", "text"),
     [
         ({"features": ["surf"]}, "Unknown local features 'surf'"),
-        ({"features": []}, "expected a list of one or more"),
+        ({"features": []}, "features.kinds"),
         ({"matcher": "lightglue"}, "suits none of the features. Known for sift: mutual"),
     ],
 )

@@ -125,7 +125,7 @@ def create_extractor(name: str, settings: FeaturesSettings, device: str = "auto"
         WeightsError: the network has no weights.
     """
     make = resolve_name(feature_kind(name).extractor)
-    own = getattr(settings, name)
+    own = getattr(settings, name, None)
     extractor: Extractor = make(own) if name == "sift" else make(settings.checkpoint, device, dtype, settings=own)
     return extractor
 

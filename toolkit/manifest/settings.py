@@ -224,15 +224,13 @@ class SuperPointSettings(Settings):
     """Keypoints closer than this to the image's border are left out, pixels of the reduced image."""
 
 
-FeatureName = Literal["sift", "superpoint"]
-
-
 class FeaturesSettings(Settings):
     """Local features, and how each kind is extracted."""
 
     shorthand = "kinds"
-    kinds: Annotated[list[FeatureName], Field(min_length=1)] = ["sift"]
-    """Kinds of local features; of several, the matches are pooled in one pose. `features: [sift]` is short for it."""
+    kinds: Annotated[list[str], Field(min_length=1)] = ["sift"]
+    """Kinds of local features: sift, superpoint; of several, the matches are pooled in one pose. `features: [sift]`
+    is short for it."""
     checkpoint: str | None = None
     """File with the weights of learned features; null: the hub's cache, else a download."""
     sift: SiftSettings = SiftSettings()
@@ -253,7 +251,7 @@ class MatcherSettings(Settings):
     """How the features of a query image and a reference image are matched."""
 
     shorthand = "name"
-    name: Literal["mutual", "lightglue"] | None = None
+    name: str | None = None
     """mutual: nearest neighbors; lightglue: the network; null: what is usual for the features."""
     checkpoint: str | None = None
     """File with the weights of a learned matcher; null: the hub's cache, else a download."""
