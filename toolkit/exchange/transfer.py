@@ -168,7 +168,10 @@ class Transfer:
                         self._advance(len(piece))
         except requests.RequestException as error:  # before OSError, of which it is one
             raise _TryAgainError(f"the connection broke ({first_line(error)})", 0) from error
-        return size is None or partial.stat().st_size == size
+        now = partial.stat().st_size
+        if size is not None and now < size and now <= have:  # else a server that sends too little is asked for ever
+            raise _TryAgainError(f"the server sent {now} of {size} bytes", 0)
+        return size is None or now == size
 
     def _require_usable(self, response: "requests.Response", file: RemoteFile, partial: Path, have: int) -> None:
         """Raise unless the answer is the file, or the range of it that begins at `have` bytes."""
