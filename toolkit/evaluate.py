@@ -41,11 +41,6 @@ if TYPE_CHECKING:
 
     from toolkit.localizers.mapping import LocalMap
 
-__all__ = [
-    "Evaluation", "draw_evaluation", "evaluate_scene", "overlap_in_view", "overlap_table", "pose_errors", "recall",
-    "threshold_name", "write_evaluation",
-]  # fmt: skip
-
 logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
@@ -104,7 +99,7 @@ def evaluate_scene(
     rows: dict[str, list[dict[str, Any]]] = {"recall": [], "retrieval": [], "losses": []}
     errors: list[pd.DataFrame] = []
     messages: list[str] = []
-    references_dir = reranked_dir or retrieval_dir
+    references_dir = retrieval_dir and (reranked_dir or retrieval_dir)
     for query in capture.devices_with("query", query_device):
         session = capture[f"{query}_query"]
         keys, truth = _queries_with_truth(session, queries, messages)

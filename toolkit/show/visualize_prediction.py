@@ -78,7 +78,7 @@ def _draw_view(
 ) -> None:
     photograph.set_axis_on()
     photograph.set(xticks=[], yticks=[])
-    photograph.imshow(read_for_display(view.image) if isinstance(view.image, Path) else view.image)
+    photograph.imshow(read_for_display(view.image) if isinstance(view.image, Path) else view.image, cmap="gray")
     photograph.set_title(label, fontsize=8, color=color)
     photograph.spines[:].set(color=color, linewidth=2.5, visible=True)
     prediction = part.prediction
