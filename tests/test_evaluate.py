@@ -273,7 +273,7 @@ def test_missing_and_torn_files_are_rows_not_exceptions(scene):
 def test_unknown_choices_are_named(scene):
     with pytest.raises(ToolkitError, match=r"'spot'.*ios, hl"):
         evaluate_scene(*scene, None, map_device="spot")
-    with pytest.raises(ToolkitError, match="Known: device, camera"):
+    with pytest.raises(ToolkitError, match="device, camera"):
         evaluate_ios(scene, at="rig")
 
 

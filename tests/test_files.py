@@ -99,7 +99,7 @@ def test_fingerprint_tells_different_values_apart(other: dict) -> None:
 
 def test_fingerprint_respects_the_order_of_lists_and_refuses_objects() -> None:
     assert files.fingerprint([1, 2]) != files.fingerprint([2, 1])
-    with pytest.raises(TypeError, match="Settings must be JSON"):
+    with pytest.raises(TypeError, match="JSON"):
         files.fingerprint({"a": object()})
 
 

@@ -90,7 +90,7 @@ def test_inherited_paths_count_from_the_file_that_has_them(tmp_path: Path, monke
     path = write_files(tmp_path, mine="inherits: bases/base.yaml\ncaptures: [a]", bases__base="captures: [$UNSET/a]")
     assert load_manifest(path).captures == [str(tmp_path / "a")], "what is replaced need not be known"
     path = write_files(tmp_path, mine="inherits: bases/base.yaml")
-    with pytest.raises(ManifestError, match=r"mine\.yaml: captures: '\$UNSET/a' uses the variable \$UNSET"):
+    with pytest.raises(ManifestError, match=r"mine\.yaml: captures: .*\$UNSET"):
         load_manifest(path)
 
 
@@ -196,7 +196,7 @@ def test_wrong_overrides_are_named(tmp_path: Path, override: str, expected: str)
 
 
 def test_a_missing_manifest_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ManifestError, match="no such manifest"):
+    with pytest.raises(ManifestError, match=r"none\.yaml"):
         load_manifest(tmp_path / "none.yaml")
 
 

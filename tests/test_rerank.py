@@ -286,7 +286,7 @@ def test_a_network_matches_all_references_of_a_query_at_once(
 
 
 def test_a_matcher_that_does_not_suit_is_refused(small_capture: Path, files: SceneFiles) -> None:
-    with pytest.raises(ManifestError, match="'lightglue' suits none of the features"):
+    with pytest.raises(ManifestError, match="lightglue"):
         run(small_capture, files, matcher="lightglue")
 
 
@@ -316,7 +316,7 @@ def test_wrong_settings_and_files_are_refused(small_capture: Path, files: SceneF
         run(small_capture, files, topk=7)
     path = files.retrieval("ios", "hl")
     path.write_text(path.read_text() + "{}\n")
-    with pytest.raises(ArtifactError, match=r"line \d+: not a retrieval row"):
+    with pytest.raises(ArtifactError, match=r"\.jsonl, line \d+"):
         run(small_capture, files)
     path.write_text(path.read_text().splitlines()[0].replace("ios_map/raw_data/", "ios_map/raw_data/x") + "\n")
     with pytest.raises(ArtifactError, match="of another capture"):

@@ -11,7 +11,7 @@ from toolkit.models.compute import Fitting, resolve_device, resolve_precision
 
 @pytest.mark.parametrize("name", ["gpu", "cuda:", "cuda:x", "cuda0", "", "CPU", "xpu"])
 def test_unknown_devices(name: str) -> None:
-    with pytest.raises(ManifestError, match="expected auto, cpu, cuda"):
+    with pytest.raises(ManifestError, match="auto, cpu, cuda"):
         resolve_device(name)
 
 
@@ -19,14 +19,14 @@ def test_devices_that_are_not_here(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
     assert resolve_device("auto").type == "cpu"
-    with pytest.raises(ToolkitError, match="sees no GPU"):
+    with pytest.raises(ToolkitError, match="GPU"):
         resolve_device("cuda")
-    with pytest.raises(ToolkitError, match="no Apple GPU"):
+    with pytest.raises(ToolkitError, match="GPU"):
         resolve_device("mps")
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     assert resolve_device("auto").type == "cuda"
     assert resolve_device("cuda:1").index == 1
-    with pytest.raises(ToolkitError, match=r"cuda:2.*sees 2 GPUs, cuda:0 to cuda:1"):
+    with pytest.raises(ToolkitError, match=r"cuda:2.*cuda:0 to cuda:1"):
         resolve_device("cuda:2")
 
 
@@ -72,7 +72,7 @@ def test_a_batch_that_does_not_fit_is_halved(caplog: pytest.LogCaptureFixture) -
 
 
 def test_not_even_one_row_fits() -> None:
-    with pytest.raises(ToolkitError, match=r"does not hold.*one of the images.*Tried to allocate.*image_size"):
+    with pytest.raises(ToolkitError, match=r"images.*image_size"):
         Fitting(Memory(0), "images")(torch.arange(3))
 
 

@@ -184,13 +184,13 @@ def test_the_embedder_takes_any_photographs(tiny: MegaLoc) -> None:
     np.testing.assert_array_equal(vectors[2], vectors[3])
     assert embedder.embed([]).shape == (0, 32)
     for wrong in (noise(9, 9).astype(np.float32), noise(9, 9)[:, :, :2], noise(9, 9)[:0], noise(9, 9)[0, 0]):
-        with pytest.raises(ValueError, match="expected uint8"):
+        with pytest.raises(ValueError, match="uint8"):
             embedder.embed([wrong])
 
 
 @pytest.mark.parametrize("size", [100, 112, 0, -14, 323, 322.0])
 def test_image_sizes_that_are_refused(size: Any) -> None:
-    with pytest.raises(ManifestError, match="multiple of 14, at least 126"):
+    with pytest.raises(ManifestError, match=r"14.*126"):
         MegaLocEmbedder(tiny_megaloc(), device="cpu", image_size=size)
 
 
@@ -227,5 +227,5 @@ def test_a_network_that_is_given_stays_as_it_is(tiny: MegaLoc) -> None:
 
 def test_descriptors_that_are_no_numbers_are_not_written(tiny: MegaLoc) -> None:
     tiny.aggregator.linear.bias[3] = torch.nan
-    with pytest.raises(ToolkitError, match=r"not finite.*NaN.*bfloat16"):
+    with pytest.raises(ToolkitError, match=r"NaN.*bfloat16"):
         MegaLocEmbedder(tiny, device="cpu", image_size=126).embed([noise(126, 126)])

@@ -254,10 +254,10 @@ def test_images_of_another_shape_are_refused(model: VGGT, shape: tuple[int, ...]
 def test_other_wrong_input_is_refused(model: VGGT, images: torch.Tensor) -> None:
     with pytest.raises(ValueError, match=r"patch_tokens have shape .*expected \(2, 3, 12, 32\)"):
         model(images, patch_tokens=torch.zeros(2, 3, 11, 32))
-    with pytest.raises(ValueError, match="expected some of"):
+    with pytest.raises(ValueError, match="heads are"):
         tiny(("camera",))(images, heads=("depth",))
     for heads in (("track",), (), "camera"):
-        with pytest.raises(ValueError, match="expected some of"):
+        with pytest.raises(ValueError, match="heads are"):
             VGGT(heads)
     with pytest.raises(ValueError, match=r"expected \(N, 3, H, W\)"):
         model.encode(images)
@@ -349,7 +349,7 @@ def test_pose_encoding_known_answers() -> None:
     assert np.isinf(K[[0, 1], [0, 1]]).all()
     with pytest.raises(ValueError, match=r"expected \(\.\.\., 9\)"):
         cameras_from_pose_encoding(np.zeros((2, 8)), (100, 200))
-    with pytest.raises(ValueError, match="zero or not finite"):
+    with pytest.raises(ValueError, match="quaternion"):
         cameras_from_pose_encoding(np.zeros(9), (100, 200))
 
 
@@ -431,7 +431,7 @@ def test_depth_comes_back_to_the_pixels_it_belongs_to() -> None:
     assert np.array_equal(np.flatnonzero(np.isfinite(whole).any(axis=1)), seen)
     assert (seen[0], seen[-1]) == (199, 500)
     assert np.isfinite(views.to_image(1, depth)).all()
-    with pytest.raises(ValueError, match="the map has shape"):
+    with pytest.raises(ValueError, match="shape"):
         views.sample(0, depth[:-1], points)
 
 
@@ -448,17 +448,17 @@ def test_all_kinds_of_sources_are_alike(tmp_path: Path) -> None:
 
 def test_wrong_images_are_refused(tmp_path: Path) -> None:
     (tmp_path / "torn.png").write_bytes(b"\x89PNG\r\n\x1a\n")
-    with pytest.raises(ImageError, match=r"not found: .*none\.png"):
+    with pytest.raises(ImageError, match=r"none\.png"):
         load_images([tmp_path / "none.png"])
-    with pytest.raises(ImageError, match=r"cannot be decoded: .*torn\.png"):
+    with pytest.raises(ImageError, match=r"torn\.png"):
         load_images([tmp_path / "torn.png"])
-    with pytest.raises(ImageError, match="1000 x 10 pixels is too elongated"):
+    with pytest.raises(ImageError, match="1000 x 10"):
         load_images([np.zeros((10, 1000, 3), np.uint8)])
-    with pytest.raises(ImageError, match="too elongated"):
+    with pytest.raises(ImageError, match="10 x 1000"):
         load_images([np.zeros((1000, 10, 3), np.uint8)], "pad")
     with pytest.raises(ValueError, match="no images"):
         load_images([])
-    with pytest.raises(ValueError, match="expected one of"):
+    with pytest.raises(ValueError, match="stretch"):
         load_images([np.zeros((10, 10, 3), np.uint8)], "stretch")
 
 

