@@ -21,6 +21,7 @@ from tests.fake_hub import FakeHub, serving, use_hub
 from toolkit.errors import ToolkitError
 from toolkit.features.features import create_extractor
 from toolkit.features.matching import create_matcher
+from toolkit.manifest.settings import FeaturesSettings
 from toolkit.models.weights import (
     LIGHTGLUE,
     MEGALOC,
@@ -144,7 +145,11 @@ def test_wrong_checksum(hub: FakeHub, tmp_path: Path) -> None:
     assert_recovers(hub)
 
 
-@pytest.mark.parametrize(("source", "create"), [(SUPERPOINT, create_extractor), (LIGHTGLUE, create_matcher)])
+def create_superpoint(name: str, checkpoint: Path | None = None, device: str = "auto") -> object:
+    return create_extractor(name, FeaturesSettings(checkpoint=checkpoint and str(checkpoint)), device)
+
+
+@pytest.mark.parametrize(("source", "create"), [(SUPERPOINT, create_superpoint), (LIGHTGLUE, create_matcher)])
 def test_local_features_and_matches(
     hub: FakeHub, monkeypatch: pytest.MonkeyPatch, source: WeightsSource, create: Callable[..., Any]
 ) -> None:
