@@ -131,3 +131,11 @@ def test_pose_error_of_many_and_of_missing_poses() -> None:
     np.testing.assert_allclose(distance_m[[0, 2]], [0, 2], atol=1e-12)
     # Symmetric, though only the distance is obviously so.
     np.testing.assert_allclose(geometry.pose_error(true, estimated)[0][[0, 2]], rotation_deg[[0, 2]], atol=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_unit_vectors_keep_their_type_and_zero_stays_zero(dtype: type) -> None:
+    unit = geometry.unit(np.array([[[3, 4], [0, 0]]], dtype))
+    assert unit.dtype == dtype
+    np.testing.assert_allclose(unit, [[[0.6, 0.8], [0, 0]]], atol=1e-7)
+    assert 0 < geometry.unit(np.array([1e-9, 0], dtype), shortest=1.0)[0] < 1e-8

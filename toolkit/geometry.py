@@ -3,7 +3,7 @@
 All functions are batched over leading dimensions.
 """
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +12,14 @@ if TYPE_CHECKING:
     import pycolmap
 
 Array = NDArray[np.float64]
+Real = TypeVar("Real", np.float32, np.float64)
+
+
+def unit(vectors: NDArray[Real], shortest: float = 1e-12) -> NDArray[Real]:
+    """Return vectors (..., D) at length 1, in their type; one shorter than `shortest` is divided by that instead."""
+    lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    units: NDArray[Real] = vectors / np.maximum(lengths, vectors.dtype.type(shortest))
+    return units
 
 
 def quaternion_to_rotation(qwxyz: ArrayLike) -> Array:
@@ -26,7 +34,7 @@ def quaternion_to_rotation(qwxyz: ArrayLike) -> Array:
     norm = np.linalg.norm(q, axis=-1, keepdims=True)
     if not np.all(np.isfinite(norm)) or np.any(norm < 1e-12):
         raise ValueError("A quaternion is zero or not finite; expected qw qx qy qz of length 1.")
-    w, x, y, z = np.moveaxis(q / norm, -1, 0)
+    w, x, y, z = np.moveaxis(unit(q), -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
@@ -59,7 +67,7 @@ def rotation_to_quaternion(rotation: ArrayLike) -> Array:
     )
     best = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
     q = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    q = unit(q)
     return np.where(q[..., :1] < 0, -q, q)
 
 

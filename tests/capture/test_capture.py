@@ -9,6 +9,7 @@ from toolkit.capture import (
     Capture,
     Session,
     Trajectory,
+    camera_text,
     parse_camera,
     read_depth,
     tables,
@@ -178,6 +179,7 @@ def test_files_as_programs_write_them(tmp_path: Path) -> None:
     ]
     assert session.image_path(1) == path / "raw_data" / "s" / "2.jpg"
     assert session.image_name(1) == "ios_query/raw_data/s/2.jpg"
+    assert [session.row_of_name[name] for name in session.image_names] == [0, 1, 2]
     assert session.sensors["params"].tolist()[1:3] == ["", "a, 1"]
     assert (session.device, session.split, session.subsessions) == ("ios", "query", ["s"])
     assert session.rows_of(1, "s/cam 1/ä?").tolist() == [0]
@@ -452,6 +454,13 @@ def test_real_captures_open(name: str) -> None:
         if session.split == "query":
             assert session.keyframe_lists == ["original", "pruned", "pruned_subsampled"]
             assert all(len(rows) for rows in session.rows_of_keyframes(session.keyframes()))
+
+
+@pytest.mark.parametrize(
+    "text", ["PINHOLE, 640, 480, 500.25, 500.0, 320.0, 240.1", "SIMPLE_RADIAL, 64, 48, 50.0, 32.0, 24.0, -1e-05"]
+)
+def test_a_camera_reads_back_as_it_was_written(text: str) -> None:
+    assert camera_text(parse_camera("camera", text)) == text
 
 
 def test_a_focal_length_of_zero_is_refused() -> None:

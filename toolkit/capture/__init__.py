@@ -1,6 +1,6 @@
 """The capture format of LaMAR and CroCoDL: sessions of images with calibration and poses, read, written and checked."""
 
-from toolkit.capture.cameras import CAMERA_TYPES, parse_camera
+from toolkit.capture.cameras import CAMERA_TYPES, camera_text, parse_camera
 from toolkit.capture.session import (
     COLUMNS,
     DEPTH_SCALE,
@@ -21,6 +21,7 @@ __all__ = [
     "Capture",
     "Session",
     "Trajectory",
+    "camera_text",
     "parse_camera",
     "read_depth",
     "write_depth",

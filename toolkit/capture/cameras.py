@@ -1,9 +1,10 @@
 """Cameras: intrinsics as sensors.txt has them, rays, and what a camera sees."""
 
-
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+
+from toolkit.geometry import unit
 
 Floats = NDArray[np.float64]
 
@@ -47,12 +48,18 @@ def parse_camera(sensor_type: str, params: str) -> pycolmap.Camera:
     return camera
 
 
+def camera_text(camera: pycolmap.Camera) -> str:
+    """Return what `parse_camera` reads: `MODEL, width, height, parameter, ...`, with all digits."""
+    params = (repr(float(value)) for value in camera.params)
+    return ", ".join([camera.model.name, str(camera.width), str(camera.height), *params])
+
+
 def rays_of(camera: pycolmap.Camera, pixels: NDArray[np.floating]) -> Floats:
     """Return unit rays (N, 3) in the camera's frame of pixels (N, 2)."""
     if not len(pixels):
         return np.zeros((0, 3))
     rays = np.asarray(camera.cam_ray_from_img(np.asarray(pixels, np.float64)))
-    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return unit(rays)
 
 
 def projection_jacobian(in_cams: Floats, focals_px: Floats) -> Floats:

@@ -269,6 +269,16 @@ class Session:
         return f"{self.path.name}/{RAW_DATA}/{self.images['path'].iloc[row]}"
 
     @cached_property
+    def image_names(self) -> list[str]:
+        """The names of all images, in the order of `images`."""
+        return [f"{self.path.name}/{RAW_DATA}/{path}" for path in self.images["path"]]
+
+    @cached_property
+    def row_of_name(self) -> dict[str, int]:
+        """Row of `images` by the image's name."""
+        return {name: row for row, name in enumerate(self.image_names)}
+
+    @cached_property
     def depths(self) -> pd.DataFrame | None:
         """Table [timestamp, sensor_id, path] of depths.txt, or None."""
         return self._records("depths.txt", "depth_path") if (self.path / "depths.txt").exists() else None

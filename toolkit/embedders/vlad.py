@@ -19,9 +19,12 @@ from toolkit.errors import ArtifactError, ToolkitError
 from toolkit.features.features import LocalFeatures
 from toolkit.features.matching import unit_descriptors
 from toolkit.files import file_fingerprint, write_atomic
+from toolkit.geometry import unit
 from toolkit.manifest import VladSettings
 
 Floats = NDArray[np.float32]
+
+_SHORTEST = 1e-9  # a shorter vector, of rounding errors, is not stretched to length 1
 
 
 class Vlad:
@@ -99,7 +102,7 @@ class Vlad:
             "local_projection": (directions[:, keep] / scale).astype(np.float32),
             "projection": np.zeros((0, 0), np.float32),
         }
-        local = _unit(((sample - arrays["local_mean"]) @ arrays["local_projection"]).astype(np.float32))
+        local = unit(((sample - arrays["local_mean"]) @ arrays["local_projection"]).astype(np.float32), _SHORTEST)
         words = max(1, min(settings.words, len(local) // 8))
         arrays["centroids"] = _kmeans(local, words, settings.iterations, rng)
         vlad = cls(settings, arrays)
@@ -136,14 +139,14 @@ class Vlad:
             descriptors = _select(image, self._settings)
             if not len(descriptors):
                 continue
-            local = _unit(((descriptors - self.local_mean) @ self.local_projection).astype(np.float32))
+            local = unit(((descriptors - self.local_mean) @ self.local_projection).astype(np.float32), _SHORTEST)
             nearest = _assign(local, self.centroids)
-            residuals = _unit(local - self.centroids[nearest])
+            residuals = unit(local - self.centroids[nearest], _SHORTEST)
             order = np.argsort(nearest, kind="stable")
             present, starts = np.unique(nearest[order], return_index=True)
-            vector[present] = _unit(np.add.reduceat(residuals[order], starts, axis=0).astype(np.float32))
+            vector[present] = unit(np.add.reduceat(residuals[order], starts, axis=0).astype(np.float32), _SHORTEST)
         flat = vectors.reshape(len(images), words * size)
-        return _unit(np.sign(flat) * np.sqrt(np.abs(flat)))
+        return unit(np.sign(flat) * np.sqrt(np.abs(flat)), _SHORTEST)
 
 
 def _select(image: LocalFeatures, settings: VladSettings) -> Floats:
@@ -155,9 +158,6 @@ def _select(image: LocalFeatures, settings: VladSettings) -> Floats:
     return unit_descriptors(image.descriptors[chosen])
 
 
-def _unit(rows: Floats) -> Floats:
-    unit: Floats = rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), np.float32(1e-9))
-    return unit
 
 
 def _assign(points: Floats, centroids: Floats) -> NDArray[np.intp]:

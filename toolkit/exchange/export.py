@@ -112,7 +112,7 @@ def colmap_model(local_map: LocalMap, session: Session, keypoints: Keypoints) ->
     Raises:
         ArtifactError: the session does not list an image of the map.
     """
-    row_of = {session.image_name(row): row for row in range(len(session.images))}
+    row_of = session.row_of_name
     unknown = [name for name in local_map.image_names if name not in row_of]
     if unknown:
         raise ArtifactError(f"{session.path}: image {unknown[0]} of the map is not in it. Run the map's stages again.")

@@ -16,7 +16,7 @@ from tqdm.auto import tqdm
 
 from toolkit import geometry
 from toolkit.capture import Session
-from toolkit.capture.cameras import in_view, projection_jacobian, rays_of, view_bounds
+from toolkit.capture.cameras import camera_text, in_view, parse_camera, projection_jacobian, rays_of, view_bounds
 from toolkit.capture.images import prefetch, read_image
 from toolkit.errors import ArtifactError, ImageError
 from toolkit.features.features import LocalFeatures, feature_kind
@@ -78,8 +78,8 @@ def select_pairs(
         rays = np.stack([*np.meshgrid(x, y), np.ones((len(y), len(x)))], -1).reshape(-1, 3)
         points = geometry.transform(world_from_cams[i], (rays * np.asarray(depths_m)[:, None, None]).reshape(-1, 3))
         seen = in_view(geometry.transform(cams_from_world[near], points[None]), bounds[near])
-        to_i = _unit(centers[i] - points)
-        to_j = _unit(centers[near][:, None] - points)
+        to_i = geometry.unit(centers[i] - points)
+        to_j = geometry.unit(centers[near][:, None] - points)
         angle_deg = np.degrees(np.arccos(np.clip((to_j * to_i).sum(-1), -1, 1)))
         # Below 4 degrees depth is poor; beyond 30 descriptors stop matching.
         weight = np.clip(angle_deg / 4, 0.1, 1) * np.clip((60 - angle_deg) / 30, 0, 1)
@@ -87,10 +87,6 @@ def select_pairs(
         order = np.argsort(-scores, kind="stable")[:per_image]
         pairs.update((min(i, int(j)), max(i, int(j))) for j in near[order[scores[order] > 0.02]])
     return np.array(sorted(pairs), np.int64).reshape(-1, 2)
-
-
-def _unit(vectors: Floats) -> Floats:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 
 def match_pairs(
@@ -288,22 +284,11 @@ class LocalMap:
             with np.load(path) as arrays:
                 data = {name: arrays[name] for name in arrays.files}
             names, cameras = data.pop("image_names").tolist(), data.pop("cameras").tolist()
-            return cls(image_names=names, cameras=[_camera(text) for text in cameras], **data)
+            return cls(image_names=names, cameras=[parse_camera("camera", text) for text in cameras], **data)
         except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile) as error:
             raise ArtifactError(
                 f"The triangulated map {path} cannot be read ({error}). Build it with the localize stage."
             ) from None
-
-
-def camera_text(camera: pycolmap.Camera) -> str:
-    """Return a camera in one line: model, width, height, parameters, all their digits."""
-    params = ", ".join(repr(float(p)) for p in camera.params)
-    return f"{camera.model.name}, {camera.width}, {camera.height}, {params}"
-
-
-def _camera(text: str) -> pycolmap.Camera:
-    model, width, height, *params = [word.strip() for word in text.split(",")]
-    return pycolmap.Camera(model=model, width=int(width), height=int(height), params=[float(p) for p in params])
 
 
 def triangulate(
@@ -486,7 +471,7 @@ def build_map(
     if skip_existing and is_current(path, map_record):
         with suppress(ArtifactError):  # torn behind our back: build it anew
             return LocalMap.load(path)
-    names = [session.image_name(row) for row in range(len(session.images))]
+    names = session.image_names
     poses = session.world_from_cam()
     rows = np.array(
         [row for row, name in enumerate(names) if name in features and np.isfinite(poses[row]).all()],

@@ -92,14 +92,14 @@ class SimulatedPredictor:
 
     @cached_property
     def _rows(self) -> dict[str, int]:
-        return {s.image_name(row): row for s in self._sessions.values() for row in range(len(s.images))}
+        return {name: row for s in self._sessions.values() for name, row in s.row_of_name.items()}
 
     @cached_property
     def _truth(self) -> dict[str, Floats]:
         return {
-            session.image_name(row): pose
+            name: pose
             for session in self._sessions.values()
-            for row, pose in enumerate(session.world_from_cam(ground_truth=True))
+            for name, pose in zip(session.image_names, session.world_from_cam(ground_truth=True), strict=True)
         }
 
     def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
