@@ -122,6 +122,22 @@ def test_poses_compose_as_world_from_device_times_rig_from_sensor(tmp_path: Path
     assert session.device_ids.tolist() == ["rig", "rig"]
 
 
+@pytest.mark.parametrize("name", ["spot_query", "query_phone"])
+def test_odometry_of_queries_is_no_ground_truth(tmp_path: Path, name: str) -> None:
+    odometry, aligned = "1, cam, 1, 0, 0, 0, 5, 6, 7\n", "1, cam, 1, 0, 0, 0, 10, 0, 0\n"
+    path = write(tmp_path / name, {"trajectories.txt": odometry})
+    session = Session.open(path)
+    assert session.ground_truth is None
+    assert np.isnan(session.world_from_cam(ground_truth=True)).all()
+    write(path, {"proc/alignment_trajectories.txt": aligned})
+    assert Session.open(path).world_from_cam(ground_truth=True)[0, :3, 3].tolist() == [10, 0, 0]
+
+
+def test_poses_of_a_map_are_its_ground_truth(tmp_path: Path) -> None:
+    session = Session.open(write(tmp_path / "spot_map", {"trajectories.txt": "1, cam, 1, 0, 0, 0, 5, 6, 7\n"}))
+    assert session.ground_truth is session.trajectory
+
+
 def test_a_frame_takes_the_rig_of_its_time(session: Session) -> None:
     assert session.device_ids.tolist() == [f"s/rig_{t}" for t in (10, 10, 20, 20, 30, 30)] + ["s/free"]
     table = session.rig_from_sensor_table

@@ -44,6 +44,19 @@ def append(capture: Path, file: str, text: str) -> None:
         stream.write(text)
 
 
+def test_odometry_of_queries_is_told_from_ground_truth(capture: Path) -> None:
+    query = capture / "sessions" / "hl_query"
+    (query / "trajectories.txt").write_text(f"10, s/rig_10, {QT}\n")
+
+    table = check_capture(capture).tables["hl_query"].set_index("what")
+    assert table["count"][["poses", "ground truth"]].tolist() == ["1", "2"]
+    assert "odometry" in table["details"]["poses"]
+    (query / "proc" / "alignment_trajectories.txt").unlink()
+    table = check_capture(capture).tables["hl_query"].set_index("what")
+    assert table["count"][["poses", "ground truth"]].tolist() == ["1", "-"]
+    assert "alignment_trajectories.txt" in table["details"]["ground truth"]
+
+
 def test_a_good_capture_has_no_problems(capture: Path) -> None:
     report = check_capture(capture)
     assert report.ok

@@ -193,6 +193,9 @@ def test_a_table_of_a_session_makes_the_same_session(small_capture: Path, tmp_pa
         assert {tuple(back.camera(s).params) for s in back.sensors["sensor_id"]} == {
             tuple(session.camera(s).params) for s in session.sensors["sensor_id"]
         }
-    # Queries have no poses but their ground truth.
+    # Queries have no poses but their ground truth: odometry is no place in the map.
+    odometry = shutil.copytree(session.path, tmp_path / "PLACE" / "hl_query", symlinks=True) / "trajectories.txt"
+    shutil.copy(odometry.parent / "proc" / "alignment_trajectories.txt", odometry)
+    session = Session.open(odometry.parent)
     header = export_table(session, tmp_path / "cameras.csv").read_text().splitlines()[0]
     assert header == "image,model,width,height,params"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from toolkit.capture.cameras import CAMERA_TYPES, parse_camera
 from toolkit.capture.devices import OTHER_SESSIONS, SPLITS, kinds
-from toolkit.capture.session import RAW_DATA, Capture, Session, Trajectory
+from toolkit.capture.session import ALIGNED, RAW_DATA, Capture, Session, Trajectory
 from toolkit.capture.tables import POSE_NAMES, KeyIndex, TextTable
 
 ERROR, WARNING = "error", "warning"
@@ -135,7 +135,7 @@ class _SessionCheck:
             self._check_rigs()
         for file, trajectory in (
             ("trajectories.txt", session.trajectory),
-            ("proc/alignment_trajectories.txt", session.ground_truth),
+            (ALIGNED, session.ground_truth),
         ):
             if trajectory is not None and file in session.tables:
                 self._check_trajectory(file, trajectory)
@@ -321,12 +321,15 @@ class _SessionCheck:
             add("rigs", len(per_rig), f"{sizes} sensors each" if len(per_rig) else "")
         for what, trajectory in (("poses", session.trajectory), ("ground truth", session.ground_truth)):
             if trajectory is None:
-                add(what, None)
+                no_truth = what == "ground truth" and session.split == "query"
+                add(what, None, f"no {ALIGNED}: these queries cannot be evaluated" if no_truth else "")
                 continue
             found = trajectory.index.find(times, session.device_ids)
             details = f"{np.sum(found >= 0):,} of {len(times):,} images have one"
             if what == "ground truth" and trajectory is session.trajectory:
                 details += ", from trajectories.txt"
+            elif what == "poses" and session.split != "map":
+                details += ", the device's own odometry: never used as ground truth"
             add(what, len(trajectory), details)
         depths = session.depths
         missing = self.missing.get("depths.txt", 0)

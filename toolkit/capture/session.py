@@ -55,6 +55,7 @@ Strings = NDArray[np.object_]
 Rows = ArrayLike | slice | None
 
 RAW_DATA = "raw_data"
+ALIGNED = "proc/alignment_trajectories.txt"
 DEPTH_SCALE = 1000.0  # depth maps are 16-bit PNGs in millimeters
 
 COLUMNS: dict[str, Columns] = {
@@ -63,7 +64,7 @@ COLUMNS: dict[str, Columns] = {
     "images.txt": (("timestamp", INTEGER), ("sensor_id", ID), ("image_path", ID)),
     "depths.txt": (("timestamp", INTEGER), ("sensor_id", ID), ("depth_path", ID)),
     "trajectories.txt": (("timestamp", INTEGER), ("device_id", ID), *POSE),
-    "proc/alignment_trajectories.txt": (("timestamp", INTEGER), ("device_id", ID), *POSE),
+    ALIGNED: (("timestamp", INTEGER), ("device_id", ID), *POSE),
     "proc/subsessions.txt": (("subsession", ID),),
     "keyframes": (("timestamp", INTEGER), ("device_id", ID)),
 }
@@ -200,8 +201,10 @@ class Session:
         images: table [timestamp, sensor_id, path], in the order of images.txt; path is relative to raw_data/.
         sensors: table [sensor_id, name, sensor_type, params], params as written.
         rigs: table [rig_id, sensor_id], or None.
-        trajectory: trajectories.txt, or None.
-        ground_truth: proc/alignment_trajectories.txt, else trajectories.txt, else None.
+        trajectory: trajectories.txt, or None. Of a query session it is the device's own odometry, in a frame of its
+            own: good for motion between two times, never a place in the map.
+        ground_truth: poses in the world of the map: proc/alignment_trajectories.txt; of a map session without that
+            file trajectories.txt; else None.
     """
 
     def __init__(self, path: str | Path, strict: bool = True) -> None:
@@ -224,8 +227,8 @@ class Session:
             self.rigs = _frame(table, ["rig_id", "sensor_id"])
             self._rig_qt = table.numbers(POSE_NAMES)
         self.trajectory = self._trajectory("trajectories.txt")
-        aligned = self._trajectory("proc/alignment_trajectories.txt")
-        self.ground_truth = self.trajectory if aligned is None else aligned
+        aligned = self._trajectory(ALIGNED)
+        self.ground_truth = self.trajectory if aligned is None and self.split == "map" else aligned
         self._cameras: dict[str, pycolmap.Camera] = {}
 
     @classmethod
@@ -769,7 +772,7 @@ def write_session(
     if trajectory is not None:
         trajectory.write(path / "trajectories.txt")
     if ground_truth is not None:
-        ground_truth.write(proc / "alignment_trajectories.txt")
+        ground_truth.write(path / ALIGNED)
     if subsessions is not None:
         write_table(proc / "subsessions.txt", None, (_row([name]) for name in subsessions))
     for name, table in (keyframes or {}).items():

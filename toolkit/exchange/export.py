@@ -189,10 +189,13 @@ def export_table(session: Session, out: str | Path, ground_truth: bool = False) 
     Args:
         session: the session.
         out: the CSV file.
-        ground_truth: write the poses of `session.ground_truth`, instead of `session.trajectory`.
+        ground_truth: write the poses of `session.ground_truth`; else those of a map session's `session.trajectory`,
+            and none for queries.
     """
     rows = session.camera_rows
     poses = session.world_from_cam(rows, ground_truth)
+    if session.split == "query" and not ground_truth:
+        poses[:] = np.nan  # odometry says nothing of the place in the map
     posed = np.isfinite(poses).all((1, 2))
     if posed.any():
         rows, poses = rows[posed], poses[posed]

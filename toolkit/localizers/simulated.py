@@ -120,7 +120,7 @@ class SimulatedPredictor:
             if view.name not in self._truth or not np.isfinite(self._truth[view.name]).all():
                 raise CaptureError(
                     f"The simulated predictor has no true pose of {view.name}: it works only where "
-                    "proc/alignment_trajectories.txt or trajectories.txt has one. Use another predictor or method."
+                    "queries have ground truth in proc/alignment_trajectories.txt. Use another predictor or method."
                 )
         true = np.stack([self._truth[view.name] for view in group])
         noisy = np.stack([self._noisy(pose, names, view, true) for pose, view in zip(true, group, strict=True)])
