@@ -36,6 +36,11 @@ def write(path: Path, files: dict[str, str]) -> Path:
     return path
 
 
+def rows_of(session: Session, timestamp: int, device_id: str) -> list[int]:
+    """Return the rows of the images that a device took at a time."""
+    return session.rows_of_keyframes(pd.DataFrame({"timestamp": [timestamp], "device_id": [device_id]}))[0].tolist()
+
+
 @pytest.fixture
 def session(tmp_path: Path) -> Session:
     """Two cameras, a rig made anew for each of three frames, one more camera without rig, a covariance."""
@@ -81,7 +86,7 @@ def test_a_written_session_reads_back_equal_and_is_written_again_byte_for_byte(
         session.images,
         depths=session.depths,
         subsessions=session.subsessions,
-        keyframes={name: session.keyframes(name) for name in session.keyframe_lists},
+        keyframes={name: session.keyframes(name) for name in session.keyframe_files},
         ground_truth=session.ground_truth,
     )
     files = sorted(path.relative_to(session.path) for path in session.path.rglob("*.txt"))
@@ -145,8 +150,8 @@ def test_a_frame_takes_the_rig_of_its_time(session: Session) -> None:
     expected = session.trajectory.world_from_device[[0, 0, 1, 1, 2, 2]] @ table
     np.testing.assert_allclose(session.world_from_cam(np.arange(6)), expected, atol=1e-12)
     np.testing.assert_array_equal(session.world_from_cam([6], ground_truth=True), session.world_from_cam([6]))
-    assert session.rows_of(20, "s/rig_20").tolist() == [2, 3]
-    assert session.rows_of(20, "s/rig_10").tolist() == []
+    assert rows_of(session, 20, "s/rig_20") == [2, 3]
+    assert rows_of(session, 20, "s/rig_10") == []
     assert [rows.tolist() for rows in session.rows_of_keyframes(session.keyframes("all"))] == [
         [0, 1],
         [2, 3],
@@ -198,10 +203,10 @@ def test_files_as_programs_write_them(tmp_path: Path) -> None:
     assert [session.row_of_name[name] for name in session.image_names] == [0, 1, 2]
     assert session.sensors["params"].tolist()[1:3] == ["", "a, 1"]
     assert (session.device, session.split, session.subsessions) == ("ios", "query", ["s"])
-    assert session.rows_of(1, "s/cam 1/ä?").tolist() == [0]
-    assert session.rows_of(1, "tof").tolist() == [], "a depth map is no photograph"
+    assert rows_of(session, 1, "s/cam 1/ä?") == [0]
+    assert rows_of(session, 1, "tof") == [], "a depth map is no photograph"
     assert session.camera("tof").width == 64
-    assert not session.is_camera("tof")
+    assert session.camera_rows.tolist() == [0, 1]
     assert session.trajectory.covariances is None
     assert session.trajectory.qt[0, 4] == 10
     with pytest.raises(
@@ -468,7 +473,7 @@ def test_real_captures_open(name: str) -> None:
         centers = session.world_from_cam(ground_truth=True)[:, :3, 3]
         assert max(np.ptp(centers[rows], axis=0).max() for rows in frames) < 1e-9
         if session.split == "query":
-            assert session.keyframe_lists == ["original", "pruned", "pruned_subsampled"]
+            assert list(session.keyframe_files) == ["original", "pruned", "pruned_subsampled"]
             assert all(len(rows) for rows in session.rows_of_keyframes(session.keyframes()))
 
 

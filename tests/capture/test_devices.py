@@ -90,7 +90,7 @@ def test_the_query_list_of_lamar_is_a_keyframe_list(tmp_path: Path) -> None:
     path = write(tmp_path / "CAB", "query_phone")
     (path / "queries.txt").write_text("1, s/phone\n")
     session = Capture.open(tmp_path / "CAB")["ios_query"]
-    assert session.keyframe_lists == ["pruned_subsampled", "queries"]
+    assert list(session.keyframe_files) == ["pruned_subsampled", "queries"]
     assert session.keyframes("queries").to_numpy().tolist() == [[1, "s/phone"]]
     (path / "queries.txt").write_text("1, s/phone\n2, s/tablet\n")
     lines = [str(problem) for problem in check_capture(tmp_path / "CAB").problems]

@@ -1,17 +1,11 @@
 """The capture format of LaMAR and CroCoDL: sessions of images with calibration and poses, read, written and checked."""
 
 from toolkit.capture.cameras import CAMERA_TYPES, camera_text, parse_camera
-from toolkit.capture.session import (
-    COLUMNS,
-    DEPTH_SCALE,
-    RAW_DATA,
-    Capture,
-    Session,
-    Trajectory,
-    read_depth,
-    write_depth,
-    write_session,
-)
+from toolkit.capture.folder import Capture
+from toolkit.capture.session import RAW_DATA, Session
+from toolkit.capture.tables import COLUMNS
+from toolkit.capture.trajectory import Trajectory
+from toolkit.capture.writing import DEPTH_SCALE, read_depth, write_depth, write_session
 
 __all__ = [
     "CAMERA_TYPES",

@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 from toolkit.capture.cameras import CAMERA_TYPES, parse_camera
 from toolkit.capture.devices import OTHER_SESSIONS, SPLITS, kinds
-from toolkit.capture.session import ALIGNED, RAW_DATA, Capture, Session, Trajectory
-from toolkit.capture.tables import POSE_NAMES, KeyIndex, TextTable
+from toolkit.capture.folder import Capture
+from toolkit.capture.session import RAW_DATA, Session
+from toolkit.capture.tables import ALIGNED, POSE_NAMES, KeyIndex, TextTable
+from toolkit.capture.trajectory import Trajectory
 
 ERROR, WARNING = "error", "warning"
 UNUSED = {"wifi": "wifi.txt", "bluetooth": "bt.txt", "point clouds": "pointclouds.txt"}
@@ -141,7 +143,7 @@ class _SessionCheck:
                 self._check_trajectory(file, trajectory)
         if session.split == "map":
             self._check_images_have_poses()
-        for name in session.keyframe_lists:
+        for name in session.keyframe_files:
             self._check_keyframes(name)
         self._check_subsessions(subsessions)
         for file, table in session.tables.items():
@@ -345,7 +347,7 @@ class _SessionCheck:
             len(session.subsessions),
             ", ".join(shown) + (", ..." if len(session.subsessions) > 6 else ""),
         )
-        for name in session.keyframe_lists:
+        for name in session.keyframe_files:
             table = session.tables[session.keyframe_files[name]]
             devices = len(pc.unique(table.columns["device_id"]))
             add(f"keyframes {name}", len(table), f"{_count(devices, 'device')}")

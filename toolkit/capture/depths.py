@@ -24,7 +24,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from toolkit import geometry
 from toolkit.capture.cameras import in_view, rays_of, view_bounds
-from toolkit.capture.session import RAW_DATA, Session, read_depth
+from toolkit.capture.session import RAW_DATA, Session
+from toolkit.capture.writing import read_depth
 from toolkit.errors import CaptureError
 
 log = logging.getLogger(__name__)

@@ -1,9 +1,9 @@
-"""Text tables of the capture format, and rows found by key, at the speed of Arrow.
+"""Text tables of the capture format: their columns, a reader at the speed of Arrow, and rows found by key.
 
-Lines of comma-separated values with `#` comments and blank lines anywhere, spaces around values, Windows
-line ends, a byte-order mark, and further columns that are passed over or kept as one text. A file is cut into
-blocks of whole lines; Arrow splits and converts them, two at a time, so that nothing loops over rows in
-Python and line numbers are at hand for messages.
+The reader takes lines of comma-separated values with `#` comments and blank lines anywhere, spaces around values,
+Windows line ends and a byte-order mark. Columns beyond the expected ones are ignored, or kept as one text. It cuts a
+file into blocks of whole lines; Arrow splits and converts two blocks at a time. So no Python code loops over rows, and
+an error message can name the line.
 """
 
 import os
@@ -29,8 +29,21 @@ Columns = Sequence[tuple[str, str]]
 
 # Column types: an integer, a finite number, a text that must not be empty, any text.
 INTEGER, NUMBER, ID, TEXT = "integer", "finite number", "id", "text"
-POSE = tuple((name, NUMBER) for name in ("qw", "qx", "qy", "qz", "tx", "ty", "tz"))
-POSE_NAMES = tuple(name for name, _ in POSE)
+POSE_NAMES = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
+POSE = tuple((name, NUMBER) for name in POSE_NAMES)
+ALIGNED = "proc/alignment_trajectories.txt"
+_TRAJECTORY: Columns = (("timestamp", INTEGER), ("device_id", ID), *POSE)
+COLUMNS: dict[str, Columns] = {
+    "sensors.txt": (("sensor_id", ID), ("name", TEXT), ("sensor_type", ID)),
+    "rigs.txt": (("rig_id", ID), ("sensor_id", ID), *POSE),
+    "images.txt": (("timestamp", INTEGER), ("sensor_id", ID), ("image_path", ID)),
+    "depths.txt": (("timestamp", INTEGER), ("sensor_id", ID), ("depth_path", ID)),
+    "trajectories.txt": _TRAJECTORY,
+    ALIGNED: _TRAJECTORY,
+    "proc/subsessions.txt": (("subsession", ID),),
+    "keyframes": (("timestamp", INTEGER), ("device_id", ID)),
+}
+"""The columns of each file of a session: names and types."""
 
 
 @dataclass
@@ -39,13 +52,13 @@ class TextTable:
 
     path: Path
     columns: dict[str, pa.Array]
-    """Values by column name; `extra`, where asked for, is what follows the last column, as one text."""
+    """Values by column name; `extra`, if requested, holds the text after the last column."""
     lines: Ints
     """Line number of each row, from 1."""
     problems: list[tuple[int, str]]
-    """Line number (0: the file itself) and what is wrong, for lines that are left out."""
+    """Line number (0: the file itself) and fault of each malformed line; such lines are left out."""
     has_extra: bool
-    """Whether any line has more columns than asked for."""
+    """Whether any line has more columns than expected."""
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -54,7 +67,12 @@ class TextTable:
         """Return number columns side by side, (N, len(names))."""
         return np.stack([self.columns[name].to_numpy() for name in names], axis=1)
 
+    def frame(self, *names: str) -> pd.DataFrame:
+        """Return columns as a table: numbers as NumPy arrays, texts as pandas' str on Arrow memory."""
+        return pd.DataFrame({name: as_pandas(self.columns[name]) for name in names}, copy=False)
+
     def where(self, row: int) -> str:
+        """Return file and line of a row, for messages."""
         return f"{self.path}, line {self.lines[row]}"
 
 
@@ -64,11 +82,11 @@ def read_table(path: Path, columns: Columns, strict: bool = True, extra: bool = 
     Args:
         columns: name and type of each column, as in COLUMNS.
         strict: raise at a malformed line; else leave it out and list it in `.problems`.
-        extra: keep what follows the last column, as column `extra`.
+        extra: keep the text after the last column, as column `extra`.
 
     Raises:
-        CaptureError: the file is missing, or (strict) a line is malformed: says which, what is there and what
-            belongs there.
+        CaptureError: the file is missing, or (strict) a line is malformed. The message gives the line, its text and
+            what was expected there.
     """
     try:
         spans = _line_blocks(path)
@@ -91,9 +109,7 @@ def read_table(path: Path, columns: Columns, strict: bool = True, extra: bool = 
         blocks = list(pool.map(parse, spans))
     first = np.cumsum([0, *(block.count for block in blocks)])[:-1]
     problems = [
-        (int(start + line), what)
-        for start, block in zip(first, blocks, strict=True)
-        for line, what in block.problems
+        (int(start + line), what) for start, block in zip(first, blocks, strict=True) for line, what in block.problems
     ]
     if strict and problems:
         line, what = problems[0]
@@ -104,20 +120,12 @@ def read_table(path: Path, columns: Columns, strict: bool = True, extra: bool = 
         )
     kinds = dict(columns) | ({"extra": TEXT} if extra else {})
     values = {
-        # Each block lets go of a column as it is joined, so that the table is never in memory twice.
-        name: pa.concat_arrays(
-            [pa.array([], _ARROW_TYPES[kind]), *(block.columns.pop(name) for block in blocks)]
-        )
+        # Each block gives up a column as it is joined, so that the table is never in memory twice.
+        name: pa.concat_arrays([pa.array([], _ARROW_TYPES[kind]), *(block.columns.pop(name) for block in blocks)])
         for name, kind in kinds.items()
     }
-    lines = [start + block.lines for start, block in zip(first, blocks, strict=True)]
-    return TextTable(
-        path,
-        values,
-        np.concatenate([np.zeros(0, np.int64), *lines]),
-        problems,
-        any(block.has_extra for block in blocks),
-    )
+    lines = [np.zeros(0, np.int64), *(start + block.lines for start, block in zip(first, blocks, strict=True))]
+    return TextTable(path, values, np.concatenate(lines), problems, any(block.has_extra for block in blocks))
 
 
 @dataclass
@@ -169,7 +177,7 @@ def _parse_block(data: bytes, first: bool, columns: Columns, keep_extra: bool) -
     offsets[1:] = ends + 1
     text = pa.LargeStringArray.from_buffers(len(ends), pa.py_buffer(offsets), pa.py_buffer(data))
     text = pc.ascii_trim_whitespace(text)
-    # A line of a file that is not UTF-8 has its problem already; it was made a comment.
+    # A line that is not UTF-8 is reported already; `_decode` made it a comment.
     kept = pc.invert(pc.or_(pc.starts_with(text, "#"), pc.equal(text, "")))
     text, lines = text.filter(kept), np.flatnonzero(kept.to_numpy(zero_copy_only=False)) + 1
 
@@ -177,10 +185,9 @@ def _parse_block(data: bytes, first: bool, columns: Columns, keep_extra: bool) -
     values = pc.split_pattern(text, ",", max_splits=width)
     counts = pc.list_value_length(values).to_numpy()
     if np.any(counts < width):
-        wanted = f"expected {width}: {_layout(columns)}"
         for row in np.flatnonzero(counts < width):
-            found = f"found {counts[row]} value{'s' if counts[row] > 1 else ''} in {_shorten(text[row])}"
-            problems.append((int(lines[row]), f"{found}, {wanted}"))
+            values_there = f"{counts[row]} value{'s' if counts[row] > 1 else ''} in {_shorten(text[row])}"
+            problems.append((int(lines[row]), f"found {values_there}, expected {width}: {_layout(columns)}"))
         good = counts >= width
         values, lines, counts = values.filter(pa.array(good)), lines[good], counts[good]
 
@@ -190,8 +197,7 @@ def _parse_block(data: bytes, first: bool, columns: Columns, keep_extra: bool) -
         column = pc.ascii_trim_whitespace(pc.list_element(values, index))
         arrays[name], wrong = convert(column, kind)
         for row in np.flatnonzero(wrong & ~bad):
-            found = repr(column[row].as_py())
-            problems.append((int(lines[row]), f"found {name} = {found}, expected {_EXPECTED[kind]}"))
+            problems.append((int(lines[row]), f"found {name} = {column[row].as_py()!r}, expected {_EXPECTED[kind]}"))
         bad |= wrong
     has_extra = bool(np.any(counts > width))
     if keep_extra:
@@ -202,9 +208,7 @@ def _parse_block(data: bytes, first: bool, columns: Columns, keep_extra: bool) -
     if columns[-len(POSE) :] == POSE:
         q = np.stack([arrays[name].to_numpy() for name, _ in POSE[:4]], axis=1)
         zero = (np.einsum("ij,ij->i", q, q) < 1e-12) & ~bad
-        problems += [
-            (int(lines[row]), "found a zero quaternion, expected length 1") for row in np.flatnonzero(zero)
-        ]
+        problems += [(int(lines[row]), "found a zero quaternion, expected length 1") for row in np.flatnonzero(zero)]
         bad |= zero
     if bad.any():
         good_rows = pa.array(~bad)
@@ -212,11 +216,7 @@ def _parse_block(data: bytes, first: bool, columns: Columns, keep_extra: bool) -
     return _Block(arrays, lines, len(ends), sorted(problems), has_extra)
 
 
-_EXPECTED = {
-    INTEGER: "an integer (microseconds)",
-    NUMBER: "a finite number",
-    ID: "a text that is not empty",
-}
+_EXPECTED = {INTEGER: "an integer (microseconds)", NUMBER: "a finite number", ID: "a text that is not empty"}
 
 
 def convert(column: pa.Array, kind: str) -> tuple[pa.Array, NDArray[np.bool_]]:
@@ -255,6 +255,18 @@ def _shorten(text: object) -> str:
     return repr(shown if len(shown) <= 60 else shown[:57] + "...")
 
 
+def as_pandas(column: pa.Array) -> Any:
+    """Return a column for a pandas table."""
+    if pa.types.is_large_string(column.type):
+        return pd.array(column, dtype=pd.StringDtype("pyarrow", na_value=np.nan))
+    return column.to_numpy()
+
+
+def times_of(table: pd.DataFrame) -> Ints:
+    """Return the timestamps of a table, (N,) int64 microseconds."""
+    return table["timestamp"].to_numpy(np.int64)
+
+
 def as_strings(ids: Any) -> pa.Array:
     """Return ids (a sequence, array or Series of str) as one Arrow array."""
     if isinstance(ids, (pd.Series, pd.api.extensions.ExtensionArray)):
@@ -266,10 +278,10 @@ def as_strings(ids: Any) -> pa.Array:
     return ids if ids.type == pa.large_string() else ids.cast(pa.large_string())
 
 
-def codes_of(ids: pa.Array, known: pa.Array) -> Ints:
-    """Return the place of each id in `known`, -1 where it is not there."""
-    found = pc.fill_null(pc.index_in(ids, value_set=known), -1)
-    return found.to_numpy(zero_copy_only=False).astype(np.int64)
+def codes_of(ids: pa.Array, vocabulary: pa.Array) -> Ints:
+    """Return the place of each id in a vocabulary, -1 where it is not there."""
+    codes = pc.fill_null(pc.index_in(ids, value_set=vocabulary), -1)
+    return codes.to_numpy(zero_copy_only=False).astype(np.int64)
 
 
 class KeyIndex:
@@ -312,10 +324,10 @@ class KeyIndex:
 
 
 def read_query_table(path: Path, columns: Sequence[str]) -> pd.DataFrame:
-    """Read the CSV file of a pair, a row a query: timestamp int64, device_id and `columns` text, others as they are.
+    """Read the CSV file of a pair, one row for each query: timestamp int64; device_id and `columns` as text.
 
     Raises:
-        ArtifactError: the file cannot be read, is no such table, or has not got the columns.
+        ArtifactError: the file cannot be read, is not such a table, or lacks a column.
     """
     types: dict[Any, Any] = {"timestamp": np.int64, "device_id": str, **dict.fromkeys(columns, str)}
     try:

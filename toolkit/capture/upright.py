@@ -21,7 +21,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from toolkit.capture.session import Capture, Rows, Session
+from toolkit.capture.folder import Capture
+from toolkit.capture.session import Rows, Session
 from toolkit.errors import CaptureError, ManifestError, ToolkitError
 from toolkit.geometry import Array
 

@@ -1,0 +1,106 @@
+"""The folder of a capture: its sessions by name."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from toolkit.capture.devices import SPLITS, in_order, session_id, session_of
+from toolkit.capture.session import Session
+from toolkit.errors import CaptureError
+
+
+class Capture:
+    """A capture folder: its sessions, each read when first asked for."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        if not self.path.is_dir():
+            raise CaptureError(f"No such capture folder: {self.path}. Expected a folder that holds `sessions/`.")
+        self._root = self.path / "sessions"
+        if not self._root.is_dir():
+            raise CaptureError(
+                f"{self.path} is not a capture: it has no folder `sessions`. Expected "
+                f"{self.path.name}/sessions/<device>_<map|query>/images.txt."
+            )
+        self._folders: dict[str, Path] = {}
+        for folder in sorted(self._root.iterdir()):
+            name = session_id(folder.name)
+            is_session = any((folder / file).exists() for file in ("sensors.txt", "images.txt"))
+            if is_session and (name not in self._folders or folder.name == name):
+                self._folders[name] = folder
+        self.session_ids = sorted(self._folders)
+        if not self.session_ids:
+            raise CaptureError(
+                f"{self._root} holds no session: no folder in it has a sensors.txt or images.txt. "
+                "Expected e.g. ios_map, hl_query."
+            )
+        self._sessions: dict[str, Session] = {}
+
+    @classmethod
+    def open(cls, path: str | Path) -> "Capture":
+        """Open a capture folder.
+
+        Raises:
+            CaptureError: no such folder, no `sessions/` in it, or nothing in that.
+        """
+        return cls(path)
+
+    @classmethod
+    def from_sessions_root(cls, sessions_root: str | Path) -> "Capture":
+        """Open the capture whose `sessions` folder this is."""
+        root = Path(sessions_root).absolute()
+        if root.name != "sessions":
+            raise CaptureError(f"{root} is not the `sessions` folder of a capture; expected <capture>/sessions.")
+        return cls(root.parent)
+
+    @property
+    def name(self) -> str:
+        """Name of the folder; the scene's name in all outputs."""
+        return self.path.absolute().name
+
+    @property
+    def devices(self) -> list[str]:
+        """The device keys that have a session."""
+        sessions = (session_of(folder.name) for folder in self._folders.values())
+        return in_order(device for device, split in sessions if split in SPLITS)
+
+    def devices_with(self, split: str, device: str = "all") -> list[str]:
+        """Return the devices that have a session of a split: all of them, or a given one.
+
+        Args:
+            split: `map` or `query`.
+            device: a device key, or `all` (also `auto`).
+
+        Raises:
+            CaptureError: no device, or not this one, has such a session.
+        """
+        present = [key for key in self.devices if f"{key}_{split}" in self]
+        if device in ("all", "auto") and present:
+            return present
+        if device not in present:
+            raise CaptureError(
+                f"No {split} session of device {device!r} in {self.path}. "
+                f"Devices with one: {', '.join(present) or 'none'} (or `all`)."
+            )
+        return [device]
+
+    def folder(self, session_id: str) -> Path:
+        """Return the folder of a session."""
+        return self._folders[session_id]
+
+    def __getitem__(self, session_id: str) -> Session:
+        if session_id not in self.session_ids:
+            raise CaptureError(
+                f"Capture {self.path} has no session {session_id!r}; known: {', '.join(self.session_ids)}."
+            )
+        if session_id not in self._sessions:
+            self._sessions[session_id] = Session.open(self._folders[session_id])
+        return self._sessions[session_id]
+
+    def __contains__(self, session_id: object) -> bool:
+        return session_id in self.session_ids
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.session_ids)
+
+    def __len__(self) -> int:
+        return len(self.session_ids)
