@@ -15,7 +15,8 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
 from toolkit.capture.images import default_workers, prefetch, read_image
-from toolkit.capture.upright import Turns, turn_image, upright_turns
+from toolkit.capture.turning import turn_image
+from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import Embedder, create_embedder, resolve_name
 from toolkit.errors import ImageError, ManifestError, ToolkitError
 from toolkit.features.features import LocalFeatures, SiftExtractor

@@ -19,7 +19,7 @@ from tqdm.auto import tqdm
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import default_workers, prefetch, read_image
-from toolkit.capture.upright import turn_image
+from toolkit.capture.turning import turn_image
 from toolkit.errors import ImageError, ToolkitError
 from toolkit.features.features import LocalFeatures, SiftExtractor
 from toolkit.features.groups import GroupWriter

@@ -14,7 +14,7 @@ from PIL import Image
 
 from tests.models.test_vggt import tiny
 from toolkit.capture.images import read_image
-from toolkit.capture.upright import turn_camera, turn_image, turn_points, turned_from_cam
+from toolkit.capture.turning import turn_camera, turn_image, turn_points, turned_from_cam
 from toolkit.errors import ManifestError, ToolkitError, WeightsError
 from toolkit.geometry import invert
 from toolkit.localizers import network

@@ -5,7 +5,7 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from toolkit.capture.upright import up_of_cameras
+from toolkit.capture.world_up import up_of_cameras
 from toolkit.geometry import make_pose, project
 from toolkit.show.figures import error_colors
 from toolkit.show.localized import QueryDetails, ShownImage

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from toolkit.capture import Capture, Session
 from toolkit.capture.devices import color_of
 from toolkit.capture.images import read_for_display
-from toolkit.capture.upright import up_of_cameras
+from toolkit.capture.world_up import up_of_cameras
 from toolkit.files import image_name, read_references
 from toolkit.show.figures import GREEN, ORANGE, VERMILLION, new_figure, styled
 from toolkit.show.metrics import is_posed

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.images import read_for_display
-from toolkit.capture.upright import up_of_cameras
+from toolkit.capture.world_up import up_of_cameras
 from toolkit.geometry import project
 from toolkit.show.figures import ESTIMATED, GREEN, MAP, ORANGE, SKY, TRUE, draw_error_legend, error_colors
 from toolkit.show.localized import REFERENCES, Localizations, QueryDetails, ShownImage, support_of

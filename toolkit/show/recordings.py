@@ -16,7 +16,7 @@ from tqdm.auto import tqdm
 from toolkit.capture import DEPTH_SCALE, Capture, Session, Trajectory
 from toolkit.capture.devices import color_of
 from toolkit.capture.images import default_workers, prefetch, read_for_display, read_image
-from toolkit.capture.upright import up_of_cameras
+from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import ArtifactError, CaptureError, ImageError
 from toolkit.files import file_fingerprint, files_fingerprint, write_sidecar
 from toolkit.localizers.correspondences import LocalizedQueries, LocalizedQuery

@@ -10,7 +10,7 @@ from matplotlib.collections import LineCollection
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.images import read_for_display
-from toolkit.capture.upright import up_of_cameras
+from toolkit.capture.world_up import up_of_cameras
 from toolkit.geometry import pose_error, project
 from toolkit.show.figures import (
     ESTIMATED,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.images import read_for_display
-from toolkit.capture.upright import up_of_cameras
+from toolkit.capture.world_up import up_of_cameras
 from toolkit.localizers.base import Query, View
 from toolkit.localizers.feed_forward import CameraAnswer, FeedForwardAnswer, FeedForwardLocalizer
 from toolkit.show.figures import BLUE, GRAY, GREEN, VERMILLION, new_figure, save_figure, styled
