@@ -106,11 +106,11 @@ def test_a_good_capture_has_no_problems(capture: Path) -> None:
         (
             "hl_map/rigs.txt",
             f"s/rig_10, s/a, {QT}",
-            ":6: error: duplicate key (rig 's/rig_10', sensor 's/a')",
+            ":6: error: duplicate key (rig_id 's/rig_10', sensor_id 's/a')",
         ),
         ("hl_map/rigs.txt", f"imu, s/a, {QT}", ":6: error: rig 'imu' has the name of a sensor"),
         ("hl_map/rigs.txt", "r, s/a, 0, 0, 0, 0, 1, 1, 1", ":6: error: found a zero quaternion"),
-        ("hl_map/sensors.txt", "s/a, , wifi", ":5: error: duplicate sensor 's/a'"),
+        ("hl_map/sensors.txt", "s/a, , wifi", ":5: error: duplicate key (sensor_id 's/a')"),
         (
             "hl_map/sensors.txt",
             "c, , camera, PINHOLE, 1, 1, 1",
@@ -167,7 +167,7 @@ def test_a_good_capture_has_no_problems(capture: Path) -> None:
             ":1: warning: keyframe without ground truth (timestamp 10",
         ),
         ("hl_map/proc/subsessions.txt", "t", ":2: warning: subsession 't' has no images"),
-        ("hl_map/proc/subsessions.txt", "s", ":2: error: duplicate subsession 's'"),
+        ("hl_map/proc/subsessions.txt", "s", ":2: error: duplicate key (subsession 's')"),
     ],
 )
 def test_each_inconsistency_is_found_at_its_line(capture: Path, file: str, text: str, expected: str) -> None:

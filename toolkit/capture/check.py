@@ -1,28 +1,23 @@
-"""Look for inconsistencies in a capture: every one, with file and line."""
+"""Look for inconsistencies in a capture and list every one, with file and line."""
 
 import os
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-import pyarrow.compute as pc
-from numpy.typing import NDArray
 
 from toolkit.capture.cameras import CAMERA_TYPES, parse_camera
 from toolkit.capture.devices import OTHER_SESSIONS, SPLITS, kinds
 from toolkit.capture.folder import Capture
 from toolkit.capture.session import RAW_DATA, Session
-from toolkit.capture.tables import ALIGNED, POSE_NAMES, KeyIndex, TextTable
+from toolkit.capture.tables import ALIGNED, COLUMNS, POSE_NAMES, KeyIndex, read_table, times_of
 from toolkit.capture.trajectory import Trajectory
 
 ERROR, WARNING = "error", "warning"
 UNUSED = {"wifi": "wifi.txt", "bluetooth": "bt.txt", "point clouds": "pointclouds.txt"}
-"""Files of the format that nothing here reads; sensors of these kinds are passed over."""
-UNIT_TOLERANCE = 1e-3  # longer or shorter quaternions were not meant to be rotations, or lost digits
-Mask = NDArray[np.bool_]
+"""Files of the format that the toolkit does not read; it ignores sensors of these kinds."""
+UNIT_TOLERANCE = 1e-3  # of the length of a quaternion; one further off is no rotation, or lost digits
 
 
 @dataclass(frozen=True)
@@ -36,7 +31,7 @@ class Problem:
     """From 1; 0 where it is about the whole file."""
     message: str
     severity: str
-    """`error`: data would be missing or wrong; `warning`: worth a look."""
+    """`error`: data is missing or wrong; `warning`: worth a look."""
 
     def __str__(self) -> str:
         place = f"{self.session}/{self.file}" + (f":{self.line}" if self.line else "")
@@ -45,11 +40,11 @@ class Problem:
 
 @dataclass
 class CheckReport:
-    """What a capture holds and what is wrong with it."""
+    """What a capture contains and what is wrong with it."""
 
     path: Path
     tables: dict[str, pd.DataFrame] = field(default_factory=dict)
-    """For each session, a table [what, count, details]."""
+    """For each session, a table [what, count, details] of texts."""
     problems: list[Problem] = field(default_factory=list)
 
     @property
@@ -62,15 +57,12 @@ class CheckReport:
         return [problem for problem in self.problems if problem.severity == ERROR]
 
     def text(self, most: int | None = None) -> str:
-        """Return the report as text: a table a session, then the problems, one a line, or so many of them."""
+        """Return the report as text: a table for each session, then the problems, one a line (the first `most`)."""
         parts = [f"Capture {self.path}"]
         for session, table in self.tables.items():
-            widths = [max(map(len, table[name])) for name in ("what", "count")]
-            rows = [
-                f"  {what:<{widths[0]}}  {count:>{widths[1]}}  {details}".rstrip()
-                for what, count, details in table.itertuples(index=False)
-            ]
-            parts.append("\n".join([session, *rows]))
+            wide, narrow = (max(map(len, table[name])) for name in ("what", "count"))
+            rows = (f"  {what:<{wide}}  {count:>{narrow}}  {details}" for what, count, details in table.to_numpy())
+            parts.append("\n".join([session, *map(str.rstrip, rows)]))
         if self.problems:
             lines = [str(problem) for problem in self.problems[:most]]
             if len(self.problems) > len(lines):
@@ -98,26 +90,28 @@ def check_capture(path: str | Path) -> CheckReport:
 
 
 class _SessionCheck:
+    """Collects the problems of one session."""
+
     def __init__(self, path: Path) -> None:
         self.session = Session(path, strict=False)
         self.problems: list[Problem] = []
         self.missing: dict[str, int] = {}
-        self.sensor_ids = self._column("sensors.txt", "sensor_id")
-        self.rig_ids = self._column("rigs.txt", "rig_id")
+        self.sensors = self._rows("sensors.txt")
+        self.rig_ids = self.session.rigs["rig_id"] if self.session.rigs is not None else pd.Series([], dtype=object)
+        self.cameras = self.sensors[self.sensors["sensor_type"] == "camera"]["sensor_id"]
 
-    def _column(self, file: str, name: str) -> pa.Array:
-        table = self.session.tables.get(file)
-        return pa.array([], pa.large_string()) if table is None else table.columns[name]
+    def _rows(self, file: str) -> pd.DataFrame:
+        """Return the well-formed rows of a file; the index is the line number."""
+        table = self.session.tables[file]
+        return table.frame(*table.columns).set_index(pd.Index(table.lines))
 
     def _add(self, file: str, line: int, message: str, severity: str = ERROR) -> None:
         self.problems.append(Problem(self.session.id, file, int(line), message, severity))
 
-    def _add_rows(self, file: str, wrong: Mask, message: str, *names: str, severity: str = ERROR) -> None:
-        """Report the rows of a table where `wrong`; `{}` in the message stand for the values of columns."""
-        table = self.session.tables[file]
-        for row in np.flatnonzero(wrong):
-            values = [table.columns[name][row].as_py() for name in names]
-            self._add(file, table.lines[row], message.format(*values), severity)
+    def _add_rows(self, file: str, rows: pd.DataFrame, message: str, severity: str = ERROR) -> None:
+        """Report some rows of a file; `{column}` in the message stands for the row's value."""
+        for line, row in zip(rows.index, rows.to_dict("records"), strict=True):
+            self._add(file, line, message.format(**row), severity)
 
     def run(self) -> None:
         session = self.session
@@ -128,287 +122,178 @@ class _SessionCheck:
         elif session.device not in [*known, *(device for device, _ in OTHER_SESSIONS.values())]:
             message = f"device {session.device!r} is none of {', '.join(known)}; it takes part. Meant? Else rename it"
             self._add("", 0, message, WARNING)
-        subsessions, _ = session.subsessions, session.depths
-        self._check_sensors()
-        self._check_records("images.txt", "image_path")
-        if "depths.txt" in session.tables:
-            self._check_records("depths.txt", "depth_path")
-        if "rigs.txt" in session.tables:
-            self._check_rigs()
-        for file, trajectory in (
-            ("trajectories.txt", session.trajectory),
-            (ALIGNED, session.ground_truth),
-        ):
+        _ = session.subsessions, session.depths, [session.keyframes(name) for name in session.keyframe_files]
+        for file in session.tables:
+            self._check_rows(file, self._rows(file))
+        self._check_cameras()
+        for file in ("images.txt", "depths.txt"):
+            if file in session.tables:
+                self._check_files(file, self._rows(file))
+        for file, trajectory in (("trajectories.txt", session.trajectory), (ALIGNED, session.ground_truth)):
             if trajectory is not None and file in session.tables:
                 self._check_trajectory(file, trajectory)
         if session.split == "map":
             self._check_images_have_poses()
-        for name in session.keyframe_files:
-            self._check_keyframes(name)
-        self._check_subsessions(subsessions)
-        for file, table in session.tables.items():
-            for line, message in table.problems:
-                self._add(file, line, message)
+        for file in session.keyframe_files.values():
+            self._check_keyframes(file, self._rows(file))
+        if "proc/subsessions.txt" in session.tables:
+            self._check_subsessions()
         order = {file: place for place, file in enumerate(session.tables)}
         self.problems.sort(key=lambda problem: (order.get(problem.file, -1), problem.line))
 
-    def _check_sensors(self) -> None:
-        table = self.session.tables["sensors.txt"]
-        keys = KeyIndex(np.zeros(len(table), np.int64), self.sensor_ids)
-        self._add_rows(
-            "sensors.txt", _mask(keys.repeated(), len(table)), "duplicate sensor {!r}", "sensor_id"
-        )
+    def _check_rows(self, file: str, rows: pd.DataFrame) -> None:
+        """Check what does not depend on the kind of file: malformed lines, keys, ids and quaternions."""
+        for line, message in self.session.tables[file].problems:
+            self._add(file, line, message)
+        key = list(rows.columns[: 1 if file in ("sensors.txt", "proc/subsessions.txt") else 2])
+        shown = ", ".join(f"{name} {{{name}!r}}" for name in key)
+        self._add_rows(file, rows[rows.duplicated(key)], f"duplicate key ({shown})")
+        if "sensor_id" in rows:
+            unknown = ~rows["sensor_id"].isin(self.sensors["sensor_id"])
+            if file == "depths.txt":  # maps that were rendered for a photograph: <prefix>/<sensor id>
+                unknown &= ~rows["sensor_id"].str.replace("^[^/]*/", "", regex=True).isin(self.sensors["sensor_id"])
+            self._add_rows(file, rows[unknown], "unknown sensor {sensor_id!r}: not in sensors.txt")
+        if "device_id" in rows:
+            message = "unknown device {device_id!r}: neither in rigs.txt nor in sensors.txt"
+            self._add_rows(file, rows[~self._is_device(rows)], message)
+        if file == "rigs.txt":
+            clash = rows["rig_id"].isin(self.sensors["sensor_id"])
+            self._add_rows(file, rows[clash], "rig {rig_id!r} has the name of a sensor")
+        if "qw" in rows:
+            off = np.abs(np.linalg.norm(rows[list(POSE_NAMES[:4])].to_numpy(np.float64), axis=1) - 1) > UNIT_TOLERANCE
+            self._add_rows(file, rows[off], "quaternion {qw} {qx} {qy} {qz} is not of length 1", WARNING)
+
+    def _is_device(self, rows: pd.DataFrame) -> "pd.Series[bool]":
+        return rows["device_id"].isin(self.rig_ids) | rows["device_id"].isin(self.sensors["sensor_id"])
+
+    def _check_cameras(self) -> None:
         verdicts: dict[tuple[str, str], str] = {}
-        kinds, params = (table.columns[name].to_pylist() for name in ("sensor_type", "extra"))
-        for row, key in enumerate(zip(kinds, params, strict=True)):
-            if key[0] not in CAMERA_TYPES:
-                continue
-            if key not in verdicts:
+        rows = self.sensors[self.sensors["sensor_type"].isin(CAMERA_TYPES)]
+        for line, kind, params in zip(rows.index, rows["sensor_type"], rows["extra"], strict=True):
+            if (kind, params) not in verdicts:
                 try:
-                    parse_camera(*key)
-                    verdicts[key] = ""
+                    parse_camera(kind, params)
+                    verdicts[kind, params] = ""
                 except ValueError as error:
-                    verdicts[key] = str(error)
-            if verdicts[key]:
-                self._add("sensors.txt", table.lines[row], verdicts[key].rstrip("."))
+                    verdicts[kind, params] = str(error).rstrip(".")
+            if verdicts[kind, params]:
+                self._add("sensors.txt", line, verdicts[kind, params])
 
-    def _check_records(self, file: str, path_column: str) -> None:
-        table = self.session.tables[file]
-        sensors = table.columns["sensor_id"]
-        unknown = ~_is_in(sensors, self.sensor_ids)
-        if file == "depths.txt":  # maps that were rendered for a photograph: <prefix>/<sensor id>
-            unknown &= ~_is_in(pc.replace_substring_regex(sensors, "^[^/]*/", ""), self.sensor_ids)
-        self._add_rows(file, unknown, "unknown sensor {!r}: not in sensors.txt", "sensor_id")
-        types = self._column("sensors.txt", "sensor_type")
-        others = self.sensor_ids.filter(
-            pc.invert(pc.is_in(types, value_set=pa.array(CAMERA_TYPES, types.type)))
-        )
-        self._add_rows(file, _is_in(sensors, others), "sensor {!r} of an image is no camera", "sensor_id")
-        self._add_duplicates(file, "sensor_id")
-        present = _existing(self.session.path / RAW_DATA, table.columns[path_column])
-        self.missing[file] = int(np.sum(~present))
-        self._add_rows(file, ~present, f"missing file {RAW_DATA}/{{}}", path_column)
-
-    def _add_duplicates(self, file: str, column: str) -> None:
-        table = self.session.tables[file]
-        keys = KeyIndex(table.columns["timestamp"].to_numpy(), table.columns[column])
-        repeated = _mask(keys.repeated(), len(table))
-        self._add_rows(
-            file, repeated, f"duplicate key (timestamp {{}}, {column} {{!r}})", "timestamp", column
-        )
-
-    def _add_not_unit(self, file: str) -> None:
-        lengths = np.linalg.norm(self.session.tables[file].numbers(POSE_NAMES[:4]), axis=1)
-        wrong = np.abs(lengths - 1) > UNIT_TOLERANCE
-        message = "quaternion {} {} {} {} is not of length 1"
-        self._add_rows(file, wrong, message, *POSE_NAMES[:4], severity=WARNING)
-
-    def _check_rigs(self) -> None:
-        table = self.session.tables["rigs.txt"]
-        unknown = ~_is_in(table.columns["sensor_id"], self.sensor_ids)
-        self._add_rows("rigs.txt", unknown, "unknown sensor {!r}: not in sensors.txt", "sensor_id")
-        clash = _is_in(self.rig_ids, self.sensor_ids)
-        self._add_rows("rigs.txt", clash, "rig {!r} has the name of a sensor", "rig_id")
-        rig_codes = pc.index_in(self.rig_ids, value_set=pc.unique(self.rig_ids)).to_numpy().astype(np.int64)
-        repeated = _mask(KeyIndex(rig_codes, table.columns["sensor_id"]).repeated(), len(table))
-        self._add_rows("rigs.txt", repeated, "duplicate key (rig {!r}, sensor {!r})", "rig_id", "sensor_id")
-        self._add_not_unit("rigs.txt")
+    def _check_files(self, file: str, rows: pd.DataFrame) -> None:
+        others = self.sensors[~self.sensors["sensor_type"].isin(CAMERA_TYPES)]["sensor_id"]
+        self._add_rows(file, rows[rows["sensor_id"].isin(others)], "sensor {sensor_id!r} of an image is no camera")
+        path = rows.columns[2]
+        missing = rows[~_exist(self.session.path / RAW_DATA, rows[path])]
+        self.missing[file] = len(missing)
+        self._add_rows(file, missing, f"missing file {RAW_DATA}/{{{path}}}")
 
     def _check_trajectory(self, file: str, trajectory: Trajectory) -> None:
-        session, table = self.session, self.session.tables[file]
-        devices = table.columns["device_id"]
-        in_rigs, in_sensors = _is_in(devices, self.rig_ids), _is_in(devices, self.sensor_ids)
-        self._add_rows(
-            file,
-            ~in_rigs & ~in_sensors,
-            "unknown device {!r}: neither in rigs.txt nor in sensors.txt",
-            "device_id",
-        )
-        self._add_duplicates(file, "device_id")
-        self._add_not_unit(file)
-        with_image = KeyIndex(session.images["timestamp"].to_numpy(), session.device_ids).find(
-            trajectory.timestamps, devices
-        )
-        takes_images = in_rigs | _is_in(devices, self._cameras())
-        without = takes_images & (with_image < 0)
-        message = "pose without image (timestamp {}, device {!r})"
-        self._add_rows(file, without, message, "timestamp", "device_id", severity=WARNING)
-        if table.has_extra:
-            self._check_covariances(file)
-
-    def _check_covariances(self, file: str) -> None:
-        for line, extra in _extra_columns(self.session.path / file, self.session.tables[file]):
-            values = extra.split(",")
-            if len(values) != 36:
-                self._add(
-                    file,
-                    line,
-                    f"{len(values)} values after the pose, expected none or 36 (covariance)",
-                    WARNING,
-                )
-            elif not _all_finite(values):
-                self._add(file, line, "the covariance has values that are not finite numbers")
-
-    def _cameras(self) -> pa.Array:
-        types = self._column("sensors.txt", "sensor_type")
-        return self.sensor_ids.filter(pc.equal(types, "camera"))
+        session, rows = self.session, self._rows(file)
+        images = KeyIndex(times_of(session.images), session.device_ids)
+        without = images.find(times_of(rows), rows["device_id"]) < 0
+        takes_images = rows["device_id"].isin(self.rig_ids) | rows["device_id"].isin(self.cameras)
+        message = "pose without image (timestamp {timestamp}, device {device_id!r})"
+        self._add_rows(file, rows[takes_images & without], message, WARNING)
+        if session.tables[file].has_extra:
+            table = read_table(session.path / file, COLUMNS[file], strict=False, extra=True)
+            for line, extra in zip(table.lines, table.columns["extra"].to_pylist(), strict=True):
+                numbers = extra.split(",")
+                if extra and len(numbers) != 36:
+                    message = f"{len(numbers)} values after the pose, expected none or 36 (covariance)"
+                    self._add(file, line, message, WARNING)
+                elif extra and not np.isfinite(pd.to_numeric(pd.Series(numbers).str.strip(), errors="coerce")).all():
+                    self._add(file, line, "the covariance has values that are not finite numbers")
 
     def _check_images_have_poses(self) -> None:
         session = self.session
-        if session.trajectory is None:
-            if len(session.images):
-                self._add("trajectories.txt", 0, "file not found: images of a map session need poses")
-            return
-        poses = session.trajectory.index.find(session.images["timestamp"].to_numpy(), session.device_ids)
-        message = "image without pose (timestamp {}, sensor {!r})"
-        self._add_rows("images.txt", poses < 0, message, "timestamp", "sensor_id", severity=WARNING)
+        if session.trajectory is not None:
+            without = session.trajectory.index.find(times_of(session.images), session.device_ids) < 0
+            message = "image without pose (timestamp {timestamp}, sensor {sensor_id!r})"
+            self._add_rows("images.txt", self._rows("images.txt")[without], message, WARNING)
+        elif len(session.images):
+            self._add("trajectories.txt", 0, "file not found: images of a map session need poses")
 
-    def _check_keyframes(self, name: str) -> None:
-        session, file = self.session, self.session.keyframe_files[name]
-        keys = session.keyframes(name)
-        devices = session.tables[file].columns["device_id"]
-        known = _is_in(devices, self.rig_ids) | _is_in(devices, self.sensor_ids)
-        message = "unknown device {!r}: neither in rigs.txt nor in sensors.txt"
-        self._add_rows(file, ~known, message, "device_id")
-        self._add_duplicates(file, "device_id")
-        images = np.array([len(rows) for rows in session.rows_of_keyframes(keys)], np.int64)
-        message = "keyframe without image (timestamp {}, device {!r})"
-        self._add_rows(file, known & (images == 0), message, "timestamp", "device_id")
+    def _check_keyframes(self, file: str, rows: pd.DataFrame) -> None:
+        session, known = self.session, self._is_device(rows)
+        without = np.array([not len(images) for images in session.rows_of_keyframes(rows)], bool)
+        shown = "(timestamp {timestamp}, device {device_id!r})"
+        self._add_rows(file, rows[known & without], f"keyframe without image {shown}")
         if session.ground_truth is not None:
-            poses = session.ground_truth.index.find(keys["timestamp"].to_numpy(), devices)
-            message = "keyframe without ground truth (timestamp {}, device {!r})"
-            self._add_rows(file, known & (poses < 0), message, "timestamp", "device_id", severity=WARNING)
+            without = session.ground_truth.index.find(times_of(rows), rows["device_id"]) < 0
+            self._add_rows(file, rows[known & without], f"keyframe without ground truth {shown}", WARNING)
 
-    def _check_subsessions(self, subsessions: list[str]) -> None:
-        file = "proc/subsessions.txt"
-        if file not in self.session.tables:
-            return
-        of_image = self.session.subsession_of()
-        table = self.session.tables[file]
-        empty = ~np.isin(np.array(subsessions, object), of_image)
-        self._add_rows(file, empty, "subsession {!r} has no images", "subsession", severity=WARNING)
-        repeated = KeyIndex(np.zeros(len(table), np.int64), table.columns["subsession"]).repeated()
-        self._add_rows(file, _mask(repeated, len(table)), "duplicate subsession {!r}", "subsession")
-        message = "image {} is in no subsession of proc/subsessions.txt"
-        self._add_rows("images.txt", of_image == "", message, "image_path", severity=WARNING)
+    def _check_subsessions(self) -> None:
+        of_image, rows = self.session.subsession_of(), self._rows("proc/subsessions.txt")
+        empty = rows[~rows["subsession"].isin(of_image)]
+        self._add_rows("proc/subsessions.txt", empty, "subsession {subsession!r} has no images", WARNING)
+        message = "image {image_path} is in no subsession of proc/subsessions.txt"
+        self._add_rows("images.txt", self._rows("images.txt")[of_image == ""], message, WARNING)
 
     def summary(self) -> pd.DataFrame:
         """Return a table [what, count, details] of texts."""
-        session = self.session
-        rows: list[tuple[str, str, str]] = []
+        session, rows = self.session, list[tuple[str, str, str]]()
 
-        def add(what: str, count: int | None, details: str = "") -> None:
-            rows.append((what, "-" if count is None else f"{count:,}", details))
+        def add(what: str, count: int | None, *details: str) -> None:
+            rows.append((what, "-" if count is None else f"{count:,}", ", ".join(filter(None, details))))
 
-        times = session.images["timestamp"].to_numpy()
+        def missing(file: str) -> str:
+            return f"{self.missing[file]:,} files missing" if self.missing.get(file) else ""
+
+        times = times_of(session.images)
         span = f"over {(times.max() - times.min()) / 1e6:,.1f} s" if len(times) else ""
-        missing = self.missing["images.txt"]
-        add(
-            "images",
-            len(session.images),
-            ", ".join(filter(None, [span, f"{missing:,} files missing" if missing else ""])),
-        )
-        kinds = session.sensors["sensor_type"].value_counts(sort=False)
-        add("sensors", len(session.sensors), ", ".join(f"{count:,} {kind}" for kind, count in kinds.items()))
-        add("cameras", len(self._cameras()), self._camera_models())
-        if session.rigs is None:
-            add("rigs", None)
-        else:
-            per_rig = session.rigs["rig_id"].value_counts()
-            sizes = (
-                f"{per_rig.min()}"
-                if per_rig.min() == per_rig.max()
-                else f"{per_rig.min()} to {per_rig.max()}"
-            )
-            add("rigs", len(per_rig), f"{sizes} sensors each" if len(per_rig) else "")
+        add("images", len(times), span, missing("images.txt"))
+        types = session.sensors["sensor_type"].value_counts(sort=False)
+        add("sensors", len(session.sensors), *(f"{count:,} {kind}" for kind, count in types.items()))
+        add("cameras", len(self.cameras), *self._camera_models())
+        sizes = self.rig_ids.value_counts()
+        span = f"{sizes.min()} to {sizes.max()}" if sizes.nunique() > 1 else f"{sizes.min()}"
+        add("rigs", None if session.rigs is None else len(sizes), f"{span} sensors each" if len(sizes) else "")
         for what, trajectory in (("poses", session.trajectory), ("ground truth", session.ground_truth)):
+            note = ""
+            if what == "poses" and trajectory is not None and session.split != "map":
+                note = "the device's own odometry: never used as ground truth"
+            elif what == "ground truth" and trajectory is None and session.split == "query":
+                note = f"no {ALIGNED}: these queries cannot be evaluated"
+            elif what == "ground truth" and trajectory is not None and trajectory is session.trajectory:
+                note = "from trajectories.txt"
             if trajectory is None:
-                no_truth = what == "ground truth" and session.split == "query"
-                add(what, None, f"no {ALIGNED}: these queries cannot be evaluated" if no_truth else "")
-                continue
-            found = trajectory.index.find(times, session.device_ids)
-            details = f"{np.sum(found >= 0):,} of {len(times):,} images have one"
-            if what == "ground truth" and trajectory is session.trajectory:
-                details += ", from trajectories.txt"
-            elif what == "poses" and session.split != "map":
-                details += ", the device's own odometry: never used as ground truth"
-            add(what, len(trajectory), details)
-        depths = session.depths
-        missing = self.missing.get("depths.txt", 0)
-        add(
-            "depth maps",
-            None if depths is None else len(depths),
-            f"{missing:,} files missing" if missing else "",
-        )
+                add(what, None, note)
+            else:
+                posed = np.sum(trajectory.index.find(times, session.device_ids) >= 0)
+                add(what, len(trajectory), f"{posed:,} of {len(times):,} images have one", note)
+        add("depth maps", None if session.depths is None else len(session.depths), missing("depths.txt"))
         images = pd.Series(session.subsession_of()).value_counts()
         shown = [f"{name} ({images.get(name, 0):,} images)" for name in session.subsessions[:6]]
-        add(
-            "subsessions",
-            len(session.subsessions),
-            ", ".join(shown) + (", ..." if len(session.subsessions) > 6 else ""),
-        )
-        for name in session.keyframe_files:
-            table = session.tables[session.keyframe_files[name]]
-            devices = len(pc.unique(table.columns["device_id"]))
-            add(f"keyframes {name}", len(table), f"{_count(devices, 'device')}")
+        add("subsessions", len(session.subsessions), *shown, "..." if len(session.subsessions) > 6 else "")
+        for name, file in session.keyframe_files.items():
+            keys = self._rows(file)
+            add(f"keyframes {name}", len(keys), _count(keys["device_id"].nunique(), "device"))
         for what, file in UNUSED.items():
             if (session.path / file).exists():
                 add(what, None, f"{file} is there and is not used")
         return pd.DataFrame(rows, columns=["what", "count", "details"])
 
-    def _camera_models(self) -> str:
-        params = self.session.sensors["params"][self.session.sensors["sensor_type"] == "camera"]
+    def _camera_models(self) -> list[str]:
+        params = self.sensors["extra"][self.sensors["sensor_type"] == "camera"]
         heads = params.str.split(",", n=3).str[:3].map(lambda words: " ".join(word.strip() for word in words))
         counts = heads.value_counts()
-        shown = [f"{count:,} {head}" for head, count in counts.head(4).items()]
-        return ", ".join(shown) + (", ..." if len(counts) > 4 else "")
+        return [*(f"{count:,} {head}" for head, count in counts.head(4).items()), "..." if len(counts) > 4 else ""]
 
 
-def _extra_columns(path: Path, table: TextTable) -> Iterable[tuple[int, str]]:
-    """Yield line and text of what follows the columns of a table's rows, where there is something."""
-    width = len(table.columns)
-    wanted = iter(table.lines.tolist())
-    line = next(wanted, None)
-    with open(path, encoding="utf-8-sig", errors="replace") as stream:
-        for number, text in enumerate(stream, 1):
-            if number == line:
-                words = text.strip().split(",", width)
-                if len(words) > width:
-                    yield number, words[width]
-                line = next(wanted, None)
-
-
-def _all_finite(values: list[str]) -> bool:
-    try:
-        return bool(np.all(np.isfinite([float(value) for value in values])))
-    except ValueError:
-        return False
-
-
-def _existing(root: Path, paths: pa.Array) -> Mask:
-    """Tell which paths relative to `root` are files: a folder is listed once, not asked file by file."""
+def _exist(root: Path, paths: "pd.Series[str]") -> "pd.Series[bool]":
+    """Tell which paths relative to `root` exist. Each folder is listed once, which is faster than asking per file."""
     listed: dict[str, set[str]] = {}
-    found = np.zeros(len(paths), bool)
-    for row, path in enumerate(paths.to_pylist()):
+
+    def exists(path: str) -> bool:
         folder, name = os.path.split(path)
         if folder not in listed:
             try:
-                with os.scandir(root / folder) as entries:
-                    listed[folder] = {entry.name for entry in entries}
+                listed[folder] = {entry.name for entry in (root / folder).iterdir()}
             except OSError:
                 listed[folder] = set()
-        found[row] = name in listed[folder]
-    return found
+        return name in listed[folder]
 
-
-def _is_in(values: pa.Array, known: pa.Array) -> Mask:
-    return pc.is_in(values, value_set=known).to_numpy(zero_copy_only=False)
-
-
-def _mask(rows: NDArray[np.int64], size: int) -> Mask:
-    mask = np.zeros(size, bool)
-    mask[rows] = True
-    return mask
+    return pd.Series([exists(path) for path in paths], index=paths.index, dtype=bool)
 
 
 def _count(number: int, what: str) -> str:
