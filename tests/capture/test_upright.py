@@ -6,110 +6,14 @@ from typing import Any
 
 import cv2
 import numpy as np
-import pycolmap
 import pytest
 
 from toolkit.capture import Capture, Session, Trajectory, write_session
-from toolkit.capture.turning import DIRECTED, turn_camera, turn_image, turn_points, turned_from_cam
+from toolkit.capture.turning import turned_from_cam
 from toolkit.capture.upright import quarter_turns
 from toolkit.capture.world_up import estimate_world_up, given_world_up
-from toolkit.errors import CaptureError, ManifestError, ToolkitError
-from toolkit.geometry import invert, make_pose, transform
-
-PARAMS = {
-    "SIMPLE_PINHOLE": [500, 330, 230],
-    "PINHOLE": [500, 480, 330, 230],
-    "SIMPLE_RADIAL": [500, 330, 230, -0.05],
-    "RADIAL": [500, 330, 230, -0.05, 0.02],
-    "SIMPLE_RADIAL_FISHEYE": [500, 330, 230, -0.05],
-    "RADIAL_FISHEYE": [500, 330, 230, -0.05, 0.02],
-    "OPENCV": [500, 480, 330, 230, -0.05, 0.02, 0.004, -0.007],
-    "OPENCV_FISHEYE": [500, 480, 330, 230, -0.05, 0.02, 0.004, -0.007],
-    "FULL_OPENCV": [500, 480, 330, 230, -0.05, 0.02, 0.004, -0.007, 0.01, 0.02, 0.03, 0.01],
-    "FOV": [500, 480, 330, 230, 0.3],
-    "THIN_PRISM_FISHEYE": [500, 480, 330, 230, -0.05, 0.02, 0.004, -0.007, 0.01, 0.02, 0.03, 0.01],
-    "RAD_TAN_THIN_PRISM_FISHEYE": [
-        *[500, 480, 330, 230, -0.05, 0.02, 0.01, 0.01, 0.02, 0.01],
-        *[0.004, -0.007, 0.01, 0.02, 0.03, 0.015],
-    ],
-    "SIMPLE_DIVISION": [500, 330, 230, -0.05],
-    "DIVISION": [500, 480, 330, 230, -0.05],
-    "SIMPLE_FISHEYE": [500, 330, 230],
-    "FISHEYE": [500, 480, 330, 230],
-    "EUCM": [500, 480, 330, 230, 0.5, 1.1],
-}
-
-
-# Images, intrinsics, poses, pixels
-
-
-def test_every_camera_model_of_colmap_is_known_or_refused() -> None:
-    assert set(PARAMS) == set(DIRECTED)
-    known = {name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"}
-    assert set(DIRECTED) <= known
-    for name in known - set(DIRECTED):
-        camera = pycolmap.Camera.create_from_model_name(1, name, 500.0, 640, 480)
-        with pytest.raises(ToolkitError, match=name):
-            turn_camera(camera, 1)
-
-
-@pytest.mark.parametrize("k", range(4))
-@pytest.mark.parametrize("model", PARAMS)
-def test_a_point_projects_to_the_turned_pixel(model: str, k: int) -> None:
-    camera = pycolmap.Camera(model=model, width=640, height=480, params=PARAMS[model])
-    turned = turn_camera(camera, k)
-    assert (turned.width, turned.height) == ((480, 640) if k % 2 else (640, 480))
-    assert turned.model_name == model
-
-    rng = np.random.default_rng(0)
-    points = np.column_stack([rng.uniform(-0.5, 0.5, (50, 2)), np.ones(50)]) * rng.uniform(1, 9, (50, 1))
-    before = camera.img_from_cam(points)
-    after = turned.img_from_cam(transform(turned_from_cam(k), points))
-    assert np.ptp(before[:, 0]) > 200
-    np.testing.assert_allclose(after, turn_points(before, 640, 480, k), atol=1e-6)
-
-
-def test_camera_keeps_its_id_and_the_one_given_is_not_changed() -> None:
-    camera = pycolmap.Camera(model="OPENCV", width=640, height=480, params=PARAMS["OPENCV"], camera_id=7)
-    assert turn_camera(camera, 1).camera_id == 7
-    assert camera.params.tolist() == PARAMS["OPENCV"]
-    assert (camera.width, camera.height) == (640, 480)
-
-
-@pytest.mark.parametrize("k", range(4))
-@pytest.mark.parametrize("shape", [(5, 8), (5, 8, 3)])
-def test_a_marked_pixel_is_where_turn_points_says(shape: tuple[int, ...], k: int) -> None:
-    image = np.zeros(shape, np.uint8)
-    image[1, 6] = 200
-    turned = turn_image(image, k)
-    np.testing.assert_array_equal(turned, np.rot90(image, k))
-    assert turned.flags.c_contiguous
-    x, y = turn_points([[6.5, 1.5]], 8, 5, k)[0]
-    assert x % 1 == y % 1 == 0.5
-    assert np.all(turned[int(y), int(x)] == 200)
-
-
-def test_four_turns_are_none() -> None:
-    image = np.random.default_rng(0).integers(0, 255, (4, 6, 3), np.uint8)
-    four = image
-    for _ in range(4):
-        four = turn_image(four, 1)
-    np.testing.assert_array_equal(four, image)
-    np.testing.assert_array_equal(turned_from_cam(1) @ turned_from_cam(3), np.eye(4))
-    assert turned_from_cam(np.array([[0, 1, 2], [3, 0, 1]])).shape == (2, 3, 4, 4)
-
-
-def test_a_turned_pose_keeps_the_center_and_shows_the_same_world() -> None:
-    world_from_cam = _pose(30, -10, 90)
-    world_from_cam[:3, 3] = 1, 2, 3
-    world_from_turned = world_from_cam @ invert(turned_from_cam(3))
-    np.testing.assert_allclose(world_from_turned[:3, 3], [1, 2, 3])
-    camera = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=PARAMS["PINHOLE"])
-    points = transform(world_from_cam, [[0.1, 0.2, 2.0], [-0.3, 0.1, 4.0]])
-    before = camera.img_from_cam(transform(invert(world_from_cam), points))
-    after = turn_camera(camera, 3).img_from_cam(transform(invert(world_from_turned), points))
-    np.testing.assert_allclose(after, turn_points(before, 640, 480, 3), atol=1e-9)
-
+from toolkit.errors import CaptureError, ManifestError
+from toolkit.geometry import invert, make_pose
 
 # Simulated captures: a world with z up, then turned as a whole
 

@@ -14,7 +14,7 @@ from PIL import Image
 
 from tests.models.test_vggt import tiny
 from toolkit.capture.images import read_image
-from toolkit.capture.turning import turn_camera, turn_image, turn_points, turned_from_cam
+from toolkit.capture.turning import turn_image, turn_points, turned_from_cam
 from toolkit.errors import ManifestError, ToolkitError, WeightsError
 from toolkit.geometry import invert
 from toolkit.localizers import network
@@ -435,7 +435,10 @@ def test_a_rolled_camera_is_shown_upright_and_answered_as_it_is(
     query, upright = photographs.view(size), photographs.view(size)
     path = upright.path.with_name("rolled.png")
     Image.fromarray(turn_image(read_image(upright.path), -turns)).save(path)
-    rolled = View("rolled", path, turn_camera(upright.camera, -turns), known=True, turns=turns)
+    width, height = size[:: -1 if turns % 2 else 1]
+    params = [size[0], size[0], width / 2, height / 2]
+    camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params)
+    rolled = View("rolled", path, camera, known=True, turns=turns)
     expected, found = make(needs_depth=True).predict([[query, upright], [query, rolled]])
     np.testing.assert_allclose(found.model_from_cams[0], expected.model_from_cams[0], atol=1e-6)
     model_from_turned = found.model_from_cams[1] @ invert(turned_from_cam(turns))

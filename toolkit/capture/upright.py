@@ -1,8 +1,8 @@
 """Decide by how many quarter turns the images of each sensor have to be turned so that gravity points down in them.
 
 Headset and robot cameras are mounted rotated; people hold phones upright while the sensor lies on its side. Networks
-that learned from upright photographs expect upright ones. `toolkit.capture.turning` has the functions that turn images,
-intrinsics, poses and pixel positions by a number of counter-clockwise quarter turns.
+that learned from upright photographs expect upright ones. The functions of `toolkit.capture.turning` turn images, poses
+and pixel positions.
 
     turns = quarter_turns([capture["hl_map"], capture["ios_map"]], world_up=None)
     k = turns.of(capture["hl_query"])
