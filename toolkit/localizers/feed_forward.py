@@ -223,7 +223,7 @@ def _combine(query: Query, cameras: tuple[CameraAnswer, ...]) -> PoseEstimate:
         covariances = np.stack([
             _moved(_covariance(cameras[index]), query.rig_from_cams[index]) for index in known
         ])  # fmt: skip
-        mean = robust_mean_pose(poses, covariances=covariances)
+        mean = robust_mean_pose(poses, covariances)
         pose, covariance = mean.world_from_cam, mean.covariance
         kept = [index for index, inside in zip(known, mean.inliers, strict=True) if inside]
         reasons = "; ".join(part for part in (reasons, mean.reason) if part)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from toolkit import geometry
 from toolkit.capture.depths import lifted
-from toolkit.localizers.alignment import DEPTH_NOISE
 from toolkit.localizers.base import PoseEstimate, Prior, Query, References
+from toolkit.localizers.depth_scale import DEPTH_NOISE
 from toolkit.localizers.feed_forward import CameraAnswer, FeedForwardAnswer, FeedForwardLocalizer
 from toolkit.localizers.mapping import LocalMap
 from toolkit.localizers.matches import MappedFeatures

@@ -1,0 +1,92 @@
+"""What robust estimates of poses share: checked input, the prior of the noise, the nearest rotation."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from toolkit.errors import ToolkitError
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+NOISE_FACTOR = np.log(2.5)  # standard deviation of the prior of a noise, in its logarithm
+_LEVELS = np.exp(np.linspace(-3.5, 3.5, 29))  # noise over its expected size, to integrate over
+
+
+class AlignmentError(ToolkitError):
+    """Cameras, weights or depth ratios that cannot be what they should be."""
+
+
+def noise_variance(squares: ArrayLike, free: ArrayLike, expected: float) -> Floats:
+    """Return the mean of the variance by axis, (...), given sums of squared residuals and their degrees of freedom.
+
+    The prior of the noise is log-normal about `expected`, within a factor of exp(NOISE_FACTOR). The result is the mean,
+    not the most likely variance, because the variance of an estimate is proportional to it.
+    """
+    squares, free = np.asarray(squares)[..., None], np.asarray(free)[..., None]
+    logs = np.log(_LEVELS)
+    log_density = -((logs / NOISE_FACTOR) ** 2) / 2 - free * logs - squares / (2 * (expected * _LEVELS) ** 2)
+    density = np.exp(log_density - log_density.max(axis=-1, keepdims=True))
+    return np.asarray(expected**2 * (density @ _LEVELS**2) / density.sum(axis=-1))
+
+
+def nearest_rotation(matrices: Floats, keep: Floats | None = None) -> Floats:
+    """Return the rotations (K, 3, 3) with the largest trace of their transpose times the matrices (Umeyama 1991).
+
+    `keep` is returned where a matrix is zero.
+    """
+    U, values, Vt = np.linalg.svd(matrices)
+    U[..., :, 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
+    rotations = U @ Vt
+    if keep is not None:
+        rotations = np.where((values[..., 0] > 0)[..., None, None], rotations, keep)
+    return np.asarray(rotations, np.float64)
+
+
+def rigid_poses(poses: ArrayLike, name: str) -> tuple[Floats, Bools]:
+    """Return poses (M, 4, 4) with their rotations made exact, and which are finite; the others are identities.
+
+    Raises:
+        AlignmentError: a wrong shape, or a finite matrix that is not a rigid pose; says which by `name` and index.
+    """
+    matrices = np.array(poses, np.float64)
+    if matrices.size == 0 and matrices.shape[:1] == (0,):
+        matrices = matrices.reshape(0, 4, 4)
+    if matrices.ndim != 3 or matrices.shape[1:] != (4, 4):
+        raise AlignmentError(f"{name} has shape {matrices.shape}: expected (M, 4, 4).")
+    finite = np.asarray(np.isfinite(matrices).all(axis=(1, 2)), np.bool_)
+    matrices[~finite] = np.eye(4)
+    R = matrices[:, :3, :3]
+    off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
+    last = np.abs(matrices[:, 3] - [0, 0, 0, 1]).max(axis=1)
+    bad = np.flatnonzero((off > 1e-3) | (np.linalg.det(R) < 0) | (last > 1e-6))
+    if len(bad):
+        mirrored = np.linalg.det(R[bad[0]]) < 0
+        what = "is mirrored (determinant below 0)" if mirrored else "is not a rotation and a translation"
+        raise AlignmentError(
+            f"{name}[{bad[0]}] {what}: expected a rigid pose, its rotation orthonormal to 1e-3. "
+            "A scale or a flip of axes has to be taken out before."
+        )
+    matrices[:, :3, :3] = nearest_rotation(R)
+    return matrices, finite
+
+
+def checked_weights(weights: ArrayLike | None, count: int) -> Floats:
+    """Return weights (count,), all 1 where there are none.
+
+    Raises:
+        AlignmentError: a wrong shape, or one that is negative or not finite.
+    """
+    if weights is None:
+        return np.ones(count)
+    values = np.asarray(weights, np.float64)
+    if values.shape != (count,):
+        raise AlignmentError(f"weights has shape {values.shape}: expected ({count},), one a camera.")
+    bad = np.flatnonzero(~np.isfinite(values) | (values < 0))
+    if len(bad):
+        raise AlignmentError(f"weights[{bad[0]}] is {values[bad[0]]}: expected a finite number, 0 or more.")
+    return values
+
+
+def listed(chosen: Bools) -> str:
+    """Return the indices that are chosen, as a message lists them."""
+    return ", ".join(str(index) for index in np.flatnonzero(chosen))
