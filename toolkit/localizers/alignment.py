@@ -285,13 +285,13 @@ class _Problem:
     def __init__(self, model: Floats, world: Floats, weight: Floats, center_noise_m: float, rotation_noise_deg: float):
         self.weight = weight
         self.expected = (center_noise_m, rotation_noise_deg)
-        self.world_from_model = world[:, :3, :3] @ np.swapaxes(model[:, :3, :3], -1, -2)  # each camera's own opinion
+        self.world_from_model = world[:, :3, :3] @ np.swapaxes(model[:, :3, :3], -1, -2)  # by each camera alone
         self.flat_opinions = self.world_from_model.reshape(-1, 9)
         self.model, self.world = model, world
         # About a reference near the middle: products of large coordinates would lose digits.
         self.origin_m, self.origin_c = _middle(model[:, :3, 3]), _middle(world[:, :3, 3])
         self.m, self.c = model[:, :3, 3] - self.origin_m, world[:, :3, 3] - self.origin_c
-        # Sums over references become products with a membership.
+        # With these, sums over references become products with members.
         self.outer_cm = (self.c[:, :, None] * self.m[:, None, :]).reshape(-1, 9)
         typical = np.median(np.linalg.norm(self.c, axis=1))
         # Noise by axis, of which three make the length.
@@ -303,7 +303,7 @@ class _Problem:
         self.extent = float(np.sqrt(np.mean(gaps_m))) if len(first) else 0.0
         apart = gaps_m > 1e-18 * max(self.extent**2, 1e-300)
         ratios = np.sqrt((gaps_c[apart] + 6 * self.center_prior**2) / gaps_m[apart])
-        # For want of better where centers say nothing.
+        # The scale where centers do not tell.
         self.rough_scale = float(np.median(ratios)) if apart.any() else 1.0
 
     def subset(self, kept: Bools) -> _Problem:
@@ -311,11 +311,8 @@ class _Problem:
 
     def search(self, depth: ScaleEstimate | None, noise: tuple[float, float] | None = None) -> _Candidate:
         """Return the most likely similarity and the references that agree with it, within `noise` if it is given."""
-        count = len(self.m)
-        first, second = np.triu_indices(count, 1)
-        members = np.zeros((len(first) + count, count))
-        members[np.arange(len(first)), first] = members[np.arange(len(first)), second] = 1.0
-        members[len(first) + np.arange(count), np.arange(count)] = 1.0
+        alone, (first, second) = np.eye(len(self.m)), np.triu_indices(len(self.m), 1)
+        members = np.vstack([alone[first] + alone[second], alone])
         state = self.fit(members, self.opening(members), None)
         if depth is not None:
             state = state.joined(self.fit(members, self.opening(members), depth))
