@@ -10,7 +10,7 @@ import pandas as pd
 from toolkit.capture.cameras import CAMERA_TYPES, parse_camera
 from toolkit.capture.devices import OTHER_SESSIONS, SPLITS, kinds
 from toolkit.capture.folder import Capture
-from toolkit.capture.session import RAW_DATA, Session
+from toolkit.capture.session import RAW_DATA, SUBSESSIONS, Session
 from toolkit.capture.tables import ALIGNED, COLUMNS, POSE_NAMES, KeyIndex, read_table, times_of
 from toolkit.capture.trajectory import Trajectory
 
@@ -136,7 +136,7 @@ class _SessionCheck:
             self._check_images_have_poses()
         for file in session.keyframe_files.values():
             self._check_keyframes(file, self._rows(file))
-        if "proc/subsessions.txt" in session.tables:
+        if SUBSESSIONS in session.tables:
             self._check_subsessions()
         order = {file: place for place, file in enumerate(session.tables)}
         self.problems.sort(key=lambda problem: (order.get(problem.file, -1), problem.line))
@@ -145,7 +145,7 @@ class _SessionCheck:
         """Check what does not depend on the kind of file: malformed lines, keys, ids and quaternions."""
         for line, message in self.session.tables[file].problems:
             self._add(file, line, message)
-        key = list(rows.columns[: 1 if file in ("sensors.txt", "proc/subsessions.txt") else 2])
+        key = list(rows.columns[: 1 if file in ("sensors.txt", SUBSESSIONS) else 2])
         shown = ", ".join(f"{name} {{{name}!r}}" for name in key)
         self._add_rows(file, rows[rows.duplicated(key)], f"duplicate key ({shown})")
         if "sensor_id" in rows:
@@ -223,9 +223,9 @@ class _SessionCheck:
             self._add_rows(file, rows[known & without], f"keyframe without ground truth {shown}", WARNING)
 
     def _check_subsessions(self) -> None:
-        of_image, rows = self.session.subsession_of(), self._rows("proc/subsessions.txt")
+        of_image, rows = self.session.subsession_of(), self._rows(SUBSESSIONS)
         empty = rows[~rows["subsession"].isin(of_image)]
-        self._add_rows("proc/subsessions.txt", empty, "subsession {subsession!r} has no images", WARNING)
+        self._add_rows(SUBSESSIONS, empty, "subsession {subsession!r} has no images", WARNING)
         message = "image {image_path} is in no subsession of proc/subsessions.txt"
         self._add_rows("images.txt", self._rows("images.txt")[of_image == ""], message, WARNING)
 

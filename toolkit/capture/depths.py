@@ -1,12 +1,12 @@
-"""What the depth maps of a capture say of its photographs.
+"""The depth of photographs, from the depth maps of a capture.
 
-A depth map belongs to a photograph in one of these ways, as the official tools write `depths.txt`:
+The official tools write `depths.txt` such that a depth map belongs to a photograph in one of three ways:
 
-- rendered for it: at its time, under its sensor's id or, which is no sensor, `<prefix>/<sensor id>`;
-- measured with it (phones): at its time, under its sensor's id with `cam` replaced by `depth` in the last part;
-- measured by another sensor of its rig (headsets, robots), with intrinsics, a place in the rig and times of its own.
+- rendered for it: same timestamp, under the photograph's sensor id or under `<prefix>/<sensor id>`, which is no sensor;
+- measured with it (phones): same timestamp, under its sensor id with `cam` replaced by `depth` in the last part;
+- measured by another sensor of its rig (headsets, robots), which has its own intrinsics, place in the rig and times.
 
-Either way its points are brought into the photograph's camera, and what stands behind something else there is left out.
+In each case the points of the map are transformed to the photograph's camera, and occluded points are left out.
 """
 
 import logging
@@ -36,25 +36,25 @@ Ints = NDArray[np.int64]
 MAX_OFFSET_US = 100_000
 """Between a photograph and the depth map of another sensor: half the period of the slowest, at 5 Hz."""
 MAX_GAP_US = 1_000_000
-"""Between two poses of a sensor, for its place at a time between them."""
-_MOST_POINTS = 30_000  # of a depth map; more say nothing new to a few hundred features
-_HIDDEN = 1.1  # times the depth of what is next to it: behind it, or on its edge
-_CELL = 1.5  # width of a cell in which the nearest hides the others, in spacings of the points
-_FITTED = 8  # points that a surface element is fitted to
-_UNEVEN = 0.05  # relative depth by which one of them may be off
+"""Between two poses of a sensor that are interpolated."""
+_MOST_POINTS = 30_000  # of a depth map; a few hundred features need no more
+_HIDDEN = 1.1  # a point deeper than that many times its nearest neighbor is occluded, or on an edge
+_CELL = 1.5  # width of a cell in which the nearest point hides the others, in spacings of the points
+_FITTED = 8  # points that a plane is fitted to
+_UNEVEN = 0.05  # relative inverse depth by which one of them may be off the plane
 _KEPT = 32  # photographs whose depth is kept in memory
 
 
 @dataclass(frozen=True)
 class SeenDepth:
-    """Depth that is known at some places of a photograph."""
+    """Depth at some pixels of a photograph."""
 
     pixels: Floats
     """(P, 2) of the photograph, in rows from the top."""
     depth_m: Floats
     """(P,) along the photograph's optical axis."""
     cell_px: float = 1.0
-    """No two points are nearer than neighboring cells of this width allow."""
+    """Width of the grid's cells; there is at most one point in each."""
     reason: str = ""
     """What was left out and why; without points, why there are none."""
 
@@ -66,38 +66,38 @@ class SeenDepth:
         return KDTree(self.pixels)
 
     def at(self, xy: ArrayLike) -> Floats:
-        """Return depth (N,), meters, at pixels (N, 2): of a plane through the points about each.
+        """Return depth (N,), meters, at pixels (N, 2), from a plane through the points about each.
 
-        Inverse depth is linear in the pixels of a plane. NaN where fewer than four points are near, or where they do
-        not lie on one surface.
+        Inverse depth is linear in the pixels of a plane. NaN where fewer than four points are near, or where the points
+        do not lie on one surface.
         """
-        wanted = np.asarray(xy, np.float64).reshape(-1, 2)
-        found = np.full(len(wanted), np.nan)
-        if len(self) < _FITTED or not len(wanted):
-            return found
-        distance, near = self._tree.query(wanted, k=_FITTED)
+        xy = np.asarray(xy, np.float64).reshape(-1, 2)
+        depth_m = np.full(len(xy), np.nan)
+        if len(self) < _FITTED or not len(xy):
+            return depth_m
+        distance, near = self._tree.query(xy, k=_FITTED)
         inside = np.flatnonzero(distance[:, 3] <= 2 * self.cell_px)
         inverse = 1 / self.depth_m[near[inside]]
-        offset = (self.pixels[near[inside]] - wanted[inside, None]) / self.cell_px
+        offset = (self.pixels[near[inside]] - xy[inside, None]) / self.cell_px
         rows = np.concatenate([np.ones((*inverse.shape, 1)), offset], axis=2)
-        normal = np.einsum("nki,nkj->nij", rows, rows) + 1e-6 * np.eye(3)  # points on one line: no slope across it
+        normal = np.einsum("nki,nkj->nij", rows, rows) + 1e-6 * np.eye(3)  # if points lie on a line: flat across it
         plane = np.linalg.solve(normal, np.einsum("nki,nk->ni", rows, inverse)[..., None])
         off = np.abs((rows @ plane)[..., 0] - inverse).max(axis=1)
         value = plane[:, 0, 0]
         smooth = (value > 0) & (off <= _UNEVEN * np.abs(value))
-        found[inside[smooth]] = 1 / value[smooth]
-        return found
+        depth_m[inside[smooth]] = 1 / value[smooth]
+        return depth_m
 
 
 def lifted(camera: pycolmap.Camera, pixels: Floats, depth_m: Floats) -> Floats:
-    """Return the points (P, 3) in a camera's frame that lie at depths (P,) along its axis behind pixels (P, 2)."""
+    """Return the points (P, 3) in a camera's frame that project to pixels (P, 2) and have depths (P,)."""
     rays = rays_of(camera, pixels)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(rays / rays[:, 2:] * np.asarray(depth_m)[:, None], np.float64)
 
 
 @dataclass(frozen=True)
-class _Source:
+class _DepthMap:
     """A depth map of a photograph."""
 
     path: str
@@ -120,11 +120,10 @@ class DepthMaps:
         self._told: set[str] = set()
 
     def of(self, row: int) -> SeenDepth:
-        """Return the depth known in a photograph, a row of `Session.images`.
+        """Return the depth in a photograph, a row of `Session.images`.
 
-        Of every depth sensor that goes with its camera the map nearest in time counts, no further off than
-        `max_offset_us`. A map that cannot be read or does not fit its sensor is left out, with a reason; it is logged
-        once. Nothing is raised for it.
+        It comes from the map nearest in time of every depth sensor that belongs to the camera, at most `max_offset_us`
+        away. A map that cannot be read or does not fit its sensor is left out with a reason, which is logged once.
         """
         with self._lock:
             if row in self._kept:
@@ -144,21 +143,18 @@ class DepthMaps:
         points, spacing = [np.zeros((0, 3))], 0.0
         for source in sources:
             try:
-                found, spacing_px = self._points(source, camera)
+                points_of_map, spacing_px = self._points(source, camera)
             except CaptureError as error:
                 reasons.append(str(error))
                 continue
-            points.append(found)
+            points.append(points_of_map)
             spacing = max(spacing, spacing_px)
-        self._tell(reasons)
-        return _visible(np.concatenate(points), camera, max(1.0, _CELL * spacing), "; ".join(reasons))
-
-    def _tell(self, reasons: list[str]) -> None:
         with self._lock:
             new = [reason for reason in reasons if reason not in self._told]
             self._told.update(new)
         for reason in new:
             log.warning("left out: %s", reason)
+        return _visible(np.concatenate(points), camera, max(1.0, _CELL * spacing), "; ".join(reasons))
 
     @cached_property
     def _rows_of_sensor(self) -> dict[str, Ints]:
@@ -186,7 +182,8 @@ class DepthMaps:
         pairs = pairs[pairs["sensor_id"] != pairs["sensor_id_depth"]].drop_duplicates()
         return {str(key): [str(i) for i in part] for key, part in pairs.groupby("sensor_id")["sensor_id_depth"]}
 
-    def _sources(self, row: int, timestamp: int, sensor: str) -> tuple[list[_Source], list[str]]:
+    def _sources(self, row: int, timestamp: int, sensor: str) -> tuple[list[_DepthMap], list[str]]:
+        """Return the depth maps of a photograph, and why others are left out."""
         session = self._session
         if session.depths is None:
             return [], []
@@ -194,22 +191,23 @@ class DepthMaps:
         folder, slash, last = sensor.rpartition("/")
         named = folder + slash + last.replace("cam", "depth")
         for other in (sensor, self._renderings.get(sensor, ""), "" if named in mates else named):
-            found = self._nearest(other, timestamp, 0)
-            if found is not None:
+            nearest = self._nearest(other, timestamp, 0)
+            if nearest is not None:
                 own = other == sensor or not session.has_sensor(other)
-                return [_Source(found[1], None if own else session.camera(other), np.eye(4))], []
+                return [_DepthMap(nearest[1], None if own else session.camera(other), np.eye(4))], []
         sources, reasons = [], []
         world_from_cam = session.world_from_cam([row])[0]
         for other in mates:
-            found = self._nearest(other, timestamp, self._max_offset_us)
-            if found is None:
+            nearest = self._nearest(other, timestamp, self._max_offset_us)
+            if nearest is None:
                 continue
-            world_from_depth = self._pose(other, found[0])
+            world_from_depth = self._pose(other, nearest[0])
             if world_from_depth is None or not np.isfinite(world_from_cam).all():
                 why = "its sensor" if world_from_depth is None else "the photograph"
-                reasons.append(f"depth map {found[1]}: {why} has no pose at that time or about it")
+                reasons.append(f"depth map {nearest[1]}: {why} has no pose at that time or about it")
                 continue
-            sources.append(_Source(found[1], session.camera(other), geometry.invert(world_from_cam) @ world_from_depth))
+            cam_from_depth = geometry.invert(world_from_cam) @ world_from_depth
+            sources.append(_DepthMap(nearest[1], session.camera(other), cam_from_depth))
         return sources, reasons
 
     def _nearest(self, sensor: str, timestamp: int, tolerance_us: int) -> tuple[int, str] | None:
@@ -224,7 +222,7 @@ class DepthMaps:
         return int(times[best]), str(self._session.depths["path"].iloc[int(rows[best])])
 
     def _pose(self, sensor: str, timestamp: int) -> Floats | None:
-        """Return world_from_sensor at a time, between two poses on the way from one to the other, or None."""
+        """Return world_from_sensor at a time, interpolated between two poses; None without poses near in time."""
         with self._lock:
             if sensor not in self._tracks:
                 self._tracks[sensor] = self._session.poses_of_sensor(sensor)
@@ -239,8 +237,8 @@ class DepthMaps:
         place = (1 - share) * poses[after - 1, :3, 3] + share * poses[after, :3, 3]
         return geometry.make_pose(turn, place)
 
-    def _points(self, source: _Source, photograph: pycolmap.Camera) -> tuple[Floats, float]:
-        """Return the points (P, 3) of a depth map in the photograph's camera, and how many pixels they are apart.
+    def _points(self, source: _DepthMap, photograph: pycolmap.Camera) -> tuple[Floats, float]:
+        """Return the points (P, 3) of a depth map in the photograph's camera, and their spacing in its pixels.
 
         Raises:
             CaptureError: no such file, not 16 bits, or not of the sensor's size.
@@ -266,7 +264,7 @@ class DepthMaps:
 
 
 def _visible(points: Floats, camera: pycolmap.Camera, cell_px: float, reason: str) -> SeenDepth:
-    """Project points (P, 3) in a camera's frame, and keep the nearest of each cell that nothing next to it hides."""
+    """Project points (P, 3) in a camera's frame; keep the nearest of each cell unless a neighbor occludes it."""
     if len(points):
         points = points[in_view(points[None], view_bounds(camera)[None])[0]]
     pixels = np.asarray(camera.img_from_cam(points), np.float64).reshape(-1, 2) if len(points) else np.zeros((0, 2))

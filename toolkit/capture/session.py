@@ -52,6 +52,7 @@ Strings = NDArray[np.object_]
 Rows = ArrayLike | slice | None
 
 RAW_DATA = "raw_data"
+SUBSESSIONS = "proc/subsessions.txt"
 
 
 class Session:
@@ -150,10 +151,10 @@ class Session:
     @cached_property
     def camera_rows(self) -> Ints:
         """Rows of `images` that cameras took, in file order: no depth maps."""
-        codes = codes_of(as_strings(self.images["sensor_id"]), as_strings(self.sensors["sensor_id"]))
-        if (codes < 0).any():
-            self._sensor_row(str(self.images["sensor_id"].iloc[int(np.argmax(codes < 0))]))
-        return np.flatnonzero((self.sensors["sensor_type"] == "camera").to_numpy(bool)[codes])
+        sensors = self.images["sensor_id"]
+        for sensor in sensors[~sensors.isin(self.sensors["sensor_id"])][:1]:
+            self._sensor_row(sensor)  # raises
+        return np.flatnonzero(sensors.isin(self.sensors["sensor_id"][self.sensors["sensor_type"] == "camera"]))
 
     @cached_property
     def files_fingerprint(self) -> str:
@@ -219,17 +220,9 @@ class Session:
     @cached_property
     def subsessions(self) -> list[str]:
         """The recordings in the session: proc/subsessions.txt, else the first folders of image paths."""
-        if self._has_subsessions:
-            return self._read("proc/subsessions.txt").columns["subsession"].to_pylist()
-        return sorted(set(self._first_folders().to_pylist()))
-
-    @property
-    def _has_subsessions(self) -> bool:
-        return (self.path / "proc" / "subsessions.txt").exists()
-
-    def _first_folders(self) -> pa.Array:
-        parts = pc.split_pattern(as_strings(self.images["path"]), "/", max_splits=1)
-        return pc.if_else(pc.greater(pc.list_value_length(parts), 1), pc.list_element(parts, 0), self.id)
+        if (self.path / SUBSESSIONS).exists():
+            return self._read(SUBSESSIONS).columns["subsession"].to_pylist()
+        return sorted(set(self._subsession_of_image))
 
     def subsession_of(self, rows: Rows = None) -> Strings:
         """Return the subsession of images, (n,) str: the longest that starts path or sensor id, else ""."""
@@ -237,10 +230,12 @@ class Session:
 
     @cached_property
     def _subsession_of_image(self) -> Strings:
-        if not self._has_subsessions:
-            return self._first_folders().to_numpy(zero_copy_only=False)
-        subsessions = np.full(len(self.images), "", object)
         columns = [as_strings(self.images[name]) for name in ("sensor_id", "path")]
+        if not (self.path / SUBSESSIONS).exists():
+            parts = pc.split_pattern(columns[1], "/", max_splits=1)
+            first = pc.if_else(pc.greater(pc.list_value_length(parts), 1), pc.list_element(parts, 0), self.id)
+            return first.to_numpy(zero_copy_only=False)
+        subsessions = np.full(len(self.images), "", object)
         for name in sorted(self.subsessions, key=len):
             for column in columns:
                 subsessions[pc.starts_with(column, f"{name}/").to_numpy(zero_copy_only=False)] = name
@@ -266,15 +261,13 @@ class Session:
         Raises:
             CaptureError: there is no such list.
         """
+        if name == "all" and self.ground_truth is not None:
+            truth = self.ground_truth
+            return pd.DataFrame({"timestamp": truth.timestamps, "device_id": as_pandas(truth.arrow_ids)}, copy=False)
         if name == "all":
-            if self.ground_truth is not None:
-                times, devices = self.ground_truth.timestamps, self.ground_truth.arrow_ids
-            else:
-                times, devices = times_of(self.images), self._devices[0]
-            keys = pd.DataFrame({"timestamp": times, "device_id": as_pandas(devices)}, copy=False)
-            return keys if self.ground_truth is not None else keys.drop_duplicates(ignore_index=True)
-        short = name.removesuffix(".txt").removeprefix("keyframes_")
-        files = self.keyframe_files
+            keys = pd.DataFrame({"timestamp": times_of(self.images), "device_id": as_pandas(self._devices[0])})
+            return keys.drop_duplicates(ignore_index=True)
+        short, files = name.removesuffix(".txt").removeprefix("keyframes_"), self.keyframe_files
         if short not in files:
             raise CaptureError(
                 f"Session {self.id} has no keyframe list {name!r}; available: "
@@ -380,9 +373,8 @@ class Session:
     @cached_property
     def _image_index(self) -> tuple[KeyIndex, Ints]:
         """Finds photographs by (timestamp, device_id); the second part has the row in `images` of each."""
-        types = as_strings(self.sensors["sensor_type"])
-        others = as_strings(self.sensors["sensor_id"]).filter(pc.not_equal(types, "camera"))
-        photographs = np.flatnonzero(codes_of(as_strings(self.images["sensor_id"]), others) < 0)
+        others = self.sensors["sensor_id"][self.sensors["sensor_type"] != "camera"]
+        photographs = np.flatnonzero(~self.images["sensor_id"].isin(others))
         devices = self._devices[0].take(pa.array(photographs))
         return KeyIndex(times_of(self.images)[photographs], devices), photographs
 
