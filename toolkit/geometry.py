@@ -35,19 +35,19 @@ def quaternion_to_rotation(qwxyz: ArrayLike) -> Array:
     if not np.all(np.isfinite(norm)) or np.any(norm < 1e-12):
         raise ValueError("A quaternion is zero or not finite; expected qw qx qy qz of length 1.")
     w, x, y, z = np.moveaxis(unit(q), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    elements = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        *(2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        *(2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
     ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return np.stack(elements, axis=-1).reshape(*q.shape[:-1], 3, 3)
 
 
 def rotation_to_quaternion(rotation: ArrayLike) -> Array:
     """Return unit quaternions (..., 4), qw >= 0, of rotation matrices (..., 3, 3).
 
-    The branch with the largest of the four components is taken for each matrix (Shepperd 1978), which stays
-    exact at 180 degrees.
+    Each is computed from its largest component (Shepperd 1978), which stays exact at 180 degrees. SciPy's conversions
+    round otherwise, in both directions: with them the last digits of poses in files would change.
     """
     R = np.asarray(rotation, np.float64)
     if R.shape[-2:] != (3, 3):
@@ -56,19 +56,16 @@ def rotation_to_quaternion(rotation: ArrayLike) -> Array:
     a, b, c = R[..., 2, 1], R[..., 0, 2], R[..., 1, 0]
     d, e, f = R[..., 1, 2], R[..., 2, 0], R[..., 0, 1]
     # Each row is 4 * q_k * q for one k: any of them is the quaternion up to scale.
-    rows = np.stack(
-        [
-            np.stack([1 + m00 + m11 + m22, a - d, b - e, c - f], -1),
-            np.stack([a - d, 1 + m00 - m11 - m22, c + f, b + e], -1),
-            np.stack([b - e, c + f, 1 - m00 + m11 - m22, a + d], -1),
-            np.stack([c - f, b + e, a + d, 1 - m00 - m11 + m22], -1),
-        ],
-        axis=-2,
-    )
+    elements = [
+        *(1 + m00 + m11 + m22, a - d, b - e, c - f),
+        *(a - d, 1 + m00 - m11 - m22, c + f, b + e),
+        *(b - e, c + f, 1 - m00 + m11 - m22, a + d),
+        *(c - f, b + e, a + d, 1 - m00 - m11 + m22),
+    ]
+    rows = np.stack(elements, axis=-1).reshape(*R.shape[:-2], 4, 4)
     best = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
     q = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
-    q = unit(q)
-    return np.where(q[..., :1] < 0, -q, q)
+    return np.where(q[..., :1] < 0, -unit(q), unit(q))
 
 
 def pose_from_qt(qt: ArrayLike) -> Array:
@@ -109,14 +106,12 @@ def transform(a_from_b: ArrayLike, points_in_b: ArrayLike) -> Array:
 
 
 def rotation_angle_deg(rotation: ArrayLike) -> Array:
-    """Return the angle, degrees in [0, 180], of rotations (..., 3, 3).
+    """Return the angle, degrees in [0, 180], of rotations (..., 3, 3); NaN for NaN.
 
-    From atan2 of the skew part and the trace: exact near 0, where arccos of the trace alone is not.
+    It is atan2 of the skew part and the trace: exact near 0, where arccos of the trace alone is not.
     """
     R = np.asarray(rotation, np.float64)
-    skew = np.stack(
-        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1
-    )
+    skew = np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1)
     trace = np.trace(R, axis1=-2, axis2=-1)
     return np.degrees(np.arctan2(np.linalg.norm(skew, axis=-1), trace - 1.0))
 

@@ -1,4 +1,4 @@
-"""Cameras: intrinsics as sensors.txt has them, rays, and what a camera sees."""
+"""Cameras: intrinsics in the format of sensors.txt, rays, and the view of a camera."""
 
 import numpy as np
 import pycolmap
@@ -15,19 +15,18 @@ def parse_camera(sensor_type: str, params: str) -> pycolmap.Camera:
     """Return the camera that a line of sensors.txt describes.
 
     Args:
-        params: what follows the sensor type: `MODEL, width, height, parameter, ...`.
+        sensor_type: `camera` or `depth`.
+        params: the text after the sensor type: `MODEL, width, height, parameter, ...`.
 
     Raises:
         ValueError: it is not a camera, or its model, size or parameters are not valid.
     """
     if sensor_type not in CAMERA_TYPES:
-        raise ValueError(
-            f"found type {sensor_type!r}, expected one with intrinsics: {' or '.join(CAMERA_TYPES)}."
-        )
+        raise ValueError(f"found type {sensor_type!r}, expected one with intrinsics: {' or '.join(CAMERA_TYPES)}.")
     model, *values = [value.strip() for value in params.split(",")]
-    known = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
-    if model not in known:
-        raise ValueError(f"found camera model {model!r}, expected one of {', '.join(sorted(known))}.")
+    models = sorted(set(pycolmap.CameraModelId.__members__) - {"INVALID"})
+    if model not in models:
+        raise ValueError(f"found camera model {model!r}, expected one of {', '.join(models)}.")
     count = len(pycolmap.Camera.create_from_model_name(0, model, 1.0, 1, 1).params)
     try:
         # The benchmark writes whole numbers without a point, other tools `960.0`.
@@ -63,9 +62,9 @@ def rays_of(camera: pycolmap.Camera, pixels: NDArray[np.floating]) -> Floats:
 
 
 def projection_jacobian(in_cams: Floats, focals_px: Floats) -> Floats:
-    """Return how the projections of points (n, 3) in cameras' frames move with them, pixels a meter: (n, 2, 3).
+    """Return the Jacobians (n, 2, 3), pixels per meter, of the projections (f x/z, f y/z) of points (n, 3).
 
-    d(f x/z, f y/z), with the depth z at least 1 mm.
+    The points are in the cameras' frames; the depth z counts as at least 1 mm.
     """
     z = np.maximum(in_cams[:, 2], 1e-3)
     scale = focals_px / z

@@ -1,8 +1,8 @@
-"""The kinds of devices: rows of a table, and what their sessions are called.
+"""The table of device kinds, and the names of their sessions.
 
-A capture's sessions say which kinds it has: every folder `<kind>_map` or `<kind>_query` is a session of that kind, and
-a kind that no row is about takes part like the others. Rows hold what a name alone does not tell. A manifest adds rows
-with `extra_devices`; a run hands them to its notebooks in the environment.
+Every folder `<kind>_map` or `<kind>_query` of a capture is a session of that kind. The table gives a kind its label,
+its color and session names of other data sets; a kind without a row is treated like the others. A manifest adds rows
+with `extra_devices`; a run passes them to its notebooks in the environment.
 """
 
 import json
@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 
 EXTRA_DEVICES = "TOOLKIT_EXTRA_DEVICES"
-"""Variable of the environment that holds the rows a manifest adds, as JSON."""
+"""Environment variable with the rows that a manifest adds, as JSON."""
 SPLITS = ("map", "query")
 
 
@@ -22,22 +22,22 @@ class DeviceKind:
     """One kind of device."""
 
     key: str
-    """In session names, file names and tables."""
+    """Name in session folders, file names and tables."""
     label: str
-    """For people."""
+    """Name for people."""
     color: str
-    """In figures, as #rrggbb."""
+    """Color in figures, #rrggbb."""
     sessions: Mapping[str, str] = field(default_factory=dict)
     """Name of the session folder by split, where a data set does not call it `<key>_<split>`."""
 
 
-# Colors of Okabe and Ito, which people with any color vision tell apart. Session names are those of LaMAR.
+# Colors of Okabe and Ito, which people with any color vision can distinguish. Session names are those of LaMAR.
 TABLE = (
     DeviceKind("ios", "phone", "#0072B2", {"query": "query_phone"}),
     DeviceKind("hl", "headset", "#D55E00", {"query": "query_hololens"}),
     DeviceKind("spot", "robot", "#009E73"),
 )
-# LaMAR has one map, which all its devices took.
+# LaMAR has one map, with images of all its devices.
 OTHER_SESSIONS = {"map": ("mixed", "map")}
 _FURTHER_COLORS = ("#CC79A7", "#8C6D1F", "#332288", "#882255")
 
@@ -46,19 +46,19 @@ def kinds() -> tuple[DeviceKind, ...]:
     """Return the rows of the table, with those that the manifest of this run adds or replaces."""
     rows = {kind.key: kind for kind in TABLE}
     for row in json.loads(os.environ.get(EXTRA_DEVICES, "[]")):
-        known = rows.get(row["key"])
-        label = row.get("label") or (known.label if known else row["key"])
-        color = row.get("color") or (known.color if known else _color_of_other(row["key"]))
-        rows[row["key"]] = DeviceKind(row["key"], label, color, row.get("sessions") or {})
+        key = row["key"]
+        default = rows.get(key) or DeviceKind(key, key, _color_of_other(key))
+        label, color = row.get("label") or default.label, row.get("color") or default.color
+        rows[key] = DeviceKind(key, label, color, row.get("sessions") or {})
     return tuple(rows.values())
 
 
 @contextmanager
 def extra_devices(rows: Sequence[Mapping[str, object]]) -> Iterator[None]:
-    """Add rows to the table, here and in processes that are started meanwhile.
+    """Add rows to the table, in this process and in those that it starts within the context.
 
     Args:
-        rows: `key`, and where they are given `label`, `color`, `sessions`, as in `DeviceKind`.
+        rows: `key` and, optionally, `label`, `color`, `sessions`, as in `DeviceKind`.
     """
     before = os.environ.get(EXTRA_DEVICES)
     os.environ[EXTRA_DEVICES] = json.dumps([dict(row) for row in rows])
@@ -71,33 +71,30 @@ def extra_devices(rows: Sequence[Mapping[str, object]]) -> Iterator[None]:
 
 
 def table_record() -> list[dict[str, object]]:
-    """Return the table as JSON, for what is made from it."""
+    """Return the table as JSON, for fingerprints of artifacts that depend on it."""
     return [asdict(kind) for kind in kinds()]
 
 
 def color_of(key: str) -> str:
-    """Return the color of a kind of device, #rrggbb; one of a few for a kind that has no row."""
+    """Return the color of a kind of device, #rrggbb; a kind without a row has one of a few others."""
     return next((kind.color for kind in kinds() if kind.key == key), _color_of_other(key))
 
 
 def in_order(keys: Iterable[str]) -> list[str]:
-    """Return different keys in the order of the table, and after those the ones that have no row, by name."""
-    present = set(keys)
-    known = [kind.key for kind in kinds() if kind.key in present]
-    return known + sorted(present - set(known))
+    """Return the different keys in the order of the table; keys without a row come last, by name."""
+    order = [kind.key for kind in kinds()]
+    return sorted(set(keys), key=lambda key: (order.index(key) if key in order else len(order), key))
 
 
 def session_of(folder: str) -> tuple[str, str]:
-    """Return kind and split of the session in a folder of this name; another folder's split is none of `SPLITS`."""
-    other = {name: (kind.key, split) for kind in kinds() for split, name in kind.sessions.items()}
-    if folder in (names := OTHER_SESSIONS | other):
-        return names[folder]
+    """Return kind and split of the session in a folder; the split of a folder that is no session is not in `SPLITS`."""
+    names = {name: (kind.key, split) for kind in kinds() for split, name in kind.sessions.items()}
     key, _, split = folder.rpartition("_")
-    return key, split
+    return (OTHER_SESSIONS | names).get(folder, (key, split))
 
 
 def session_id(folder: str) -> str:
-    """Return what the session in a folder of this name is called in all outputs, `<key>_<split>`."""
+    """Return the name that the session in a folder has in all outputs, `<key>_<split>`."""
     key, split = session_of(folder)
     return f"{key}_{split}" if split in SPLITS else folder
 

@@ -1,4 +1,4 @@
-"""What a photograph's file says of itself: its size as stored, when it was taken, and a guess of its intrinsics."""
+"""The metadata in the file of a photograph: its size as stored, when it was taken, and a guess of its intrinsics."""
 
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -36,7 +36,7 @@ def read_header(path: Path) -> tuple[tuple[int, int], dict[int, Any]]:
 
 
 def time_taken(exif: Mapping[int, Any]) -> int | None:
-    """Return microseconds since 1970 of the camera's clock, whose time zone is not known."""
+    """Return the time by the camera's clock, microseconds since 1970, of unknown time zone; None without a tag."""
     try:
         taken = datetime.strptime(str(exif[_TIME]), "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
     except (KeyError, ValueError):
@@ -46,7 +46,7 @@ def time_taken(exif: Mapping[int, Any]) -> int | None:
 
 
 def read_number(exif: Mapping[int, Any], tag: int) -> float:
-    """Return the number of a tag; 0 where there is none."""
+    """Return the number of a tag; 0 if it is missing, not a number or not finite."""
     try:
         number = float(exif.get(tag, 0))
     except (TypeError, ValueError, ZeroDivisionError):
@@ -55,13 +55,13 @@ def read_number(exif: Mapping[int, Any], tag: int) -> float:
 
 
 def exif_camera(path: Path) -> tuple[pycolmap.Camera, str]:
-    """Guess the intrinsics of an image from its EXIF tags: no distortion, the middle of the image in its center.
+    """Guess the intrinsics of an image from its EXIF tags: no distortion, the principal point in the center.
 
-    FocalLengthIn35mmFilm is taken at the diagonal of 36 mm x 24 mm film, as CIPA DC-008 has it; else FocalLength with
-    FocalPlaneXResolution, scaled where the image was resized since.
+    FocalLengthIn35mmFilm refers to the diagonal of 36 mm x 24 mm film, as in CIPA DC-008. Without that tag the guess is
+    FocalLength times FocalPlaneXResolution, scaled if the image was resized later.
 
     Returns:
-        A SIMPLE_PINHOLE camera, and a sentence that says what it rests on.
+        A SIMPLE_PINHOLE camera, and a phrase that says which tags it rests on.
 
     Raises:
         ImageError: the image cannot be read, or has no focal length in EXIF.

@@ -40,7 +40,7 @@ def read_image(path: str | Path, gray: bool = False) -> NDArray[np.uint8]:
 
 
 def read_for_display(path: str | Path) -> NDArray[np.uint8]:
-    """Return an image, (H, W, 3) RGB, or a gray one that says so where it cannot be read: pictures go on."""
+    """Return an image, (H, W, 3) RGB; a gray image with the text `unreadable` if it cannot be read."""
     try:
         return read_image(path)
     except ImageError:
@@ -50,7 +50,7 @@ def read_for_display(path: str | Path) -> NDArray[np.uint8]:
 
 
 def default_workers() -> int:
-    """Return the number of threads to use where nobody asks for one: the cores at hand, at most 8."""
+    """Return the default number of threads: the available cores, at most 8."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min(cores, 8)
 
@@ -58,8 +58,8 @@ def default_workers() -> int:
 def prefetch(function: Callable[[T], R], items: Iterable[T], workers: int = 2, ahead: int = 4) -> Iterator[R]:
     """Yield `function(item)` in order while `workers` threads work on the next ones, at most `ahead` of them.
 
-    Memory stays bounded however long `items` is. For functions that release the interpreter lock (decoding,
-    SIFT, RANSAC); an exception of `function` is raised at its item's turn.
+    Memory stays bounded however long `items` is. Meant for functions that release the interpreter lock (decoding, SIFT,
+    RANSAC). An exception of `function` is raised when its item's turn comes.
     """
     pool = ThreadPoolExecutor(workers)
     pending: deque[Future[R]] = deque()

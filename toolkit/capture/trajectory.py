@@ -60,11 +60,7 @@ class Trajectory:
 
     @classmethod
     def from_poses(
-        cls,
-        timestamps: ArrayLike,
-        device_ids: Any,
-        world_from_device: ArrayLike,
-        covariances: ArrayLike | None = None,
+        cls, timestamps: ArrayLike, device_ids: Any, world_from_device: ArrayLike, covariances: ArrayLike | None = None
     ) -> "Trajectory":
         """Make a trajectory of poses (N, 4, 4)."""
         return cls(timestamps, device_ids, qt_from_pose(world_from_device), covariances)

@@ -35,7 +35,6 @@ SHARES = {"sensor": 0.0, "role": MAJORITY, "name": MAJORITY, "device": MAJORITY}
 """Share of the votes that a decision needs, for each kind of name under which sensors are looked up."""
 
 
-
 @dataclass(frozen=True)
 class _TurnsByName:
     """Quarter turns that map images voted for, by a name that sensors share.
