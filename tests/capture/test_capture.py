@@ -26,10 +26,7 @@ PINHOLE = ("camera", "PINHOLE", 64, 48, 50.5, 51.5, 32.0, 24.0)
 
 def write(path: Path, files: dict[str, str]) -> Path:
     """Write text files of a session; sensors.txt and images.txt of one camera unless given."""
-    defaults = {
-        "sensors.txt": "cam, , camera, PINHOLE, 64, 48, 50, 50, 32, 24\n",
-        "images.txt": "1, cam, a/1.jpg\n",
-    }
+    defaults = {"sensors.txt": "cam, , camera, PINHOLE, 64, 48, 50, 50, 32, 24\n", "images.txt": "1, cam, a/1.jpg\n"}
     for name, text in (defaults | files).items():
         (path / name).parent.mkdir(parents=True, exist_ok=True)
         (path / name).write_bytes(text.encode() if isinstance(text, str) else text)
@@ -45,9 +42,7 @@ def rows_of(session: Session, timestamp: int, device_id: str) -> list[int]:
 def session(tmp_path: Path) -> Session:
     """Two cameras, a rig made anew for each of three frames, one more camera without rig, a covariance."""
     rng = np.random.default_rng(0)
-    rows = [(t, f"s/cam{c}", f"s/cam{c}/{t}.jpg") for t in (10, 20, 30) for c in (0, 1)] + [
-        (20, "s/free", "s/f.jpg")
-    ]
+    rows = [(t, f"s/cam{c}", f"s/cam{c}/{t}.jpg") for t in (10, 20, 30) for c in (0, 1)] + [(20, "s/free", "s/f.jpg")]
     qt = rng.normal(size=(4, 7))
     qt[:, :4] /= np.linalg.norm(qt[:, :4], axis=1, keepdims=True)
     trajectory = Trajectory(
@@ -55,12 +50,7 @@ def session(tmp_path: Path) -> Session:
     )
     write_session(
         tmp_path / "hl_map",
-        [
-            ("s/cam0", "left", *PINHOLE),
-            ("s/cam1", "", *PINHOLE),
-            ("s/free", "free", *PINHOLE),
-            ("s/imu", "", "imu"),
-        ],
+        [("s/cam0", "left", *PINHOLE), ("s/cam1", "", *PINHOLE), ("s/free", "free", *PINHOLE), ("s/imu", "", "imu")],
         [(f"s/rig_{t}", f"s/cam{c}", rng.normal(size=7)) for t in (10, 20, 30) for c in (0, 1)],
         trajectory,
         rows,
@@ -98,14 +88,12 @@ def test_a_written_session_reads_back_equal_and_is_written_again_byte_for_byte(
 def test_rigs_given_as_matrices_are_written_as_poses(tmp_path: Path) -> None:
     pose = np.eye(4)
     pose[:3, 3] = 1, 2, 3
-    write_session(
-        tmp_path / "hl_map", [("cam", "", *PINHOLE)], [("rig", "cam", pose)], None, [(1, "cam", "a.jpg")]
-    )
+    write_session(tmp_path / "hl_map", [("cam", "", *PINHOLE)], [("rig", "cam", pose)], None, [(1, "cam", "a.jpg")])
     np.testing.assert_array_equal(Session.open(tmp_path / "hl_map").rig_from_sensor_table, [pose])
 
 
 def test_a_comma_cannot_be_written(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="cannot hold a comma"):
+    with pytest.raises(ValueError, match="a,b"):
         write_session(tmp_path, [("a,b", "", *PINHOLE)], None, None, [])
 
 
@@ -161,9 +149,7 @@ def test_a_frame_takes_the_rig_of_its_time(session: Session) -> None:
 
 
 def test_without_poses_a_keyframe_then_the_name_of_the_rig_tells_it(tmp_path: Path) -> None:
-    rigs = "".join(
-        f"{rig}, cam, 1, 0, 0, 0, {i}, 0, 0\n" for i, rig in enumerate(["s1/a_7", "s1/b", "s2022/9-body"])
-    )
+    rigs = "".join(f"{rig}, cam, 1, 0, 0, 0, {i}, 0, 0\n" for i, rig in enumerate(["s1/a_7", "s1/b", "s2022/9-body"]))
     path = write(
         tmp_path / "spot_query",
         {
@@ -194,10 +180,7 @@ def test_files_as_programs_write_them(tmp_path: Path) -> None:
         },
     )
     session = Session.open(path)
-    assert session.images.to_numpy().tolist()[:2] == [
-        [1, "s/cam 1/ä?", "s/1.jpg"],
-        [2, "s/cam 1/ä?", "s/2.jpg"],
-    ]
+    assert session.images.to_numpy().tolist()[:2] == [[1, "s/cam 1/ä?", "s/1.jpg"], [2, "s/cam 1/ä?", "s/2.jpg"]]
     assert session.image_path(1) == path / "raw_data" / "s" / "2.jpg"
     assert session.image_name(1) == "ios_query/raw_data/s/2.jpg"
     assert [session.row_of_name[name] for name in session.image_names] == [0, 1, 2]
@@ -209,43 +192,26 @@ def test_files_as_programs_write_them(tmp_path: Path) -> None:
     assert session.camera_rows.tolist() == [0, 1]
     assert session.trajectory.covariances is None
     assert session.trajectory.qt[0, 4] == 10
-    with pytest.raises(
-        CaptureError, match=r"sensors.txt, line 4: .*found type 'wifi', expected one with intrinsics"
-    ):
+    with pytest.raises(CaptureError, match=r"sensors.txt, line 4: .*'wifi'"):
         session.camera("wifi")
-    with pytest.raises(CaptureError, match="Unknown sensor 'nothing' in session ios_query"):
+    with pytest.raises(CaptureError, match=r"'nothing'.*sensors\.txt"):
         session.camera("nothing")
-
-
-POSE_COLUMNS = "qw, qx, qy, qz, tx, ty, tz"
 
 
 @pytest.mark.parametrize(
     ("file", "line", "message"),
     [
-        ("images.txt", "2, cam", "found 2 values in '2, cam', expected 3: timestamp, sensor_id, image_path"),
-        ("images.txt", "2.5, cam, a.jpg", "found timestamp = '2.5', expected an integer (microseconds)"),
-        ("images.txt", "x, cam, a.jpg", "found timestamp = 'x', expected an integer"),
-        ("images.txt", "2, , a.jpg", "found sensor_id = '', expected a text that is not empty"),
-        ("images.txt", "2, cam,", "found image_path = '', expected a text"),
-        (
-            "sensors.txt",
-            "cam2, name",
-            "found 2 values in 'cam2, name', expected 3: sensor_id, name, sensor_type",
-        ),
-        (
-            "rigs.txt",
-            "rig, cam, 1, 0, 0, 0, 0, 0",
-            f"found 8 values in 'rig, cam, 1, 0, 0, 0, 0, 0', expected 9: rig_id, sensor_id, {POSE_COLUMNS}",
-        ),
-        ("rigs.txt", "rig, cam, 0, 0, 0, 0, 1, 2, 3", "found a zero quaternion, expected length 1"),
-        ("trajectories.txt", "2, cam, 1, 0, 0, 0, 0, nan, 0", "found ty = 'nan', expected a finite number"),
-        ("trajectories.txt", "2, cam, 1, 0, 0, 0, 0, one, 0", "found ty = 'one', expected a finite number"),
-        (
-            "proc/alignment_trajectories.txt",
-            "2, cam, inf, 0, 0, 0, 0, 0, 0",
-            "found qw = 'inf', expected a finite",
-        ),
+        ("images.txt", "2, cam", "found 2 values in '2, cam'"),
+        ("images.txt", "2.5, cam, a.jpg", "found timestamp = '2.5'"),
+        ("images.txt", "x, cam, a.jpg", "found timestamp = 'x'"),
+        ("images.txt", "2, , a.jpg", "found sensor_id = ''"),
+        ("images.txt", "2, cam,", "found image_path = ''"),
+        ("sensors.txt", "cam2, name", "found 2 values in 'cam2, name'"),
+        ("rigs.txt", "rig, cam, 1, 0, 0, 0, 0, 0", "found 8 values in 'rig, cam, 1, 0, 0, 0, 0, 0'"),
+        ("rigs.txt", "rig, cam, 0, 0, 0, 0, 1, 2, 3", "found a zero quaternion"),
+        ("trajectories.txt", "2, cam, 1, 0, 0, 0, 0, nan, 0", "found ty = 'nan'"),
+        ("trajectories.txt", "2, cam, 1, 0, 0, 0, 0, one, 0", "found ty = 'one'"),
+        ("proc/alignment_trajectories.txt", "2, cam, inf, 0, 0, 0, 0, 0, 0", "found qw = 'inf'"),
         ("images.txt", b"2, c\xe4m, a.jpg", "found bytes that are not UTF-8"),
     ],
 )
@@ -272,7 +238,7 @@ def test_line_numbers_hold_across_blocks(tmp_path: Path, monkeypatch: pytest.Mon
     rows[2345] = "nonsense"
     rows[77] = "1.5, cam, a.jpg"
     path = write(tmp_path / "ios_map", {"images.txt": "# header\n" + "\n".join(rows)})
-    with pytest.raises(CaptureError, match=r"line 79: found timestamp = '1.5'.*1 more such"):
+    with pytest.raises(CaptureError, match=r"images.txt, line 79: .*'1.5'.*1 more"):
         Session.open(path)
     assert [line for line, _ in Session(path, strict=False).tables["images.txt"].problems] == [79, 2347]
 
@@ -283,8 +249,7 @@ def test_every_camera_model_of_colmap_opens(tmp_path: Path) -> None:
     models = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
     cameras = {name: pycolmap.Camera.create_from_model_name(0, name, 50.0, 64, 48) for name in models}
     sensors = [
-        (name, "", "camera", name, 64, 48, *(camera.params + 0.125).tolist())
-        for name, camera in cameras.items()
+        (name, "", "camera", name, 64, 48, *(camera.params + 0.125).tolist()) for name, camera in cameras.items()
     ]
     write_session(tmp_path / "ios_map", sensors, None, None, [])
     session = Session.open(tmp_path / "ios_map")
@@ -382,9 +347,7 @@ def test_keyframe_lists(session: Session) -> None:
     expected = [[20, "s/rig_20"]]
     assert session.keyframes("pruned").to_numpy().tolist() == expected
     assert session.keyframes("keyframes_pruned").to_numpy().tolist() == expected
-    with pytest.raises(
-        CaptureError, match=r"no keyframe list 'keyframes_pruned_subsampled'; available: pruned, all"
-    ):
+    with pytest.raises(CaptureError, match=r"'keyframes_pruned_subsampled'; available: pruned, all"):
         session.keyframes()
 
 
@@ -394,10 +357,10 @@ def test_depth_maps(session: Session, tmp_path: Path) -> None:
     depth = np.array([[0, 1.5], [70, np.nan], [-1, 65.535]], np.float32)
     write_depth(tmp_path / "d.png", depth)
     np.testing.assert_array_equal(read_depth(tmp_path / "d.png"), np.float32([[0, 1.5], [0, 0], [0, 65.535]]))
-    with pytest.raises(CaptureError, match="no such file"):
+    with pytest.raises(CaptureError, match="Depth map"):
         read_depth(tmp_path / "none.png")
     (tmp_path / "bad.png").write_bytes(b"no image")
-    with pytest.raises(CaptureError, match="no 16-bit image"):
+    with pytest.raises(CaptureError, match="Depth map"):
         read_depth(tmp_path / "bad.png")
 
 
@@ -407,34 +370,30 @@ def test_capture_opens_sessions_lazily(tmp_path: Path) -> None:
     write(root / "ios_map", {"images.txt": "broken\n"})
     (root / "notes").mkdir()
     capture = Capture.from_sessions_root(root)
-    assert (capture.name, list(capture), capture.devices) == (
-        "PLACE",
-        ["ios_map", "spot_query"],
-        ["ios", "spot"],
-    )
+    assert (capture.name, list(capture), capture.devices) == ("PLACE", ["ios_map", "spot_query"], ["ios", "spot"])
     assert "ios_map" in capture
     assert "hl_map" not in capture
     assert capture["spot_query"] is capture["spot_query"]
     with pytest.raises(CaptureError, match="line 1"):
         capture["ios_map"]
-    with pytest.raises(CaptureError, match=r"no session 'hl_map'; known: ios_map, spot_query"):
+    with pytest.raises(CaptureError, match=r"'hl_map'.*ios_map, spot_query"):
         capture["hl_map"]
 
 
 def test_what_is_no_capture_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(CaptureError, match="No such capture folder"):
+    with pytest.raises(CaptureError, match="capture folder"):
         Capture.open(tmp_path / "none")
-    with pytest.raises(CaptureError, match="has no folder `sessions`"):
+    with pytest.raises(CaptureError, match="sessions"):
         Capture.open(tmp_path)
     (tmp_path / "sessions").mkdir()
-    with pytest.raises(CaptureError, match="holds no session"):
+    with pytest.raises(CaptureError, match="sessions"):
         Capture.open(tmp_path)
     with pytest.raises(CaptureError, match="is not the `sessions` folder"):
         Capture.from_sessions_root(tmp_path)
-    with pytest.raises(CaptureError, match="No such session folder"):
+    with pytest.raises(CaptureError, match="ios_map"):
         Session.open(tmp_path / "ios_map")
     (tmp_path / "ios_map").mkdir()
-    with pytest.raises(CaptureError, match=r"sensors.txt: file not found; expected lines of `sensor_id"):
+    with pytest.raises(CaptureError, match=r"sensors.txt: "):
         Session.open(tmp_path / "ios_map")
 
 
@@ -485,5 +444,5 @@ def test_a_camera_reads_back_as_it_was_written(text: str) -> None:
 
 
 def test_a_focal_length_of_zero_is_refused() -> None:
-    with pytest.raises(ValueError, match="focal length that is not positive"):
+    with pytest.raises(ValueError, match="focal length"):
         parse_camera("camera", "PINHOLE, 640, 480, 0, 500, 320, 240")

@@ -63,13 +63,7 @@ def test_a_good_capture_has_no_problems(capture: Path) -> None:
     assert report.problems == []
     text = report.text()
     assert "0 errors, 0 warnings." in text
-    for expected in (
-        "hl_map",
-        "2 camera, 1 imu",
-        "2 PINHOLE 64 48",
-        "2 sensors each",
-        "4 of 4 images have one",
-    ):
+    for expected in ("hl_map", "2 camera, 1 imu", "2 PINHOLE 64 48", "2 sensors each", "4 of 4 images have one"):
         assert expected in text
     table = report.tables["hl_query"].set_index("what")
     assert table.loc["images", "count"] == "4"
@@ -83,17 +77,9 @@ def test_a_good_capture_has_no_problems(capture: Path) -> None:
     [
         ("hl_map/images.txt", "1, s/a", ":6: error: found 2 values in '1, s/a', expected 3"),
         ("hl_map/images.txt", "30, s/x, s/a/10.jpg", ":6: error: unknown sensor 's/x': not in sensors.txt"),
-        (
-            "hl_map/images.txt",
-            "20, s/a, s/a/20.jpg",
-            ":6: error: duplicate key (timestamp 20, sensor_id 's/a')",
-        ),
+        ("hl_map/images.txt", "20, s/a, s/a/20.jpg", ":6: error: duplicate key (timestamp 20, sensor_id 's/a')"),
         ("hl_map/images.txt", "30, s/a, s/a/30.jpg", ":6: error: missing file raw_data/s/a/30.jpg"),
-        (
-            "hl_map/images.txt",
-            "30, s/a, s/a/10.jpg",
-            ":6: warning: image without pose (timestamp 30, sensor 's/a')",
-        ),
+        ("hl_map/images.txt", "30, s/a, s/a/10.jpg", ":6: warning: image without pose (timestamp 30, sensor 's/a')"),
         (
             "hl_map/images.txt",
             "10, imu, t/10.jpg",
@@ -103,30 +89,14 @@ def test_a_good_capture_has_no_problems(capture: Path) -> None:
         ("hl_map/depths.txt", "10, s/a, s/a/10.png", ":1: error: missing file raw_data/s/a/10.png"),
         ("hl_map/depths.txt", "10, render/s/x, s/a/10.jpg", ":1: error: unknown sensor 'render/s/x'"),
         ("hl_map/rigs.txt", f"r, s/x, {QT}", ":6: error: unknown sensor 's/x': not in sensors.txt"),
-        (
-            "hl_map/rigs.txt",
-            f"s/rig_10, s/a, {QT}",
-            ":6: error: duplicate key (rig_id 's/rig_10', sensor_id 's/a')",
-        ),
+        ("hl_map/rigs.txt", f"s/rig_10, s/a, {QT}", ":6: error: duplicate key (rig_id 's/rig_10', sensor_id 's/a')"),
         ("hl_map/rigs.txt", f"imu, s/a, {QT}", ":6: error: rig 'imu' has the name of a sensor"),
         ("hl_map/rigs.txt", "r, s/a, 0, 0, 0, 0, 1, 1, 1", ":6: error: found a zero quaternion"),
         ("hl_map/sensors.txt", "s/a, , wifi", ":5: error: duplicate key (sensor_id 's/a')"),
-        (
-            "hl_map/sensors.txt",
-            "c, , camera, PINHOLE, 1, 1, 1",
-            ":5: error: found 1 parameters for model PINHOLE",
-        ),
-        (
-            "hl_map/sensors.txt",
-            "c, , depth, PIN, 1, 1, 1",
-            ":5: error: found camera model 'PIN', expected one of",
-        ),
+        ("hl_map/sensors.txt", "c, , camera, PINHOLE, 1, 1, 1", ":5: error: found 1 parameters for model PINHOLE"),
+        ("hl_map/sensors.txt", "c, , depth, PIN, 1, 1, 1", ":5: error: found camera model 'PIN', expected one of"),
         ("hl_map/trajectories.txt", f"10, x, {QT}", ":4: error: unknown device 'x'"),
-        (
-            "hl_map/trajectories.txt",
-            f"10, s/rig_10, {QT}",
-            ":4: error: duplicate key (timestamp 10, device_id",
-        ),
+        ("hl_map/trajectories.txt", f"10, s/rig_10, {QT}", ":4: error: duplicate key (timestamp 10, device_id"),
         (
             "hl_map/trajectories.txt",
             f"30, s/rig_10, {QT}",
@@ -139,33 +109,17 @@ def test_a_good_capture_has_no_problems(capture: Path) -> None:
             "10, s/a, 2, 0, 0, 0, 1, 1, 1",
             ":4: warning: quaternion 2.0 0.0 0.0 0.0 is not of length 1",
         ),
-        (
-            "hl_map/trajectories.txt",
-            f"10, s/a, {QT}, 1, 2",
-            ":4: warning: 2 values after the pose, expected none",
-        ),
+        ("hl_map/trajectories.txt", f"10, s/a, {QT}, 1, 2", ":4: warning: 2 values after the pose, expected none"),
         (
             "hl_map/trajectories.txt",
             f"10, s/a, {QT}" + ", 1" * 35 + ", nan",
             ":4: error: the covariance has values that are not finite",
         ),
         ("hl_query/proc/keyframes_pruned.txt", "10, x", ":3: error: unknown device 'x'"),
-        (
-            "hl_query/proc/keyframes_pruned.txt",
-            "10, s/rig_10",
-            ":3: error: duplicate key (timestamp 10, device_id",
-        ),
-        (
-            "hl_query/proc/keyframes_pruned.txt",
-            "30, s/rig_10",
-            ":3: error: keyframe without image (timestamp 30",
-        ),
+        ("hl_query/proc/keyframes_pruned.txt", "10, s/rig_10", ":3: error: duplicate key (timestamp 10, device_id"),
+        ("hl_query/proc/keyframes_pruned.txt", "30, s/rig_10", ":3: error: keyframe without image (timestamp 30"),
         ("hl_query/proc/keyframes_pruned.txt", "ten, s/rig_10", ":3: error: found timestamp = 'ten'"),
-        (
-            "hl_query/proc/keyframes_new.txt",
-            "10, s/a",
-            ":1: warning: keyframe without ground truth (timestamp 10",
-        ),
+        ("hl_query/proc/keyframes_new.txt", "10, s/a", ":1: warning: keyframe without ground truth (timestamp 10"),
         ("hl_map/proc/subsessions.txt", "t", ":2: warning: subsession 't' has no images"),
         ("hl_map/proc/subsessions.txt", "s", ":2: error: duplicate key (subsession 's')"),
     ],
@@ -221,17 +175,12 @@ def test_warnings_alone_leave_it_ok(capture: Path) -> None:
 
 def test_a_map_without_trajectories_is_an_error(capture: Path) -> None:
     (capture / "sessions" / "hl_map" / "trajectories.txt").unlink()
-    assert found(capture) == [
-        "hl_map/trajectories.txt: error: file not found: images of a map session need poses"
-    ]
+    assert found(capture) == ["hl_map/trajectories.txt: error: file not found: images of a map session need poses"]
 
 
 def test_a_strange_session_name_is_noted(capture: Path) -> None:
     (capture / "sessions" / "hl_map").rename(capture / "sessions" / "walk")
-    assert any(
-        "found session name 'walk', expected <ios, hl, spot>_<map or query>" in line
-        for line in found(capture)
-    )
+    assert any("found session name 'walk', expected <ios, hl, spot>_<map or query>" in line for line in found(capture))
 
 
 def test_what_is_no_capture_is_refused(tmp_path: Path) -> None:
