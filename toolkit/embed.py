@@ -32,6 +32,7 @@ from toolkit.files import (
     write_sidecar,
     write_text,
 )
+from toolkit.geometry import unit
 from toolkit.manifest import EmbedSettings
 
 log = logging.getLogger(__name__)
@@ -274,7 +275,7 @@ def _embed(
             if vectors.shape != (len(batch), embedder.dim):
                 raise ValueError(f"{embedder.name} gave {vectors.shape}; expected {(len(batch), embedder.dim)}.")
             if settings.normalize:
-                vectors = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+                vectors = unit(vectors)
             failed |= unreadable
             done += len(batch) + len(unreadable)
             note = {"done": done, "failed": list(unreadable.items())}

@@ -15,7 +15,7 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
 from toolkit.embedders import load_embeddings
-from toolkit.embedders.search import Backend, search, unit_rows
+from toolkit.embedders.search import Backend, search
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError
 from toolkit.files import (
     file_fingerprint,
@@ -27,6 +27,7 @@ from toolkit.files import (
     write_sidecar,
     write_text,
 )  # fmt: skip
+from toolkit.geometry import unit
 from toolkit.manifest import RetrieveSettings
 
 __all__ = ["retrieve_pairs", "search"]
@@ -185,7 +186,7 @@ def _write_pair(path: Path, query: _Images, database: _Images, settings: Retriev
         )
     queries, references = query.vectors, database.vectors
     if settings.normalize:
-        queries, references = unit_rows(queries), unit_rows(references)
+        queries, references = unit(queries), unit(references)
     backend: Backend = "faiss" if settings.use_faiss else "torch"
     try:
         scores, indices = search(

@@ -79,13 +79,6 @@ def _matrix(values: ArrayLike, name: str) -> NDArray[np.float32]:
     return matrix
 
 
-def unit_rows(rows: NDArray[np.float32]) -> NDArray[np.float32]:
-    unit: NDArray[np.float32] = rows / np.maximum(
-        np.linalg.norm(rows, axis=1, keepdims=True), np.float32(1e-12)
-    )
-    return unit
-
-
 def _candidates(
     query: NDArray[np.float32],
     database: NDArray[np.float32],

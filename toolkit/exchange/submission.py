@@ -22,7 +22,7 @@ from toolkit.capture.check import UNIT_TOLERANCE
 from toolkit.capture.tables import KeyIndex, read_query_table, read_table
 from toolkit.errors import ArtifactError, CaptureError, ManifestError, ToolkitError
 from toolkit.files import SceneFiles, file_fingerprint, read_references, write_atomic, write_sidecar
-from toolkit.geometry import invert, qt_from_pose
+from toolkit.geometry import invert, qt_from_pose, unit
 
 FAILED = ("nearest", "leave-out")
 LEFT_OUT, FILLED = "left out", "nearest"
@@ -294,7 +294,7 @@ def _fill_entry(
             reasons[index] = f"{status}; {why_not}"
     entry.queries = keyframes.assign(pose=origins, reason=reasons)
     posed = np.isfinite(qt).all(axis=1)
-    qt[:, :4] /= np.linalg.norm(qt[:, :4], axis=1, keepdims=True)
+    qt[:, :4] = unit(qt[:, :4])
     entry.poses = Trajectory(timestamps[posed], device_ids[posed], qt[posed])
     counts = entry.counts()
     notes = {"left_out": "left out", "filled": "filled", "not_asked": "not asked"}

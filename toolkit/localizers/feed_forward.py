@@ -76,7 +76,6 @@ class FeedForwardLocalizer:
         self.settings = settings or PredictorSettings()
         self._session = session
         self._depths = DepthMaps(session)
-        self._rows = {session.image_name(row): row for row in range(len(session.images))}
         self._turns = np.zeros(len(session.images), np.int64) if turns is None else turns.of(session)
 
     @property
@@ -122,7 +121,7 @@ class FeedForwardLocalizer:
     def view(self, index: int) -> View:
         """Return a map image as a network is shown it."""
         name = self.map.image_names[index]
-        turns = int(self._turns[self._rows[name]])
+        turns = int(self._turns[self._session.row_of_name[name]])
         return View(name, self._session.path.parent / name, self.map.cameras[index], in_map=True, turns=turns)
 
     def _choose(self, references: References) -> Ints:
@@ -207,7 +206,7 @@ class FeedForwardLocalizer:
 
     def seen_depth(self, image: int) -> SeenDepth:
         """Return what the capture's depth maps say of a map image."""
-        return self._depths.of(self._rows[self.map.image_names[image]])
+        return self._depths.of(self._session.row_of_name[self.map.image_names[image]])
 
 
 def _combine(query: Query, cameras: tuple[CameraAnswer, ...]) -> PoseEstimate:

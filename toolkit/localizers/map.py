@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 from toolkit.capture import Capture, Session
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import Embedder, create_embedder, load_embeddings
-from toolkit.embedders.search import search, unit_rows
+from toolkit.embedders.search import search
 from toolkit.errors import ArtifactError
 from toolkit.features.features import KINDS
 from toolkit.features.matching import LocalMethod, create_local_methods
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import SceneFiles, file_fingerprint, fingerprint, image_name
+from toolkit.geometry import unit
 from toolkit.localizers.base import Localizer, References
 from toolkit.localizers.correspondences import MAPS
 from toolkit.localizers.feed_forward import FeedForwardLocalizer
@@ -180,14 +181,13 @@ class Map:
     def _descriptors(self) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """Global descriptors (N, D) of map images as they are searched, and the images' indices (N,)."""
         vectors, table = load_embeddings(self._run.embeddings / f"{self.device}_map")
-        row_of = {self.session.image_name(row): row for row in range(len(self.session.images))}
         names = [image_name(path) for path in table["abs_path"]]
         # As the retrieve stage: images with a pose. One without features is found, and left out of the references.
-        poses = self.session.world_from_cam(np.array([row_of[name] for name in names], np.int64))
+        poses = self.session.world_from_cam(np.array([self.session.row_of_name[name] for name in names], np.int64))
         posed = np.isfinite(poses).reshape(-1, 16).all(axis=1)
         indices = np.array([self.index_of.get(name, -1) for name in names], np.int64)
         vectors = vectors[posed]
-        return unit_rows(vectors) if self.retrieve_settings.normalize else vectors, indices[posed]
+        return unit(vectors) if self.retrieve_settings.normalize else vectors, indices[posed]
 
     def retrieve(self, vectors: NDArray[np.float32]) -> list[References]:
         """Return the references of query images, given by the vectors (Q, D) that the embedder gave, as the run would.
@@ -197,7 +197,7 @@ class Map:
         """
         database, indices = self._descriptors
         if self.embed_settings.normalize:
-            vectors = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+            vectors = unit(vectors)
         vectors = vectors.astype(self.embed_settings.dtype).astype(np.float32)
         if vectors.shape[1] != database.shape[1]:
             raise ArtifactError(
@@ -205,7 +205,7 @@ class Map:
                 f"{self.embedder.name} gives {vectors.shape[1]}. Embed again."
             )
         settings = self.retrieve_settings
-        vectors = unit_rows(vectors) if settings.normalize else vectors
+        vectors = unit(vectors) if settings.normalize else vectors
         scores, rows = search(vectors, database, settings.topk, "torch", "cpu")
         known = indices[rows] >= 0
         return [

@@ -13,6 +13,7 @@ from toolkit.capture.devices import color_of
 from toolkit.capture.images import read_for_display
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.files import image_name, read_references
+from toolkit.geometry import unit
 from toolkit.show.figures import GREEN, ORANGE, VERMILLION, new_figure, styled
 from toolkit.show.metrics import is_posed
 from toolkit.show.top_view import ground_axes, places_of
@@ -200,7 +201,7 @@ def _descriptors(session: Path, limit: int) -> NDArray[np.float32]:
     total = sum(len(part) for part in parts)
     step = max(1, -(-total // limit))
     rows = np.concatenate([np.asarray(part[::step], np.float32) for part in parts])
-    return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
+    return unit(rows)
 
 
 def _poses(session: Session) -> NDArray[np.float64]:

@@ -200,11 +200,6 @@ class LocalizedPair:
         queries = LocalizedQueries(Path(f"{stem}.h5"))
         return cls(name, capture[f"{map_device}_map"], session, table, rows, poses, queries, local_map)
 
-    @cached_property
-    def _map_rows(self) -> dict[str, int]:
-        """Row of a map image by its name."""
-        return {self.map_session.image_name(row): row for row in range(len(self.map_session))}
-
     def localized(self, k: int) -> LocalizedQuery:
         """Return what the pose of query k rests on; nothing where the stage could not even begin."""
         key = int(self.table["timestamp"].iloc[k]), str(self.table["device_id"].iloc[k])
@@ -218,9 +213,9 @@ class LocalizedPair:
         estimated = self.world_from_rig @ session.rig_from_cam(first)
         centers = np.full((len(first), 3), np.nan)
         for k in np.flatnonzero(~is_posed(estimated)):
-            names = [name for name in self.localized(int(k)).references if name in self._map_rows]
+            names = [name for name in self.localized(int(k)).references if name in self.map_session.row_of_name]
             if names:
-                centers[k] = self.map_session.world_from_cam([self._map_rows[names[0]]])[0, :3, 3]
+                centers[k] = self.map_session.world_from_cam([self.map_session.row_of_name[names[0]]])[0, :3, 3]
         names = [session.image_name(int(row)) for row in first]
         return Localizations(names, self.table, estimated, session.world_from_cam(first, ground_truth=True), centers)
 
@@ -245,7 +240,7 @@ class LocalizedPair:
 
     def _reference(self, name: str, query: LocalizedQuery, number: int = -1) -> ShownImage | None:
         """Return a map image with the correspondences that it sees as reference `number`; None: no such image."""
-        row, found = self._map_rows.get(name), query.correspondences
+        row, found = self.map_session.row_of_name.get(name), query.correspondences
         if row is None:
             return None
         views = np.flatnonzero(found.view_reference == number)

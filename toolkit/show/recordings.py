@@ -558,7 +558,7 @@ class _QueryPoses:
             )
         queries, map_session = LocalizedQueries(path.with_suffix(".h5")), capture[f"{map_device}_map"]
         centers = map_session.world_from_cam()[:, :3, 3]
-        center_of = {map_session.image_name(row): center for row, center in enumerate(centers)}
+        center_of = dict(zip(map_session.image_names, centers, strict=True))
         keys = zip(poses.timestamps.tolist(), poses.device_ids.tolist(), strict=True)
         lines = [
             np.stack([pose[:3, 3], center_of[name]])
