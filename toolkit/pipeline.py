@@ -43,7 +43,7 @@ from toolkit.manifest import (
     nearest,
 )
 from toolkit.manifest.messages import nested_model
-from toolkit.models.weights import VGGT, WeightsSource, check_weights, find_any, resolve_any
+from toolkit.models.weights import VGGT, WeightsSource, check_weights, find_weights, resolve_weights
 from toolkit.notebook import (
     COUNTS_MIME,
     UPSTREAM,
@@ -324,16 +324,16 @@ def _name_embedder(manifest: Manifest, say: Say) -> Manifest:
 
 def _require_weights(stage: str, settings: Settings) -> None:
     """Find or download the weights that a stage needs, before hours of work and where its progress is seen."""
-    for sources, checkpoint in _weights_needed(stage, settings):
-        check_weights(sources[0], resolve_any(sources, checkpoint))
+    for source, checkpoint in _weights_needed(stage, settings):
+        check_weights(source, resolve_weights(source, checkpoint))
 
 
-def _weights_needed(stage: str, settings: Settings) -> list[tuple[tuple[WeightsSource, ...], str | None]]:
-    """Return the weights of each network that a stage runs with these settings: any of some will do, or the file."""
+def _weights_needed(stage: str, settings: Settings) -> list[tuple[WeightsSource, str | None]]:
+    """Return the weights of each network that a stage runs with these settings, and the file given for them."""
     if isinstance(settings, EmbedSettings):
         weights = EMBEDDER_WEIGHTS.get(settings.model)
-        return [] if weights is None else [((weights,), settings.checkpoint)]
-    needed: list[tuple[tuple[WeightsSource, ...], str | None]] = []
+        return [] if weights is None else [(weights, settings.checkpoint)]
+    needed: list[tuple[WeightsSource, str | None]] = []
     if isinstance(settings, LocalizeSettings):
         if settings.method == "nearest":
             return []
@@ -347,7 +347,7 @@ def _weights_needed(stage: str, settings: Settings) -> list[tuple[tuple[WeightsS
         ("matcher", matchers.values(), settings.matcher.checkpoint),
     ):
         for name in sorted({*names} & LOCAL_WEIGHTS.keys()):
-            needed.append(((replace(LOCAL_WEIGHTS[name], setting=f"{stage}.{key}.checkpoint"),), checkpoint))
+            needed.append((replace(LOCAL_WEIGHTS[name], setting=f"{stage}.{key}.checkpoint"), checkpoint))
     return needed
 
 
@@ -456,7 +456,7 @@ def _inputs_of(job: Job, capture: str) -> str:
 def _weights_of(job: Job) -> str | None:
     """Return what identifies the file with the weights that a job uses, None if it uses none or has none yet."""
     needed = _weights_needed(job.stage, job.settings)
-    paths = [path for sources, checkpoint in needed if (path := find_any(sources, checkpoint))]
+    paths = [path for source, checkpoint in needed if (path := find_weights(source, checkpoint))]
     return files_fingerprint([path.resolve() for path in paths]) if paths else None
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from toolkit.errors import ImageError, WeightsError
 from toolkit.models.vggt import (
@@ -20,7 +21,6 @@ from toolkit.models.vggt import (
     VGGT,
     cameras_from_pose_encoding,
     load_images,
-    pose_encoding_from_cameras,
     unproject_depth,
 )
 from toolkit.models.vggt.aggregator import SPECIAL, rope_of_view
@@ -173,12 +173,12 @@ def test_bfloat16_stays_in_the_trunk(model: VGGT, images: torch.Tensor) -> None:
 
 def test_position_embedding_at_its_own_size_is_as_stored(model: VGGT) -> None:
     encoder = model.aggregator.patch_embed
-    torch.testing.assert_close(encoder._position(5, 5), encoder.pos_embed[:, 1:])
+    torch.testing.assert_close(encoder._position(5, 5), encoder.pos_embed)
     # Resizing keeps the mean of a smooth embedding, and its order: rows first.
     ramp = torch.arange(5.0).repeat_interleave(5)[None, :, None].expand(1, 25, 32)
     kept = encoder.pos_embed.clone()
     encoder.pos_embed[:, 1:] = ramp
-    resized = encoder._position(3, 4).unflatten(1, (3, 4))
+    resized = encoder._position(3, 4)[:, 1:].unflatten(1, (3, 4))
     encoder.pos_embed.copy_(kept)
     assert (resized.diff(dim=1) > 0.5).all()
     torch.testing.assert_close(resized[:, :, 0], resized[:, :, 3], atol=1e-4, rtol=0)
@@ -254,10 +254,10 @@ def test_images_of_another_shape_are_refused(model: VGGT, shape: tuple[int, ...]
 def test_other_wrong_input_is_refused(model: VGGT, images: torch.Tensor) -> None:
     with pytest.raises(ValueError, match=r"patch_tokens have shape .*expected \(2, 3, 12, 32\)"):
         model(images, patch_tokens=torch.zeros(2, 3, 11, 32))
-    with pytest.raises(ValueError, match="heads are"):
+    with pytest.raises(ValueError, match="expected some of"):
         tiny(("camera",))(images, heads=("depth",))
     for heads in (("track",), (), "camera"):
-        with pytest.raises(ValueError, match="heads are"):
+        with pytest.raises(ValueError, match="expected some of"):
             VGGT(heads)
     with pytest.raises(ValueError, match=r"expected \(N, 3, H, W\)"):
         model.encode(images)
@@ -314,22 +314,20 @@ def test_checkpoint_fills_a_whole_network(monkeypatch: pytest.MonkeyPatch, tmp_p
 # Cameras
 
 
-def random_cameras(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """cam_from_world (count, 3, 4) and K (count, 3, 3) of 560 x 420 images."""
+def random_cameras(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """cam_from_world (count, 3, 4) and K (count, 3, 3) of 560 x 420 images, and their encodings (count, 9)."""
     rng = np.random.default_rng(0)
-    q, _ = np.linalg.qr(rng.normal(size=(count, 3, 3)))
-    rotation = q * np.linalg.det(q)[:, None, None]
+    rotation, translation = Rotation.random(count, rng=0), rng.normal(size=(count, 3))
     K = np.zeros((count, 3, 3))
     K[:, 0, 0], K[:, 1, 1] = rng.uniform(200, 900, (2, count))
     K[:, :2, 2], K[:, 2, 2] = (280, 210), 1
-    return np.concatenate([rotation, rng.normal(size=(count, 3, 1))], axis=2), K
+    fields = 2 * np.arctan(np.stack([210 / K[:, 1, 1], 280 / K[:, 0, 0]], axis=1))
+    encoding = np.concatenate([translation, rotation.as_quat(), fields], axis=1)
+    return np.concatenate([rotation.as_matrix(), translation[:, :, None]], axis=2), K, encoding
 
 
-def test_pose_encoding_round_trip() -> None:
-    cam_from_world, K = random_cameras(50)
-    encoding = pose_encoding_from_cameras(cam_from_world, K, (420, 560))
-    assert encoding.shape == (50, 9)
-    assert (encoding[:, 6] >= 0).all()
+def test_cameras_of_pose_encodings() -> None:
+    cam_from_world, K, encoding = random_cameras(50)
     pose, intrinsics = cameras_from_pose_encoding(encoding, (420, 560))
     np.testing.assert_allclose(pose, cam_from_world, atol=1e-12)
     np.testing.assert_allclose(intrinsics, K, rtol=1e-12)
@@ -349,12 +347,12 @@ def test_pose_encoding_known_answers() -> None:
     assert np.isinf(K[[0, 1], [0, 1]]).all()
     with pytest.raises(ValueError, match=r"expected \(\.\.\., 9\)"):
         cameras_from_pose_encoding(np.zeros((2, 8)), (100, 200))
-    with pytest.raises(ValueError, match="quaternion"):
+    with pytest.raises(ValueError, match="zero or not finite"):
         cameras_from_pose_encoding(np.zeros(9), (100, 200))
 
 
 def test_unprojected_points_project_back() -> None:
-    cam_from_world, K = random_cameras(3)
+    cam_from_world, K, _ = random_cameras(3)
     depth = np.random.default_rng(1).uniform(1, 5, (3, 6, 8, 1))
     world = unproject_depth(torch.from_numpy(depth), cam_from_world, K)
     assert world.shape == (3, 6, 8, 3)
@@ -399,40 +397,7 @@ def test_a_marked_pixel_goes_where_the_map_says(mode: str, together: bool) -> No
         assert all(side % 14 == 0 for side in views.images.shape[2:])
         assert tuple(views.sizes[row]) == SIZES[index]
         place = find_spot(views.images[row])
-        np.testing.assert_allclose(views.to_network(row, spots[index]), place, atol=0.1)
-        np.testing.assert_allclose(views.from_network(row, place), spots[index], atol=0.25)
-
-
-@pytest.mark.parametrize("mode", ["crop", "pad"])
-def test_intrinsics_follow_the_pixels(mode: str) -> None:
-    views = load_images([np.zeros((height, width, 3), np.uint8) for width, height in SIZES], mode)
-    K = np.array([[500.0, 0, 310], [0, 480, 255], [0, 0, 1]])
-    point = np.array([0.3, -0.2, 2.0])
-    for index, k in enumerate(views.intrinsics(K)):
-        x, y, z = K @ point
-        u, v, w = k @ point
-        np.testing.assert_allclose([u / w, v / w], views.to_network(index, [x / z, y / z]))
-    each = np.stack([K * [[1 + i], [1 + i], [1]] for i in range(len(SIZES))])
-    np.testing.assert_allclose(views.intrinsics(each)[2], views.intrinsics(each[2])[2])
-
-
-def test_depth_comes_back_to_the_pixels_it_belongs_to() -> None:
-    views = load_images([np.zeros((700, 300, 3), np.uint8), np.zeros((480, 640, 3), np.uint8)])
-    height, width = views.images.shape[2:]
-    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    depth = 3.0 + 0.01 * x + 0.02 * y  # linear: bilinear interpolation is exact
-    points = np.array([[150.0, 350.0], [20.5, 250.0], [299.0, 210.0]])
-    place = views.to_network(0, points)
-    np.testing.assert_allclose(views.sample(0, depth, points), 3.0 + place @ [0.01, 0.02])
-    # 700 rows became 1204, of which the middle 518 were kept: rows 199.4 to 500.6.
-    whole = views.to_image(0, depth)
-    assert whole.shape == (700, 300)
-    seen = np.flatnonzero(np.isfinite(whole).all(axis=1))
-    assert np.array_equal(np.flatnonzero(np.isfinite(whole).any(axis=1)), seen)
-    assert (seen[0], seen[-1]) == (199, 500)
-    assert np.isfinite(views.to_image(1, depth)).all()
-    with pytest.raises(ValueError, match="shape"):
-        views.sample(0, depth[:-1], points)
+        np.testing.assert_allclose(views.scale[row] * spots[index] + views.offset[row], place, atol=0.1)
 
 
 def test_all_kinds_of_sources_are_alike(tmp_path: Path) -> None:
@@ -448,17 +413,17 @@ def test_all_kinds_of_sources_are_alike(tmp_path: Path) -> None:
 
 def test_wrong_images_are_refused(tmp_path: Path) -> None:
     (tmp_path / "torn.png").write_bytes(b"\x89PNG\r\n\x1a\n")
-    with pytest.raises(ImageError, match=r"none\.png"):
+    with pytest.raises(ImageError, match=r"not found: .*none\.png"):
         load_images([tmp_path / "none.png"])
-    with pytest.raises(ImageError, match=r"torn\.png"):
+    with pytest.raises(ImageError, match=r"cannot be decoded: .*torn\.png"):
         load_images([tmp_path / "torn.png"])
-    with pytest.raises(ImageError, match="1000 x 10"):
+    with pytest.raises(ImageError, match="1000 x 10 pixels is too elongated"):
         load_images([np.zeros((10, 1000, 3), np.uint8)])
-    with pytest.raises(ImageError, match="10 x 1000"):
+    with pytest.raises(ImageError, match="too elongated"):
         load_images([np.zeros((1000, 10, 3), np.uint8)], "pad")
     with pytest.raises(ValueError, match="no images"):
         load_images([])
-    with pytest.raises(ValueError, match="stretch"):
+    with pytest.raises(ValueError, match="expected one of"):
         load_images([np.zeros((10, 10, 3), np.uint8)], "stretch")
 
 

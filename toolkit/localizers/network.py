@@ -20,7 +20,7 @@ from toolkit.localizers.base import View
 from toolkit.localizers.prediction import Prediction
 from toolkit.models.compute import PRECISIONS, Fitting, check_device_name, resolve_device, resolve_precision
 from toolkit.models.weights import VGGT as WEIGHTS
-from toolkit.models.weights import resolve_any
+from toolkit.models.weights import resolve_weights
 
 if TYPE_CHECKING:
     import torch
@@ -223,7 +223,7 @@ class NetworkPredictor:
         expected = [name for name in PRECISIONS if name != "float16"]
         if dtype_compute not in expected:
             raise ManifestError(f"dtype_compute is {dtype_compute!r}; VGGT expects one of {', '.join(expected)}.")
-        self.checkpoint = resolve_any(WEIGHTS, checkpoint)
+        self.checkpoint = resolve_weights(WEIGHTS, checkpoint)
         self.compute_device, self.dtype_compute = compute_device, dtype_compute
         self.needs_depth = needs_depth
         self._batch_size = batch_size

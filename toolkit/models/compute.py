@@ -1,4 +1,4 @@
-"""Where networks run and in which precision, and what happens when a batch does not fit the memory there."""
+"""Devices and precisions that networks run in, and batches that do not fit the memory of the device."""
 
 import logging
 import re
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 DEVICE_NAME = r"auto|cpu|mps|cuda(:\d+)?"
-"""Pattern of the names of devices."""
+"""Regular expression of the names of devices."""
 PRECISIONS = ("auto", "float32", "bfloat16", "float16")
 
 
 def check_device_name(name: str) -> None:
-    """Refuse what is no name of a device, without loading torch.
+    """Refuse an invalid name of a device, without importing torch.
 
     Raises:
         ManifestError: not `auto`, `cpu`, `cuda`, `cuda:<i>` or `mps`.
@@ -33,8 +33,8 @@ def resolve_device(name: str = "auto") -> "torch.device":
     `auto`: the first GPU, else Apple's, else the CPU.
 
     Raises:
-        ManifestError: none of these names.
-        ToolkitError: torch does not see such a device here.
+        ManifestError: another name.
+        ToolkitError: torch finds no such device on this machine.
     """
     import torch
 
@@ -52,56 +52,54 @@ def resolve_device(name: str = "auto") -> "torch.device":
 
 
 def resolve_precision(name: str, device: "torch.device") -> "torch.dtype":
-    """Return the type that a network computes in.
+    """Return the type in which a network computes.
 
     `auto`: bfloat16 where the device multiplies it natively (GPUs since Ampere; CPUs with AMX or AVX512-BF16),
     float16 on older GPUs, else float32.
 
     Raises:
-        ManifestError: none of `PRECISIONS`.
+        ManifestError: not one of `PRECISIONS`.
     """
     import torch
 
     if name not in PRECISIONS:
         raise ManifestError(f"dtype_compute is {name!r}; expected one of {', '.join(PRECISIONS)}.")
     if name != "auto":
-        return {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}[name]
+        dtype: torch.dtype = getattr(torch, name)
+        return dtype
     if device.type == "cuda":
-        native = torch.cuda.get_device_capability(device) >= (8, 0)
-        return torch.bfloat16 if native else torch.float16
-    if device.type == "cpu" and cpu_multiplies_bfloat16():
-        return torch.bfloat16
-    return torch.float32
+        return torch.bfloat16 if torch.cuda.get_device_capability(device) >= (8, 0) else torch.float16
+    return torch.bfloat16 if device.type == "cpu" and cpu_multiplies_bfloat16() else torch.float32
 
 
 def cpu_multiplies_bfloat16() -> bool:
     """Tell whether this CPU has instructions for products of bfloat16 matrices: AMX or AVX512-BF16.
 
-    Others only emulate them, some ten times slower than float32.
+    Other CPUs emulate them, some ten times slower than float32.
     """
     import torch
 
     capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
-    # A torch before 2.8 has no list; it knows of AMX.
+    # torch before 2.8 has no list of capabilities, but can tell AMX.
     amx = getattr(torch.cpu, "_is_amx_tile_supported", bool)()
     return bool(amx or capabilities.get("amx_bf16") or capabilities.get("avx512_bf16"))
 
 
 class Fitting:
-    """Runs a function on batches, in smaller parts once one did not fit the memory of the device."""
+    """Runs a function on batches; splits them into smaller parts once one did not fit the memory of the device."""
 
     def __init__(self, run: "Callable[[torch.Tensor], torch.Tensor]", what: str) -> None:
         """
         Args:
-            run: maps (B, ...) to (B, ...), each row of the result by the same row of the input alone.
+            run: maps (B, ...) to (B, ...); each row of the result depends only on the same row of the input.
             what: what the rows are, in the plural, for messages.
         """
         self._run = run
         self._what = what
-        self._most: int | None = None
+        self._limit: int | None = None
 
     def __call__(self, batch: "torch.Tensor") -> "torch.Tensor":
-        """Return `run(batch)`; halves the batch as often as needed, says so, and remembers what fits.
+        """Return `run(batch)`; halves the batch as often as needed, logs a warning, and remembers the size that fits.
 
         Raises:
             ToolkitError: not even one row fits.
@@ -111,7 +109,7 @@ class Fitting:
         parts = []
         start = 0
         while start < len(batch):
-            count = min(self._most or len(batch), len(batch) - start)
+            count = min(self._limit or len(batch), len(batch) - start)
             try:
                 parts.append(self._run(batch[start : start + count]))
                 start += count
@@ -120,15 +118,15 @@ class Fitting:
                 if not _is_out_of_memory(error):
                     raise
                 reason = str(error).strip().split("\n")[0]
-            # Outside the handler: the traceback holds what the failed attempt had allocated.
+            # Outside the handler, where the traceback would keep the tensors of the failed attempt alive.
             if count == 1:
                 raise ToolkitError(
                     f"The memory of {batch.device} does not hold the network with one of the {self._what} "
                     f"({reason}). Use a smaller image_size, dtype_compute: bfloat16, or compute_device: cpu."
                 )
-            self._most = count // 2
+            self._limit = count // 2
             log.warning("%d %s do not fit the memory of %s, going on with %d at a time",
-                        count, self._what, batch.device, self._most)  # fmt: skip
+                        count, self._what, batch.device, self._limit)  # fmt: skip
             if batch.device.type == "cuda":
                 torch.cuda.empty_cache()
         return parts[0] if len(parts) == 1 else torch.cat(parts)
@@ -137,6 +135,6 @@ class Fitting:
 def _is_out_of_memory(error: Exception) -> bool:
     import torch
 
-    # Only CUDA has a type of its own for it.
+    # Only CUDA raises its own exception type.
     text = str(error)
     return isinstance(error, torch.OutOfMemoryError) or "out of memory" in text or "can't allocate memory" in text

@@ -1,8 +1,8 @@
-"""What went wrong with the Hugging Face hub, in words."""
+"""Errors of the Hugging Face hub, in words."""
 
 
 def failure_reason(error: Exception, page: str = "the model's page") -> str:
-    """Return in a few words why the hub did not give something; `page` is where its terms are accepted."""
+    """Return in a few words why a request to the hub failed; `page` is where its terms are accepted."""
     from huggingface_hub import constants, errors
 
     sign_in = f"accept the license on {page} and set HF_TOKEN (HTTP {status_of(error)})"

@@ -13,63 +13,37 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from toolkit.models.vit import Block, PatchEmbed, SharedRoom
+from toolkit.models.vit import PATCH, Dinov2
 from toolkit.models.weights import load_checkpoint
 
-PATCH = 14
 _SINKHORN_STEPS = 3
 
 
-class Dinov2(nn.Module):
-    """DINOv2 ViT (Oquab et al., 2023) without registers."""
-
-    def __init__(self, dim: int = 768, depth: int = 12, num_heads: int = 12, grid: int = 37) -> None:
-        super().__init__()
-        self.grid = grid
-        self.patch_embed = PatchEmbed(dim, PATCH)
-        self.cls_token = nn.Parameter(torch.empty(1, 1, dim))
-        self.pos_embed = nn.Parameter(torch.empty(1, grid * grid + 1, dim))
-        self.blocks = nn.ModuleList([Block(dim, num_heads) for _ in range(depth)])
-        self.norm = nn.LayerNorm(dim, eps=1e-6)
+class Backbone(Dinov2):
+    """DINOv2 without registers."""
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Return the patches (B, N, C), row by row, and the class token (B, C) of images (B, 3, H, W)."""
-        rows, columns = images.shape[2] // PATCH, images.shape[3] // PATCH
-        position = self._position(rows, columns)
-        patches = self.patch_embed(images.to(self.patch_embed.proj.weight.dtype))
-        cls_token = (self.cls_token + position[:, :1]).to(patches.dtype).expand(len(images), -1, -1)
-        x = torch.cat([cls_token, patches + position[:, 1:].to(patches.dtype)], dim=1)
-        room = SharedRoom.on(x.device)
-        for block in self.blocks:
-            x = block(x, room=room)
-        x = self.norm(x)
+        x = self.norm(self._tokens(images))
         return x[:, 1:], x[:, 0]
 
-    def _position(self, rows: int, columns: int) -> Tensor:
-        """Return the position embedding of class token and patches, (1, 1 + rows * columns, C).
-
-        Trained for grid x grid patches; for others interpolated as in training, by a factor with an offset of
-        0.1 that the weights have learned to expect.
-        """
-        if rows == columns == self.grid:
-            return self.pos_embed
-        trained = self.pos_embed[:, 1:].float().reshape(1, self.grid, self.grid, -1).permute(0, 3, 1, 2)
-        factor = ((rows + 0.1) / self.grid, (columns + 0.1) / self.grid)
-        patches = F.interpolate(trained, scale_factor=factor, mode="bicubic", antialias=False)
-        return torch.cat([self.pos_embed[:, :1].float(), patches.flatten(2).transpose(1, 2)], dim=1)
+    def _resize(self, trained: Tensor, rows: int, columns: int) -> Tensor:
+        # As in training: by factors with an offset of 0.1, which the weights have learned to expect.
+        factors = ((rows + 0.1) / self.grid, (columns + 0.1) / self.grid)
+        return F.interpolate(trained, scale_factor=factors, mode="bicubic", antialias=False)
 
 
 class PatchMlp(nn.Sequential):
-    """Two layers on each patch, (B, N, C) -> (B, N, out), under the names of 1 x 1 convolutions."""
+    """Two linear layers on each patch, (B, N, C) -> (B, N, out), with the keys of 1 x 1 convolutions."""
 
     def __init__(self, dim: int, hidden: int, out: int) -> None:
-        # No. 1 is a dropout of training.
+        # The identity keeps the place of a dropout that only training has.
         super().__init__(nn.Conv2d(dim, hidden, 1), nn.Identity(), nn.ReLU(), nn.Conv2d(hidden, out, 1))
 
     def forward(self, patches: Tensor) -> Tensor:
         first: Any = self[0]
         last: Any = self[3]
-        # As products with a matrix they need no rows and columns of patches.
+        # Written as matrix products: the patches need not be arranged in rows and columns.
         hidden = F.relu(F.linear(patches, first.weight.flatten(1), first.bias))
         return F.linear(hidden, last.weight.flatten(1), last.bias)
 
@@ -94,17 +68,17 @@ class Salad(nn.Module):
 
 
 def transport(scores: Tensor, dust_bin: Tensor) -> Tensor:
-    """Return how much of each patch goes to each cluster, (B, M, N), for scores (B, M, N), N > M.
+    """Return the share of each patch that each cluster receives, (B, M, N), for scores (B, M, N), N > M.
 
-    Sinkhorn's iteration on logarithms (Cuturi, NeurIPS 2013): each of the M clusters shall receive one patch and
-    a bin for what fits none, one more row with the score `dust_bin`, the other N - M.
+    Sinkhorn's iteration on logarithms (Cuturi, NeurIPS 2013). The margins ask that each of the M clusters receives
+    one patch, and that a dust bin (one more row, with the score `dust_bin`) receives the other N - M.
     """
     B, M, N = scores.shape
     scores = torch.cat([scores, dust_bin.to(scores.dtype).expand(B, 1, N)], dim=1)
     log_received = scores.new_zeros(M + 1)
     log_received[M] = math.log(N - M)
     log_given = 0.0
-    # The common factor 1 / (N + M) of both margins cancels: it is left out from the start.
+    # Both margins would have the factor 1 / (N + M), which cancels.
     columns = scores.new_zeros(B, 1, N)
     for _ in range(_SINKHORN_STEPS):
         rows = log_received[:, None] - torch.logsumexp(scores + columns, dim=2, keepdim=True)
@@ -149,7 +123,7 @@ class MegaLoc(nn.Module):
         """
         super().__init__()
         self.clusters = clusters
-        self.backbone = Dinov2(dim, depth, num_heads, grid)
+        self.backbone = Backbone(dim, depth, num_heads, grid)
         self.aggregator = Aggregator(dim, clusters, cluster_dim, token_dim, hidden, out)
 
     @property
@@ -159,13 +133,13 @@ class MegaLoc(nn.Module):
 
     @classmethod
     def from_checkpoint(cls, checkpoint: str | Path | Mapping[str, Tensor]) -> "MegaLoc":
-        """Return the network with official weights, float32, on the CPU, ready to use.
+        """Return the network with official weights, float32, on the CPU, in evaluation mode.
 
         Args:
             checkpoint: the official `model.safetensors`, or its tensors by name (shared, not copied).
 
         Raises:
-            WeightsError: not such a file, or other weights; names missing, unexpected and mis-shaped keys.
+            WeightsError: the file is no checkpoint, or of another model; names missing, unexpected, mis-shaped keys.
         """
         with torch.device("meta"):
             model = cls()
@@ -176,8 +150,8 @@ class MegaLoc(nn.Module):
         """Return descriptors (B, 8448) float32, of length 1.
 
         Args:
-            images: (B, 3, H, W), RGB in [0, 1] minus `vit.IMAGENET_MEAN`, over `vit.IMAGENET_STD`. Sides that are no
-                multiple of 14 are resized to the nearest.
+            images: (B, 3, H, W), RGB in [0, 1] minus `vit.IMAGENET_MEAN`, divided by `vit.IMAGENET_STD`. Height and
+                width are resized to the nearest multiples of 14.
 
         Raises:
             ValueError: another shape, or too small: the aggregation needs more patches of 14 x 14 than clusters.

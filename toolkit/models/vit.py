@@ -1,13 +1,15 @@
-"""The parts of a vision transformer (Dosovitskiy et al., ICLR 2021) in the form and with the key names of DINOv2.
+"""The parts of a vision transformer (Dosovitskiy et al., ICLR 2021), with the structure and key names of DINOv2.
 
-Modules may stand in another type than their input's numbers: `LayerNorm` weights and the layer scales fit any, and a
-block computes in the type of its matrices (`set_matrix_type`) what it adds to its input in the input's type.
+The matrices of a block may have another type than its input (`set_matrix_type`): the block then computes in the type
+of its matrices and adds the result to its input in the type of the input.
 """
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+PATCH = 14
+"""Side of a patch in pixels."""
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
@@ -15,42 +17,42 @@ Rope = tuple[Tensor, Tensor]
 """Cosines and signed sines of a rotary position embedding, each (N, C / heads): see `rotate_`."""
 
 
-class SharedRoom:
-    """One array that the widest layers of a pass write into, each over what the one before left.
+class SharedBuffer:
+    """A buffer for the widest layers of one forward pass: each layer overwrites the result of the one before.
 
-    On a CPU glibc has arrays above 32 MB from the system, anew for each layer, and the system clears them page by page:
-    2 to 6 % of a network's time in float32, and the more, the faster the products are. For one pass in one mode:
-    numbers of `torch.inference_mode` cannot be written over outside of it.
+    On a CPU, glibc requests arrays above 32 MB from the system for every layer, and the system clears them page by
+    page. That costs 2 to 6 % of a network's time in float32, and more the faster the matrix products are. Use a new
+    buffer for each pass: tensors of `torch.inference_mode` cannot be overwritten outside of it.
     """
 
     def __init__(self) -> None:
         self._held = torch.empty(0)
 
     @classmethod
-    def on(cls, device: torch.device) -> "SharedRoom | None":
-        """Return room for a pass; None on another device, where it does not help, and where gradients are recorded,
-        which need what would be written over."""
+    def for_device(cls, device: torch.device) -> "SharedBuffer | None":
+        """Return a buffer on a CPU, None on other devices, where it does not help, and while gradients are recorded,
+        which need the results that would be overwritten."""
         return cls() if device.type == "cpu" and not torch.is_grad_enabled() else None
 
     def linear(self, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        """Return `F.linear(x, weight, bias)`, (..., C); what was returned before is lost."""
+        """Return `F.linear(x, weight, bias)`, (..., C); overwrites what it returned before."""
         count = x.shape[:-1].numel() * len(weight)
         if self._held.numel() < count or self._held.dtype != x.dtype:
-            self._held = torch.empty(0)  # let go before more is asked for
+            self._held = torch.empty(0)  # free the old array before allocating the new one
             self._held = x.new_empty(count)
         out = self._held[:count].view(-1, len(weight))
         return torch.addmm(bias, x.flatten(0, -2), weight.t(), out=out).view(*x.shape[:-1], len(weight))
 
 
-def _linear(x: Tensor, weight: Tensor, bias: Tensor, room: SharedRoom | None) -> Tensor:
-    return F.linear(x, weight, bias) if room is None else room.linear(x, weight, bias)
+def _linear(x: Tensor, weight: Tensor, bias: Tensor, buffer: SharedBuffer | None) -> Tensor:
+    return F.linear(x, weight, bias) if buffer is None else buffer.linear(x, weight, bias)
 
 
 def rotate_(x: Tensor, rope: Rope) -> Tensor:
-    """Turn each pair of channels of queries or keys (B, heads, N, D) by an angle of its own, in place.
+    """Rotate each pair of channels of queries or keys (B, heads, N, D) by its own angle, in place.
 
-    Rotary position embedding (Su et al., RoFormer, 2021) in two dimensions: of the four quarters of D, the first
-    two hold pairs (first, second) for y, the last two for x. The sines come with the sign of the pair's other half.
+    This is rotary position embedding (Su et al., RoFormer, 2021) in two dimensions. The first two quarters of D hold
+    pairs (first, second) for y, the last two for x. The sines are negative for the first element of each pair.
     """
     cosine, sine = rope
     first_y, second_y, first_x, second_x = x.chunk(4, dim=-1)
@@ -64,8 +66,8 @@ class Attention(nn.Module):
     def __init__(self, dim: int, num_heads: int, qk_norm_eps: float | None = None) -> None:
         """
         Args:
-            dim, num_heads: C, and into how many parts it is cut.
-            qk_norm_eps: where given, queries and keys of each head go through a LayerNorm with this epsilon.
+            dim, num_heads: C, and the number of heads that share it.
+            qk_norm_eps: epsilon of a LayerNorm on the queries and keys of each head; None: no such norm.
         """
         super().__init__()
         self.num_heads = num_heads
@@ -77,29 +79,29 @@ class Attention(nn.Module):
         self.proj = nn.Linear(dim, dim)
 
     def forward(
-        self, x: Tensor, rope: Rope | None = None, every: int = 1, room: SharedRoom | None = None
+        self, x: Tensor, rope: Rope | None = None, every: int = 1, buffer: SharedBuffer | None = None
     ) -> Tensor:
-        """Return what tokens 0, every, 2 * every, ... gather from all tokens, (B, ceil(N / every), C)."""
-        q, k, v = self._parts(x, every, room)
+        """Return the attention output of tokens 0, every, 2 * every, ... over all tokens, (B, ceil(N / every), C)."""
+        q, k, v = self._queries_keys_values(x, every, buffer)
         if self.has_qk_norm:
-            # The norm takes, and makes, numbers in order; where they are converted before, at once in that order.
+            # LayerNorm needs contiguous input: convert type and layout in one copy.
             q = self.q_norm(q.to(torch.float32, memory_format=torch.contiguous_format))
             k = self.k_norm(k.to(torch.float32, memory_format=torch.contiguous_format))
         if rope is not None:
             q, k = rotate_(q, (rope[0][::every], rope[1][::every])), rotate_(k, rope)
         gathered = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v)
-        del q, k, v  # with norms of their own, a fifth of what a pass holds: let go before the projection
+        del q, k, v  # a fifth of the memory of a pass where they are normalized: free it before the projection
         return self.proj(gathered.transpose(1, 2).reshape(len(x), -1, x.shape[-1]))
 
-    def _parts(self, x: Tensor, every: int, room: SharedRoom | None) -> tuple[Tensor, ...]:
+    def _queries_keys_values(self, x: Tensor, every: int, buffer: SharedBuffer | None) -> tuple[Tensor, ...]:
         """Return queries, of tokens 0, every, 2 * every, ..., keys and values, each (B, heads, tokens, C / heads)."""
         C = x.shape[-1]
         weight, bias = self.qkv.weight, self.qkv.bias
         if every == 1:
-            parts = _linear(x, weight, bias, room).split(C, dim=-1)
+            parts = _linear(x, weight, bias, buffer).split(C, dim=-1)
         else:
             q = F.linear(x[:, ::every], weight[:C], bias[:C])
-            parts = (q, *_linear(x, weight[C:], bias[C:], room).split(C, dim=-1))
+            parts = (q, *_linear(x, weight[C:], bias[C:], buffer).split(C, dim=-1))
         return tuple(part.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for part in parts)
 
 
@@ -111,9 +113,9 @@ class Mlp(nn.Module):
         self.fc1 = nn.Linear(dim, hidden)
         self.fc2 = nn.Linear(hidden, dim if out is None else out)
 
-    def forward(self, x: Tensor, room: SharedRoom | None = None) -> Tensor:
-        hidden = _linear(x, self.fc1.weight, self.fc1.bias, room)
-        return self.fc2(torch.ops.aten.gelu_(hidden))  # in place: the hidden layer is the largest array
+    def forward(self, x: Tensor, buffer: SharedBuffer | None = None) -> Tensor:
+        hidden = _linear(x, self.fc1.weight, self.fc1.bias, buffer)
+        return self.fc2(torch.ops.aten.gelu_(hidden))  # in place: the hidden layer is the largest tensor
 
 
 class LayerScale(nn.Module):
@@ -129,7 +131,7 @@ class LayerScale(nn.Module):
 
 
 class Block(nn.Module):
-    """A transformer block: attention and MLP, each on the normalized stream and added to it, scaled."""
+    """A transformer block: attention, then an MLP. Each reads the normalized tokens; its scaled output is added."""
 
     def __init__(self, dim: int, num_heads: int, eps: float = 1e-6, qk_norm_eps: float | None = None) -> None:
         super().__init__()
@@ -141,36 +143,79 @@ class Block(nn.Module):
         self.ls2 = LayerScale(dim)
 
     def forward(
-        self, x: Tensor, rope: Rope | None = None, every: int = 1, room: SharedRoom | None = None
+        self, x: Tensor, rope: Rope | None = None, every: int = 1, buffer: SharedBuffer | None = None
     ) -> Tensor:
         """Return the tokens (B, N, C) one block further.
 
         Args:
             x: (B, N, C).
             rope: position of each token, for queries and keys.
-            every: return only tokens 0, every, 2 * every, ...; what is read of the others alone is computed.
-            room: of this pass, shared by its blocks.
+            every: return only tokens 0, every, 2 * every, ...; of the others, only keys and values are computed.
+            buffer: of this forward pass, shared by its blocks.
         """
         matrix_type = self.attn.qkv.weight.dtype
-        x = self.ls1(x[:, ::every], self.attn(self.norm1(x).to(matrix_type), rope, every, room))
-        return self.ls2(x, self.mlp(self.norm2(x).to(matrix_type), room))
+        x = self.ls1(x[:, ::every], self.attn(self.norm1(x).to(matrix_type), rope, every, buffer))
+        return self.ls2(x, self.mlp(self.norm2(x).to(matrix_type), buffer))
 
 
 class PatchEmbed(nn.Module):
-    """Cut images (B, 3, H, W) into patches and embed each: (B, H / patch * W / patch, C), row by row."""
+    """Cut images (B, 3, H, W) into patches and embed each: (B, H / PATCH * W / PATCH, C), row by row."""
 
-    def __init__(self, dim: int, patch: int) -> None:
+    def __init__(self, dim: int) -> None:
         super().__init__()
-        self.proj = nn.Conv2d(3, dim, kernel_size=patch, stride=patch)
+        self.proj = nn.Conv2d(3, dim, kernel_size=PATCH, stride=PATCH)
 
     def forward(self, images: Tensor) -> Tensor:
         return self.proj(images).flatten(2).transpose(1, 2)
 
 
-def set_matrix_type(module: nn.Module, dtype: torch.dtype) -> None:
-    """Convert the linear layers of a module, and these alone, to a type that its blocks then compute in.
+class Dinov2(nn.Module):
+    """DINOv2 ViT-14 (Oquab et al., 2023). Subclasses add tokens and say how the position embedding is resized."""
 
-    Norms, layer scales, learned tokens and the stream of tokens keep theirs: float32 sums of bfloat16 products.
+    def __init__(self, dim: int, depth: int, num_heads: int, grid: int) -> None:
+        """
+        Args:
+            dim, depth, num_heads: of the blocks.
+            grid: rows and columns of patches that the position embedding was trained for.
+        """
+        super().__init__()
+        self.grid = grid
+        self.patch_embed = PatchEmbed(dim)
+        self.cls_token = nn.Parameter(torch.empty(1, 1, dim))
+        self.pos_embed = nn.Parameter(torch.empty(1, grid * grid + 1, dim))
+        self.blocks = nn.ModuleList([Block(dim, num_heads) for _ in range(depth)])
+        self.norm = nn.LayerNorm(dim, eps=1e-6)
+
+    def _tokens(self, images: Tensor, *registers: Tensor) -> Tensor:
+        """Return the tokens after the last block: class token, registers (1, R, C), patches; before the norm."""
+        position = self._position(images.shape[2] // PATCH, images.shape[3] // PATCH)
+        patches = self.patch_embed(images.to(self.patch_embed.proj.weight.dtype))
+        cls_token = (self.cls_token + position[:, :1]).to(patches.dtype)
+        special = torch.cat([cls_token, *registers], dim=1).expand(len(images), -1, -1)
+        x = torch.cat([special, patches + position[:, 1:].to(patches.dtype)], dim=1)
+        buffer = SharedBuffer.for_device(x.device)
+        for block in self.blocks:
+            x = block(x, buffer=buffer)
+        return x
+
+    def _position(self, rows: int, columns: int) -> Tensor:
+        """Return the position embedding of the class token and the patches, (1, 1 + rows * columns, C)."""
+        if rows == columns == self.grid:
+            return self.pos_embed
+        trained = self.pos_embed[:, 1:].float().unflatten(1, (self.grid, self.grid)).permute(0, 3, 1, 2)
+        patches = self._resize(trained, rows, columns)
+        return torch.cat([self.pos_embed[:, :1].float(), patches.flatten(2).transpose(1, 2)], dim=1)
+
+    def _resize(self, trained: Tensor, rows: int, columns: int) -> Tensor:
+        """Return the embedding (1, C, grid, grid) for another number of patches, (1, C, rows, columns)."""
+        raise NotImplementedError
+
+
+def set_matrix_type(module: nn.Module, dtype: torch.dtype) -> None:
+    """Convert the linear layers of a module, and only these, to the type that its blocks shall compute in.
+
+    Norms, layer scales and learned tokens keep their type, and so do the sums over blocks: float32 sums of bfloat16
+    products.
     """
     for part in module.modules():
         if isinstance(part, nn.Linear):

@@ -1,15 +1,7 @@
 """VGGT: the network, its images, and the cameras it returns."""
 
 from toolkit.models.vggt.network import HEADS, VGGT
-from toolkit.models.vggt.pose_encoding import cameras_from_pose_encoding, pose_encoding_from_cameras, unproject_depth
+from toolkit.models.vggt.pose_encoding import cameras_from_pose_encoding, unproject_depth
 from toolkit.models.vggt.preprocess import Views, load_images
 
-__all__ = [
-    "HEADS",
-    "VGGT",
-    "Views",
-    "cameras_from_pose_encoding",
-    "load_images",
-    "pose_encoding_from_cameras",
-    "unproject_depth",
-]
+__all__ = ["HEADS", "VGGT", "Views", "cameras_from_pose_encoding", "load_images", "unproject_depth"]

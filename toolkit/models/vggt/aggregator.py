@@ -1,4 +1,4 @@
-"""VGGT's trunk: patches of each image by DINOv2, then attention within a view and among all views in turn."""
+"""VGGT's trunk: DINOv2 encodes the patches of each image, then layers attend within each view and among all views."""
 
 from collections.abc import Collection
 
@@ -6,60 +6,41 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from toolkit.models.vit import IMAGENET_MEAN, IMAGENET_STD, Block, PatchEmbed, Rope, SharedRoom
+from toolkit.models.vit import IMAGENET_MEAN, IMAGENET_STD, Block, Dinov2, Rope, SharedBuffer
 
-PATCH = 14
 REGISTERS = 4
 SPECIAL = 1 + REGISTERS
-"""Tokens of a view before its patches: the camera's, then the registers."""
+"""Number of tokens of a view before its patches: one camera token, then the registers. (The encoder's own tokens
+before the patches are as many: a class token and its registers.)"""
 _ROPE_BASE = 100.0
 _EPS = 1e-5
 
 LayerTokens = tuple[Tensor, Tensor]
-"""Tokens (B, S, T, C) after a layer's attention within the views, and after that among them."""
+"""Tokens (B, S, T, C) after a layer's attention within views, and after its attention among views."""
 
 
-class PatchEncoder(nn.Module):
-    """DINOv2 ViT with registers (Darcet et al., ICLR 2024), for its patches alone."""
+class PatchEncoder(Dinov2):
+    """DINOv2 with registers (Darcet et al., ICLR 2024), of which only the patch tokens are used."""
 
     def __init__(self, dim: int, depth: int, num_heads: int, grid: int) -> None:
-        super().__init__()
-        self.grid = grid
-        self.patch_embed = PatchEmbed(dim, PATCH)
-        self.cls_token = nn.Parameter(torch.empty(1, 1, dim))
+        super().__init__(dim, depth, num_heads, grid)
         self.register_tokens = nn.Parameter(torch.empty(1, REGISTERS, dim))
-        self.mask_token = nn.Parameter(torch.empty(1, dim))  # of training: the checkpoint has it
-        self.pos_embed = nn.Parameter(torch.empty(1, grid * grid + 1, dim))
-        self.blocks = nn.ModuleList([Block(dim, num_heads) for _ in range(depth)])
-        self.norm = nn.LayerNorm(dim, eps=1e-6)
+        self.mask_token = nn.Parameter(torch.empty(1, dim))  # only used in training, but in the checkpoint
 
     def forward(self, images: Tensor) -> Tensor:
-        """Return the patches (N, P, C), row by row, of images (N, 3, H, W) in [0, 1]."""
+        """Return the patch tokens (N, P, C), row by row, of images (N, 3, H, W) in [0, 1]."""
         mean, std = (images.new_tensor(values).view(3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_STD))
-        rows, columns = images.shape[2] // PATCH, images.shape[3] // PATCH
-        patches = self.patch_embed((images - mean) / std) + self._position(rows, columns)
-        special = torch.cat([self.cls_token + self.pos_embed[:, :1], self.register_tokens], dim=1)
-        x = torch.cat([special.expand(len(images), -1, -1), patches], dim=1)
-        room = SharedRoom.on(x.device)
-        for block in self.blocks:
-            x = block(x, room=room)
-        return self.norm(x[:, special.shape[1] :])
+        return self.norm(self._tokens((images - mean) / std, self.register_tokens)[:, SPECIAL:])
 
-    def _position(self, rows: int, columns: int) -> Tensor:
-        """Return the position embedding of the patches, (1, rows * columns, C), trained for grid x grid of them."""
-        patches = self.pos_embed[:, 1:]
-        if rows == columns == self.grid:
-            return patches
-        trained = patches.unflatten(1, (self.grid, self.grid)).permute(0, 3, 1, 2)
-        resized = F.interpolate(trained, (rows, columns), mode="bicubic", antialias=True)
-        return resized.flatten(2).transpose(1, 2)
+    def _resize(self, trained: Tensor, rows: int, columns: int) -> Tensor:
+        return F.interpolate(trained, (rows, columns), mode="bicubic", antialias=True)
 
 
 def rope_of_view(rows: int, columns: int, head_dim: int, device: torch.device) -> Rope:
-    """Return the rotary position embedding of one view's tokens: place 0 for special ones, from 1 for patches.
+    """Return the rotary position embedding of one view's tokens, cosines and signed sines (T, head_dim).
 
-    Of D = head_dim channels, the first half turns with the row, the second with the column; pair i of D / 4 turns
-    by place * 100 ** (-4 i / D) radians.
+    Special tokens are at place 0, patches at places from 1. The first half of D = head_dim channels rotates with the
+    row, the second with the column; pair i of D / 4 rotates by place * 100 ** (-4 i / D) radians.
     """
     half = head_dim // 2
     frequencies = 1.0 / _ROPE_BASE ** (torch.arange(0, half, 2, device=device).float() / half)
@@ -73,7 +54,7 @@ def rope_of_view(rows: int, columns: int, head_dim: int, device: torch.device) -
 
 
 class Aggregator(nn.Module):
-    """Patch encoder, and layers of a block within each view followed by one among all views."""
+    """The patch encoder, then `depth` layers: a block within each view, followed by a block among all views."""
 
     def __init__(
         self, dim: int, depth: int, num_heads: int, encoder_depth: int, encoder_num_heads: int, grid: int
@@ -81,7 +62,7 @@ class Aggregator(nn.Module):
         super().__init__()
         self.head_dim = dim // num_heads
         self.patch_embed = PatchEncoder(dim, encoder_depth, encoder_num_heads, grid)
-        # Of the first view, which is to be the world's frame; and of the others.
+        # One token for the first view, whose frame is the world, and one for all others.
         self.camera_token = nn.Parameter(torch.empty(1, 2, 1, dim))
         self.register_token = nn.Parameter(torch.empty(1, 2, REGISTERS, dim))
         self.frame_blocks = nn.ModuleList([Block(dim, num_heads, _EPS, _EPS) for _ in range(depth)])
@@ -90,16 +71,16 @@ class Aggregator(nn.Module):
     def forward(
         self, patch_tokens: Tensor, rows: int, columns: int, layers: Collection[int], cameras_only: bool = False
     ) -> dict[int, LayerTokens]:
-        """Return the tokens after each layer asked for, and no other.
+        """Return the tokens after each of some layers.
 
         Args:
             patch_tokens: (B, S, rows * columns, C) of `patch_embed`.
             rows, columns: of patches.
-            layers: numbers of layers, from 0.
-            cameras_only: of the last layer return the camera tokens alone, T = 1: the rest is not computed.
+            layers: numbers of these layers, from 0.
+            cameras_only: compute and return only the camera tokens of the last of them, T = 1.
 
         Returns:
-            By layer, the tokens (B, S, T, C) after its two blocks; T = SPECIAL + rows * columns.
+            By layer, the tokens (B, S, T, C) after each of its two blocks; T = SPECIAL + rows * columns.
         """
         B, S, P, C = patch_tokens.shape
         special = torch.cat([self.camera_token, self.register_token], dim=2)  # (1, 2, SPECIAL, C)
@@ -108,12 +89,12 @@ class Aggregator(nn.Module):
         T = SPECIAL + P
         rope = rope_of_view(rows, columns, self.head_dim, tokens.device)
         rope_of_views = (rope[0].repeat(S, 1), rope[1].repeat(S, 1))
-        room = SharedRoom.on(tokens.device)
+        buffer = SharedBuffer.for_device(tokens.device)
         kept = {}
         for layer in range(max(layers) + 1):
             every = T if cameras_only and layer == max(layers) else 1
-            within = self.frame_blocks[layer](tokens.view(B * S, T, C), rope, room=room).view(B, S * T, C)
-            tokens = self.global_blocks[layer](within, rope_of_views, every, room)
+            within = self.frame_blocks[layer](tokens.view(B * S, T, C), rope, buffer=buffer).view(B, S * T, C)
+            tokens = self.global_blocks[layer](within, rope_of_views, every, buffer)
             if layer in layers:
                 kept[layer] = (within.view(B, S, T, C)[:, :, ::every], tokens.view(B, S, -1, C))
         return kept

@@ -1,4 +1,4 @@
-"""VGGT's heads: cameras, and what each pixel has (depth or a point, each with a confidence)."""
+"""VGGT's heads: one for cameras, and dense ones for depth or points, with a confidence for each pixel."""
 
 from collections.abc import Mapping, Sequence
 
@@ -6,8 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from toolkit.models.vggt.aggregator import PATCH, SPECIAL, LayerTokens
-from toolkit.models.vit import Block, Mlp
+from toolkit.models.vggt.aggregator import SPECIAL, LayerTokens
+from toolkit.models.vit import PATCH, Block, Mlp
 
 _EPS = 1e-5
 _CAMERA_STEPS = 4
@@ -15,7 +15,7 @@ _POSE = 9
 
 
 class CameraHead(nn.Module):
-    """Cameras from the camera tokens, in steps: each adds a correction to the pose encoding before."""
+    """Predicts cameras from the camera tokens, in steps that each correct the pose encoding."""
 
     def __init__(self, dim: int, depth: int, num_heads: int) -> None:
         super().__init__()
@@ -30,8 +30,8 @@ class CameraHead(nn.Module):
     def forward(self, tokens: LayerTokens) -> list[Tensor]:
         """Return the pose encoding (B, S, 9) after each step, for the tokens of the last layer.
 
-        The tokens enter each step anew, shifted, scaled and gated by the encoding so far (Peebles and Xie, ICCV
-        2023). What is returned has no field of view below 0; the next step gets the raw one.
+        Each step starts from the camera tokens, shifted, scaled and gated by the encoding so far (Peebles and Xie,
+        ICCV 2023). Returned fields of view are clamped to 0; the next step gets the raw ones.
         """
         within, among = tokens
         camera = self.token_norm(torch.cat([within[:, :, 0], among[:, :, 0]], dim=-1).float())
@@ -51,7 +51,7 @@ class CameraHead(nn.Module):
 
 
 class ResidualUnit(nn.Module):
-    """Two 3 x 3 convolutions added to the *rectified* input: in the official code its ReLU overwrites the input."""
+    """Two 3 x 3 convolutions, added to the *rectified* input: the official code's ReLU overwrites the input."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -64,7 +64,7 @@ class ResidualUnit(nn.Module):
 
 
 class Fusion(nn.Module):
-    """Add a finer map to a coarser one, and enlarge the sum."""
+    """Adds a finer map to a coarser one and enlarges the sum."""
 
     def __init__(self, channels: int, has_residual: bool) -> None:
         super().__init__()
@@ -77,12 +77,12 @@ class Fusion(nn.Module):
         """Return (N, C, *size) of maps (N, C, h, w)."""
         if fine is not None:
             coarse = self.resConfUnit1(fine).add_(coarse)
-        # A 1 x 1 convolution and an interpolation may be exchanged: the small map is the cheaper one to convolve.
+        # A 1 x 1 convolution and an interpolation commute: convolving the small map is cheaper.
         return _resize(self.out_conv(self.resConfUnit2(coarse)), size)
 
 
 class Scratch(nn.Module):
-    """What fuses the maps of the four layers (its name in the checkpoint)."""
+    """Fuses the maps of the four layers. (The name is the checkpoint's.)"""
 
     def __init__(self, channels: Sequence[int], features: int, out: int) -> None:
         super().__init__()
@@ -116,8 +116,8 @@ class DenseHead(nn.Module):
     def __init__(self, dim: int, out: int, channels: Sequence[int], features: int) -> None:
         """
         Args:
-            dim: of the tokens of both blocks of a layer together.
-            out: channels of the result, the confidence among them.
+            dim: channels of the concatenated tokens of both blocks of a layer.
+            out: channels of the result, including the confidence.
             channels: of the maps of the four layers.
             features: channels of the fused maps.
         """
@@ -153,11 +153,11 @@ def dense_output(
     """Return the values (B, S, H, W, out - 1) before activation, and the confidence (B, S, H, W), above 1.
 
     Args:
-        head: which head.
+        head: the head.
         layers: tokens (B, S, T, C) by layer.
         read: the four layers that the head reads.
         size: (H, W) of the images.
-        frames: how many to compute at a time: the maps of one take many times the memory of its tokens.
+        frames: number of frames to compute at a time. A frame's maps take many times the memory of its tokens.
     """
     B, S = layers[read[0]][0].shape[:2]
     flat = [(layers[layer][0].flatten(0, 1), layers[layer][1].flatten(0, 1)) for layer in read]
@@ -170,9 +170,9 @@ def dense_output(
 
 
 def add_position(x: Tensor, aspect: float, factor: float = 0.1) -> Tensor:
-    """Add sines and cosines of each pixel's place to maps (N, C, h, w), in place: of x in C / 2 channels, then of y.
+    """Add sines and cosines of each pixel's x (in the first C / 2 channels) and y to maps (N, C, h, w), in place.
 
-    Places are those on the image plane of a half diagonal of 1, for width / height = `aspect`.
+    x and y are coordinates on an image plane whose half diagonal is 1, for width / height = `aspect`.
     """
     _, C, height, width = x.shape
     diagonal = (1 + aspect**2) ** 0.5

@@ -1,14 +1,14 @@
-"""Cameras as VGGT encodes them, and points from depth.
+"""Cameras from VGGT's pose encoding, and points from depth.
 
-Nine numbers a camera: translation and quaternion (x, y, z, w, of any length) of `cam_from_world`, then the vertical
-and the horizontal field of view, radians. The principal point is the image's center. "World" is VGGT's own frame,
-near that of the first view, in a unit of its own.
+The encoding of a camera has nine numbers: translation and quaternion (x, y, z, w, of any length) of `cam_from_world`,
+then the vertical and the horizontal field of view in radians. The principal point is the image's center. "World" is
+VGGT's own frame, close to that of the first view, in an arbitrary unit.
 """
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from toolkit.geometry import Array, quaternion_to_rotation, rotation_to_quaternion
+from toolkit.geometry import Array, quaternion_to_rotation
 
 
 def cameras_from_pose_encoding(pose_enc: ArrayLike, size: tuple[int, int]) -> tuple[Array, Array]:
@@ -36,28 +36,11 @@ def cameras_from_pose_encoding(pose_enc: ArrayLike, size: tuple[int, int]) -> tu
     return np.concatenate([rotation, encoding[..., :3, None]], axis=-1), intrinsics
 
 
-def pose_encoding_from_cameras(cam_from_world: ArrayLike, intrinsics: ArrayLike, size: tuple[int, int]) -> Array:
-    """Return pose encodings (..., 9), the quaternion of length 1 with w >= 0.
-
-    The encoding has no place for a principal point: that of `intrinsics` is lost.
-
-    Args:
-        cam_from_world: (..., 3, 4) or (..., 4, 4).
-        intrinsics: K, (..., 3, 3), pixels.
-        size: (H, W) of the images.
-    """
-    pose, K = np.asarray(cam_from_world, np.float64), np.asarray(intrinsics, np.float64)
-    quaternion = rotation_to_quaternion(pose[..., :3, :3])[..., [1, 2, 3, 0]]
-    height, width = size
-    fields = 2 * np.arctan(np.stack([height / 2 / K[..., 1, 1], width / 2 / K[..., 0, 0]], axis=-1))
-    return np.concatenate([pose[..., :3, 3], quaternion, fields], axis=-1)
-
-
 def unproject_depth(depth: ArrayLike, cam_from_world: ArrayLike, intrinsics: ArrayLike) -> Array:
-    """Return the world points (S, H, W, 3) that depth maps show.
+    """Return the world point of each pixel of depth maps, (S, H, W, 3).
 
-    As in the official code the center of the first pixel is (0, 0) here, not (0.5, 0.5) as elsewhere in this toolkit:
-    for cameras of that convention, take 0.5 from their principal points first.
+    As in the official code, the center of the first pixel is (0, 0) here, not (0.5, 0.5) as elsewhere in this toolkit:
+    for cameras of that convention, subtract 0.5 from their principal points first.
 
     Args:
         depth: (S, H, W) or (S, H, W, 1), along the camera's z.
@@ -71,5 +54,5 @@ def unproject_depth(depth: ArrayLike, cam_from_world: ArrayLike, intrinsics: Arr
     focal, center = K[:, None, None, [0, 1], [0, 1]], K[:, None, None, :2, 2]
     rays = (np.stack([u, v], axis=-1) - center) / focal
     in_camera = np.concatenate([rays * z[..., None], z[..., None]], axis=-1)
-    # Rows of points times R: the inverse rotation of each.
+    # Row vectors times R: this applies the inverse rotation.
     return np.einsum("shwi,sij->shwj", in_camera - pose[:, None, None, :3, 3], pose[:, :3, :3])

@@ -1,4 +1,4 @@
-"""Images as VGGT takes them, with what that does to pixels: to intrinsics on the way in, to depth on the way back."""
+"""Images in the form that VGGT takes, and where their pixels come from."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,14 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
-from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from toolkit.errors import ImageError
 from toolkit.geometry import Array
-from toolkit.models.vggt.aggregator import PATCH
+from toolkit.models.vit import PATCH
 
 SIDE = 518
 MODES = ("crop", "pad")
@@ -23,7 +22,7 @@ Source = str | Path | Image.Image | NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Views:
-    """Images for the network, and where their pixels came from.
+    """Images for the network, and how their pixels map to those of the given images.
 
     Image coordinates (x, y) are in pixels; the center of the top-left one is (0.5, 0.5).
     """
@@ -31,70 +30,28 @@ class Views:
     images: Tensor
     """(S, 3, H, W) float32, RGB in [0, 1]."""
     scale: Array
-    """(S, 2): of x and of y. A point (x, y) of image i is at scale[i] * (x, y) + offset[i] in images[i]."""
+    """(S, 2): for x and y. The point (x, y) of the given image i is at scale[i] * (x, y) + offset[i] in images[i]."""
     offset: Array
     """(S, 2), network pixels."""
     sizes: NDArray[np.int64]
-    """(S, 2): width and height of the images as given."""
-
-    def intrinsics(self, K: ArrayLike) -> Array:
-        """Return the cameras' K (S, 3, 3) for the network's images, for those of the images as given.
-
-        Args:
-            K: (S, 3, 3), or (3, 3) for all: focal lengths and principal point, pixels. Distortion is no part of it.
-        """
-        change = np.zeros((len(self.scale), 3, 3))
-        change[:, [0, 1], [0, 1]], change[:, :2, 2], change[:, 2, 2] = self.scale, self.offset, 1.0
-        return change @ np.asarray(K, np.float64)
-
-    def to_network(self, index: int, points: ArrayLike) -> Array:
-        """Return where points (..., 2) of image `index` are in its network image, (..., 2)."""
-        return np.asarray(points, np.float64) * self.scale[index] + self.offset[index]
-
-    def from_network(self, index: int, points: ArrayLike) -> Array:
-        """Return where points (..., 2) of network image `index` are in the image as given, (..., 2)."""
-        return (np.asarray(points, np.float64) - self.offset[index]) / self.scale[index]
-
-    def sample(self, index: int, values: ArrayLike, points: ArrayLike) -> Array:
-        """Return a network map, such as depth, at points of the image as given: bilinear; NaN where it was cropped.
-
-        Args:
-            index: of the image.
-            values: (H, W), one a pixel of the network's image.
-            points: (..., 2) in the image as given.
-        """
-        values = np.asarray(values, np.float64)
-        size = np.array(values.shape[::-1])
-        if values.shape != tuple(self.images.shape[2:]):
-            raise ValueError(f"the map has shape {values.shape}; expected {tuple(self.images.shape[2:])}.")
-        in_network = self.to_network(index, points)
-        x, y = np.moveaxis(in_network - 0.5, -1, 0)
-        inside = ((in_network >= 0) & (in_network <= size)).all(axis=-1)
-        return np.where(inside, map_coordinates(values, [y, x], order=1, mode="nearest"), np.nan)
-
-    def to_image(self, index: int, values: ArrayLike) -> Array:
-        """Return a network map (H, W) for all pixels of the image as given, (height, width); NaN where cropped."""
-        width, height = self.sizes[index]
-        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        return self.sample(index, values, np.stack([x, y], axis=-1))
+    """(S, 2): width and height of the given images."""
 
 
 def resized_size(width: int, height: int, mode: str) -> tuple[int, int]:
-    """Return the width and height to which `load_images` resizes an image, before it cuts or fills."""
+    """Return the width and height to which `load_images` resizes an image, before it crops or pads."""
     longest = width if mode == "crop" else max(width, height)
-    # In the order of the official code: where a quotient is near a half, another one rounds otherwise.
+    # Computed in the order of the official code: near a half, another order rounds differently.
     new_width = SIDE if longest == width else round(width * (SIDE / height) / PATCH) * PATCH
     new_height = SIDE if longest != width else round(height * (SIDE / width) / PATCH) * PATCH
     return new_width, new_height
 
 
 def load_images(sources: Sequence[Source], mode: str = "crop") -> Views:
-    """Return images as the official loader makes them.
+    """Load images as the official loader does.
 
-    Each is put on white where it is transparent, resized (bicubic, by Pillow) and cut or filled:
-    "crop": to a width of 518, the height in proportion to the nearest multiple of 14, its middle 518 rows where it
-    has more; "pad": its longer side to 518, the other in proportion to a multiple of 14, white up to 518 x 518. Where
-    images then differ in size, white is added around the smaller. EXIF orientation is not applied.
+    Transparent pixels become white. Images are resized (bicubic, by Pillow) in proportion, to multiples of 14:
+    "crop" makes the width 518 and keeps the middle 518 rows where there are more; "pad" makes the longer side 518 and
+    adds white up to 518 x 518. Smaller images then get a white border. EXIF orientation is not applied.
 
     Args:
         sources: paths, Pillow images, or arrays (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) gray, uint8.
@@ -102,7 +59,7 @@ def load_images(sources: Sequence[Source], mode: str = "crop") -> Views:
 
     Raises:
         ImageError: a file is missing or cannot be decoded, or an image is too elongated.
-        ValueError: no image, or another mode.
+        ValueError: no images, or unknown mode.
     """
     if mode not in MODES:
         raise ValueError(f"mode is {mode!r}; expected one of {list(MODES)}.")
@@ -138,7 +95,7 @@ def load_images(sources: Sequence[Source], mode: str = "crop") -> Views:
 
 
 def _open(source: Source) -> Image.Image:
-    """Return an RGB image, blended on white where it has an alpha channel."""
+    """Return an RGB image; one with an alpha channel is blended with white."""
     if isinstance(source, Image.Image):
         image = source
     elif isinstance(source, np.ndarray):
