@@ -1,15 +1,28 @@
-"""What the pictures of the documentation and the browser tests rest on, as far as it needs no browser."""
+"""The documentation: its links, commands and examples, and its pictures, as far as they need no browser."""
 
 import io
 import re
+import shlex
+import shutil
 from pathlib import Path
+from typing import Any
 
+import click
 import numpy as np
 import pytest
+import typer
 from PIL import Image
 
 from docs import chromium, make_images
+from toolkit.__main__ import app
+from toolkit.embed import embed_sessions
+from toolkit.errors import ManifestError
+from toolkit.files import SceneFiles
+from toolkit.geometry import pose_error
+from toolkit.localize import localize_pairs
+from toolkit.manifest import load_manifest
 from toolkit.notebook import notebook_parameters
+from toolkit.retrieve import retrieve_pairs
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -75,8 +88,100 @@ def test_pictures_are_made_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert Image.open(tmp_path / "images" / "a.png").size == (400, 300)
 
 
-def test_pictures_of_the_readme_exist_and_are_small() -> None:
-    pictures = re.findall(r"!\[[^\]]+\]\((docs/images/[^)]+)\)", (ROOT / "README.md").read_text())
-    assert pictures
-    for picture in pictures:
-        assert (ROOT / picture).stat().st_size <= 300_000, picture
+def test_pictures_are_small() -> None:
+    pictures = [target for _, target in links() if target.suffix == ".png"]
+    assert len(pictures) == 4
+    assert all(picture.stat().st_size <= 300_000 for picture in pictures)
+
+
+# Pages
+
+
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", ROOT / "benchmarks" / "README.md"]
+PAGES += sorted((ROOT / "docs").glob("*.md"))
+
+
+def links() -> list[tuple[Path, Path]]:
+    """Return the page and the target of each link to a file of the repository; checks anchors."""
+    found = []
+    for page in PAGES:
+        for link in re.findall(r"\]\(([^)]+)\)", page.read_text()):
+            if re.match(r"https?://|mailto:", link):
+                continue
+            name, _, anchor = link.partition("#")
+            target = (page.parent / name).resolve() if name else page
+            assert target.exists(), f"{page.name} links to {link}"
+            headings = re.findall(r"^#+ (.+)$", target.read_text(), re.MULTILINE) if anchor else []
+            anchors = [re.sub(r"[^a-z0-9 -]", "", heading.lower()).replace(" ", "-") for heading in headings]
+            assert not anchor or anchor in anchors, f"{page.name} links to {link}; headings: {anchors}"
+            found.append((page, target))
+    return found
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """Return the code blocks of a page whose info string is `language`."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)
+
+
+def test_the_readme_is_short_and_links_each_page_once() -> None:
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 150
+    linked = [target for page, target in links() if page.name == "README.md" and target.suffix == ".md"]
+    for page in sorted((ROOT / "docs").glob("*.md")):
+        assert linked.count(page) == 1, page.name
+
+
+def test_commands_exist_with_their_options() -> None:
+    """Each `python -m toolkit` command of the pages is parsed by the command line; files need not be there."""
+    main = typer.main.get_command(app)
+    lines = "\n".join(block for page in PAGES for block in blocks(page, "bash")).replace("\\\n", " ").splitlines()
+    calls = [shlex.split(line, comments=True) for line in lines if "-m toolkit " in line]
+    assert len(calls) > 20
+    for call in calls:
+        command, words = main, call[call.index("toolkit") + 1 :]
+        while isinstance(command, click.Group):
+            assert words[0] in command.commands, call
+            command, words = command.commands[words[0]], words[1:]
+        command.make_context(command.name, words)  # raises for unknown options and missing arguments
+
+
+def test_settings_of_the_pages_exist() -> None:
+    """Each `--set` of the pages, and each setting that the text names, is a setting of the manifest."""
+    text = "\n".join(page.read_text() for page in PAGES if page.name != "CHANGELOG.md")
+    overrides = re.findall(r"--set '?([^\s'`]+=(?:\[[^]]*\]|[^\s'`]+))", text)
+    assert len(overrides) > 5
+    for override in overrides:
+        load_manifest(ROOT / "data_manifests" / "demo.yaml", [override])
+    stages = "explore|embed|retrieve|rerank|localize|evaluate|visualize"
+    for key in sorted(set(re.findall(rf"`((?:{stages})\.(?!py`)[a-z_.]+)", text))):
+        with pytest.raises(ManifestError) as caught:
+            load_manifest(ROOT / "data_manifests" / "demo.yaml", [f"{key}=[[no such value]]"])
+        assert "unknown" not in str(caught.value).lower(), key
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python.*")], ids=lambda page: page.name)
+def test_python_examples_compile(page: Path) -> None:
+    for block in blocks(page, "python.*"):
+        compile(block, page.name, "exec")
+
+
+def test_python_examples_run(small_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The examples of docs/api.md on the small capture, in their order; those that need weights are marked."""
+    (tmp_path / "data").mkdir()
+    sessions = Path(shutil.copytree(small_capture, tmp_path / "data" / "demo")) / "sessions"
+    files = SceneFiles(tmp_path / "runs" / "demo", "demo")
+    embed_sessions(sessions, files.embeddings, device="ios", features_dir=files.features)
+    retrieve_pairs(sessions, files.embeddings, "ios", "ios", out_jsonl=files.retrieval_dir)
+    where = (files.retrieval_dir, files.poses_dir, files.features, files.maps)
+    localize_pairs(sessions, *where, map_device="ios", query_device="ios")
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    for block in blocks(ROOT / "docs" / "api.md", "python"):
+        exec(compile(block, "docs/api.md", "exec"), names)
+    assert names["estimate"].status == "ok"
+    errors = pose_error(names["estimate"].world_from_rig, names["world_from_cam"][0])
+    assert max(errors) < 0.1
+    assert names["alignment"].world_from_model.scale == pytest.approx(10)
+    np.testing.assert_allclose(names["world_from_query"], names["world_from_cams"][3], atol=1e-6)
+    assert names["scores"].shape == (2, 3)
+    assert len(names["matches"].indices) > 20
+    assert np.median(names["translation_m"]) < 0.05
