@@ -14,6 +14,7 @@ import typer
 from PIL import Image
 
 from docs import chromium, make_images
+from tests.test_rooms import LEVELS
 from toolkit.__main__ import app
 from toolkit.embed import embed_sessions
 from toolkit.errors import ManifestError
@@ -156,6 +157,16 @@ def test_settings_of_the_pages_exist() -> None:
         with pytest.raises(ManifestError) as caught:
             load_manifest(ROOT / "data_manifests" / "demo.yaml", [f"{key}=[[no such value]]"])
         assert "unknown" not in str(caught.value).lower(), key
+
+
+def test_contributing_draws_the_rooms_and_names_files_that_are_there() -> None:
+    page = ROOT / "CONTRIBUTING.md"
+    drawn = [tuple(line.split()) for line in blocks(page, "text")[1].splitlines()]
+    assert drawn == [level for level in LEVELS[::-1] if level != ("__init__",)]
+    table = re.findall(r"^\| `(\w+)/` \|", page.read_text(), re.MULTILINE)
+    assert {*table} == {path.parent.name for path in (ROOT / "toolkit").glob("*/__init__.py")}
+    for name in re.findall(r"`([\w/.]+(?:/|\.py))`", page.read_text()):
+        assert (ROOT / name).exists() or (ROOT / "toolkit" / name).exists(), name
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python.*")], ids=lambda page: page.name)
