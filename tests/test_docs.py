@@ -186,11 +186,14 @@ def test_python_examples_compile(page: Path) -> None:
         compile(block, page.name, "exec")
 
 
-def test_python_examples_run(small_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_python_examples_run(
+    small_capture: Path, small_features: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The examples of docs/api.md on the small capture, in their order; those that need weights are marked."""
     (tmp_path / "data").mkdir()
     sessions = Path(shutil.copytree(small_capture, tmp_path / "data" / "demo")) / "sessions"
     files = SceneFiles(tmp_path / "runs" / "demo", "demo")
+    shutil.copytree(small_features, files.features)
     embed_sessions(sessions, files.embeddings, device="ios", features_dir=files.features)
     retrieve_pairs(sessions, files.embeddings, files.retrieval_dir, map_device="ios", query_device="ios")
     where = (files.retrieval_dir, files.poses_dir, files.features, files.maps)

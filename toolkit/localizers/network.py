@@ -18,7 +18,7 @@ from toolkit.files import files_fingerprint
 from toolkit.geometry import invert, make_pose
 from toolkit.localizers.base import View
 from toolkit.localizers.prediction import Prediction
-from toolkit.models.compute import PRECISIONS, Fitting, check_device_name, resolve_device, resolve_precision
+from toolkit.models.compute import PRECISIONS, Fitting, resolve_device, resolve_precision
 from toolkit.models.weights import VGGT as WEIGHTS
 from toolkit.models.weights import resolve_weights
 
@@ -219,7 +219,6 @@ class NetworkPredictor:
             ManifestError: no such device or precision.
             WeightsError: no weights.
         """
-        check_device_name(compute_device)
         expected = [name for name in PRECISIONS if name != "float16"]
         if dtype_compute not in expected:
             raise ManifestError(f"dtype_compute is {dtype_compute!r}; VGGT expects one of {', '.join(expected)}.")

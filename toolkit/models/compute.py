@@ -17,16 +17,6 @@ DEVICE_NAME = r"auto|cpu|mps|cuda(:\d+)?"
 PRECISIONS = ("auto", "float32", "bfloat16", "float16")
 
 
-def check_device_name(name: str) -> None:
-    """Refuse an invalid name of a device, without importing torch.
-
-    Raises:
-        ManifestError: not `auto`, `cpu`, `cuda`, `cuda:<i>` or `mps`.
-    """
-    if not re.fullmatch(DEVICE_NAME, name):
-        raise ManifestError(f"compute_device is {name!r}; expected auto, cpu, cuda, cuda:<number> or mps.")
-
-
 def resolve_device(name: str = "auto") -> "torch.device":
     """Return the device that `auto`, `cpu`, `cuda`, `cuda:<i>` or `mps` stands for.
 
@@ -38,7 +28,8 @@ def resolve_device(name: str = "auto") -> "torch.device":
     """
     import torch
 
-    check_device_name(name)
+    if not re.fullmatch(DEVICE_NAME, name):
+        raise ManifestError(f"compute_device is {name!r}; expected auto, cpu, cuda, cuda:<number> or mps.")
     gpus, apple = torch.cuda.device_count(), torch.backends.mps.is_available()
     if name == "auto":
         name = "cuda" if gpus else "mps" if apple else "cpu"

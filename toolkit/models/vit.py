@@ -82,7 +82,15 @@ class Attention(nn.Module):
         self, x: Tensor, rope: Rope | None = None, every: int = 1, buffer: SharedBuffer | None = None
     ) -> Tensor:
         """Return the attention output of tokens 0, every, 2 * every, ... over all tokens, (B, ceil(N / every), C)."""
-        q, k, v = self._queries_keys_values(x, every, buffer)
+        C = x.shape[-1]
+        weight, bias = self.qkv.weight, self.qkv.bias
+        if every == 1:
+            parts = _linear(x, weight, bias, buffer).split(C, dim=-1)
+        else:
+            q = F.linear(x[:, ::every], weight[:C], bias[:C])
+            parts = (q, *_linear(x, weight[C:], bias[C:], buffer).split(C, dim=-1))
+        q, k, v = (part.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for part in parts)  # (B, heads, tokens, D)
+        del parts
         if self.has_qk_norm:
             # LayerNorm needs contiguous input: convert type and layout in one copy.
             q = self.q_norm(q.to(torch.float32, memory_format=torch.contiguous_format))
@@ -91,18 +99,7 @@ class Attention(nn.Module):
             q, k = rotate_(q, (rope[0][::every], rope[1][::every])), rotate_(k, rope)
         gathered = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v)
         del q, k, v  # a fifth of the memory of a pass where they are normalized: free it before the projection
-        return self.proj(gathered.transpose(1, 2).reshape(len(x), -1, x.shape[-1]))
-
-    def _queries_keys_values(self, x: Tensor, every: int, buffer: SharedBuffer | None) -> tuple[Tensor, ...]:
-        """Return queries, of tokens 0, every, 2 * every, ..., keys and values, each (B, heads, tokens, C / heads)."""
-        C = x.shape[-1]
-        weight, bias = self.qkv.weight, self.qkv.bias
-        if every == 1:
-            parts = _linear(x, weight, bias, buffer).split(C, dim=-1)
-        else:
-            q = F.linear(x[:, ::every], weight[:C], bias[:C])
-            parts = (q, *_linear(x, weight[C:], bias[C:], buffer).split(C, dim=-1))
-        return tuple(part.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for part in parts)
+        return self.proj(gathered.transpose(1, 2).reshape(len(x), -1, C))
 
 
 class Mlp(nn.Module):

@@ -73,10 +73,9 @@ class Fusion(nn.Module):
             self.resConfUnit1 = ResidualUnit(channels)
         self.resConfUnit2 = ResidualUnit(channels)
 
-    def forward(self, coarse: Tensor, fine: Tensor | None, size: Sequence[int]) -> Tensor:
+    def forward(self, coarse: Tensor | None, fine: Tensor, size: Sequence[int]) -> Tensor:
         """Return (N, C, *size) of maps (N, C, h, w)."""
-        if fine is not None:
-            coarse = self.resConfUnit1(fine).add_(coarse)
+        coarse = fine if coarse is None else self.resConfUnit1(fine).add_(coarse)
         # A 1 x 1 convolution and an interpolation commute: convolving the small map is cheaper.
         return _resize(self.out_conv(self.resConfUnit2(coarse)), size)
 
@@ -86,14 +85,9 @@ class Scratch(nn.Module):
 
     def __init__(self, channels: Sequence[int], features: int, out: int) -> None:
         super().__init__()
-        self.layer1_rn = nn.Conv2d(channels[0], features, 3, padding=1, bias=False)
-        self.layer2_rn = nn.Conv2d(channels[1], features, 3, padding=1, bias=False)
-        self.layer3_rn = nn.Conv2d(channels[2], features, 3, padding=1, bias=False)
-        self.layer4_rn = nn.Conv2d(channels[3], features, 3, padding=1, bias=False)
-        self.refinenet1 = Fusion(features, has_residual=True)
-        self.refinenet2 = Fusion(features, has_residual=True)
-        self.refinenet3 = Fusion(features, has_residual=True)
-        self.refinenet4 = Fusion(features, has_residual=False)
+        for level, channel in enumerate(channels, start=1):
+            self.add_module(f"layer{level}_rn", nn.Conv2d(channel, features, 3, padding=1, bias=False))
+            self.add_module(f"refinenet{level}", Fusion(features, has_residual=level < len(channels)))
         self.output_conv1 = nn.Conv2d(features, features // 2, 3, padding=1)
         self.output_conv2 = nn.Sequential(
             nn.Conv2d(features // 2, 32, 3, padding=1), nn.ReLU(inplace=True), nn.Conv2d(32, out, 1)
@@ -101,11 +95,11 @@ class Scratch(nn.Module):
 
     def forward(self, maps: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
         """Return (N, out, H, W), size = (H, W), of maps from fine to coarse, (N, channels[level], h, w)."""
-        fine1, fine2, fine3 = self.layer1_rn(maps[0]), self.layer2_rn(maps[1]), self.layer3_rn(maps[2])
-        x = self.refinenet4(self.layer4_rn(maps[3]), None, fine3.shape[2:])
-        x = self.refinenet3(x, fine3, fine2.shape[2:])
-        x = self.refinenet2(x, fine2, fine1.shape[2:])
-        x = self.refinenet1(x, fine1, [2 * side for side in fine1.shape[2:]])
+        sizes = [[2 * side for side in maps[0].shape[2:]], *(x.shape[2:] for x in maps[:-1])]
+        x = None
+        for level in range(len(maps), 0, -1):
+            fine = self.get_submodule(f"layer{level}_rn")(maps[level - 1])
+            x = self.get_submodule(f"refinenet{level}")(x, fine, sizes[level - 1])
         x = _resize(self.output_conv1(x), size)
         return self.output_conv2(add_position(x, size[1] / size[0]))
 
