@@ -46,10 +46,10 @@ test-browser: $(INSTALLED)  ## the report and the notebooks' viewer in a real br
 test-rest: $(INSTALLED)  ## the browser tests and the slow ones together, for they share a finished run
 	$(PYTEST) -m "browser or slow" -rs
 
-docs-images: $(INSTALLED)  ## draw the README's pictures anew from a demo run; first: make browser-setup
+docs-images: $(INSTALLED)  ## draw the pictures of the documentation from a demo run; first: make browser-setup
 	$(BIN)/python -m docs.make_images
 
-docs-view: $(INSTALLED)  ## draw the README's picture of the localization view anew; needs mesa-vulkan-drivers
+docs-view: $(INSTALLED)  ## draw the documentation's picture of the localization view; needs mesa-vulkan-drivers
 	$(BIN)/python -m docs.view_image
 
 lab: $(INSTALLED)  ## JupyterLab on the notebooks

@@ -69,18 +69,18 @@ def open_browser() -> "Iterator[Browser]":
 
 @dataclass
 class Traffic:
-    """What a page asked for, and what went wrong in it."""
+    """The requests of a page to other machines, and its failures."""
 
     outside: list[str] = field(default_factory=list)
     """Requests to other machines; all were refused."""
     failed: list[str] = field(default_factory=list)
     """Other requests without an answer, or with one that says error."""
     errors: list[str] = field(default_factory=list)
-    """Errors of the console, and exceptions that no one caught."""
+    """Errors of the console, and uncaught exceptions."""
 
 
 def watch(page: "Page") -> Traffic:
-    """Cut a page off from other machines, and note what happens in it."""
+    """Block requests of a page to other machines, and record its requests and errors."""
     traffic = Traffic()
 
     def guard(route: "Route") -> None:
@@ -100,7 +100,7 @@ def watch(page: "Page") -> Traffic:
             traffic.failed.append(f"{request.failure} {request.url}")
 
     def said(message: Any) -> None:
-        # A refused request is an error of the console, too; it is in `outside`.
+        # A refused request is also an error of the console; it is already in `outside`.
         if message.type == "error" and message.location.get("url") not in traffic.outside:
             traffic.errors.append(message.text)
 
@@ -167,7 +167,7 @@ def _wait_for(url: str, server: "subprocess.Popen[bytes]", log: Path, seconds: f
 
 
 def copy_notebook(stage: str, run: Path, sessions_root: Path, folder: Path) -> str:
-    """Copy a stage's notebook to a folder, set to work on what lies in a run; return its name."""
+    """Copy a stage's notebook to a folder, with parameters that name the files of a run; return its name."""
     import nbformat
 
     from toolkit.files import SceneFiles
@@ -228,7 +228,7 @@ def wait_for_scene(canvas: "Locator", seconds: float = 120) -> bytes:
     """
     deadline = time.monotonic() + seconds
     while True:
-        # Of the page: of an element, Playwright waits for two frames alike in time, and software draws them slowly.
+        # Of the page, not of the element: there Playwright waits for two equal frames, which take long in software.
         box = canvas.bounding_box()
         png = canvas.page.screenshot(clip=box, timeout=1000 * seconds)  # type: ignore[arg-type]
         if is_scene(png) or time.monotonic() > deadline:
@@ -243,8 +243,8 @@ def is_scene(png: bytes) -> bool:
 
 
 def colors(png: bytes) -> tuple[int, float]:
-    """Return how many colors a picture has, of 16 steps a channel, and the share of its pixels that do not have the
-    most common one."""
+    """Return the number of colors of a picture, with 16 steps a channel, and the share of pixels without the most
+    common one."""
     import numpy as np
     from PIL import Image
 

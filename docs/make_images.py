@@ -1,6 +1,6 @@
-"""Draw the README's pictures anew: `make docs-images`, after `make browser-setup`.
+"""Draw the pictures of the documentation: `make docs-images`, after `make browser-setup`.
 
-They come from a run of the demo, made first where it is not there yet, as a person sees it: the report in a browser,
+They show a run of the demo, which is made first if it is missing, as a person sees it: the report in a browser,
 the viewer in JupyterLab.
 """
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).resolve().parents[1]
 IMAGES = ROOT / "docs" / "images"
 LARGEST = 300_000
-"""Bytes of a picture at most: a README is read over slow lines, too."""
+"""Largest size of a picture in bytes: pages are also read over slow lines."""
 
 
 def main() -> None:
@@ -36,7 +36,7 @@ def main() -> None:
 
 
 def result(run: Path) -> bytes:
-    """Return a query of the phone in the headset's map, above all of them seen from above."""
+    """Return the picture of a query of the phone in the headset's map, with the map from above below it."""
     from PIL import Image
 
     folder, pair = run / run.name / "visualization", f"{run.name}_map_hl_query_ios"
@@ -51,14 +51,14 @@ def result(run: Path) -> bytes:
 
 
 def report(browser: "Browser", run: Path) -> bytes:
-    """Return the numbers of the report, without its head: how long the demo takes depends on the machine."""
+    """Return a picture of the report's tables, without its head, which has times of this machine."""
     page = browser.new_page(viewport={"width": 1000, "height": 1150})
     page.goto((run / "report.html").as_uri() + "#scene-1")
     return page.screenshot()
 
 
 def viewer(browser: "Browser", run: Path, sessions_root: Path) -> bytes:
-    """Return the notebook 06_visualize in JupyterLab, scrolled to its viewer."""
+    """Return a picture of notebook 06_visualize in JupyterLab, scrolled to its viewer."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         name = chromium.copy_notebook("visualize", run, sessions_root, folder / "notebooks")
@@ -69,7 +69,7 @@ def viewer(browser: "Browser", run: Path, sessions_root: Path) -> bytes:
                 sys.exit(f"{name}: {errors[0]}")
             canvas = chromium.find_viewer(page)
             chromium.wait_for_scene(canvas)
-            # What stands above and below names folders of this machine.
+            # The lines above and below it name folders of this machine.
             canvas.evaluate("element => element.scrollIntoView({block: 'start'})")
             picture: bytes = page.screenshot(timeout=120_000)
             page.close()
@@ -77,7 +77,7 @@ def viewer(browser: "Browser", run: Path, sessions_root: Path) -> bytes:
 
 
 def save(png: bytes, path: Path) -> None:
-    """Write a picture with as many colors of a palette as fit in `LARGEST` bytes."""
+    """Write a picture with a palette of as many colors as fit in `LARGEST` bytes."""
     from PIL import Image
 
     image = Image.open(io.BytesIO(png)).convert("RGB")

@@ -1,4 +1,4 @@
-"""Draw the README's picture of the localization view anew: `make docs-view`.
+"""Draw the picture of the localization view for the documentation: `make docs-view`.
 
 The viewer runs without a window; it needs a Vulkan driver, on Debian the package mesa-vulkan-drivers.
 """
@@ -19,7 +19,7 @@ MAX_WIDTH = 1280
 
 
 def main() -> None:
-    """Make the picture from a run of the demo, which is made first where it is not there yet."""
+    """Make the picture from a run of the demo, which is made first if it is missing."""
     run = pipeline.run(ROOT / "data_manifests" / "demo.yaml")
     draw(run / run.name / "visualization" / f"{run.name}_map_hl_query_ios.rrd", OUT)
     print(OUT)
@@ -31,7 +31,7 @@ def draw(recording: Path, out: Path, query: int | None = None) -> None:
     Args:
         recording: `.rrd`.
         out: PNG.
-        query: on the timeline; None: the first.
+        query: number of the query on the timeline; None: the first.
 
     Raises:
         ToolkitError: the viewer shows nothing, such as without a Vulkan driver, or a view reports an error.
@@ -49,7 +49,7 @@ def draw(recording: Path, out: Path, query: int | None = None) -> None:
         if query is not None:
             viewer.set_time("query", sequence=query)
         for _ in range(TRIES):
-            time.sleep(PAUSE_S)  # pictures are decoded, and notices go away
+            time.sleep(PAUSE_S)  # until pictures are decoded and notices are gone
             with suppress(Exception):  # too busy to answer; the next try may succeed
                 viewer.save_screenshot(str(out.resolve()))
                 drawn = True
@@ -62,7 +62,7 @@ def draw(recording: Path, out: Path, query: int | None = None) -> None:
     with Image.open(out) as picture:
         small = picture.convert("RGB")
         small.thumbnail((MAX_WIDTH, MAX_WIDTH))
-        small.quantize(128, dither=Image.Dither.NONE).save(out, optimize=True)  # a README is read over slow lines
+        small.quantize(128, dither=Image.Dither.NONE).save(out, optimize=True)  # pages are also read over slow lines
 
 
 if __name__ == "__main__":
