@@ -11,7 +11,7 @@ from toolkit.models.compute import Fitting, resolve_device, resolve_precision
 
 @pytest.mark.parametrize("name", ["gpu", "cuda:", "cuda:x", "cuda0", "", "CPU", "xpu"])
 def test_unknown_devices(name: str) -> None:
-    with pytest.raises(ManifestError, match="auto, cpu, cuda"):
+    with pytest.raises(ManifestError, match=f"compute_device is {name!r}"):
         resolve_device(name)
 
 
@@ -19,9 +19,9 @@ def test_devices_that_are_not_here(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
     assert resolve_device("auto").type == "cpu"
-    with pytest.raises(ToolkitError, match="GPU"):
+    with pytest.raises(ToolkitError, match="compute_device is cuda"):
         resolve_device("cuda")
-    with pytest.raises(ToolkitError, match="GPU"):
+    with pytest.raises(ToolkitError, match="compute_device is mps"):
         resolve_device("mps")
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     assert resolve_device("auto").type == "cuda"
@@ -41,7 +41,7 @@ def test_precisions(monkeypatch: pytest.MonkeyPatch) -> None:
     for capability, expected in {(7, 5): torch.float16, (8, 0): torch.bfloat16, (9, 0): torch.bfloat16}.items():
         monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _, value=capability: value)
         assert resolve_precision("auto", gpu) == expected
-    with pytest.raises(ManifestError, match=r"'half'.*float32, bfloat16"):
+    with pytest.raises(ManifestError, match="dtype_compute is 'half'"):
         resolve_precision("half", cpu)
 
 
@@ -72,7 +72,7 @@ def test_a_batch_that_does_not_fit_is_halved(caplog: pytest.LogCaptureFixture) -
 
 
 def test_not_even_one_row_fits() -> None:
-    with pytest.raises(ToolkitError, match=r"images.*image_size"):
+    with pytest.raises(ToolkitError, match=r"images.*Tried to allocate.*image_size"):
         Fitting(Memory(0), "images")(torch.arange(3))
 
 

@@ -252,12 +252,12 @@ def test_images_of_another_shape_are_refused(model: VGGT, shape: tuple[int, ...]
 
 
 def test_other_wrong_input_is_refused(model: VGGT, images: torch.Tensor) -> None:
-    with pytest.raises(ValueError, match=r"patch_tokens have shape .*expected \(2, 3, 12, 32\)"):
+    with pytest.raises(ValueError, match=r"patch_tokens.*\(2, 3, 12, 32\)"):
         model(images, patch_tokens=torch.zeros(2, 3, 11, 32))
-    with pytest.raises(ValueError, match="expected some of"):
+    with pytest.raises(ValueError, match="heads"):
         tiny(("camera",))(images, heads=("depth",))
     for heads in (("track",), (), "camera"):
-        with pytest.raises(ValueError, match="expected some of"):
+        with pytest.raises(ValueError, match="heads"):
             VGGT(heads)
     with pytest.raises(ValueError, match=r"expected \(N, 3, H, W\)"):
         model.encode(images)
@@ -288,7 +288,7 @@ def test_strict_loading_refuses_the_rest() -> None:
 
 
 def test_checkpoint_of_another_network_is_refused() -> None:
-    with pytest.raises(WeightsError, match=r"camera_token found \(1, 2, 1, 32\), expected \(1, 2, 1, 1024\)"):
+    with pytest.raises(WeightsError, match=r"camera_token .*\(1, 2, 1, 32\).*\(1, 2, 1, 1024\)"):
         VGGT.from_checkpoint(tiny().state_dict())
 
 
@@ -345,7 +345,7 @@ def test_pose_encoding_known_answers() -> None:
     np.testing.assert_allclose(K, [[200, 0, 100], [0, 50, 50], [0, 0, 1]], atol=1e-12)
     _, K = cameras_from_pose_encoding([0, 0, 0, 0, 0, 0, 1, 0, 0], (100, 200))
     assert np.isinf(K[[0, 1], [0, 1]]).all()
-    with pytest.raises(ValueError, match=r"expected \(\.\.\., 9\)"):
+    with pytest.raises(ValueError, match=r"\(2, 8\)"):
         cameras_from_pose_encoding(np.zeros((2, 8)), (100, 200))
     with pytest.raises(ValueError, match="zero or not finite"):
         cameras_from_pose_encoding(np.zeros(9), (100, 200))
@@ -413,17 +413,17 @@ def test_all_kinds_of_sources_are_alike(tmp_path: Path) -> None:
 
 def test_wrong_images_are_refused(tmp_path: Path) -> None:
     (tmp_path / "torn.png").write_bytes(b"\x89PNG\r\n\x1a\n")
-    with pytest.raises(ImageError, match=r"not found: .*none\.png"):
+    with pytest.raises(ImageError, match=r"none\.png"):
         load_images([tmp_path / "none.png"])
-    with pytest.raises(ImageError, match=r"cannot be decoded: .*torn\.png"):
+    with pytest.raises(ImageError, match=r"torn\.png"):
         load_images([tmp_path / "torn.png"])
-    with pytest.raises(ImageError, match="1000 x 10 pixels is too elongated"):
+    with pytest.raises(ImageError, match="1000 x 10 pixels"):
         load_images([np.zeros((10, 1000, 3), np.uint8)])
-    with pytest.raises(ImageError, match="too elongated"):
+    with pytest.raises(ImageError, match="10 x 1000 pixels"):
         load_images([np.zeros((1000, 10, 3), np.uint8)], "pad")
     with pytest.raises(ValueError, match="no images"):
         load_images([])
-    with pytest.raises(ValueError, match="expected one of"):
+    with pytest.raises(ValueError, match="stretch"):
         load_images([np.zeros((10, 10, 3), np.uint8)], "stretch")
 
 

@@ -3,6 +3,7 @@
 import hashlib
 import os
 import pickle
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -230,7 +231,7 @@ def test_a_wrong_path_never_falls_back(hub: FakeHub, tmp_path: Path, given: str)
     resolve_weights(MEGALOC)  # the cache has it
     hub.requests.clear()
     for function in (find_weights, resolve_weights):
-        with pytest.raises(WeightsError, match=r"found no weights file .*expected `model.safetensors` of .*MegaLoc"):
+        with pytest.raises(WeightsError, match=r"MegaLoc: .*`model.safetensors` of .*embed.checkpoint"):
             function(MEGALOC, tmp_path / given)
     assert hub.requests == []
 
@@ -289,14 +290,14 @@ def test_a_part_that_is_called_module_keeps_its_name(tmp_path: Path) -> None:
 def test_a_pickle_with_code_is_not_run(tmp_path: Path, is_zip: bool) -> None:
     content = {**tensors(), "x": Bomb(tmp_path / "ran")}
     torch.save(content, tmp_path / "model.pt", _use_new_zipfile_serialization=is_zip)
-    with pytest.raises(WeightsError, match=r"model\.pt .*runs code.*mkdir.*not loaded.*\.safetensors"):
+    with pytest.raises(WeightsError, match=r"model\.pt .*mkdir.*\.safetensors"):
         read_state_dict(tmp_path / "model.pt")
     assert not (tmp_path / "ran").exists()
 
 
 def test_a_plain_pickle_is_not_run(tmp_path: Path) -> None:
     (tmp_path / "model.bin").write_bytes(pickle.dumps({"x": Bomb(tmp_path / "ran")}, protocol=2))
-    with pytest.raises(WeightsError, match="not loaded"):
+    with pytest.raises(WeightsError, match=r"model\.bin"):
         read_state_dict(tmp_path / "model.bin")
     assert not (tmp_path / "ran").exists()
 
@@ -315,7 +316,7 @@ def test_a_torn_safetensors_file(tmp_path: Path, keep: int) -> None:
 
 def test_a_safetensors_header_of_absurd_length(tmp_path: Path) -> None:
     (tmp_path / "model.safetensors").write_bytes(b"\xff" * 7 + b"\x7f" + b"{}")
-    with pytest.raises(WeightsError, match="not a whole safetensors file"):
+    with pytest.raises(WeightsError, match=r"model\.safetensors"):
         read_state_dict(tmp_path / "model.safetensors")
 
 
@@ -341,22 +342,22 @@ def test_a_torn_pickle(tmp_path: Path, is_zip: bool, share: float) -> None:
 )
 def test_other_files(tmp_path: Path, name: str, content: bytes, says: str) -> None:
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(WeightsError, match=rf"{name} \({len(content)} bytes\) is .*{says}.*expected .* data"):
+    with pytest.raises(WeightsError, match=rf"{name} \({len(content)} bytes\) is .*{says}"):
         read_state_dict(tmp_path / name)
 
 
 def test_names_that_lie(tmp_path: Path) -> None:
     torch.save(tensors(), tmp_path / "model.safetensors")
-    with pytest.raises(WeightsError, match=r"named \.safetensors but holds torch pickle"):
+    with pytest.raises(WeightsError, match=r"model\.safetensors .*torch pickle"):
         read_state_dict(tmp_path / "model.safetensors")
     save_file(tensors(), tmp_path / "model.pt")
-    with pytest.raises(WeightsError, match=r"named \.pt but holds safetensors"):
+    with pytest.raises(WeightsError, match=r"model\.pt .*safetensors"):
         read_state_dict(tmp_path / "model.pt")
 
 
 def test_no_file(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "nowhere.pt"):
-        with pytest.raises(ToolkitError, match=r"cannot be read \(.+\); expected a file"):
+        with pytest.raises(ToolkitError, match=re.escape(str(path))):
             read_state_dict(path)
 
 
