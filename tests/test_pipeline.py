@@ -329,7 +329,7 @@ def test_other_weights_in_the_same_place_are_noticed(place: Path, go: Callable[.
 def test_the_weights_of_every_network_of_a_stage_are_asked_for() -> None:
     def needed(**settings: object) -> list[tuple[list[str], object]]:
         found = pipeline._weights_needed("localize", LocalizeSettings.of(settings))
-        return [([source.model for source in sources], place) for sources, place in found]
+        return [([release.model for release in (source, *source.others)], place) for source, place in found]
 
     assert needed() == needed(features=["sift"]) == needed(method="nearest", features=["superpoint"]) == []
     assert needed(features=["sift", "superpoint"], matcher={"checkpoint": "/w/lg"}) == [
@@ -341,7 +341,7 @@ def test_the_weights_of_every_network_of_a_stage_are_asked_for() -> None:
     assert both[0] == (["VGGT-1B", "VGGT-1B-Commercial"], "vggt.pt")
     assert [models for models, _ in both[1:]] == [["SuperPoint"], ["LightGlue"]]
     reranking = pipeline._weights_needed("rerank", RerankSettings.of({"features": "superpoint"}))
-    settings = [sources[0].setting for sources, _ in reranking]
+    settings = [source.setting for source, _ in reranking]
     assert settings == ["rerank.features.checkpoint", "rerank.matcher.checkpoint"]
     assert pipeline._weights_needed("rerank", RerankSettings()) == []
 
