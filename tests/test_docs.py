@@ -205,7 +205,8 @@ def test_python_examples_run(
     assert names["estimate"].status == "ok"
     errors = pose_error(names["estimate"].world_from_rig, names["world_from_cam"][0])
     assert max(errors) < 0.1
-    true = names["rig"].ground_truth.lookup([names["timestamp"]], [names["device_id"]])[0]
+    [keyframe] = names["query_keyframe"].to_dict("records")
+    true = names["rig"].ground_truth.lookup([keyframe["timestamp"]], [keyframe["device_id"]])[0]
     assert max(pose_error(names["estimate_of_rig"].world_from_rig, true)) < 0.1
     assert names["stored"].correspondences.inlier.sum() > 20
     assert names["alignment"].world_from_model.scale == pytest.approx(10)
