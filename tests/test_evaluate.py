@@ -1,16 +1,21 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pycolmap
 import pytest
 
 from tests.calls import call
+from tests.localized import write_queries
 from toolkit.capture import Trajectory, write_session
 from toolkit.errors import ToolkitError
 from toolkit.evaluate import draw_evaluation, evaluate_scene, pose_errors, recall
 from toolkit.geometry import make_pose, pose_error
+from toolkit.localizers.mapping import LocalMap
 
+CAMERA_MODEL = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[500, 500, 320, 240])
 CAMERA = ("camera", "PINHOLE", "640", "480", "500", "500", "320", "240")
 # Two cameras a meter to either side of the rig's origin, so that a turn of the rig moves them.
 RIG_FROM_CAM = {"left": make_pose(np.eye(3), [-1, 0, 0]), "right": make_pose(np.eye(3), [1, 0, 0])}
@@ -282,3 +287,18 @@ def test_only_the_pairs_asked_for_are_evaluated(scene):
     wanted = everything[["map_device", "query_device"]].iloc[:1].to_numpy().tolist()
     some = evaluate_scene(*scene, None, pairs=wanted).recall
     assert some[["map_device", "query_device"]].to_numpy().tolist() == wanted
+
+
+def test_overlap_is_judged_by_the_maps_that_the_poses_were_found_with(scene, tmp_path):
+    _, poses, _ = scene
+    index = np.zeros(1, np.int64)
+    local_map = LocalMap(
+        ["ios_map/raw_data/0.jpg"], [CAMERA_MODEL], pose()[None], np.array([[0, 0, 3.0]]), np.zeros((1, 3), np.uint8),
+        index, index, index, np.ones(1, np.float32),
+    )  # fmt: skip
+    local_map.save(tmp_path / "ios_map-superpoint.npz")
+    replace(local_map, points=np.array([[0, 0, -3.0]])).save(tmp_path / "ios_map.npz")
+    write_queries(poses / f"TINY_{IOS}.h5", {}, ["ios_map-superpoint.npz"])
+    (row,) = evaluate_ios(scene, map_dir=tmp_path).overlap.to_dict("records")
+    assert [row["points"], row["images"]] == ["map", 4]
+    assert row["retrieved"] == 0.25  # the point lies before the first query's camera; the others stand 10 m aside
