@@ -72,14 +72,19 @@ def test_the_state_dict_is_the_official_one(golden_root: Path) -> None:
     }
 
 
+@pytest.fixture(scope="module")
+def official_bfloat16(golden: ModuleType) -> MegaLoc:
+    return MegaLoc.from_checkpoint(golden.state("megaloc")).to(torch.bfloat16)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ["a", "b", "c"])
-def test_bfloat16_on_the_cpu_points_the_same_way(golden: ModuleType, case: str) -> None:
+def test_bfloat16_on_the_cpu_points_the_same_way(
+    golden: ModuleType, official: MegaLoc, official_bfloat16: MegaLoc, case: str
+) -> None:
     images = golden.case_images("megaloc", golden.info("megaloc")["cases"][case])
-    model = MegaLoc.from_checkpoint(golden.state("megaloc"))
     with torch.inference_mode():
-        exact = model(images)
-        rough = model.to(torch.bfloat16)(images)
+        exact, rough = official(images), official_bfloat16(images)
     assert rough.dtype == torch.float32
     assert (exact * rough).sum(dim=1).min() >= 0.999
 
