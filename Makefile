@@ -22,7 +22,7 @@ demo: $(INSTALLED)  ## render a small capture, localize all nine pairs, write a 
 run: $(INSTALLED)  ## run RUN_MANIFEST=data_manifests/<yours>.yaml
 	$(BIN)/python -m toolkit run $(RUN_MANIFEST)
 
-test: $(INSTALLED)  ## the default tests, about a minute or two
+test: $(INSTALLED)  ## the default tests, 2 to 3 minutes on 2 idle cores
 	$(PYTEST)
 
 test-slow: $(INSTALLED)  ## whole runs, and accuracy on real captures where they are present

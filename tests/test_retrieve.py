@@ -130,13 +130,16 @@ def test_missing_images_and_poses_are_reported(
 
 
 def test_only_listed_keyframes(tiny: Path, tmp_path: Path) -> None:
-    (tiny / "sessions" / "ios_query" / "proc" / "keyframes_few.txt").write_text(
-        "1010, ios_a/cam\n1020, another_device\n"
-    )
-    devices = {"map_device": "ios", "query_device": "ios"}
-    row = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", queries="keyframes_few", **devices).iloc[0]
+    listed = tiny / "sessions" / "ios_query" / "proc" / "keyframes_few.txt"
+    listed.write_text("1010, ios_a/cam\n1020, another_device\n")
+    options = {"map_device": "ios", "query_device": "ios", "queries": "keyframes_few"}
+    row = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", **options).iloc[0]
     assert (row["keyframes"], row["keyframes_missing"], row["queries"]) == (2, 1, 1)
     assert [record["timestamp"] for record in lines(row["path"])] == ["1010"]
+    listed.write_text("1000, ios_a/cam\n1020, another_device\n")
+    row = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", **options).iloc[0]
+    assert not row["skipped"], "another list is another question"
+    assert [record["timestamp"] for record in lines(row["path"])] == ["1000"]
 
 
 def test_refused(tiny: Path, tmp_path: Path) -> None:
