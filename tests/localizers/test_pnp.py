@@ -10,12 +10,16 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from tests.queries import ask, rests_on
 from toolkit import geometry
 from toolkit.features.features import DESCRIPTOR_SCALE, KINDS, LocalFeatures
 from toolkit.features.matching import MutualMatcher, PairMatches
-from toolkit.localizers.mapped import MappedFeatures
+from toolkit.localizers.base import PoseEstimate
 from toolkit.localizers.mapping import LocalMap
-from toolkit.localizers.pnp import PnpLocalizer, PnpSettings, PoseEstimate, least_squares_covariance
+from toolkit.localizers.matches import MappedFeatures
+from toolkit.localizers.pnp import PnpLocalizer
+from toolkit.localizers.rig import least_squares_covariance
+from toolkit.manifest import PnpSettings
 
 Floats = NDArray[np.float64]
 SIZE_M = 0.02  # standard deviation of each point's blob on its surface
@@ -103,7 +107,7 @@ class World:
         return cls(points, descriptors, local_map, features, rng)
 
     def localizer(self, **settings: object) -> PnpLocalizer:
-        return PnpLocalizer(self.local_map, self.features, PnpSettings(**settings))  # type: ignore[arg-type]
+        return PnpLocalizer.of_sift(self.local_map, self.features, PnpSettings(**settings))  # type: ignore[arg-type]
 
     def look(
         self,
@@ -159,7 +163,7 @@ def check(estimate: PoseEstimate, true: Floats, max_deg: float = 0.1, max_m: flo
 @pytest.mark.parametrize("model", CAMERAS)
 def test_a_single_camera(room: World, model: str) -> None:
     camera = CAMERAS[model]
-    estimate = room.localizer().localize([camera], np.eye(4)[None], [room.look(camera, QUERY)], [REFERENCES])
+    estimate = ask(room.localizer(), [camera], np.eye(4)[None], [room.look(camera, QUERY)], [REFERENCES])
     check(estimate, QUERY)
     assert min(estimate.num_guided, estimate.num_inliers) > 500
     assert estimate.num_matches >= estimate.num_inliers
@@ -167,15 +171,16 @@ def test_a_single_camera(room: World, model: str) -> None:
     assert 0.4 < estimate.rmse_px < 0.9  # of 0.5 px a coordinate
     assert set(estimate.references) <= set(REFERENCES)
     # What the pose rests on can be looked at: those points, projected, are those pixels.
-    assert len(estimate.pixels) == len(estimate.point_index) == len(estimate.camera_index) == estimate.num_guided
-    in_cam = geometry.transform(geometry.invert(estimate.world_from_rig), room.points[estimate.point_index])
-    errors = np.linalg.norm(np.asarray(camera.img_from_cam(in_cam)) - estimate.pixels, axis=1)
+    _, pixels, point_index = rests_on(estimate)
+    assert len(pixels) == estimate.num_guided
+    in_cam = geometry.transform(geometry.invert(estimate.world_from_rig), room.points[point_index])
+    errors = np.linalg.norm(np.asarray(camera.img_from_cam(in_cam)) - pixels, axis=1)
     assert np.sqrt(np.mean(errors**2)) == pytest.approx(estimate.rmse_px, rel=0.01)
 
 
 def test_exact_pixels_give_the_exact_pose(room: World) -> None:
     seen = room.look(PINHOLE, QUERY, noise_px=0)
-    estimate = room.localizer().localize([PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
+    estimate = ask(room.localizer(), [PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
     check(estimate, QUERY, 1e-4, 1e-5)
 
 
@@ -191,14 +196,14 @@ RIG_CAMERAS = [CAMERAS["OPENCV"], PINHOLE, CAMERAS["OPENCV_FISHEYE"]]
 
 def test_the_pose_of_a_rig_is_the_rigs(room: World) -> None:
     features = [room.look(c, QUERY @ r) for c, r in zip(RIG_CAMERAS, RIG_FROM_CAMS, strict=True)]
-    estimate = room.localizer().localize(RIG_CAMERAS, RIG_FROM_CAMS, features, [REFERENCES] * 3)
+    estimate = ask(room.localizer(), RIG_CAMERAS, RIG_FROM_CAMS, features, [REFERENCES] * 3)
     check(estimate, QUERY)
-    assert set(estimate.camera_index) == {0, 1, 2}
+    assert set(rests_on(estimate)[0]) == {0, 1, 2}
 
 
 def test_one_camera_off_the_rigs_center_gives_the_rigs_pose(room: World) -> None:
     features = [room.look(PINHOLE, QUERY @ RIG_FROM_CAMS[1])]
-    estimate = room.localizer().localize([PINHOLE], RIG_FROM_CAMS[1:2], features, [REFERENCES])
+    estimate = ask(room.localizer(), [PINHOLE], RIG_FROM_CAMS[1:2], features, [REFERENCES])
     check(estimate, QUERY)
 
 
@@ -210,9 +215,9 @@ def test_a_rig_needs_not_see_with_all_cameras(room: World) -> None:
     covered = LocalFeatures(nothing.reshape(0, 2), nothing, nothing, np.zeros((0, 128), np.uint8), (640, 480))
     noise = room.look(PINHOLE, QUERY, outliers=1.0)
     features = [room.look(PINHOLE, QUERY @ poses[0]), noise, covered]
-    estimate = room.localizer().localize([PINHOLE] * 3, poses, features, [REFERENCES, [], REFERENCES])
+    estimate = ask(room.localizer(), [PINHOLE] * 3, poses, features, [REFERENCES, [], REFERENCES])
     check(estimate, QUERY)
-    assert set(estimate.camera_index) == {0}
+    assert set(rests_on(estimate)[0]) == {0}
 
 
 @pytest.mark.parametrize("rig", [False, True])
@@ -220,7 +225,7 @@ def test_seventy_percent_outliers(room: World, rig: bool) -> None:
     cameras = RIG_CAMERAS if rig else [PINHOLE]
     poses = RIG_FROM_CAMS if rig else np.eye(4)[None]
     features = [room.look(c, QUERY @ p, outliers=0.7) for c, p in zip(cameras, poses, strict=True)]
-    estimate = room.localizer().localize(cameras, poses, features, [REFERENCES] * len(cameras))
+    estimate = ask(room.localizer(), cameras, poses, features, [REFERENCES] * len(cameras))
     check(estimate, QUERY, 0.2, 0.02)
     assert estimate.inlier_ratio < 0.45
 
@@ -229,13 +234,13 @@ def test_points_on_one_plane() -> None:
     wall = np.random.default_rng(0).uniform([-4, -2.5, 6], [4, 2.5, 6], (800, 3))
     world = World.build(wall, MAP_POSES)
     for pose in (QUERY, facing(0, 0, 1)):  # aslant, and straight on
-        estimate = world.localizer().localize([PINHOLE], np.eye(4)[None], [world.look(PINHOLE, pose)], [REFERENCES])
+        estimate = ask(world.localizer(), [PINHOLE], np.eye(4)[None], [world.look(PINHOLE, pose)], [REFERENCES])
         check(estimate, pose, 0.2, 0.02)
 
 
 def test_no_references(room: World) -> None:
     seen = room.look(PINHOLE, QUERY)
-    estimate = room.localizer().localize([PINHOLE], np.eye(4)[None], [seen], [[]])
+    estimate = ask(room.localizer(), [PINHOLE], np.eye(4)[None], [seen], [[]])
     assert estimate.status == "failed: no references"
     assert estimate.world_from_rig is None
     assert estimate.covariance is None
@@ -246,7 +251,7 @@ def test_no_references(room: World) -> None:
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_too_few_matches(room: World, count: int) -> None:
     seen = room.look(PINHOLE, QUERY, limit=count)
-    estimate = room.localizer().localize([PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
+    estimate = ask(room.localizer(), [PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
     assert estimate.status == "failed: too few matches"
     assert estimate.world_from_rig is None
     assert estimate.num_matches <= count * len(REFERENCES)
@@ -258,14 +263,14 @@ def test_eight_matches_are_no_pose(room: World, rig: bool) -> None:
     cameras = RIG_CAMERAS if rig else [PINHOLE]
     poses = RIG_FROM_CAMS if rig else np.eye(4)[None]
     features = [room.look(c, QUERY @ p, limit=8 // len(cameras)) for c, p in zip(cameras, poses, strict=True)]
-    estimate = room.localizer().localize(cameras, poses, features, [REFERENCES] * len(cameras))
+    estimate = ask(room.localizer(), cameras, poses, features, [REFERENCES] * len(cameras))
     assert estimate.status.startswith("failed: ")
     assert estimate.world_from_rig is None
 
 
 def test_between_least_and_ok_a_pose_is_of_low_confidence(room: World) -> None:
     seen = room.look(PINHOLE, QUERY, limit=20)
-    estimate = room.localizer().localize([PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
+    estimate = ask(room.localizer(), [PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
     assert estimate.status == "low_confidence"
     assert geometry.pose_error(estimate.world_from_rig, QUERY)[1] < 0.1
 
@@ -280,7 +285,7 @@ def test_a_query_from_elsewhere_is_not_ok(room: World, seed: int) -> None:
         stored(rng, room.descriptors[rng.integers(0, 1200, 1000)]),  # matches, but nothing in its place
         (640, 480),
     )
-    estimate = room.localizer().localize([PINHOLE], np.eye(4)[None], [stranger], [REFERENCES])
+    estimate = ask(room.localizer(), [PINHOLE], np.eye(4)[None], [stranger], [REFERENCES])
     assert estimate.status != "ok"
 
 
@@ -288,8 +293,8 @@ def test_a_map_image_without_points_does_no_harm(room: World) -> None:
     none = np.zeros(0, np.int64)
     world = World.build(room.points, MAP_POSES, room.descriptors, sees={0: none, 1: none})
     seen = world.look(PINHOLE, QUERY)
-    check(world.localizer().localize([PINHOLE], np.eye(4)[None], [seen], [REFERENCES]), QUERY)
-    alone = world.localizer().localize([PINHOLE], np.eye(4)[None], [seen], [[0, 1]])
+    check(ask(world.localizer(), [PINHOLE], np.eye(4)[None], [seen], [REFERENCES]), QUERY)
+    alone = ask(world.localizer(), [PINHOLE], np.eye(4)[None], [seen], [[0, 1]])
     assert alone.status == "failed: too few matches"
 
 
@@ -311,7 +316,7 @@ def twins(extra: int) -> tuple[World, NDArray[np.int64]]:
 def test_of_two_like_places_none_is_ok(outliers: float) -> None:
     world, visible = twins(extra=0)
     seen = world.look(PINHOLE, facing(0.1, 0.1, 0.3), only=visible, outliers=outliers)
-    estimate = world.localizer().localize([PINHOLE], np.eye(4)[None], [seen], [list(range(12))])
+    estimate = ask(world.localizer(), [PINHOLE], np.eye(4)[None], [seen], [list(range(12))])
     assert estimate.status == "low_confidence"
     assert estimate.rival_support > 0.8
 
@@ -320,7 +325,7 @@ def test_what_is_there_once_decides_between_like_places() -> None:
     world, visible = twins(extra=250)
     pose = facing(0.1, 0.1, 0.3)
     seen = world.look(PINHOLE, pose, only=visible)
-    estimate = world.localizer().localize([PINHOLE], np.eye(4)[None], [seen], [list(range(12))])
+    estimate = ask(world.localizer(), [PINHOLE], np.eye(4)[None], [seen], [list(range(12))])
     check(estimate, pose, 0.2, 0.02)
     assert estimate.rival_support < 0.8
 
@@ -347,7 +352,7 @@ def test_the_right_one_of_many_like_places_is_found(place: int) -> None:
     }
     seen = LocalFeatures(**both, image_size=(640, 480))
     localizer = world.localizer(max_query_features=len(strong), contested_references=10)
-    check(localizer.localize([PINHOLE], np.eye(4)[None], [seen], [list(range(10))]), pose, 0.2, 0.02)
+    check(ask(localizer, [PINHOLE], np.eye(4)[None], [seen], [list(range(10))]), pose, 0.2, 0.02)
 
 
 @pytest.mark.slow
@@ -372,11 +377,11 @@ def test_covariance_is_the_scatter_of_the_poses(rig: bool, map_noise_px: float) 
     motions, predicted = [], []
     for _ in range(200):
         moved = world.points + np.einsum("pij,pj->pi", spread_of_points, rng.normal(size=(400, 3)))
-        localizer = PnpLocalizer(replace(sure, points=moved), world.features)
+        localizer = PnpLocalizer.of_sift(replace(sure, points=moved), world.features)
         noisy = [
             replace(f, keypoints=(f.keypoints + rng.normal(size=f.keypoints.shape)).astype(np.float32)) for f in exact
         ]
-        estimate = localizer.localize(cameras, poses, noisy, [REFERENCES] * len(cameras))
+        estimate = ask(localizer, cameras, poses, noisy, [REFERENCES] * len(cameras))
         assert estimate.status == "ok"
         motion = geometry.invert(true) @ estimate.world_from_rig
         motions.append([*Rotation.from_matrix(motion[:3, :3]).as_rotvec(), *motion[:3, 3]])
@@ -398,7 +403,7 @@ def test_guided_matches_alone_make_no_pose_more_certain(room: World) -> None:
     stds, guided = [], []
     for known_to_descriptors in (1536, 100):
         localizer = room.localizer(max_query_features=known_to_descriptors)
-        found = localizer.localize([PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
+        found = ask(localizer, [PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
         stds.append(found.position_std_m)
         guided.append(found.num_guided)
     assert guided[1] > 0.9 * guided[0] > 150
@@ -411,8 +416,8 @@ def test_a_point_that_is_not_known_well_tells_less(room: World) -> None:
 
     def std(noise_px: float) -> float:
         local_map = replace(room.local_map, noise_px=np.full(len(room.points), noise_px, np.float32))
-        localizer = PnpLocalizer(local_map, room.features)
-        return localizer.localize([PINHOLE], np.eye(4)[None], [seen], [REFERENCES]).position_std_m
+        localizer = PnpLocalizer.of_sift(local_map, room.features)
+        return ask(localizer, [PINHOLE], np.eye(4)[None], [seen], [REFERENCES]).position_std_m
 
     exact, noisy, hopeless, worse = std(0), std(2), std(1e3), std(1e6)
     assert 1.2 * exact < noisy < hopeless
@@ -439,7 +444,7 @@ def test_more_noise_is_more_uncertainty(room: World) -> None:
     stds = []
     for noise in (0.2, 0.8):
         seen = room.look(PINHOLE, QUERY, noise_px=noise)
-        stds.append(room.localizer().localize([PINHOLE], np.eye(4)[None], [seen], [REFERENCES]).position_std_m)
+        stds.append(ask(room.localizer(), [PINHOLE], np.eye(4)[None], [seen], [REFERENCES]).position_std_m)
     assert 2 < stds[1] / stds[0] < 6
 
 
@@ -448,7 +453,7 @@ def test_the_same_answer_in_whatever_order_threads_come(room: World) -> None:
     queries = [room.look(PINHOLE, pose, outliers=0.5) for pose in poses]
 
     def answer(localizer: PnpLocalizer, index: int) -> tuple:
-        estimate = localizer.localize([PINHOLE], np.eye(4)[None], [queries[index]], [REFERENCES])
+        estimate = ask(localizer, [PINHOLE], np.eye(4)[None], [queries[index]], [REFERENCES])
         return estimate.status, estimate.world_from_rig.tobytes(), estimate.covariance.tobytes(), estimate.num_guided
 
     alone = [answer(room.localizer(), index) for index in range(6)]
@@ -460,7 +465,7 @@ def test_the_same_answer_in_whatever_order_threads_come(room: World) -> None:
 
 def test_localizing_leaves_the_map_as_it_is(room: World) -> None:
     before = {name: getattr(room.local_map, name).tobytes() for name in ("points", "world_from_cams", "obs_point")}
-    room.localizer().localize([PINHOLE], np.eye(4)[None], [room.look(PINHOLE, QUERY)], [REFERENCES])
+    ask(room.localizer(), [PINHOLE], np.eye(4)[None], [room.look(PINHOLE, QUERY)], [REFERENCES])
     assert all(getattr(room.local_map, name).tobytes() == content for name, content in before.items())
 
 
@@ -494,20 +499,21 @@ def test_several_kinds_of_features_give_one_pose_with_the_matches_of_all(room: W
              MappedFeatures(other.local_map, other.features, SINGLE_SCALE)]  # fmt: skip
     seen = [room.look(PINHOLE, QUERY, limit=60), other.look(PINHOLE, QUERY, limit=60)]
     alone = [
-        PnpLocalizer.of([kind]).localize([PINHOLE], np.eye(4)[None], [one], [REFERENCES])
+        ask(PnpLocalizer([kind]), [PINHOLE], np.eye(4)[None], [one], [REFERENCES])
         for kind, one in zip(kinds, seen, strict=True)
     ]
-    both = PnpLocalizer.of(kinds)
-    estimate = both.localize([PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
+    both = PnpLocalizer(kinds)
+    estimate = ask(both, [PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
     check(estimate, QUERY)
     assert estimate.num_matches == sum(one.num_matches for one in alone)
     assert estimate.num_inliers >= max(one.num_inliers for one in alone)
     # Of each kind, points of its own: the second kind's follow the first's.
-    of_other = estimate.point_index >= len(room.local_map.points)
+    _, pixels, point_index = rests_on(estimate)
+    of_other = point_index >= len(room.local_map.points)
     assert 0 < of_other.sum() < len(of_other)
-    projected = PINHOLE.img_from_cam(geometry.transform(geometry.invert(QUERY), both.map.points[estimate.point_index]))
-    assert np.linalg.norm(projected - estimate.pixels, axis=1).max() < 6
-    rig = both.localize(RIG_CAMERAS, RIG_FROM_CAMS, [
+    projected = PINHOLE.img_from_cam(geometry.transform(geometry.invert(QUERY), both.map.points[point_index]))
+    assert np.linalg.norm(projected - pixels, axis=1).max() < 6
+    rig = ask(both, RIG_CAMERAS, RIG_FROM_CAMS, [
         [world.look(camera, QUERY @ pose) for world in (room, other)]
         for camera, pose in zip(RIG_CAMERAS, RIG_FROM_CAMS, strict=True)
     ], [REFERENCES] * 3)  # fmt: skip
@@ -520,8 +526,8 @@ def test_one_kind_that_sees_nothing_leaves_the_answer_of_the_other(room: World) 
              MappedFeatures(other.local_map, other.features, SINGLE_SCALE)]  # fmt: skip
     seen = room.look(PINHOLE, QUERY)
     nothing = other.look(PINHOLE, QUERY, limit=0)
-    expected = room.localizer().localize([PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
-    estimate = PnpLocalizer.of(kinds).localize([PINHOLE], np.eye(4)[None], [[seen, nothing]], [REFERENCES])
+    expected = ask(room.localizer(), [PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
+    estimate = ask(PnpLocalizer(kinds), [PINHOLE], np.eye(4)[None], [[seen, nothing]], [REFERENCES])
     np.testing.assert_array_equal(estimate.world_from_rig, expected.world_from_rig)
     assert estimate.num_inliers == expected.num_inliers
 
@@ -542,21 +548,21 @@ class Learned:
 
 def test_a_network_sees_all_features_and_is_not_asked_what_is_known(room: World) -> None:
     network = Learned()
-    localizer = PnpLocalizer.of([MappedFeatures(room.local_map, room.features, matcher=network)])  # type: ignore[arg-type]
+    localizer = PnpLocalizer([MappedFeatures(room.local_map, room.features, matcher=network)])  # type: ignore[arg-type]
     seen = room.look(PINHOLE, QUERY)
     asked = ([PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
-    estimate = localizer.localize(*asked)
+    estimate = ask(localizer, *asked)
     check(estimate, QUERY)
     sizes = [len(room.features[room.local_map.image_names[index]]) for index in REFERENCES]
     assert network.sizes == [(len(seen), size) for size in sizes]
     network.sizes.clear()
     names = []
 
-    def known(name: str) -> PairMatches:
+    def matched_before(name: str) -> PairMatches:
         names.append(name)
         return MutualMatcher(0.85).match([(seen, room.features[name])])[0]
 
-    again = localizer.localize(*asked, known=[[known]])
+    again = ask(localizer, *asked, network_matches=[[matched_before]])
     assert network.sizes == []
     assert names == [room.local_map.image_names[index] for index in REFERENCES]
     np.testing.assert_array_equal(again.world_from_rig, estimate.world_from_rig)
