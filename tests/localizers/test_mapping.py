@@ -370,8 +370,8 @@ def test_a_current_map_is_loaded_and_another_is_built(
     assert json.loads(sidecar_path(path).read_text())["settings"]["map"]["pairs_per_image"] == 2
     for more in [
         {"inputs": "b"},
-        {"inputs": "b", "settings": replace(quick, ratio=0.8)},
-        {"inputs": "b", "settings": replace(quick, ratio=0.8), "skip_existing": False},
+        {"inputs": "b", "settings": quick.model_copy(update={"ratio": 0.8})},
+        {"inputs": "b", "settings": quick.model_copy(update={"ratio": 0.8}), "skip_existing": False},
     ]:
         built.clear()
         build_map(session, store, path, **({"settings": quick} | more))

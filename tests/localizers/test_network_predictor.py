@@ -19,8 +19,9 @@ from toolkit.capture.turning import turn_image, turn_points, turned_from_cam
 from toolkit.errors import ManifestError, ToolkitError, WeightsError
 from toolkit.geometry import invert
 from toolkit.localizers import network
+from toolkit.localizers.base import View
 from toolkit.localizers.network import NetworkPredictor, TokenCache, estimate_bytes
-from toolkit.localizers.prediction import Prediction, View
+from toolkit.localizers.prediction import Prediction
 from toolkit.models.vggt import VGGT, cameras_from_pose_encoding, load_images
 
 # In the network 518 x 112, 518 x 126 and 112 x 518 pixels.
@@ -46,7 +47,7 @@ class Photographs:
         self.folder = folder
         self.count = 0
 
-    def view(self, size: tuple[int, int] = WIDE, known: bool = True) -> View:
+    def view(self, size: tuple[int, int] = WIDE, in_map: bool = True) -> View:
         self.count += 1
         path = self.folder / f"{self.count}.png"
         width, height = size
@@ -55,10 +56,10 @@ class Photographs:
         camera = pycolmap.Camera(
             model="PINHOLE", width=width, height=height, params=[width, width, width / 2, height / 2]
         )
-        return View(f"map/raw_data/{path.name}", path, camera, known)
+        return View(f"map/raw_data/{path.name}", path, camera, in_map)
 
     def group(self, *sizes: tuple[int, int]) -> list[View]:
-        return [self.view(size, known=index > 0) for index, size in enumerate(sizes)]
+        return [self.view(size, in_map=index > 0) for index, size in enumerate(sizes)]
 
 
 @pytest.fixture
@@ -96,7 +97,7 @@ def record_shapes(predictor: NetworkPredictor, monkeypatch: pytest.MonkeyPatch) 
 def test_a_prediction_is_what_the_network_says(make: Make, photographs: Photographs) -> None:
     group = photographs.group(WIDE, WIDE, HIGHER)
     [found] = make(needs_depth=True).predict([group])
-    loaded = load_images([view.path for view in group], "crop")
+    loaded = load_images([view.image for view in group], "crop")
     assert loaded.images.shape == (3, 3, 126, 518)
     output = tiny(("camera", "depth"))(loaded.images)
     cam_from_model, _ = cameras_from_pose_encoding(output["pose_enc"][0], (126, 518))
@@ -127,17 +128,17 @@ def test_nothing_of_a_portrait_photograph_is_cut(
     encoded = count_encoded(predictor, monkeypatch)
     group = photographs.group(PORTRAIT, WIDE)
     [found] = predictor.predict([group])
-    loaded = load_images([view.path for view in group], "pad")
+    loaded = load_images([view.image for view in group], "pad")
     assert loaded.images.shape == (2, 3, 518, 518)
     torch.testing.assert_close(torch.stack(encoded), loaded.images)
     np.testing.assert_allclose(found.map_from_image, np.hstack([loaded.scale, loaded.offset]))
-    assert load_images([group[0].path], "crop").offset[0, 1] < -800, "that is what the other way would cut"
+    assert load_images([group[0].image], "crop").offset[0, 1] < -800, "that is what the other way would cut"
 
 
 def test_a_map_image_in_groups_of_other_sizes(make: Make, photographs: Photographs) -> None:
     """Its encoding in one group is of no use in the other."""
     reference = photographs.view()
-    groups = [[photographs.view(size, known=False), reference] for size in (WIDE, HIGHER, PORTRAIT)]
+    groups = [[photographs.view(size, in_map=False), reference] for size in (WIDE, HIGHER, PORTRAIT)]
     predictor = make()
     for found, group in zip(predictor.predict(groups), groups, strict=True):
         assert_same(found, make().predict([group])[0])
@@ -153,7 +154,7 @@ def test_a_blob_is_where_the_map_says(
     center = np.array([0.3 * width, 0.7 * height])
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     blob = np.exp(-((x - center[0]) ** 2 + (y - center[1]) ** 2) / (2 * 4.0**2))
-    Image.fromarray(np.rint(255 * blob).astype(np.uint8)).save(group[0].path)
+    Image.fromarray(np.rint(255 * blob).astype(np.uint8)).save(group[0].image)
     predictor = make()
     encoded = count_encoded(predictor, monkeypatch)
     [found] = predictor.predict([group])
@@ -181,7 +182,7 @@ def test_groups_do_not_change_each_other(make: Make, photographs: Photographs, m
 
 def test_map_images_are_encoded_once(make: Make, photographs: Photographs, monkeypatch: pytest.MonkeyPatch) -> None:
     references = [photographs.view() for _ in range(4)]
-    groups = [[photographs.view(known=False), *references[start : start + 3]] for start in (0, 1, 0)]
+    groups = [[photographs.view(in_map=False), *references[start : start + 3]] for start in (0, 1, 0)]
     predictor, forgetful = make(batch_size=2), make(cache_bytes=0)
     encoded = count_encoded(predictor, monkeypatch)  # both share the network
     first = predictor.predict(groups)
@@ -193,7 +194,7 @@ def test_map_images_are_encoded_once(make: Make, photographs: Photographs, monke
         assert_same(one, expected)
     assert len(encoded) == 4 + 3 + 3 + 12
     for reference in references:
-        reference.path.unlink()
+        reference.image.unlink()
     assert np.isfinite(predictor.predict(groups)[1].model_from_cams).all(), "what is kept is not read again"
 
 
@@ -328,12 +329,12 @@ def test_a_reference_that_cannot_be_read_is_left_out(
     predictor = make(needs_depth=True, batch_size=3)
     whole = predictor.predict(groups)
     bad = groups[1][2]
-    bad.path.write_bytes(b"not an image")
+    bad.image.write_bytes(b"not an image")
     fresh = make(needs_depth=True, batch_size=3)
     found = fresh.predict(groups)
     assert_same(found[0], whole[0])
     assert_same(found[2], whole[2])
-    assert str(bad.path) in caplog.text
+    assert str(bad.image) in caplog.text
     [expected] = fresh.predict([[groups[1][0], groups[1][1], groups[1][3]]])
     order = [0, 1, 3]
     np.testing.assert_allclose(found[1].model_from_cams[order], expected.model_from_cams, atol=2e-5)
@@ -348,8 +349,8 @@ def test_a_query_that_cannot_be_read_fails_alone(
 ) -> None:
     groups = [photographs.group(WIDE, WIDE, WIDE) for _ in range(4)]
     expected = make().predict(groups)
-    groups[1][0].path.unlink()
-    Image.new("RGB", (WIDE[0], 2 * WIDE[1])).save(groups[2][0].path)
+    groups[1][0].image.unlink()
+    Image.new("RGB", (WIDE[0], 2 * WIDE[1])).save(groups[2][0].image)
     found = make(batch_size=4).predict(groups)
     for number in (0, 3):
         assert_same(found[number], expected[number])
@@ -357,7 +358,7 @@ def test_a_query_that_cannot_be_read_fails_alone(
         assert found[number].model_from_cams.shape == (3, 4, 4)
         assert np.isnan(found[number].model_from_cams).all()
         assert found[number].depth is None
-    assert found[1].reason == f"Image not found: {groups[1][0].path}"
+    assert found[1].reason == f"Image not found: {groups[1][0].image}"
     assert found[0].reason == ""
     assert found[1].reason in caplog.text
     assert "Image of 370 x 160 pixels" in caplog.text
@@ -436,12 +437,12 @@ def test_a_rolled_camera_is_shown_upright_and_answered_as_it_is(
 ) -> None:
     """A photograph stored upright, and stored after turns: its camera differs by the turn, its depth is turned."""
     query, upright = photographs.view(size), photographs.view(size)
-    path = upright.path.with_name("rolled.png")
-    Image.fromarray(turn_image(read_image(upright.path), -turns)).save(path)
+    path = upright.image.with_name("rolled.png")
+    Image.fromarray(turn_image(read_image(upright.image), -turns)).save(path)
     width, height = size[:: -1 if turns % 2 else 1]
     params = [size[0], size[0], width / 2, height / 2]
     camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params)
-    rolled = View("rolled", path, camera, known=True, turns=turns)
+    rolled = View("rolled", path, camera, in_map=True, turns=turns)
     expected, found = make(needs_depth=True).predict([[query, upright], [query, rolled]])
     np.testing.assert_allclose(found.model_from_cams[0], expected.model_from_cams[0], atol=1e-6)
     model_from_turned = found.model_from_cams[1] @ invert(turned_from_cam(turns))
