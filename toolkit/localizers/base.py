@@ -57,7 +57,7 @@ class Query:
             self,
             views=[self.views[index] for index in images],
             rig_from_cams=self.rig_from_cams[list(images)],
-            features=[self.features[index] for index in images],
+            features=[self.features[index] for index in images] if self.features else [],
             network_matches=[self.network_matches[index] for index in images] if self.network_matches else [],
         )
 
