@@ -7,8 +7,12 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from toolkit import geometry
+from toolkit.capture import Session
 from toolkit.features.features import LocalFeatures
+from toolkit.features.stores import FeatureStore
 from toolkit.localizers.base import NetworkMatches, PoseEstimate, Query, References, View
+from toolkit.localizers.mapping import LocalMap
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -64,3 +68,36 @@ def rests_on(estimate: PoseEstimate) -> tuple[Ints, Floats, Ints]:
     matches = estimate.correspondences
     kept = matches.inlier & np.char.endswith(matches.found_by, "/guided")
     return matches.camera[kept], matches.pixels[kept], matches.point_index[kept]
+
+
+def session_query(
+    session: Session, rows: Ints, local_map: LocalMap, count: int = 10, store: FeatureStore | None = None
+) -> tuple[Query, list[References]]:
+    """Return images of a query session with the map images that stand and look most alike.
+
+    Args:
+        session: with true poses.
+        rows: of the images of one device at one instant.
+        local_map: the map.
+        count: references of each image.
+        store: features of the session; None: the query has none.
+    """
+    references = []
+    for pose in session.world_from_cam(rows, ground_truth=True):
+        score = likeness(local_map.world_from_cams, pose)
+        best = np.argsort(-score, kind="stable")[:count]
+        references.append(References(best, score[best]))
+    sensors = session.images["sensor_id"].astype(str).to_numpy()
+    names = [session.image_name(int(row)) for row in rows]
+    views = [
+        View(name, session.image_path(int(row)), session.camera(sensors[row]), in_map=False)
+        for name, row in zip(names, rows, strict=True)
+    ]
+    features = [] if store is None else [[store[name]] for name in names]
+    return Query(views, session.rig_from_cam(rows), features), references
+
+
+def likeness(world_from_cams: Floats, world_from_query: Floats) -> Floats:
+    """Return for N poses (N, 4, 4) how near they are to a query's (4, 4), larger is nearer."""
+    rotation_deg, distance_m = geometry.pose_error(world_from_cams, world_from_query[None])
+    return np.asarray(-rotation_deg / 20 - distance_m)

@@ -1,0 +1,98 @@
+"""The file of what each pose rests on: what is written is read."""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from tests.localized import some_correspondences
+from toolkit.errors import ArtifactError
+from toolkit.features.groups import GroupWriter
+from toolkit.localizers.correspondences import MAPS, Correspondences, LocalizedQueries, LocalizedQuery, query_group
+
+NAMES = ["ios_map/raw_data/1.jpg", "ios_map/raw_data/morning walk/2.jpg"]
+QUERIES = {
+    (5, "phone"): LocalizedQuery(
+        ["ios_query/raw_data/5.jpg"],
+        NAMES,
+        ["ios_map/raw_data/ä.jpg"],
+        some_correspondences([0] * 6, [True, False] * 3),
+    ),
+    (17, "robot/body"): LocalizedQuery(
+        ["spot_query/raw_data/front/17.jpg", "spot_query/raw_data/back/17.jpg"],
+        NAMES,
+        [],
+        some_correspondences([0, 1, 1, 0], [True, True, False, True], point_index=-1),
+    ),
+    (17, "phone"): LocalizedQuery(["ios_query/raw_data/17.jpg"]),
+    (18, "phone"): LocalizedQuery(),
+}
+
+
+def write(path: Path, queries: dict[tuple[int, str], LocalizedQuery], finish: bool = True) -> None:
+    """Add queries to a file as the localize stage does."""
+    with GroupWriter(path, {"settings": 1}, {MAPS: '["ios_map.npz"]'}) as writer:
+        for key, query in queries.items():
+            writer.add(query_group(*key), arrays=query.arrays())
+        if finish:
+            writer.finish()
+
+
+@pytest.fixture
+def stored(tmp_path: Path) -> LocalizedQueries:
+    """The queries, written by two runs, the first of which was stopped."""
+    path = tmp_path / "poses" / "pair.h5"
+    first = dict(list(QUERIES.items())[:2])
+    write(path, first, finish=False)
+    assert not path.exists()
+    write(path, {key: query for key, query in QUERIES.items() if key not in first})
+    return LocalizedQueries(path)
+
+
+@pytest.mark.parametrize("key", QUERIES)
+def test_what_is_written_is_read(stored: LocalizedQueries, key: tuple[int, str]) -> None:
+    assert key in stored
+    read, written = stored[key], QUERIES[key]
+    assert (read.images, read.references, read.rejected) == (written.images, written.references, written.rejected)
+    assert len(read.correspondences) == len(written.correspondences)
+    for name, array in vars(written.correspondences).items():
+        again = getattr(read.correspondences, name)
+        assert again.dtype.kind == array.dtype.kind, name
+        assert again.dtype.itemsize == array.dtype.itemsize or array.dtype.kind == "U", name
+        np.testing.assert_allclose(again, array, atol=1e-4) if array.dtype.kind == "f" else (
+            np.testing.assert_array_equal(again, array)
+        )
+
+
+def test_a_file_is_a_mapping_of_queries(stored: LocalizedQueries) -> None:
+    assert len(stored) == len(QUERIES)
+    # `/` in a device's id makes no further level.
+    assert set(stored) == {(5, "phone"), (17, "robot-body"), (17, "phone"), (18, "phone")}
+    assert stored.maps == ["ios_map.npz"]
+    for key in ((6, "phone"), (5, "robot"), (5, "phone/images"), 5, "5/phone"):
+        assert key not in stored
+    with pytest.raises(KeyError):
+        stored[6, "phone"]
+    stored.close()
+
+
+def test_correspondences_of_one_image(stored: LocalizedQueries) -> None:
+    correspondences = stored[17, "robot/body"].correspondences
+    assert correspondences.in_camera(1).tolist() == [1, 2]
+    assert correspondences.in_camera(2).tolist() == []
+    assert len(Correspondences().in_camera(0)) == 0
+
+
+def test_a_missing_torn_or_incomplete_file_says_what_to_do(stored: LocalizedQueries, tmp_path: Path) -> None:
+    with pytest.raises(ArtifactError, match=r"none\.h5.*Localize again"):
+        LocalizedQueries(tmp_path / "none.h5")
+    stored.close()
+    torn = tmp_path / "torn.h5"
+    torn.write_bytes(stored.path.read_bytes()[:2000])
+    with pytest.raises(ArtifactError, match=r"torn\.h5.*Localize again"):
+        LocalizedQueries(torn)
+    with h5py.File(stored.path, "a") as file:
+        del file["5/phone/references"]
+    with pytest.raises(ArtifactError, match=r"pair\.h5 is damaged at 5/phone.*Localize again"):
+        LocalizedQueries(stored.path)[5, "phone"]
