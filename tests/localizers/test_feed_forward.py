@@ -3,17 +3,19 @@
 import json
 import logging
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
+import h5py
 import numpy as np
 import pandas as pd
 import pytest
 from numpy.typing import NDArray
 
 from tests.calls import call
+from tests.queries import likeness, session_query
 from toolkit import geometry
 from toolkit import localize as localize_stage
 from toolkit.capture import Capture, Session, Trajectory
@@ -22,18 +24,20 @@ from toolkit.features.matching import MutualMatcher
 from toolkit.features.stores import extract_session
 from toolkit.files import SceneFiles
 from toolkit.localize import COLUMNS, PREDICTION_COLUMNS, localize_pairs
+from toolkit.localizers.base import PoseEstimate, Prior, Query, References, View
+from toolkit.localizers.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
 from toolkit.localizers.hybrid import HybridLocalizer
-from toolkit.localizers.mapped import MappedFeatures
 from toolkit.localizers.mapping import LocalMap
-from toolkit.localizers.pnp import PnpLocalizer, PoseEstimate, Prior
-from toolkit.localizers.prediction import Prediction, View
+from toolkit.localizers.matches import MappedFeatures
+from toolkit.localizers.pnp import PnpLocalizer
+from toolkit.localizers.prediction import Prediction
 from toolkit.localizers.predictors import create_predictor
 from toolkit.localizers.simulated import SimulatedPredictor
-from toolkit.localizers.vggt import VggtAnswer, VggtLocalizer, VggtQuery
 from toolkit.manifest import PredictorSettings
 from toolkit.show.visualize_prediction import draw_prediction
 
 Floats = NDArray[np.float64]
+Asked = tuple[Query, list[References]]
 LIST = "keyframes_original"
 LOW = {"rotation_noise_deg": 0.2, "position_noise_m": 0.01, "depth_noise": 0.02}
 
@@ -51,33 +55,23 @@ class World:
     def predictor(self, depth: bool = True, **noise: float) -> SimulatedPredictor:
         return SimulatedPredictor(self.sessions, self.files.maps if depth else None, **noise)  # type: ignore[arg-type]
 
-    def localizer(self, predictor: object, **settings: int) -> VggtLocalizer:
-        return VggtLocalizer(self.map, self.map_session, predictor, PredictorSettings(**settings))  # type: ignore[arg-type]
+    def localizer(self, predictor: object, **settings: int) -> FeedForwardLocalizer:
+        return FeedForwardLocalizer(self.map, self.map_session, predictor, PredictorSettings(**settings))  # type: ignore[arg-type]
 
-    def queries(self, device: str, count: int = 10) -> tuple[list[VggtQuery], Floats]:
+    def queries(self, device: str, count: int = 10) -> tuple[list[Asked], Floats]:
         """Return the queries of a device with the map images that stand and look most alike, and their true poses."""
         session = self.capture[f"{device}_query"]
         keyframes = session.keyframes(LIST)
-        queries = [self.query(session, rows, count) for rows in session.rows_of_keyframes(keyframes)]
+        queries = [session_query(session, rows, self.map, count) for rows in session.rows_of_keyframes(keyframes)]
         return queries, session.ground_truth.lookup(keyframes["timestamp"], keyframes["device_id"])
 
-    def query(self, session: Session, rows: NDArray[np.int64], count: int) -> VggtQuery:
-        references, scores = [], []
-        for pose in session.world_from_cam(rows, ground_truth=True):
-            score = likeness(self.map.world_from_cams, pose)
-            best = np.argsort(-score, kind="stable")[:count]
-            references.append(best)
-            scores.append(score[best])
-        sensors = session.images["sensor_id"].to_numpy()
-        views = [
-            View(session.image_name(int(row)), session.image_path(int(row)), session.camera(str(sensors[row])), False)
-            for row in rows
-        ]
-        return VggtQuery(views, session.rig_from_cam(rows), references, scores)
 
-
-def run_stage(capture: Path, files: SceneFiles, **more: object) -> pd.DataFrame:
-    options = {"map_device": "ios", "queries": LIST, "workers": 1, "predictor": "simulated", "method": "vggt"} | more
+def run_stage(
+    capture: Path, files: SceneFiles, predictor: Mapping[str, object] | None = None, **more: object
+) -> pd.DataFrame:
+    """Localize; `predictor` holds what differs from a simulation with the default settings."""
+    settings = {"method": "vggt", "predictor": {"name": "simulated"} | dict(predictor or {})}
+    options = {"map_device": "ios", "queries": LIST, "workers": 1} | settings | more
     folders = (files.retrieval_dir, files.poses_dir, files.features, files.maps)
     return call(localize_pairs, capture / "sessions", *folders, **options)  # type: ignore[arg-type]
 
@@ -109,11 +103,6 @@ def write_retrieval(path: Path, mapped: Session, session: Session) -> None:
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
 
 
-def likeness(world_from_cams: Floats, world_from_query: Floats) -> Floats:
-    rotation_deg, distance_m = geometry.pose_error(world_from_cams, world_from_query[None])
-    return np.asarray(-rotation_deg / 20 - distance_m)
-
-
 @pytest.fixture(scope="module")
 def world(small_capture: Path, finished: SceneFiles) -> World:
     return World(small_capture, finished)
@@ -128,7 +117,7 @@ def run(finished: SceneFiles, tmp_path: Path) -> SceneFiles:
     return files
 
 
-def errors(answers: Sequence[VggtAnswer], true: Floats) -> tuple[Floats, Floats]:
+def errors(answers: Sequence[FeedForwardAnswer], true: Floats) -> tuple[Floats, Floats]:
     poses = [answer.estimate.world_from_rig for answer in answers]
     assert all(pose is not None for pose in poses), [answer.estimate.status for answer in answers]
     return geometry.pose_error(np.stack(poses), true)  # type: ignore[arg-type]
@@ -166,9 +155,9 @@ def test_no_depth_is_unknown_depth() -> None:
 
 
 def group_of(world: World, device: str = "ios", index: int = 0) -> list[View]:
-    query = world.queries(device)[0][index]
+    query, references = world.queries(device)[0][index]
     localizer = world.localizer(world.predictor())
-    return [query.views[0], *(localizer.view(int(i)) for i in query.references[0][:4])]
+    return [query.views[0], *(localizer.view(int(i)) for i in references[0].images[:4])]
 
 
 def test_a_simulation_depends_on_seed_and_names_alone(world: World) -> None:
@@ -219,7 +208,7 @@ def test_a_view_without_a_true_pose_is_refused(world: World) -> None:
 @pytest.mark.parametrize("device", ["ios", "hl", "spot"])
 def test_poses_are_metric_and_right(world: World, device: str) -> None:
     queries, true = world.queries(device)
-    answers = world.localizer(world.predictor(**LOW)).localize(queries)
+    answers = world.localizer(world.predictor(**LOW)).predict(queries)
     rotation_deg, distance_m = errors(answers, true)
     assert (rotation_deg < 1).all()
     assert (distance_m < 0.1).all()
@@ -232,11 +221,11 @@ def test_poses_are_metric_and_right(world: World, device: str) -> None:
 
 def test_the_covariance_is_that_of_the_rig(world: World) -> None:
     """A rig whose origin is 10 m from its camera turns about it: its place is as uncertain as that arm is long."""
-    (query, *_), _ = world.queries("ios")
+    ((query, references), *_), _ = world.queries("ios")
     localizer = world.localizer(world.predictor(**LOW))
-    (near,) = localizer.localize([query])
+    (near,) = localizer.predict([(query, references)])
     rig_from_cam = geometry.make_pose(np.eye(3), [10.0, 0.0, 0.0])[None]
-    (far,) = localizer.localize([replace(query, rig_from_cams=rig_from_cam)])
+    (far,) = localizer.predict([(replace(query, rig_from_cams=rig_from_cam), references)])
     np.testing.assert_allclose(
         far.estimate.world_from_rig @ rig_from_cam[0], near.estimate.world_from_rig, atol=1e-9
     )
@@ -250,7 +239,7 @@ def test_wrong_references_are_left_out(world: World) -> None:
     for seed in range(3):
         predictor = world.predictor(**LOW, wrong_references=0.25, seed=seed)
         queries, true = world.queries("ios")
-        answers = world.localizer(predictor, num_references=8).localize(queries)
+        answers = world.localizer(predictor, num_references=8).predict(queries)
         rotation_deg, distance_m = errors(answers, true)
         right += int(((rotation_deg < 1) & (distance_m < 0.1)).sum())
         for answer, found in zip(answers, zip(rotation_deg, distance_m, strict=True), strict=True):
@@ -290,7 +279,7 @@ def test_an_unknown_scale_is_never_ok(world: World) -> None:
     localizer.map = replace(world.map, world_from_cams=places)
     for device in ("ios", "spot"):
         queries, true = world.queries(device)
-        answers = localizer.localize(queries)
+        answers = localizer.predict(queries)
         rotation_deg, _ = errors(answers, true)
         for answer, error in zip(answers, rotation_deg, strict=True):
             assert answer.estimate.status == "low_confidence"
@@ -302,11 +291,10 @@ def test_an_unknown_scale_is_never_ok(world: World) -> None:
 
 
 def test_depth_of_the_map_gives_the_scale_that_baselines_do_not(world: World) -> None:
-    query = world.queries("ios")[0][0]
-    best = query.references[0][:1]
-    alone = replace(query, references=[best], scores=[query.scores[0][:1]])
+    query, (references,) = world.queries("ios")[0][0]
+    best = References(references.images[:1], references.scores[:1])
     without, with_depth = (
-        world.localizer(world.predictor(depth, **LOW)).localize([alone])[0] for depth in (False, True)
+        world.localizer(world.predictor(depth, **LOW)).predict([(query, [best])])[0] for depth in (False, True)
     )
     assert np.isinf(without.estimate.scale_std)
     assert with_depth.estimate.scale_std < 0.1
@@ -328,7 +316,7 @@ def test_depth_maps_stand_in_for_points(world: World) -> None:
     ratio = in_cam[0][near, 2] / in_cam[1][:, 2]
     assert np.median(np.abs(ratio - 1)) < 0.1, "both lie on what the camera sees"
     queries, true = world.queries("ios")
-    answers = localizer.localize(queries)
+    answers = localizer.predict(queries)
     assert (errors(answers, true)[1] < 0.15).all()
     assert all(answer.estimate.scale_std < 0.1 for answer in answers)
 
@@ -338,14 +326,10 @@ def test_a_rig_knows_better_than_its_cameras(world: World) -> None:
     for seed in range(4):
         localizer = world.localizer(world.predictor(seed=seed))
         queries, true = world.queries("spot")
-        together += errors(localizer.localize(queries), true)[1].tolist()
-        for camera in range(len(queries[0].views)):
-            single = [
-                VggtQuery([q.views[camera]], q.rig_from_cams[camera : camera + 1], [q.references[camera]],
-                          [q.scores[camera]])
-                for q in queries
-            ]  # fmt: skip
-            alone += errors(localizer.localize(single), true)[1].tolist()
+        together += errors(localizer.predict(queries), true)[1].tolist()
+        for camera in range(len(queries[0][0].views)):
+            single = [(query.part([camera]), [references[camera]]) for query, references in queries]
+            alone += errors(localizer.predict(single), true)[1].tolist()
     assert np.median(together) < 0.9 * np.median(alone)
 
 
@@ -382,10 +366,10 @@ class Failing(SimulatedPredictor):
 )
 def test_one_bad_query_is_a_failed_answer_and_the_others_go_on(world: World, how: str, reason: str) -> None:
     queries, _ = world.queries("ios")
-    good = world.localizer(world.predictor(**LOW)).localize(queries)
+    good = world.localizer(world.predictor(**LOW)).predict(queries)
     predictor = Failing(world.sessions, world.files.maps, **LOW)  # type: ignore[arg-type]
-    predictor.bad, predictor.how = queries[1].views[0].name, how
-    answers = world.localizer(predictor).localize(queries)
+    predictor.bad, predictor.how = queries[1][0].views[0].name, how
+    answers = world.localizer(predictor).predict(queries)
     assert answers[1].estimate.status == reason
     assert answers[1].estimate.world_from_rig is None
     for index in (0, 2):
@@ -395,18 +379,17 @@ def test_one_bad_query_is_a_failed_answer_and_the_others_go_on(world: World, how
 def test_a_rig_goes_on_without_a_camera_that_fails(world: World) -> None:
     queries, true = world.queries("spot")
     predictor = Failing(world.sessions, world.files.maps, **LOW)  # type: ignore[arg-type]
-    predictor.bad = queries[0].views[0].name
-    (answer,) = world.localizer(predictor).localize(queries[:1])
+    predictor.bad = queries[0][0].views[0].name
+    (answer,) = world.localizer(predictor).predict(queries[:1])
     assert geometry.pose_error(answer.estimate.world_from_rig, true[0])[1] < 0.1
     assert "RuntimeError: out of luck" in answer.estimate.reason
 
 
 def test_without_references_there_is_no_pose(world: World) -> None:
-    (query, *_), _ = world.queries("ios")
-    nothing = replace(query, references=[np.zeros(0, np.int64)], scores=[np.zeros(0)])
-    (answer,) = world.localizer(world.predictor()).localize([nothing])
+    ((query, _), *_), _ = world.queries("ios")
+    (answer,) = world.localizer(world.predictor()).predict([(query, [References.of([])])])
     assert answer.estimate.status == "failed: no references"
-    assert world.localizer(world.predictor()).localize([]) == []
+    assert world.localizer(world.predictor()).predict([]) == []
 
 
 # --------------------------------------------------------------------------------------------------- the stage
@@ -443,32 +426,35 @@ def test_the_log_says_that_it_is_simulated(
 def test_the_network_is_never_replaced_by_the_simulation(
     run: SceneFiles, small_capture: Path, method: str, no_hub: None
 ) -> None:
-    with pytest.raises(WeightsError, match=r"(?s)VGGT-1B.*localize\.checkpoint.*localize\.method: pnp"):
-        run_stage(small_capture, run, method=method, predictor="vggt")
+    with pytest.raises(WeightsError, match=r"(?s)VGGT-1B.*localize\.predictor\.checkpoint.*localize\.method: pnp"):
+        run_stage(small_capture, run, method=method, predictor={"name": "vggt"})
     with pytest.raises(WeightsError, match=r"nowhere\.pt"):
-        run_stage(small_capture, run, method=method, predictor="vggt", checkpoint="nowhere.pt")
+        run_stage(small_capture, run, method=method, predictor={"name": "vggt", "checkpoint": "nowhere.pt"})
     assert not run.poses_dir.exists()
 
 
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"predictor": "magic"}, "Unknown predictor 'magic'. Known: vggt, simulated"),
-        ({"num_references": 0}, "num_references is 0"),
-        ({"candidates": 0}, "candidates is 0"),
-        ({"batch_size": 0}, "batch_size is 0"),
-        ({"predictor": "vggt", "compute_device": "tpu"}, "compute_device is 'tpu'"),
-        ({"predictor": "vggt", "dtype_compute": "int8"}, "dtype_compute is 'int8'"),
+        ({"predictor": {"name": "magic"}}, r"predictor\.name.*magic"),
+        ({"predictor": {"num_references": 0}}, r"predictor\.num_references.*0"),
+        ({"predictor": {"candidates": 0}}, r"predictor\.candidates.*0"),
+        ({"predictor": {"batch_size": 0}}, r"predictor\.batch_size.*0"),
+        ({"predictor": {"name": "vggt"}, "compute_device": "tpu"}, r"compute_device.*tpu"),
+        ({"predictor": {"name": "vggt"}, "dtype_compute": "int8"}, r"dtype_compute.*int8"),
     ],
 )
 def test_wrong_parameters_are_refused(run: SceneFiles, small_capture: Path, wrong: dict, message: str) -> None:
     with pytest.raises(ManifestError, match=message):
         run_stage(small_capture, run, **wrong)
-    with pytest.raises(ManifestError):
+    with pytest.raises(ManifestError, match=r"Unknown predictor 'magic'. Known: vggt, simulated"):
         create_predictor("magic")
 
 
-@pytest.mark.parametrize(("method", "more"), [("vggt", {"batch_size": 1}), ("hybrid", {"batch_size": 3, "workers": 2})])
+@pytest.mark.parametrize(
+    ("method", "more"),
+    [("vggt", {"predictor": {"batch_size": 1}}), ("hybrid", {"predictor": {"batch_size": 3}, "workers": 2})],
+)
 def test_rows_do_not_depend_on_batches_threads_or_being_killed(
     run: SceneFiles, small_capture: Path, monkeypatch: pytest.MonkeyPatch, method: str, more: dict
 ) -> None:
@@ -483,11 +469,12 @@ def test_rows_do_not_depend_on_batches_threads_or_being_killed(
             raise KeyboardInterrupt
         return predict(self, groups)
 
+    anew = {"method": method, "query_device": "spot", "skip_existing": False}
     with monkeypatch.context() as patch:
         patch.setattr(SimulatedPredictor, "predict", killed)
         with pytest.raises(KeyboardInterrupt):
-            run_stage(small_capture, run, method=method, query_device="spot", skip_existing=False, batch_size=2)
-    table = run_stage(small_capture, run, method=method, query_device="spot", skip_existing=False, **more)
+            run_stage(small_capture, run, {"batch_size": 2}, **anew)
+    table = run_stage(small_capture, run, **anew, **more)
     assert not table["skipped"].any()
     assert (table_of(run, "spot"), run.poses_txt("ios", "spot").read_bytes()) == expected
 
@@ -496,7 +483,7 @@ def test_a_killed_run_goes_on_where_it_was(
     run: SceneFiles, finished: SceneFiles, small_capture: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[str] = []
-    localize, row = VggtLocalizer.localize, localize_stage._row
+    predict, row = FeedForwardLocalizer.predict, localize_stage._row
     rows: list[object] = []
 
     def killed(*args: object) -> dict:
@@ -505,18 +492,19 @@ def test_a_killed_run_goes_on_where_it_was(
             raise KeyboardInterrupt
         return row(*args)  # type: ignore[arg-type]
 
-    def counted(self: VggtLocalizer, queries: Sequence[VggtQuery]) -> list[VggtAnswer]:
-        asked.extend(query.views[0].name for query in queries)
-        return localize(self, queries)
+    def counted(self: FeedForwardLocalizer, queries: Sequence[Asked]) -> list[FeedForwardAnswer]:
+        asked.extend(query.views[0].name for query, _ in queries)
+        return predict(self, queries)
 
     with monkeypatch.context() as patch:
         patch.setattr(localize_stage, "_row", killed)
         with pytest.raises(KeyboardInterrupt):
-            run_stage(small_capture, run, query_device="ios", batch_size=1)
+            run_stage(small_capture, run, query_device="ios", predictor={"batch_size": 1})
     assert not run.poses_txt("ios", "ios").exists()
-    (progress,) = run.poses_dir.glob(".*.partial.jsonl")
-    assert len(progress.read_text().splitlines()) == 3, "the record, and two rows"
-    monkeypatch.setattr(VggtLocalizer, "localize", counted)
+    (part,) = run.poses_dir.glob(".*.parts/*.h5")
+    with h5py.File(part) as file:
+        assert sum(len(devices) for devices in file.values()) == 2
+    monkeypatch.setattr(FeedForwardLocalizer, "predict", counted)
     table = run_stage(small_capture, run, query_device="ios")
     assert len(asked) == table["queries"].iloc[0] - 2
     assert table_of(run, "ios") == table_of(finished, "ios")
@@ -528,9 +516,9 @@ def test_other_noise_references_or_weights_make_poses_anew(run: SceneFiles, smal
         return bool(run_stage(small_capture, run, query_device="ios", **more)["skipped"].iloc[0])
 
     assert not skipped()
-    assert skipped(batch_size=1, workers=2)
-    assert not skipped(num_references=3)
-    assert not skipped(candidates=4)
+    assert skipped(predictor={"batch_size": 1}, workers=2)
+    assert not skipped(predictor={"num_references": 3})
+    assert not skipped(predictor={"candidates": 4})
     assert not skipped(seed=1)
     assert not skipped(method="hybrid")
 
@@ -540,16 +528,19 @@ def test_other_noise_references_or_weights_make_poses_anew(run: SceneFiles, smal
 
 @pytest.fixture(scope="module")
 def pnp(world: World) -> PnpLocalizer:
-    return PnpLocalizer(world.map, extract_session(world.map_session, world.files.features, progress=False))
+    return PnpLocalizer.of_sift(world.map, extract_session(world.map_session, world.files.features, progress=False))
 
 
-def asked_of(world: World, device: str, index: int, references: int = 10) -> tuple:
-    """Return the arguments of `PnpLocalizer.localize` for a query."""
+@pytest.fixture(scope="module")
+def hybrid(world: World, pnp: PnpLocalizer) -> HybridLocalizer:
+    return HybridLocalizer(pnp, world.localizer(world.predictor(**LOW)))
+
+
+def asked_of(world: World, device: str, index: int) -> Asked:
+    """Return a query with its features, and its references."""
     session = world.capture[f"{device}_query"]
-    query = world.queries(device, references)[0][index]
     store = extract_session(session, world.files.features, progress=False)
-    features = [store[view.name] for view in query.views]
-    return [view.camera for view in query.views], query.rig_from_cams, features, [r.tolist() for r in query.references]
+    return session_query(session, session.rows_of_keyframes(session.keyframes(LIST))[index], world.map, store=store)
 
 
 def same(one: PoseEstimate, other: PoseEstimate) -> bool:
@@ -563,25 +554,33 @@ def same(one: PoseEstimate, other: PoseEstimate) -> bool:
 
 
 @pytest.mark.parametrize("device", ["ios", "spot"])
-def test_without_a_usable_prediction_the_hybrid_is_pnp(world: World, pnp: PnpLocalizer, device: str) -> None:
+def test_without_a_usable_prediction_the_hybrid_is_pnp(
+    world: World, pnp: PnpLocalizer, hybrid: HybridLocalizer, device: str
+) -> None:
     asked = asked_of(world, device, 0)
     expected = pnp.localize(*asked)
     assert expected.status == "ok"
-    assert same(HybridLocalizer(pnp).localize(*asked, VggtAnswer(PoseEstimate("failed: no references"))), expected)
+    assert same(hybrid.localize(*asked, FeedForwardAnswer(PoseEstimate("failed: no references"))), expected)
     unknown = np.diag([1e-4] * 3 + [np.inf] * 3)
     far = PoseEstimate("low_confidence", np.eye(4), unknown, found_by="vggt")
-    assert same(HybridLocalizer(pnp).localize(*asked, VggtAnswer(far)), expected)
+    assert same(hybrid.localize(*asked, FeedForwardAnswer(far)), expected)
 
 
 @pytest.mark.parametrize("device", ["ios", "spot"])
-def test_a_wrong_prediction_does_no_harm(world: World, pnp: PnpLocalizer, device: str) -> None:
-    asked = asked_of(world, device, 0)
-    expected = pnp.localize(*asked)
+def test_a_wrong_prediction_does_no_harm(
+    world: World, pnp: PnpLocalizer, hybrid: HybridLocalizer, device: str
+) -> None:
+    query, references = asked_of(world, device, 0)
+    expected = pnp.localize(query, references)
     wrong = expected.world_from_rig @ geometry.make_pose(np.eye(3), [1.0, 0.5, 0.0])
+    prediction = predicted_at(wrong, references[0].images[:4])
+    assert same(hybrid.localize(query, references, FeedForwardAnswer(prediction)), expected)
+
+
+def predicted_at(world_from_rig: Floats, references: Sequence[int]) -> PoseEstimate:
     covariance = np.diag([1e-4] * 3 + [1e-3] * 3)
-    prediction = PoseEstimate("ok", wrong, covariance, references=tuple(asked[3][0][:4]), found_by="vggt")
-    found = HybridLocalizer(pnp).localize(*asked, VggtAnswer(prediction))
-    assert same(found, expected)
+    rests_on = tuple(int(image) for image in references)
+    return PoseEstimate("ok", world_from_rig, covariance, references=rests_on, found_by="vggt")
 
 
 def prediction_near(true: Floats, references: Sequence[int], seed: int = 0) -> PoseEstimate:
@@ -589,50 +588,54 @@ def prediction_near(true: Floats, references: Sequence[int], seed: int = 0) -> P
     nearby = true @ geometry.make_pose(
         geometry.quaternion_to_rotation([1.0, *(rng.normal(size=3) * 0.004)]), rng.normal(size=3) * 0.02
     )
-    covariance = np.diag([1e-4] * 3 + [1e-3] * 3)
-    return PoseEstimate("ok", nearby, covariance, references=tuple(references), found_by="vggt")
+    return predicted_at(nearby, references)
 
 
-def test_a_prediction_finds_what_descriptors_alone_do_not(world: World, pnp: PnpLocalizer) -> None:
+def test_a_prediction_finds_what_descriptors_alone_do_not(world: World, hybrid: HybridLocalizer) -> None:
     """Descriptors too alike to be matched in all of an image are matched about the predicted pose."""
-    cameras, rig_from_cams, features, references = asked_of(world, "ios", 0)
-    true = world.queries("ios")[1][0]
-    strict = PnpLocalizer.of([MappedFeatures(world.map, pnp.mapped[0].features, matcher=MutualMatcher(ratio=0.0))])
-    alone = strict.localize(cameras, rig_from_cams, features, references)
+    query, references = asked_of(world, "ios", 0)
+    true, near = world.queries("ios")[1][0], references[0].images[:4]
+    features = hybrid.pnp.matcher.mapped[0].features
+    strict = PnpLocalizer([MappedFeatures(world.map, features, matcher=MutualMatcher(ratio=0.0))])
+    alone = strict.localize(query, references)
     assert alone.status.startswith("failed")
-    found = HybridLocalizer(strict).localize(
-        cameras, rig_from_cams, features, references, VggtAnswer(prediction_near(true, references[0][:4]))
-    )
+    prediction = FeedForwardAnswer(prediction_near(true, near))
+    found = HybridLocalizer(strict, hybrid.feed_forward).localize(query, references, prediction)
     assert found.found_by == "pnp+vggt"
     assert found.status == "ok"
     error_deg, error_m = geometry.pose_error(found.world_from_rig, true)
     assert error_deg < 0.3
     assert error_m < 0.03
-    assert set(found.references) <= set(references[0][:4])
+    assert set(found.references) <= set(near)
 
 
-def test_where_nothing_matches_the_prediction_is_the_answer(world: World, pnp: PnpLocalizer) -> None:
-    cameras, rig_from_cams, features, references = asked_of(world, "ios", 0)
-    blind = [
-        replace(f, keypoints=f.keypoints[:0], scales=f.scales[:0], descriptors=f.descriptors[:0]) for f in features
-    ]
+def test_where_nothing_matches_the_prediction_is_the_answer(world: World, hybrid: HybridLocalizer) -> None:
+    query, references = asked_of(world, "ios", 0)
+    blind = replace(query, features=[[kinds[0].take(slice(0))] for kinds in query.features])
     true = world.queries("ios")[1][0]
-    prediction = prediction_near(true, references[0][:4])
-    found = HybridLocalizer(pnp).localize(cameras, rig_from_cams, blind, references, VggtAnswer(prediction))
+    prediction = prediction_near(true, references[0].images[:4])
+    found = hybrid.localize(blind, references, FeedForwardAnswer(prediction))
     assert found.found_by == "vggt"
     assert found.status == "ok"
     np.testing.assert_array_equal(found.world_from_rig, prediction.world_from_rig)
     assert "failed: too few matches" in found.reason
 
 
+def test_a_hybrid_asks_its_network_where_no_prediction_is_given(world: World, hybrid: HybridLocalizer) -> None:
+    asked = asked_of(world, "ios", 0)
+    found = hybrid.localize(*asked)
+    assert same(found, hybrid.localize(*asked, hybrid.predict([asked])[0]))
+    assert np.isfinite(found.scale_std)
+
+
 def test_a_prior_is_found_again_in_whatever_order(world: World, pnp: PnpLocalizer) -> None:
     asked = asked_of(world, "spot", 1)
     true = world.queries("spot")[1][1]
-    images = np.unique(np.concatenate([np.array(refs) for refs in asked[3]]))
+    images = np.unique(np.concatenate([retrieved.images for retrieved in asked[1]]))
     priors = [Prior(prediction_near(true, [], seed).world_from_rig, images, 2.0) for seed in range(2)]
-    found = [pnp.localize(*asked, priors) for _ in range(2)]
+    found = [pnp.localize(*asked, priors=priors) for _ in range(2)]
     assert same(*found)
-    assert same(found[0], pnp.localize(*asked, priors[::-1]))
+    assert same(found[0], pnp.localize(*asked, priors=priors[::-1]))
 
 
 def test_the_hybrid_run_is_as_good_as_pnp(run: SceneFiles, small_capture: Path) -> None:
@@ -658,15 +661,15 @@ def test_the_hybrid_run_is_as_good_as_pnp(run: SceneFiles, small_capture: Path) 
 def test_a_prediction_is_drawn_and_labeled(world: World, tmp_path: Path) -> None:
     queries, _ = world.queries("spot")
     localizer = world.localizer(world.predictor(wrong_references=0.3, seed=2))
-    (answer,) = localizer.localize(queries[:1])
-    figure = draw_prediction(localizer, queries[0], answer, out=tmp_path / "prediction.png")
+    (answer,) = localizer.predict(queries[:1])
+    figure = draw_prediction(localizer, queries[0][0], answer, out=tmp_path / "prediction.png")
     assert (tmp_path / "prediction.png").stat().st_size > 20_000
     assert figure.get_suptitle().startswith("SIMULATED, no result")
-    failed = VggtAnswer(PoseEstimate("failed: no references"), ())
-    assert "failed: no references" in draw_prediction(localizer, queries[0], failed).get_suptitle()
+    failed = FeedForwardAnswer(PoseEstimate("failed: no references"), ())
+    assert "failed: no references" in draw_prediction(localizer, queries[0][0], failed).get_suptitle()
     undecided = replace(answer.cameras[0], reason="undecided")
-    failed = VggtAnswer(PoseEstimate("failed: undecided"), (undecided,))
-    assert draw_prediction(localizer, queries[0], failed).get_suptitle().count("undecided") == 1
+    failed = FeedForwardAnswer(PoseEstimate("failed: undecided"), (undecided,))
+    assert draw_prediction(localizer, queries[0][0], failed).get_suptitle().count("undecided") == 1
 
 
 class Refuses:
@@ -685,6 +688,6 @@ class Refuses:
 def test_wrong_weights_end_the_run_and_a_bad_image_does_not(world: World) -> None:
     queries, _ = world.queries("ios")
     with pytest.raises(WeightsError, match="of another network"):
-        world.localizer(Refuses(WeightsError("of another network"))).localize(queries)
-    answers = world.localizer(Refuses(ImageError("torn.jpg"))).localize(queries)
+        world.localizer(Refuses(WeightsError("of another network"))).predict(queries)
+    answers = world.localizer(Refuses(ImageError("torn.jpg"))).predict(queries)
     assert {answer.estimate.status for answer in answers} == {"failed: ImageError: torn.jpg"}

@@ -12,18 +12,20 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.calls import call
+from tests.queries import session_query
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import SceneFiles, write_text
 from toolkit.localize import localize_pairs
+from toolkit.localizers.base import PoseEstimate, Query, References, View
+from toolkit.localizers.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
 from toolkit.localizers.hybrid import HybridLocalizer
 from toolkit.localizers.lifting import DepthLifter
 from toolkit.localizers.mapping import LocalMap
-from toolkit.localizers.pnp import PnpLocalizer, PoseEstimate
-from toolkit.localizers.prediction import Prediction, View
+from toolkit.localizers.pnp import PnpLocalizer
+from toolkit.localizers.prediction import Prediction
 from toolkit.localizers.simulated import SimulatedPredictor
-from toolkit.localizers.vggt import VggtAnswer, VggtLocalizer, VggtQuery
 
 Floats = NDArray[np.float64]
 NOISE = {"rotation_noise_deg": 0.3, "position_noise_m": 0.01, "depth_noise": 0.02}
@@ -38,22 +40,18 @@ class World:
     map: LocalMap
     pnp: PnpLocalizer
     predictor: SimulatedPredictor
-    queries: list[VggtQuery]
-    features: list[list]
+    queries: list[tuple[Query, list[References]]]
     true: Floats
 
-    def answer(self, index: int, predictor: object, session: Session) -> tuple[VggtLocalizer, VggtAnswer]:
-        vggt = VggtLocalizer(self.map, session, predictor)  # type: ignore[arg-type]
-        return vggt, vggt.localize([self.queries[index]])[0]
-
-    def asked(self, index: int) -> tuple:
-        query = self.queries[index]
-        cameras = [view.camera for view in query.views]
-        return cameras, query.rig_from_cams, self.features[index], [r.tolist() for r in query.references]
+    def answer(
+        self, index: int, predictor: object, session: Session
+    ) -> tuple[FeedForwardLocalizer, FeedForwardAnswer]:
+        localizer = FeedForwardLocalizer(self.map, session, predictor)  # type: ignore[arg-type]
+        return localizer, localizer.predict([self.queries[index]])[0]
 
     def localize(self, index: int, predictor: object, session: Session) -> PoseEstimate:
-        vggt, answer = self.answer(index, predictor, session)
-        return HybridLocalizer(self.pnp, DepthLifter(self.pnp, vggt)).localize(*self.asked(index), answer)
+        feed_forward, answer = self.answer(index, predictor, session)
+        return HybridLocalizer(self.pnp, feed_forward).localize(*self.queries[index], answer)
 
     def error(self, index: int, found: PoseEstimate) -> tuple[float, float]:
         rotation_deg, distance_m = geometry.pose_error(found.world_from_rig, self.true[index])
@@ -88,39 +86,21 @@ def world(small_capture: Path, small_features: Path, tmp_path_factory: pytest.Te
     local_map.save(folder / "maps" / "ios_map.npz")
     sessions = [capture[name] for name in capture.session_ids]
     predictor = SimulatedPredictor(sessions, folder / "maps", **NOISE)  # type: ignore[arg-type]
-    queries, features, true = [], [], []
+    queries, true = [], []
     for device, count in (("ios", 3), ("spot", 1)):
         session = capture[f"{device}_query"]
         keyframes = session.keyframes("original").iloc[:count]
         members = session.rows_of_keyframes(keyframes)
         local = extract_session(session, folder / "features", rows=np.concatenate(members), progress=False)
-        for rows in members:
-            queries.append(query_of(session, rows, local_map))
-            features.append([local[session.image_name(int(row))] for row in rows])
+        queries += [session_query(session, rows, local_map, count=8, store=local) for rows in members]
         true.append(session.ground_truth.lookup(keyframes["timestamp"], keyframes["device_id"]))
-    pnp = PnpLocalizer(local_map, store)
-    return World(mapped, Session.open(bare), local_map, pnp, predictor, queries, features, np.concatenate(true))
-
-
-def query_of(session: Session, rows: NDArray[np.int64], local_map: LocalMap) -> VggtQuery:
-    """Return a query with the eight map images that stand and look most alike."""
-    references, scores = [], []
-    for pose in session.world_from_cam(rows, ground_truth=True):
-        rotation_deg, distance_m = geometry.pose_error(local_map.world_from_cams, pose[None])
-        score = -rotation_deg / 20 - distance_m
-        references.append(np.argsort(-score, kind="stable")[:8])
-        scores.append(score[references[-1]])
-    views = [
-        View(session.image_name(int(row)), session.image_path(int(row)),
-             session.camera(str(session.images["sensor_id"].iloc[int(row)])), known=False)
-        for row in rows
-    ]  # fmt: skip
-    return VggtQuery(views, session.rig_from_cam(rows), references, scores)
+    pnp = PnpLocalizer.of_sift(local_map, store)
+    return World(mapped, Session.open(bare), local_map, pnp, predictor, queries, np.concatenate(true))
 
 
 @pytest.mark.parametrize("index", range(4))
 def test_depth_maps_localize_where_nothing_is_triangulated(world: World, index: int) -> None:
-    assert world.pnp.localize(*world.asked(index)).status == "failed: too few matches"
+    assert world.pnp.localize(*world.queries[index]).status == "failed: too few matches"
     found = world.localize(index, world.predictor, world.map_session)
     assert found.found_by == "lifted"
     assert found.status == "ok"
@@ -128,13 +108,16 @@ def test_depth_maps_localize_where_nothing_is_triangulated(world: World, index: 
     assert rotation_deg < 0.3
     assert distance_m < 0.03
     assert distance_m < 5 * found.position_std_m, "the uncertainty tells"
-    assert (found.point_index == -1).all()
+    matches = found.correspondences
+    assert matches.inlier.any()
+    assert (matches.point_index == -1).all()
+    assert (matches.found_by == "sift/lifted").all()
 
 
 @pytest.mark.parametrize("index", range(4))
 def test_predicted_depth_localizes_without_depth_maps(world: World, index: int) -> None:
-    vggt, answer = world.answer(index, world.predictor, world.without_depth)
-    found = DepthLifter(world.pnp, vggt).localize(*world.asked(index), answer)
+    feed_forward, answer = world.answer(index, world.predictor, world.without_depth)
+    found = DepthLifter(world.pnp, feed_forward).localize(*world.queries[index], answer)
     assert found is not None
     assert found.found_by == "lifted+vggt"
     rotation_deg, distance_m = world.error(index, found)
@@ -173,8 +156,8 @@ class WrongDepth:
 @pytest.mark.parametrize("how", ["twice", "half", "flat", "noise", "mirrored"])
 def test_wrong_depth_is_never_a_wrong_pose_called_ok(world: World, how: str) -> None:
     for index in range(3):
-        vggt, answer = world.answer(index, WrongDepth(world.predictor, how), world.without_depth)
-        lifted = DepthLifter(world.pnp, vggt).localize(*world.asked(index), answer)
+        feed_forward, answer = world.answer(index, WrongDepth(world.predictor, how), world.without_depth)
+        lifted = DepthLifter(world.pnp, feed_forward).localize(*world.queries[index], answer)
         assert lifted is not None
         found = world.localize(index, WrongDepth(world.predictor, how), world.without_depth)
         for estimate in (lifted, found):
@@ -186,11 +169,11 @@ def test_wrong_depth_is_never_a_wrong_pose_called_ok(world: World, how: str) -> 
 
 def test_a_wrong_scale_of_one_image_is_in_the_covariance(world: World) -> None:
     """Matches of one reference alone cannot tell the scale of its depth; the place is as unsure as that makes it."""
-    vggt, answer = world.answer(0, world.predictor, world.without_depth)
-    cameras, rig_from_cams, features, references = world.asked(0)
+    feed_forward, answer = world.answer(0, world.predictor, world.without_depth)
+    query, (references,) = world.queries[0]
     place = world.true[0, :3, 3]
-    far = max(references[0][:5], key=lambda image: np.linalg.norm(world.map.world_from_cams[image, :3, 3] - place))
-    found = DepthLifter(world.pnp, vggt).localize(cameras, rig_from_cams, features, [[far]], answer)
+    far = max(references.images[:5], key=lambda image: np.linalg.norm(world.map.world_from_cams[image, :3, 3] - place))
+    found = DepthLifter(world.pnp, feed_forward).localize(query, [References.of([far])], answer)
     assert found is not None
     if found.world_from_rig is not None:
         arm = np.linalg.norm(world.map.world_from_cams[far, :3, 3] - found.world_from_rig[:3, 3])
@@ -198,10 +181,10 @@ def test_a_wrong_scale_of_one_image_is_in_the_covariance(world: World) -> None:
 
 
 def test_without_depth_nothing_is_lifted(world: World) -> None:
-    vggt, _ = world.answer(0, world.predictor, world.without_depth)
-    nothing = VggtAnswer(PoseEstimate("failed: no references"))
-    assert DepthLifter(world.pnp, vggt).localize(*world.asked(0), nothing) is None
-    found = HybridLocalizer(world.pnp, DepthLifter(world.pnp, vggt)).localize(*world.asked(0), nothing)
+    feed_forward, _ = world.answer(0, world.predictor, world.without_depth)
+    nothing = FeedForwardAnswer(PoseEstimate("failed: no references"))
+    assert DepthLifter(world.pnp, feed_forward).localize(*world.queries[0], nothing) is None
+    found = HybridLocalizer(world.pnp, feed_forward).localize(*world.queries[0], nothing)
     assert found.status == "failed: too few matches"
 
 
