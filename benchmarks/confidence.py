@@ -83,6 +83,7 @@ def localize_session(
     from toolkit.capture.images import prefetch, read_image
     from toolkit.features.features import SiftExtractor
     from toolkit.geometry import pose_error
+    from toolkit.localizers.base import Query, References, View
 
     extractor = SiftExtractor()
     keyframes = session.keyframes("keyframes_original")
@@ -92,18 +93,25 @@ def localize_session(
 
     def localize(index: int) -> list[dict[str, Any]]:
         rows = rows_of_queries[index]
-        cameras = [session.camera(session.images["sensor_id"].iloc[row]) for row in rows]
         images = [read_image(session.image_path(int(row)), gray=True) for row in rows]
+        cameras = [session.camera(session.images["sensor_id"].iloc[row]) for row in rows]
+        views = [
+            View(session.image_name(int(row)), image, camera, in_map=False)
+            for row, image, camera in zip(rows, images, cameras, strict=True)
+        ]
         rig_from_cams = session.rig_from_cam(rows)
         found_rows = []
         for turn, how in enumerate(DEGRADATIONS):
             rng = np.random.default_rng([seed, index, turn])
             features = extractor.extract([degrade(image, how, rng) for image in images])
+            query = Query(views, rig_from_cams, [[of_image] for of_image in features])
             for chosen in REFERENCES:
                 world_from_cams = truth[index] @ rig_from_cams
                 poses = localizer.map.world_from_cams
-                references = [choose_references(pose, poses, chosen, rng) for pose in world_from_cams]
-                found = localizer.localize(cameras, rig_from_cams, features, references)
+                references = [
+                    References.of(choose_references(pose, poses, chosen, rng)) for pose in world_from_cams
+                ]
+                found = localizer.localize(query, references)
                 row = {"seed": seed, "session": session.id, "query": index, "images": how, "references": chosen}
                 row |= {"status": found.status, "posed": found.world_from_rig is not None, "wrong": False}
                 row |= {"rotation_error_deg": float("nan"), "translation_error_m": float("nan")}
@@ -134,7 +142,7 @@ def measure(
         session = capture[f"{device}_map"]
         store = extract_session(session, folder / f"features{seed}", workers=workers)
         local_map = build_map(session, store, folder / f"{device}{seed}.npz", workers=workers)
-        localizer = PnpLocalizer(local_map, store)
+        localizer = PnpLocalizer.of_sift(local_map, store)
         yield [
             row | {"map": device}
             for asked in capture.devices

@@ -68,11 +68,12 @@ def run_toolkit(sessions_root: Path, run: Path, queries: str, threads: int) -> d
     start = _clocks()
     from toolkit import embed, localize, retrieve
     from toolkit.files import SceneFiles
+    from toolkit.localizers import map as map_module
     from toolkit.localizers.mapping import LocalMap
 
     imported = _clocks()
     files = SceneFiles(run, sessions_root.parent.name)
-    inner = _time_parts(embed, localize)
+    inner = _time_parts(embed, localize, map_module)
     started = _clocks()
     table = embed.embed_sessions(sessions_root, files.embeddings, features_dir=files.features)
     embedded, features = _clocks(), inner["features"]
@@ -152,9 +153,10 @@ def localize_plainly(sessions_root: Path, run: Path, queries: str, threads: int)
     """Localize in a finished run's maps with the plain setting; returns wall and CPU seconds."""
     from toolkit import localize
     from toolkit.files import SceneFiles
+    from toolkit.localizers import map as map_module
 
     files = SceneFiles(run, sessions_root.parent.name)
-    inner = _time_parts(localize)
+    inner = _time_parts(localize, map_module)
     started = _clocks()
     folders = (files.retrieval_dir, run / "plain_poses", files.features, files.maps)
     localize.localize_pairs(sessions_root, *folders, {"pnp": PLAIN}, queries=queries, workers=threads)
