@@ -17,7 +17,7 @@ from toolkit.features.matching import MutualMatcher, PairMatches
 from toolkit.localizers.base import PoseEstimate
 from toolkit.localizers.mapping import LocalMap
 from toolkit.localizers.matches import MappedFeatures
-from toolkit.localizers.pnp import PnpLocalizer
+from toolkit.localizers.pnp import VIEWS, PnpLocalizer
 from toolkit.localizers.rig import least_squares_covariance
 from toolkit.manifest import PnpSettings
 
@@ -469,6 +469,105 @@ def test_localizing_leaves_the_map_as_it_is(room: World) -> None:
     assert all(getattr(room.local_map, name).tobytes() == content for name, content in before.items())
 
 
+# ------------------------------------------------------------------------------------------- what a pose rests on
+
+
+def errors_deg(points: Floats, estimate: PoseEstimate, cameras: list[pycolmap.Camera], rig_from_cams: Floats) -> Floats:
+    """Return how far each correspondence's point is projected from its pixel, as an angle; inf behind the camera."""
+    matches, errors = estimate.correspondences, np.full(len(estimate.correspondences), np.inf)
+    np.testing.assert_array_equal(matches.points, points[matches.point_index])
+    for index, (camera, rig_from_cam) in enumerate(zip(cameras, rig_from_cams, strict=True)):
+        mine = matches.in_camera(index)
+        cam_from_world = geometry.invert(estimate.world_from_rig @ rig_from_cam)
+        in_cam = geometry.transform(cam_from_world, matches.points[mine])
+        errors_px = np.linalg.norm(np.asarray(camera.img_from_cam(in_cam)) - matches.pixels[mine], axis=1)
+        errors[mine] = np.degrees(np.arctan(errors_px / camera.mean_focal_length()))
+        errors[mine[in_cam[:, 2] <= 0]] = np.inf
+    return errors
+
+
+def rig_asked(world: World, **more: float) -> tuple:
+    features = [world.look(c, QUERY @ r, **more) for c, r in zip(RIG_CAMERAS, RIG_FROM_CAMS, strict=True)]
+    return RIG_CAMERAS, RIG_FROM_CAMS, features, [REFERENCES] * 3
+
+
+@pytest.mark.parametrize("rig", [False, True])
+def test_inliers_are_what_the_pose_agrees_with_and_the_rest_is_rejected(room: World, rig: bool) -> None:
+    single = [PINHOLE], np.eye(4)[None], [room.look(PINHOLE, QUERY, outliers=0.5)], [REFERENCES]
+    asked = rig_asked(room, outliers=0.5) if rig else single
+    localizer = room.localizer()
+    estimate = ask(localizer, *asked)
+    check(estimate, QUERY, 0.2, 0.02)
+    matches = estimate.correspondences
+    errors = errors_deg(room.points, estimate, *asked[:2])
+    assert (errors[matches.inlier] < localizer.settings.max_error_deg).all()
+    assert (errors[~matches.inlier] >= localizer.settings.max_error_deg).all()
+    assert (~matches.inlier).sum() > 100
+    guided = np.char.endswith(matches.found_by, "/guided")
+    assert set(matches.found_by) == {"sift/guided", "sift/descriptors"}
+    assert guided.sum() == estimate.num_guided
+    assert matches.inlier[guided].all()
+    # Each match is there once: those that descriptors found too are among the guided ones.
+    rows = np.column_stack([matches.camera, matches.pixels, matches.point_index])
+    assert len(np.unique(rows, axis=0)) == len(rows)
+    # Each pixel is that of a feature.
+    for camera, features in enumerate(asked[2]):
+        mine = matches.pixels[matches.in_camera(camera)]
+        assert np.isin(mine.view("f8,f8"), features.keypoints.astype(np.float64).view("f8,f8")).all()
+
+
+@pytest.mark.parametrize("rig", [False, True])
+def test_views_are_the_keypoints_of_references_that_see_the_points(room: World, rig: bool) -> None:
+    asked = rig_asked(room) if rig else ([PINHOLE], np.eye(4)[None], [room.look(PINHOLE, QUERY)], [REFERENCES])
+    estimate = ask(room.localizer(), *asked)
+    matches = estimate.correspondences
+    shown = estimate.references[: matches.view_reference.max() + 1]
+    assert len(shown) == VIEWS
+    for rank, image in enumerate(shown):
+        keypoint, point = room.local_map.observations(image)
+        features = room.features[room.local_map.image_names[image]]
+        pixels_of = dict(zip(point.tolist(), features.keypoints[keypoint].tolist(), strict=True))
+        mine = matches.view_reference == rank
+        expected = [pixels_of[point] for point in matches.point_index[matches.view_of[mine]].tolist()]
+        np.testing.assert_array_equal(matches.view_pixels[mine], expected)
+        # Every correspondence whose point the reference sees, also where two cameras of a rig see the point.
+        assert sorted(matches.view_of[mine]) == np.flatnonzero(np.isin(matches.point_index, point)).tolist()
+
+
+def test_references_that_see_the_most_come_first(room: World) -> None:
+    seen_by = {index: np.arange(60 * index) for index in REFERENCES}
+    world = World.build(room.points, MAP_POSES, room.descriptors, sees=seen_by)
+    estimate = ask(world.localizer(), [PINHOLE], np.eye(4)[None], [world.look(PINHOLE, QUERY)], [REFERENCES])
+    assert set(estimate.references) == set(REFERENCES[1:])
+    counts = [np.isin(rests_on(estimate)[2], world.local_map.observations(index)[1]).sum() for index in REFERENCES]
+    assert [counts[index] for index in estimate.references] == sorted(counts[1:], reverse=True)
+
+
+def test_without_a_pose_all_matches_are_rejected(room: World) -> None:
+    seen = room.look(PINHOLE, QUERY, outliers=1.0)
+    matches = ask(room.localizer(), [PINHOLE], np.eye(4)[None], [seen], [[4]]).correspondences
+    few = room.look(PINHOLE, QUERY, limit=3)
+    estimate = ask(room.localizer(), [PINHOLE], np.eye(4)[None], [few], [REFERENCES])
+    assert estimate.status == "failed: too few matches"
+    for rejected in (matches, estimate.correspondences):
+        assert len(rejected)
+        assert not rejected.inlier.any()
+        assert set(rejected.found_by) == {"sift/descriptors"}
+        assert len(rejected.view_of) == 0
+
+
+def test_images_without_features_are_left_out_and_the_others_keep_their_numbers(room: World) -> None:
+    cameras, poses, features, references = rig_asked(room)
+    estimate = ask(room.localizer(), cameras, poses, ["torn", *features[1:]], references)
+    check(estimate, QUERY)
+    assert set(estimate.correspondences.camera) == {1, 2}
+    errors = errors_deg(room.points, estimate, cameras, poses)
+    assert (errors[estimate.correspondences.inlier] < room.localizer().settings.max_error_deg).all()
+    none = ask(room.localizer(), cameras, poses, ["torn", "no features", "torn"], references)
+    assert none.status == "failed: no readable image (torn; no features; torn)"
+    assert none.world_from_rig is None
+
+
 # ------------------------------------------------------------------------------------- several kinds of features
 
 
@@ -496,7 +595,7 @@ SINGLE_SCALE = replace(KINDS["sift"], scale_octaves=float("inf"))
 def test_several_kinds_of_features_give_one_pose_with_the_matches_of_all(room: World) -> None:
     other = other_kind(room, 5)
     kinds = [MappedFeatures(room.local_map, room.features),
-             MappedFeatures(other.local_map, other.features, SINGLE_SCALE)]  # fmt: skip
+             MappedFeatures(other.local_map, other.features, SINGLE_SCALE, name="other")]  # fmt: skip
     seen = [room.look(PINHOLE, QUERY, limit=60), other.look(PINHOLE, QUERY, limit=60)]
     alone = [
         ask(PnpLocalizer([kind]), [PINHOLE], np.eye(4)[None], [one], [REFERENCES])
@@ -511,6 +610,15 @@ def test_several_kinds_of_features_give_one_pose_with_the_matches_of_all(room: W
     _, pixels, point_index = rests_on(estimate)
     of_other = point_index >= len(room.local_map.points)
     assert 0 < of_other.sum() < len(of_other)
+    matches = estimate.correspondences
+    of_other = matches.point_index >= len(room.local_map.points)
+    np.testing.assert_array_equal(of_other, np.char.startswith(matches.found_by, "other/"))
+    # And so are the places where references show them.
+    for rank in np.unique(matches.view_reference):
+        mine = matches.view_reference == rank
+        cam_from_world = geometry.invert(MAP_POSES[estimate.references[rank]])
+        in_cam = geometry.transform(cam_from_world, matches.points[matches.view_of[mine]])
+        np.testing.assert_allclose(PINHOLE.img_from_cam(in_cam), matches.view_pixels[mine], atol=0.01)
     projected = PINHOLE.img_from_cam(geometry.transform(geometry.invert(QUERY), both.map.points[point_index]))
     assert np.linalg.norm(projected - pixels, axis=1).max() < 6
     rig = ask(both, RIG_CAMERAS, RIG_FROM_CAMS, [

@@ -237,8 +237,10 @@ class MapMatcher:
 
     def keypoints(self, image: int, points: Ints) -> tuple[Ints, Floats]:
         """Return which of the points a map image sees, as indices into `points`, and where, (n, 2) pixels."""
-        keypoint, seen = self.map.observations(image)
-        _, at, where = np.intersect1d(points, seen, return_indices=True)
+        keypoint, observed = self.map.observations(image)
+        seen, first = np.unique(observed, return_index=True)
+        at = np.flatnonzero(np.isin(points, seen))  # several cameras of a rig may see the same point
+        where = first[np.searchsorted(seen, points[at])]
         pixels = np.zeros((len(at), 2))
         kinds = np.searchsorted(self._first_point, points[at], side="right") - 1
         for kind in np.unique(kinds):
