@@ -152,7 +152,7 @@ class FeedForwardLocalizer:
             if isinstance(error, ToolkitError) and not isinstance(error, ImageError):
                 raise
             if len(groups) > 1:
-                return [found for group in groups for found in self._predict([group])]
+                return [prediction for group in groups for prediction in self._predict([group])]
             log.exception("predicting %s", groups[0][0].name)
             return [f"{type(error).__name__}: {error}"]
 
@@ -235,7 +235,7 @@ def _combine(query: Query, cameras: tuple[CameraAnswer, ...]) -> PoseEstimate:
         turn, covariance = rig_from_cam[:3, :3], np.diag(np.full(6, np.inf))
         covariance[:3, :3] = turn @ _covariance(cameras[kept[0]])[:3, :3] @ turn.T
     consistent = [int(i) for c in kept for i in cameras[c].references[_alignment(cameras[c]).inliers]]
-    asked = [int(i) for answer in cameras if answer.prediction is not None for i in answer.references]
+    shown = [int(i) for answer in cameras if answer.prediction is not None for i in answer.references]
     return PoseEstimate(
         status="ok" if sure else "low_confidence",
         world_from_rig=pose,
@@ -245,7 +245,7 @@ def _combine(query: Query, cameras: tuple[CameraAnswer, ...]) -> PoseEstimate:
         references=tuple(dict.fromkeys(consistent)),
         found_by="vggt",
         scale_std=min(_alignment(cameras[index]).scale_std for index in kept),
-        rejected=tuple(index for index in dict.fromkeys(asked) if index not in consistent),
+        rejected=tuple(index for index in dict.fromkeys(shown) if index not in consistent),
         reason=reasons,
     )
 

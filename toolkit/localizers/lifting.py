@@ -63,13 +63,13 @@ class LiftedMap:
 class DepthLifter:
     """Lifts the features of one map's images, and localizes with them. Safe to use from several threads."""
 
-    def __init__(self, pnp: PnpLocalizer, vggt: FeedForwardLocalizer) -> None:
+    def __init__(self, pnp: PnpLocalizer, feed_forward: FeedForwardLocalizer) -> None:
         """
         Args:
             pnp: of several kinds of features, those of the first are lifted and matched.
-            vggt: on the same map.
+            feed_forward: on the same map.
         """
-        self._first, self._pnp, self._vggt = pnp.matcher.mapped[0], pnp, vggt
+        self._first, self._pnp, self._feed_forward = pnp.matcher.mapped[0], pnp, feed_forward
 
     def localize(
         self, query: Query, references: Sequence[References], answer: FeedForwardAnswer, priors: Sequence[Prior] = ()
@@ -165,7 +165,7 @@ class DepthLifter:
 
     def _depth(self, image: int, xy: Floats, predicted: tuple[CameraAnswer, int] | None) -> Depth | None:
         """Return the depth at pixels of a map image: of the capture's depth maps, else predicted."""
-        seen = self._vggt.seen_depth(image)
+        seen = self._feed_forward.seen_depth(image)
         depth_m = seen.at(xy)
         if np.isfinite(depth_m).sum() >= LEAST_LIFTED:
             return Depth(depth_m, DEPTH_MAP_STD)
@@ -194,34 +194,34 @@ class DepthLifter:
 class _LiftedLocalizer(PnpLocalizer):
     """Localizes in a lifted map; the common scale of each image's depth is unknown within its standard deviation."""
 
-    def __init__(self, made: LiftedMap, mapped: MappedFeatures, settings: PnpSettings, seed: int) -> None:
-        features = MappedFeatures(made.local_map, mapped.features, mapped.kind, mapped.matcher, mapped.name)
+    def __init__(self, lifted_map: LiftedMap, mapped: MappedFeatures, settings: PnpSettings, seed: int) -> None:
+        features = MappedFeatures(lifted_map.local_map, mapped.features, mapped.kind, mapped.matcher, mapped.name)
         super().__init__([features], settings, seed)
-        self._made = made
+        self._lifted_map = lifted_map
 
     def _covariance(self, query: RigQuery, rig_from_world: Floats, matches: Matches) -> Floats | None:
-        made = self._made
-        source = made.image[matches.point]
+        lifted_map, local_map = self._lifted_map, self._lifted_map.local_map
+        source = lifted_map.image[matches.point]
         images = np.unique(source[source >= 0])
         if not len(images):
             return super()._covariance(query, rig_from_world, matches)
-        of_pose, of_point = query.jacobians(rig_from_world, matches, made.local_map.points)
+        of_pose, of_point = query.jacobians(rig_from_world, matches, local_map.points)
         of_scales = np.zeros((len(matches), 2, len(images)))
         for number, image in enumerate(images):
             mine = source == image
             # A change s of the scale moves a point by s times its place relative to the image's camera.
-            arm = made.local_map.points[matches.point[mine]] - made.local_map.world_from_cams[image, :3, 3]
+            arm = local_map.points[matches.point[mine]] - local_map.world_from_cams[image, :3, 3]
             of_scales[mine, :, number] = np.einsum("okj,oj->ok", of_point[mine], arm)
         noise = self._noise_of_points(query, matches, of_point)
         noise[source >= 0] = 0  # what is a lifted point's own shows in its error
-        known = np.zeros((6 + len(images),) * 2)
-        known[6:, 6:] = np.linalg.inv(_scale_covariance([made.depths[int(image)] for image in images]))
+        information = np.zeros((6 + len(images),) * 2)
+        information[6:, 6:] = np.linalg.inv(_scale_covariance([lifted_map.depths[int(image)] for image in images]))
         # Rotations, places and scales are of like size; what is not determined shows in the whole.
         covariance = least_squares_covariance(
             np.concatenate([of_pose, of_scales], axis=2),
-            query.errors_px(rig_from_world, matches, made.local_map.points),
+            query.errors_px(rig_from_world, matches, local_map.points),
             noise,
-            known,
+            information,
         )
         return None if covariance is None else covariance[:6, :6]
 
@@ -239,19 +239,20 @@ def _scale_covariance(depths: Sequence[Depth]) -> Floats:
 
 def _predictions(answer: FeedForwardAnswer) -> dict[int, tuple[CameraAnswer, int]]:
     """Return for each consistent reference what was predicted of it, and its place in the prediction."""
-    found: dict[int, tuple[CameraAnswer, int]] = {}
+    predictions: dict[int, tuple[CameraAnswer, int]] = {}
     for camera in answer.cameras:
         if camera.prediction is None or camera.alignment is None or camera.world_from_cam is None:
             continue
         for view, image in enumerate(camera.references, start=1):
             if camera.alignment.inliers[view - 1]:
-                found.setdefault(int(image), (camera, view))
-    return found
+                predictions.setdefault(int(image), (camera, view))
+    return predictions
 
 
-def _consistent(found: PoseEstimate, predicted: PoseEstimate) -> bool:
+def _consistent(estimate: PoseEstimate, predicted: PoseEstimate) -> bool:
     """Tell whether a pose and a predicted one agree, as far as both are known."""
-    poses, covariances = (found.world_from_rig, predicted.world_from_rig), (found.covariance, predicted.covariance)
+    poses = estimate.world_from_rig, predicted.world_from_rig
+    covariances = estimate.covariance, predicted.covariance
     if poses[0] is None or poses[1] is None or covariances[0] is None or covariances[1] is None:
         return False
     spread = np.sqrt(np.diagonal(covariances[0] + covariances[1]).reshape(2, 3).sum(axis=1))

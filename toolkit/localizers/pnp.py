@@ -212,7 +212,7 @@ class PnpLocalizer:
         for index in best[: self.settings.contested_references]:
             start = self._ransac(query, matches[shown[index]], self.settings.ransac_max_error_deg, least_inliers=5)
             if start is not None and not any(
-                agree(known.world_from_rig, geometry.invert(start)) for known in hypotheses
+                agree(hypothesis.world_from_rig, geometry.invert(start)) for hypothesis in hypotheses
             ):
                 hypotheses.append(self._improve(query, start, matches))
 

@@ -13,16 +13,6 @@ PREDICTORS = ("vggt", "simulated")
 """Names that `create_predictor` takes. `simulated` is taken only where it is asked for by name."""
 
 
-def check_predictor_name(name: str) -> None:
-    """Refuse what is no name of a predictor.
-
-    Raises:
-        ManifestError: none of `PREDICTORS`.
-    """
-    if name not in PREDICTORS:
-        raise ManifestError(f"Unknown predictor {name!r}. Known: {', '.join(PREDICTORS)}.")
-
-
 def create_predictor(
     name: str,
     *,
@@ -48,7 +38,8 @@ def create_predictor(
         ManifestError: unknown name, device or precision.
         WeightsError: `vggt` and no weights to be had; says what to do.
     """
-    check_predictor_name(name)
+    if name not in PREDICTORS:
+        raise ManifestError(f"Unknown predictor {name!r}. Known: {', '.join(PREDICTORS)}.")
     if name == "simulated":
         return SimulatedPredictor(sessions, map_dir, features, seed=seed)
     return NetworkPredictor(checkpoint, compute_device, dtype_compute)
