@@ -32,6 +32,7 @@ from toolkit.localizers.pnp import PnpLocalizer
 from toolkit.localizers.prediction import Prediction
 from toolkit.localizers.simulated import SimulatedPredictor
 from toolkit.manifest import LocalizeSettings
+from toolkit.rerank import rerank_pairs
 from toolkit.retrieve import retrieve_pairs
 
 LIST = "keyframes_original"
@@ -551,6 +552,23 @@ def test_pictures_get_the_pose_of_the_run_byte_for_byte(
         before = localized[key.timestamp, key.device_id].correspondences
         np.testing.assert_array_equal(before.point_index, estimate.correspondences.point_index)
         np.testing.assert_array_equal(before.inlier, estimate.correspondences.inlier)
+
+
+def test_a_picture_is_reranked_as_the_run_was(small_capture: Path, run: SceneFiles) -> None:
+    sessions = small_capture / "sessions"
+    retrieve_pairs(sessions, run.embeddings, run.retrieval_dir, {"topk": 9}, map_device="ios", queries=LIST)
+    settings = {"topn": 9, "topk": 3, "seed": 2}
+    rerank_pairs(sessions, run.retrieval_dir, run.features, run.reranked_dir, settings, map_device="ios")
+    folders = (run.reranked_dir, run.poses_dir, run.features, run.maps)
+    localize_pairs(sessions, *folders, map_device="ios", query_device="ios", queries=LIST, workers=1)
+    place = Map.open(run.run, run.scene, "ios")
+    assert place.reranked
+    session = Capture.open(small_capture)["ios_query"]
+    lines = run.poses_txt("ios", "ios").read_text().splitlines()[1:]
+    for line, rows in zip(lines, session.rows_of_keyframes(session.keyframes(LIST)), strict=True):
+        camera = session.camera(session.images["sensor_id"].iloc[rows[0]])
+        pose = localize_image(place, session.image_path(int(rows[0])), camera).world_from_rig
+        assert ", ".join(repr(float(number)) for number in geometry.qt_from_pose(pose)) in line
 
 
 # ------------------------------------------------------------------------------------- other features, and several

@@ -16,12 +16,14 @@ from toolkit.capture import Capture
 from toolkit.embed import embed_sessions
 from toolkit.errors import ArtifactError, ManifestError
 from toolkit.evaluate import overlap_in_view, overlap_table
+from toolkit.features import verification
 from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor
 from toolkit.features.matching import LocalMethod, MutualMatcher
+from toolkit.features.verification import count_inliers, is_meaningful
 from toolkit.files import SceneFiles, read_references, sidecar_path
 from toolkit.geometry import invert, make_pose, transform
 from toolkit.manifest import RerankSettings
-from toolkit.rerank import count_inliers, is_meaningful, rerank_pairs
+from toolkit.rerank import rerank_pairs
 from toolkit.retrieve import retrieve_pairs
 
 WIDE = pycolmap.Camera(model="PINHOLE", width=960, height=720, params=[700, 700, 480, 360])
@@ -208,7 +210,7 @@ def test_what_is_current_is_reused_and_a_killed_run_goes_on(
     before = reranked(files).read_bytes()
     assert run(small_capture, files)["skipped"].tolist() == [True]
     asked: list[int] = []
-    verify = rerank.Verifier.verify
+    verify = verification.Verifier.verify
 
     def count(self: Any, *arguments: Any) -> Any:
         asked.append(1)
@@ -216,7 +218,7 @@ def test_what_is_current_is_reused_and_a_killed_run_goes_on(
             raise KeyboardInterrupt
         return verify(self, *arguments)
 
-    monkeypatch.setattr(rerank.Verifier, "verify", count)
+    monkeypatch.setattr(verification.Verifier, "verify", count)
     sidecar_path(reranked(files)).unlink()
     with pytest.raises(KeyboardInterrupt):
         run(small_capture, files)
@@ -327,7 +329,7 @@ def test_wrong_settings_and_files_are_refused(small_capture: Path, files: SceneF
 
 
 def test_map_images_in_memory_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rerank, "MAP_IMAGES_KEPT", 2)
+    monkeypatch.setattr(verification, "MAP_IMAGES_KEPT", 2)
     features = LocalFeatures(
         np.zeros((9, 2), np.float32), *[np.ones(9, np.float32)] * 2, np.zeros((9, 128), np.uint8), (640, 480)
     )
@@ -338,7 +340,7 @@ def test_map_images_in_memory_are_bounded(monkeypatch: pytest.MonkeyPatch) -> No
             read.append(name)
             return features
 
-    verifier = rerank.Verifier(RerankSettings(max_features=4), MutualMatcher(0.8), Store())
+    verifier = verification.Verifier(RerankSettings(max_features=4), MutualMatcher(0.8), Store())
     for name in "ababcab":
         verifier.verify(features, WIDE, [name], [WIDE])
     assert read == ["a", "b", "c", "a", "b"]

@@ -278,7 +278,7 @@ class _PairRun:
         """Localize the queries that a killed run has not; returns a row for each, in the list's order."""
         path = self.pair.file("h5")
         groups = [query_group(*key) for key in self.keys]
-        with GroupWriter(path, record, attributes(self.place)) as writer:
+        with GroupWriter(path, record, attributes(self.place, self.pair.retrieval_dir)) as writer:
             if not self.skip_existing:
                 writer.discard()
             done = writer.notes()
@@ -291,7 +291,7 @@ class _PairRun:
             rows = writer.notes()
         if not path.exists():  # no query at all
             with write_atomic(path) as temporary, h5py.File(temporary, "w") as file:
-                file.attrs.update(attributes(self.place))
+                file.attrs.update(attributes(self.place, self.pair.retrieval_dir))
         return [rows[group] for group in groups]
 
     def _predicted(self, numbers: Sequence[int]) -> Iterator[tuple[int, Query, list[References], Any, float]]:
@@ -478,7 +478,7 @@ def localize_image(
     else:
         turned = [turn_image(color, turn) for (color, _), turn in zip(pixels, quarter_turns, strict=True)]
         inputs = [embedder.prepare(color) for color in turned]
-    references = place.retrieve(embedder.embed(inputs))
+    references = place.retrieve(embedder.embed(inputs), pixels, cameras)
     with threadpool_limits(1, "blas"):  # sums stay in one order, as in a run
         return place.localizer.localize(Query(views, poses, features), references)
 

@@ -3,13 +3,14 @@
 import json
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from toolkit.capture import Capture, Session
@@ -19,7 +20,8 @@ from toolkit.embedders.search import search
 from toolkit.errors import ArtifactError
 from toolkit.features.features import KINDS
 from toolkit.features.matching import LocalMethod, create_local_methods
-from toolkit.features.stores import FeatureStore, extract_session
+from toolkit.features.stores import FeatureStore, as_stored, extract_session
+from toolkit.features.verification import Verifier
 from toolkit.files import SceneFiles, file_fingerprint, fingerprint, image_name
 from toolkit.geometry import unit
 from toolkit.localizers.base import Localizer, References
@@ -32,13 +34,15 @@ from toolkit.localizers.nearest import NearestLocalizer
 from toolkit.localizers.pnp import PnpLocalizer
 from toolkit.localizers.prediction import Predictor
 from toolkit.localizers.predictors import create_predictor
-from toolkit.manifest import EmbedSettings, LocalizeSettings, RetrieveSettings
+from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings
 
 log = logging.getLogger(__name__)
 
 SETTINGS = "settings"
 SESSIONS_ROOT = "sessions_root"
-"""Attributes of `poses/<pair>.h5`: the settings that the pair was localized with, and the capture's `sessions`."""
+RETRIEVAL = "retrieval_dir"
+"""Attributes of `poses/<pair>.h5`: the settings that the pair was localized with, the capture's `sessions`, and the
+folder of the references."""
 
 
 @dataclass
@@ -57,7 +61,8 @@ class Map:
     """The map's features of each kind."""
     files: SceneFiles | None = None
     """Of the run that the map is of; None: pictures of no session cannot be localized, as they need its embedder."""
-    _localizer: Localizer | None = field(default=None, repr=False)
+    reranked: bool = False
+    """Whether the run localized with reranked references."""
 
     @classmethod
     def build(
@@ -104,6 +109,7 @@ class Map:
         with h5py.File(max(pairs, key=lambda path: path.stat().st_mtime_ns), "r") as file:
             settings = LocalizeSettings.of(json.loads(file.attrs[SETTINGS]))
             sessions_root, names = Path(file.attrs[SESSIONS_ROOT]), json.loads(file.attrs[MAPS])
+            reranked = Path(file.attrs[RETRIEVAL]).name == files.reranked_dir.name
         kinds = []
         if settings.method != "nearest":
             kinds = create_local_methods(
@@ -119,7 +125,7 @@ class Map:
             )
             for name, kind in zip(names, kinds, strict=True)
         ]
-        return cls(device, sessions_root, files.maps, settings, kinds, mapped, files)
+        return cls(device, sessions_root, files.maps, settings, kinds, mapped, files, reranked)
 
     @cached_property
     def capture(self) -> Capture:
@@ -179,23 +185,30 @@ class Map:
 
     @cached_property
     def _descriptors(self) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """Global descriptors (N, D) of map images as they are searched, and the images' indices (N,)."""
+        """Global descriptors (N, D) of posed map images as they are searched, and the images' rows (N,)."""
         vectors, table = load_embeddings(self._run.embeddings / f"{self.device}_map")
-        names = [image_name(path) for path in table["abs_path"]]
-        # As the retrieve stage: images with a pose. One without features is found, and left out of the references.
-        poses = self.session.world_from_cam(np.array([self.session.row_of_name[name] for name in names], np.int64))
-        posed = np.isfinite(poses).reshape(-1, 16).all(axis=1)
-        indices = np.array([self.index_of.get(name, -1) for name in names], np.int64)
+        rows = np.array([self.session.row_of_name[image_name(path)] for path in table["abs_path"]], np.int64)
+        posed = np.isfinite(self.session.world_from_cam(rows)).reshape(-1, 16).all(axis=1)
         vectors = vectors[posed]
-        return unit(vectors) if self.retrieve_settings.normalize else vectors, indices[posed]
+        return unit(vectors) if self.retrieve_settings.normalize else vectors, rows[posed]
 
-    def retrieve(self, vectors: NDArray[np.float32]) -> list[References]:
-        """Return the references of query images, given by the vectors (Q, D) that the embedder gave, as the run would.
+    def retrieve(
+        self,
+        vectors: NDArray[np.float32],
+        pictures: Sequence[tuple[NDArray[np.uint8], NDArray[np.uint8]]] = (),
+        cameras: Sequence[pycolmap.Camera] = (),
+    ) -> list[References]:
+        """Return the references of query images as the run would find them.
+
+        Args:
+            vectors: (Q, D) what the embedder gave for them.
+            pictures: their pixels in color, (H, W, 3), and in gray, (H, W); of use to a run that reranks.
+            cameras: their intrinsics; likewise.
 
         Raises:
             ArtifactError: the map was embedded by another embedder.
         """
-        database, indices = self._descriptors
+        database, rows = self._descriptors
         if self.embed_settings.normalize:
             vectors = unit(vectors)
         vectors = vectors.astype(self.embed_settings.dtype).astype(np.float32)
@@ -204,14 +217,47 @@ class Map:
                 f"{self._run.embeddings}: the map's descriptors have {database.shape[1]} dimensions, "
                 f"{self.embedder.name} gives {vectors.shape[1]}. Embed again."
             )
-        settings = self.retrieve_settings
-        vectors = unit(vectors) if settings.normalize else vectors
-        scores, rows = search(vectors, database, settings.topk, "torch", "cpu")
-        known = indices[rows] >= 0
-        return [
-            References(indices[row[mask]], score[mask].astype(np.float64))
-            for row, score, mask in zip(rows, scores, known, strict=True)
-        ]
+        vectors = unit(vectors) if self.retrieve_settings.normalize else vectors
+        scores, nearest = search(vectors, database, self.retrieve_settings.topk, "torch", "cpu")
+        ranked = list(zip(rows[nearest], scores.astype(np.float64), strict=True))
+        if self.reranked:
+            ranked = [self._rerank(*each) for each in zip(ranked, pictures, cameras, strict=True)]
+        references = []
+        for images, similarities in ranked:
+            indices = np.array([self.index_of.get(self.session.image_name(int(row)), -1) for row in images], np.int64)
+            references.append(References(indices[indices >= 0], similarities[indices >= 0]))
+        return references
+
+    @cached_property
+    def _verification(self) -> tuple[LocalMethod, Verifier]:
+        """What the rerank stage of the run verified references with."""
+        settings = RerankSettings.of(_read_settings(self._run.reranked_dir / "settings.json"))
+        (method,) = create_local_methods(
+            settings.features, settings.matcher, settings.compute_device, settings.dtype_compute
+        )
+        store = FeatureStore.of_session(self._run.features, f"{self.device}_map", method.extractor.settings)
+        return method, Verifier(settings, method.matcher, store)
+
+    def _rerank(
+        self,
+        ranked: tuple[NDArray[np.int64], NDArray[np.float64]],
+        picture: tuple[NDArray[np.uint8], NDArray[np.uint8]],
+        camera: pycolmap.Camera,
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return rows of map images and their inliers in the order of verified matches, as the rerank stage does."""
+        method, verifier = self._verification
+        settings, rows = verifier.settings, ranked[0][: verifier.settings.topn]
+        features = as_stored(method.extractor.extract([picture[0 if method.extractor.color else 1]])[0])
+        readable = [index for index, row in enumerate(rows) if self.session.image_name(int(row)) in verifier.store]
+        inliers = np.zeros(len(rows))
+        inliers[readable], _ = verifier.verify(
+            features,
+            camera,
+            [self.session.image_name(int(rows[index])) for index in readable],
+            [self.session.camera(self.session.images["sensor_id"].iloc[int(rows[index])]) for index in readable],
+        )
+        order = np.argsort(-inliers, kind="stable")[: settings.topk]
+        return rows[order], inliers[order]
 
 
 def _read_settings(path: Path) -> dict[str, Any]:
@@ -288,11 +334,12 @@ def label(settings: LocalizeSettings, found_by: str) -> str:
     return found_by or settings.method
 
 
-def attributes(map: Map) -> dict[str, Any]:  # noqa: A002
+def attributes(map: Map, retrieval_dir: Path) -> dict[str, Any]:  # noqa: A002
     """Return what `Map.open` reads from the file of correspondences."""
     names = [map_path(map.map_dir, f"{map.device}_map", kind.name).name for kind in map.kinds]
     return {
         MAPS: json.dumps(names),
         SETTINGS: map.settings.model_dump_json(),
         SESSIONS_ROOT: str(map.sessions_root),
+        RETRIEVAL: str(retrieval_dir),
     }

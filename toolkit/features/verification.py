@@ -1,0 +1,145 @@
+"""Geometric verification: how many matches of two photographs agree with one relative pose of their cameras."""
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from scipy.special import gammaln
+
+from toolkit.features.features import LocalFeatures
+from toolkit.features.matching import Matcher
+from toolkit.manifest import RerankSettings
+
+MAP_IMAGES_KEPT = 256
+"""Map images whose features stay in memory: some 60 MB."""
+
+
+class Verifier:
+    """Counts, for a query image and map images, the matches that agree with one relative pose.
+
+    Safe to use from several threads. The features of the map images used last stay in memory.
+    """
+
+    def __init__(self, settings: RerankSettings, matcher: Matcher, store: Mapping[str, LocalFeatures]):
+        """
+        Args:
+            settings, matcher: how to verify and to match.
+            store: the features of the map images.
+        """
+        self.settings = settings
+        self.matcher = matcher
+        self.store = store
+        self._map_features = lru_cache(MAP_IMAGES_KEPT)(lambda name: self._strongest(store[name]))
+
+    def verify(
+        self,
+        features: LocalFeatures,
+        camera: pycolmap.Camera,
+        references: Sequence[str],
+        cameras: Sequence[pycolmap.Camera],
+    ) -> tuple[list[int], list[int]]:
+        """Return the inliers and the matches of a query image with each reference.
+
+        Args:
+            features, camera: of the query image.
+            references, cameras: names and cameras of map images, all of which have features.
+        """
+        features = self._strongest(features)
+        map_features = [self._map_features(name) for name in references]
+        matched = self.matcher.match([(features, other) for other in map_features])
+        inliers = [
+            count_inliers(
+                camera,
+                features.keypoints[matches.indices[:, 0]],
+                other_camera,
+                other.keypoints[matches.indices[:, 1]],
+                matches.scores,
+                self.settings,
+                tests=len(references),
+            )
+            for matches, other, other_camera in zip(matched, map_features, cameras, strict=True)
+        ]
+        return inliers, [len(matches) for matches in matched]
+
+    def _strongest(self, features: LocalFeatures) -> LocalFeatures:
+        return features.take(slice(self.settings.max_features))
+
+
+def count_inliers(
+    camera_a: pycolmap.Camera,
+    pixels_a: NDArray[np.floating],
+    camera_b: pycolmap.Camera,
+    pixels_b: NDArray[np.floating],
+    scores: NDArray[np.floating],
+    settings: RerankSettings,
+    tests: int = 1,
+) -> int:
+    """Return how many matches agree with one essential matrix, or 0 where chance would give as many.
+
+    Matches that share a keypoint with another inlier count once. The essential matrix is that of D. Nister, "An
+    Efficient Solution to the Five-Point Relative Pose Problem", PAMI 2004, drawn in the order of the matches' scores
+    (O. Chum, J. Matas, "Matching with PROSAC", CVPR 2005).
+
+    Args:
+        camera_a, camera_b: intrinsics, with their distortion.
+        pixels_a, pixels_b: (K, 2) matched pixels.
+        scores: (K,) how sure the matches are.
+        tests: how many pairs are looked at together; among more, chance does more.
+    """
+    if len(scores) < 6:  # five always agree
+        return 0
+    order = np.argsort(-scores, kind="stable")
+    pixels_a, pixels_b = (np.asarray(pixels, np.float64)[order] for pixels in (pixels_a, pixels_b))
+    rays_a, rays_b = np.asarray(camera_a.cam_from_img(pixels_a)), np.asarray(camera_b.cam_from_img(pixels_b))
+    finite = np.isfinite(rays_a).all(axis=1) & np.isfinite(rays_b).all(axis=1)  # far out, distortion has no inverse
+    if finite.sum() < 6:
+        return 0
+    options = cv2.UsacParams()
+    options.sampler = cv2.SAMPLING_PROSAC
+    options.score = cv2.SCORE_METHOD_MSAC
+    options.loMethod = cv2.LOCAL_OPTIM_INNER_LO
+    options.loIterations, options.loSampleSize = 5, 20
+    options.confidence = 0.999
+    options.maxIterations = settings.max_trials
+    options.randomGeneratorState = settings.seed
+    options.isParallel = False
+    options.threshold = float(np.tan(np.radians(settings.max_error_deg)))
+    pinhole = np.eye(3), np.eye(3), np.zeros(5), np.zeros(5)  # the rays are calibrated already
+    _, mask = cv2.findEssentialMat(rays_a[finite], rays_b[finite], *pinhole, options)
+    agree = np.flatnonzero(finite)[:0] if mask is None else np.flatnonzero(finite)[np.ravel(mask) > 0]
+    inliers = min(len(np.unique(pixels[agree], axis=0)) for pixels in (pixels_a, pixels_b))
+    chance = max(_chance(camera, options.threshold) for camera in (camera_a, camera_b))
+    return inliers if is_meaningful(inliers, len(scores), chance, tests) else 0
+
+
+def is_meaningful(inliers: int, matches: int, chance: float, tests: int = 1) -> bool:
+    """Tell whether less than one such agreement is expected among random matches.
+
+    The number of false alarms of L. Moisan, B. Stival, "A Probabilistic Criterion to Detect Rigid Point Matches Between
+    Two Images and Estimate the Fundamental Matrix", IJCV 2004, for a model of five matches, at a fixed threshold.
+
+    Args:
+        inliers: matches that agree with a model.
+        matches: of so many.
+        chance: probability that a random match agrees with a model.
+        tests: how many sets of matches are looked at.
+    """
+    if inliers <= 5:
+        return False
+
+    def log_choose(n: int, k: int) -> float:
+        return float(gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1))
+
+    models = 10  # that five matches allow, at most
+    ways = np.log(models * (matches - 5)) + log_choose(matches, inliers) + log_choose(inliers, 5)
+    return bool(np.log(tests) + ways + (inliers - 5) * np.log(min(chance, 1.0)) < 0)
+
+
+def _chance(camera: pycolmap.Camera, threshold: float) -> float:
+    """Return how much of an image lies within the threshold of a line through it, at most."""
+    # Sampson's error shares a deviation among both images, so that in one of them it may be sqrt(2) times larger.
+    band_px = 2 * np.sqrt(2) * threshold * camera.mean_focal_length()
+    return float(band_px * np.hypot(camera.width, camera.height) / (camera.width * camera.height))
