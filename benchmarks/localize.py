@@ -69,7 +69,7 @@ def run_toolkit(sessions_root: Path, run: Path, queries: str, threads: int) -> d
     from toolkit import embed, localize, retrieve
     from toolkit.files import SceneFiles
     from toolkit.localizers import map as map_module
-    from toolkit.localizers.mapping import LocalMap
+    from toolkit.localizers.local_map import LocalMap
 
     imported = _clocks()
     files = SceneFiles(run, sessions_root.parent.name)

@@ -12,7 +12,7 @@ from toolkit.capture import Session
 from toolkit.features.features import LocalFeatures
 from toolkit.features.stores import FeatureStore
 from toolkit.localizers.base import NetworkMatches, PoseEstimate, Query, References, View
-from toolkit.localizers.mapping import LocalMap
+from toolkit.localizers.local_map import LocalMap
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

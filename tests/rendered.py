@@ -15,7 +15,7 @@ from toolkit.files import SceneFiles
 from toolkit.localize import localize_pairs
 from toolkit.localizers.base import Query, References
 from toolkit.localizers.feed_forward import FeedForwardLocalizer
-from toolkit.localizers.mapping import LocalMap
+from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.simulated import SimulatedPredictor
 from toolkit.manifest import PredictorSettings
 

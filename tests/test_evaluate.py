@@ -13,7 +13,7 @@ from toolkit.capture import Trajectory, write_session
 from toolkit.errors import ToolkitError
 from toolkit.evaluate import draw_evaluation, evaluate_scene, pose_errors, recall
 from toolkit.geometry import make_pose, pose_error
-from toolkit.localizers.mapping import LocalMap
+from toolkit.localizers.local_map import LocalMap
 
 CAMERA_MODEL = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[500, 500, 320, 240])
 CAMERA = ("camera", "PINHOLE", "640", "480", "500", "500", "320", "240")

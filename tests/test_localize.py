@@ -27,7 +27,7 @@ from toolkit.localize import COLUMNS, Map, localize_image, localize_pairs
 from toolkit.localizers import map as maps
 from toolkit.localizers.base import PoseEstimate, View
 from toolkit.localizers.correspondences import LocalizedQueries
-from toolkit.localizers.mapping import LocalMap
+from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.pnp import PnpLocalizer
 from toolkit.localizers.prediction import Prediction
 from toolkit.localizers.simulated import SimulatedPredictor

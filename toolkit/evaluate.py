@@ -39,7 +39,7 @@ from toolkit.show.metrics import (
 if TYPE_CHECKING:
     import pycolmap
 
-    from toolkit.localizers.mapping import LocalMap
+    from toolkit.localizers.local_map import LocalMap
 
 logger = logging.getLogger(__name__)
 

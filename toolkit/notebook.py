@@ -1,4 +1,4 @@
-"""What the notebooks call, and what can be read from them: parameters, folders, counts.
+"""What the notebooks call, what can be read from them (parameters, folders, counts), and their execution.
 
 `start` resolves a notebook's folders, so that each opens and runs alone on the demo capture; `finish` tells
 the pipeline what was done.
@@ -6,20 +6,28 @@ the pipeline what was done.
 
 import ast
 import os
+import re
+import shutil
 import sys
-from collections.abc import Iterable
+import tempfile
+import threading
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import tqdm.auto
 import tqdm.std
 
-from toolkit.errors import ManifestError
+from toolkit import errors
+from toolkit.errors import ManifestError, ToolkitError
 from toolkit.files import SceneFiles
 from toolkit.manifest import OPTIONAL, DemoData, nearest
 from toolkit.show import TEXT_BARS
 
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
+Say = Callable[..., None]
+"""Takes the progress lines of a run; called like `print`."""
 COUNTS_MIME = "application/vnd.visual-localization.counts+json"
 # What each stage is made from, besides the capture. A stage runs again when one of these has run again.
 UPSTREAM: dict[str, tuple[str, ...]] = {
@@ -227,3 +235,164 @@ def _literals(source: str) -> dict[str, Any]:
             raise ValueError(f"line {node.lineno}: {ast.unparse(node)}")
         values[target.id] = ast.literal_eval(node.value)
     return values
+
+
+class StageError(ToolkitError):
+    """A stage stopped; the message holds the failing cell's error and the path of the executed notebook."""
+
+
+class StatusLine:
+    """The line of a running stage; on a terminal it ends in the stage's own progress bar, which it is fed."""
+
+    def __init__(self, head: str, say: Say) -> None:
+        self.head, self.say = head, say
+        # Elsewhere, and for a caller with a `say` of its own, the line is written once.
+        self.live = say is print and sys.stdout.isatty()
+        say(f"{head} ...", end="", flush=True)
+
+    def write(self, text: str) -> None:
+        """Take what the kernel writes to stderr; the last line of it is shown."""
+        shown = [part for part in re.split(r"[\r\n]", text) if part.strip()]
+        if self.live and shown:
+            width = shutil.get_terminal_size().columns - 1
+            self.say(f"\r{f'{self.head} ... {shown[-1].strip()}'[:width]}\033[K", end="", flush=True)
+
+    def flush(self) -> None:
+        """Do nothing: every write is shown at once."""
+
+    def end(self, text: str) -> None:
+        """Replace the progress by what came of it."""
+        self.say(f"\r{self.head}  {text}\033[K" if self.live else f"  {text}")
+
+
+def execute(
+    path: Path, output: Path, parameters: dict[str, Any], progress: StatusLine | None = None
+) -> tuple[Any, float]:
+    """Execute the notebook `path` in a fresh kernel and write the executed copy to `output`.
+
+    Args:
+        path: the notebook.
+        output: where the executed copy goes, also of a notebook that failed.
+        parameters: replacing those of its parameters cell.
+        progress: shows what the kernel writes to stderr.
+
+    Returns:
+        The executed notebook, and the highest memory (MB) of this process and the kernel's together.
+
+    Raises:
+        ManifestError: a parameter that the notebook does not have.
+        StageError: a cell failed, or the kernel died; `output` shows where.
+    """
+    check_parameters(path, parameters)
+    # papermill takes seconds to import, and a run that reuses everything does not need it.
+    import papermill
+    from nbclient.exceptions import DeadKernelError
+    from papermill.exceptions import PapermillExecutionError
+    from traitlets.config import Config
+
+    output.parent.mkdir(parents=True, exist_ok=True)
+    partial = output.with_name(f".{output.stem}.partial.ipynb")
+    sockets = tempfile.TemporaryDirectory(prefix="kernel-")
+    # Sockets in the file system: other users of the machine cannot listen in. Their paths have to be short.
+    ipc = os.name == "posix" and len(sockets.name) < 80
+    memory = MemoryWatch()
+    os.environ[TEXT_BARS] = "1"
+    try:
+        notebook = papermill.execute_notebook(
+            # papermill formats paths with the parameters, so braces in them need escaping.
+            *(str(file).replace("{", "{{").replace("}", "}}") for file in (path, partial)),
+            parameters=parameters,
+            kernel_name="python3",
+            progress_bar=False,
+            stderr_file=progress,
+            # What the kernel has to say of its own shutdown is of no use to anybody.
+            extra_arguments=["--log-level=CRITICAL"],
+            cwd=str(output.parent),
+            config=Config({"KernelManager": {"transport": "ipc", "ip": f"{sockets.name}/s"}} if ipc else {}),
+        )
+    except PapermillExecutionError as error:
+        known = {name for name, kind in vars(errors).items() if isinstance(kind, type)}
+        text = error.evalue if error.ename in known else f"{error.ename}: {error.evalue}"
+        raise StageError(f"{text}\nThe executed notebook shows where: {output}") from None
+    except DeadKernelError:
+        raise StageError(
+            "The notebook's kernel died; when the system ends it, memory is the usual reason "
+            f"({memory.stop():.0f} MB were in use).\nThe executed notebook shows where: {output}"
+        ) from None
+    finally:
+        del os.environ[TEXT_BARS]
+        memory.stop()
+        sockets.cleanup()
+        if partial.exists():
+            _tidy_streams(partial)
+            partial.replace(output)
+    return notebook, memory.stop()
+
+
+def _tidy_streams(path: Path) -> None:
+    """Join the pieces of each stream of an executed notebook; keep what a terminal would show in the end."""
+    import nbformat
+
+    content = nbformat.read(path, as_version=4)
+    for cell in content.cells:
+        outputs: list[Any] = []
+        for output in cell.get("outputs", []):
+            joins = output.output_type == "stream" and outputs and outputs[-1].get("name") == output.name
+            if joins:
+                outputs[-1].text += output.text
+            else:
+                outputs.append(output)
+        for output in outputs:
+            if output.output_type == "stream":
+                lines = output.text.split("\n")
+                output.text = "\n".join(line.rstrip("\r").rpartition("\r")[2] for line in lines)
+        if "outputs" in cell:
+            cell.outputs = outputs
+    nbformat.write(content, path)
+
+
+def work_seconds(notebook: Any) -> float:
+    """Return the seconds in cells after the one tagged `setup`, which imports and resolves."""
+    cells = list(notebook.cells)
+    setup = [i for i, cell in enumerate(cells) if "setup" in cell.metadata.get("tags", [])]
+    later = cells[setup[-1] + 1 :] if setup else cells
+    return sum((cell.metadata.get("papermill", {}).get("duration") or 0.0) for cell in later)
+
+
+def handed_counts(notebook: Any) -> dict[str, Any]:
+    """Return what the notebook handed to `toolkit.notebook.finish`."""
+    for cell in reversed(notebook.cells):
+        for output in cell.get("outputs", []):
+            if COUNTS_MIME in output.get("data", {}):
+                return dict(output["data"][COUNTS_MIME])
+    return {}
+
+
+class MemoryWatch(threading.Thread):
+    """Samples the memory of this process and its children, so that workers of a kernel count as well."""
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self._ended = threading.Event()
+        self._peak_mb = 0.0
+        self.start()
+
+    def run(self) -> None:
+        """Sample until stopped."""
+        import psutil
+
+        me = psutil.Process()
+        while not self._ended.wait(0.5):
+            total = 0
+            for process in [me, *me.children(recursive=True)]:
+                with suppress(psutil.Error):
+                    info = process.memory_full_info()
+                    # Proportional set size: pages shared between forked workers count once.
+                    total += getattr(info, "pss", info.rss)
+            self._peak_mb = max(self._peak_mb, total / 2**20)
+
+    def stop(self) -> float:
+        """End the sampling and return the highest sum seen, in MB."""
+        self._ended.set()
+        self.join()
+        return self._peak_mb

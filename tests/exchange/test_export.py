@@ -19,7 +19,8 @@ from toolkit.exchange.interchange import import_colmap, import_images
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import SceneFiles, pair_name
 from toolkit.localizers.correspondences import MAPS
-from toolkit.localizers.mapping import LocalMap, build_map
+from toolkit.localizers.local_map import LocalMap
+from toolkit.localizers.mapping import build_map
 
 
 def write_localization(files: SceneFiles, map_device: str, query_device: str, maps: list[str]) -> None:

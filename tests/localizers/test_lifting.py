@@ -22,7 +22,7 @@ from toolkit.localizers.base import PoseEstimate, Query, References, View
 from toolkit.localizers.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
 from toolkit.localizers.hybrid import HybridLocalizer
 from toolkit.localizers.lifting import DepthLifter
-from toolkit.localizers.mapping import LocalMap
+from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.pnp import PnpLocalizer
 from toolkit.localizers.prediction import Prediction
 from toolkit.localizers.simulated import SimulatedPredictor

@@ -19,7 +19,8 @@ from toolkit.features.features import SiftExtractor, SiftSettings
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import sidecar_path
 from toolkit.localizers import mapping
-from toolkit.localizers.mapping import LocalMap, MapSettings, build_map, select_pairs, triangulate
+from toolkit.localizers.local_map import LocalMap
+from toolkit.localizers.mapping import MapSettings, build_map, select_pairs, triangulate
 
 Floats = NDArray[np.float64]
 

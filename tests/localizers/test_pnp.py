@@ -15,7 +15,7 @@ from toolkit import geometry
 from toolkit.features.features import DESCRIPTOR_SCALE, KINDS, LocalFeatures
 from toolkit.features.matching import MutualMatcher, PairMatches
 from toolkit.localizers.base import PoseEstimate
-from toolkit.localizers.mapping import LocalMap
+from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.matches import MappedFeatures
 from toolkit.localizers.pnp import VIEWS, PnpLocalizer
 from toolkit.localizers.rig import least_squares_covariance

@@ -9,7 +9,7 @@ from tests.localized import instants, some_correspondences, write_pair, write_qu
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError
 from toolkit.localizers.correspondences import LocalizedQuery
-from toolkit.localizers.mapping import LocalMap
+from toolkit.localizers.local_map import LocalMap
 from toolkit.show.localized import LocalizedPair, load_maps, map_files
 from toolkit.show.stills import draw_localization
 

@@ -11,7 +11,7 @@ from toolkit.capture import Capture, Trajectory, write_depth, write_session
 from toolkit.errors import ArtifactError, CaptureError
 from toolkit.geometry import make_pose, quaternion_to_rotation
 from toolkit.localizers.correspondences import LocalizedQuery
-from toolkit.localizers.mapping import LocalMap
+from toolkit.localizers.local_map import LocalMap
 from toolkit.show.localization_view import record_localizations
 from toolkit.show.localized import Localizations, QueryDetails, ShownImage
 from toolkit.show.recordings import record_session, session_tracks

@@ -18,7 +18,7 @@ from toolkit.features.stores import FeatureStore
 from toolkit.files import SceneFiles, image_name, pair_name, read_references, write_atomic, write_text
 from toolkit.geometry import invert, qt_from_pose
 from toolkit.localizers.correspondences import LocalizedQueries
-from toolkit.localizers.mapping import LocalMap
+from toolkit.localizers.local_map import LocalMap
 
 Keypoints = Mapping[str, NDArray[np.floating]]
 

@@ -14,7 +14,7 @@ from toolkit.capture.upright import Turns
 from toolkit.errors import ImageError, ToolkitError
 from toolkit.localizers.alignment import Alignment, align_to_map, is_trustworthy, query_pose
 from toolkit.localizers.base import PoseEstimate, Query, References, View
-from toolkit.localizers.mapping import LocalMap
+from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.pose_mean import robust_mean_pose
 from toolkit.localizers.prediction import Prediction, Predictor
 from toolkit.localizers.references import select_references

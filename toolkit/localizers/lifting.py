@@ -16,7 +16,7 @@ from toolkit.capture.depths import lifted
 from toolkit.localizers.base import PoseEstimate, Prior, Query, References
 from toolkit.localizers.depth_scale import DEPTH_NOISE
 from toolkit.localizers.feed_forward import CameraAnswer, FeedForwardAnswer, FeedForwardLocalizer
-from toolkit.localizers.mapping import LocalMap
+from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.matches import MappedFeatures
 from toolkit.localizers.pnp import PnpLocalizer
 from toolkit.localizers.rig import Matches, RigQuery, least_squares_covariance

@@ -28,7 +28,8 @@ from toolkit.localizers.base import Localizer, References
 from toolkit.localizers.correspondences import MAPS
 from toolkit.localizers.feed_forward import FeedForwardLocalizer
 from toolkit.localizers.hybrid import HybridLocalizer
-from toolkit.localizers.mapping import LocalMap, build_map, map_path
+from toolkit.localizers.local_map import LocalMap, map_path
+from toolkit.localizers.mapping import build_map
 from toolkit.localizers.matches import MappedFeatures
 from toolkit.localizers.nearest import NearestLocalizer
 from toolkit.localizers.pnp import PnpLocalizer

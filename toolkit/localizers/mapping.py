@@ -2,11 +2,10 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 import pycolmap
@@ -16,14 +15,15 @@ from tqdm.auto import tqdm
 
 from toolkit import geometry
 from toolkit.capture import Session
-from toolkit.capture.cameras import camera_text, in_view, parse_camera, projection_jacobian, rays_of, view_bounds
+from toolkit.capture.cameras import camera_text, in_view, projection_jacobian, rays_of, view_bounds
 from toolkit.capture.images import prefetch, read_image
 from toolkit.errors import ArtifactError, ImageError
 from toolkit.features.features import LocalFeatures, feature_kind
 from toolkit.features.groups import GroupWriter
 from toolkit.features.matching import PairMatches, match_along_epipolar_lines, unit_descriptors
 from toolkit.features.stores import FeatureStore, MatchStore, group_names, matches_path, write_matches
-from toolkit.files import fingerprint, is_current, write_atomic, write_sidecar
+from toolkit.files import fingerprint, is_current, write_sidecar
+from toolkit.localizers.local_map import LocalMap
 from toolkit.manifest import MapSettings
 
 Floats = NDArray[np.float64]
@@ -137,158 +137,6 @@ def match_pairs(
 def map_settings(settings: MapSettings, seed: int) -> dict[str, Any]:
     """Return what a map depends on besides what it is made of; part of fingerprints."""
     return {**settings.model_dump(), "seed": seed, "format": _MAP_FORMAT}
-
-
-@dataclass(frozen=True)
-class LocalMap:
-    """Posed images and the points triangulated from them, as arrays.
-
-    Observations are sorted by image; observation o says that keypoint `obs_keypoint[o]` of image `obs_image[o]` sees
-    point `obs_point[o]`.
-    """
-
-    image_names: list[str]
-    """N names (`Session.image_name`)."""
-    cameras: list[pycolmap.Camera]
-    """N cameras, with distortion, as in the capture."""
-    world_from_cams: Floats
-    """(N, 4, 4)."""
-    points: Floats
-    """(P, 3) in the world, meters."""
-    colors: NDArray[np.uint8]
-    """(P, 3) RGB."""
-    obs_image: NDArray[np.int64]
-    obs_keypoint: NDArray[np.int64]
-    obs_point: NDArray[np.int64]
-    noise_px: NDArray[np.float32]
-    """(P,) standard deviation of the observations of each point, by axis; all of one kind of features have the same."""
-
-    @cached_property
-    def index_of(self) -> dict[str, int]:
-        """Index of an image by its name."""
-        return {name: index for index, name in enumerate(self.image_names)}
-
-    @cached_property
-    def cams_from_world(self) -> Floats:
-        return geometry.invert(self.world_from_cams)
-
-    @cached_property
-    def focals_px(self) -> Floats:
-        return np.array([camera.mean_focal_length() for camera in self.cameras])
-
-    @cached_property
-    def track_lengths(self) -> NDArray[np.int64]:
-        """(P,) images that see each point."""
-        return np.bincount(self.obs_point, minlength=len(self.points))
-
-    @cached_property
-    def _image_starts(self) -> NDArray[np.int64]:
-        return np.searchsorted(self.obs_image, np.arange(len(self.image_names) + 1))
-
-    @cached_property
-    def _by_point(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        order = np.argsort(self.obs_point, kind="stable")
-        return order, np.searchsorted(self.obs_point[order], np.arange(len(self.points) + 1))
-
-    def observations(self, image: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the keypoints (n,) of an image that see a point, and the points (n,)."""
-        part = slice(self._image_starts[image], self._image_starts[image + 1])
-        return self.obs_keypoint[part], self.obs_point[part]
-
-    def point_covariances(self, points: NDArray[np.int64]) -> Floats:
-        """Return the covariance (n, 3, 3) of the places of n points, square meters, as least squares triangulate them.
-
-        A point that fewer than two images see has NaN.
-        """
-        order, starts = self._by_point
-        counts = starts[points + 1] - starts[points]
-        which = np.repeat(np.arange(len(points)), counts)  # the point of each observation
-        within = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
-        image = self.obs_image[order[np.repeat(starts[points], counts) + within]]
-        # Keypoints of one image at one place (two orientations) are one view.
-        which, image = np.unique(np.column_stack([which, image]), axis=0).T
-        views = np.bincount(which, minlength=len(points))
-        in_cams = geometry.transform(self.cams_from_world[image], self.points[points[which], None])[:, 0]
-        jacobian = projection_jacobian(in_cams, self.focals_px[image]) @ self.cams_from_world[image, :3, :3]
-        information = np.zeros((len(points), 3, 3))
-        np.add.at(information, which, np.einsum("oki,okj->oij", jacobian, jacobian))
-        # A little damping, so that two views from one place are uncertain and not an error.
-        information += 1e-9 * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        covariances = np.full((len(points), 3, 3), np.nan)
-        noise_px2 = self.noise_px[points].astype(np.float64) ** 2
-        covariances[views > 1] = noise_px2[views > 1, None, None] * np.linalg.inv(information[views > 1])
-        return covariances
-
-    def images_seeing(self, points: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return how many of the given points each image sees, (N,)."""
-        order, starts = self._by_point
-        seen = np.concatenate([order[starts[p] : starts[p + 1]] for p in points] or [np.zeros(0, np.int64)])
-        return np.bincount(self.obs_image[seen], minlength=len(self.image_names))
-
-    def shared_points(self, images: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return how many points each two of n images both see, (n, n)."""
-        seen = [np.unique(self.observations(int(image))[1]) for image in images]
-        return np.array([[len(np.intersect1d(a, b, assume_unique=True)) for b in seen] for a in seen], np.int64)
-
-    @classmethod
-    def pooled(cls, maps: Sequence["LocalMap"]) -> "LocalMap":
-        """Return one map of maps of one session, each triangulated from another kind of features.
-
-        The points of one map follow those of the map before. A keypoint is one of the kind that its point is of, so
-        the point tells the kind.
-        """
-        if len(maps) == 1:
-            return maps[0]
-        cameras: dict[str, tuple[pycolmap.Camera, Floats]] = {}
-        for one in maps:
-            for name, camera, pose in zip(one.image_names, one.cameras, one.world_from_cams, strict=True):
-                cameras.setdefault(name, (camera, pose))
-        index_of = {name: index for index, name in enumerate(cameras)}
-        starts = np.cumsum([0, *(len(one.points) for one in maps)])
-        image = np.concatenate(
-            [np.array([index_of[name] for name in one.image_names], np.int64)[one.obs_image] for one in maps]
-        )
-        point = np.concatenate([one.obs_point + start for one, start in zip(maps, starts[:-1], strict=True)])
-        order = np.argsort(image, kind="stable")
-        return cls(
-            image_names=list(cameras),
-            cameras=[camera for camera, _ in cameras.values()],
-            world_from_cams=np.stack([pose for _, pose in cameras.values()]),
-            points=np.concatenate([one.points for one in maps]),
-            colors=np.concatenate([one.colors for one in maps]),
-            obs_image=image[order],
-            obs_keypoint=np.concatenate([one.obs_keypoint for one in maps])[order],
-            obs_point=point[order],
-            noise_px=np.concatenate([one.noise_px for one in maps]),
-        )
-
-    def save(self, path: str | Path) -> None:
-        """Write the map as one `.npz` file."""
-        arrays: dict[str, Any] = {
-            "image_names": np.array(self.image_names, np.str_),
-            "cameras": np.array([camera_text(camera) for camera in self.cameras], np.str_),
-        }
-        for name in ("world_from_cams", "points", "colors", "obs_image", "obs_keypoint", "obs_point", "noise_px"):
-            arrays[name] = getattr(self, name)
-        with write_atomic(path) as temporary, open(temporary, "wb") as stream:
-            np.savez(stream, **arrays)
-
-    @classmethod
-    def load(cls, path: str | Path) -> "LocalMap":
-        """Read a map.
-
-        Raises:
-            ArtifactError: the file is missing or torn.
-        """
-        try:
-            with np.load(path) as arrays:
-                data = {name: arrays[name] for name in arrays.files}
-            names, cameras = data.pop("image_names").tolist(), data.pop("cameras").tolist()
-            return cls(image_names=names, cameras=[parse_camera("camera", text) for text in cameras], **data)
-        except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile) as error:
-            raise ArtifactError(
-                f"The triangulated map {path} cannot be read ({error}). Build it with the localize stage."
-            ) from None
 
 
 def triangulate(
@@ -432,11 +280,6 @@ def _refine_points(
     freedom = max(2 * len(kept) - 3 * int(seen.sum()), 1)
     noise_px = float(np.sqrt((error[good][used] ** 2).sum() / freedom))
     return points[seen], kept, noise_px
-
-
-def map_path(map_dir: str | Path, session_id: str, features: str = "sift") -> Path:
-    """Return the file of a session's map of one kind of features; that of SIFT has the session's name alone."""
-    return Path(map_dir) / (f"{session_id}.npz" if features == "sift" else f"{session_id}-{features}.npz")
 
 
 def build_map(

@@ -14,7 +14,7 @@ from toolkit.capture.cameras import in_view
 from toolkit.features.features import KINDS, FeatureKind, LocalFeatures
 from toolkit.features.matching import Matcher, MutualMatcher, unit_descriptors
 from toolkit.localizers.base import NetworkMatches, References
-from toolkit.localizers.mapping import LocalMap
+from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.rig import Matches, RigQuery
 from toolkit.manifest import PnpSettings
 

@@ -17,7 +17,7 @@ from toolkit import geometry
 from toolkit.features.features import LocalFeatures
 from toolkit.localizers.base import PoseEstimate, Prior, Query, References, agree
 from toolkit.localizers.correspondences import Correspondences
-from toolkit.localizers.mapping import LocalMap
+from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.matches import MapMatcher, MappedFeatures
 from toolkit.localizers.rig import Matches, RigQuery, least_squares_covariance
 from toolkit.manifest import PnpSettings

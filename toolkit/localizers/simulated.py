@@ -26,7 +26,7 @@ from toolkit.capture.depths import DepthMaps, lifted
 from toolkit.capture.devices import session_id
 from toolkit.errors import CaptureError
 from toolkit.localizers.base import View
-from toolkit.localizers.mapping import LocalMap, map_path
+from toolkit.localizers.local_map import LocalMap, map_path
 from toolkit.localizers.prediction import Prediction
 
 Floats = NDArray[np.float64]

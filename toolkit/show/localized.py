@@ -16,7 +16,7 @@ from toolkit.capture.tables import read_query_table
 from toolkit.errors import ArtifactError
 from toolkit.files import pair_name
 from toolkit.localizers.correspondences import Correspondences, LocalizedQueries, LocalizedQuery
-from toolkit.localizers.mapping import LocalMap
+from toolkit.localizers.local_map import LocalMap
 from toolkit.show.metrics import is_posed, pose_errors, worst_first
 
 if TYPE_CHECKING:
