@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from toolkit import __version__
 from toolkit.errors import ArtifactError
@@ -104,52 +104,6 @@ def is_current(path: str | Path, settings: dict[str, Any]) -> bool:
     """Tell whether the artifact `path` is whole and was made by this version from exactly these settings."""
     found = read_sidecar(path)
     return found is not None and fingerprint(found) == fingerprint(settings)
-
-
-class Progress:
-    """What a long stage has finished so far: rows of JSON in a file that a killed run leaves behind."""
-
-    def __init__(self, stream: TextIO, rows: list[dict[str, Any]]) -> None:
-        self.rows = rows
-        """Rows that an earlier run finished."""
-        self._stream = stream
-
-    def add(self, row: dict[str, Any]) -> None:
-        """Keep a row from now on."""
-        self._stream.write(json.dumps(row) + "\n")
-        self._stream.flush()
-
-
-@contextmanager
-def open_progress(path: str | Path, settings: dict[str, Any], keep: bool = True) -> Iterator[Progress]:
-    """Open the file of a stage's finished rows, with those that are there if they came of the same settings.
-
-    Args:
-        path: the file; the caller removes it once the artifact stands.
-        settings: what the rows depend on.
-        keep: False begins anew.
-    """
-    rows = _read_progress(Path(path), settings) if keep else []
-    lines = [{"record": fingerprint(settings)}, *rows]
-    write_text(path, "".join(json.dumps(line) + "\n" for line in lines))
-    with open(path, "a", encoding="utf-8") as stream:
-        yield Progress(stream, rows)
-
-
-def _read_progress(path: Path, settings: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the rows that a killed run finished, if it was asked the same."""
-    rows: list[dict[str, Any]] = []
-    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    for number, line in enumerate(lines):
-        try:
-            row = json.loads(line)
-        except ValueError:
-            break  # the line that was being written
-        if number == 0 and row != {"record": fingerprint(settings)}:
-            break
-        if number > 0:
-            rows.append(row)
-    return rows
 
 
 def _jsonable(value: Any) -> Any:
