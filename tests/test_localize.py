@@ -464,6 +464,14 @@ def test_the_map_of_an_unfinished_run(finished: tuple[SceneFiles, pd.DataFrame])
         Map.open(finished[0].run, finished[0].scene, "hl")
 
 
+def test_a_torn_file_of_correspondences_is_named(run: SceneFiles, finished: tuple[SceneFiles, pd.DataFrame]) -> None:
+    path = run.poses_dir / "SMALL_map_ios_query_ios.h5"
+    path.parent.mkdir()
+    path.write_bytes((finished[0].poses_dir / path.name).read_bytes()[:500])
+    with pytest.raises(ArtifactError, match=path.name):
+        Map.open(run.run, run.scene, "ios")
+
+
 class Learned:
     """An embedder of images that always points at the same descriptor."""
 

@@ -107,10 +107,14 @@ class Map:
                 f"{files.poses_dir}: no poses of queries in the map of {device!r}. Localize first: "
                 "python -m toolkit run MANIFEST."
             )
-        with h5py.File(max(pairs, key=lambda path: path.stat().st_mtime_ns), "r") as file:
-            settings = LocalizeSettings.of(json.loads(file.attrs[SETTINGS]))
-            sessions_root, names = Path(file.attrs[SESSIONS_ROOT]), json.loads(file.attrs[MAPS])
-            reranked = Path(file.attrs[RETRIEVAL]).name == files.reranked_dir.name
+        newest = max(pairs, key=lambda path: path.stat().st_mtime_ns)
+        try:
+            with h5py.File(newest, "r") as file:
+                settings = LocalizeSettings.of(json.loads(file.attrs[SETTINGS]))
+                sessions_root, names = Path(file.attrs[SESSIONS_ROOT]), json.loads(file.attrs[MAPS])
+                reranked = Path(file.attrs[RETRIEVAL]).name == files.reranked_dir.name
+        except (OSError, KeyError, ValueError) as error:
+            raise ArtifactError(f"{newest} does not tell how it was made ({error}). Localize again.") from None
         kinds = []
         if settings.method != "nearest":
             kinds = create_local_methods(
