@@ -69,6 +69,12 @@ def test_of_several_bases_the_later_wins(tmp_path: Path) -> None:
     assert manifest.name == "mine"
 
 
+def test_the_default_output_folder_counts_from_the_manifest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_files(tmp_path, mine="captures: [a]")
+    monkeypatch.chdir("/")
+    assert load_manifest(path).output_root == str(tmp_path.parent / "runs")
+
+
 def test_inherited_paths_count_from_the_file_that_has_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", "/home/me")
     monkeypatch.setenv("DATA", "/data")

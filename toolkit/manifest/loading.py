@@ -43,6 +43,7 @@ def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
         raw = merge(raw, expand(Manifest, _read_override(override)))
         source = f"{path} with --set {override}" if source == str(path) else f"{source} {override}"
     raw.setdefault("name", path.stem)
+    raw.setdefault("output_root", Manifest.model_fields["output_root"].default)  # a path like any other
     folder = path.resolve().parent
     try:
         Manifest.model_validate(raw)  # before paths are looked at, whose messages are about other things
