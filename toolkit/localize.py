@@ -278,7 +278,8 @@ class _PairRun:
             if not self.skip_existing:
                 writer.discard()
             done = writer.notes()
-            todo = [number for number, group in enumerate(groups) if group not in done]
+            numbers = {group: number for number, group in enumerate(groups)}  # a list may name a query twice
+            todo = [number for group, number in numbers.items() if group not in done]
             progress = f"localize {self.pair.query_device} in {self.pair.map_device}"
             answers = prefetch(self._localize, self._predicted(todo), self.workers)
             for number, row, localized in tqdm(answers, total=len(todo), desc=progress, unit="query"):

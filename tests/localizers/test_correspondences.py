@@ -68,7 +68,7 @@ def test_what_is_written_is_read(stored: LocalizedQueries, key: tuple[int, str])
 def test_a_file_is_a_mapping_of_queries(stored: LocalizedQueries) -> None:
     assert len(stored) == len(QUERIES)
     # `/` in a device's id makes no further level.
-    assert set(stored) == {(5, "phone"), (17, "robot-body"), (17, "phone"), (18, "phone")}
+    assert set(stored) == {(5, "phone"), (17, "robot/body"), (17, "phone"), (18, "phone")}
     assert stored.maps == ["ios_map.npz"]
     for key in ((6, "phone"), (5, "robot"), (5, "phone/images"), 5, "5/phone"):
         assert key not in stored

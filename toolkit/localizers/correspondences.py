@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import h5py
 import numpy as np
@@ -101,8 +102,8 @@ class LocalizedQuery:
 
 
 def query_group(timestamp: int, device_id: str) -> str:
-    """Return the name of a query's group; `/` in a device's id does not make another level."""
-    return f"{timestamp}/{device_id.replace('/', '-')}"
+    """Return the name of a query's group; in a device's id, `/` is `%2F`, for it would make another level."""
+    return f"{timestamp}/{device_id.replace('%', '%25').replace('/', '%2F')}"
 
 
 class LocalizedQueries(Mapping[tuple[int, str], LocalizedQuery]):
@@ -147,8 +148,8 @@ class LocalizedQueries(Mapping[tuple[int, str], LocalizedQuery]):
 
     def __iter__(self) -> Iterator[tuple[int, str]]:
         for timestamp, group in self._file.items():
-            for device_id in group:
-                yield int(timestamp), device_id
+            for name in group:
+                yield int(timestamp), unquote(name)
 
     def __len__(self) -> int:
         return sum(len(group) for group in self._file.values())
