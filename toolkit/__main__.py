@@ -48,9 +48,7 @@ def run(
 
 
 @app.command()
-def settings(
-    stage: Annotated[str, typer.Argument(help="Only this stage, e.g. localize.")] = "",
-) -> None:
+def settings(stage: Annotated[str, typer.Argument(help="Only this stage, e.g. localize.")] = "") -> None:
     """Show all settings of a manifest, with meanings and defaults, as YAML that a manifest can hold."""
     from toolkit.manifest import STAGES, Manifest, RerankSettings, describe, nearest
 

@@ -32,7 +32,7 @@ from toolkit.files import (
     write_sidecar,
     write_text,
 )
-from toolkit.geometry import unit
+from toolkit.geometry import Ints, unit
 from toolkit.manifest import EmbedSettings
 
 log = logging.getLogger(__name__)
@@ -147,7 +147,7 @@ class _Subsession:
     name: str
     rows: NDArray[np.intp]
     """(N,) its images, rows of `session.images`."""
-    turns: NDArray[np.int64]
+    turns: Ints
     """(N,) counter-clockwise quarter turns that make each image upright for the embedder."""
 
 

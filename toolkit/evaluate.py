@@ -16,7 +16,7 @@ from toolkit.capture.devices import in_order
 from toolkit.capture.tables import read_query_table
 from toolkit.errors import ArtifactError, CaptureError, ToolkitError
 from toolkit.files import image_name, pair_name, read_references, write_atomic, write_sidecar
-from toolkit.geometry import invert, transform
+from toolkit.geometry import Floats, invert, transform
 from toolkit.manifest import EvaluateSettings
 from toolkit.show.evaluation import Evaluation, draw_evaluation
 from toolkit.show.figures import save_figure
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
 FIGURES = ("recall", "median_errors", "error_curves", "losses", "retrieval")
 ERROR_COLUMNS = ["map_device", "query_device", "timestamp", "device_id", "status", "num_inliers",
@@ -320,14 +319,14 @@ def _retrieval_recall(
     return {**row, "in_map": float(by_device["in_map"].eq(True).mean())}, np.isfinite(rank)
 
 
-def _is_near(a: Array, b: Array, limits: tuple[float, float]) -> NDArray[np.bool_]:
+def _is_near(a: Floats, b: Floats, limits: tuple[float, float]) -> NDArray[np.bool_]:
     """Return whether cameras a and b, world_from_cam (..., 4, 4), stand and look alike; False for NaN."""
     distance = np.linalg.norm(a[..., :3, 3] - b[..., :3, 3], axis=-1)
     cosine = np.sum(a[..., :3, 2] * b[..., :3, 2], axis=-1)
     return (distance <= limits[0]) & (cosine >= np.cos(np.radians(limits[1])))
 
 
-def _near_any(cameras: Array, map_cameras: Array, limits: tuple[float, float]) -> NDArray[np.bool_]:
+def _near_any(cameras: Floats, map_cameras: Floats, limits: tuple[float, float]) -> NDArray[np.bool_]:
     """Return which of cameras, world_from_cam (N, 4, 4), have a map camera that stands and looks alike."""
     from scipy.spatial import cKDTree
 
@@ -344,7 +343,7 @@ def _near_any(cameras: Array, map_cameras: Array, limits: tuple[float, float]) -
 # Overlap
 
 
-def overlap_in_view(points: Array, reference: Array, world_from_cam: Array, camera: "pycolmap.Camera") -> float:
+def overlap_in_view(points: Floats, reference: Floats, world_from_cam: Floats, camera: "pycolmap.Camera") -> float:
     """Return the share, 0 to 1, of the points that a reference sees which lie in the view of another camera.
 
     The overlap of two images by sparse points, as M. Dusmanu et al., "D2-Net", CVPR 2019, choose training pairs. A
@@ -433,7 +432,7 @@ def _overlap(
     return row
 
 
-def _seen_by(reference: dict[str, Any], session: Session, local_map: "LocalMap | None") -> Array:
+def _seen_by(reference: dict[str, Any], session: Session, local_map: "LocalMap | None") -> Floats:
     """Return the points (P, 3) that a reference sees, world, meters."""
     if local_map is not None:
         image = local_map.index_of.get(image_name(str(reference["path"])))

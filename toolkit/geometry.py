@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 if TYPE_CHECKING:
     import pycolmap
 
-Array = NDArray[np.float64]
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 Real = TypeVar("Real", np.float32, np.float64)
 
 
@@ -22,7 +23,7 @@ def unit(vectors: NDArray[Real], shortest: float = 1e-12) -> NDArray[Real]:
     return units
 
 
-def quaternion_to_rotation(qwxyz: ArrayLike) -> Array:
+def quaternion_to_rotation(qwxyz: ArrayLike) -> Floats:
     """Return the rotation matrices (..., 3, 3) of quaternions (..., 4); they need not be unit.
 
     Raises:
@@ -43,7 +44,7 @@ def quaternion_to_rotation(qwxyz: ArrayLike) -> Array:
     return np.stack(elements, axis=-1).reshape(*q.shape[:-1], 3, 3)
 
 
-def rotation_to_quaternion(rotation: ArrayLike) -> Array:
+def rotation_to_quaternion(rotation: ArrayLike) -> Floats:
     """Return unit quaternions (..., 4), qw >= 0, of rotation matrices (..., 3, 3).
 
     Each is computed from its largest component (Shepperd 1978), which stays exact at 180 degrees. SciPy's conversions
@@ -68,7 +69,7 @@ def rotation_to_quaternion(rotation: ArrayLike) -> Array:
     return np.where(q[..., :1] < 0, -unit(q), unit(q))
 
 
-def pose_from_qt(qt: ArrayLike) -> Array:
+def pose_from_qt(qt: ArrayLike) -> Floats:
     """Return poses (..., 4, 4) from rows qw qx qy qz tx ty tz, (..., 7)."""
     qt = np.asarray(qt, np.float64)
     pose = np.zeros((*qt.shape[:-1], 4, 4))
@@ -78,13 +79,13 @@ def pose_from_qt(qt: ArrayLike) -> Array:
     return pose
 
 
-def qt_from_pose(pose: ArrayLike) -> Array:
+def qt_from_pose(pose: ArrayLike) -> Floats:
     """Return rows qw qx qy qz tx ty tz, (..., 7), of poses (..., 4, 4)."""
     pose = np.asarray(pose, np.float64)
     return np.concatenate([rotation_to_quaternion(pose[..., :3, :3]), pose[..., :3, 3]], axis=-1)
 
 
-def make_pose(rotation: ArrayLike, translation: ArrayLike) -> Array:
+def make_pose(rotation: ArrayLike, translation: ArrayLike) -> Floats:
     """Return a_from_b, (..., 4, 4), from its rotation (..., 3, 3) and translation (..., 3)."""
     rotation, translation = np.asarray(rotation, np.float64), np.asarray(translation, np.float64)
     pose = np.zeros((*np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1]), 4, 4))
@@ -92,20 +93,20 @@ def make_pose(rotation: ArrayLike, translation: ArrayLike) -> Array:
     return pose
 
 
-def invert(a_from_b: ArrayLike) -> Array:
+def invert(a_from_b: ArrayLike) -> Floats:
     """Return b_from_a, (..., 4, 4), of rigid poses (..., 4, 4)."""
     pose = np.asarray(a_from_b, np.float64)
     Rt = np.swapaxes(pose[..., :3, :3], -1, -2)
     return make_pose(Rt, -(Rt @ pose[..., :3, 3:])[..., 0])
 
 
-def transform(a_from_b: ArrayLike, points_in_b: ArrayLike) -> Array:
+def transform(a_from_b: ArrayLike, points_in_b: ArrayLike) -> Floats:
     """Return points in frame a, (..., N, 3), of points in frame b, (..., N, 3)."""
     pose, points = np.asarray(a_from_b, np.float64), np.asarray(points_in_b, np.float64)
     return points @ np.swapaxes(pose[..., :3, :3], -1, -2) + pose[..., None, :3, 3]
 
 
-def rotation_angle_deg(rotation: ArrayLike) -> Array:
+def rotation_angle_deg(rotation: ArrayLike) -> Floats:
     """Return the angle, degrees in [0, 180], of rotations (..., 3, 3); NaN for NaN.
 
     It is atan2 of the skew part and the trace: exact near 0, where arccos of the trace alone is not.
@@ -116,7 +117,7 @@ def rotation_angle_deg(rotation: ArrayLike) -> Array:
     return np.degrees(np.arctan2(np.linalg.norm(skew, axis=-1), trace - 1.0))
 
 
-def pose_error(world_from_estimated: ArrayLike, world_from_true: ArrayLike) -> tuple[Array, Array]:
+def pose_error(world_from_estimated: ArrayLike, world_from_true: ArrayLike) -> tuple[Floats, Floats]:
     """Return the rotation error, degrees, and the translation error, meters, of poses (..., 4, 4).
 
     As the LaMAR benchmark defines them: the angle and the length of inverse(estimated) @ true.
@@ -126,7 +127,7 @@ def pose_error(world_from_estimated: ArrayLike, world_from_true: ArrayLike) -> t
     return rotation_angle_deg(estimated_from_true[..., :3, :3]), distance_m
 
 
-def project(points: Array, camera: "pycolmap.Camera", world_from_cam: Array) -> tuple[Array, NDArray[np.bool_]]:
+def project(points: Floats, camera: "pycolmap.Camera", world_from_cam: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the pixels (n, 2) of world points (n, 3), and which are in front of the camera (others NaN)."""
     in_cam = transform(invert(world_from_cam), points)
     front = in_cam[:, 2] > 1e-3

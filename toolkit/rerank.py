@@ -17,7 +17,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
@@ -37,6 +36,7 @@ from toolkit.files import (
     write_sidecar,
     write_text,
 )  # fmt: skip
+from toolkit.geometry import Ints
 from toolkit.manifest import RerankSettings
 
 log = logging.getLogger(__name__)
@@ -173,7 +173,7 @@ class _Pair:
             write_sidecar(self.path, self.record)
             progress.discard()
 
-    def _rows(self, session: Session, images: Sequence[dict[str, Any]]) -> NDArray[np.int64]:
+    def _rows(self, session: Session, images: Sequence[dict[str, Any]]) -> Ints:
         """Return the rows of `session.images` of images in the retrieval file.
 
         Raises:

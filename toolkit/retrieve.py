@@ -27,7 +27,7 @@ from toolkit.files import (
     write_sidecar,
     write_text,
 )  # fmt: skip
-from toolkit.geometry import unit
+from toolkit.geometry import Ints, unit
 from toolkit.manifest import RetrieveSettings
 
 __all__ = ["retrieve_pairs", "search"]
@@ -120,7 +120,7 @@ class _Images:
     """Embedded images of a session: rows of `session.images`, their vectors and their lines of the manifests."""
 
     session: Session
-    rows: NDArray[np.int64]
+    rows: Ints
     vectors: NDArray[np.float32]
     table: pd.DataFrame
     keyframes: int = 0
@@ -128,7 +128,7 @@ class _Images:
     images_missing: int = 0
     unposed: int = 0
 
-    def take(self, chosen: NDArray[np.int64]) -> "_Images":
+    def take(self, chosen: Ints) -> "_Images":
         table = self.table.iloc[chosen].reset_index(drop=True)
         return replace(self, rows=self.rows[chosen], vectors=self.vectors[chosen], table=table)
 

@@ -4,9 +4,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from toolkit.geometry import unit
-
-Floats = NDArray[np.float64]
+from toolkit.geometry import Floats, unit
 
 CAMERA_TYPES = ("camera", "depth")  # both have intrinsics; only the first takes photographs
 

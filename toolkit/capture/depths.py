@@ -17,7 +17,7 @@ from threading import Lock
 
 import numpy as np
 import pycolmap
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import minimum_filter
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation, Slerp
@@ -27,11 +27,10 @@ from toolkit.capture.cameras import in_view, rays_of, view_bounds
 from toolkit.capture.session import RAW_DATA, Session
 from toolkit.capture.writing import read_depth
 from toolkit.errors import CaptureError
+from toolkit.geometry import Floats, Ints
 
 log = logging.getLogger(__name__)
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 MAX_OFFSET_US = 100_000
 """Between a photograph and the depth map of another sensor: half the period of the slowest, at 5 Hz."""

@@ -7,7 +7,8 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from toolkit.capture.tables import Ints, KeyIndex, as_strings, codes_of
+from toolkit.capture.tables import KeyIndex, as_strings, codes_of
+from toolkit.geometry import Ints
 
 
 def find_rigs(

@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 
 from toolkit.errors import ArtifactError, CaptureError
 from toolkit.files import write_atomic
+from toolkit.geometry import Floats, Ints
 
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
 Columns = Sequence[tuple[str, str]]
 
 # Column types: an integer, a finite number, a text that must not be empty, any text.

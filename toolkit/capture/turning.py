@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from toolkit.geometry import Array
+from toolkit.geometry import Floats
 
 
 def turn_image(image: NDArray[Any], k: int) -> NDArray[Any]:
@@ -20,7 +20,7 @@ def turn_image(image: NDArray[Any], k: int) -> NDArray[Any]:
     return image if k % 4 == 0 else cv2.rotate(image, codes[k % 4 - 1])
 
 
-def turn_points(xy: ArrayLike, width: int, height: int, k: int) -> Array:
+def turn_points(xy: ArrayLike, width: int, height: int, k: int) -> Floats:
     """Return pixel positions (N, 2) of an image of this size as they are after k quarter turns, (N, 2).
 
     The center of the top-left pixel is (0.5, 0.5), before and after.
@@ -30,7 +30,7 @@ def turn_points(xy: ArrayLike, width: int, height: int, k: int) -> Array:
     return np.stack(turned, axis=-1)
 
 
-def turned_from_cam(k: ArrayLike) -> Array:
+def turned_from_cam(k: ArrayLike) -> Floats:
     """Return the pose of the camera in the coordinates of the camera after k quarter turns, (..., 4, 4).
 
     A turned image's pose is world_from_cam @ invert(turned_from_cam(k)).

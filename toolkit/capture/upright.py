@@ -18,16 +18,15 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from toolkit.capture.folder import Capture
 from toolkit.capture.session import Rows, Session
 from toolkit.capture.world_up import WorldUp, estimate_world_up, given_world_up, posed_photographs, sensor_names
-from toolkit.geometry import Array, unit
+from toolkit.geometry import Floats, Ints, unit
 
 log = logging.getLogger(__name__)
 
-Ints = NDArray[np.int64]
 
 CLEAR = 0.15  # the least margin of votes that is a decision; one image's vote is at most 1
 MAJORITY = 2 / 3  # share of the votes that a decision needs where sensors are only alike, not the same
@@ -47,10 +46,10 @@ class _TurnsByName:
 
     names: pd.Index
     turns: Ints
-    ups: Array
+    ups: Floats
 
     @classmethod
-    def learn(cls, names: pd.Series, up_in_cams: Array, share: float) -> "_TurnsByName":
+    def learn(cls, names: pd.Series, up_in_cams: Floats, share: float) -> "_TurnsByName":
         """Let images vote: (n,) names, None where an image does not vote, and (n, 3) up directions in their cameras.
 
         Every image votes for the quarter turns that bring up nearest to its top, the more the clearer.
@@ -69,7 +68,7 @@ class _TurnsByName:
         clear = (ordered[:, 3] - ordered[:, 2] >= CLEAR) & (ordered[:, 3] >= share * ordered.sum(1))
         return cls(pd.Index(unique, dtype=object), np.where(clear, votes.argmax(1), -1), unit(ups))
 
-    def find(self, names: pd.Series) -> tuple[Ints, Array]:
+    def find(self, names: pd.Series) -> tuple[Ints, Floats]:
         """Return turns (n,), -1 where unknown, and up directions (n, 3), zero where unknown."""
         rows = self.names.get_indexer(names.to_numpy(object)) if len(self.names) else np.full(len(names), -1)
         return np.append(self.turns, -1)[rows], np.vstack([self.ups, np.zeros(3)])[rows]
@@ -194,7 +193,7 @@ def upright_turns(capture: Capture, world_up: ArrayLike | None = None) -> Turns:
     return quarter_turns([capture[name] for name in capture if capture[name].split == "map"], world_up)
 
 
-def _from_rigs(session: Session, sensors: pd.Series, turns: Ints, ups: Array) -> Ints:
+def _from_rigs(session: Session, sensors: pd.Series, turns: Ints, ups: Floats) -> Ints:
     """Return the turns with those added that follow from the known cameras of the same rig."""
     if session.rigs is None:
         return turns

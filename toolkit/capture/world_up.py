@@ -5,13 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from toolkit.capture.session import Session
 from toolkit.errors import CaptureError, ManifestError
-from toolkit.geometry import Array
-
-Ints = NDArray[np.int64]
+from toolkit.geometry import Floats, Ints
 
 MAX_IMAGES = 2000  # of a session
 SIGMA_ROLL = 0.1  # radians; how far from a multiple of 90 degrees cameras are held
@@ -37,7 +35,7 @@ class WorldUp:
         reason: how it was determined, for messages.
     """
 
-    direction: Array
+    direction: Floats
     known: bool
     reason: str
 
@@ -95,7 +93,7 @@ def estimate_world_up(sessions: Sequence[Session]) -> WorldUp:
     return WorldUp(up, known, f"({numbers}), estimated from {count} images, {how}")
 
 
-def up_of_cameras(world_from_cams: ArrayLike) -> Array:
+def up_of_cameras(world_from_cams: ArrayLike) -> Floats:
     """Return the direction (3,) that is up for cameras (N, 4, 4), as `estimate_world_up` does; z without any pose.
 
     All cameras count as one sensor; poses that are not finite are left out.
@@ -108,7 +106,7 @@ def up_of_cameras(world_from_cams: ArrayLike) -> Array:
     return _most_upright(poses[:, :3, :3], poses[:, :3, 3], np.zeros(len(poses), np.int64))[0]
 
 
-def _most_upright(axes: Array, centers: Array, groups: Ints) -> tuple[Array, float]:
+def _most_upright(axes: Floats, centers: Floats, groups: Ints) -> tuple[Floats, float]:
     """Return the direction (3,) that explains the cameras best, and by how much it beats its opposite (log)."""
     order = np.argsort(groups, kind="stable")
     few = order[_evenly(len(order), 300)]
@@ -122,13 +120,13 @@ def _most_upright(axes: Array, centers: Array, groups: Ints) -> tuple[Array, flo
     return (up, float(score - opposite)) if score >= opposite else (-up, float(opposite - score))
 
 
-def _posed_cameras(sessions: Sequence[Session]) -> tuple[Array, Array, Ints]:
+def _posed_cameras(sessions: Sequence[Session]) -> tuple[Floats, Floats, Ints]:
     """Return axes (n, 3, 3), centers (n, 3) and groups (n,) of up to MAX_IMAGES cameras a session, in the world.
 
     The columns of the axes are right, down and forward. A group is one camera of a device in all its recordings. The
     cameras that took only a few of a device's images (a phone may have one sensor id for each image) form one group.
     """
-    poses: list[Array] = []
+    poses: list[Floats] = []
     roles: list[pd.Series] = []
     for session in sessions:
         world_from_cam, rows = posed_photographs(session)
@@ -148,7 +146,7 @@ def _posed_cameras(sessions: Sequence[Session]) -> tuple[Array, Array, Ints]:
     return world_from_cam[:, :3, :3], world_from_cam[:, :3, 3], groups.astype(np.int64)
 
 
-def posed_photographs(session: Session) -> tuple[Array, Ints]:
+def posed_photographs(session: Session) -> tuple[Floats, Ints]:
     """Return world_from_cam, (n, 4, 4), of the photographs of a session that have a pose, and their rows."""
     poses = session.world_from_cam(ground_truth=session.trajectory is None)
     rows = session.camera_rows
@@ -161,7 +159,7 @@ def _evenly(count: int, most: int) -> Ints:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 
-def _candidates(axes: Array) -> Array:
+def _candidates(axes: Floats) -> Floats:
     """Return directions that may be up, (c, 3) unit: axes of images, cross products of two of them, and z."""
     few = axes[_evenly(len(axes), 40)]
     x, y = few[:, :, 0], few[:, :, 1]
@@ -173,7 +171,7 @@ def _candidates(axes: Array) -> Array:
     return np.concatenate([directions, -directions])
 
 
-def _distinct(directions: Array, count: int) -> Array:
+def _distinct(directions: Floats, count: int) -> Floats:
     """Return the first directions (at most `count`) that are 15 degrees or more from the ones before, and opposites."""
     kept = directions[:1]
     for direction in directions[1:]:
@@ -190,7 +188,7 @@ class _UpLikelihood:
     thousand images would outweigh every prior.
     """
 
-    def __init__(self, axes: Array, centers: Array, groups: Ints) -> None:
+    def __init__(self, axes: Floats, centers: Floats, groups: Ints) -> None:
         """Take the arrays of `_posed_cameras`."""
         self.axes = axes
         self.member = (groups[:, None] == np.unique(groups)).astype(np.float64)
@@ -198,7 +196,7 @@ class _UpLikelihood:
         self.spread = offsets.T @ offsets / max(float((offsets**2).sum()), 1e-9)
         self.weight = min(1.0, 100 / len(axes))
 
-    def _likelihoods(self, ups: Array) -> tuple[Array, Array]:
+    def _likelihoods(self, ups: Floats) -> tuple[Floats, Floats]:
         """Return the likelihood of each image to need 0 to 3 quarter turns, (4, n, c), and sines of pitch, (n, c)."""
         right, down, forward = np.moveaxis(np.einsum("nij,ci->jnc", self.axes, ups), 0, 0)
         roll = np.exp(-0.5 * (np.stack([right, down]) / SIGMA_ROLL) ** 2)
@@ -206,7 +204,7 @@ class _UpLikelihood:
         tops = np.stack([-down, right, down, -right])
         return roll[[0, 1, 0, 1]] * pitch * (tops > 0), forward
 
-    def _by_group(self, likely: Array, forward: Array) -> Array:
+    def _by_group(self, likely: Floats, forward: Floats) -> Floats:
         """Return the log likelihood of each group to need 0 to 3 quarter turns, (4, g, c)."""
         mixed = OUTLIER + (1 - ODD) * likely + ODD * np.einsum("kj,jnc->knc", ODD_PRIOR, likely, optimize=True)
         logs = np.einsum("ng,knc->kgc", self.member, np.log(mixed), optimize=True)
@@ -214,14 +212,14 @@ class _UpLikelihood:
         clarity = self.member.T @ (1 - np.clip(forward, -1, 1) ** 2) / self.member.sum(0)[:, None]
         return logs * self.weight + SENSOR_PRIOR[:, None, None] * clarity
 
-    def scores(self, ups: Array) -> Array:
+    def scores(self, ups: Floats) -> Floats:
         """Return the score of directions (c, 3), (c,)."""
         held = self._by_group(*self._likelihoods(ups)).max(0).sum(0)
         from_z = np.arccos(np.clip(np.abs(ups[:, 2]), 0, 1))
         walk = np.einsum("ci,ij,cj->c", ups, self.spread, ups)
         return held + Z_BONUS * np.exp(-0.5 * (from_z / Z_NEAR) ** 2) - WALK_BONUS * walk
 
-    def _scatter(self, up: Array) -> tuple[Array, Array]:
+    def _scatter(self, up: Floats) -> tuple[Floats, Floats]:
         """Return the mean outer products (3, 3) of the axes that are level if `up` is up, and of view directions."""
         likely, forward = self._likelihoods(up[None])
         held = self.member @ np.eye(4)[self._by_group(likely, forward)[..., 0].argmax(0)]
@@ -233,7 +231,7 @@ class _UpLikelihood:
         outer = np.einsum("nij,nj,nkj->jik", self.axes, weights, self.axes, optimize=True)
         return outer[0] + outer[1], outer[2]
 
-    def refined(self, up: Array) -> Array:
+    def refined(self, up: Floats) -> Floats:
         """Return the direction (3,) near `up` that level axes agree on, with a weak pull towards level views.
 
         Without the pull, cameras that all look one way would leave the angle about their level axes open.
@@ -244,7 +242,7 @@ class _UpLikelihood:
             up = _smallest(level + pull * views, up)
         return up
 
-    def polished(self, up: Array) -> Array:
+    def polished(self, up: Floats) -> Floats:
         """Return `up` refined without the pull, if level axes alone determine it; else `up`.
 
         The pull bends the result where all cameras look down. Level axes are enough where their second eigenvalue,
@@ -260,9 +258,9 @@ class _UpLikelihood:
         return polished
 
 
-def _smallest(scatter: Array, near: Array) -> Array:
+def _smallest(scatter: Floats, near: Floats) -> Floats:
     """Return the eigenvector (3,) of the smallest eigenvalue, in the direction that is nearer to `near`."""
-    smallest: Array = np.linalg.eigh(scatter)[1][:, 0]
+    smallest: Floats = np.linalg.eigh(scatter)[1][:, 0]
     return smallest if smallest @ near >= 0 else -smallest
 
 

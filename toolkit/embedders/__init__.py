@@ -114,8 +114,7 @@ def load_embeddings(folder: str | Path) -> tuple[NDArray[np.float32], pd.DataFra
             )
         if matrices and matrix.shape[1] != matrices[0].shape[1]:
             raise ArtifactError(
-                f"{path} has {matrix.shape[1]} dimensions, {manifests[0].parent} {matrices[0].shape[1]}; "
-                "embed again."
+                f"{path} has {matrix.shape[1]} dimensions, {manifests[0].parent} {matrices[0].shape[1]}; embed again."
             )
         matrices.append(matrix)
         base = folder.parent if manifest.parent == folder else folder

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.errors import ToolkitError
+from toolkit.geometry import Ints
 from toolkit.models.compute import resolve_device
 
 Backend = Literal["faiss", "torch"]
@@ -19,7 +20,7 @@ def search(
     backend: Backend = "faiss",
     compute_device: str = "cpu",
     faiss_gpu: bool = False,
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+) -> tuple[NDArray[np.float32], Ints]:
     """Return the rows of the database with the largest dot products, best first; equal ones by index.
 
     The backend finds candidates; their scores are then computed alike for all backends, so that the result
@@ -86,7 +87,7 @@ def _candidates(
     backend: Backend,
     compute_device: str,
     faiss_gpu: bool,
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+) -> tuple[NDArray[np.float32], Ints]:
     """Return the `width` best (scores, indices) (Q, width) of each query, best first, up to rounding."""
     if backend == "torch":
         return _torch_candidates(query, database, width, compute_device)
@@ -110,7 +111,7 @@ def _candidates(
 
 def _torch_candidates(
     query: NDArray[np.float32], database: NDArray[np.float32], width: int, compute_device: str
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+) -> tuple[NDArray[np.float32], Ints]:
     """Search the database in blocks, so that the scores of all its rows are never in memory together."""
     import torch
 

@@ -158,8 +158,6 @@ def _select(image: LocalFeatures, settings: VladSettings) -> Floats:
     return unit_descriptors(image.descriptors[chosen])
 
 
-
-
 def _assign(points: Floats, centroids: Floats) -> NDArray[np.intp]:
     """Return the nearest centroid of each point, (N,)."""
     return np.asarray((points @ centroids.T - 0.5 * (centroids**2).sum(axis=1)).argmax(axis=1))

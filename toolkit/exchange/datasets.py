@@ -104,7 +104,5 @@ def _copy_rows(source: Path, target: Path, column: int, subsessions: set[str]) -
     with open(source, encoding="utf-8") as lines, open(target, "w", encoding="utf-8") as out:
         for line in lines:
             cells = line.split(",", column + 1)
-            if line.startswith("#") or (
-                len(cells) > column and cells[column].strip().partition("/")[0] in subsessions
-            ):
+            if line.startswith("#") or (len(cells) > column and cells[column].strip().partition("/")[0] in subsessions):
                 out.write(line)

@@ -16,7 +16,7 @@ from toolkit.errors import ArtifactError, ManifestError
 from toolkit.exchange.submission import Captures
 from toolkit.features.stores import FeatureStore
 from toolkit.files import SceneFiles, image_name, pair_name, read_references, write_atomic, write_text
-from toolkit.geometry import invert, qt_from_pose
+from toolkit.geometry import Floats, Ints, invert, qt_from_pose
 from toolkit.localizers.correspondences import LocalizedQueries
 from toolkit.localizers.local_map import LocalMap
 
@@ -150,7 +150,7 @@ def colmap_model(local_map: LocalMap, session: Session, keypoints: Keypoints) ->
     return model
 
 
-def _frames(session: Session, rows: NDArray[np.int64]) -> list[list[int]]:
+def _frames(session: Session, rows: Ints) -> list[list[int]]:
     """Return the positions in `rows` of the images of each device at each time, cameras in order of their ids."""
     images = session.images.iloc[rows][["timestamp", "sensor_id"]].assign(device=session.device_ids[rows])
     by_frame = images.reset_index(drop=True).sort_values("sensor_id", kind="stable").groupby(["timestamp", "device"])
@@ -158,7 +158,7 @@ def _frames(session: Session, rows: NDArray[np.int64]) -> list[list[int]]:
 
 
 def _add_rig(
-    model: pycolmap.Reconstruction, cameras: Sequence[pycolmap.Camera], first_from_cams: NDArray[np.float64]
+    model: pycolmap.Reconstruction, cameras: Sequence[pycolmap.Camera], first_from_cams: Floats
 ) -> tuple[int, list[int]]:
     """Add a rig and its cameras to a model; return their ids."""
     rig, camera_ids = pycolmap.Rig(), list[int]()
@@ -176,7 +176,7 @@ def _add_rig(
     return rig.rig_id, camera_ids
 
 
-def _rigid(pose: NDArray[np.float64]) -> pycolmap.Rigid3d:
+def _rigid(pose: Floats) -> pycolmap.Rigid3d:
     return pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:3, :3]), pose[:3, 3])
 
 

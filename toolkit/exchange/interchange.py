@@ -22,14 +22,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pycolmap
-from numpy.typing import NDArray
 
 from toolkit.capture import RAW_DATA, Trajectory, parse_camera, write_session
 from toolkit.capture.devices import SPLITS
 from toolkit.capture.exif import ORIENTATION, exif_camera, read_header, read_number, time_taken
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import CaptureError, ImageError, ManifestError
-from toolkit.geometry import invert, make_pose, pose_from_qt
+from toolkit.geometry import Floats, invert, make_pose, pose_from_qt
 from toolkit.localizers.mapping import camera_text
 from toolkit.manifest import nearest
 
@@ -97,9 +96,9 @@ class _Draft:
     images: list[_Image] = field(default_factory=list)
     rows: list[dict[str, Any]] = field(default_factory=list)
     """Of `proc/import.csv`."""
-    poses: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    poses: dict[str, Floats] = field(default_factory=dict)
     """world_from_device, (4, 4), by frame."""
-    rigs: list[tuple[str, str, NDArray[np.float64]]] = field(default_factory=list)
+    rigs: list[tuple[str, str, Floats]] = field(default_factory=list)
     """Rig, sensor, rig_from_sensor."""
     notes: list[str] = field(default_factory=list)
 
@@ -413,7 +412,7 @@ def _read_table(path: Path) -> pd.DataFrame:
     return rows
 
 
-def _inverse(a_from_b: pycolmap.Rigid3d) -> NDArray[np.float64]:
+def _inverse(a_from_b: pycolmap.Rigid3d) -> Floats:
     """Return b_from_a, (4, 4)."""
     b_from_a = a_from_b.inverse()
     return make_pose(b_from_a.rotation.matrix(), b_from_a.translation)

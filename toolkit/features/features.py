@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from toolkit.errors import ManifestError
+from toolkit.geometry import Ints
 from toolkit.manifest import FeaturesSettings, SiftSettings
 
 DESCRIPTOR_SCALE = 512.0
@@ -36,7 +37,7 @@ class LocalFeatures:
     def __len__(self) -> int:
         return len(self.keypoints)
 
-    def take(self, part: slice | NDArray[np.int64]) -> "LocalFeatures":
+    def take(self, part: slice | Ints) -> "LocalFeatures":
         """Return some of the features, by index."""
         return LocalFeatures(
             self.keypoints[part], self.scales[part], self.scores[part], self.descriptors[part], self.image_size

@@ -18,17 +18,16 @@ from toolkit.features.features import (
     create_extractor,
     feature_kind,
 )  # fmt: skip
+from toolkit.geometry import Floats, Ints
 from toolkit.manifest import FeaturesSettings, MatcherSettings
 from toolkit.models.weights import LIGHTGLUE, SUPERPOINT, WeightsSource
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class PairMatches:
     """K matches of the features of two images."""
 
-    indices: NDArray[np.int64]
+    indices: Ints
     """(K, 2) indices of the first image's features and of the second's; no feature is matched twice."""
     scores: NDArray[np.float32]
     """(K,) larger is better: cosine similarity of the descriptors, or the confidence of a network."""
@@ -151,11 +150,7 @@ def create_local_methods(
             methods.append(LocalMethod(name, extractor, MutualMatcher(KINDS[name].ratio, KINDS[name].min_score)))
         else:
             network = create_matcher(
-                matched_by,
-                checkpoint=matcher.checkpoint,
-                device=device,
-                dtype=dtype,
-                min_score=matcher.min_confidence,
+                matched_by, checkpoint=matcher.checkpoint, device=device, dtype=dtype, min_score=matcher.min_confidence
             )
             methods.append(LocalMethod(name, extractor, network))
     return methods
@@ -167,7 +162,7 @@ def unit_descriptors(descriptors: Descriptors) -> NDArray[np.float32]:
     return unit * np.float32(1.0 / DESCRIPTOR_SCALE) if descriptors.dtype == np.uint8 else unit
 
 
-def mutual_matches(scores: NDArray[np.float32], ratio: float = 0.8, min_score: float = -1.0) -> NDArray[np.int64]:
+def mutual_matches(scores: NDArray[np.float32], ratio: float = 0.8, min_score: float = -1.0) -> Ints:
     """Return mutual nearest neighbors whose rows pass Lowe's ratio test.
 
     Args:
@@ -191,7 +186,7 @@ def mutual_matches(scores: NDArray[np.float32], ratio: float = 0.8, min_score: f
     return np.stack([keep, best[keep]], axis=1)
 
 
-def _two_best(scores: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+def _two_best(scores: NDArray[np.float32]) -> tuple[Ints, NDArray[np.float32]]:
     """Return the best column of each row, (N,), and the second best score, (N,), -1 where there is none."""
     best = np.argmax(scores, axis=1)
     if scores.shape[1] == 1:
@@ -214,7 +209,7 @@ def match_along_epipolar_lines(
     max_angle_b: float,
     ratio: float = 0.9,
     min_score: float = 0.6,
-) -> NDArray[np.int64]:
+) -> Ints:
     """Match two images of known poses, and compare only features that can show the same point.
 
     Each ray lies in an epipolar half-plane, which the baseline bounds. Two rays can meet only if they share it, so rays

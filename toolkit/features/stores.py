@@ -30,6 +30,7 @@ from toolkit.features.features import DESCRIPTOR_SCALE, Extractor, LocalFeatures
 from toolkit.features.groups import GroupWriter
 from toolkit.features.matching import Matcher, PairMatches
 from toolkit.files import files_fingerprint, fingerprint, read_sidecar
+from toolkit.geometry import Ints
 
 PIXEL_CENTER = "top_left_pixel_center"
 """Attribute of a file of features: where the center of the top-left pixel is."""
@@ -206,7 +207,7 @@ def extract_session(
     session: Session,
     out: str | Path,
     extractor: Extractor | None = None,
-    rows: NDArray[np.int64] | None = None,
+    rows: Ints | None = None,
     workers: int = 2,
     skip_existing: bool = True,
     progress: bool = True,
@@ -265,9 +266,7 @@ def _made_from(session: Session, row: int) -> str:
     return fingerprint([files_fingerprint([session.image_path(row)]), camera.width, camera.height])
 
 
-def _extract(
-    session: Session, rows: list[int], extractor: Extractor, workers: int
-) -> Iterator[LocalFeatures | str]:
+def _extract(session: Session, rows: list[int], extractor: Extractor, workers: int) -> Iterator[LocalFeatures | str]:
     """Yield the features of each image, or why it has none."""
     sensors = session.images["sensor_id"].to_numpy()
 

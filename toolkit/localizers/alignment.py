@@ -17,23 +17,21 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from toolkit import geometry
+from toolkit.geometry import Floats, Ints
 from toolkit.localizers.depth_scale import DepthRatios, DepthSamples, ScaleEstimate, combined_scale
 from toolkit.localizers.robust import (
     NOISE_FACTOR,
     AlignmentError,
     Bools,
-    Floats,
     checked_weights,
     listed,
     nearest_rotation,
     noise_variance,
     rigid_poses,
 )
-
-Ints = NDArray[np.int64]
 
 OUTLIER_SHARE = 0.2  # expected share of wrong references
 WRONG_PLACE = 20.0  # wrong centers are spread over at least that many times the expected noise

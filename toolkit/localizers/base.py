@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 from toolkit import geometry
 from toolkit.features.features import LocalFeatures
 from toolkit.features.matching import PairMatches
+from toolkit.geometry import Floats, Ints
 from toolkit.localizers.correspondences import Correspondences
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 CONFIRMED = (5.0, 0.5)  # degrees, meters: further apart, two answers contradict each other
 

@@ -16,9 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from toolkit.errors import ArtifactError
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from toolkit.geometry import Floats, Ints
 
 MAPS = "maps"
 """Attribute of the file: names of the triangulated maps, one a kind of features, in the folder of maps."""

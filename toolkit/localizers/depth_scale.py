@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from toolkit.localizers.robust import AlignmentError, Bools, Floats, noise_variance
+from toolkit.geometry import Floats, Ints
+from toolkit.localizers.robust import AlignmentError, Bools, noise_variance
 
-Ints = NDArray[np.int64]
 DepthSamples = ArrayLike | Sequence[ArrayLike]
 
 OUTLIER_SHARE = 0.2  # expected share of wrong samples

@@ -5,13 +5,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from toolkit import geometry
 from toolkit.capture import Session
 from toolkit.capture.depths import DepthMaps, SeenDepth, lifted
 from toolkit.capture.upright import Turns
 from toolkit.errors import ImageError, ToolkitError
+from toolkit.geometry import Floats, Ints
 from toolkit.localizers.alignment import Alignment, align_to_map, is_trustworthy, query_pose
 from toolkit.localizers.base import PoseEstimate, Query, References, View
 from toolkit.localizers.local_map import LocalMap
@@ -21,9 +21,6 @@ from toolkit.localizers.references import select_references
 from toolkit.manifest import PredictorSettings
 
 log = logging.getLogger(__name__)
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

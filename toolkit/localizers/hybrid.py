@@ -89,4 +89,3 @@ def _prior(predicted: PoseEstimate) -> Prior | None:
     spread_deg = predicted.rotation_std_deg + np.degrees(np.arctan(predicted.position_std_m / NEARBY_M))
     radius_deg = float(np.clip(2 * spread_deg, *SEARCH_DEG))
     return Prior(predicted.world_from_rig, np.array(predicted.references, np.int64), radius_deg)
-

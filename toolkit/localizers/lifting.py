@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from toolkit import geometry
 from toolkit.capture.depths import lifted
+from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import PoseEstimate, Prior, Query, References
 from toolkit.localizers.depth_scale import DEPTH_NOISE
 from toolkit.localizers.feed_forward import CameraAnswer, FeedForwardAnswer, FeedForwardLocalizer
@@ -21,9 +21,6 @@ from toolkit.localizers.matches import MappedFeatures
 from toolkit.localizers.pnp import PnpLocalizer
 from toolkit.localizers.rig import Matches, RigQuery, least_squares_covariance
 from toolkit.manifest import PnpSettings
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 DEPTH_MAP_STD = 0.01  # relative, of what is common to the depth of a depth map
 LEAST_LIFTED = 20  # features of a map image that its depth maps reach; with fewer, predicted depth is asked

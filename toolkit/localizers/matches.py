@@ -13,13 +13,11 @@ from toolkit import geometry
 from toolkit.capture.cameras import in_view
 from toolkit.features.features import KINDS, FeatureKind, LocalFeatures
 from toolkit.features.matching import Matcher, MutualMatcher, unit_descriptors
+from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import NetworkMatches, References
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.rig import Matches, RigQuery
 from toolkit.manifest import PnpSettings
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 CACHED_IMAGES = 256
 """Map images whose features are kept in memory."""
@@ -167,9 +165,7 @@ class MappedFeatures:
             similar = octaves < self.kind.scale_octaves
             observed, keypoint = observed[similar], keypoint[similar]
             score = np.einsum(
-                "od,od->o",
-                unit_descriptors(descriptors[observed]),
-                unit_descriptors(features.descriptors[keypoint]),
+                "od,od->o", unit_descriptors(descriptors[observed]), unit_descriptors(features.descriptors[keypoint])
             )
             order = np.argsort(-score, kind="stable")
             order = order[score[order] > self.kind.guided_min_score]

@@ -2,13 +2,9 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
 from toolkit import geometry
+from toolkit.geometry import Floats
 from toolkit.localizers.base import PoseEstimate, Query, References
-
-Floats = NDArray[np.float64]
 
 
 class NearestLocalizer:

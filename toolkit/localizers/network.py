@@ -15,7 +15,7 @@ from toolkit.capture.images import default_workers, prefetch, read_image
 from toolkit.capture.turning import turn_image, turn_points, turned_from_cam
 from toolkit.errors import ImageError, ManifestError, ToolkitError
 from toolkit.files import files_fingerprint
-from toolkit.geometry import invert, make_pose
+from toolkit.geometry import Floats, invert, make_pose
 from toolkit.localizers.base import View
 from toolkit.localizers.prediction import Prediction
 from toolkit.models.compute import PRECISIONS, Fitting, resolve_device, resolve_precision
@@ -101,7 +101,7 @@ class _Placed:
         return image if isinstance(image, Path) else id(image), self.size, self.view.turns
 
     @property
-    def map_from_image(self) -> NDArray[np.float64]:
+    def map_from_image(self) -> Floats:
         """(4,), see `Prediction`: from the photograph as it is stored to the network's image turned back to it."""
         camera, (height, width) = self.view.camera, self.size
         corners = np.array([[0, 0], [camera.width, camera.height]], np.float64)
@@ -116,12 +116,12 @@ class _Placed:
         return turn_image(values, -self.view.turns)
 
     @property
-    def offset(self) -> NDArray[np.float64]:
+    def offset(self) -> Floats:
         """(2,): of x and of y, pixels of the network's image."""
         return np.asarray((np.array(self.size[::-1]) - self._resized) // 2)
 
     @property
-    def _resized(self) -> NDArray[np.float64]:
+    def _resized(self) -> Floats:
         return np.array(_resized(*_shown_size(self.view)), np.float64)
 
     @property

@@ -15,15 +15,13 @@ from numpy.typing import NDArray
 
 from toolkit import geometry
 from toolkit.features.features import LocalFeatures
+from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import PoseEstimate, Prior, Query, References, agree
 from toolkit.localizers.correspondences import Correspondences
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.matches import MapMatcher, MappedFeatures
 from toolkit.localizers.rig import Matches, RigQuery, least_squares_covariance
 from toolkit.manifest import PnpSettings
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 VIEWS = 4
 """References of an estimate whose keypoints are kept with its correspondences, those that see the most of them."""
@@ -74,11 +72,7 @@ class PnpLocalizer:
         return [None] * len(queries)
 
     def localize(
-        self,
-        query: Query,
-        references: Sequence[References],
-        prediction: None = None,
-        priors: Sequence[Prior] = (),
+        self, query: Query, references: Sequence[References], prediction: None = None, priors: Sequence[Prior] = ()
     ) -> PoseEstimate:
         """Return one pose for the cameras of a rig, or for a single camera.
 
@@ -94,9 +88,7 @@ class PnpLocalizer:
             if not usable:
                 return PoseEstimate(f"failed: no readable image ({'; '.join(map(str, query.features))})")
             estimate = self.localize(query.part(usable), [references[index] for index in usable], None, priors)
-            used = replace(
-                estimate.correspondences, camera=np.array(usable, np.int64)[estimate.correspondences.camera]
-            )
+            used = replace(estimate.correspondences, camera=np.array(usable, np.int64)[estimate.correspondences.camera])
             return replace(estimate, correspondences=used)
         if not any(len(retrieved.images) for retrieved in references):
             return PoseEstimate("failed: no references")
@@ -163,9 +155,7 @@ class PnpLocalizer:
         points = [self.map.observations(int(image))[1] for image in images]
         return self.matcher.covisible(np.unique(np.concatenate([np.zeros(0, np.int64), *points])))
 
-    def _hypotheses(
-        self, query: RigQuery, matches: Matches, references: Sequence[References]
-    ) -> list[_Hypothesis]:
+    def _hypotheses(self, query: RigQuery, matches: Matches, references: Sequence[References]) -> list[_Hypothesis]:
         """Return refined poses, best supported first.
 
         Repeated structure (a row of like windows) gives several poses that many descriptors agree with, and
@@ -199,11 +189,7 @@ class PnpLocalizer:
         return sorted(hypotheses, key=lambda hypothesis: -len(hypothesis.matches))
 
     def _add_by_reference(
-        self,
-        query: RigQuery,
-        matches: Matches,
-        references: Sequence[References],
-        hypotheses: list[_Hypothesis],
+        self, query: RigQuery, matches: Matches, references: Sequence[References], hypotheses: list[_Hypothesis]
     ) -> None:
         """Add the poses that matches with single references agree on, where they are clearly others."""
         every = dict.fromkeys(int(index) for retrieved in references for index in retrieved.images)
@@ -238,11 +224,7 @@ class PnpLocalizer:
         return best
 
     def _estimate(
-        self,
-        query: RigQuery,
-        matches: Matches,
-        hypotheses: list[_Hypothesis],
-        references: Sequence[References],
+        self, query: RigQuery, matches: Matches, hypotheses: list[_Hypothesis], references: Sequence[References]
     ) -> PoseEstimate:
         """Judge the best pose by the matches that were made without it, and by its rivals."""
         settings = self.settings
@@ -345,9 +327,7 @@ class PnpLocalizer:
                 return len(other.matches) / max(len(first.matches), 1)
         return 0.0
 
-    def _ransac(
-        self, query: RigQuery, matches: Matches, max_error_deg: float, least_inliers: int = 0
-    ) -> Floats | None:
+    def _ransac(self, query: RigQuery, matches: Matches, max_error_deg: float, least_inliers: int = 0) -> Floats | None:
         return query.ransac(matches, self.map.points, max_error_deg, self.settings, self.seed, least_inliers)
 
 

@@ -7,7 +7,8 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from toolkit import geometry
-from toolkit.localizers.robust import AlignmentError, Bools, Floats, listed, rigid_poses
+from toolkit.geometry import Floats
+from toolkit.localizers.robust import AlignmentError, Bools, listed, rigid_poses
 
 _TOO_SMALL = 2.0  # standard deviations of hypotheses are often that many times too small; the result is widened
 

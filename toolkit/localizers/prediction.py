@@ -7,9 +7,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from toolkit.geometry import Floats
 from toolkit.localizers.base import View
-
-Floats = NDArray[np.float64]
 
 LOW_CONFIDENCE = 0.2
 """Share of a view's depths, the least confident, that are not used."""

@@ -8,13 +8,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import pycolmap
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from toolkit import geometry
 from toolkit.capture.cameras import in_view, view_bounds
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from toolkit.geometry import Floats, Ints
 
 WIDE_BASELINE = 0.25  # of the depth; wider adds nothing
 NEAR_DUPLICATE = 0.03  # of the depth

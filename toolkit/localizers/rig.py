@@ -13,10 +13,8 @@ from scipy.spatial import KDTree
 from toolkit import geometry
 from toolkit.capture.cameras import projection_jacobian, view_bounds
 from toolkit.features.features import LocalFeatures
+from toolkit.geometry import Floats, Ints
 from toolkit.manifest import PnpSettings
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 RANSAC_CONFIDENCE = 0.9999
 

@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.errors import ToolkitError
+from toolkit.geometry import Floats
 
-Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 NOISE_FACTOR = np.log(2.5)  # standard deviation of the prior of a noise, in its logarithm

@@ -15,7 +15,6 @@ from threading import Lock
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -25,11 +24,10 @@ from toolkit.capture.cameras import in_view, view_bounds
 from toolkit.capture.depths import DepthMaps, lifted
 from toolkit.capture.devices import session_id
 from toolkit.errors import CaptureError
+from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import View
 from toolkit.localizers.local_map import LocalMap, map_path
 from toolkit.localizers.prediction import Prediction
-
-Floats = NDArray[np.float64]
 
 _GRID = 96  # pixels of the longer side of a depth map
 _NEAREST = 5  # points whose depth a pixel has; some triangulated points are wrong
@@ -146,7 +144,7 @@ class SimulatedPredictor:
             moved = rng.normal(size=3) * max(2.0, float(np.ptp(group[:, :3, 3], axis=0).max()))
         return geometry.make_pose(world_from_cam[:3, :3] @ turn.as_matrix(), world_from_cam[:3, 3] + moved)
 
-    def _depth(self, view: View, group: list[View], names: list[str], grid: NDArray[np.int64]) -> Floats:
+    def _depth(self, view: View, group: list[View], names: list[str], grid: Ints) -> Floats:
         key = f"{view.name} {grid}"
         with self._lock:
             kept = self._depths.get(key) if view.in_map else None
@@ -186,7 +184,7 @@ class SimulatedPredictor:
             return self._maps[session]
 
 
-def _nearest_depth(points: Floats, view: View, world_from_cam: Floats, grid: NDArray[np.int64]) -> Floats:
+def _nearest_depth(points: Floats, view: View, world_from_cam: Floats, grid: Ints) -> Floats:
     """Return depth in meters, (h, w), the median of the points nearest to each pixel of a grid; NaN without points."""
     in_cam = geometry.transform(geometry.invert(world_from_cam), points)
     in_cam = in_cam[in_view(in_cam[None], view_bounds(view.camera)[None])[0]] if len(in_cam) else in_cam

@@ -23,10 +23,7 @@ def nested_model(annotation: Any) -> type[BaseModel] | None:
 
 
 def explain(
-    error: ValidationError,
-    model: type[BaseModel],
-    source: str,
-    origin: Callable[[list[str]], str] = lambda keys: "",
+    error: ValidationError, model: type[BaseModel], source: str, origin: Callable[[list[str]], str] = lambda keys: ""
 ) -> str:
     """Return the lines of an error.
 

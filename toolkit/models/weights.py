@@ -214,10 +214,7 @@ def read_state_dict(path: str | Path) -> "dict[str, Tensor]":
 
 
 def load_checkpoint(
-    module: "nn.Module",
-    checkpoint: "str | Path | Mapping[str, Tensor]",
-    name: str = "",
-    ignore: tuple[str, ...] = (),
+    module: "nn.Module", checkpoint: "str | Path | Mapping[str, Tensor]", name: str = "", ignore: tuple[str, ...] = ()
 ) -> None:
     """Load a checkpoint into a module and make it ready for inference: no gradients, evaluation mode.
 

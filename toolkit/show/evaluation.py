@@ -126,10 +126,7 @@ def draw_error_curves(errors: pd.DataFrame, thresholds: Sequence[Threshold] = TH
     queries, maps = in_order(errors["query_device"]), in_order(errors["map_device"])
     figure = new_figure(3.6 * len(queries) + 0.8, 6.0)
     axes = figure.subplots(2, len(queries), squeeze=False, sharey=True, sharex="row")
-    quantities = [
-        ("translation_error_m", "translation error [m]", 1),
-        ("rotation_error_deg", "rotation error [°]", 0),
-    ]
+    quantities = [("translation_error_m", "translation error [m]", 1), ("rotation_error_deg", "rotation error [°]", 0)]
     for row, (column, label, part) in enumerate(quantities):
         finite = errors[column].to_numpy(float)
         finite = np.maximum(finite[np.isfinite(finite)], 1e-4)

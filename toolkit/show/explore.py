@@ -13,7 +13,7 @@ from toolkit.capture.devices import color_of
 from toolkit.capture.images import read_for_display
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.files import image_name, read_references
-from toolkit.geometry import unit
+from toolkit.geometry import Floats, unit
 from toolkit.show.figures import GREEN, ORANGE, VERMILLION, new_figure, styled
 from toolkit.show.metrics import is_posed
 from toolkit.show.top_view import ground_axes, places_of
@@ -175,9 +175,7 @@ def draw_statuses(paths: Iterable[str | Path]) -> "Figure":
     Args:
         paths: poses of each pair, `<scene>_map_<M>_query_<Q>.txt` or `.csv`.
     """
-    tables = {
-        Path(path).stem.rpartition("_map_")[2]: pd.read_csv(Path(path).with_suffix(".csv")) for path in paths
-    }
+    tables = {Path(path).stem.rpartition("_map_")[2]: pd.read_csv(Path(path).with_suffix(".csv")) for path in paths}
     figure = new_figure(8, 0.35 * len(tables) + 1.2)
     plot = figure.subplots()
     colors = {"ok": GREEN, "low_confidence": ORANGE, "failed": VERMILLION}
@@ -204,7 +202,7 @@ def _descriptors(session: Path, limit: int) -> NDArray[np.float32]:
     return unit(rows)
 
 
-def _poses(session: Session) -> NDArray[np.float64]:
+def _poses(session: Session) -> Floats:
     """Return world_from_cam of the images that have one, (n, 4, 4)."""
     poses = session.world_from_cam(ground_truth=session.split == "query")
     return poses[is_posed(poses)]

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.images import read_for_display
 from toolkit.capture.world_up import up_of_cameras
-from toolkit.geometry import project
+from toolkit.geometry import Floats, project
 from toolkit.show.figures import ESTIMATED, GREEN, MAP, ORANGE, SKY, TRUE, draw_error_legend, error_colors
 from toolkit.show.localized import REFERENCES, Localizations, QueryDetails, ShownImage, support_of
 from toolkit.show.metrics import is_posed
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
 QUERY = "query"
 """The timeline: one steps through the queries, numbered as the rows of the pair's csv."""
@@ -45,7 +44,7 @@ WHITE = [255, 255, 255]
 def record_localizations(
     out: str | Path,
     name: str,
-    map_poses: Array,
+    map_poses: Floats,
     points: ArrayLike,
     colors: NDArray[np.uint8] | None,
     localizations: Localizations,
@@ -89,7 +88,7 @@ def record_localizations(
     return Path(out)
 
 
-def _layout(name: str, poses: Array, up: Array) -> Any:
+def _layout(name: str, poses: Floats, up: Floats) -> Any:
     """Return the viewer's layout: the scene, and beside it the chosen query, its references, and a page about it."""
     import rerun.blueprint as rrb
 
@@ -118,7 +117,7 @@ def _layout(name: str, poses: Array, up: Array) -> Any:
     return rrb.Blueprint(rrb.Horizontal(scene, side, column_shares=[3, 2]), panel, collapse_panels=True)
 
 
-def _log_map_cameras(stream: "rr.RecordingStream", poses: Array, size: float) -> None:
+def _log_map_cameras(stream: "rr.RecordingStream", poses: Floats, size: float) -> None:
     """Log the map's cameras as small pyramids, all in one entity."""
     import rerun as rr
 
@@ -136,7 +135,7 @@ def _log_overview(stream: "rr.RecordingStream", queries: Localizations) -> None:
     colors = error_colors(queries.ranked["translation_error_m"])
     labels = np.array([f"#{k} {describe(queries, k)}" for k in range(len(queries.names))], object)
 
-    def dots(path: str, rows: NDArray[np.bool_], centers: Array, color: Any, radius: float) -> None:
+    def dots(path: str, rows: NDArray[np.bool_], centers: Floats, color: Any, radius: float) -> None:
         style = {"colors": color, "radii": rr.Radius.ui_points(radius), "show_labels": False}
         stream.log(path, rr.Points3D(centers[rows], labels=labels[rows].tolist(), **style), static=True)
 
@@ -208,7 +207,7 @@ class _ChosenWriter:
         import rerun as rr
 
         stream = self._stream
-        measured, inlier, predicted, lines = np.zeros((0, 2)), np.zeros(0, bool), np.zeros((0, 2)), list[Array]()
+        measured, inlier, predicted, lines = np.zeros((0, 2)), np.zeros(0, bool), np.zeros((0, 2)), list[Floats]()
         if image is None:
             # Of the last one's size: the viewer takes pictures of an entity for frames of a film.
             width, height = self._sizes.get(path, (4, 3))

@@ -15,6 +15,7 @@ from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.tables import read_query_table
 from toolkit.errors import ArtifactError
 from toolkit.files import pair_name
+from toolkit.geometry import Floats, Ints
 from toolkit.localizers.correspondences import Correspondences, LocalizedQueries, LocalizedQuery
 from toolkit.localizers.local_map import LocalMap
 from toolkit.show.metrics import is_posed, pose_errors, worst_first
@@ -22,8 +23,6 @@ from toolkit.show.metrics import is_posed, pose_errors, worst_first
 if TYPE_CHECKING:
     import pycolmap
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 REFERENCES = 4
 """References shown of a query, at most."""
@@ -58,7 +57,7 @@ def load_maps(paths: Sequence[Path]) -> LocalMap | None:
     return LocalMap.pooled(maps) if maps else None
 
 
-def sure_points(local_map: LocalMap | None) -> tuple[Array, NDArray[np.uint8] | None]:
+def sure_points(local_map: LocalMap | None) -> tuple[Floats, NDArray[np.uint8] | None]:
     """Return the points that at least three images see, (P, 3), and their colors (P, 3) RGB; the rest is noisy."""
     if local_map is None:
         return np.zeros((0, 3)), None
@@ -73,17 +72,17 @@ class ShownImage:
     name: str
     path: Path
     camera: "pycolmap.Camera"
-    world_from_cam: Array
+    world_from_cam: Floats
     """(4, 4); NaN where it is not known."""
-    pixels: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    pixels: Floats = field(default_factory=lambda: np.zeros((0, 2)))
     """(n, 2) where the points were measured, in the full image."""
-    points: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    points: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     """(n, 3) the points, meters; projecting them gives what the pose predicts."""
     matches: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     """(n,) numbers of the correspondences: the same number in two images joins their pixels."""
     inlier: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
     """(n,) whether the pose agrees with it."""
-    world_from_cam_true: Array = field(default_factory=lambda: np.full((4, 4), np.nan))
+    world_from_cam_true: Floats = field(default_factory=lambda: np.full((4, 4), np.nan))
     """(4, 4); NaN where it is not known."""
 
     @property
@@ -145,11 +144,11 @@ class Localizations:
     names: Sequence[str]
     table: pd.DataFrame
     """Columns status and num_inliers, and others of the pair's csv."""
-    estimated: Array
+    estimated: Floats
     """world_from_cam (Q, 4, 4), NaN where there is no pose."""
-    true: Array
+    true: Floats
     """The same, true; NaN where it is not known."""
-    nearest_reference: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    nearest_reference: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     """World position (Q, 3) of the first reference of queries without a pose; NaN where there is none."""
 
     @cached_property
@@ -174,7 +173,7 @@ class LocalizedPair:
     """The pair's csv: a row for each query that has an image."""
     rows: list[Ints]
     """Rows of the session's images of each query."""
-    world_from_rig: Array
+    world_from_rig: Floats
     """(Q, 4, 4), NaN where there is no pose."""
     queries: LocalizedQueries
     local_map: LocalMap | None
@@ -249,7 +248,7 @@ class LocalizedPair:
 
 
 def _shown_image(
-    session: Session, row: int, pose: Array, found: Correspondences, matches: Ints, pixels: Array
+    session: Session, row: int, pose: Floats, found: Correspondences, matches: Ints, pixels: Floats
 ) -> ShownImage:
     return ShownImage(
         session.image_name(row),

@@ -7,12 +7,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from toolkit.geometry import pose_error
+from toolkit.geometry import Floats, Ints, pose_error
 
 if TYPE_CHECKING:
     from toolkit.capture import Trajectory
 
-Array = NDArray[np.float64]
 Threshold = tuple[float, float]
 """Degrees and meters."""
 
@@ -24,8 +23,8 @@ NO_REFERENCE, NO_POSE, WRONG_POSE = REASONS = ("no good reference", "no pose", "
 
 
 def pose_errors(
-    estimated: "Trajectory | Array", truth: "Trajectory | Array", keys: pd.DataFrame | None = None
-) -> tuple[Array, Array]:
+    estimated: "Trajectory | Floats", truth: "Trajectory | Floats", keys: pd.DataFrame | None = None
+) -> tuple[Floats, Floats]:
     """Return the rotation error, degrees, and the translation error, meters, of each query, (N,) each.
 
     As the LaMAR benchmark defines them: angle and length of inverse(estimated) @ true. A query without an
@@ -48,7 +47,7 @@ def pose_errors(
     return rotation_deg, translation_m
 
 
-def poses_of(poses: "Trajectory | Array", keys: pd.DataFrame | None) -> Array:
+def poses_of(poses: "Trajectory | Floats", keys: pd.DataFrame | None) -> Floats:
     """Return world_from_device (N, 4, 4) of queries (columns timestamp, device_id); NaN where there is no pose."""
     if isinstance(poses, np.ndarray):
         return poses
@@ -57,14 +56,12 @@ def poses_of(poses: "Trajectory | Array", keys: pd.DataFrame | None) -> Array:
     return poses.lookup(keys["timestamp"].to_numpy(np.int64), keys["device_id"].to_numpy(str))
 
 
-def is_posed(poses: Array) -> NDArray[np.bool_]:
+def is_posed(poses: Floats) -> NDArray[np.bool_]:
     """Return which of poses (..., 4, 4) are finite."""
     return np.asarray(np.isfinite(poses).all((-1, -2)), bool)
 
 
-def recall(
-    rotation_deg: Array, translation_m: Array, thresholds: Sequence[Threshold] = THRESHOLDS
-) -> NDArray[np.float64]:
+def recall(rotation_deg: Floats, translation_m: Floats, thresholds: Sequence[Threshold] = THRESHOLDS) -> Floats:
     """Return the share of queries, 0 to 1, with both errors strictly below each (degrees, meters) pair.
 
     All queries count; one without a pose has infinite errors and is a miss. NaN where there is no query.
@@ -75,7 +72,7 @@ def recall(
     return np.array([np.mean(is_below(rotation_deg, translation_m, threshold)) for threshold in thresholds])
 
 
-def is_below(rotation_deg: Array, translation_m: Array, threshold: Threshold) -> NDArray[np.bool_]:
+def is_below(rotation_deg: Floats, translation_m: Floats, threshold: Threshold) -> NDArray[np.bool_]:
     """Return which queries have both errors strictly below a threshold."""
     return (rotation_deg < threshold[0]) & (translation_m < threshold[1])
 
@@ -91,7 +88,7 @@ def parse_threshold(name: str) -> Threshold:
     return float(degrees.removesuffix("deg")), float(meters.removesuffix("m"))
 
 
-def worst_first(queries: pd.DataFrame, threshold: Threshold = THRESHOLDS[0]) -> NDArray[np.int64]:
+def worst_first(queries: pd.DataFrame, threshold: Threshold = THRESHOLDS[0]) -> Ints:
     """Return the positions of queries in order from the worst to the best.
 
     Failed queries come first. Then, where the truth is known, queries by their error: the larger of the rotation and
@@ -104,7 +101,7 @@ def worst_first(queries: pd.DataFrame, threshold: Threshold = THRESHOLDS[0]) -> 
         threshold: degrees and meters that weigh alike.
     """
 
-    def column(name: str, unknown: float) -> Array:
+    def column(name: str, unknown: float) -> Floats:
         values: Any = queries[name] if name in queries else np.full(len(queries), np.nan)
         values = np.asarray(values, np.float64)
         return np.where(np.isnan(values), unknown, values)

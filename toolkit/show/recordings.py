@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from tqdm.auto import tqdm
 
 from toolkit.capture import DEPTH_SCALE, Capture, Session, Trajectory
@@ -19,6 +19,7 @@ from toolkit.capture.images import default_workers, prefetch, read_for_display, 
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import ArtifactError, CaptureError, ImageError
 from toolkit.files import file_fingerprint, files_fingerprint, write_sidecar
+from toolkit.geometry import Floats, Ints
 from toolkit.localizers.correspondences import LocalizedQueries, LocalizedQuery
 from toolkit.show.figures import ORANGE
 from toolkit.show.localized import load_maps, map_files, sure_points
@@ -47,7 +48,6 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
 FRAME, CAPTURE_TIME = "frame", "capture_time"
 """Timelines: index of the frame in its session, and the timestamp of the files as a duration (microseconds)."""
@@ -211,7 +211,7 @@ class _Shot:
     slot: str
     """Name of its camera in the recording, the same from frame to frame."""
     camera: "pycolmap.Camera"
-    parent_from_sensor: Array
+    parent_from_sensor: Floats
     """(4, 4) in the rig; of a camera without one, in the world; NaN where it has no pose."""
     path: Path
     is_depth: bool = False
@@ -233,9 +233,9 @@ class _Frame:
     device: str
     """Name of the rig in the recording; empty for a camera without one."""
     device_id: str
-    world_from_device: Array
+    world_from_device: Floats
     """(4, 4), NaN without a pose."""
-    rows: NDArray[np.int64]
+    rows: Ints
     """Of the session's images."""
     slots: tuple[str, ...]
     """Names of their cameras in the recording."""
@@ -257,13 +257,13 @@ class _Plan:
 
     session: Session
     frames: list[_Frame]
-    tracks: dict[str, list[Array]]
+    tracks: dict[str, list[Floats]]
     """World positions (n, 3) along each device's way, of every subsession shown, thinned or not."""
-    all_poses: Array
+    all_poses: Floats
     """world_from_cam (n, 4, 4) of one camera a frame shown."""
     depths: dict[tuple[int, str], list[int]]
     """Rows of the session's depth maps by timestamp and device."""
-    rig_from_depth: Array
+    rig_from_depth: Floats
 
     @classmethod
     def of(
@@ -330,7 +330,7 @@ class _Plan:
         return shots
 
 
-def session_tracks(session: Session) -> list[Array]:
+def session_tracks(session: Session) -> list[Floats]:
     """Return the ways of a session's cameras, a list of world positions (n, 3), meters, a subsession and device.
 
     Of a rig its first camera's; of a map by the trajectory, of queries by the ground truth.
@@ -341,9 +341,9 @@ def session_tracks(session: Session) -> list[Array]:
     return [t for ts in _tracks(first, session.world_from_cam(rows, session.split == "query")).values() for t in ts]
 
 
-def _tracks(frames: pd.DataFrame, poses: Array) -> dict[str, list[Array]]:
+def _tracks(frames: pd.DataFrame, poses: Floats) -> dict[str, list[Floats]]:
     """Return the positions of frames that have a pose, by subsession, a list a device."""
-    tracks: dict[str, list[Array]] = {}
+    tracks: dict[str, list[Floats]] = {}
     groups = frames.reset_index(drop=True).groupby(["subsession", "device_slot"], sort=False)
     for (name, _), rows in groups.indices.items():
         centers = poses[rows, :3, 3]
@@ -498,7 +498,7 @@ class _FrameWriter:
             self._last[path, kind] = values
 
 
-def _session_layout(plan: _Plan, poses: Array, up: Array) -> Any:
+def _session_layout(plan: _Plan, poses: Floats, up: Floats) -> Any:
     """Return the viewer's layout: the scene, and beside it the cameras of each subsession."""
     import rerun.blueprint as rrb
 
@@ -534,7 +534,7 @@ class _QueryPoses:
     map_device: str
     """Of the pair that the file is named after; empty where its name says none."""
     query_device: str
-    lines: list[Array]
+    lines: list[Floats]
     """Positions (2, 3) of a query and of a reference that it was localized by; none where they are not wanted."""
 
     @classmethod

@@ -206,8 +206,7 @@ def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> dict[str, An
     """Return what the page shows of one scene, by the names that the template has for it."""
     messages: list[str] = []
     recall, errors, losses, retrieval = (
-        _read_table(files.evaluation / f"{name}.csv", messages)
-        for name in ("recall", "errors", "losses", "retrieval")
+        _read_table(files.evaluation / f"{name}.csv", messages) for name in ("recall", "errors", "losses", "retrieval")
     )
     thresholds = [column for column in recall.columns if column.startswith("recall@")]
     statuses = _read_statuses(files, messages)

@@ -11,18 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.images import read_for_display
 from toolkit.capture.world_up import up_of_cameras
-from toolkit.geometry import pose_error, project
-from toolkit.show.figures import (
-    ESTIMATED,
-    GREEN,
-    MAP,
-    TRUE,
-    error_bar,
-    error_colors,
-    new_figure,
-    save_figure,
-    styled,
-)
+from toolkit.geometry import Floats, Ints, pose_error, project
+from toolkit.show.figures import ESTIMATED, GREEN, MAP, TRUE, error_bar, error_colors, new_figure, save_figure, styled
 from toolkit.show.localized import QueryDetails
 from toolkit.show.metrics import is_posed
 from toolkit.show.top_view import ground_axes, places_of
@@ -31,7 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 Window = tuple[tuple[float, float], tuple[float, float]]
 """Limits of x and y, meters."""
 
@@ -51,18 +40,18 @@ class WorstQuery:
 
 @styled
 def draw_scene_png(
-    points: Array,
+    points: Floats,
     colors: NDArray[np.uint8] | None,
     map_poses: ArrayLike,
-    estimated: Array,
-    true: Array,
+    estimated: Floats,
+    true: Floats,
     out: str | Path | None = None,
     up: ArrayLike | None = None,
     title: str = "Queries in the map, seen from above",
     max_places: int = 6,
     max_points: int = 60_000,
-    map_tracks: Sequence[Array] = (),
-    query_tracks: Sequence[Array] = (),
+    map_tracks: Sequence[Floats] = (),
+    query_tracks: Sequence[Floats] = (),
 ) -> "Figure":
     """Draw the map from above with estimated and true queries, one panel a place; return the figure.
 
@@ -254,7 +243,7 @@ def _draw_side_by_side(axis: "Axes", query: QueryDetails) -> None:
     axis.set(xlim=(0, end), ylim=(height, 0), aspect="equal")
 
 
-def _on(pixels: Array) -> Array:
+def _on(pixels: Floats) -> Floats:
     """Return pixels as imshow counts them: it has the center of the top-left pixel at (0, 0)."""
     return pixels - 0.5
 
@@ -268,11 +257,11 @@ def _length(meters: float) -> str:
     return f"{100 * meters:.2g} cm" if meters < 0.995 else f"{meters:.3g} m"
 
 
-def _dots(axis: "Axes", xy: Array, **style: Any) -> None:
+def _dots(axis: "Axes", xy: Floats, **style: Any) -> None:
     axis.scatter(xy[:, 0], xy[:, 1], **style)
 
 
-def _nearest(positions: Array, cameras: Array, place: NDArray[np.int64]) -> NDArray[np.int64]:
+def _nearest(positions: Floats, cameras: Floats, place: Ints) -> Ints:
     """Return the place of the nearest camera; -1 where the position is not known."""
     from scipy.spatial import cKDTree
 
@@ -283,7 +272,7 @@ def _nearest(positions: Array, cameras: Array, place: NDArray[np.int64]) -> NDAr
     return nearest
 
 
-def _window(cloud: Array, cameras: Array, queries: Array) -> Window:
+def _window(cloud: Floats, cameras: Floats, queries: Floats) -> Window:
     """Return x and y limits that hold the cameras and queries, and all but the farthest of the points."""
     parts = [cameras, queries[np.isfinite(queries).all(1)]]
     if len(cloud):
@@ -298,20 +287,20 @@ def _window(cloud: Array, cameras: Array, queries: Array) -> Window:
     return (float(x0), float(x1)), (float(y0), float(y1))
 
 
-def _muted(colors: NDArray[np.uint8]) -> Array:
+def _muted(colors: NDArray[np.uint8]) -> Floats:
     """Return colors for thin points on white: bright ones would not be seen."""
     rgb = colors.astype(np.float64) / 255
     return np.clip(rgb * 0.75 + 0.2, 0, 0.75)
 
 
-def _draw_headings(axis: "Axes", positions: Array, poses: Array, axes: Array, window: Window, **style: Any) -> None:
+def _draw_headings(axis: "Axes", positions: Floats, poses: Floats, axes: Floats, window: Window, **style: Any) -> None:
     """Draw a line in the direction that each camera looks."""
     length = 0.035 * max(np.ptp(window[0]), np.ptp(window[1]))
     heads = positions + length * poses[:, :3, 2] @ axes.T
     axis.add_collection(LineCollection(list(np.stack([positions, heads], axis=1)), linewidths=1.0, **style))
 
 
-def _draw_queries(axis: "Axes", estimated: Array, true: Array, axes: Array, window: Window) -> None:
+def _draw_queries(axis: "Axes", estimated: Floats, true: Floats, axes: Floats, window: Window) -> None:
     has_estimate, has_truth = is_posed(estimated), is_posed(true)
     both, lost = has_estimate & has_truth, has_truth & ~has_estimate
     estimated_xy, true_xy = estimated[:, :3, 3] @ axes.T, true[:, :3, 3] @ axes.T

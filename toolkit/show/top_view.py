@@ -1,12 +1,12 @@
 """Seeing a map from above: which way is right and up in the picture, and which places lie apart."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from toolkit.geometry import Floats, Ints
 
 
-def ground_axes(up: ArrayLike) -> tuple[Array, list[str]]:
+def ground_axes(up: ArrayLike) -> tuple[Floats, list[str]]:
     """Return the right and the upward axis of a map seen from above, (2, 3), and their labels.
 
     They are world axes where the world stands upright, so the picture's numbers are coordinates.
@@ -25,7 +25,7 @@ def ground_axes(up: ArrayLike) -> tuple[Array, list[str]]:
     return axes, labels
 
 
-def places_of(positions: Array, gap_ratio: float = 5.0, share: float = 0.12) -> NDArray[np.int64]:
+def places_of(positions: Floats, gap_ratio: float = 5.0, share: float = 0.12) -> Ints:
     """Return the number of the place, (N,) counted from 0 in order of appearance, of positions (N, 2 or 3).
 
     Places are apart by more than `share` of the whole extent and by more than `gap_ratio` times the usual

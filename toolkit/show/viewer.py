@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.files import write_atomic
-from toolkit.geometry import rotation_to_quaternion
+from toolkit.geometry import Floats, rotation_to_quaternion
 from toolkit.show.figures import GRAY
 from toolkit.show.top_view import places_of
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     import pycolmap
     import rerun as rr
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 APPLICATION = "visual-localization"
@@ -82,7 +81,7 @@ def small_jpeg(image: Image, size: int, quality: int = 75) -> tuple[bytes, tuple
     return data.tobytes(), (width, height)
 
 
-def shown_intrinsics(camera: "pycolmap.Camera", shown: tuple[int, int]) -> Array:
+def shown_intrinsics(camera: "pycolmap.Camera", shown: tuple[int, int]) -> Floats:
     """Return the matrix (3, 3) of a camera for its image at another size (w, h), pixels.
 
     The top-left corner of the image is (0, 0) at every size, so the matrix scales by rows. Distortion is left out:
@@ -120,7 +119,7 @@ def jpeg_of(data: bytes) -> "rr.EncodedImage":
     return rr.EncodedImage(contents=data, media_type="image/jpeg")
 
 
-def world_axes(up: Array) -> Any:
+def world_axes(up: Floats) -> Any:
     """Return the viewer's coordinates for the world axis that is nearest to `up`."""
     import rerun as rr
 
@@ -128,7 +127,7 @@ def world_axes(up: Array) -> Any:
     return getattr(rr.ViewCoordinates, f"RIGHT_HAND_{'XYZ'[axis]}_{'UP' if up[axis] > 0 else 'DOWN'}")
 
 
-def scene_view(poses: Array, up: Array, name: str) -> Any:
+def scene_view(poses: Floats, up: Floats, name: str) -> Any:
     """Return the view of the 3D scene: from behind and above the place with the most cameras (N, 4, 4)."""
     import rerun.blueprint as rrb
 
@@ -144,7 +143,7 @@ def scene_view(poses: Array, up: Array, name: str) -> Any:
     return rrb.Spatial3DView(origin="world", name=name, eye_controls=eye)
 
 
-def camera_depth_m(centers: Array) -> float:
+def camera_depth_m(centers: Floats) -> float:
     """Return how deep to draw the cameras at (N, 3): about half the usual step between neighbors."""
     from scipy.spatial import cKDTree
 

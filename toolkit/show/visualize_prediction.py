@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.images import read_for_display
 from toolkit.capture.world_up import up_of_cameras
+from toolkit.geometry import Floats
 from toolkit.localizers.base import Query, View
 from toolkit.localizers.feed_forward import CameraAnswer, FeedForwardAnswer, FeedForwardLocalizer
 from toolkit.show.figures import BLUE, GRAY, GREEN, VERMILLION, new_figure, save_figure, styled
@@ -17,8 +18,6 @@ from toolkit.show.top_view import ground_axes
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-Array = NDArray[np.float64]
 
 
 @styled
@@ -136,7 +135,7 @@ def _draw_from_above(
     axis.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=3, frameon=False)
 
 
-def _draw_cameras(axis: "Axes", poses: Array, axes: Array, color: str, label: str, marker: str) -> None:
+def _draw_cameras(axis: "Axes", poses: Floats, axes: Floats, color: str, label: str, marker: str) -> None:
     """Draw places (N, 4, 4) from above, with a stroke where they look."""
     if not len(poses):
         return

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from toolkit.errors import CaptureError
-from toolkit.geometry import Array, invert, pose_from_qt, qt_from_pose
+from toolkit.geometry import Floats, invert, pose_from_qt, qt_from_pose
 from toolkit.synthetic.devices import DEVICES, Device, walks
 from toolkit.synthetic.light import paint
 from toolkit.synthetic.render import Rays, render
@@ -44,7 +44,7 @@ class Shot:
     path: str  # below raw_data/
     depth_path: str | None
     camera: "pycolmap.Camera"
-    world_from_cam: Array
+    world_from_cam: Floats
     device: Device
 
 
@@ -53,8 +53,8 @@ class Tables:
     """The rows of a session's files, as they are collected."""
 
     sensors: dict[str, tuple[Any, ...]] = field(default_factory=dict)
-    rigs: list[tuple[int, str, str, Array]] = field(default_factory=list)
-    poses: list[tuple[int, str, Array]] = field(default_factory=list)
+    rigs: list[tuple[int, str, str, Floats]] = field(default_factory=list)
+    poses: list[tuple[int, str, Floats]] = field(default_factory=list)
     images: list[tuple[int, str, str]] = field(default_factory=list)
     depths: list[tuple[int, str, str]] = field(default_factory=list)
     subsessions: list[str] = field(default_factory=list)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from toolkit.geometry import Array, invert, make_pose, rotation_angle_deg
+from toolkit.geometry import Floats, invert, make_pose, rotation_angle_deg
 from toolkit.synthetic.scene import Scene, named_rng
 from toolkit.synthetic.textures import Rng
 
@@ -23,7 +23,7 @@ class Sensor:
     roll_deg: float = 0.0
 
     @property
-    def body_from_cam(self) -> Array:
+    def body_from_cam(self) -> Floats:
         """The camera's pose (4, 4) in the body frame."""
         return make_pose(looking(self.yaw_deg, self.pitch_deg, self.roll_deg), self.at)
 
@@ -78,7 +78,7 @@ DEVICES = {
 }  # fmt: skip
 
 
-def looking(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Array:
+def looking(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Floats:
     """Return a camera's rotation (3, 3) in a frame with z up: yaw left of x, pitch up, roll clockwise."""
     yaw, pitch, roll = np.radians([yaw_deg, pitch_deg, roll_deg])
     forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
@@ -91,14 +91,14 @@ def looking(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Array:
 BODY_FROM_LEVEL_CAM = make_pose(looking(0, 0, 0), (0, 0, 0))
 
 
-def _walk(rng: Rng, scene: Scene, device: Device, radius: float, angles: Array) -> Array:
+def _walk(rng: Rng, scene: Scene, device: Device, radius: float, angles: Floats) -> Floats:
     """Return poses world_from_body (N, 4, 4) along an ellipse around the room's middle, looking across it.
 
     `angles` (N,) are the directions of the look, radians; `radius` is a share of the room's sides. The wobble
     is a sum of slow waves, so the walk is smooth however many frames it has.
     """
 
-    def wave(amplitude: float) -> Array:
+    def wave(amplitude: float) -> Floats:
         a, b = rng.uniform(0, 2 * np.pi, 2)
         return amplitude * (0.6 * np.sin(1.7 * angles + a) + 0.4 * np.sin(4.1 * angles + b))
 
@@ -112,7 +112,7 @@ def _walk(rng: Rng, scene: Scene, device: Device, radius: float, angles: Array) 
     return make_pose(rotations, np.stack([x, y, z], -1)) @ invert(BODY_FROM_LEVEL_CAM)
 
 
-def _turn(poses: Array, degrees: Array) -> Array:
+def _turn(poses: Floats, degrees: Floats) -> Floats:
     """Turn poses world_from_body about the world's vertical through their own place."""
     a = np.radians(degrees)
     spin = np.zeros((len(poses), 3, 3))
@@ -123,7 +123,7 @@ def _turn(poses: Array, degrees: Array) -> Array:
     return make_pose(spin @ poses[:, :3, :3], poses[:, :3, 3])
 
 
-def walks(scene: Scene, seed: int, index: int, frames: int, name: str) -> dict[tuple[str, int], Array]:
+def walks(scene: Scene, seed: int, index: int, frames: int, name: str) -> dict[tuple[str, int], Floats]:
     """Return the poses world_from_body of one device in one room, by split and subsession.
 
     The two map walks follow an outer and an inner ring, the queries the ring between them, turned 10 to 25
@@ -133,7 +133,7 @@ def walks(scene: Scene, seed: int, index: int, frames: int, name: str) -> dict[t
     device, rng = DEVICES[name], named_rng(seed, index, "walk", name)
     start = named_rng(seed, index, "start").uniform(0, 2 * np.pi)
     span = np.radians(min(360, 15 * frames))
-    poses: dict[tuple[str, int], Array] = {}
+    poses: dict[tuple[str, int], Floats] = {}
     for split, total in (("map", frames), ("query", max(2, frames // 2))):
         phase = rng.uniform(0, 0.3)
         for part, count in enumerate((total - total // 2, total // 2)):

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from toolkit.geometry import Array
+from toolkit.geometry import Floats
 from toolkit.synthetic.light import LEVELS
 from toolkit.synthetic.scene import Quad
 from toolkit.synthetic.textures import Image
@@ -30,7 +30,7 @@ class Rays:
     camera: "pycolmap.Camera"
     x: Image
     y: Image
-    planes: Array  # (5, 4) the view's borders in the camera frame; inside is positive
+    planes: Floats  # (5, 4) the view's borders in the camera frame; inside is positive
 
     @classmethod
     def of(cls, camera: "pycolmap.Camera") -> "Rays":
@@ -50,13 +50,13 @@ class Rays:
         return cls(camera, np.ascontiguousarray(x), np.ascontiguousarray(y), planes)
 
 
-def _visible_area(polygon: Array, rays: Rays) -> tuple[slice, slice] | None:
+def _visible_area(polygon: Floats, rays: Rays) -> tuple[slice, slice] | None:
     """Return the rows and columns of samples that may see a polygon (N, 3), camera frame; None if none."""
     for plane in rays.planes:
         side = polygon @ plane[:3] + plane[3]
         if (side >= 0).all():
             continue
-        kept: list[Array] = []
+        kept: list[Floats] = []
         for i in range(len(polygon)):
             a, b, sa, sb = polygon[i - 1], polygon[i], side[i - 1], side[i]
             if (sa >= 0) != (sb >= 0):
@@ -88,7 +88,7 @@ def _texture(level: Image, x: Image, y: Image) -> Image:
     return read.reshape(rows * width, -1)[: len(x)]
 
 
-def render(quads: list[Quad], world_from_cam: Array, rays: Rays, gray: bool) -> tuple[Image, Image]:
+def render(quads: list[Quad], world_from_cam: Floats, rays: Rays, gray: bool) -> tuple[Image, Image]:
     """Return a picture, (H, W, 3) BGR or (H, W), float32 0..255, and its depth, (H, W) float32 meters.
 
     Depth is along the optical axis at pixel centers; 0 on the sky and where a pixel straddles an edge.

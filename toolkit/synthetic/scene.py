@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.geometry import Array
+from toolkit.geometry import Floats
 from toolkit.synthetic import textures as tex
 from toolkit.synthetic.textures import Image, Material, Rng
 
@@ -27,9 +27,9 @@ def named_rng(*key: int | str) -> Rng:
 class Quad:
     """A textured rectangle: its texture's top left corner and unit axes, in world meters."""
 
-    corner: Array
-    right: Array
-    down: Array
+    corner: Floats
+    right: Floats
+    down: Floats
     width: float
     height: float
     material: Material
@@ -39,12 +39,12 @@ class Quad:
     gray: list[Image] = field(default_factory=list)
 
     @cached_property
-    def normal(self) -> Array:
+    def normal(self) -> Floats:
         """The unit normal on the side that is seen."""
         return np.cross(self.down, self.right)
 
     @cached_property
-    def corners(self) -> Array:
+    def corners(self) -> Floats:
         """The four corners (4, 3), clockwise from the texture's top left."""
         w, h = self.width, self.height
         return self.corner + np.array([[0, 0], [w, 0], [w, h], [0, h]]) @ np.stack([self.right, self.down])
@@ -54,15 +54,15 @@ class Quad:
 class Scene:
     """The rectangles of one room, its boxes as obstacles to light, and its lamps."""
 
-    origin: Array
+    origin: Floats
     size: tuple[float, float, float]
     outdoor: bool
     quads: list[Quad] = field(default_factory=list)
-    blockers: list[tuple[Array, Array, float]] = field(default_factory=list)  # center, half sizes, yaw
-    lamps: list[Array] = field(default_factory=list)
+    blockers: list[tuple[Floats, Floats, float]] = field(default_factory=list)  # center, half sizes, yaw
+    lamps: list[Floats] = field(default_factory=list)
 
     @cached_property
-    def blocker_bounds(self) -> tuple[Array, Array]:
+    def blocker_bounds(self) -> tuple[Floats, Floats]:
         """The lowest and the highest corners (N, 3) of upright boxes around the blockers, for a scene that is built."""
         centers = np.array([center for center, _, _ in self.blockers]).reshape(-1, 3)
         halves = np.array([half for _, half, _ in self.blockers]).reshape(-1, 3)

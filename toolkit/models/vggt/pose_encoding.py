@@ -8,10 +8,10 @@ VGGT's own frame, close to that of the first view, in an arbitrary unit.
 import numpy as np
 from numpy.typing import ArrayLike
 
-from toolkit.geometry import Array, quaternion_to_rotation
+from toolkit.geometry import Floats, quaternion_to_rotation
 
 
-def cameras_from_pose_encoding(pose_enc: ArrayLike, size: tuple[int, int]) -> tuple[Array, Array]:
+def cameras_from_pose_encoding(pose_enc: ArrayLike, size: tuple[int, int]) -> tuple[Floats, Floats]:
     """Return `cam_from_world` (..., 3, 4) and intrinsics K (..., 3, 3), pixels, of pose encodings (..., 9).
 
     A field of view of 0, to which the network clamps negative ones, gives an infinite focal length.
@@ -36,7 +36,7 @@ def cameras_from_pose_encoding(pose_enc: ArrayLike, size: tuple[int, int]) -> tu
     return np.concatenate([rotation, encoding[..., :3, None]], axis=-1), intrinsics
 
 
-def unproject_depth(depth: ArrayLike, cam_from_world: ArrayLike, intrinsics: ArrayLike) -> Array:
+def unproject_depth(depth: ArrayLike, cam_from_world: ArrayLike, intrinsics: ArrayLike) -> Floats:
     """Return the world point of each pixel of depth maps, (S, H, W, 3).
 
     As in the official code, the center of the first pixel is (0, 0) here, not (0.5, 0.5) as elsewhere in this toolkit:

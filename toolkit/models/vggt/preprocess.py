@@ -11,7 +11,7 @@ from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from toolkit.errors import ImageError
-from toolkit.geometry import Array
+from toolkit.geometry import Floats, Ints
 from toolkit.models.vit import PATCH
 
 SIDE = 518
@@ -29,11 +29,11 @@ class Views:
 
     images: Tensor
     """(S, 3, H, W) float32, RGB in [0, 1]."""
-    scale: Array
+    scale: Floats
     """(S, 2): for x and y. The point (x, y) of the given image i is at scale[i] * (x, y) + offset[i] in images[i]."""
-    offset: Array
+    offset: Floats
     """(S, 2), network pixels."""
-    sizes: NDArray[np.int64]
+    sizes: Ints
     """(S, 2): width and height of the given images."""
 
 
