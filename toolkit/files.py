@@ -186,7 +186,6 @@ def read_references(path: str | Path, *needed: str) -> list[dict[str, Any]]:
     those that the toolkit writes have the keys that the retrieve stage describes.
 
     Args:
-        path: the file.
         needed: further keys that each row must have.
 
     Raises:

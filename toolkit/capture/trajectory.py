@@ -43,7 +43,6 @@ class Trajectory:
     ) -> None:
         """
         Args:
-            device_ids: N texts.
             covariances: (N, 6, 6), or None.
             source: the file to read the covariances from when they are first needed.
         """

@@ -74,7 +74,6 @@ class Vlad:
         Args:
             features: yields the features of the same images in the same order each time it is called. It is called
                 twice, so that memory does not grow with the number of local features.
-            count: number of these images.
 
         Raises:
             ToolkitError: the images have no local features.

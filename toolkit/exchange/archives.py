@@ -21,8 +21,6 @@ def unpack(archive: Path, target: Path, place: Callable[[list[str]], str | None]
     """Unpack a zip archive into a new folder, and refuse one that would write anywhere else.
 
     Args:
-        archive: the zip file.
-        target: folder to make.
         place: returns the path in the folder (with `/`) for the parts of a member's path, or None to leave it out.
         name: of the archive, for messages and the progress bar; its file name when not given.
 

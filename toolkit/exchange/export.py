@@ -34,9 +34,6 @@ def export_colmap(
     that of its first camera, as COLMAP wants it; rigs with the same cameras at the same places are one rig.
 
     Args:
-        run: the run folder.
-        scene: the capture's name.
-        device: whose map.
         out: folder of the model; it must be empty or absent.
         capture: the capture, where it is no longer where the run found it.
 
@@ -105,8 +102,6 @@ def colmap_model(local_map: LocalMap, session: Session, keypoints: Keypoints) ->
     """Return a map as a COLMAP model.
 
     Args:
-        local_map: the map of the session.
-        session: what the images were taken with.
         keypoints: by image name, (n, 2) pixels that the map's observations count through.
 
     Raises:
@@ -187,8 +182,6 @@ def export_table(session: Session, out: str | Path, ground_truth: bool = False) 
     cameras only; an image without a pose is left out where others have one.
 
     Args:
-        session: the session.
-        out: the CSV file.
         ground_truth: write the poses of `session.ground_truth`; else those of a map session's `session.trajectory`,
             and none for queries.
     """
@@ -219,9 +212,6 @@ def export_pairs(
     Names are relative to the capture's folder `sessions`, as those of `export_colmap`.
 
     Args:
-        run, scene: the run folder, and the capture's name.
-        map_device, query_device: the pair.
-        out: the text file.
         topk: so many references a query; None: all that were retrieved.
 
     Raises:

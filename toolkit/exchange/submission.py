@@ -220,7 +220,6 @@ class Captures(dict[str, Capture]):
     def __init__(self, runs: Iterable[Path], given: Iterable[str | Path], scenes: Sequence[str]) -> None:
         """
         Args:
-            runs: run folders.
             given: capture folders that the user gives; each has the name of one of the `scenes`.
 
         Raises:

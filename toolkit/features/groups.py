@@ -74,7 +74,6 @@ class GroupWriter:
     def __init__(self, path: Path, made_by: Mapping[str, Any], attributes: Mapping[str, Any] | None = None):
         """
         Args:
-            path: the file.
             made_by: JSON; what all groups were made by. Groups that were made by something else are not kept.
             attributes: of the file, for other readers.
         """
@@ -125,9 +124,7 @@ class GroupWriter:
         """Write a group.
 
         Args:
-            name: of the group.
             made_from: fingerprint of what it was made from, besides what the file was made by.
-            arrays: by name.
             attributes: of some of the arrays.
             note: about the group, any JSON; `notes` returns it.
         """

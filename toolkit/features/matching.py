@@ -135,7 +135,6 @@ def create_local_methods(
     """Return kinds of local features, with their networks ready.
 
     Args:
-        features: the kinds and how they are extracted.
         matcher: how they are matched; `mutual` takes the limits of the kind.
         device, dtype: of networks, see `create_extractor`.
 

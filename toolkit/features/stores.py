@@ -73,7 +73,6 @@ def _from_arrays(arrays: Mapping[str, NDArray[Any]], offset: np.float32, quantiz
     """Return the features of an image that a file has; hloc's files may lack scores and scales.
 
     Args:
-        arrays: what the image's group holds.
         offset: what makes the center of the top-left pixel 0.5.
         quantized: the descriptors were bytes.
 
@@ -152,8 +151,6 @@ class FeatureStore(Mapping[str, LocalFeatures]):
         """Open all features of a session that were extracted.
 
         Args:
-            out: folder of all features.
-            session_id: the session's.
             settings: of the extractor; None: of SIFT.
 
         Raises:
@@ -221,9 +218,7 @@ def extract_session(
         out: folder of all features; this session's go to `features_path`.
         extractor: how to extract; None: SIFT.
         rows: rows of `session.images` that are needed; None: all.
-        workers: threads.
         skip_existing: reuse the features of images that have not changed since.
-        progress: show a progress bar.
 
     Returns:
         The store of the features of these rows. Unreadable images are in its `failed`.
@@ -301,8 +296,6 @@ def matches_path(out: str | Path, session0: str, session1: str, made_by: Mapping
     """Return the file of the matches of two sessions.
 
     Args:
-        out: folder of all matches.
-        session0, session1: the sessions' ids.
         made_by: settings of the `features`, each by session, and of the `matcher`.
     """
     features, matcher = made_by["features"][0].get("name", "features"), made_by["matcher"]["name"]
@@ -376,9 +369,7 @@ def match_sessions(
     Args:
         stores: features of the first images and of the second ones.
         pairs: names of images, the first session's first.
-        matcher: how to match.
         out: folder of all matches, see `matches_path`.
-        sessions: the sessions' ids.
         skip_existing: reuse the matches of features that have not changed since.
 
     Returns:
@@ -412,7 +403,6 @@ def group_names(pairs: Iterable[tuple[str, str]], existing: Container[str] = ())
     of hloc's layout do not find.
 
     Args:
-        pairs: names of images.
         existing: groups that the file has.
     """
     shared = {pair: _shared_group(*pair) for pair in pairs}

@@ -55,9 +55,7 @@ def load_network(
     """Return a network of `transformers` with official weights, float32, on the CPU, ready to use.
 
     Args:
-        source: its weights.
         checkpoint: the official file, or its tensors by name; None: the hub's cache, else a download.
-        build: makes the network from the package.
         ignore: prefixes of tensors in the file that the network does not use.
 
     Raises:
@@ -97,7 +95,6 @@ class SuperPointExtractor:
             dtype: of the encoder: `float32`, `bfloat16`, `float16`; `auto`: the fastest on the device. The heads are
                 always float32, so that neighboring pixels do not tie.
             batch_size: most images at a time; None: as suits the device.
-            settings: how features are extracted.
 
         Raises:
             WeightsError: no weights, or other ones.

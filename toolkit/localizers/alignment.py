@@ -210,7 +210,6 @@ def query_pose(alignment: Alignment, model_from_query: ArrayLike) -> tuple[Float
     unknown, for everything if the alignment is unknown.
 
     Args:
-        alignment: of `align_to_map`.
         model_from_query: (4, 4) predicted with the references, in their frame.
 
     Returns:
@@ -257,7 +256,6 @@ def is_trustworthy(
     references agrees on another alignment.
 
     Args:
-        alignment: the alignment that the pose came from.
         covariance: (6, 6) of the pose, as `query_pose` gives it.
         max_position_std_m: limit of the root of the trace of the position's covariance.
         max_rotation_std_deg: limit of the root of the trace of the rotation's covariance.

@@ -64,7 +64,6 @@ class FeedForwardLocalizer:
     ):
         """
         Args:
-            local_map: the map of the session.
             session: where the map's images and depth maps are.
             turns: what makes images upright; None: they are shown as they are.
         """

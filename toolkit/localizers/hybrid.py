@@ -50,10 +50,6 @@ class HybridLocalizer:
         that is not `ok`, and features placed by a capture's depth maps, or by predicted depth too, support a pose
         better. `vggt`: the predicted pose itself, where matching finds none, or only an uncertain one that a certain
         prediction contradicts.
-
-        Args:
-            query, references: see `Localizer`.
-            prediction: what `predict` returned; None: the network is asked here.
         """
         answer = self.predict([(query, references)])[0] if prediction is None else prediction
         predicted = answer.estimate

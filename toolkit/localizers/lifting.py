@@ -64,7 +64,6 @@ class DepthLifter:
         """
         Args:
             pnp: of several kinds of features, those of the first are lifted and matched.
-            feed_forward: on the same map.
         """
         self._first, self._pnp, self._feed_forward = pnp.matcher.mapped[0], pnp, feed_forward
 

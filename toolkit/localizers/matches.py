@@ -49,7 +49,6 @@ class MappedFeatures:
             features: of the map's images, by name.
             kind: what is peculiar to these features.
             matcher: of a query image with a reference; None: mutual nearest neighbors, as suits the kind.
-            name: of the kind.
         """
         self.map = local_map
         self.features = features
@@ -70,7 +69,6 @@ class MappedFeatures:
         """Match a query image with references; returns keypoints of the query and map points, each (K,).
 
         Args:
-            query: its features.
             references: indices of this map's images.
             settings: how many features `mutual` is given.
             network_matches: matches that a network made before.

@@ -48,8 +48,6 @@ class PnpLocalizer:
         """
         Args:
             mapped: the map's features, one or several kinds; those of several are used together.
-            settings: see `PnpSettings`.
-            seed: of RANSAC.
         """
         self.settings = settings or PnpSettings()
         self.seed = seed
@@ -277,7 +275,6 @@ class PnpLocalizer:
         """Return matches as correspondences, with the places where the first references show their points.
 
         Args:
-            matches: K matches.
             inlier: (K,) whether the pose agrees.
             guided: how many of them, the first, were found near where a pose puts their points.
             references: map images, those that see the most of the inliers first.

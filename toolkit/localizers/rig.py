@@ -96,8 +96,6 @@ class RigQuery:
             matches: K matches.
             points: (P, 3) the map points.
             max_error_deg: largest error of an inlier, as an angle.
-            settings: how much is drawn.
-            seed: of the draws.
             least_inliers: a pose with fewer may be missed.
         """
         if len(np.unique(matches.point)) < 4:

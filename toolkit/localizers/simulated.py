@@ -67,7 +67,6 @@ class SimulatedPredictor:
             position_noise_m: standard deviation of a camera's place, as a length.
             depth_noise: relative standard deviation of each pixel's depth.
             wrong_references: share of the map images that are put anywhere, looking anywhere.
-            seed: of all of it.
         """
         self._sessions = {session.id: session for session in sessions}
         self._map_dir = None if map_dir is None else Path(map_dir)

@@ -22,7 +22,6 @@ def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
     merged key by key, lists and values replaced, and each path counts from the folder of the file that has it.
 
     Args:
-        path: YAML file.
         overrides: `key=value` or `section.key=value`, as deep as the tree of settings is, the value in YAML; merged
             over what the file says.
 

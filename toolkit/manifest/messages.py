@@ -28,8 +28,6 @@ def explain(
     """Return the lines of an error.
 
     Args:
-        error: what pydantic found.
-        model: the model that was validated.
         source: what was validated, for the first line.
         origin: returns what to add of where the value under some keys comes from.
     """

@@ -95,7 +95,6 @@ def find_weights(source: WeightsSource, checkpoint: str | Path | None = None) ->
     """Return the file with the weights if it is on this machine, else None. Does not use the network.
 
     Args:
-        source: the model.
         checkpoint: the file to use, or the folder that holds it under its official name; `~` and `$VARIABLES`
             are expanded. None: search the cache of the hub's library.
 
@@ -125,9 +124,6 @@ def resolve_weights(source: WeightsSource, checkpoint: str | Path | None = None)
 
     A download shows its progress and is compared with the SHA-256 that the hub states. The environment variables of
     the hub's library apply: HF_HOME, HF_ENDPOINT, HF_HUB_OFFLINE, HF_TOKEN and others.
-
-    Args:
-        source, checkpoint: as for `find_weights`.
 
     Raises:
         WeightsError: `checkpoint` is given but missing, or the download failed; says why, and where to put the file.
@@ -225,7 +221,6 @@ def load_checkpoint(
     Args:
         module: has the checkpoint's parameters and buffers, each with its shape and type.
         checkpoint: a file (see `read_state_dict`), or tensors by name.
-        name: of the network, for messages.
         ignore: prefixes of keys that the checkpoint may have and the module does not need.
 
     Raises:

@@ -81,7 +81,6 @@ def draw_matrices(
     Args:
         table: one row a pair.
         columns: for each panel a column's name, title, factor and unit.
-        title: of the figure.
         better: `higher` or `lower`: which values are good, shown light to dark.
         limits: range of the colors after the factor; None: of the values.
     """

@@ -113,10 +113,7 @@ def draw_references(sessions_root: str | Path, jsonl: str | Path, samples: int =
     """Return a figure of some query images of a pair, each beside its first references.
 
     Args:
-        sessions_root: folder `sessions` of the capture.
         jsonl: the retrieval of a pair, `<scene>_map_<M>_query_<Q>.jsonl`.
-        samples: queries shown, evenly spread.
-        references: references shown of each.
     """
     lines = read_references(jsonl)
     chosen = np.unique(np.linspace(0, len(lines) - 1, min(samples, len(lines))).round().astype(int))
@@ -132,10 +129,8 @@ def draw_reranked(
     Queries that another reference leads now come first.
 
     Args:
-        sessions_root: folder `sessions` of the capture.
         jsonl: the reranked references of a pair, `<scene>_map_<M>_query_<Q>.jsonl`.
         retrieved: those of the retrieval stage.
-        samples: queries shown.
         references: references shown of each, before and after.
     """
     before, after = read_references(retrieved), read_references(jsonl)

@@ -21,7 +21,6 @@ def show_recording(path: str | Path, still: str | Path | None = None, height: in
     saved pages do not keep what a viewer shows.
 
     Args:
-        path: recording, `.rrd`.
         still: picture of the same, for the saved page.
         height: of the viewer, pixels.
 

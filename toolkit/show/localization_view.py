@@ -59,12 +59,9 @@ def record_localizations(
     `world/chosen_points`, and a page about it, `about`. Errors are colored by `figures.error_colors`.
 
     Args:
-        out: file to write.
-        name: of the recording.
         map_poses: world_from_cam (N, 4, 4) of the map's images; NaN rows are passed over.
         points: (P, 3), meters.
         colors: (P, 3) RGB or None.
-        localizations: all queries.
         details: number and details of those that can be chosen; taken one at a time.
         up: direction (3,) that is up; None: estimated from the map's cameras.
         image_size: longer side of the images, pixels.

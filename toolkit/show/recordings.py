@@ -115,13 +115,11 @@ def record_session(
     timestamp of the files.
 
     Args:
-        scene: capture folder.
         split: `map` or `query`.
         device: device key; with `split` it names the session.
         subsession: `all`, or one.
         keyframes_only: only frames in the session's keyframe list `queries`.
         every: every so many frames (after `keyframes_only`).
-        spawn: open the viewer when done.
         vis_retrieve_queries: with `queries_pose`, join each query with the references that it was localized by; they
             are read from the `.h5` file beside it.
         queries_pose: trajectories file, world_from_device of queries. In a query session, cameras stand where it
@@ -130,12 +128,10 @@ def record_session(
         map_dir: folder of triangulated maps: the points of the session's map are shown; of a query session, the
             points of the map that `queries_pose` is named after. With `queries_pose`, of the maps that it was found
             with; else of all of the session.
-        queries: keyframe list.
         image_size: longer side of the images shown, pixels; depth maps have half of it.
         quality: of JPEG, 1 to 100.
         world_up: direction (3,) that is up; None: estimated from the cameras.
         workers: threads that read and shrink; None: the cores at hand.
-        progress: show a bar.
 
     Raises:
         CaptureError: unknown session, subsession or keyframe list.

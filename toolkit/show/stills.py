@@ -63,7 +63,6 @@ def draw_scene_png(
         true: the same, true; NaN where it is not known.
         out: PNG to write; None: no file.
         up: direction (3,) that is up; None: estimated from the map's cameras.
-        title: of the figure.
         max_places: panels at most; the places with the most map images.
         max_points: points drawn at most in all, a regular choice.
         map_tracks: ways of the map's devices, (n, 3) each, drawn as lines.
@@ -195,7 +194,6 @@ def draw_worst(
     Args:
         queries: the worst first.
         out: PNG to write; None: no file.
-        title: of the figure.
     """
     columns = 2 if len(queries) > 1 else 1
     rows = max(1, -(-len(queries) // columns))

@@ -32,7 +32,6 @@ def draw_prediction(
     """Draw one query image with its references, and where its network's cameras lie in the map; return the figure.
 
     Args:
-        localizer: that gave the answer.
         query, answer: of one query device.
         camera: which of its images; None: the first with the most consistent references.
         up: direction (3,) that is up; None: estimated from the map's cameras.

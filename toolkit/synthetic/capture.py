@@ -191,7 +191,6 @@ def render_capture(
         rooms: how many rooms, at least 1.
         frames: frames (rig poses) a room and map session, at least 2; query sessions have half as many.
         seed: of everything; the same seed gives the same bytes.
-        progress: whether to show a bar.
         look_alikes: whether doors, windows, shelves, cabinets and crates come in few models, the same in all rooms,
             which are easily taken for one another.
 

@@ -147,7 +147,6 @@ def dense_output(
     """Return the values (B, S, H, W, out - 1) before activation, and the confidence (B, S, H, W), above 1.
 
     Args:
-        head: the head.
         layers: tokens (B, S, T, C) by layer.
         read: the four layers that the head reads.
         size: (H, W) of the images.
