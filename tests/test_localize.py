@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -19,6 +19,7 @@ from toolkit.capture import Capture, Trajectory
 from toolkit.capture.images import read_image
 from toolkit.embed import embed_sessions
 from toolkit.errors import ArtifactError, CaptureError, ImageError, ManifestError, ToolkitError
+from toolkit.features import groups
 from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor, SiftSettings
 from toolkit.features.matching import MATCHERS, MutualMatcher, unit_descriptors
 from toolkit.features.stores import extract_session
@@ -343,6 +344,29 @@ def test_a_torn_part_costs_at_most_what_it_held(
     run_stage(small_capture, run, query_device="ios")
     assert len(calls) == 3
     assert run.poses_txt("ios", "ios").read_bytes() == finished[0].poses_txt("ios", "ios").read_bytes()
+
+
+@pytest.mark.parametrize("torn", ["the table", "the record of the correspondences"])
+def test_a_run_killed_at_its_end_leaves_no_files_of_two_runs(small_capture: Path, run: SceneFiles, torn: str) -> None:
+    run_stage(small_capture, run, query_device="ios")
+    before = run.poses_txt("ios", "ios").read_bytes()
+    path = run.poses_txt("ios", "ios").with_suffix(".h5")
+
+    write_sidecar = groups.write_sidecar
+
+    def killed(written: Path, *content: Any) -> None:
+        if torn == "the table" or written == path:
+            raise KeyboardInterrupt
+        write_sidecar(written, *content)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(*((localize, "_write_poses") if torn == "the table" else (groups, "write_sidecar")), killed)
+        with pytest.raises(KeyboardInterrupt):
+            run_stage(small_capture, run, query_device="ios", method="nearest")
+    assert not run.poses_txt("ios", "ios").exists()
+    run_stage(small_capture, run, query_device="ios")
+    assert run.poses_txt("ios", "ios").read_bytes() == before
+    assert all(query.correspondences.inlier.any() for query in LocalizedQueries(path).values())
 
 
 def test_progress_of_another_question_is_not_taken_over(small_capture: Path, run: SceneFiles) -> None:

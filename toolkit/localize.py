@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pandas as pd
 from threadpoolctl import threadpool_limits
@@ -27,6 +26,7 @@ from toolkit.files import (
     is_current,
     pair_name,
     read_references,
+    sidecar_path,
     write_atomic,
     write_sidecar,
 )
@@ -284,11 +284,11 @@ class _PairRun:
             answers = prefetch(self._localize, self._predicted(todo), self.workers)
             for number, row, localized in tqdm(answers, total=len(todo), desc=progress, unit="query"):
                 writer.add(groups[number], arrays=localized.arrays(), note=row)
+            # From here until the new poses are there, a kill must not leave poses of one run with a file of another.
+            for poses in (self.pair.file("txt"), sidecar_path(self.pair.file("txt"))):
+                poses.unlink(missing_ok=True)
             writer.finish()
             rows = writer.notes()
-        if not path.exists():  # no query at all
-            with write_atomic(path) as temporary, h5py.File(temporary, "w") as file:
-                file.attrs.update(attributes(self.place, self.pair.retrieval_dir))
         return [rows[group] for group in groups]
 
     def _predicted(self, numbers: Sequence[int]) -> Iterator[tuple[int, Query, list[References], Any, float]]:

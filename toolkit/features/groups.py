@@ -181,6 +181,8 @@ class GroupWriter:
     def _join(self) -> None:
         joined = Index() if self._whole is None else self._whole
         parts = dict(self._parts)
+        if self._whole is None:  # a kill before the new record is there must not leave the old one with the new file
+            sidecar_path(self.path).unlink(missing_ok=True)
         with write_atomic(self.path) as temporary:
             if self._whole is None:
                 first = next(iter(parts))
