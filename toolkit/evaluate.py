@@ -379,11 +379,8 @@ def overlap_table(
     into the reference's view.
 
     Args:
-        sessions_root: folder `sessions/` of the capture.
+        sessions_root, map_dir, map_device, query_device, pairs: as for `evaluate_scene`.
         references: folders of references (`SCENE_map_<M>_query_<Q>.jsonl`) by the names of their columns.
-        map_dir: folder of the triangulated maps.
-        map_device: `all` or one device key; likewise `query_device`.
-        pairs: only these [map device, query device]; None: all.
         poses_dir: folder of the poses, which name the maps that they were found with; None: any map of the device.
 
     Returns:

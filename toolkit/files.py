@@ -51,11 +51,8 @@ def fingerprint(value: Any) -> str:
 
 def file_fingerprint(path: str | Path) -> str:
     """Return 16 hex digits that identify a file's content by its bytes."""
-    digest = hashlib.sha256()
     with open(path, "rb") as stream:
-        while block := stream.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()[:16]
+        return hashlib.file_digest(stream, "sha256").hexdigest()[:16]
 
 
 def files_fingerprint(paths: list[Path]) -> str:

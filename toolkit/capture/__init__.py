@@ -6,18 +6,3 @@ from toolkit.capture.session import RAW_DATA, Session
 from toolkit.capture.tables import COLUMNS
 from toolkit.capture.trajectory import Trajectory
 from toolkit.capture.writing import DEPTH_SCALE, read_depth, write_depth, write_session
-
-__all__ = [
-    "CAMERA_TYPES",
-    "COLUMNS",
-    "DEPTH_SCALE",
-    "RAW_DATA",
-    "Capture",
-    "Session",
-    "Trajectory",
-    "camera_text",
-    "parse_camera",
-    "read_depth",
-    "write_depth",
-    "write_session",
-]

@@ -16,7 +16,7 @@ from toolkit.errors import ArtifactError, ManifestError
 from toolkit.exchange.submission import Captures
 from toolkit.features.stores import FeatureStore
 from toolkit.files import SceneFiles, image_name, pair_name, read_references, write_atomic, write_text
-from toolkit.geometry import Floats, Ints, invert, qt_from_pose
+from toolkit.geometry import Floats, invert, qt_from_pose
 from toolkit.localizers.correspondences import LocalizedQueries
 from toolkit.localizers.local_map import LocalMap
 
@@ -115,7 +115,10 @@ def colmap_model(local_map: LocalMap, session: Session, keypoints: Keypoints) ->
     sensors = session.images["sensor_id"].to_numpy(str)[rows]
     model = pycolmap.Reconstruction()
     rigs: dict[object, tuple[int, list[int]]] = {}  # ids of each rig and of its cameras
-    for frame_id, members in enumerate(_frames(session, rows), start=1):
+    # The images of each device at each time, cameras in order of their ids.
+    images = session.images.iloc[rows][["timestamp", "sensor_id"]].assign(device=session.device_ids[rows])
+    by_frame = images.reset_index(drop=True).sort_values("sensor_id", kind="stable").groupby(["timestamp", "device"])
+    for frame_id, members in enumerate((group.index.tolist() for _, group in by_frame), start=1):
         # Rig ids are often made anew for each frame; the cameras and their places say which rig it is.
         rig_from_cams = session.rig_from_cam(rows[members])
         first_from_cams = invert(rig_from_cams[0]) @ rig_from_cams
@@ -143,13 +146,6 @@ def colmap_model(local_map: LocalMap, session: Session, keypoints: Keypoints) ->
         model.add_point3D(xyz, track, color)
     model.update_point_3d_errors()
     return model
-
-
-def _frames(session: Session, rows: Ints) -> list[list[int]]:
-    """Return the positions in `rows` of the images of each device at each time, cameras in order of their ids."""
-    images = session.images.iloc[rows][["timestamp", "sensor_id"]].assign(device=session.device_ids[rows])
-    by_frame = images.reset_index(drop=True).sort_values("sensor_id", kind="stable").groupby(["timestamp", "device"])
-    return [group.index.tolist() for _, group in by_frame]
 
 
 def _add_rig(

@@ -93,15 +93,11 @@ def matchers_of(features: Sequence[str], matcher: str | None = None) -> dict[str
 
 
 class MutualMatcher:
-    """Matches mutual nearest neighbors that pass Lowe's ratio test, of any descriptors."""
+    """Matches mutual nearest neighbors that pass Lowe's ratio test, of any descriptors; see `mutual_matches`."""
 
     batch_size = 1
 
     def __init__(self, ratio: float = 0.8, min_score: float = -1.0):
-        """
-        Args:
-            ratio, min_score: see `mutual_matches`.
-        """
         self.ratio = ratio
         self.min_score = min_score
 

@@ -303,13 +303,12 @@ def matches_path(out: str | Path, session0: str, session1: str, made_by: Mapping
 
 
 class MatchStore:
-    """Read access to the matches of two sessions' images. Safe to use from several threads."""
+    """Read access to the matches of two sessions' images, in a file of the toolkit or of hloc.
+
+    Safe to use from several threads.
+    """
 
     def __init__(self, path: str | Path):
-        """
-        Args:
-            path: a file of the toolkit or of hloc.
-        """
         self.path = Path(path)
         self._file: h5py.File | None = None
         self._lock = threading.Lock()

@@ -143,7 +143,9 @@ class SuperPointExtractor:
             fitting = self._fitting.setdefault(size, Fitting(partial(self._forward, size=size), "images"))
             for start in range(0, len(numbers), self.batch_size):
                 part = numbers[start : start + self.batch_size]
-                batch = torch.from_numpy(np.stack([_pad(prepared[number]) for number in part]))
+                # Whole cells: the last column and row are repeated, so that the image's border is no edge.
+                margins = [(0, 0), *((0, -side % _CELL) for side in size)]
+                batch = torch.from_numpy(np.pad(np.stack([prepared[number] for number in part]), margins, mode="edge"))
                 with torch.inference_mode():
                     packed = fitting(batch.to(self._device)).cpu().numpy()
                 for number, rows in zip(part, packed, strict=True):
@@ -190,11 +192,6 @@ class SuperPointExtractor:
             elif not features.isfinite().all():
                 row[0] = torch.nan  # what is not finite is above no threshold
         return packed
-
-
-def _pad(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return an image of whole cells: its last column and row repeated, so that its border is no edge."""
-    return np.pad(image, [(0, -side % _CELL) for side in image.shape], mode="edge")
 
 
 def _unpack(rows: NDArray[np.float32], size: tuple[int, int], shape: tuple[int, ...]) -> LocalFeatures:

@@ -24,11 +24,6 @@ class Verifier:
     """
 
     def __init__(self, settings: RerankSettings, matcher: Matcher, store: Mapping[str, LocalFeatures]):
-        """
-        Args:
-            settings, matcher: how to verify and to match.
-            store: the features of the map images.
-        """
         self.settings = settings
         self.matcher = matcher
         self.store = store

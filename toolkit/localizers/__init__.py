@@ -2,5 +2,3 @@
 
 from toolkit.localizers.base import Localizer, PoseEstimate, Query, References, View
 from toolkit.localizers.map import Map, create_localizer
-
-__all__ = ["Localizer", "Map", "PoseEstimate", "Query", "References", "View", "create_localizer"]

@@ -62,11 +62,7 @@ class FeedForwardLocalizer:
         settings: PredictorSettings | None = None,
         turns: Turns | None = None,
     ):
-        """
-        Args:
-            session: where the map's images and depth maps are.
-            turns: what makes images upright; None: they are shown as they are.
-        """
+        """`session` has the map's images and depth maps; `turns` makes images upright, None leaves them as they are."""
         self.map = local_map
         self.predictor = predictor
         self.settings = settings or PredictorSettings()

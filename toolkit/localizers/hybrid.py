@@ -19,11 +19,6 @@ class HybridLocalizer:
     """Adds a prediction to the hypotheses of a `PnpLocalizer`, and depth where its points do not suffice."""
 
     def __init__(self, pnp: PnpLocalizer, feed_forward: FeedForwardLocalizer):
-        """
-        Args:
-            pnp: matches with triangulated points.
-            feed_forward: of the same map.
-        """
         self.pnp = pnp
         self.feed_forward = feed_forward
         self.lifter = DepthLifter(pnp, feed_forward)

@@ -58,13 +58,12 @@ class LiftedMap:
 
 
 class DepthLifter:
-    """Lifts the features of one map's images, and localizes with them. Safe to use from several threads."""
+    """Lifts the features of one map's images, those of the first kind that `pnp` has, and localizes with them.
+
+    Safe to use from several threads.
+    """
 
     def __init__(self, pnp: PnpLocalizer, feed_forward: FeedForwardLocalizer) -> None:
-        """
-        Args:
-            pnp: of several kinds of features, those of the first are lifted and matched.
-        """
         self._first, self._pnp, self._feed_forward = pnp.matcher.mapped[0], pnp, feed_forward
 
     def localize(

@@ -40,15 +40,14 @@ class _Hypothesis:
 
 
 class PnpLocalizer:
-    """Localizes queries in one map by matching. Safe to use from several threads; the map is never changed."""
+    """Localizes queries in one map by matching, with one or several kinds of its features together.
+
+    Safe to use from several threads; the map is never changed.
+    """
 
     batch_size = 1
 
     def __init__(self, mapped: Sequence[MappedFeatures], settings: PnpSettings | None = None, seed: int = 0):
-        """
-        Args:
-            mapped: the map's features, one or several kinds; those of several are used together.
-        """
         self.settings = settings or PnpSettings()
         self.seed = seed
         self.matcher = MapMatcher(mapped, self.settings)
@@ -318,11 +317,9 @@ class PnpLocalizer:
 
     def _rival_support(self, hypotheses: list[_Hypothesis]) -> float:
         """Return the support of the best pose that is another one, relative to the best pose's."""
-        first = hypotheses[0]
-        for other in hypotheses[1:]:
-            if _differ(first, other):
-                return len(other.matches) / max(len(first.matches), 1)
-        return 0.0
+        first, *others = hypotheses
+        rivals = (len(other.matches) for other in others if _differ(first, other))
+        return next(rivals, 0) / max(len(first.matches), 1)
 
     def _ransac(self, query: RigQuery, matches: Matches, max_error_deg: float, least_inliers: int = 0) -> Floats | None:
         return query.ransac(matches, self.map.points, max_error_deg, self.settings, self.seed, least_inliers)

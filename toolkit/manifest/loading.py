@@ -49,7 +49,13 @@ def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
         raw = _map_paths(raw, lambda text, key: str(_expand(text, folder, f"{source}: {key}")))
         manifest = Manifest.model_validate(raw)
     except ValidationError as error:
-        raise ManifestError(explain(error, Manifest, source, _origin(path, chain))) from None
+
+        def origin(keys: list[str]) -> str:
+            """Say of a key that an inherited file is where it stands."""
+            giver = next((file for file, content in reversed(chain) if _has(content, keys)), path)
+            return "" if giver == path else f" (in {giver}, which it inherits)"
+
+        raise ManifestError(explain(error, Manifest, source, origin)) from None
     names = [Path(capture).name for capture in manifest.captures]
     if twice := {name for name in names if names.count(name) > 1}:
         raise ManifestError(
@@ -135,16 +141,6 @@ def _read_override(override: str) -> dict[str, Any]:
     for section in reversed(key.strip().split(".")):
         value = {section: value}
     return dict(value)
-
-
-def _origin(path: Path, chain: Chain) -> Callable[[list[str]], str]:
-    """Return what tells of a key that an inherited file is where it stands."""
-
-    def origin(keys: list[str]) -> str:
-        giver = next((file for file, content in reversed(chain) if _has(content, keys)), path)
-        return "" if giver == path else f" (in {giver}, which it inherits)"
-
-    return origin
 
 
 def _has(content: Any, keys: list[str]) -> bool:

@@ -93,7 +93,8 @@ def draw_scene_png(
         axis.set_visible(False)
     for axis, p, window in zip(panels, shown, windows, strict=False):
         near, here, mine = point_place == p, place == p, query_place == p
-        tint = "#9A9A9A" if shades is None else _muted(shades[near])
+        # Thin points on white are muted: bright ones would not be seen.
+        tint = "#9A9A9A" if shades is None else np.clip(shades[near] / 255 * 0.75 + 0.2, 0, 0.75)
         _dots(axis, cloud[near], s=1.2, c=tint, lw=0, rasterized=True)
         for tracks, color, label in ((map_tracks, MAP, "way of the map's devices"), (query_tracks, TRUE, "true way")):
             for number, track in enumerate(tracks):
@@ -283,12 +284,6 @@ def _window(cloud: Floats, cameras: Floats, queries: Floats) -> Window:
     middle = (low + high) / 2
     (x0, y0), (x1, y1) = middle - half, middle + half
     return (float(x0), float(x1)), (float(y0), float(y1))
-
-
-def _muted(colors: NDArray[np.uint8]) -> Floats:
-    """Return colors for thin points on white: bright ones would not be seen."""
-    rgb = colors.astype(np.float64) / 255
-    return np.clip(rgb * 0.75 + 0.2, 0, 0.75)
 
 
 def _draw_headings(axis: "Axes", positions: Floats, poses: Floats, axes: Floats, window: Window, **style: Any) -> None:

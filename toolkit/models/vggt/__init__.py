@@ -3,5 +3,3 @@
 from toolkit.models.vggt.network import HEADS, VGGT
 from toolkit.models.vggt.pose_encoding import cameras_from_pose_encoding, unproject_depth
 from toolkit.models.vggt.preprocess import Views, load_images
-
-__all__ = ["HEADS", "VGGT", "Views", "cameras_from_pose_encoding", "load_images", "unproject_depth"]
