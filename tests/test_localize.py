@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
 
+import h5py
 import numpy as np
 import pandas as pd
 import pytest
@@ -25,6 +26,7 @@ from toolkit.features.matching import MATCHERS, MutualMatcher, unit_descriptors
 from toolkit.features.stores import extract_session
 from toolkit.files import SceneFiles, sidecar_path
 from toolkit.localize import COLUMNS, Map, localize_image, localize_pairs
+from toolkit.localizers import create_localizer
 from toolkit.localizers import map as maps
 from toolkit.localizers.base import PoseEstimate, View
 from toolkit.localizers.correspondences import LocalizedQueries
@@ -492,6 +494,57 @@ def test_a_picture_of_another_size_than_its_camera_is_refused(small_capture: Pat
         localize_image(opened, np.zeros((20, 10), np.uint8), camera)
     with pytest.raises(ImageError, match="not found"):
         localize_image(opened, "nowhere.jpg", camera)
+
+
+def test_a_run_whose_capture_has_moved_opens_after_the_next_run(
+    capture: Path, run: SceneFiles, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_stage(capture, run, query_device="ios")
+    moved = capture.parent.with_name("moved") / capture.name
+    capture.parent.rename(moved.parent)
+    calls = spy(monkeypatch)
+    assert run_stage(moved, run, query_device="ios", compute_device="cpu")["skipped"].all()
+    assert not calls
+    place = Map.open(run.run, run.scene, "ios")
+    assert place.session.path == moved / "sessions" / "ios_map"
+    assert place.settings.compute_device == "cpu", "as the last run had it"
+    path = run.poses_txt("ios", "ios").with_suffix(".h5")
+    assert all(query.correspondences.inlier.any() for query in LocalizedQueries(path).values())
+    stamp = path.stat().st_mtime_ns
+    run_stage(moved, run, query_device="ios", compute_device="cpu")
+    assert path.stat().st_mtime_ns == stamp
+
+
+@pytest.mark.parametrize("content", [b"torn", b""])
+def test_a_run_with_a_torn_file_of_correspondences_says_so(
+    small_capture: Path, run: SceneFiles, content: bytes
+) -> None:
+    run_stage(small_capture, run, query_device="ios")
+    path = run.poses_txt("ios", "ios").with_suffix(".h5")
+    if content:
+        path.write_bytes(content)
+    else:
+        h5py.File(path, "w").close()
+    with pytest.raises(ArtifactError, match=path.name):
+        Map.open(run.run, run.scene, "ios")
+
+
+def test_a_map_without_points_is_refused(small_capture: Path, run: SceneFiles) -> None:
+    run_stage(small_capture, run, query_device="ios", method="nearest")
+    place = Map.open(run.run, run.scene, "ios")
+    with pytest.raises(ArtifactError, match=r"'nearest'.*'pnp'"):
+        create_localizer(LocalizeSettings(), place)
+
+
+def test_a_localizer_of_another_method_sees_images_upright_as_its_settings_say(
+    opened: Map, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directions: list[object] = []
+    monkeypatch.setattr(maps, "upright_turns", lambda _, direction: directions.append(direction))
+    for predictor in ({"name": "simulated"}, {"name": "simulated", "upright": False}):
+        settings = {"method": "vggt", "predictor": predictor, "world_up": [0, 0, 1]}
+        create_localizer(LocalizeSettings.of(opened.settings, settings), opened)
+    assert directions == [[0, 0, 1]]
 
 
 def test_the_map_of_an_unfinished_run(finished: tuple[SceneFiles, pd.DataFrame]) -> None:

@@ -33,7 +33,15 @@ from toolkit.files import (
 from toolkit.localizers.base import Localizer, NetworkMatches, PoseEstimate, Query, References, View
 from toolkit.localizers.correspondences import LocalizedQuery, query_group
 from toolkit.localizers.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
-from toolkit.localizers.map import Map, attributes, create_localizer, label, open_predictor, session_fingerprint
+from toolkit.localizers.map import (
+    Map,
+    attributes,
+    create_localizer,
+    label,
+    open_predictor,
+    session_fingerprint,
+    update_attributes,
+)
 from toolkit.localizers.mapping import map_settings
 from toolkit.localizers.picture import localize_image
 from toolkit.localizers.prediction import Predictor
@@ -108,6 +116,7 @@ def localize_pairs(
                 started = time.perf_counter()
                 pair = _Pair(capture, mapped, queried, Path(retrieval_dir), Path(out_dir), queries)
                 record = pair.record(settings, kinds, predictor)
+                about = attributes(settings, kinds, capture, mapped, pair.retrieval_dir)
                 skipped = skip_existing and pair.is_current(record)
                 if not skipped:
                     if localizer is None:
@@ -117,8 +126,9 @@ def localize_pairs(
                         )  # fmt: skip
                         localizer = create_localizer(settings, place, predictor)
                     run = _PairRun(pair, place, localizer, Path(features_dir), workers, skip_existing)
-                    _write_poses(pair, run.localize(record), settings)
+                    _write_poses(pair, run.localize(record, about), settings)
                     write_sidecar(pair.file("txt"), record)
+                update_attributes(pair.file("h5"), about)
                 counts = pd.read_csv(pair.file("csv"))["status"].str.split(":").str[0].value_counts()
                 table.append(
                     {
@@ -270,11 +280,11 @@ class _PairRun:
 
         return [None if store is None else of(store) for store in self.matches]
 
-    def localize(self, record: dict[str, Any]) -> list[dict[str, Any]]:
+    def localize(self, record: dict[str, Any], about: Mapping[str, str]) -> list[dict[str, Any]]:
         """Localize the queries that a killed run has not; returns a row for each, in the list's order."""
         path = self.pair.file("h5")
         groups = [query_group(*key) for key in self.keys]
-        with GroupWriter(path, record, attributes(self.place, self.pair.retrieval_dir)) as writer:
+        with GroupWriter(path, record, about) as writer:
             if not self.skip_existing:
                 writer.discard()
             done = writer.notes()

@@ -2,7 +2,8 @@
 
 import json
 import logging
-from collections.abc import Sequence
+import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,7 +23,7 @@ from toolkit.features.features import KINDS
 from toolkit.features.matching import LocalMethod, create_local_methods
 from toolkit.features.stores import FeatureStore, as_stored, extract_session
 from toolkit.features.verification import Verifier
-from toolkit.files import SceneFiles, file_fingerprint, fingerprint, image_name
+from toolkit.files import SceneFiles, file_fingerprint, fingerprint, image_name, write_atomic
 from toolkit.geometry import unit
 from toolkit.localizers.base import Localizer, References
 from toolkit.localizers.correspondences import MAPS
@@ -144,9 +145,7 @@ class Map:
     @cached_property
     def turns(self) -> Turns | None:
         """What makes the capture's images upright; None where the network sees them as they are."""
-        settings = self.settings
-        show_upright = settings.predicts and settings.predictor.upright
-        return upright_turns(self.capture, settings.world_up) if show_upright else None
+        return _turns(self.settings, self.capture)
 
     @cached_property
     def localizer(self) -> Localizer:
@@ -306,6 +305,11 @@ def open_predictor(settings: LocalizeSettings, capture: Capture, map_dir: Path) 
     return predictor
 
 
+def _turns(settings: LocalizeSettings, capture: Capture) -> Turns | None:
+    show_upright = settings.predicts and settings.predictor.upright
+    return upright_turns(capture, settings.world_up) if show_upright else None
+
+
 def create_localizer(settings: LocalizeSettings, map: Map, predictor: Predictor | None = None) -> Localizer:  # noqa: A002
     """Return what localizes queries in a map by `settings.method`.
 
@@ -315,6 +319,7 @@ def create_localizer(settings: LocalizeSettings, map: Map, predictor: Predictor 
         predictor: of `vggt` and `hybrid`; None: opened as the settings say.
 
     Raises:
+        ArtifactError: the map is of a run of `nearest` and has no points.
         WeightsError: the network has no weights.
     """
     if settings.method == "nearest":
@@ -323,12 +328,18 @@ def create_localizer(settings: LocalizeSettings, map: Map, predictor: Predictor 
         poses = session.world_from_cam(rows)
         posed = np.isfinite(poses).reshape(-1, 16).all(axis=1)
         return NearestLocalizer([session.image_name(int(row)) for row in rows[posed]], poses[posed])
+    if not map.mapped:
+        raise ArtifactError(
+            f"The map of {map.device!r} is of a run of the method {map.settings.method!r} and has no points, which the "
+            f"method {settings.method!r} needs. Localize with that method first."
+        )
     pnp = PnpLocalizer(map.mapped, settings.pnp, settings.seed)
     if not settings.predicts:
         return pnp
     predictor = predictor or open_predictor(settings, map.capture, map.map_dir)
     local_map = map.mapped[0].map
-    feed_forward = FeedForwardLocalizer(local_map, map.session, predictor, settings.predictor, map.turns)
+    turns = map.turns if settings == map.settings else _turns(settings, map.capture)
+    feed_forward = FeedForwardLocalizer(local_map, map.session, predictor, settings.predictor, turns)
     return feed_forward if settings.method == "vggt" else HybridLocalizer(pnp, feed_forward)
 
 
@@ -339,12 +350,32 @@ def label(settings: LocalizeSettings, found_by: str) -> str:
     return found_by or settings.method
 
 
-def attributes(map: Map, retrieval_dir: Path) -> dict[str, Any]:  # noqa: A002
-    """Return what `Map.open` reads from the file of correspondences."""
-    names = [map_path(map.map_dir, f"{map.device}_map", kind.name).name for kind in map.kinds]
+def attributes(
+    settings: LocalizeSettings, kinds: Sequence[LocalMethod], capture: Capture, device: str, retrieval_dir: Path
+) -> dict[str, str]:
+    """Return what `Map.open` reads from the file of correspondences.
+
+    Args:
+        settings, kinds: what the queries were localized with.
+        capture: the capture.
+        device: of the map.
+        retrieval_dir: folder of the references.
+    """
     return {
-        MAPS: json.dumps(names),
-        SETTINGS: map.settings.model_dump_json(),
-        SESSIONS_ROOT: str(map.sessions_root),
+        MAPS: json.dumps([map_path("", f"{device}_map", kind.name).name for kind in kinds]),
+        SETTINGS: settings.model_dump_json(),
+        SESSIONS_ROOT: str(capture.path / "sessions"),
         RETRIEVAL: str(retrieval_dir),
     }
+
+
+def update_attributes(path: Path, attributes: Mapping[str, str]) -> None:
+    """Bring the attributes of a file up to date that was made by settings of the same effect, or of a capture that
+    has moved since."""
+    with h5py.File(path, "r") as file:
+        current = {name: file.attrs.get(name) for name in attributes} == dict(attributes)
+    if not current:
+        with write_atomic(path) as temporary:
+            shutil.copyfile(path, temporary)
+            with h5py.File(temporary, "a", libver="latest") as file:
+                file.attrs.update(attributes)
