@@ -12,6 +12,7 @@ from typing import Any, Literal
 import h5py
 import numpy as np
 import pandas as pd
+import pycolmap
 import pytest
 
 from tests.calls import call
@@ -28,13 +29,13 @@ from toolkit.files import SceneFiles, sidecar_path
 from toolkit.localize import COLUMNS, Map, localize_image, localize_pairs
 from toolkit.localizers import create_localizer
 from toolkit.localizers import map as maps
-from toolkit.localizers.base import PoseEstimate, View
+from toolkit.localizers.base import PoseEstimate, Query, View
 from toolkit.localizers.correspondences import LocalizedQueries
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.pnp import PnpLocalizer
 from toolkit.localizers.prediction import Prediction
 from toolkit.localizers.simulated import SimulatedPredictor
-from toolkit.manifest import LocalizeSettings
+from toolkit.manifest import EmbedSettings, LocalizeSettings
 from toolkit.rerank import rerank_pairs
 from toolkit.retrieve import retrieve_pairs
 
@@ -477,6 +478,44 @@ def test_a_picture_may_be_pixels(small_capture: Path, opened: Map) -> None:
     rotation_deg, distance_m = geometry.pose_error(color.world_from_rig, from_file.world_from_rig)
     assert rotation_deg < 0.1
     assert distance_m < 0.01
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"image": np.zeros((20, 10), np.float32)}, "float32"),
+        ({"image": np.zeros((20, 10, 1), np.uint8)}, r"\(20, 10, 1\)"),
+        ({"image": np.zeros((20, 10, 4), np.uint8)}, r"\(20, 10, 4\)"),
+        ({"image": ["1.jpg", "2.jpg"]}, "2 pictures, 1 cameras"),
+        ({"image": [], "camera": []}, "0 pictures"),
+        ({"image": "12345.jpg", "camera": []}, "1 pictures, 0 cameras"),
+        ({"turns": [1, 2]}, "2 turns"),
+    ],
+)
+def test_what_is_no_picture_is_refused(opened: Map, changed: dict, message: str) -> None:
+    camera = pycolmap.Camera(model="PINHOLE", width=10, height=20, params=[10, 10, 5, 10])
+    with pytest.raises(ImageError, match=message):
+        localize_image(opened, **({"image": np.zeros((20, 10), np.uint8), "camera": camera} | changed))
+
+
+@pytest.mark.parametrize("upright", [None, False])
+def test_a_picture_is_turned_for_what_the_run_turned_images_for(
+    small_capture: Path,
+    finished: tuple[SceneFiles, pd.DataFrame],
+    upright: bool | None,
+) -> None:
+    files = finished[0]
+    place = Map.open(files.run, files.scene, "ios")
+    place.settings = LocalizeSettings.of({"method": "vggt", "predictor": {"upright": upright is None}})
+    place.embed_settings = EmbedSettings.of({"upright": upright})  # type: ignore[misc]
+    place.embedder = learned = Learned(np.ones(place._descriptors[0].shape[1], np.float32))  # type: ignore[misc]
+    asked: list[Query] = []
+    answer = SimpleNamespace(localize=lambda query, _: asked.append(query), image_names=[])
+    place.localizer = answer  # type: ignore[misc, assignment]
+    camera = pycolmap.Camera(model="PINHOLE", width=10, height=20, params=[10, 10, 5, 10])
+    localize_image(place, np.zeros((20, 10), np.uint8), camera, turns=[1])
+    assert learned.seen == [(10, 20, 3) if upright is None else (20, 10, 3)]
+    assert asked[0].views[0].turns == (1 if upright is None else 0)
 
 
 def test_a_picture_of_nothing_has_no_pose(small_capture: Path, opened: Map) -> None:

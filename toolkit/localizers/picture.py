@@ -45,19 +45,18 @@ def localize_image(
         ImageError: a file cannot be read, or its size is not the camera's.
         ArtifactError: files of the run are missing.
     """
-    pictures: list[Any] = [image]
-    if not isinstance(camera, pycolmap.Camera):
-        pictures = list(image)  # type: ignore[arg-type]
+    pictures: list[Any] = [image] if isinstance(image, str | Path | np.ndarray) else list(image)
     cameras = [camera] if isinstance(camera, pycolmap.Camera) else list(camera)
     poses = np.eye(4)[None] if rig_from_cams is None else np.asarray(rig_from_cams, np.float64).reshape(-1, 4, 4)
-    if not len(pictures) == len(cameras) == len(poses):
-        raise ImageError(
-            f"Found {len(pictures)} pictures, {len(cameras)} cameras and {len(poses)} rig_from_cams: expected as many."
-        )
     quarter_turns = [0] * len(cameras) if turns is None else list(turns)
+    if not 0 < len(pictures) == len(cameras) == len(poses) == len(quarter_turns):
+        raise ImageError(
+            f"Found {len(pictures)} pictures, {len(cameras)} cameras, {len(poses)} rig_from_cams and "
+            f"{len(quarter_turns)} turns: expected as many, and at least one."
+        )
     pixels = [_read(picture, of) for picture, of in zip(pictures, cameras, strict=True)]
     views = [
-        View(f"picture {number}", color, of, in_map=False, turns=turn)
+        View(f"picture {number}", color, of, in_map=False, turns=turn if place.settings.predictor.upright else 0)
         for number, ((color, _), of, turn) in enumerate(zip(pixels, cameras, quarter_turns, strict=True), start=1)
     ]
     grays = [gray for _, gray in pixels]
@@ -73,8 +72,9 @@ def localize_image(
     if embedder.inputs == "features":
         inputs = [as_stored(found) for found in SiftExtractor().extract(grays)]
     else:
-        turned = [turn_image(color, turn) for (color, _), turn in zip(pixels, quarter_turns, strict=True)]
-        inputs = [embedder.prepare(color) for color in turned]
+        upright = embedder.upright if place.embed_settings.upright is None else place.embed_settings.upright
+        shown = zip(pixels, quarter_turns if upright else [0] * len(pixels), strict=True)
+        inputs = [embedder.prepare(turn_image(color, turn)) for (color, _), turn in shown]
     references = place.retrieve(embedder.embed(inputs), pixels, cameras)
     with threadpool_limits(1, "blas"):  # sums stay in one order, as in a run
         return place.localizer.localize(Query(views, poses, features), references)
@@ -84,6 +84,8 @@ def _read(picture: Picture, camera: pycolmap.Camera) -> tuple[NDArray[np.uint8],
     """Return the pixels of a picture in color, (H, W, 3), and in gray, (H, W), as a run reads them."""
     if isinstance(picture, str | Path):
         gray, color = read_image(picture, gray=True), read_image(picture)
+    elif picture.dtype != np.uint8 or picture.shape[2:] not in ((), (3,)):
+        raise ImageError(f"Found pixels {picture.shape} {picture.dtype}: expected (H, W) or (H, W, 3) uint8.")
     elif picture.ndim == 2:
         gray, color = picture, np.repeat(picture[:, :, None], 3, axis=2)
     else:
