@@ -6,7 +6,16 @@ import pytest
 import yaml
 
 from toolkit.errors import ManifestError
-from toolkit.manifest import STAGES, Manifest, load_manifest
+from toolkit.manifest import (
+    STAGES,
+    LocalizeSettings,
+    Manifest,
+    MatcherSettings,
+    Settings,
+    describe,
+    load_manifest,
+)
+from toolkit.manifest.messages import nested_model
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 MANIFESTS = sorted((REPOSITORY / "data_manifests").glob("*.yaml"))
@@ -192,6 +201,8 @@ def test_wrong_manifests_say_what_is_wrong(tmp_path: Path, text: str, expected: 
         ("retrieve.topk=[", "not valid YAML"),
         ("retrieve.k=5", "unknown key 'retrieve.k'"),
         ("retrieve.topk=many", "found 'many'"),
+        ("captures.ios=here", "captures: found {'ios': 'here'}"),
+        ("localize.predictor=[vggt]", "localize.predictor.name: found ['vggt']"),
     ],
 )
 def test_wrong_overrides_are_named(tmp_path: Path, override: str, expected: str) -> None:
@@ -242,3 +253,43 @@ def test_the_checkpoint_is_found_from_the_manifest(tmp_path: Path, monkeypatch: 
     }.items():
         path = write(tmp_path, f"captures: [a]\nembed: {{checkpoint: {text}}}")
         assert load_manifest(path).embed.checkpoint == expected
+
+
+def test_the_printed_tree_is_accepted_and_changes_nothing(tmp_path: Path) -> None:
+    text = "\n".join(describe(Manifest))
+    plain = load_manifest(write(tmp_path, "captures: [here]\n"))
+    printed = load_manifest(write(tmp_path, text), ["captures=[here]"])
+    for stage in STAGES:
+        assert printed.stage(stage) == plain.stage(stage)
+
+
+def test_every_setting_has_a_meaning() -> None:
+    sections: list[type[Settings]] = [Manifest]
+    for section in sections:
+        for name, field in section.model_fields.items():
+            assert field.description, f"{section.__name__}.{name}"
+            inner = nested_model(field.annotation)
+            if inner and issubclass(inner, Settings) and inner not in sections:
+                sections.append(inner)
+    assert len(sections) > 15
+
+
+def test_a_plain_value_stands_for_the_field_that_matters(tmp_path: Path) -> None:
+    localize = "localize: {matcher: mutual, features: [sift], predictor: simulated}"
+    manifest = load_manifest(
+        write(tmp_path, f"captures: [here]\n{localize}\n"), ["localize.matcher.min_confidence=0.3"]
+    )
+    assert manifest.localize.matcher == MatcherSettings(name="mutual", min_confidence=0.3)
+    assert manifest.localize.features.kinds == ["sift"]
+    assert manifest.localize.predictor.name == "simulated"
+    assert LocalizeSettings.of({"features": ("sift",)}).features.kinds == ["sift"]
+
+
+def test_switching_a_stage_on_keeps_its_settings(tmp_path: Path) -> None:
+    path = write(tmp_path, "captures: [here]\nrerank: {topn: 40}\n")
+    on = load_manifest(path, ["rerank=true"]).rerank
+    assert on is not None
+    assert on.topn == 40
+    assert load_manifest(path, ["rerank=false"]).rerank is None
+    back = load_manifest(path, ["rerank=false", "rerank=true"]).rerank
+    assert back is not None

@@ -7,6 +7,9 @@ from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
+_BRANCH = r"literal|list\[|dict\[|constrained"
+"""What pydantic adds to the keys of a value that may be of several types."""
+
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return a sentence that names the nearest of the known names, and lists them all."""
@@ -33,15 +36,17 @@ def explain(
     """
     lines = []
     for problem in error.errors():
-        keys = [str(key) for key in problem["loc"] if not re.match(r"literal|list\[|dict\[|constrained", str(key))]
+        path = [str(key) for key in problem["loc"]]
+        keys = [key for key in path if not re.match(_BRANCH, key)]
         where = ".".join(keys) or source
+        of_branch = path != [] and re.match(_BRANCH, path[-1]) is not None
         if problem["type"] == "extra_forbidden":
             line = f"unknown key {where!r}. {nearest(keys[-1], _model_at(model, keys[:-1]).model_fields)}"
         elif problem["type"] == "value_error":
             line = f"{where}: {problem['ctx']['error']}." if keys else f"{problem['ctx']['error']}."
-        elif problem["type"] == "literal_error" and isinstance(problem["input"], list):
+        elif of_branch and problem["type"] == "literal_error" and isinstance(problem["input"], list):
             continue  # the other branch of `"all" | list`, which says what is wrong in the list
-        elif problem["type"] in ("list_type", "dict_type") and isinstance(problem["input"], list | dict):
+        elif of_branch and problem["type"] in ("list_type", "dict_type") and isinstance(problem["input"], list | dict):
             continue  # likewise, of `list | dict`
         elif problem["type"] == "missing":
             line = f"{where}: not given. {problem['msg']}."

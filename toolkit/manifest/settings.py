@@ -80,7 +80,9 @@ def expand(model: type[Settings], raw: Mapping[str, Any]) -> dict[str, Any]:
             if isinstance(value, dict):
                 value = expand(inner, value)
             elif inner.shorthand and value is not None:
-                value = {inner.shorthand: value}
+                value = {inner.shorthand: _plain(value)}
+            elif value is True and model.model_fields[key].default is None:
+                value = {}  # switches an optional section on, and leaves what a base says in it
         expanded[key] = _plain(value)
     return expanded
 
