@@ -133,6 +133,7 @@ def measure(
     from toolkit.capture import Capture
     from toolkit.features.stores import extract_session
     from toolkit.localizers.mapping import build_map
+    from toolkit.localizers.matches import MappedFeatures
     from toolkit.localizers.pnp import PnpLocalizer
     from toolkit.synthetic import render_capture
 
@@ -142,7 +143,7 @@ def measure(
         session = capture[f"{device}_map"]
         store = extract_session(session, folder / f"features{seed}", workers=workers)
         local_map = build_map(session, store, folder / f"{device}{seed}.npz", workers=workers)
-        localizer = PnpLocalizer.of_sift(local_map, store)
+        localizer = PnpLocalizer([MappedFeatures(local_map, store)])
         yield [
             row | {"map": device}
             for asked in capture.devices

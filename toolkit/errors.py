@@ -27,3 +27,8 @@ class WeightsError(ToolkitError):
 
 class DownloadError(ToolkitError):
     """A capture, or a file of it, cannot be listed, fetched, unpacked or put in its place."""
+
+
+def first_line(error: BaseException) -> str:
+    """Return the kind and the first line of an error."""
+    return f"{type(error).__name__}: {str(error).strip()}".split("\n")[0].rstrip(".")[:300]

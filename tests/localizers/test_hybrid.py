@@ -27,7 +27,8 @@ Floats = NDArray[np.float64]
 
 @pytest.fixture(scope="module")
 def pnp(world: World) -> PnpLocalizer:
-    return PnpLocalizer.of_sift(world.map, extract_session(world.map_session, world.files.features, progress=False))
+    features = extract_session(world.map_session, world.files.features, progress=False)
+    return PnpLocalizer([MappedFeatures(world.map, features)])
 
 
 @pytest.fixture(scope="module")

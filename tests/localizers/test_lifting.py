@@ -23,6 +23,7 @@ from toolkit.localizers.feed_forward import FeedForwardAnswer, FeedForwardLocali
 from toolkit.localizers.hybrid import HybridLocalizer
 from toolkit.localizers.lifting import DepthLifter
 from toolkit.localizers.local_map import LocalMap
+from toolkit.localizers.matches import MappedFeatures
 from toolkit.localizers.pnp import PnpLocalizer
 from toolkit.localizers.prediction import Prediction
 from toolkit.localizers.simulated import SimulatedPredictor
@@ -94,7 +95,7 @@ def world(small_capture: Path, small_features: Path, tmp_path_factory: pytest.Te
         local = extract_session(session, folder / "features", rows=np.concatenate(members), progress=False)
         queries += [session_query(session, rows, local_map, count=8, store=local) for rows in members]
         true.append(session.ground_truth.lookup(keyframes["timestamp"], keyframes["device_id"]))
-    pnp = PnpLocalizer.of_sift(local_map, store)
+    pnp = PnpLocalizer([MappedFeatures(local_map, store)])
     return World(mapped, Session.open(bare), local_map, pnp, predictor, queries, np.concatenate(true))
 
 

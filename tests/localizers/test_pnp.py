@@ -107,7 +107,7 @@ class World:
         return cls(points, descriptors, local_map, features, rng)
 
     def localizer(self, **settings: object) -> PnpLocalizer:
-        return PnpLocalizer.of_sift(self.local_map, self.features, PnpSettings(**settings))  # type: ignore[arg-type]
+        return PnpLocalizer([MappedFeatures(self.local_map, self.features)], PnpSettings(**settings))  # type: ignore[arg-type]
 
     def look(
         self,
@@ -377,7 +377,7 @@ def test_covariance_is_the_scatter_of_the_poses(rig: bool, map_noise_px: float) 
     motions, predicted = [], []
     for _ in range(200):
         moved = world.points + np.einsum("pij,pj->pi", spread_of_points, rng.normal(size=(400, 3)))
-        localizer = PnpLocalizer.of_sift(replace(sure, points=moved), world.features)
+        localizer = PnpLocalizer([MappedFeatures(replace(sure, points=moved), world.features)])
         noisy = [
             replace(f, keypoints=(f.keypoints + rng.normal(size=f.keypoints.shape)).astype(np.float32)) for f in exact
         ]
@@ -416,7 +416,7 @@ def test_a_point_that_is_not_known_well_tells_less(room: World) -> None:
 
     def std(noise_px: float) -> float:
         local_map = replace(room.local_map, noise_px=np.full(len(room.points), noise_px, np.float32))
-        localizer = PnpLocalizer.of_sift(local_map, room.features)
+        localizer = PnpLocalizer([MappedFeatures(local_map, room.features)])
         return ask(localizer, [PINHOLE], np.eye(4)[None], [seen], [REFERENCES]).position_std_m
 
     exact, noisy, hopeless, worse = std(0), std(2), std(1e3), std(1e6)

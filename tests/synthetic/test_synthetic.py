@@ -13,6 +13,7 @@ import pycolmap
 import pytest
 
 from toolkit.capture import Capture, read_depth
+from toolkit.capture import images as capture_images
 from toolkit.errors import CaptureError
 from toolkit.geometry import invert, make_pose, rotation_angle_deg, transform
 from toolkit.synthetic import capture as capture_writing
@@ -222,7 +223,7 @@ def test_same_seed_same_bytes_on_any_number_of_cores(
     coarse: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(capture_writing, "build_room", coarse_room)
-    monkeypatch.setattr(capture_writing, "_cores", lambda: 3 if os.cpu_count() == 1 else 1)
+    monkeypatch.setattr(capture_images, "default_workers", lambda: 3 if os.cpu_count() == 1 else 1)
     again = render_capture(tmp_path / "AGAIN", 1, 2, seed=3, progress=False)
     assert digest(again) == digest(coarse)
 

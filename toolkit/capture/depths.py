@@ -10,9 +10,8 @@ In each case the points of the map are transformed to the photograph's camera, a
 """
 
 import logging
-from collections import OrderedDict
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from threading import Lock
 
 import numpy as np
@@ -110,10 +109,9 @@ class _DepthMap:
 class DepthMaps:
     """The depth maps of a session, by photograph. Safe to use from several threads."""
 
-    def __init__(self, session: Session, max_offset_us: int = MAX_OFFSET_US) -> None:
+    def __init__(self, session: Session) -> None:
         self._session = session
-        self._max_offset_us = max_offset_us
-        self._kept: OrderedDict[int, SeenDepth] = OrderedDict()
+        self._seen = lru_cache(_KEPT)(self._see)
         self._tracks: dict[str, tuple[Ints, Floats]] = {}
         self._lock = Lock()
         self._told: set[str] = set()
@@ -121,19 +119,10 @@ class DepthMaps:
     def of(self, row: int) -> SeenDepth:
         """Return the depth in a photograph, a row of `Session.images`.
 
-        It comes from the map nearest in time of every depth sensor that belongs to the camera, at most `max_offset_us`
+        It comes from the map nearest in time of every depth sensor that belongs to the camera, at most `MAX_OFFSET_US`
         away. A map that cannot be read or does not fit its sensor is left out with a reason, which is logged once.
         """
-        with self._lock:
-            if row in self._kept:
-                self._kept.move_to_end(row)
-                return self._kept[row]
-        seen = self._see(row)
-        with self._lock:
-            self._kept[row] = seen
-            if len(self._kept) > _KEPT:
-                self._kept.popitem(last=False)
-        return seen
+        return self._seen(row)
 
     def _see(self, row: int) -> SeenDepth:
         image = self._session.images.iloc[row]
@@ -197,7 +186,7 @@ class DepthMaps:
         sources, reasons = [], []
         world_from_cam = session.world_from_cam([row])[0]
         for other in mates:
-            nearest = self._nearest(other, timestamp, self._max_offset_us)
+            nearest = self._nearest(other, timestamp, MAX_OFFSET_US)
             if nearest is None:
                 continue
             world_from_depth = self._pose(other, nearest[0])

@@ -25,20 +25,16 @@ class Embedder(Protocol):
     @property
     def dim(self) -> int:
         """Length of the vectors, D."""
-        ...
 
     @property
     def settings(self) -> dict[str, Any]:
         """What the vectors depend on besides the images; part of their fingerprint."""
-        ...
 
     def prepare(self, item: Any) -> Any:
         """Return an input as the embedder needs it; threads call this while other inputs are embedded."""
-        ...
 
     def embed(self, inputs: Sequence[Any]) -> NDArray[np.float32]:
         """Return the vectors (B, D) float32; an image without structure may have a zero vector."""
-        ...
 
 
 EMBEDDERS: dict[str, str] = {

@@ -8,7 +8,7 @@ import zlib
 from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 
-from toolkit.errors import DownloadError
+from toolkit.errors import DownloadError, first_line
 
 _SPARE = 1.02  # of the disk: folders and file systems need some for themselves
 
@@ -122,8 +122,3 @@ def size_text(count: int | None) -> str:
         if count is not None and count >= scale:
             return f"{count / scale:.1f} {unit}"
     return "?" if count is None else f"{count} B"
-
-
-def first_line(error: BaseException) -> str:
-    """Return the kind and the first line of an error."""
-    return f"{type(error).__name__}: {str(error).strip()}".split("\n")[0].rstrip(".")[:300]

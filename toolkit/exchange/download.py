@@ -25,8 +25,8 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
-from toolkit.errors import DownloadError, ManifestError
-from toolkit.exchange.archives import FileError, first_line, require_space, safe_parts, size_text, top_folders, unpack
+from toolkit.errors import DownloadError, ManifestError, first_line
+from toolkit.exchange.archives import FileError, require_space, safe_parts, size_text, top_folders, unpack
 from toolkit.exchange.datasets import arrange
 from toolkit.exchange.transfer import NETWORK, RemoteFile, Transfer
 from toolkit.files import fingerprint, write_text

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from toolkit.errors import DownloadError
-from toolkit.exchange.archives import FileError, first_line
+from toolkit.errors import DownloadError, first_line
+from toolkit.exchange.archives import FileError
 
 if TYPE_CHECKING:
     import requests

@@ -57,11 +57,9 @@ class Extractor(Protocol):
     @property
     def settings(self) -> dict[str, Any]:
         """All that the features depend on besides the images, `name` first; part of their fingerprint."""
-        ...
 
     def extract(self, images: Sequence[NDArray[np.uint8]]) -> list[LocalFeatures]:
         """Return the features of images, uint8, of any sizes."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -44,11 +44,8 @@ class LightGlueMatcher:
     ) -> None:
         """
         Args:
-            checkpoint: the official file, or its tensors by name (shared, not copied); None: from the hub's cache,
-                else downloaded there. The detector in it is not used.
-            device: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
-            dtype: of the products in the layers: `float32`, `bfloat16`, `float16`; `auto`: the fastest on the
-                device. Positions and the assignment are always float32.
+            checkpoint, device, dtype: as of `SuperPointExtractor`. The detector in the file is not used; positions and
+                the assignment are always float32.
             batch_size: most pairs at a time; None: as suits the device.
             min_score: least confidence of a match, from 0 to 1.
 

@@ -45,11 +45,9 @@ class Matcher(Protocol):
     @property
     def settings(self) -> dict[str, Any]:
         """All that the matches depend on besides the features, `name` first; part of their fingerprint."""
-        ...
 
     def match(self, pairs: Sequence[tuple[LocalFeatures, LocalFeatures]]) -> list[PairMatches]:
         """Return the matches of pairs of images."""
-        ...
 
 
 MATCHERS: dict[str, str] = {

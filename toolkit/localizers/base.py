@@ -141,12 +141,10 @@ class Localizer(Protocol):
     @property
     def image_names(self) -> list[str]:
         """Names of the map images that references and estimates count through."""
-        ...
 
     @property
     def batch_size(self) -> int:
         """How many queries `predict` is best given at once."""
-        ...
 
     def predict(self, queries: Sequence[tuple[Query, Sequence[References]]]) -> list[Any]:
         """Return what a network says of each query, or None of each where the method asks none. Not for threads.
@@ -154,7 +152,6 @@ class Localizer(Protocol):
         Raises:
             ToolkitError: what no other query would do better with: no such device, other weights, too little memory.
         """
-        ...
 
     def localize(self, query: Query, references: Sequence[References], prediction: Any = None) -> PoseEstimate:
         """Return one pose for the cameras of a rig, or for a single camera.
@@ -164,7 +161,6 @@ class Localizer(Protocol):
             references: of each image.
             prediction: what `predict` returned for the query; None: it is asked here where it is needed.
         """
-        ...
 
 
 def agree(world_from_rig: Floats | None, other: Floats | None) -> bool:

@@ -23,47 +23,27 @@ MAPS = "maps"
 _NAMES = ("images", "references", "rejected")
 
 
-def _no_pixels() -> Floats:
-    return np.zeros((0, 2))
-
-
-def _no_points() -> Floats:
-    return np.zeros((0, 3))
-
-
-def _no_indices() -> Ints:
-    return np.zeros(0, np.int64)
-
-
-def _no_flags() -> NDArray[np.bool_]:
-    return np.zeros(0, np.bool_)
-
-
-def _no_labels() -> NDArray[np.str_]:
-    return np.zeros(0, "U1")
-
-
 @dataclass(frozen=True)
 class Correspondences:
     """K correspondences of a query device with the map, and the M places where references show their points."""
 
-    camera: Ints = field(default_factory=_no_indices)
+    camera: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     """(K,) index of the query image."""
-    pixels: Floats = field(default_factory=_no_pixels)
+    pixels: Floats = field(default_factory=lambda: np.zeros((0, 2)))
     """(K, 2) in the query image; the center of the top-left pixel is (0.5, 0.5)."""
-    points: Floats = field(default_factory=_no_points)
+    points: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     """(K, 3) in the world, meters."""
-    point_index: Ints = field(default_factory=_no_indices)
+    point_index: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     """(K,) index of the map point, those of several maps one after the other; -1: a point lifted by depth."""
-    inlier: NDArray[np.bool_] = field(default_factory=_no_flags)
+    inlier: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
     """(K,) whether the pose agrees with it."""
-    found_by: NDArray[np.str_] = field(default_factory=_no_labels)
+    found_by: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, "U1"))
     """(K,) `<kind of features>/<descriptors, guided or lifted>`."""
-    view_of: Ints = field(default_factory=_no_indices)
+    view_of: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     """(M,) index of a correspondence."""
-    view_reference: Ints = field(default_factory=_no_indices)
+    view_reference: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     """(M,) index of a reference that sees its point."""
-    view_pixels: Floats = field(default_factory=_no_pixels)
+    view_pixels: Floats = field(default_factory=lambda: np.zeros((0, 2)))
     """(M, 2) where, in the reference."""
 
     def __len__(self) -> int:

@@ -1,8 +1,8 @@
 """Match the images of a query with the points of a map: by descriptors alone, and near where a pose puts them."""
 
-from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from threading import Lock
 
 import numpy as np
@@ -55,8 +55,8 @@ class MappedFeatures:
         self.kind = kind
         self.matcher = matcher or MutualMatcher(kind.ratio, kind.min_score)
         self.name = name
-        self._cache: OrderedDict[tuple[int, int], MapImage] = OrderedDict()
-        self._lock = Lock()
+        self.image = lru_cache(CACHED_IMAGES)(self._image)
+        """Returns what `_image` does, and keeps it for those that ask again."""
         self._network = Lock()
 
     def match(
@@ -91,21 +91,11 @@ class MappedFeatures:
         point = np.concatenate([nothing, *(of[pair.indices[:, 1]] for of, pair in zip(points, pairs, strict=True))])
         return keypoint[point >= 0], point[point >= 0]
 
-    def image(self, index: int, max_features: int) -> MapImage:
+    def _image(self, index: int, max_features: int) -> MapImage:
         """Return the features of a map image that see points, those of the longest tracks."""
-        key = (index, max_features)
-        with self._lock:
-            if key in self._cache:
-                self._cache.move_to_end(key)
-                return self._cache[key]
         keypoint, point = self.map.observations(index)
         order = np.argsort(-self.map.track_lengths[point], kind="stable")[:max_features]
-        image = MapImage(self.features[self.map.image_names[index]].take(keypoint[order]), point[order])
-        with self._lock:
-            self._cache[key] = image
-            if len(self._cache) > CACHED_IMAGES:
-                self._cache.popitem(last=False)
-        return image
+        return MapImage(self.features[self.map.image_names[index]].take(keypoint[order]), point[order])
 
     def _point_of_each_feature(self, index: int) -> Ints:
         """Return the point that each feature of a map image sees, -1 for none."""

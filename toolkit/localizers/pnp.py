@@ -7,18 +7,16 @@ pose, the points of all covisible map images are projected into the query and ma
 which finds several times as many and makes the pose more precise.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from toolkit import geometry
-from toolkit.features.features import LocalFeatures
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import PoseEstimate, Prior, Query, References, agree
 from toolkit.localizers.correspondences import Correspondences
-from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.matches import MapMatcher, MappedFeatures
 from toolkit.localizers.rig import Matches, RigQuery, least_squares_covariance
 from toolkit.manifest import PnpSettings
@@ -53,13 +51,6 @@ class PnpLocalizer:
         self.matcher = MapMatcher(mapped, self.settings)
         self.map = self.matcher.map
 
-    @classmethod
-    def of_sift(
-        cls, local_map: LocalMap, features: Mapping[str, LocalFeatures], settings: PnpSettings | None = None
-    ) -> "PnpLocalizer":
-        """Return the localizer of a map that was triangulated from SIFT features of its images, given by name."""
-        return cls([MappedFeatures(local_map, features)], settings)
-
     @property
     def image_names(self) -> list[str]:
         return self.map.image_names
@@ -71,14 +62,10 @@ class PnpLocalizer:
     def localize(
         self, query: Query, references: Sequence[References], prediction: None = None, priors: Sequence[Prior] = ()
     ) -> PoseEstimate:
-        """Return one pose for the cameras of a rig, or for a single camera.
+        """Return one pose for the cameras of a rig, or for a single camera; see `Localizer`.
 
-        Args:
-            query: the images of one device at one instant, with their features; images without are left out.
-            references: map images to match each image with, best first.
-            prediction: of no use here.
-            priors: poses that are hypotheses too. One wins if clearly more guided matches support it; one that
-                confirms an `ok` pose changes nothing.
+        Images without features are left out. Priors are hypotheses too: one wins if clearly more guided matches support
+        it; one that confirms an `ok` pose changes nothing.
         """
         usable = [index for index, features in enumerate(query.features) if not isinstance(features, str)]
         if len(usable) < len(query.features):
@@ -97,16 +84,11 @@ class PnpLocalizer:
         matches = self.matcher.by_descriptors(rig, references, query.network_matches)
         distinct = len(np.unique(matches.point))
         hypotheses = self._hypotheses(rig, matches, references) if distinct >= 4 else []
-        if distinct < 4:
-            estimate = PoseEstimate(
-                "failed: too few matches", num_matches=len(matches), correspondences=self._rejected(matches)
-            )
-        elif not hypotheses:
-            estimate = PoseEstimate(
-                "failed: no consistent pose", num_matches=len(matches), correspondences=self._rejected(matches)
-            )
-        else:
+        if hypotheses:
             estimate = self._estimate(rig, matches, hypotheses, references)
+        else:
+            status = "failed: no consistent pose" if distinct >= 4 else "failed: too few matches"
+            estimate = PoseEstimate(status, num_matches=len(matches), correspondences=self._rejected(matches))
         for prior in priors:
             estimate = self._compare(rig, matches, hypotheses, estimate, references, prior)
         return estimate

@@ -10,6 +10,7 @@ from toolkit import geometry
 from toolkit.geometry import Floats
 from toolkit.localizers.robust import AlignmentError, Bools, listed, rigid_poses
 
+_GATE = 3.0  # standard deviations by axis; hypotheses further from the mean are left out
 _TOO_SMALL = 2.0  # standard deviations of hypotheses are often that many times too small; the result is widened
 
 
@@ -28,7 +29,7 @@ class PoseMean:
     """What was left out or is unknown; empty if nothing."""
 
 
-def robust_mean_pose(world_from_cams: ArrayLike, covariances: ArrayLike, *, gate: float = 3.0) -> PoseMean:
+def robust_mean_pose(world_from_cams: ArrayLike, covariances: ArrayLike) -> PoseMean:
     """Return the robust mean of hypotheses of a pose on SE(3), and its covariance.
 
     The hypotheses count as independent. The one with the most others near it is refined by iteratively reweighted
@@ -38,7 +39,6 @@ def robust_mean_pose(world_from_cams: ArrayLike, covariances: ArrayLike, *, gate
         world_from_cams: (H, 4, 4). Hypotheses that are not finite are left out.
         covariances: (H, 6, 6) as `PoseMean.covariance`. A common factor widens them, never narrows them, to explain the
             spread.
-        gate: hypotheses further from the mean, in standard deviations by axis, are left out.
 
     Raises:
         AlignmentError: no hypothesis, a wrong shape, a matrix that is not a rigid pose or a covariance that is not
@@ -50,19 +50,19 @@ def robust_mean_pose(world_from_cams: ArrayLike, covariances: ArrayLike, *, gate
         raise AlignmentError(f"None of {len(poses)} hypotheses is finite: expected at least one.")
     information = _information(covariances, len(poses))
     notes = [] if finite.all() else [f"hypotheses {listed(~finite)} left out: not finite"]
-    pose, covariance, inside = _mean(poses[usable], information[usable], gate)
+    pose, covariance, inside = _mean(poses[usable], information[usable])
     inliers, left_out = np.zeros(len(poses), bool), np.zeros(len(poses), bool)
     inliers[usable], left_out[usable] = inside, ~inside
     if left_out.any():
         notes.append(f"hypotheses {listed(left_out)} left out: far from the others")
-        rivals = int(_mean(poses[left_out], information[left_out], gate)[2].sum())
+        rivals = int(_mean(poses[left_out], information[left_out])[2].sum())
         if rivals > 0.9 * inside.sum():
             notes.append(f"{int(inside.sum())} hypotheses agree, and {rivals} others elsewhere: undecided")
             covariance = np.diag(np.full(6, np.inf))
     return PoseMean(pose, covariance, inliers, "; ".join(notes))
 
 
-def _mean(poses: Floats, information: Floats, gate: float) -> tuple[Floats, Floats, Bools]:
+def _mean(poses: Floats, information: Floats) -> tuple[Floats, Floats, Bools]:
     """Return the mean (4, 4) of poses (H, 4, 4), its covariance (6, 6) and which hypotheses are inliers (H,)."""
 
     def distances(errors: Floats) -> Floats:
@@ -70,12 +70,12 @@ def _mean(poses: Floats, information: Floats, gate: float) -> tuple[Floats, Floa
         return np.sqrt(np.einsum("hi,hij,hj->h", errors, information, errors) / 6 / _TOO_SMALL**2)
 
     # The geodesic median among the hypotheses; all beyond the gate count as equally far.
-    costs = [np.minimum(distances(_log(geometry.invert(start) @ poses)), gate).sum() for start in poses]
+    costs = [np.minimum(distances(_log(geometry.invert(start) @ poses)), _GATE).sum() for start in poses]
     mean = poses[int(np.argmax(np.array(costs) < min(costs) + 1e-12))]
     for _ in range(30):
         errors = _log(geometry.invert(mean) @ poses)
         distance = distances(errors)
-        inside = distance <= gate
+        inside = distance <= _GATE
         if not inside.any():
             inside = distance == distance.min()
         share = np.where(inside, np.minimum(1.0, 2.0 / np.maximum(distance, 1e-12)), 0.0)

@@ -68,8 +68,6 @@ class Predictor(Protocol):
     @property
     def settings(self) -> dict[str, Any]:
         """What the predictions depend on besides the views; part of the poses' fingerprint."""
-        ...
 
     def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
         """Return a prediction for each group of views; groups do not influence each other."""
-        ...

@@ -9,7 +9,7 @@ import hashlib
 import json
 from collections import OrderedDict
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -78,7 +78,7 @@ class SimulatedPredictor:
             "wrong_references": wrong_references,
             "seed": seed,
         }
-        self._maps: dict[str, LocalMap | None] = {}
+        self._map = cache(self._load_map)
         self._depths: OrderedDict[str, Floats] = OrderedDict()
         self._lock = Lock()
 
@@ -175,12 +175,9 @@ class SimulatedPredictor:
     def _depth_maps(self) -> dict[str, DepthMaps]:
         return {key: DepthMaps(session) for key, session in self._sessions.items()}
 
-    def _map(self, session: str) -> LocalMap | None:
-        with self._lock:
-            if session not in self._maps:
-                path = None if self._map_dir is None else map_path(self._map_dir, session, self._features)
-                self._maps[session] = LocalMap.load(path) if path is not None and path.exists() else None
-            return self._maps[session]
+    def _load_map(self, session: str) -> LocalMap | None:
+        path = None if self._map_dir is None else map_path(self._map_dir, session, self._features)
+        return LocalMap.load(path) if path is not None and path.exists() else None
 
 
 def _nearest_depth(points: Floats, view: View, world_from_cam: Floats, grid: Ints) -> Floats:

@@ -6,11 +6,11 @@ import os
 import pickle
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from toolkit.errors import WeightsError
+from toolkit.errors import WeightsError, first_line
 from toolkit.models.hub import failure_reason
 
 if TYPE_CHECKING:
@@ -62,13 +62,11 @@ VGGT_1B_COMMERCIAL = WeightsSource(
     alternative="set `localize.method: pnp`, which needs none",
     setting="localize.predictor.checkpoint",
 )
-VGGT = WeightsSource(
+VGGT = replace(
+    VGGT_1B_COMMERCIAL,
     model="VGGT-1B",
     repo_id="facebook/VGGT-1B",
-    filename="model.pt",
     license="non-commercial, as the code's README says of the original checkpoint",
-    alternative="set `localize.method: pnp`, which needs none",
-    setting="localize.predictor.checkpoint",
     others=(VGGT_1B_COMMERCIAL,),
 )
 SUPERPOINT = WeightsSource(
@@ -168,7 +166,7 @@ def check_weights(source: WeightsSource, path: Path) -> None:
             names = {name.removeprefix("module.") for name in file.keys()}  # noqa: SIM118 - it is no mapping
         found = f"{len(names)} tensors, none of which is {source.tensor}"
     except (SafetensorError, OSError) as error:
-        names, found = set(), f"no whole safetensors file ({_first_line(error)})"
+        names, found = set(), f"no whole safetensors file ({first_line(error)})"
     if source.tensor not in names:
         raise WeightsError(
             f"{path}: these are not weights of {source.model}: found {found}. Expected {source}. Correct "
@@ -327,7 +325,7 @@ def _read_safetensors(path: Path, where: str) -> "dict[str, Tensor]":
         return load_file(path)
     except (SafetensorError, OSError) as error:
         raise WeightsError(
-            f"{where} is not a whole safetensors file: {_first_line(error)}; expected {_announced_size(path)}. "
+            f"{where} is not a whole safetensors file: {first_line(error)}; expected {_announced_size(path)}. "
             "Delete it and get it again."
         ) from error
 
@@ -359,7 +357,7 @@ def _read_pickle(path: Path, where: str) -> Any:
         ) from error
     except Exception as error:  # the exception depends on where the file is cut off
         raise WeightsError(
-            f"{where} is not a whole file of torch.save: {_first_line(error)}. Delete it and get it again."
+            f"{where} is not a whole file of torch.save: {first_line(error)}. Delete it and get it again."
         ) from error
 
 
@@ -392,9 +390,5 @@ def _tensors(content: Any, where: str) -> "dict[str, Tensor]":
     return {key.removeprefix(prefix): value for key, value in state.items()}
 
 
-def _first(names: list[str], count: int = 5) -> str:
-    return ", ".join(names[:count]) + (", ..." if len(names) > count else "")
-
-
-def _first_line(error: Exception) -> str:
-    return f"{type(error).__name__}: {str(error).strip()}".split("\n")[0].rstrip(".")
+def _first(names: list[str]) -> str:
+    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")

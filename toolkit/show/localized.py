@@ -1,7 +1,7 @@
 """The queries of a pair as the localize stage left them: poses, errors, and the correspondences that poses rest on."""
 
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -41,9 +41,8 @@ def map_files(map_dir: str | Path | None, session_id: str, poses: Path | None = 
         return ()
     record, names = None if poses is None else poses.with_name(f"{poses.stem}.h5"), list[str]()
     if record is not None and record.is_file():
-        queries = LocalizedQueries(record)
-        names = queries.maps
-        queries.close()
+        with closing(LocalizedQueries(record)) as queries:
+            names = queries.maps
     paths = [Path(map_dir) / name for name in names] or sorted(Path(map_dir).glob(f"{session_id}*.npz"))
     return tuple(path for path in paths if path.is_file())
 

@@ -236,6 +236,8 @@ def _render_sessions(out: Path, rooms: int, frames: int, seed: int, progress: bo
     """Render the pictures of all sessions, room by room, and write the sessions' files."""
     from tqdm.auto import tqdm
 
+    from toolkit.capture.images import default_workers
+
     sessions = out / "sessions"
     tables = {f"{name}_{split}": Tables() for name in DEVICES for split in ("map", "query")}
     hours = 1 + int(1.4 * rooms * (frames + 8) / 3600)
@@ -243,7 +245,7 @@ def _render_sessions(out: Path, rooms: int, frames: int, seed: int, progress: bo
     rays: dict[tuple[float, ...], Rays] = {}
     with (
         tqdm(total=pictures, desc="render", unit="image", disable=not progress) as bar,
-        ThreadPoolExecutor(min(_cores(), 8)) as pool,  # a thread may hold 150 MB
+        ThreadPoolExecutor(default_workers()) as pool,  # a thread may hold 150 MB
     ):
         try:
             for index in range(rooms):
@@ -266,11 +268,6 @@ def _render_sessions(out: Path, rooms: int, frames: int, seed: int, progress: bo
             raise
     for session, table in tables.items():
         _write_session(sessions / session, session.rpartition("_")[2], table)
-
-
-def _cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _is_complete(out: Path, settings: dict[str, int]) -> bool:
