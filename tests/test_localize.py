@@ -634,6 +634,38 @@ def test_a_learned_embedder_is_given_colors(small_capture: Path, finished: tuple
         localize_image(place, path, camera)
 
 
+class AsManyAsFeatures:
+    """A localizer of somebody's own, which counts the features that it is given."""
+
+    batch_size = 1
+
+    def __init__(self, image_names: list[str]) -> None:
+        self.image_names = image_names
+
+    def predict(self, queries: Sequence[object]) -> list[None]:
+        return [None] * len(queries)
+
+    def localize(self, query: Query, _: object, prediction: None = None) -> PoseEstimate:
+        return PoseEstimate("failed: counts only", num_matches=len(query.features[0][0]))
+
+
+def test_a_method_of_ones_own_is_given_features_as_in_a_run(
+    small_capture: Path, run: SceneFiles, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (maps, localize):
+        monkeypatch.setattr(
+            module, "create_localizer", lambda _, place, *__: AsManyAsFeatures(place.mapped[0].map.image_names)
+        )
+    run_stage(small_capture, run, query_device="ios")
+    place = Map.open(run.run, run.scene, "ios")
+    monkeypatch.setattr(place, "settings", place.settings.model_copy(update={"method": "counts"}))
+    session = Capture.open(small_capture)["ios_query"]
+    row = int(session.rows_of_keyframes(session.keyframes(LIST))[0][0])
+    camera = session.camera(session.images["sensor_id"].iloc[row])
+    count = localize_image(place, session.image_path(row), camera).num_matches
+    assert count == rows_of(run, "ios")["num_matches"].iloc[0] > 0
+
+
 class ByContent:
     """A predictor that knows a photograph by its pixels, wherever they come from, and looks up its true pose."""
 

@@ -61,7 +61,7 @@ def localize_image(
     ]
     grays = [gray for _, gray in pixels]
     features: list[list[LocalFeatures]] = []
-    if place.settings.method in ("pnp", "hybrid"):
+    if place.settings.method != "vggt" and place.kinds:
         # As a run reads them: the file of features rounds keypoints at the border.
         extracted = [
             [as_stored(kind.extractor.extract([color if kind.extractor.color else gray])[0]) for color, gray in pixels]
