@@ -174,11 +174,7 @@ class _Pair:
             progress.discard()
 
     def _rows(self, session: Session, images: Sequence[dict[str, Any]]) -> Ints:
-        """Return the rows of `session.images` of images in the retrieval file.
-
-        Raises:
-            ArtifactError: an image is not in the session.
-        """
+        """Return the rows of `session.images` of images in the retrieval file; refuse one that the session lacks."""
         prefix = f"{session.path.name}/raw_data/"
         names = list(dict.fromkeys(_name(image) for image in images))
         rows = pd.Index(session.images["path"]).get_indexer([name.removeprefix(prefix) for name in names])

@@ -226,11 +226,7 @@ class DepthMaps:
         return geometry.make_pose(turn, place)
 
     def _points(self, source: _DepthMap, photograph: pycolmap.Camera) -> tuple[Floats, float]:
-        """Return the points (P, 3) of a depth map in the photograph's camera, and their spacing in its pixels.
-
-        Raises:
-            CaptureError: no such file, not 16 bits, or not of the sensor's size.
-        """
+        """Return the points (P, 3) of a depth map in the photograph's camera, and their spacing in its pixels."""
         path = self._session.path / RAW_DATA / source.path
         depth = read_depth(path)
         height, width = depth.shape

@@ -41,11 +41,7 @@ class Trajectory:
         covariances: ArrayLike | None = None,
         source: Path | None = None,
     ) -> None:
-        """
-        Args:
-            covariances: (N, 6, 6), or None.
-            source: the file to read the covariances from when they are first needed.
-        """
+        """`covariances` are (N, 6, 6); from the file `source` they are read when they are first needed."""
         self.timestamps = np.asarray(timestamps, np.int64)
         self.arrow_ids = as_strings(device_ids)
         self.qt = np.asarray(qt, np.float64).reshape(-1, 7)

@@ -29,7 +29,7 @@ def write_session(
     keyframes: Mapping[str, pd.DataFrame] | None = None,
     ground_truth: Trajectory | None = None,
 ) -> Path:
-    """Write the text files of a session (not the images); what is None is not written.
+    """Write the text files of a session (not the images); what is None is not written. Return the folder.
 
     Args:
         path: the session's folder; made where it does not exist.
@@ -39,9 +39,6 @@ def write_session(
         images, depths: rows (timestamp, sensor_id, path relative to raw_data/).
         keyframes: tables [timestamp, device_id] by name, e.g. `pruned_subsampled`.
         ground_truth: goes to proc/alignment_trajectories.txt.
-
-    Returns:
-        The folder.
 
     Raises:
         ValueError: a value has a comma or line break, which the format cannot hold.

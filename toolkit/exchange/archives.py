@@ -18,14 +18,11 @@ class FileError(DownloadError):
 
 
 def unpack(archive: Path, target: Path, place: Callable[[list[str]], str | None], name: str = "") -> int:
-    """Unpack a zip archive into a new folder, and refuse one that would write anywhere else.
+    """Unpack a zip archive into a new folder, and return how many files it has written.
 
     Args:
         place: returns the path in the folder (with `/`) for the parts of a member's path, or None to leave it out.
         name: of the archive, for messages and the progress bar; its file name when not given.
-
-    Returns:
-        How many files were written.
 
     Raises:
         DownloadError: a member's path leads out of the folder; a member is not a file, is encrypted, or is there twice;

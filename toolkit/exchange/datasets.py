@@ -30,14 +30,12 @@ def arrange(sessions: str | Path, names: Mapping[str, str]) -> list[str]:
     """Rename the sessions of a data set, and split by device a session that several names stand for.
 
     A session is split by its subsessions, whose names begin with `<device>_`. A list `queries.txt` becomes
-    `proc/keyframes_original.txt`. Images are moved, not copied.
+    `proc/keyframes_original.txt`. Images are moved, not copied. Return what was left
+    out, in words.
 
     Args:
         sessions: folder of the sessions; changed in place. A session that `names` does not have stays as it is.
         names: for each new name, `<device>_<map or query>`, the session's name in the data set.
-
-    Returns:
-        What was left out, in words.
 
     Raises:
         CaptureError: a session to split has no subsession of a device.

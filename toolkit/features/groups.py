@@ -72,11 +72,7 @@ class GroupWriter:
     """
 
     def __init__(self, path: Path, made_by: Mapping[str, Any], attributes: Mapping[str, Any] | None = None):
-        """
-        Args:
-            made_by: JSON; what all groups were made by. Groups that were made by something else are not kept.
-            attributes: of the file, for other readers.
-        """
+        """Groups made by something else than `made_by`, JSON, are not kept; other readers see the `attributes`."""
         self.path = path
         self.index = Index()
         """What the file and the complete parts hold."""

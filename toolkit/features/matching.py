@@ -156,15 +156,12 @@ def unit_descriptors(descriptors: Descriptors) -> NDArray[np.float32]:
 
 
 def mutual_matches(scores: NDArray[np.float32], ratio: float = 0.8, min_score: float = -1.0) -> Ints:
-    """Return mutual nearest neighbors whose rows pass Lowe's ratio test.
+    """Return mutual nearest neighbors whose rows pass Lowe's ratio test, (K, 2) indices of rows and columns.
 
     Args:
         scores: (N, M) cosine similarities; less than -1 where geometry excludes a match.
         ratio: the nearest must be closer than `ratio` times the second nearest, as Euclidean distance.
         min_score: least cosine similarity of a match.
-
-    Returns:
-        (K, 2) indices into the rows and the columns.
     """
     n, m = scores.shape
     if n == 0 or m == 0:
@@ -203,8 +200,9 @@ def match_along_epipolar_lines(
     ratio: float = 0.9,
     min_score: float = 0.6,
 ) -> Ints:
-    """Match two images of known poses, and compare only features that can show the same point.
+    """Return the matches of two images of known poses, (K, 2) indices; none where the cameras share one place.
 
+    Only features that can show the same point are compared.
     Each ray lies in an epipolar half-plane, which the baseline bounds. Two rays can meet only if they share it, so rays
     are sorted by the angle of their half-planes and compared only with their neighbors in that order: some hundredths
     of all pairs. It works on rays, so for every central camera model.
@@ -216,9 +214,6 @@ def match_along_epipolar_lines(
         max_angle_a, max_angle_b: largest angle of a ray to the other's epipolar plane, radians.
         ratio: the nearest must be closer than `ratio` times the second nearest of the candidates.
         min_score: least cosine similarity of a match.
-
-    Returns:
-        (K, 2) indices of matched features; none where the cameras share one place.
     """
     baseline = np.linalg.norm(b_from_a[:3, 3])
     if baseline < 1e-6 or not len(rays_a) or not len(rays_b):

@@ -75,9 +75,6 @@ def _from_arrays(arrays: Mapping[str, NDArray[Any]], offset: np.float32, quantiz
     Args:
         offset: what makes the center of the top-left pixel 0.5.
         quantized: the descriptors were bytes.
-
-    Raises:
-        KeyError: an array is missing.
     """
     keypoints = arrays["keypoints"].astype(np.float32, copy=False) + offset
     descriptors, (width, height) = arrays["descriptors"], arrays["image_size"]

@@ -197,7 +197,7 @@ def align_to_map(
 
 
 def query_pose(alignment: Alignment, model_from_query: ArrayLike) -> tuple[Floats, Floats]:
-    """Bring a predicted camera into the map, with its covariance.
+    """Return a predicted camera in the map, world_from_query (4, 4), and its covariance (6, 6).
 
     The covariance follows `localizers.pnp.PoseEstimate`: (6, 6) of a small motion of the camera in its own frame,
     world_from_cam @ Exp(d), d = rotation, radians, then translation, meters. It contains the query's own noise (taken
@@ -207,9 +207,6 @@ def query_pose(alignment: Alignment, model_from_query: ArrayLike) -> tuple[Float
 
     Args:
         model_from_query: (4, 4) predicted with the references, in their frame.
-
-    Returns:
-        world_from_query (4, 4) and its covariance (6, 6).
 
     Raises:
         AlignmentError: not a rigid pose, or not finite.

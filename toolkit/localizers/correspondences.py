@@ -88,9 +88,7 @@ class LocalizedQueries(Mapping[tuple[int, str], LocalizedQuery]):
     """The queries of one pair, by timestamp and device id; each is read when it is asked for."""
 
     def __init__(self, path: str | Path):
-        """
-        Args:
-            path: `poses/<pair>.h5`.
+        """Open `poses/<pair>.h5`.
 
         Raises:
             ArtifactError: it is missing or torn.

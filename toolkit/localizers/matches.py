@@ -43,13 +43,7 @@ class MappedFeatures:
         matcher: Matcher | None = None,
         name: str = "sift",
     ):
-        """
-        Args:
-            local_map: triangulated from these features.
-            features: of the map's images, by name.
-            kind: what is peculiar to these features.
-            matcher: of a query image with a reference; None: mutual nearest neighbors, as suits the kind.
-        """
+        """The map was triangulated from these features, by image name; without a matcher, `mutual` suits the kind."""
         self.map = local_map
         self.features = features
         self.kind = kind

@@ -13,11 +13,7 @@ class NearestLocalizer:
     batch_size = 1
 
     def __init__(self, image_names: list[str], world_from_cams: Floats) -> None:
-        """
-        Args:
-            image_names: of the map's N images.
-            world_from_cams: their poses, (N, 4, 4).
-        """
+        """`world_from_cams`, (N, 4, 4), are the poses of the map's N images."""
         self.image_names = image_names
         self.world_from_cams = world_from_cams
 

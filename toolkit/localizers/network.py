@@ -445,9 +445,6 @@ def _load_network(checkpoint: Path, heads: tuple[str, ...], dtype: "torch.dtype"
 
     The last network is kept until another is asked for: a notebook that looks into one query after a run makes a
     predictor anew, and the weights are gigabytes.
-
-    Raises:
-        WeightsError: see `VGGT.from_checkpoint`.
     """
     from toolkit.models.vggt import VGGT
 

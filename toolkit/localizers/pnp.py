@@ -283,9 +283,7 @@ class PnpLocalizer:
     def _noise_of_points(self, query: RigQuery, matches: Matches, of_point: Floats) -> Floats:
         """Return the covariance (K, 2, 2) of projections that comes from their points, square pixels; NaN if unknown.
 
-        Args:
-            query, matches: K matches.
-            of_point: (K, 2, 3), how projections move with their points.
+        `of_point` (K, 2, 3) is how the projections of the K matches move with their points.
         """
         noise = of_point @ self.map.point_covariances(matches.point) @ of_point.transpose(0, 2, 1)
         # A match counts only where its point is seen near where it should be: no more of the point's noise is in it.

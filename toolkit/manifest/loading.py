@@ -16,7 +16,7 @@ from toolkit.manifest.settings import expand, merge
 
 
 def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
-    """Read and check a manifest.
+    """Read and check a manifest; its paths are made absolute.
 
     `inherits: FILE` (or a list of files, relative to the manifest) takes over what those files say: sections are
     merged key by key, lists and values replaced, and each path counts from the folder of the file that has it.
@@ -24,9 +24,6 @@ def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
     Args:
         overrides: `key=value` or `section.key=value`, as deep as the tree of settings is, the value in YAML; merged
             over what the file says.
-
-    Returns:
-        The manifest with its paths made absolute.
 
     Raises:
         ManifestError: naming the file, the key, what was found, and the nearest known key; also the file that an

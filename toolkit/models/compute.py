@@ -80,11 +80,7 @@ class Fitting:
     """Runs a function on batches; splits them into smaller parts once one did not fit the memory of the device."""
 
     def __init__(self, run: "Callable[[torch.Tensor], torch.Tensor]", what: str) -> None:
-        """
-        Args:
-            run: maps (B, ...) to (B, ...); each row of the result depends only on the same row of the input.
-            what: what the rows are, in the plural, for messages.
-        """
+        """`run` maps (B, ...) to (B, ...), each row on its own; `what` the rows are, in the plural, is for messages."""
         self._run = run
         self._what = what
         self._limit: int | None = None

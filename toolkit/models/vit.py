@@ -64,11 +64,7 @@ class Attention(nn.Module):
     """Self-attention of all tokens of a sequence, (B, N, C) -> (B, N, C)."""
 
     def __init__(self, dim: int, num_heads: int, qk_norm_eps: float | None = None) -> None:
-        """
-        Args:
-            dim, num_heads: C, and the number of heads that share it.
-            qk_norm_eps: epsilon of a LayerNorm on the queries and keys of each head; None: no such norm.
-        """
+        """`qk_norm_eps` is the epsilon of a LayerNorm on the queries and keys of each head; None: no such norm."""
         super().__init__()
         self.num_heads = num_heads
         self.qkv = nn.Linear(dim, 3 * dim)
@@ -170,11 +166,7 @@ class Dinov2(nn.Module):
     """DINOv2 ViT-14 (Oquab et al., 2023). Subclasses add tokens and say how the position embedding is resized."""
 
     def __init__(self, dim: int, depth: int, num_heads: int, grid: int) -> None:
-        """
-        Args:
-            dim, depth, num_heads: of the blocks.
-            grid: rows and columns of patches that the position embedding was trained for.
-        """
+        """`grid` is the number of rows and columns of patches that the position embedding was trained for."""
         super().__init__()
         self.grid = grid
         self.patch_embed = PatchEmbed(dim)

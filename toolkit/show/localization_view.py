@@ -197,10 +197,7 @@ class _ChosenWriter:
         self._stream.log("about", rr.TextDocument("\n".join(text), media_type="text/markdown"))
 
     def _log_image(self, path: str, image: ShownImage | None, color: str, residuals: bool) -> None:
-        """Log a photograph with its camera, and on it where points were measured and where the pose puts them.
-
-        Where there is none, nothing but gray.
-        """
+        """Log a photograph, or nothing but gray, with its camera, the points measured and where the pose puts them."""
         import rerun as rr
 
         stream = self._stream
