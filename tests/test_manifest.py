@@ -293,3 +293,16 @@ def test_switching_a_stage_on_keeps_its_settings(tmp_path: Path) -> None:
     assert load_manifest(path, ["rerank=false"]).rerank is None
     back = load_manifest(path, ["rerank=false", "rerank=true"]).rerank
     assert back is not None
+
+
+def test_an_empty_section_says_nothing(tmp_path: Path) -> None:
+    path = write_files(
+        tmp_path, mine="inherits: base.yaml\nlocalize:\n", base="captures: [a]\nlocalize: {method: nearest}"
+    )
+    assert load_manifest(path).localize.method == "nearest"
+
+
+@pytest.mark.parametrize("layer", [[1], 3, "pnp"])
+def test_settings_are_a_mapping(layer: object) -> None:
+    with pytest.raises(ManifestError, match="LocalizeSettings"):
+        LocalizeSettings.of(layer)  # type: ignore[arg-type]

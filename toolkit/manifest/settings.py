@@ -54,7 +54,9 @@ class Settings(BaseModel):
         """
         merged: dict[str, Any] = {}
         for layer in layers:
-            given = layer.given() if isinstance(layer, Settings) else dict(layer or {})
+            given = layer.given() if isinstance(layer, Settings) else layer or {}
+            if not isinstance(given, Mapping):
+                raise ManifestError(f"{cls.__name__}: found {layer!r}, expected a mapping such as {{'key': value}}.")
             merged = merge(merged, expand(cls, given))
         try:
             return cls.model_validate(merged)
@@ -83,6 +85,8 @@ def expand(model: type[Settings], raw: Mapping[str, Any]) -> dict[str, Any]:
                 value = {inner.shorthand: _plain(value)}
             elif value is True and model.model_fields[key].default is None:
                 value = {}  # switches an optional section on, and leaves what a base says in it
+            elif value is None and isinstance(model.model_fields[key].default, Settings):
+                value = {}  # a section without a key in it
         expanded[key] = _plain(value)
     return expanded
 
