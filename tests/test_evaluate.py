@@ -219,16 +219,20 @@ def test_table_of_other_queries_is_named_stale(scene):
     assert len(result.messages) == 1
 
 
-def test_errors_of_a_rig(tmp_path):
+def test_camera_errors_follow_the_rig(tmp_path):
     sessions, poses = write_capture(tmp_path), tmp_path / "poses"
     rows = [(0, "rig", make_pose(turned(4, "y"), [0, 0, 0]), "ok"), (1, "rig", None, "failed: x")]
     write_poses(poses, "map_hl_query_hl", rows)
     options = {"map_device": "hl", "query_device": "hl"}
     device = call(evaluate_scene, sessions, poses, None, None, **options)
+    camera = call(evaluate_scene, sessions, poses, None, None, at="camera", **options)
     assert len(device.errors) == 2
     assert device.errors["translation_error_m"].tolist() == [0, np.inf]
-    np.testing.assert_allclose(device.errors["rotation_error_deg"][0], 4)
-    assert device.recall["queries"].item() == 2
+    assert camera.errors["sensor_id"].tolist() == ["left", "right"] * 2
+    arc = 2 * np.sin(np.radians(2))  # a camera one meter from the rig's origin moves along the arc
+    np.testing.assert_allclose(camera.errors["translation_error_m"], [arc, arc, np.inf, np.inf])
+    np.testing.assert_allclose(camera.errors["rotation_error_deg"][:2], 4)
+    assert camera.recall["queries"].item() == 4
 
 
 def test_good_reference_of_any_camera_counts_for_the_rig(tmp_path):
@@ -274,6 +278,8 @@ def test_missing_and_torn_files_are_rows_not_exceptions(scene):
 def test_unknown_choices_are_named(scene):
     with pytest.raises(ToolkitError, match=r"'spot'.*ios, hl"):
         evaluate_scene(*scene, None, map_device="spot")
+    with pytest.raises(ToolkitError, match="device, camera"):
+        evaluate_ios(scene, at="rig")
 
 
 def test_only_the_pairs_asked_for_are_evaluated(scene):

@@ -14,7 +14,7 @@ from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.cameras import in_view, view_bounds
 from toolkit.capture.devices import in_order
 from toolkit.capture.tables import read_query_table
-from toolkit.errors import ArtifactError, CaptureError
+from toolkit.errors import ArtifactError, CaptureError, ToolkitError
 from toolkit.files import image_name, pair_name, read_references, write_atomic, write_sidecar
 from toolkit.geometry import Floats, invert, transform
 from toolkit.manifest import EvaluateSettings
@@ -61,6 +61,7 @@ def evaluate_scene(
     map_device: str = "all",
     query_device: str = "all",
     queries: str = "keyframes_pruned_subsampled",
+    at: str = "device",
     pairs: Sequence[Sequence[str]] | None = None,
     reranked_dir: str | Path | None = None,
     map_dir: str | Path | None = None,
@@ -77,14 +78,18 @@ def evaluate_scene(
         settings: see `EvaluateSettings`; a dict holds what differs from the defaults.
         map_device: `all` or one device key; likewise `query_device`.
         queries: the keyframe list that is asked; all of it is the denominator.
+        at: `device` has one error a query device; `camera` one a camera image of it, as the benchmark's own
+            code evaluates rigs.
         pairs: only these [map device, query device]; None: all.
         reranked_dir: folder of the reranked references, if queries were localized with those: retrieval recall is
             then theirs, and overlap is shown before and after.
         map_dir: folder of the triangulated maps, which say what a reference sees.
 
     Raises:
-        ToolkitError: an unknown device, or no pair to evaluate.
+        ToolkitError: an unknown device or `at`, or no pair to evaluate.
     """
+    if at not in ("device", "camera"):
+        raise ToolkitError(f"Unknown at={at!r}. Known: device, camera.")
     settings = EvaluateSettings.of(settings)
     limits = tuple((float(degrees), float(meters)) for degrees, meters in settings.thresholds)
     near = settings.retrieval_radius_m, settings.retrieval_angle_deg
@@ -121,7 +126,7 @@ def evaluate_scene(
                 continue
             if state != "evaluated":
                 messages.append(f"{name}: {state}.")
-            frame = _errors_of(results, poses_of(truth, keys), good, limits)  # type: ignore[arg-type]
+            frame = _errors_of(results, keys, truth, session, good, limits, at)
             errors.append(frame.assign(**pair))
             rows["recall"].append({**pair, "state": state, **_summary(frame, limits)})
             rows["losses"] += [{**pair, "state": state, **row} for row in _losses(frame, limits)]
@@ -142,7 +147,7 @@ def evaluate_scene(
     for message in evaluation.messages:
         logger.warning(message)
     if out_dir is not None:
-        record = {"poses": str(poses_dir), "queries": queries, **settings.model_dump()}
+        record = {"poses": str(poses_dir), "queries": queries, "at": at, **settings.model_dump()}
         write_evaluation(evaluation, out_dir, record | {"messages": evaluation.messages})
     return evaluation
 
@@ -210,13 +215,27 @@ def _read_results(stem: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, 
 
 
 def _errors_of(
-    results: pd.DataFrame, true: Floats, good: NDArray[np.bool_] | None, thresholds: Sequence[Threshold]
+    results: pd.DataFrame,
+    keys: pd.DataFrame,
+    truth: Trajectory | None,
+    session: Session,
+    good: NDArray[np.bool_] | None,
+    thresholds: Sequence[Threshold],
+    at: str,
 ) -> pd.DataFrame:
     """Return the rows of the table `errors` of a pair; `good` says which queries have a good reference."""
+    estimated, true = np.stack(results["pose"].to_list()), poses_of(truth, keys)  # type: ignore[arg-type]
     frame = results.drop(columns="pose")
     if good is not None:
         frame["good_reference"] = good
-    rotation_deg, translation_m = pose_errors(np.stack(results["pose"].to_list()), true)
+    if at == "camera":
+        rows = session.rows_of_keyframes(keys)
+        device, images = np.repeat(np.arange(len(keys)), [len(r) for r in rows]), np.concatenate(rows)
+        device_from_cam = session.rig_from_cam(images)
+        estimated, true = estimated[device] @ device_from_cam, true[device] @ device_from_cam
+        frame = frame.iloc[device].reset_index(drop=True)
+        frame.insert(2, "sensor_id", session.images["sensor_id"].to_numpy()[images])
+    rotation_deg, translation_m = pose_errors(estimated, true)
     frame["rotation_error_deg"], frame["translation_error_m"] = rotation_deg, translation_m
     no_reference = np.zeros(len(frame), bool) if good is None else ~frame["good_reference"].to_numpy(bool)
     reason = np.select([no_reference, ~np.isfinite(rotation_deg)], [NO_REFERENCE, NO_POSE], WRONG_POSE)

@@ -304,6 +304,8 @@ def test_bad_input_is_named() -> None:
     ):
         with pytest.raises(AlignmentError, match=message):
             align_to_map(*arguments)
+    with pytest.raises(AlignmentError, match="center_noise_m is 0"):
+        align_to_map(model, world, center_noise_m=0.0)
     with pytest.raises(AlignmentError, match="model_from_query"):
         query_pose(align_to_map(model, world), np.full((4, 4), np.nan))
 

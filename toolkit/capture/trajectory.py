@@ -54,9 +54,11 @@ class Trajectory:
         self._source = source
 
     @classmethod
-    def from_poses(cls, timestamps: ArrayLike, device_ids: Any, world_from_device: ArrayLike) -> "Trajectory":
+    def from_poses(
+        cls, timestamps: ArrayLike, device_ids: Any, world_from_device: ArrayLike, covariances: ArrayLike | None = None
+    ) -> "Trajectory":
         """Make a trajectory of poses (N, 4, 4)."""
-        return cls(timestamps, device_ids, qt_from_pose(world_from_device))
+        return cls(timestamps, device_ids, qt_from_pose(world_from_device), covariances)
 
     @classmethod
     def read(cls, path: str | Path) -> "Trajectory":

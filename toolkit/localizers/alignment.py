@@ -35,16 +35,7 @@ from toolkit.localizers.robust import (
 
 OUTLIER_SHARE = 0.2  # expected share of wrong references
 WRONG_PLACE = 20.0  # wrong centers are spread over at least that many times the expected noise
-# Expected noise of a prediction; the data decide within a few factors of it.
-CENTER_NOISE_M = 0.02  # of a center, as a length
-CENTER_NOISE_SHARE = 0.01  # added in squares, of the references' typical distance: a larger place is less exact
-ROTATION_NOISE_DEG = 1.0  # of an orientation, as an angle
-MAX_SCALE_STD = 0.2  # a scale with a larger relative standard deviation is called unknown
-# Up to these a pose may be `ok`: errors of 5 deg and 0.5 m are then more than 2.2 standard deviations away (2.5 for the
-# position, whose error may lie along one axis).
-MAX_POSITION_STD_M, MAX_ROTATION_STD_DEG = 0.2, 2.25
-LEAST_INLIERS = 2  # nothing checks a single reference
-MAX_RIVAL_SHARE = 0.5  # references that agree on another alignment, over the inliers
+CENTER_NOISE_SHARE = 0.01  # of the references' typical distance: a prediction of a larger place is less exact
 _STARTS = 6  # number of best hypotheses that are refined
 _ROUNDS = 10
 _LOG_PEAK = 1.5 * np.log(2 * np.pi)  # log normalization of a Gaussian in three coordinates
@@ -131,6 +122,10 @@ def align_to_map(
     world_from_cams: ArrayLike,
     weights: ArrayLike | None = None,
     depth_ratios: DepthSamples | None = None,
+    *,
+    center_noise_m: float = 0.02,
+    rotation_noise_deg: float = 1.0,
+    max_scale_std: float = 0.2,
 ) -> Alignment:
     """Estimate the similarity from a predicted frame to the map, robustly.
 
@@ -148,6 +143,10 @@ def align_to_map(
             tuple of M arrays, one for each reference: then those of excluded references are not used, and the error
             that a reference's samples share counts in their uncertainty. Up to 40 % may be wrong. Samples that are
             not finite or not positive are left out.
+        center_noise_m: expected noise of a predicted center, as a length. 1 % of the references' typical distance is
+            added, in squares. As for `rotation_noise_deg`, the data decide within a few factors of it.
+        rotation_noise_deg: expected noise of a predicted orientation, as an angle.
+        max_scale_std: a scale with a larger relative standard deviation is called unknown.
 
     Returns:
         The alignment. Few, coincident, collinear or contradicting references raise nothing: what cannot be known then
@@ -162,6 +161,9 @@ def align_to_map(
         raise AlignmentError(f"Found {len(model)} model_from_cams and {len(world)} world_from_cams: expected as many.")
     weight = checked_weights(weights, len(model))
     ratios = DepthRatios.of(depth_ratios, len(model))
+    for name, value in (("center_noise_m", center_noise_m), ("rotation_noise_deg", rotation_noise_deg)):
+        if not (np.isfinite(value) and value > 0):
+            raise AlignmentError(f"{name} is {value}: expected a number above 0.")
     finite = model_finite & world_finite
     notes = [] if finite.all() else [f"references {listed(~finite)} left out: not finite"]
     usable = np.flatnonzero(finite & (weight > 0))
@@ -171,7 +173,9 @@ def align_to_map(
             reason="; ".join([*notes, "no usable reference"]), centroid_m=np.zeros(3), rotation_noise_deg=np.inf,
             center_noise_m=np.inf, **_UNKNOWN,
         )  # fmt: skip
-    problem = _Problem(model[usable], world[usable], weight[usable] / weight[usable].mean())
+    problem = _Problem(
+        model[usable], world[usable], weight[usable] / weight[usable].mean(), center_noise_m, rotation_noise_deg
+    )
     depth = ratios.estimate(None)
     best = problem.search(depth)
     inliers, excluded = np.zeros(len(model), bool), np.zeros(len(model), bool)
@@ -190,7 +194,7 @@ def align_to_map(
         if ratios.grouped:
             depth = ratios.estimate(inliers)
     notes += ratios.notes
-    alignment = replace(problem.solve(best, depth, notes), inliers=inliers, num_rivals=num_rivals)
+    alignment = replace(problem.solve(best, depth, max_scale_std, notes), inliers=inliers, num_rivals=num_rivals)
     if undecided:
         alignment = replace(alignment, reason="; ".join([*notes, *undecided]), **_UNKNOWN)
     return alignment
@@ -233,19 +237,35 @@ def query_pose(alignment: Alignment, model_from_query: ArrayLike) -> tuple[Float
     return pose, covariance
 
 
-def is_trustworthy(alignment: Alignment, covariance: Floats) -> bool:
-    """Tell whether a pose with this covariance (6, 6), both of `query_pose`, may be called `ok`.
+def is_trustworthy(
+    alignment: Alignment,
+    covariance: Floats,
+    *,
+    max_position_std_m: float = 0.2,
+    max_rotation_std_deg: float = 2.25,
+    min_inliers: int = 2,
+    max_rival_share: float = 0.5,
+) -> bool:
+    """Tell whether a pose of `query_pose` may be called `ok`.
 
-    It may if its standard deviations are small, references confirm each other, and no large group of references agrees
-    on another alignment.
+    The defaults require that errors of 5 deg and 0.5 m are more than 2.2 standard deviations away (2.5 for the
+    position, whose error may lie along one axis), that references confirm each other, and that no large group of
+    references agrees on another alignment.
+
+    Args:
+        covariance: (6, 6) of the pose, as `query_pose` gives it.
+        max_position_std_m: limit of the root of the trace of the position's covariance.
+        max_rotation_std_deg: limit of the root of the trace of the rotation's covariance.
+        min_inliers: least number of consistent references. Nothing checks a single one.
+        max_rival_share: largest group of 2 or more references that agree otherwise, over the number of inliers.
     """
     rivals = alignment.num_rivals if alignment.num_rivals > 1 else 0
     return bool(
         alignment.scale_known
-        and alignment.num_inliers >= LEAST_INLIERS
-        and rivals <= MAX_RIVAL_SHARE * alignment.num_inliers
-        and np.sqrt(np.trace(covariance[3:, 3:])) <= MAX_POSITION_STD_M
-        and np.degrees(np.sqrt(np.trace(covariance[:3, :3]))) <= MAX_ROTATION_STD_DEG
+        and alignment.num_inliers >= min_inliers
+        and rivals <= max_rival_share * alignment.num_inliers
+        and np.sqrt(np.trace(covariance[3:, 3:])) <= max_position_std_m
+        and np.degrees(np.sqrt(np.trace(covariance[:3, :3]))) <= max_rotation_std_deg
     )
 
 
@@ -255,8 +275,9 @@ class _Problem:
     K hypotheses are processed at once. Their members (K, M) are the probabilities of each reference to be right.
     """
 
-    def __init__(self, model: Floats, world: Floats, weight: Floats):
+    def __init__(self, model: Floats, world: Floats, weight: Floats, center_noise_m: float, rotation_noise_deg: float):
         self.weight = weight
+        self.expected = (center_noise_m, rotation_noise_deg)
         self.world_from_model = world[:, :3, :3] @ np.swapaxes(model[:, :3, :3], -1, -2)  # by each camera alone
         self.flat_opinions = self.world_from_model.reshape(-1, 9)
         self.model, self.world = model, world
@@ -267,8 +288,8 @@ class _Problem:
         self.outer_cm = (self.c[:, :, None] * self.m[:, None, :]).reshape(-1, 9)
         typical = np.median(np.linalg.norm(self.c, axis=1))
         # Noise by axis, of which three make the length.
-        self.center_prior = float(np.hypot(CENTER_NOISE_M, CENTER_NOISE_SHARE * typical) / np.sqrt(3))
-        self.rotation_prior = float(np.radians(ROTATION_NOISE_DEG) / np.sqrt(3))
+        self.center_prior = float(np.hypot(center_noise_m, CENTER_NOISE_SHARE * typical) / np.sqrt(3))
+        self.rotation_prior = float(np.radians(rotation_noise_deg) / np.sqrt(3))
         first, second = np.triu_indices(len(self.m), 1)
         gaps_m, gaps_c = (((x[first] - x[second]) ** 2).sum(axis=1) for x in (self.m, self.c))
         # Room, in the model, in which a wrong camera may be: the references' extent.
@@ -279,7 +300,7 @@ class _Problem:
         self.rough_scale = float(np.median(ratios)) if apart.any() else 1.0
 
     def subset(self, kept: Bools) -> _Problem:
-        return _Problem(self.model[kept], self.world[kept], self.weight[kept])
+        return _Problem(self.model[kept], self.world[kept], self.weight[kept], *self.expected)
 
     def search(self, depth: ScaleEstimate | None, noise: tuple[float, float] | None = None) -> _Candidate:
         """Return the most likely similarity and the references that agree with it, within `noise` if it is given."""
@@ -384,7 +405,7 @@ class _Problem:
             likelihood = likelihood - (np.log(noise / expected) / NOISE_FACTOR) ** 2 / 2
         return likelihood, np.exp(right - either)
 
-    def solve(self, best: _Candidate, depth: ScaleEstimate | None, notes: list[str]) -> Alignment:
+    def solve(self, best: _Candidate, depth: ScaleEstimate | None, max_scale_std: float, notes: list[str]) -> Alignment:
         """Return the weighted least squares alignment of a candidate's references, with its uncertainty."""
         state, share = best.state, best.members * self.weight
         rotation, scale = state.rotation[0], float(state.scale[0])
@@ -404,7 +425,7 @@ class _Problem:
             )[0]
             estimate = combined_scale(float(np.sum(rotation * cross)), square_c, center_noise / scale, depth)
             scale_std, conflict = (estimate.std, estimate.conflict) if estimate is not None else (np.inf, False)
-            if estimate is not None and scale_std <= MAX_SCALE_STD:
+            if estimate is not None and scale_std <= max_scale_std:
                 scale = estimate.value
             else:
                 scale = float(self.fit(best.members[None], fitted, depth).scale[0])
@@ -416,7 +437,7 @@ class _Problem:
             free = (3 * count - 3 * part, 3 * (count - 1) - 3 * (1 - part) - float(square_c > 0))
             rotation_noise = float(np.sqrt(noise_variance(angle, max(free[0], 0.0), self.rotation_prior)))
             center_noise = float(np.sqrt(noise_variance(distance, max(free[1], 0.0), self.center_prior)))
-        known = scale_std <= MAX_SCALE_STD
+        known = scale_std <= max_scale_std
         why = "baselines not above the noise of the centers, and no depth ratios"
         if depth is not None:
             why = "neither baselines nor depth ratios give it well enough"
