@@ -59,7 +59,6 @@ def localize_image(
         View(f"picture {number}", color, of, in_map=False, turns=turn if place.settings.predictor.upright else 0)
         for number, ((color, _), of, turn) in enumerate(zip(pixels, cameras, quarter_turns, strict=True), start=1)
     ]
-    grays = [gray for _, gray in pixels]
     features: list[list[LocalFeatures]] = []
     if place.settings.method != "vggt" and place.kinds:
         # As a run reads them: the file of features rounds keypoints at the border.
@@ -70,7 +69,12 @@ def localize_image(
         features = [list(kinds) for kinds in zip(*extracted, strict=True)]
     embedder = place.embedder
     if embedder.inputs == "features":
-        inputs = [as_stored(found) for found in SiftExtractor().extract(grays)]
+        sift = SiftExtractor()
+        settings = [kind.extractor.settings for kind in place.kinds]
+        if features and sift.settings in settings:  # the features that are matched serve the embedder, too
+            inputs = [kinds[settings.index(sift.settings)] for kinds in features]
+        else:
+            inputs = [as_stored(found) for found in sift.extract([gray for _, gray in pixels])]
     else:
         upright = embedder.upright if place.embed_settings.upright is None else place.embed_settings.upright
         shown = zip(pixels, quarter_turns if upright else [0] * len(pixels), strict=True)
