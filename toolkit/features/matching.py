@@ -19,8 +19,8 @@ from toolkit.features.features import (
     feature_kind,
 )  # fmt: skip
 from toolkit.geometry import Floats, Ints
-from toolkit.manifest import FeaturesSettings, MatcherSettings
-from toolkit.models.weights import LIGHTGLUE, SUPERPOINT, WeightsSource
+from toolkit.manifest import FeaturesSettings, MatcherSettings, checkpoint_of
+from toolkit.models.weights import ALIKED, ALIKED_LIGHTGLUE, LIGHTGLUE, SUPERPOINT, WeightsSource, find_weights
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,11 @@ MATCHERS: dict[str, str] = {
     "lightglue": "toolkit.features.lightglue:LightGlueMatcher",
 }
 """Name of a matcher -> `module:callable` that makes it, imported when it is needed."""
-LOCAL_WEIGHTS: dict[str, WeightsSource] = {"superpoint": SUPERPOINT, "lightglue": LIGHTGLUE}
-"""The weights of the extractors and matchers that need some."""
+MATCHER_WEIGHTS: dict[tuple[str, str], WeightsSource] = {
+    ("lightglue", "superpoint"): LIGHTGLUE,
+    ("lightglue", "aliked"): ALIKED_LIGHTGLUE,
+}
+"""The weights of the matchers that need some, by matcher and kind of features."""
 
 
 def create_matcher(name: str, **options: Any) -> Matcher:
@@ -88,6 +91,31 @@ def matchers_of(features: Sequence[str], matcher: str | None = None) -> dict[str
         text = "; ".join(f"{name}: {', '.join(known)}" for name, known in suited.items())
         raise ManifestError(f"The matcher {matcher!r} suits none of the features. Known for {text}.")
     return {name: matcher if matcher in known else known[0] for name, known in suited.items()}
+
+
+def local_weights(features: FeaturesSettings, matcher: MatcherSettings) -> list[tuple[WeightsSource, str | None]]:
+    """Return the weights that extractors and matchers of these settings need, and the file that is given for them.
+
+    Raises:
+        ManifestError: unknown features, or a matcher that suits none of them.
+    """
+    extractors = {"superpoint": SUPERPOINT, "aliked": ALIKED[features.aliked.model]}
+    needed: list[tuple[WeightsSource, str | None]] = []
+    for kind, matched_by in matchers_of(features.kinds, matcher.name).items():
+        if kind in extractors:
+            needed.append((extractors[kind], checkpoint_of(features.checkpoint, kind)))
+        if (matched_by, kind) in MATCHER_WEIGHTS:
+            needed.append((MATCHER_WEIGHTS[matched_by, kind], checkpoint_of(matcher.checkpoint, kind)))
+    return needed
+
+
+def weights_at_hand(features: FeaturesSettings, matcher: MatcherSettings) -> bool:
+    """Tell whether all weights that these settings need are on this machine. Does not use the network.
+
+    Raises:
+        WeightsError: a file is given but missing.
+    """
+    return all(find_weights(source, checkpoint) for source, checkpoint in local_weights(features, matcher))
 
 
 class MutualMatcher:

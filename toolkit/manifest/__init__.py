@@ -4,6 +4,9 @@ from toolkit.manifest.loading import load_manifest
 from toolkit.manifest.manifest import OPTIONAL, STAGES, DatasetSettings, DemoData, Manifest, Source
 from toolkit.manifest.messages import nearest
 from toolkit.manifest.settings import (
+    AlikedModel,
+    AlikedSettings,
+    Checkpoint,
     EmbedSettings,
     EvaluateSettings,
     ExploreSettings,
@@ -20,5 +23,6 @@ from toolkit.manifest.settings import (
     SuperPointSettings,
     VisualizeSettings,
     VladSettings,
+    checkpoint_of,
     describe,
 )

