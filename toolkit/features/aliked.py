@@ -1,0 +1,66 @@
+"""ALIKED (Zhao et al., IEEE Transactions on Instrumentation and Measurement, 2023): learned local features."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from toolkit.features.network import NetworkExtractor
+from toolkit.manifest import AlikedSettings
+from toolkit.models.aliked import Aliked, find_keypoints
+from toolkit.models.weights import ALIKED, resolve_weights
+
+
+class AlikedExtractor(NetworkExtractor):
+    """Extracts ALIKED features: keypoints between pixels, unit descriptors (128,), on any device."""
+
+    color = True
+    name = "aliked"
+    title = "ALIKED"
+    cpu_batch = 1
+
+    def __init__(
+        self,
+        checkpoint: str | Path | Mapping[str, Tensor] | None = None,
+        device: str = "auto",
+        dtype: str = "auto",
+        batch_size: int | None = None,
+        settings: AlikedSettings | None = None,
+    ) -> None:
+        """
+        Args:
+            checkpoint: the official file of the model in `settings`, or its tensors by name; None: from an installed
+                package or a cache, else downloaded.
+            device: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
+            dtype: of the encoder: `float32`, `bfloat16`, `float16`; `auto`: the fastest on the device. Positions,
+                scores and descriptors are always float32.
+            batch_size: most images at a time; None: as suits the device.
+
+        Raises:
+            WeightsError: no weights, or other ones.
+            ManifestError: no such device, precision or setting.
+            ToolkitError: no such device on this machine.
+        """
+        super().__init__(checkpoint, device, dtype, batch_size, settings or AlikedSettings())
+
+    def _load(self, checkpoint: str | Path | Mapping[str, Tensor] | None) -> Aliked:
+        model = self._values.model
+        if not isinstance(checkpoint, Mapping):
+            checkpoint = resolve_weights(ALIKED[model], checkpoint)
+        return Aliked.from_checkpoint(checkpoint, model)
+
+    def _forward(self, batch: Tensor) -> Tensor:
+        settings, model = self._values, self._model
+        pixels = batch.permute(0, 3, 1, 2).float() / 255
+        with torch.autocast(batch.device.type, self._dtype, enabled=self._dtype != torch.float32):
+            levels = model.encode(pixels)
+        packed = torch.zeros(len(batch), settings.max_keypoints, 3 + model.descriptor_length, device=batch.device)
+        for number, (row, scores) in enumerate(zip(packed, model.scores(levels), strict=True)):
+            if not scores.isfinite().all():
+                row[0] = torch.nan
+                continue
+            keypoints, values = find_keypoints(scores, settings.max_keypoints, settings.threshold, settings.nms_radius)
+            descriptors = model.describe(levels, number, keypoints)
+            row[: len(keypoints)] = torch.cat([keypoints, values[:, None], descriptors], dim=1)
+        return packed

@@ -1,0 +1,133 @@
+"""What extractors that run a network share: sizes, batches, and the way back to the pixels of the photograph."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from toolkit.errors import ToolkitError
+from toolkit.features.features import LocalFeatures
+from toolkit.manifest import AlikedSettings, SuperPointSettings
+from toolkit.models.compute import Fitting, resolve_device, resolve_precision
+from toolkit.models.weights import weights_digest
+
+_BATCH_ELSEWHERE = 16
+
+
+class NetworkExtractor:
+    """Extracts features with a network, on any device.
+
+    Images of one size run together. The features of an image do not depend on the others in the batch.
+    """
+
+    color: bool
+    threaded = False
+    name: ClassVar[str]
+    """Key of the kind of features."""
+    title: ClassVar[str]
+    """Name of the network, for messages."""
+    cpu_batch: ClassVar[int]
+    """Images that keep a CPU busy; more at once take more memory and no less time."""
+
+    def __init__(
+        self,
+        checkpoint: str | Path | Mapping[str, Tensor] | None,
+        device: str,
+        dtype: str,
+        batch_size: int | None,
+        settings: AlikedSettings | SuperPointSettings,
+    ) -> None:
+        """See the extractors."""
+        self._values: Any = settings
+        self._device = resolve_device(device)
+        self._dtype = resolve_precision(dtype, self._device)
+        self.batch_size = batch_size or (self.cpu_batch if self._device.type == "cpu" else _BATCH_ELSEWHERE)
+        model = self._load(checkpoint)
+        self._weights = weights_digest(model)
+        self._model: Any = model.to(self._device)
+        self._fitting: dict[tuple[int, ...], Fitting] = {}
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        precision = str(self._dtype).removeprefix("torch.")
+        return {"name": self.name, "weights": self._weights, "dtype_compute": precision, **self._values.model_dump()}
+
+    def _load(self, checkpoint: str | Path | Mapping[str, Tensor] | None) -> nn.Module:
+        """Return the network with its weights, on the CPU."""
+        raise NotImplementedError
+
+    def _forward(self, batch: Tensor) -> Tensor:
+        """Return x, y, score and descriptor of keypoints, (B, K, 3 + D), strongest first, then rows of zeros.
+
+        In x and y the center of the top-left pixel is at 0. A row that is not finite stands for an image whose scores
+        are not.
+
+        Args:
+            batch: images (B, H, W) or (B, H, W, 3), uint8, as the network sees them.
+        """
+        raise NotImplementedError
+
+    def extract(self, images: Sequence[NDArray[np.uint8]]) -> list[LocalFeatures]:
+        """Return the features of images, (H, W) gray or (H, W, 3) RGB, uint8, of any sizes; float16 descriptors.
+
+        Raises:
+            ValueError: another shape or type.
+            ToolkitError: a response is not finite, or not even one image fits the device's memory.
+        """
+        prepared = [self._prepare(image) for image in images]
+        of_shape: dict[tuple[int, ...], list[int]] = {}
+        for number, image in enumerate(prepared):
+            of_shape.setdefault(image.shape, []).append(number)
+        features: dict[int, LocalFeatures] = {}
+        for shape, numbers in of_shape.items():
+            fitting = self._fitting.setdefault(shape, Fitting(self._forward, "images"))
+            for start in range(0, len(numbers), self.batch_size):
+                part = numbers[start : start + self.batch_size]
+                batch = torch.from_numpy(np.stack([prepared[number] for number in part]))
+                with torch.inference_mode():
+                    packed = fitting(batch.to(self._device)).cpu().numpy()
+                for number, rows in zip(part, packed, strict=True):
+                    features[number] = self._unpack(rows, shape, images[number].shape)
+        return [features[number] for number in range(len(images))]
+
+    def _prepare(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return an image of the size and with the channels that the network sees."""
+        image = np.asarray(image)
+        if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)) or not image.size:
+            raise ValueError(f"an image is {image.dtype} {image.shape}; expected uint8 (H, W) or (H, W, 3) RGB.")
+        if image.ndim == 3 and not self.color:
+            image = np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), np.uint8)
+        height, width = image.shape[:2]
+        long_side = max(height, width)
+        least, most = getattr(self._values, "min_long_side", 0), self._values.max_long_side
+        factor = min(max(long_side, least), most) / long_side
+        if factor != 1:
+            size = (max(1, round(width * factor)), max(1, round(height * factor)))
+            interpolation = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
+            image = np.asarray(cv2.resize(image, size, interpolation=interpolation), np.uint8)
+        return np.repeat(image[:, :, None], 3, axis=2) if self.color and image.ndim == 2 else image
+
+    def _unpack(self, rows: NDArray[np.float32], shown: tuple[int, ...], shape: tuple[int, ...]) -> LocalFeatures:
+        """Return what `_forward` found in an image of shape `shown`, in the pixels of the photograph of `shape`."""
+        if not np.isfinite(rows).all():
+            raise ToolkitError(
+                f"{self.title} gave a response or a descriptor that is not finite. Its weights may hold NaN: compare "
+                "the file with the official one. With float16, numbers may have been too large: use bfloat16 or "
+                "float32."
+            )
+        rows = rows[rows[:, 2] > 0]
+        (rows_shown, columns_shown), (height, width) = shown[:2], shape[:2]
+        # Pixel centers of the network are at whole numbers; resizing keeps corners, not centers, where they are.
+        keypoints = (rows[:, :2] + 0.5) * np.array([width / columns_shown, height / rows_shown])
+        return LocalFeatures(
+            keypoints.astype(np.float32),
+            np.ones(len(rows), np.float32),
+            rows[:, 2].copy(),
+            rows[:, 3:].astype(np.float16),
+            (width, height),
+        )
