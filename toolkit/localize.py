@@ -4,6 +4,7 @@ import logging
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import default_workers, prefetch
 from toolkit.errors import ToolkitError
 from toolkit.features.groups import GroupWriter
-from toolkit.features.matching import LocalMethod, MutualMatcher, create_local_methods
+from toolkit.features.matching import LocalMethod, MutualMatcher, create_local_methods, resolve_auto
 from toolkit.features.stores import FeatureStore, MatchStore, extract_session, match_sessions
 from toolkit.files import (
     file_fingerprint,
@@ -32,11 +33,13 @@ from toolkit.files import (
 )
 from toolkit.localizers.base import Localizer, NetworkMatches, PoseEstimate, Query, References, View
 from toolkit.localizers.correspondences import LocalizedQuery, query_group
+from toolkit.localizers.escalation import EscalatingLocalizer
 from toolkit.localizers.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
 from toolkit.localizers.map import (
     Map,
     attributes,
     create_localizer,
+    create_methods,
     label,
     open_predictor,
     session_fingerprint,
@@ -57,6 +60,10 @@ COLUMNS = [
 ]  # fmt: skip
 PREDICTION_COLUMNS = ["scale_std", "rejected", "reason"]
 """Further columns of the methods that predict."""
+
+ESCALATION_COLUMNS = ["first_status", "first_seconds"]
+"""Further columns where kinds of features are asked only if the pose is not sure: status and seconds before that;
+empty: they were not asked."""
 
 
 def localize_pairs(
@@ -99,14 +106,10 @@ def localize_pairs(
         CaptureError: unknown device or list.
         ArtifactError: the retrieval of a pair is missing.
     """
-    settings = LocalizeSettings.of(settings)
+    settings = resolve_auto(LocalizeSettings.of(settings))
     capture = Capture.from_sessions_root(sessions_root)
     workers = workers or default_workers()
-    kinds: list[LocalMethod] = []
-    if settings.method != "nearest":
-        kinds = create_local_methods(
-            settings.features, settings.matcher, settings.compute_device, settings.dtype_compute
-        )
+    kinds, escalation = create_methods(settings)
     predictor = open_predictor(settings, capture, Path(map_dir)) if settings.predicts else None
     table = []
     with threadpool_limits(1, "blas"):  # queries are the parallel dimension, and sums stay in one order
@@ -115,14 +118,14 @@ def localize_pairs(
             for queried in capture.devices_with("query", query_device):
                 started = time.perf_counter()
                 pair = _Pair(capture, mapped, queried, Path(retrieval_dir), Path(out_dir), queries)
-                record = pair.record(settings, kinds, predictor)
+                record = pair.record(settings, kinds, escalation, predictor)
                 about = attributes(settings, kinds, capture, mapped, pair.retrieval_dir)
                 skipped = skip_existing and pair.is_current(record)
                 if not skipped:
                     if localizer is None:
                         place = Map.build(
                             capture, mapped, settings, kinds, Path(features_dir), Path(map_dir), workers,
-                            skip_existing,
+                            skip_existing, escalation,
                         )  # fmt: skip
                         localizer = create_localizer(settings, place, predictor)
                     run = _PairRun(pair, place, localizer, Path(features_dir), workers, skip_existing)
@@ -171,7 +174,11 @@ class _Pair:
         return self.capture[f"{self.query_device}_query"]
 
     def record(
-        self, settings: LocalizeSettings, kinds: Sequence[LocalMethod], predictor: Predictor | None
+        self,
+        settings: LocalizeSettings,
+        kinds: Sequence[LocalMethod],
+        escalation: Sequence[LocalMethod],
+        predictor: Predictor | None,
     ) -> dict[str, Any]:
         """Return what the poses depend on."""
         map_session, keyframes = self.capture[f"{self.map_device}_map"], self.session.keyframes(self.queries)
@@ -180,7 +187,7 @@ class _Pair:
         record: dict[str, Any] = {
             "method": settings.method,
             "pnp": settings.pnp.model_dump() | {"seed": settings.seed},
-            "map": map_settings(settings.map, settings.seed),
+            "map": settings.map and map_settings(settings.map, settings.seed),
             "features": [kind.extractor.settings for kind in kinds],
             "matchers": [kind.matcher.settings for kind in kinds],
             "retrieval": file_fingerprint(self.retrieval),
@@ -189,6 +196,8 @@ class _Pair:
             "images": [map_session.files_fingerprint, self.session.files_fingerprint],
             "keyframes": fingerprint([keyframes["timestamp"].astype(str).tolist(), keyframes["device_id"].tolist()]),
         }
+        if escalation:
+            record["escalation"] = [[kind.extractor.settings, kind.matcher.settings] for kind in escalation]
         if predictor is not None:
             record |= {
                 "predictor": {"name": predictor.name} | predictor.settings,
@@ -211,7 +220,7 @@ class _PairRun:
         self, pair: _Pair, place: Map, localizer: Localizer, features_dir: Path, workers: int, skip_existing: bool
     ) -> None:
         self.pair, self.place, self.localizer = pair, place, localizer
-        self.workers, self.skip_existing = workers, skip_existing
+        self.features_dir, self.workers, self.skip_existing = features_dir, workers, skip_existing
         keyframes = pair.session.keyframes(pair.queries)
         self.keys = list(zip(keyframes["timestamp"].tolist(), keyframes["device_id"].tolist(), strict=True))
         self.rows = pair.session.rows_of_keyframes(keyframes)
@@ -223,16 +232,18 @@ class _PairRun:
         """Of each query image, by timestamp and sensor."""
         self.stores: list[FeatureStore] = []
         self.matches: list[MatchStore | None] = []
-        if place.settings.method != "vggt" and place.kinds:
-            self._match(features_dir)
+        if place.settings.method != "vggt":
+            for kind in place.kinds:
+                self._add_kind(kind, range(len(self.keys)))
 
-    def _match(self, features_dir: Path) -> None:
-        """Extract the features of the query images, and match them with their references where that takes a network."""
+    def _add_kind(self, kind: LocalMethod, numbers: Sequence[int]) -> None:
+        """Extract features of the images of queries, and match them with their references where that takes a network.
+
+        Where the map has no points of the kind, the features of the references are extracted, too.
+        """
         session, place = self.pair.session, self.place
-        rows = np.unique(np.concatenate([*self.rows, np.zeros(0, np.int64)]))
-        self.stores = [
-            extract_session(session, features_dir, kind.extractor, rows, self.workers) for kind in place.kinds
-        ]
+        rows = np.unique(np.concatenate([*(self.rows[number] for number in numbers), np.zeros(0, np.int64)]))
+        store = extract_session(session, self.features_dir, kind.extractor, rows, self.workers)
         images = session.images.iloc[rows]
         keys = zip(images["timestamp"].tolist(), images["sensor_id"].tolist(), strict=True)
         names = [
@@ -241,13 +252,18 @@ class _PairRun:
             if key in self.references
             for index in self.references[key].images
         ]
-        sessions = session.id, f"{place.device}_map"
-        for kind, store, mapped in zip(place.kinds, self.stores, place.mapped, strict=True):
-            matches = None
-            if isinstance(mapped.features, FeatureStore) and not isinstance(kind.matcher, MutualMatcher):
-                stores = store, mapped.features
-                matches = match_sessions(stores, names, kind.matcher, place.map_dir, sessions, self.skip_existing)
-            self.matches.append(matches)
+        of_map = next((mapped.features for mapped in place.mapped if mapped.name == kind.name), None)
+        if of_map is None:
+            references = dict.fromkeys(name for _, name in names)
+            of_map = place.on_demand[kind.name].prepare(references, self.workers, self.skip_existing)
+        matches = None
+        if isinstance(of_map, FeatureStore) and not isinstance(kind.matcher, MutualMatcher):
+            sessions = session.id, f"{place.device}_map"
+            matches = match_sessions(
+                (store, of_map), names, kind.matcher, place.map_dir, sessions, self.skip_existing
+            )
+        self.stores.append(store)
+        self.matches.append(matches)
 
     def query(self, number: int) -> tuple[Query, list[References]]:
         """Return a query with the references of its images."""
@@ -287,13 +303,27 @@ class _PairRun:
         with GroupWriter(path, record, about) as writer:
             if not self.skip_existing:
                 writer.discard()
-            done = writer.notes()
             numbers = {group: number for number, group in enumerate(groups)}  # a list may name a query twice
-            todo = [number for group, number in numbers.items() if group not in done]
-            progress = f"localize {self.pair.query_device} in {self.pair.map_device}"
-            answers = prefetch(self._localize, self._predicted(todo), self.workers)
-            for number, row, localized in tqdm(answers, total=len(todo), desc=progress, unit="query"):
+            rows = writer.notes()
+            first = self.localizer.first if isinstance(self.localizer, EscalatingLocalizer) else self.localizer
+            todo = [number for group, number in numbers.items() if group not in rows]
+            for number, row, localized in self._localized(first, todo):
+                rows[groups[number]] = row
                 writer.add(groups[number], arrays=localized.arrays(), note=row)
+            further = {group: rows[group] for group, number in numbers.items() if len(self.rows[number])}
+            todo = [
+                numbers[group] for group, row in further.items() if row["status"] != "ok" and not row["first_status"]
+            ]
+            if first is not self.localizer and todo:
+                started = time.perf_counter()
+                for kind in self.place.escalation:
+                    self._add_kind(kind, todo)
+                shared = (time.perf_counter() - started) / len(todo)
+                for number, row, localized in self._localized(self.localizer, todo):
+                    before = rows[groups[number]]
+                    row |= {"first_status": before["status"], "first_seconds": before["seconds"]}
+                    row["seconds"] = round(row["seconds"] + before["seconds"] + shared, 4)
+                    writer.add(groups[number], arrays=localized.arrays(), note=row)
             # From here until the new poses are there, a kill must not leave poses of one run with a file of another.
             for poses in (self.pair.file("txt"), sidecar_path(self.pair.file("txt"))):
                 poses.unlink(missing_ok=True)
@@ -301,26 +331,36 @@ class _PairRun:
             rows = writer.notes()
         return [rows[group] for group in groups]
 
-    def _predicted(self, numbers: Sequence[int]) -> Iterator[tuple[int, Query, list[References], Any, float]]:
+    def _localized(
+        self, localizer: Localizer, numbers: Sequence[int]
+    ) -> Iterator[tuple[int, dict[str, Any], LocalizedQuery]]:
+        """Yield queries with their rows and correspondences."""
+        answers = prefetch(partial(self._localize, localizer), self._predicted(localizer, numbers), self.workers)
+        label = f"localize {self.pair.query_device} in {self.pair.map_device}"
+        return iter(tqdm(answers, total=len(numbers), desc=label, unit="query", disable=not numbers))
+
+    def _predicted(
+        self, localizer: Localizer, numbers: Sequence[int]
+    ) -> Iterator[tuple[int, Query, list[References], Any, float]]:
         """Yield queries with what a network says of them, asked for some at a time, and the seconds that took."""
-        size = self.localizer.batch_size
+        size = localizer.batch_size
         for start in range(0, len(numbers), size):
             part = numbers[start : start + size]
             queries = [self.query(number) for number in part]
             started = time.perf_counter()
-            predictions = self.localizer.predict(queries)
+            predictions = localizer.predict(queries)
             seconds = (time.perf_counter() - started) / len(part)
             for number, query, prediction in zip(part, queries, predictions, strict=True):
                 yield number, *query, prediction, seconds
 
     def _localize(
-        self, task: tuple[int, Query, list[References], Any, float]
+        self, localizer: Localizer, task: tuple[int, Query, list[References], Any, float]
     ) -> tuple[int, dict[str, Any], LocalizedQuery]:
         number, query, references, prediction, seconds = task
         started = time.perf_counter() - seconds
         try:
             if query.views:
-                estimate = self.localizer.localize(query, references, prediction)
+                estimate = localizer.localize(query, references, prediction)
             else:
                 estimate = PoseEstimate("failed: no images of this device at this time")
         except Exception as error:  # one bad query never ends a run
@@ -368,6 +408,8 @@ def _row(
         "scale_std": round(estimate.scale_std, 6),
         "rejected": ";".join(localized.rejected),
         "reason": estimate.reason,
+        "first_status": None,
+        "first_seconds": None,
         "qt": pose,
         "covariance": covariance,
     }
@@ -375,7 +417,8 @@ def _row(
 
 def _write_poses(pair: _Pair, rows: list[dict[str, Any]], settings: LocalizeSettings) -> None:
     """Write the table and the poses of a pair, the poses last: they stand for a finished pair."""
-    columns = [*COLUMNS, *PREDICTION_COLUMNS] if settings.predicts else COLUMNS
+    columns = [*COLUMNS, *(PREDICTION_COLUMNS if settings.predicts else [])]
+    columns += ESCALATION_COLUMNS if settings.features.escalation else []
     with write_atomic(pair.file("csv")) as temporary:
         pd.DataFrame(rows, columns=columns).to_csv(temporary, index=False)
     posed = [row for row in rows if row["qt"] is not None]
@@ -418,8 +461,8 @@ def explain_query(
     if not settings.predicts:
         raise ToolkitError(f"The method {settings.method} asks no network. Use vggt or hybrid.")
     capture = Capture.from_sessions_root(sessions_root)
-    settings = LocalizeSettings.of(settings, {"method": "vggt"})
-    kinds = create_local_methods(settings.features, settings.matcher, settings.compute_device, settings.dtype_compute)
+    settings = resolve_auto(LocalizeSettings.of(settings, {"method": "vggt"}))
+    kinds = create_local_methods(settings)
     place = Map.build(capture, map_device, settings, kinds, Path(features_dir), Path(map_dir))
     localizer = create_localizer(settings, place)
     assert isinstance(localizer, FeedForwardLocalizer)

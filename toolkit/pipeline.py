@@ -25,7 +25,7 @@ from toolkit.embedders import WEIGHTS as EMBEDDER_WEIGHTS
 from toolkit.embedders import resolve_name
 from toolkit.errors import ManifestError
 from toolkit.exchange.download import is_unfinished
-from toolkit.features.matching import local_weights
+from toolkit.features.matching import local_weights, resolve_auto
 from toolkit.files import SceneFiles, files_fingerprint, fingerprint, write_text
 from toolkit.manifest import (
     STAGES,
@@ -223,9 +223,12 @@ def _weights_needed(stage: str, settings: Settings) -> list[tuple[WeightsSource,
             return []
         if settings.predicts and settings.predictor.name == "vggt":
             needed.append((VGGT, settings.predictor.checkpoint))
-    elif not isinstance(settings, RerankSettings):
+        local = local_weights(resolve_auto(settings))
+    elif isinstance(settings, RerankSettings):
+        local = local_weights(resolve_auto(settings))
+    else:
         return []
-    for source, checkpoint in local_weights(settings.features, settings.matcher):
+    for source, checkpoint in local:
         section = source.setting.removeprefix("localize.")
         needed.append((replace(source, setting=f"{stage}.{section}"), checkpoint))
     return needed

@@ -24,7 +24,7 @@ from toolkit.capture import Capture, Session
 from toolkit.capture.images import default_workers, prefetch
 from toolkit.errors import ArtifactError
 from toolkit.features.groups import GroupWriter
-from toolkit.features.matching import LocalMethod, create_local_methods
+from toolkit.features.matching import LocalMethod, create_local_methods, resolve_auto
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.features.verification import Verifier
 from toolkit.files import (
@@ -81,11 +81,9 @@ def rerank_pairs(
         CaptureError: unknown device.
         ArtifactError: the retrieval of a pair is missing, torn, or of another capture.
     """
-    settings = RerankSettings.of(settings)
+    settings = resolve_auto(RerankSettings.of(settings))
     capture = Capture.from_sessions_root(sessions_root)
-    (method,) = create_local_methods(
-        settings.features, settings.matcher, settings.compute_device, settings.dtype_compute
-    )
+    (method,) = create_local_methods(settings)
     workers = workers or default_workers()
     table = []
     cv2_threads = cv2.getNumThreads()

@@ -37,6 +37,12 @@ class LocalFeatures:
     def __len__(self) -> int:
         return len(self.keypoints)
 
+    @classmethod
+    def none(cls, image_size: tuple[int, int], length: int = 128) -> "LocalFeatures":
+        """Return the features of an image that has none; `length` is that of descriptors."""
+        zeros = np.zeros(0, np.float32)
+        return cls(zeros.reshape(0, 2), zeros, zeros, np.zeros((0, length), np.uint8), image_size)
+
     def take(self, part: slice | Ints) -> "LocalFeatures":
         """Return some of the features, by index."""
         return LocalFeatures(
@@ -177,8 +183,7 @@ class SiftExtractor:
             image = np.asarray(cv2.resize(image, size, interpolation=interpolation), np.uint8)
         keypoints, descriptors = self._sift().detectAndCompute(image, None)
         if descriptors is None or not len(keypoints):
-            none = np.zeros(0, np.float32)
-            return LocalFeatures(none.reshape(0, 2), none, none, np.zeros((0, 128), np.uint8), (width, height))
+            return LocalFeatures.none((width, height))
         scale = np.array([width / size[0], height / size[1]])
         responses = np.array([keypoint.response for keypoint in keypoints], np.float32)
         order = np.argsort(-responses, kind="stable")[: settings.max_keypoints]

@@ -117,7 +117,7 @@ class GroupWriter:
         attributes: Mapping[str, Mapping[str, Any]] | None = None,
         note: Any = None,
     ) -> None:
-        """Write a group.
+        """Write a group; it replaces one of the same name.
 
         Args:
             made_from: fingerprint of what it was made from, besides what the file was made by.
@@ -125,6 +125,8 @@ class GroupWriter:
             note: about the group, any JSON; `notes` returns it.
         """
         file, index = self._part()
+        if name in index.groups:
+            del file[name]
         group = file.create_group(name)
         for key, array in (arrays or {}).items():
             group[key] = array

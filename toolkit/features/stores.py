@@ -10,9 +10,11 @@ names replaced by `-` (see `group_names` for names that this makes equal), with 
 first image the index of the second image's feature or -1, and `matching_scores0` (N,).
 """
 
+import logging
 import threading
 from collections import Counter
 from collections.abc import Container, Iterable, Iterator, Mapping
+from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -32,10 +34,14 @@ from toolkit.features.matching import Matcher, PairMatches
 from toolkit.files import files_fingerprint, fingerprint, read_sidecar
 from toolkit.geometry import Ints
 
+log = logging.getLogger(__name__)
+
 PIXEL_CENTER = "top_left_pixel_center"
 """Attribute of a file of features: where the center of the top-left pixel is."""
 SCALE = "scale"
 """Attribute of the descriptors in a file: they were bytes, divided by this."""
+KEPT_IMAGES = 256
+"""Images whose features `OnDemandFeatures` keeps in memory."""
 _HALF_PIXEL = np.float32(0.5)
 # Files hold bytes as float16, exactly: a byte over a power of two has 8 significant bits, float16 holds 11. A look-up
 # is several times quicker than a product and a conversion.
@@ -250,6 +256,44 @@ def extract_session(
     failed = {name: index.failed[name][1] for name in made_from if name in index.failed}
     readable = {name: source for name, source in made_from.items() if name in index.groups}
     return FeatureStore(path, readable, failed, extractor.settings)
+
+
+class OnDemandFeatures:
+    """The features of a session's images, by name: those of its file, else extracted when they are asked for.
+
+    Safe to use from several threads. What was extracted last stays in memory.
+    """
+
+    def __init__(self, session: Session, out: str | Path, extractor: Extractor):
+        """`out` is the folder of all features."""
+        self._session, self._out, self._extractor = session, Path(out), extractor
+        self._store: FeatureStore | None = None
+        if features_path(out, session.id, extractor.settings).exists():
+            self._store = FeatureStore.of_session(out, session.id, extractor.settings)
+        self._extract = lru_cache(KEPT_IMAGES)(self._extract_one)
+        self._lock = threading.Lock()
+
+    def prepare(self, names: Iterable[str], workers: int, skip_existing: bool = True) -> FeatureStore:
+        """Extract the features of images into the file, and return it; see `extract_session`."""
+        rows = np.array([self._session.row_of_name[name] for name in names], np.int64)
+        self._store = extract_session(self._session, self._out, self._extractor, rows, workers, skip_existing)
+        return self._store
+
+    def __call__(self, name: str) -> LocalFeatures:
+        """Return the features of an image; none where it cannot be read."""
+        if self._store is not None and name in self._store:
+            return self._store[name]
+        with self._lock:
+            return self._extract(name)
+
+    def _extract_one(self, name: str) -> LocalFeatures:
+        row = self._session.row_of_name[name]
+        features = next(_extract(self._session, [row], self._extractor, workers=1))
+        if isinstance(features, str):
+            log.warning("%s", features)
+            camera = self._session.camera(self._session.images["sensor_id"].iloc[row])
+            return LocalFeatures.none((camera.width, camera.height))
+        return as_stored(features)
 
 
 def _made_from(session: Session, row: int) -> str:

@@ -1,7 +1,7 @@
 """The triangulated map as arrays: posed images, points, and which keypoint of which image sees which point."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -110,6 +110,29 @@ class LocalMap:
         seen = [np.unique(self.observations(int(image))[1]) for image in images]
         return np.array([[len(np.intersect1d(a, b, assume_unique=True)) for b in seen] for a in seen], np.int64)
 
+    def around(self, images: NDArray[np.int64]) -> tuple["LocalMap", NDArray[np.int64]]:
+        """Return the part of the map that the images, and those that share points with them, see.
+
+        Returns:
+            A map of the same images with some of the points, and the index of each of these here.
+        """
+        seen = np.concatenate([np.zeros(0, np.int64), *(self.observations(int(image))[1] for image in images)])
+        covisible = np.flatnonzero(self.images_seeing(np.unique(seen)))
+        points = np.unique(np.concatenate([np.zeros(0, np.int64), *(self.observations(int(i))[1] for i in covisible)]))
+        place = np.full(len(self.points), -1, np.int64)
+        place[points] = np.arange(len(points))
+        there = place[self.obs_point] >= 0
+        part = replace(
+            self,
+            points=self.points[points],
+            colors=self.colors[points],
+            obs_image=self.obs_image[there],
+            obs_keypoint=self.obs_keypoint[there],
+            obs_point=place[self.obs_point[there]],
+            noise_px=self.noise_px[points],
+        )
+        return part, points
+
     @classmethod
     def pooled(cls, maps: Sequence["LocalMap"]) -> "LocalMap":
         """Return one map of maps of one session, each triangulated from another kind of features.
@@ -120,7 +143,8 @@ class LocalMap:
         if len(maps) == 1:
             return maps[0]
         cameras: dict[str, tuple[pycolmap.Camera, Floats]] = {}
-        for one in maps:
+        same = all(one.image_names is maps[0].image_names for one in maps)
+        for one in maps[:1] if same else maps:
             for name, camera, pose in zip(one.image_names, one.cameras, one.world_from_cams, strict=True):
                 cameras.setdefault(name, (camera, pose))
         index_of = {name: index for index, name in enumerate(cameras)}

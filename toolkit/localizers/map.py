@@ -21,18 +21,20 @@ from toolkit.embedders.search import search
 from toolkit.errors import ArtifactError
 from toolkit.features.features import KINDS
 from toolkit.features.matching import LocalMethod, create_local_methods
-from toolkit.features.stores import FeatureStore, as_stored, extract_session
+from toolkit.features.stores import FeatureStore, OnDemandFeatures, as_stored, extract_session
 from toolkit.features.verification import Verifier
 from toolkit.files import SceneFiles, file_fingerprint, fingerprint, image_name, write_atomic
 from toolkit.geometry import unit
 from toolkit.localizers.base import Localizer, References
 from toolkit.localizers.correspondences import MAPS
+from toolkit.localizers.escalation import EscalatingLocalizer
 from toolkit.localizers.feed_forward import FeedForwardLocalizer
 from toolkit.localizers.hybrid import HybridLocalizer
 from toolkit.localizers.local_map import LocalMap, map_path
 from toolkit.localizers.mapping import build_map
 from toolkit.localizers.matches import MappedFeatures
 from toolkit.localizers.nearest import NearestLocalizer
+from toolkit.localizers.on_demand import OnDemandLocalizer, PosedImages
 from toolkit.localizers.pnp import PnpLocalizer
 from toolkit.localizers.prediction import Predictor
 from toolkit.localizers.predictors import create_predictor
@@ -60,7 +62,11 @@ class Map:
     kinds: Sequence[LocalMethod] = ()
     """How local features are extracted and matched; none for `nearest`."""
     mapped: Sequence[MappedFeatures] = ()
-    """The map's features of each kind."""
+    """The map's features of each kind, with their points; none where `settings.map` is null."""
+    escalation: Sequence[LocalMethod] = ()
+    """Further kinds, asked where the pose is not `ok` without them; the map has no points of theirs."""
+    features_dir: Path | None = None
+    """Folder of all local features."""
     files: SceneFiles | None = None
     """Of the run that the map is of; None: pictures of no session cannot be localized, as they need its embedder."""
     reranked: bool = False
@@ -77,16 +83,19 @@ class Map:
         map_dir: Path,
         workers: int = 1,
         skip_existing: bool = True,
+        escalation: Sequence[LocalMethod] = (),
     ) -> "Map":
         """Extract the features of a map session and triangulate its points, or load what is there."""
         session, mapped = capture[f"{device}_map"], []
-        for kind in kinds:
+        for kind in kinds if settings.map is not None else ():
             store = extract_session(session, features_dir, kind.extractor, workers=workers)
             inputs = fingerprint([session_fingerprint(session), store.fingerprint])
             path = map_path(map_dir, session.id, kind.name)
+            assert settings.map is not None
             local_map = build_map(session, store, path, settings.map, settings.seed, skip_existing, inputs, workers)
             mapped.append(MappedFeatures(local_map, store, KINDS[kind.name], kind.matcher, kind.name))
-        return cls(device, capture.path / "sessions", map_dir, settings, kinds, mapped)
+        root = capture.path / "sessions"
+        return cls(device, root, map_dir, settings, kinds, mapped, escalation, features_dir)
 
     @classmethod
     def open(cls, run: str | Path, scene: str, device: str) -> "Map":
@@ -116,11 +125,7 @@ class Map:
                 reranked = Path(file.attrs[RETRIEVAL]).name == files.reranked_dir.name
         except (OSError, KeyError, ValueError) as error:
             raise ArtifactError(f"{newest} does not tell how it was made ({error}). Localize again.") from None
-        kinds = []
-        if settings.method != "nearest":
-            kinds = create_local_methods(
-                settings.features, settings.matcher, settings.compute_device, settings.dtype_compute
-            )
+        kinds, escalation = create_methods(settings)
         mapped = [
             MappedFeatures(
                 LocalMap.load(files.maps / name),
@@ -129,9 +134,11 @@ class Map:
                 kind.matcher,
                 kind.name,
             )
-            for name, kind in zip(names, kinds, strict=True)
+            for name, kind in zip(names, kinds if settings.map is not None else (), strict=True)
         ]
-        return cls(device, sessions_root, files.maps, settings, kinds, mapped, files, reranked)
+        return cls(
+            device, sessions_root, files.maps, settings, kinds, mapped, escalation, files.features, files, reranked
+        )
 
     @cached_property
     def capture(self) -> Capture:
@@ -146,6 +153,13 @@ class Map:
     def turns(self) -> Turns | None:
         """What makes the capture's images upright; None where the network sees them as they are."""
         return _turns(self.settings, self.capture)
+
+    @cached_property
+    def on_demand(self) -> dict[str, OnDemandFeatures]:
+        """Features of map images of the kinds without points, by the name of the kind."""
+        kinds = [*(self.kinds if self.settings.map is None else ()), *self.escalation]
+        assert self.features_dir is not None
+        return {kind.name: OnDemandFeatures(self.session, self.features_dir, kind.extractor) for kind in kinds}
 
     @cached_property
     def localizer(self) -> Localizer:
@@ -236,9 +250,7 @@ class Map:
     def _verification(self) -> tuple[LocalMethod, Verifier]:
         """What the rerank stage of the run verified references with."""
         settings = RerankSettings.of(_read_settings(self._run.reranked_dir / "settings.json"))
-        (method,) = create_local_methods(
-            settings.features, settings.matcher, settings.compute_device, settings.dtype_compute
-        )
+        (method,) = create_local_methods(settings)
         store = FeatureStore.of_session(self._run.features, f"{self.device}_map", method.extractor.settings)
         return method, Verifier(settings, method.matcher, store)
 
@@ -328,19 +340,52 @@ def create_localizer(settings: LocalizeSettings, map: Map, predictor: Predictor 
         poses = session.world_from_cam(rows)
         posed = np.isfinite(poses).reshape(-1, 16).all(axis=1)
         return NearestLocalizer([session.image_name(int(row)) for row in rows[posed]], poses[posed])
-    if not map.mapped:
+    if not map.kinds:
         raise ArtifactError(
             f"The map of {map.device!r} is of a run of the method {map.settings.method!r} and has no points, which the "
             f"method {settings.method!r} needs. Localize with that method first."
         )
+    if settings.map is None:
+        return _escalating(_on_demand(settings, map, map.kinds), settings, map)
     pnp = PnpLocalizer(map.mapped, settings.pnp, settings.seed)
     if not settings.predicts:
-        return pnp
+        return _escalating(pnp, settings, map)
     predictor = predictor or open_predictor(settings, map.capture, map.map_dir)
     local_map = map.mapped[0].map
     turns = map.turns if settings == map.settings else _turns(settings, map.capture)
     feed_forward = FeedForwardLocalizer(local_map, map.session, predictor, settings.predictor, turns)
-    return feed_forward if settings.method == "vggt" else HybridLocalizer(pnp, feed_forward)
+    return feed_forward if settings.method == "vggt" else _escalating(HybridLocalizer(pnp, feed_forward), settings, map)
+
+
+def _escalating(first: Localizer, settings: LocalizeSettings, map: Map) -> Localizer:  # noqa: A002
+    """Return a localizer that asks further kinds of features where the first is not sure, if there are any."""
+    if not map.escalation:
+        return first
+    kinds = [*(map.kinds if settings.map is None else ()), *map.escalation]
+    return EscalatingLocalizer(
+        first, _on_demand(settings, map, kinds), "+".join(kind.name for kind in map.escalation)
+    )
+
+
+def _on_demand(settings: LocalizeSettings, map: Map, kinds: Sequence[LocalMethod]) -> OnDemandLocalizer:  # noqa: A002
+    """Return what localizes with the points of the map, and with those of kinds that are made for each query."""
+    names = map.mapped[0].map.image_names if map.mapped else None
+    return OnDemandLocalizer(
+        PosedImages.of_session(map.session, names),
+        map.mapped,
+        [(kind, map.on_demand[kind.name]) for kind in kinds],
+        settings.map,
+        settings.pnp,
+        settings.seed,
+    )
+
+
+def create_methods(settings: LocalizeSettings) -> tuple[list[LocalMethod], list[LocalMethod]]:
+    """Return the kinds of features that every query needs, and those that are asked where it is not sure."""
+    if settings.method == "nearest":
+        return [], []
+    further = settings.features.escalation if settings.method in ("pnp", "hybrid") else []
+    return create_local_methods(settings), create_local_methods(settings, further)
 
 
 def label(settings: LocalizeSettings, found_by: str) -> str:
@@ -362,7 +407,7 @@ def attributes(
         retrieval_dir: folder of the references.
     """
     return {
-        MAPS: json.dumps([map_path("", f"{device}_map", kind.name).name for kind in kinds]),
+        MAPS: json.dumps([map_path("", f"{device}_map", kind.name).name for kind in kinds if settings.map is not None]),
         SETTINGS: settings.model_dump_json(),
         SESSIONS_ROOT: str(capture.path / "sessions"),
         RETRIEVAL: str(retrieval_dir),

@@ -89,6 +89,12 @@ def select_pairs(
     return np.array(sorted(pairs), np.int64).reshape(-1, 2)
 
 
+def instants(session: Session, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return a number for each image (N,): those that one rig took at one instant have the same."""
+    devices = session.images["timestamp"].astype(str) + " " + session.device_ids
+    return np.asarray(np.unique(devices.to_numpy(str)[rows], return_inverse=True)[1], np.int64)
+
+
 def match_pairs(
     pairs: NDArray[np.int64],
     load: Callable[[int], LocalFeatures],
@@ -324,9 +330,7 @@ def build_map(
         raise ArtifactError(f"Session {session.id} has no image with both a pose and local features; nothing to map.")
     sensor_ids = session.images["sensor_id"].to_numpy()
     cameras = [session.camera(sensor_ids[row]) for row in rows]
-    devices = session.images["timestamp"].astype(str) + " " + session.device_ids
-    groups = np.unique(devices.to_numpy(str)[rows], return_inverse=True)[1]
-    pairs = select_pairs(poses[rows], cameras, groups, settings.pairs_per_image)
+    pairs = select_pairs(poses[rows], cameras, instants(session, rows), settings.pairs_per_image)
     names = [names[row] for row in rows]
     keypoints = [features[name].keypoints for name in names]
     matcher = _matcher(features, settings)

@@ -117,7 +117,8 @@ class MappedFeatures:
             radius_deg: largest distance of a keypoint from the projection.
             settings: how many features and matches.
         """
-        if not len(references):
+        references = [index for index in references if len(self.map.observations(index)[0])]
+        if not references:
             return
         images = [self.image(index, settings.max_map_features) for index in references]
         point = np.concatenate([image.points for image in images])

@@ -4,6 +4,7 @@ from toolkit.manifest.loading import load_manifest
 from toolkit.manifest.manifest import OPTIONAL, STAGES, DatasetSettings, DemoData, Manifest, Source
 from toolkit.manifest.messages import nearest
 from toolkit.manifest.settings import (
+    AUTO,
     AlikedModel,
     AlikedSettings,
     Checkpoint,

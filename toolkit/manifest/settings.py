@@ -253,13 +253,19 @@ class AlikedSettings(Settings):
 Checkpoint = str | dict[Literal["superpoint", "aliked"], str]
 
 
+AUTO = "auto"
+
+
 class FeaturesSettings(Settings):
     """Local features, and how each kind is extracted."""
 
     shorthand = "kinds"
-    kinds: Annotated[list[str], Field(min_length=1)] = ["sift"]
-    """Kinds of local features: sift, superpoint, aliked; of several, the matches are pooled in one pose.
+    kinds: Annotated[list[str], Field(min_length=1)] = ["auto"]
+    """Kinds of local features: sift, superpoint, aliked; of several, the matches are pooled in one pose. auto: sift,
+    with aliked as `escalation`; on a GPU both from the start; where ALIKED's weights are not at hand, sift alone.
     `features: [sift]` is short for it."""
+    escalation: list[str] = []
+    """Kinds asked too where the pose is not `ok` otherwise; the matches of all then decide together."""
     checkpoint: Checkpoint | None = None
     """File with the weights of learned features, or of several kinds a file each: `{aliked: <file>}`; null: an
     installed package or a cache, else a download."""
@@ -277,6 +283,15 @@ class FeaturesSettings(Settings):
         if isinstance(raw, dict) and isinstance(raw.get("kinds"), str):
             return {**raw, "kinds": [raw["kinds"]]}
         return raw
+
+    @model_validator(mode="after")
+    def _each_kind_once(self) -> Self:
+        kinds = [*self.kinds, *self.escalation]
+        if AUTO in kinds and kinds != [AUTO]:
+            raise ValueError(f"kinds is {self.kinds} and escalation {self.escalation}; {AUTO} stands alone")
+        if len(set(kinds)) < len(kinds):
+            raise ValueError(f"kinds is {self.kinds} and escalation {self.escalation}; expected each kind once")
+        return self
 
 
 def checkpoint_of(checkpoint: str | Mapping[Any, str] | None, kind: str) -> str | None:
@@ -305,7 +320,7 @@ class RerankSettings(Settings):
     topk: Positive = 10
     """References kept of them."""
     features: FeaturesSettings = FeaturesSettings()
-    """Local features whose matches are verified: one kind."""
+    """Local features whose matches are verified: one kind; auto: sift."""
     matcher: MatcherSettings = MatcherSettings()
     """How they are matched."""
     max_features: Positive = 1536
@@ -323,8 +338,8 @@ class RerankSettings(Settings):
 
     @model_validator(mode="after")
     def _one_kind_of_features(self) -> Self:
-        if len(self.features.kinds) != 1:
-            raise ValueError(f"features has {len(self.features.kinds)} kinds; reranking takes one")
+        if len(self.features.kinds) != 1 or self.features.escalation:
+            raise ValueError(f"features are {self.features.kinds + self.features.escalation}; reranking takes one kind")
         if self.topk > self.topn:
             raise ValueError(f"topk is {self.topk} and topn {self.topn}; expected topk to be at most topn")
         return self
@@ -419,8 +434,8 @@ class LocalizeSettings(Settings):
     """Local features."""
     matcher: MatcherSettings = MatcherSettings()
     """How a query image is matched with its references, for the kinds of features that the matcher suits."""
-    map: MapSettings = MapSettings()
-    """How the map is triangulated."""
+    map: MapSettings | None = MapSettings()
+    """How the map is triangulated; null: it is not, and points are triangulated for each query, from its references."""
     pnp: PnpSettings = PnpSettings()
     """How a pose is found from matches."""
     predictor: PredictorSettings = PredictorSettings()
