@@ -198,11 +198,12 @@ class _Pair:
         }
         if escalation:
             record["escalation"] = [[kind.extractor.settings, kind.matcher.settings] for kind in escalation]
+        if predictor is not None or any(kind.extractor.upright for kind in (*kinds, *escalation)):
+            record["world_up"] = settings.world_up
         if predictor is not None:
             record |= {
                 "predictor": {"name": predictor.name} | predictor.settings,
                 "references": settings.predictor.model_dump(exclude={"name", "checkpoint", "batch_size"}),
-                "world_up": settings.world_up,
                 "depths": map_session.depths_fingerprint,
             }
         return record
@@ -243,7 +244,8 @@ class _PairRun:
         """
         session, place = self.pair.session, self.place
         rows = np.unique(np.concatenate([*(self.rows[number] for number in numbers), np.zeros(0, np.int64)]))
-        store = extract_session(session, self.features_dir, kind.extractor, rows, self.workers)
+        turns = None if place.turns is None else place.turns.of(session)
+        store = extract_session(session, self.features_dir, kind.extractor, rows, self.workers, turns=turns)
         images = session.images.iloc[rows]
         keys = zip(images["timestamp"].tolist(), images["sensor_id"].tolist(), strict=True)
         names = [

@@ -22,6 +22,7 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
 from toolkit.capture.images import default_workers, prefetch
+from toolkit.capture.upright import Turns, upright_turns
 from toolkit.errors import ArtifactError
 from toolkit.features.groups import GroupWriter
 from toolkit.features.matching import LocalMethod, create_local_methods, resolve_auto
@@ -84,6 +85,7 @@ def rerank_pairs(
     settings = resolve_auto(RerankSettings.of(settings))
     capture = Capture.from_sessions_root(sessions_root)
     (method,) = create_local_methods(settings)
+    turns = upright_turns(capture, settings.world_up) if method.extractor.upright else None
     workers = workers or default_workers()
     table = []
     cv2_threads = cv2.getNumThreads()
@@ -99,7 +101,7 @@ def rerank_pairs(
                 pair = _Pair(*sessions, Path(retrieval_dir) / name, Path(out_dir) / name, method, settings)
                 skipped = skip_existing and is_current(pair.path, pair.record)
                 if not skipped:
-                    pair.rerank(Path(features_dir), workers, skip_existing)
+                    pair.rerank(Path(features_dir), workers, skip_existing, turns)
                 table.append(
                     {"map_device": devices[0], "query_device": devices[1]}
                     | _counts(read_references(pair.path))
@@ -138,12 +140,19 @@ class _Pair:
             "sensors": [file_fingerprint(session.path / "sensors.txt") for session in sessions],
         }
 
-    def rerank(self, features_dir: Path, workers: int, skip_existing: bool) -> None:
+    def rerank(self, features_dir: Path, workers: int, skip_existing: bool, turns: Turns | None) -> None:
         """Write the reranked file; take over the rows that a stopped run finished."""
         queries = read_references(self.retrieval, "path")
         references = [reference for query in queries for reference in query["topk"][: self.settings.topn]]
         stores = [
-            extract_session(session, features_dir, self.method.extractor, self._rows(session, images), workers)
+            extract_session(
+                session,
+                features_dir,
+                self.method.extractor,
+                self._rows(session, images),
+                workers,
+                turns=None if turns is None else turns.of(session),
+            )
             for session, images in ((self.map_session, references), (self.query_session, queries))
         ]
         verifier = Verifier(self.settings, self.method.matcher, stores[0])

@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pkgutil import resolve_name
 from typing import Any, Protocol
 
@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from toolkit.capture.turning import turn_image, turn_points
 from toolkit.errors import ManifestError
 from toolkit.geometry import Ints
 from toolkit.manifest import FeaturesSettings, SiftSettings, checkpoint_of
@@ -33,6 +34,8 @@ class LocalFeatures:
     """(N, D): unit vectors, or uint8: non-negative unit vectors times `DESCRIPTOR_SCALE` (RootSIFT)."""
     image_size: tuple[int, int]
     """Width, height of the image, pixels."""
+    turns: int = 0
+    """Counter-clockwise quarter turns that the image was shown after. Keypoints are of the image as it is stored."""
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -45,14 +48,27 @@ class LocalFeatures:
 
     def take(self, part: slice | Ints) -> "LocalFeatures":
         """Return some of the features, by index."""
-        return LocalFeatures(
-            self.keypoints[part], self.scales[part], self.scores[part], self.descriptors[part], self.image_size
+        return replace(
+            self,
+            keypoints=self.keypoints[part],
+            scales=self.scales[part],
+            scores=self.scores[part],
+            descriptors=self.descriptors[part],
         )
+
+    def turned(self, turns: int) -> "LocalFeatures":
+        """Return the features of the image after counter-clockwise quarter turns."""
+        width, height = self.image_size
+        keypoints = turn_points(self.keypoints, width, height, turns).astype(np.float32)
+        size = (height, width) if turns % 2 else (width, height)
+        return replace(self, keypoints=keypoints, image_size=size, turns=(self.turns - turns) % 4)
 
 
 class Extractor(Protocol):
     """What extracts local features of one kind."""
 
+    upright: bool
+    """Whether it was trained with upright photographs, so that images are turned upright for it."""
     color: bool
     """Whether `extract` takes images (H, W, 3) RGB, else (H, W) gray."""
     batch_size: int
@@ -140,6 +156,14 @@ def create_extractor(name: str, settings: FeaturesSettings, device: str = "auto"
     return extractor
 
 
+def extract_turned(
+    extractor: Extractor, images: Sequence[NDArray[np.uint8]], turns: Sequence[int]
+) -> list[LocalFeatures]:
+    """Return the features of images as they are stored, extracted after counter-clockwise quarter turns."""
+    upright = extractor.extract([turn_image(image, turn) for image, turn in zip(images, turns, strict=True)])
+    return [features.turned(-turn) if turn else features for features, turn in zip(upright, turns, strict=True)]
+
+
 def stretch_contrast(gray: NDArray[np.uint8], max_gain: float = 8.0) -> NDArray[np.uint8]:
     """Return the image with its 1st to 99th percentile spread over the whole range, by a gain of at most `max_gain`.
 
@@ -154,6 +178,7 @@ def stretch_contrast(gray: NDArray[np.uint8], max_gain: float = 8.0) -> NDArray[
 class SiftExtractor:
     """Extracts RootSIFT features; one instance may be used by several threads."""
 
+    upright = False
     color = False
     batch_size = 1
     threaded = True

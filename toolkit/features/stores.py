@@ -28,7 +28,7 @@ from tqdm.auto import tqdm
 from toolkit.capture import Session
 from toolkit.capture.images import prefetch, read_image
 from toolkit.errors import ArtifactError, ImageError
-from toolkit.features.features import DESCRIPTOR_SCALE, Extractor, LocalFeatures, SiftExtractor
+from toolkit.features.features import DESCRIPTOR_SCALE, Extractor, LocalFeatures, SiftExtractor, extract_turned
 from toolkit.features.groups import GroupWriter
 from toolkit.features.matching import Matcher, PairMatches
 from toolkit.files import files_fingerprint, fingerprint, read_sidecar
@@ -72,6 +72,7 @@ def _to_arrays(features: LocalFeatures) -> dict[str, NDArray[Any]]:
         "scores": features.scores,
         "descriptors": np.take(_HALVES, descriptors) if descriptors.dtype == np.uint8 else descriptors,
         "image_size": np.array(features.image_size, np.int64),
+        **({"turns": np.array(features.turns, np.int64)} if features.turns else {}),
     }
 
 
@@ -91,6 +92,7 @@ def _from_arrays(arrays: Mapping[str, NDArray[Any]], offset: np.float32, quantiz
         arrays.get("scores", ones).astype(np.float32, copy=False),
         _transposed(np.take(_BYTES, descriptors.view(np.uint16)) if quantized else descriptors),
         (int(width), int(height)),
+        int(arrays.get("turns", 0)),
     )
 
 
@@ -211,6 +213,7 @@ def extract_session(
     workers: int = 2,
     skip_existing: bool = True,
     progress: bool = True,
+    turns: Ints | None = None,
 ) -> FeatureStore:
     """Extract the local features of a session's images, or reuse those that were extracted before.
 
@@ -222,6 +225,8 @@ def extract_session(
         extractor: how to extract; None: SIFT.
         rows: rows of `session.images` that are needed; None: all.
         skip_existing: reuse the features of images that have not changed since.
+        turns: for each image of the session, the quarter turns that make it upright, see `capture.upright`; None, or
+            an extractor that does not need it: images are taken as they are.
 
     Returns:
         The store of the features of these rows. Unreadable images are in its `failed`.
@@ -231,7 +236,9 @@ def extract_session(
     row_of: dict[str, int] = {}
     for row in chosen.tolist():
         row_of.setdefault(session.image_name(row), row)  # a line of images.txt may be there twice
-    made_from = {name: _made_from(session, row) for name, row in row_of.items()}
+    if turns is None or not extractor.upright:
+        turns = np.zeros(len(session.images), np.int64)
+    made_from = {name: _made_from(session, row, int(turns[row])) for name, row in row_of.items()}
     path, label = features_path(out, session.id, extractor.settings), f"{extractor.settings['name']} {session.id}"
     with GroupWriter(path, extractor.settings, {PIXEL_CENTER: 0.0}) as writer:
         done = {*writer.index.groups.items(), *((name, source) for name, (source, _) in writer.index.failed.items())}
@@ -239,7 +246,7 @@ def extract_session(
         cv2_threads = cv2.getNumThreads()
         cv2.setNumThreads(1)  # the images are the parallel dimension
         try:
-            results = _extract(session, [row_of[name] for name, _ in todo], extractor, workers)
+            results = _extract(session, [row_of[name] for name, _ in todo], extractor, turns, workers)
             with tqdm(total=len(todo), desc=label, unit="image", disable=not progress or not todo) as bar:
                 for (name, source), features in zip(todo, results, strict=True):
                     if isinstance(features, str):
@@ -264,9 +271,10 @@ class OnDemandFeatures:
     Safe to use from several threads. What was extracted last stays in memory.
     """
 
-    def __init__(self, session: Session, out: str | Path, extractor: Extractor):
-        """`out` is the folder of all features."""
+    def __init__(self, session: Session, out: str | Path, extractor: Extractor, turns: Ints | None = None):
+        """`out` is the folder of all features, `turns` as of `extract_session`."""
         self._session, self._out, self._extractor = session, Path(out), extractor
+        self._turns = np.zeros(len(session.images), np.int64) if turns is None or not extractor.upright else turns
         self._store: FeatureStore | None = None
         if features_path(out, session.id, extractor.settings).exists():
             self._store = FeatureStore.of_session(out, session.id, extractor.settings)
@@ -276,7 +284,9 @@ class OnDemandFeatures:
     def prepare(self, names: Iterable[str], workers: int, skip_existing: bool = True) -> FeatureStore:
         """Extract the features of images into the file, and return it; see `extract_session`."""
         rows = np.array([self._session.row_of_name[name] for name in names], np.int64)
-        self._store = extract_session(self._session, self._out, self._extractor, rows, workers, skip_existing)
+        self._store = extract_session(
+            self._session, self._out, self._extractor, rows, workers, skip_existing, turns=self._turns
+        )
         return self._store
 
     def __call__(self, name: str) -> LocalFeatures:
@@ -288,7 +298,7 @@ class OnDemandFeatures:
 
     def _extract_one(self, name: str) -> LocalFeatures:
         row = self._session.row_of_name[name]
-        features = next(_extract(self._session, [row], self._extractor, workers=1))
+        features = next(_extract(self._session, [row], self._extractor, self._turns, workers=1))
         if isinstance(features, str):
             log.warning("%s", features)
             camera = self._session.camera(self._session.images["sensor_id"].iloc[row])
@@ -296,13 +306,16 @@ class OnDemandFeatures:
         return as_stored(features)
 
 
-def _made_from(session: Session, row: int) -> str:
-    """Identify an image by name, size and time of change of its file, and by the size that its camera has."""
+def _made_from(session: Session, row: int, turns: int) -> str:
+    """Identify an image by name, size and time of change of its file, by the size that its camera has, and turns."""
     camera = session.camera(session.images["sensor_id"].iloc[row])
-    return fingerprint([files_fingerprint([session.image_path(row)]), camera.width, camera.height])
+    turned = [turns] if turns else []
+    return fingerprint([files_fingerprint([session.image_path(row)]), camera.width, camera.height, *turned])
 
 
-def _extract(session: Session, rows: list[int], extractor: Extractor, workers: int) -> Iterator[LocalFeatures | str]:
+def _extract(
+    session: Session, rows: list[int], extractor: Extractor, turns: Ints, workers: int
+) -> Iterator[LocalFeatures | str]:
     """Yield the features of each image, or why it has none."""
     sensors = session.images["sensor_id"].to_numpy()
 
@@ -321,15 +334,16 @@ def _extract(session: Session, rows: list[int], extractor: Extractor, workers: i
 
     def read_and_extract(row: int) -> LocalFeatures | str:
         image = read(row)
-        return image if isinstance(image, str) else extractor.extract([image])[0]
+        return image if isinstance(image, str) else extract_turned(extractor, [image], [int(turns[row])])[0]
 
     if extractor.threaded:
         yield from prefetch(read_and_extract, rows, workers)
         return
-    images = prefetch(read, rows, workers, ahead=2 * extractor.batch_size)
+    images = zip(rows, prefetch(read, rows, workers, ahead=2 * extractor.batch_size), strict=True)
     while batch := list(islice(images, extractor.batch_size)):
-        features = iter(extractor.extract([image for image in batch if not isinstance(image, str)]))
-        for image in batch:
+        readable = [(image, int(turns[row])) for row, image in batch if not isinstance(image, str)]
+        features = iter(extract_turned(extractor, *zip(*readable, strict=True)) if readable else [])
+        for _, image in batch:
             yield image if isinstance(image, str) else next(features)
 
 

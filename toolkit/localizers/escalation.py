@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from toolkit.capture.images import read_image
-from toolkit.features.features import LocalFeatures
+from toolkit.features.features import LocalFeatures, extract_turned
 from toolkit.features.stores import as_stored
 from toolkit.localizers.base import Localizer, PoseEstimate, Query, References
 from toolkit.localizers.on_demand import OnDemandLocalizer
@@ -61,5 +61,6 @@ class EscalatingLocalizer:
                 continue
             image = read_image(view.image) if isinstance(view.image, str | Path) else view.image
             missing = self.second.on_demand[len(known) - len(self.second.mapped) :]
-            features.append([*known, *(as_stored(method.extractor.extract([image])[0]) for method, _ in missing)])
+            found = [extract_turned(method.extractor, [image], [view.turns])[0] for method, _ in missing]
+            features.append([*known, *map(as_stored, found)])
         return replace(query, features=features, network_matches=[])

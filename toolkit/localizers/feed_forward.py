@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -68,6 +68,7 @@ class FeedForwardLocalizer:
         self.settings = settings or PredictorSettings()
         self._session = session
         self._depths = DepthMaps(session)
+        self._upright = turns is not None
         self._turns = np.zeros(len(session.images), np.int64) if turns is None else turns.of(session)
 
     @property
@@ -95,7 +96,7 @@ class FeedForwardLocalizer:
         """
         chosen = [[self._choose(retrieved) for retrieved in references] for _, references in queries]
         groups = {
-            (number, camera): [query.views[camera], *(self.view(int(index)) for index in references)]
+            (number, camera): [self._as_shown(query.views[camera]), *(self.view(int(index)) for index in references)]
             for number, (query, _) in enumerate(queries)
             for camera, references in enumerate(chosen[number])
             if len(references)
@@ -109,6 +110,9 @@ class FeedForwardLocalizer:
             )
             answers.append(FeedForwardAnswer(_combine(query, cameras), cameras))
         return answers
+
+    def _as_shown(self, view: View) -> View:
+        return view if self._upright else replace(view, turns=0)
 
     def view(self, index: int) -> View:
         """Return a map image as a network is shown it."""

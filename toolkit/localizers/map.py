@@ -19,7 +19,7 @@ from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import Embedder, create_embedder, load_embeddings
 from toolkit.embedders.search import search
 from toolkit.errors import ArtifactError
-from toolkit.features.features import KINDS
+from toolkit.features.features import KINDS, extract_turned
 from toolkit.features.matching import LocalMethod, create_local_methods
 from toolkit.features.stores import FeatureStore, OnDemandFeatures, as_stored, extract_session
 from toolkit.features.verification import Verifier
@@ -87,8 +87,10 @@ class Map:
     ) -> "Map":
         """Extract the features of a map session and triangulate its points, or load what is there."""
         session, mapped = capture[f"{device}_map"], []
+        turns = turns_for(settings, [*kinds, *escalation], capture)
         for kind in kinds if settings.map is not None else ():
-            store = extract_session(session, features_dir, kind.extractor, workers=workers)
+            turned = None if turns is None else turns.of(session)
+            store = extract_session(session, features_dir, kind.extractor, workers=workers, turns=turned)
             inputs = fingerprint([session_fingerprint(session), store.fingerprint])
             path = map_path(map_dir, session.id, kind.name)
             assert settings.map is not None
@@ -151,15 +153,16 @@ class Map:
 
     @cached_property
     def turns(self) -> Turns | None:
-        """What makes the capture's images upright; None where the network sees them as they are."""
-        return _turns(self.settings, self.capture)
+        """What makes the capture's images upright; None where no network asks for it."""
+        return turns_for(self.settings, [*self.kinds, *self.escalation], self.capture)
 
     @cached_property
     def on_demand(self) -> dict[str, OnDemandFeatures]:
         """Features of map images of the kinds without points, by the name of the kind."""
         kinds = [*(self.kinds if self.settings.map is None else ()), *self.escalation]
         assert self.features_dir is not None
-        return {kind.name: OnDemandFeatures(self.session, self.features_dir, kind.extractor) for kind in kinds}
+        turns = None if self.turns is None else self.turns.of(self.session)
+        return {kind.name: OnDemandFeatures(self.session, self.features_dir, kind.extractor, turns) for kind in kinds}
 
     @cached_property
     def localizer(self) -> Localizer:
@@ -215,13 +218,14 @@ class Map:
         vectors: NDArray[np.float32],
         pictures: Sequence[tuple[NDArray[np.uint8], NDArray[np.uint8]]] = (),
         cameras: Sequence[pycolmap.Camera] = (),
+        turns: Sequence[int] = (),
     ) -> list[References]:
         """Return the references of query images as the run would find them.
 
         Args:
             vectors: (Q, D) what the embedder gave for them.
             pictures: their pixels in color, (H, W, 3), and in gray, (H, W); of use to a run that reranks.
-            cameras: their intrinsics; likewise.
+            cameras, turns: their intrinsics, and the quarter turns that make them upright; likewise.
 
         Raises:
             ArtifactError: the map was embedded by another embedder.
@@ -239,7 +243,7 @@ class Map:
         scores, nearest = search(vectors, database, self.retrieve_settings.topk, "torch", "cpu")
         ranked = list(zip(rows[nearest], scores.astype(np.float64), strict=True))
         if self.reranked:
-            ranked = [self._rerank(*each) for each in zip(ranked, pictures, cameras, strict=True)]
+            ranked = [self._rerank(*each) for each in zip(ranked, pictures, cameras, turns, strict=True)]
         references = []
         for images, similarities in ranked:
             indices = np.array([self.index_of.get(self.session.image_name(int(row)), -1) for row in images], np.int64)
@@ -259,11 +263,15 @@ class Map:
         ranked: tuple[NDArray[np.int64], NDArray[np.float64]],
         picture: tuple[NDArray[np.uint8], NDArray[np.uint8]],
         camera: pycolmap.Camera,
+        turns: int,
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return rows of map images and their inliers in the order of verified matches, as the rerank stage does."""
         method, verifier = self._verification
         settings, rows = verifier.settings, ranked[0][: verifier.settings.topn]
-        features = as_stored(method.extractor.extract([picture[0 if method.extractor.color else 1]])[0])
+        pixels = picture[0 if method.extractor.color else 1]
+        features = as_stored(
+            extract_turned(method.extractor, [pixels], [turns if method.extractor.upright else 0])[0]
+        )
         readable = [index for index, row in enumerate(rows) if self.session.image_name(int(row)) in verifier.store]
         inliers = np.zeros(len(rows))
         inliers[readable], _ = verifier.verify(
@@ -317,9 +325,10 @@ def open_predictor(settings: LocalizeSettings, capture: Capture, map_dir: Path) 
     return predictor
 
 
-def _turns(settings: LocalizeSettings, capture: Capture) -> Turns | None:
-    show_upright = settings.predicts and settings.predictor.upright
-    return upright_turns(capture, settings.world_up) if show_upright else None
+def turns_for(settings: LocalizeSettings, kinds: Sequence[LocalMethod], capture: Capture) -> Turns | None:
+    """Return what makes images upright, if a network is to see them so."""
+    upright = (settings.predicts and settings.predictor.upright) or any(kind.extractor.upright for kind in kinds)
+    return upright_turns(capture, settings.world_up) if upright else None
 
 
 def create_localizer(settings: LocalizeSettings, map: Map, predictor: Predictor | None = None) -> Localizer:  # noqa: A002
@@ -352,7 +361,9 @@ def create_localizer(settings: LocalizeSettings, map: Map, predictor: Predictor 
         return _escalating(pnp, settings, map)
     predictor = predictor or open_predictor(settings, map.capture, map.map_dir)
     local_map = map.mapped[0].map
-    turns = map.turns if settings == map.settings else _turns(settings, map.capture)
+    turns = map.turns if settings == map.settings else turns_for(settings, map.kinds, map.capture)
+    if not settings.predictor.upright:
+        turns = None
     feed_forward = FeedForwardLocalizer(local_map, map.session, predictor, settings.predictor, turns)
     return feed_forward if settings.method == "vggt" else _escalating(HybridLocalizer(pnp, feed_forward), settings, map)
 

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from toolkit.capture.images import read_image
 from toolkit.capture.turning import turn_image
 from toolkit.errors import ImageError
-from toolkit.features.features import LocalFeatures, SiftExtractor
+from toolkit.features.features import LocalFeatures, SiftExtractor, extract_turned
 from toolkit.features.stores import as_stored
 from toolkit.localizers.base import PoseEstimate, Query, View
 from toolkit.localizers.map import Map
@@ -55,15 +55,21 @@ def localize_image(
             f"{len(quarter_turns)} turns: expected as many, and at least one."
         )
     pixels = [_read(picture, of) for picture, of in zip(pictures, cameras, strict=True)]
+    learned = any(kind.extractor.upright for kind in (*place.kinds, *place.escalation))
+    upright = learned or place.settings.predictor.upright
     views = [
-        View(f"picture {number}", color, of, in_map=False, turns=turn if place.settings.predictor.upright else 0)
+        View(f"picture {number}", color, of, in_map=False, turns=turn if upright else 0)
         for number, ((color, _), of, turn) in enumerate(zip(pixels, cameras, quarter_turns, strict=True), start=1)
     ]
+    none = [0] * len(pixels)
     features: list[list[LocalFeatures]] = []
     if place.settings.method != "vggt" and place.kinds:
         # As a run reads them: the file of features rounds keypoints at the border.
         extracted = [
-            [as_stored(kind.extractor.extract([color if kind.extractor.color else gray])[0]) for color, gray in pixels]
+            [
+                as_stored(extract_turned(kind.extractor, [color if kind.extractor.color else gray], [turn])[0])
+                for (color, gray), turn in zip(pixels, quarter_turns if kind.extractor.upright else none, strict=True)
+            ]
             for kind in place.kinds
         ]
         features = [list(kinds) for kinds in zip(*extracted, strict=True)]
@@ -76,10 +82,10 @@ def localize_image(
         else:
             inputs = [as_stored(found) for found in sift.extract([gray for _, gray in pixels])]
     else:
-        upright = embedder.upright if place.embed_settings.upright is None else place.embed_settings.upright
-        shown = zip(pixels, quarter_turns if upright else [0] * len(pixels), strict=True)
+        turned = embedder.upright if place.embed_settings.upright is None else place.embed_settings.upright
+        shown = zip(pixels, quarter_turns if turned else none, strict=True)
         inputs = [embedder.prepare(turn_image(color, turn)) for (color, _), turn in shown]
-    references = place.retrieve(embedder.embed(inputs), pixels, cameras)
+    references = place.retrieve(embedder.embed(inputs), pixels, cameras, quarter_turns)
     with threadpool_limits(1, "blas"):  # sums stay in one order, as in a run
         return place.localizer.localize(Query(views, poses, features), references)
 

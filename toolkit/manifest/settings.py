@@ -335,6 +335,8 @@ class RerankSettings(Settings):
     """Precision of networks; auto: what is fast on the device."""
     seed: Natural = 0
     """Of RANSAC. The same seed gives the same order."""
+    world_up: Direction | None = None
+    """Direction that is up in the map's world, for learned features; null: estimated from its cameras."""
 
     @model_validator(mode="after")
     def _one_kind_of_features(self) -> Self:

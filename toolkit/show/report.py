@@ -28,6 +28,9 @@ MEDIANS = (
     ("median_translation_m", "Median translation error [cm]", 100.0),
 )
 # Figures that say more than the page's own tables: a heading, and how to read it.
+STATUS_COLUMNS = [
+    "timestamp", "device_id", "status", "num_inliers", "position_std_m", "seconds", "first_status", "first_seconds"
+]  # fmt: skip
 EVALUATION_FIGURES = {
     "error_curves": (
         "Error curves",
@@ -266,7 +269,7 @@ def _read_statuses(files: SceneFiles, messages: list[str]) -> pd.DataFrame:
     for (map_device, query_device), stem in _pairs_of(files).items():
         table = _read_table(stem.with_name(f"{stem.name}.csv"), messages)
         if "status" in table:
-            table = table.reindex(columns=["timestamp", "device_id", "status", "num_inliers", "position_std_m"])
+            table = table.reindex(columns=STATUS_COLUMNS)
             tables.append(table.assign(map_device=map_device, query_device=query_device))
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
@@ -298,6 +301,7 @@ def _verdict(
         counts = statuses["status"].str.split(":").str[0].value_counts()
         parts = ", ".join(f"{counts.get(s, 0)} {s.replace('_', ' ')}" for s in ("ok", "low_confidence", "failed"))
         verdict.append(f"{len(statuses)} queries asked in {pairs} pair{'s' * (pairs != 1)} of devices: {parts}.")
+        verdict += _escalation(statuses)
     done = recall.dropna(subset=thresholds) if thresholds else recall.iloc[:0]
     if not len(done):
         return verdict, headlines
@@ -318,6 +322,21 @@ def _verdict(
         wrong = float((done["ok_wrong"] * done["queries"]).sum() / done["queries"].sum())
         headlines.append((f"{percent(wrong)} %", "called ok, but beyond {:g}°, {:g} m".format(*WRONG)))
     return verdict, headlines
+
+
+def _escalation(statuses: pd.DataFrame) -> list[str]:
+    """Return what asking further kinds of features gave and took, in a sentence; none where none were asked."""
+    asked = statuses[statuses["first_status"].notna()]
+    if not len(asked):
+        return []
+    sure = (asked["status"] == "ok").sum()
+    posed = (asked["first_status"].str.startswith("failed") & ~asked["status"].str.startswith("failed")).sum()
+    seconds = (asked["seconds"] - asked["first_seconds"]).sum()
+    found = f", {posed} that had no pose have one" if posed else ""
+    return [
+        f"{len(asked)} were not sure and escalated to further features: {sure} are ok now{found}. "
+        f"That took {number(seconds)} s, {number(seconds / len(asked))} s a query."
+    ]
 
 
 def _matrix(table: pd.DataFrame, column: str, title: str, text: Any, shade: Any = lambda value: None) -> Matrix:
