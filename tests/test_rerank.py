@@ -270,18 +270,18 @@ def test_a_network_matches_all_references_of_a_query_at_once(
 
     run(small_capture, files)
     expected = reranked(files).read_bytes()
-    asked: list[Any] = []
+    asked: list[RerankSettings] = []
 
-    def create(*options: Any) -> list[LocalMethod]:
-        asked.extend(options)
+    def create(settings: RerankSettings) -> list[LocalMethod]:
+        asked.append(settings)
         return [LocalMethod("sift", SiftExtractor(), Network())]
 
     monkeypatch.setattr(rerank, "create_local_methods", create)
     glue = {"name": "lightglue", "checkpoint": "glue.safetensors"}
     table = run(small_capture, files, features="superpoint", matcher=glue)
-    features, matcher, *device = asked
-    assert (features.kinds, matcher.name, matcher.checkpoint) == (["superpoint"], "lightglue", "glue.safetensors")
-    assert device == ["auto", "auto"]
+    (settings,) = asked
+    assert settings.features.kinds == ["superpoint"]
+    assert (settings.matcher.name, settings.matcher.checkpoint) == ("lightglue", "glue.safetensors")
     assert not table["skipped"].item(), "other matches, another file"
     assert batches == [6] * table["queries"].item()
     assert reranked(files).read_bytes() == expected

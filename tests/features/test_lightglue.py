@@ -39,6 +39,8 @@ def state() -> State:
             made[name] = torch.randn(value.shape, generator=generator) * (gain / max(value[0].numel(), 1)) ** 0.5
         else:
             made[name] = 0.1 * torch.randn(value.shape, generator=generator)
+    for name in [name for name in made if "cross_attention.k_proj" in name]:
+        made[name.replace("k_proj", "q_proj")] = made[name]  # as in the official file
     made["positional_encoder.projector.weight"] *= 5
     made["match_assignment_layers.8.final_projection.weight"] = 10 * torch.eye(256)
     made["match_assignment_layers.8.matchability.bias"] += 4
@@ -105,7 +107,7 @@ def test_same_as_the_network_of_the_package(state: State) -> None:
 
 
 def test_alike_features_match(matcher: LightGlueMatcher) -> None:
-    a, b = features(1, 120), features(2, 120)
+    a, b = features(1, 150), features(2, 150)
     (found,) = matcher.match([(a, b)])
     assert found.indices.dtype == np.int64
     assert found.scores.dtype == np.float32
@@ -141,16 +143,17 @@ def test_what_does_not_fit_is_halved(
     state: State, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     matcher = LightGlueMatcher(state, device="cpu", dtype="float32", batch_size=4)
+    monkeypatch.setattr(matcher, "_pairs_at_once", 4)
     pairs = [(features(k, 20 + k), features(k + 1, 40 - k)) for k in range(5)]
     expected = matcher.match(pairs)
-    forward = matcher._model.positional_encoder.forward
+    assign = matcher._model._assign
 
-    def limited(keypoints: torch.Tensor) -> Any:
-        if len(keypoints) > 2:
+    def limited(a: torch.Tensor, *others: Any) -> Any:
+        if len(a) > 2:
             raise torch.OutOfMemoryError("CUDA out of memory.")
-        return forward(keypoints)
+        return assign(a, *others)
 
-    monkeypatch.setattr(matcher._model.positional_encoder, "forward", limited)
+    monkeypatch.setattr(matcher._model, "_assign", limited)
     for found, wanted in zip(matcher.match(pairs), expected, strict=True):
         assert_equal(found, wanted)
     assert "pairs of images do not fit the memory of cpu" in caplog.text
@@ -166,10 +169,9 @@ def test_nothing_to_match(matcher: LightGlueMatcher) -> None:
 
 def test_positions_are_those_of_training() -> None:
     corners = np.array([[0.5, 0.5], [320.5, 240.5], [640.5, 480.5]], np.float32)
-    packed = _pack((replace(features(0, 3), keypoints=corners), features(0, 0)), 4)
-    np.testing.assert_allclose(packed[0, :3, :2], [[-1, -0.75], [0, 0], [1, 0.75]], atol=1e-6)
-    assert packed[0, :, -1].tolist() == [1, 1, 1, 0]
-    assert not packed[1].any()
+    packed = _pack(replace(features(0, 3), keypoints=corners))
+    np.testing.assert_allclose(packed[:, :2], [[-1, -0.75], [0, 0], [1, 0.75]], atol=1e-6)
+    assert packed[:, -1].tolist() == [1, 1, 1]
 
 
 def test_bfloat16_finds_much_the_same(state: State, matcher: LightGlueMatcher) -> None:
@@ -217,7 +219,7 @@ def test_other_weights(state: State) -> None:
         for name, value in state.items()
         if name.startswith("keypoint_detector.")
     }
-    with pytest.raises(WeightsError, match="not weights of LightGlue, which has 305 keys; found 24") as caught:
+    with pytest.raises(WeightsError, match="not weights of LightGlue, which has 251 keys; found 24") as caught:
         LightGlueMatcher(detector, "cpu")
-    assert "305 missing: positional_encoder.projector.weight, transformer_layers.0" in str(caught.value)
+    assert "251 missing: posenc.Wr.weight, transformers.0" in str(caught.value)
     assert "24 unexpected: encoder.conv_blocks.0.conv_a.weight" in str(caught.value)

@@ -1,10 +1,6 @@
-"""LightGlue (Lindenberger, Sarlin and Pollefeys, ICCV 2023): matches SuperPoint features of two images.
+"""LightGlue (Lindenberger, Sarlin and Pollefeys, ICCV 2023): matches the learned features of two images."""
 
-The network is that of the package `transformers`. Its own forward detects keypoints anew, in images of one size, so
-its public parts are called one by one here, in `_forward` alone: `input_projection`, `positional_encoder`,
-`transformer_layers`, `match_assignment_layers`.
-"""
-
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,25 +9,29 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional as F
+from torch.nn.utils.rnn import pad_sequence
 
 from toolkit.errors import ManifestError, ToolkitError
 from toolkit.features.features import LocalFeatures
-from toolkit.features.matching import PairMatches
-from toolkit.features.superpoint import DESCRIPTOR_LENGTH, load_network
+from toolkit.features.matching import MATCHER_WEIGHTS, PairMatches
 from toolkit.models.compute import Fitting, resolve_device, resolve_precision
-from toolkit.models.weights import LIGHTGLUE, weights_digest
+from toolkit.models.lightglue import LightGlue, official_names
+from toolkit.models.weights import load_checkpoint, resolve_weights, weights_digest
 
-# Few pairs keep a CPU busy; more at once take more memory and no less time.
-_BATCH = {"cpu": 2}
+_DESCRIPTOR_LENGTHS = {"superpoint": 256, "aliked": 128}
+_BATCH = {"cpu": 8}
 _BATCH_ELSEWHERE = 32
 
 
 class LightGlueMatcher:
-    """Matches pairs of images of any sizes, with any numbers of SuperPoint features, in batches, on any device.
+    """Matches pairs of images of any sizes, with any numbers of learned features, in batches, on any device.
 
     Every pair goes through all layers with all its features. The network could stop early or drop features where it
-    is confident. Its authors advise against that where accuracy counts, and rounding, which depends on the batch, could
-    then change a pair's matches.
+    is confident. Its authors advise against that where accuracy counts.
+
+    On a CPU pairs run one after another: that is as quick, takes less memory, and the matches of a pair do not depend
+    on the others. Elsewhere rounding depends on them.
     """
 
     def __init__(
@@ -41,30 +41,47 @@ class LightGlueMatcher:
         dtype: str = "auto",
         batch_size: int | None = None,
         min_score: float = 0.1,
+        features: str = "superpoint",
     ) -> None:
         """
         Args:
-            checkpoint, device, dtype: as of `SuperPointExtractor`. The detector in the file is not used; positions and
-                the assignment are always float32.
+            checkpoint: an official file of the authors or of the hub, or its tensors by name; None: from an installed
+                package or a cache, else downloaded.
+            device: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
+            dtype: of the matrix products of the layers: `float32`, `bfloat16`, `float16`; `auto`: the fastest on the
+                device. Positions and the assignment are always float32.
             batch_size: most pairs at a time; None: as suits the device.
             min_score: least confidence of a match, from 0 to 1.
+            features: kind of the features, `superpoint` or `aliked`.
 
         Raises:
             WeightsError: no weights, or other ones.
-            ManifestError: no such device, precision or confidence.
-            ToolkitError: the package transformers is missing, or the device.
+            ManifestError: no such device, precision, confidence or kind.
+            ToolkitError: no such device on this machine.
         """
         if not 0 <= min_score <= 1:
             raise ManifestError(f"lightglue: min_score is {min_score}; expected a confidence from 0 to 1.")
+        if features not in _DESCRIPTOR_LENGTHS:
+            raise ManifestError(f"lightglue: no weights for {features!r}. Known: {', '.join(_DESCRIPTOR_LENGTHS)}.")
+        self._kind = features
         self._min_score = min_score
         self._device = resolve_device(device)
         self._dtype = resolve_precision(dtype, self._device)
         self.batch_size = batch_size or _BATCH.get(self._device.type, _BATCH_ELSEWHERE)
-        # The official file has a copy of SuperPoint. The features come from elsewhere.
-        model = load_network(LIGHTGLUE, checkpoint, _build, ignore=("keypoint_detector.",))
+        self._pairs_at_once = 1 if self._device.type == "cpu" else self.batch_size
+        source = MATCHER_WEIGHTS["lightglue", features]
+        if checkpoint is None or isinstance(checkpoint, str | Path):
+            checkpoint = resolve_weights(source, checkpoint)
+        with torch.device("meta"):
+            model = LightGlue(_DESCRIPTOR_LENGTHS[features])
+        # The hub's file has a copy of SuperPoint, and the authors' newer code stores thresholds of early stopping.
+        ignore = ("keypoint_detector.", "confidence_thresholds")
+        load_checkpoint(model, checkpoint, source.model, ignore, official_names)
         self._weights = weights_digest(model)
+        model.fold_(self._dtype)
         self._model = model.to(self._device)
-        self._fitting = Fitting(self._forward, "pairs of images")
+        self._fitting_images = Fitting(self._encode, "images")
+        self._fitting_pairs = Fitting(self._forward, "pairs of images")
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -76,82 +93,87 @@ class LightGlueMatcher:
     def match(self, pairs: Sequence[tuple[LocalFeatures, LocalFeatures]]) -> list[PairMatches]:
         """Return the matches of pairs of images, in the order of the first image's features.
 
+        An image that is in several pairs, as the same object, goes through the first half of the first layer once.
+
         Raises:
             ToolkitError: features of another kind; a confidence is not finite; or not even one pair fits the
                 device's memory.
         """
         for features in (features for pair in pairs for features in pair):
-            _check(features)
+            self._check(features)
         matches = [PairMatches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32)) for _ in pairs]
         # Pairs with similar numbers of features go together, as all are padded to the largest. The largest come first,
         # so that a batch that does not fit the memory shows at once.
-        sizes = [max(len(a), len(b)) for a, b in pairs]
-        order = [number for number in np.argsort(sizes, kind="stable")[::-1] if all(map(len, pairs[number]))]
-        for start in range(0, len(order), self.batch_size):
-            part = order[start : start + self.batch_size]
-            batch = torch.from_numpy(np.stack([_pack(pairs[number], sizes[part[0]]) for number in part]))
-            with torch.inference_mode():
-                results = self._fitting(batch.to(self._device)).cpu().numpy()
-            for number, result in zip(part, results, strict=True):
-                matches[number] = _unpack(result)
+        sizes = [-max(len(a), len(b)) for a, b in pairs]
+        order = [number for number in np.argsort(sizes, kind="stable") if all(map(len, pairs[number]))]
+        uses = Counter(id(features) for number in order for features in pairs[number])
+        encoded: dict[int, Tensor] = {}
+        with torch.inference_mode():
+            for start in range(0, len(order), self._pairs_at_once):
+                part = order[start : start + self._pairs_at_once]
+                images = [features for number in part for features in pairs[number]]
+                self._encode_new(images, encoded)
+                batch = pad_sequence([encoded[id(features)] for features in images], batch_first=True)
+                results = self._fitting_pairs(batch.unflatten(0, (-1, 2))).cpu().numpy()
+                for number, result in zip(part, results, strict=True):
+                    matches[number] = _unpack(result)
+                uses.subtract(map(id, images))
+                encoded = {key: value for key, value in encoded.items() if uses[key]}
         return matches
+
+    def _check(self, features: LocalFeatures) -> None:
+        dtype, shape, expected = features.descriptors.dtype, features.descriptors.shape, _DESCRIPTOR_LENGTHS[self._kind]
+        if dtype == np.uint8 or shape[1:] != (expected,):
+            raise ToolkitError(
+                f"These weights of LightGlue are for features of the kind {self._kind}, (N, {expected}) unit vectors; "
+                f"found {dtype} {shape}. Use the matcher `mutual` with other features."
+            )
+
+    def _encode_new(self, images: Sequence[LocalFeatures], encoded: dict[int, Tensor]) -> None:
+        """Add, for images that `encoded` lacks, what `_forward` takes, (N, 2 + DIM + 1), by the object's id."""
+        new = list({id(features): features for features in images if id(features) not in encoded}.values())
+        count = 2 * self._pairs_at_once if self._pairs_at_once > 1 else 1
+        for start in range(0, len(new), count):
+            part = new[start : start + count]
+            batch = pad_sequence([torch.from_numpy(_pack(features)) for features in part], batch_first=True)
+            for features, rows in zip(part, self._fitting_images(batch.to(self._device)), strict=True):
+                encoded[id(features)] = rows[: len(features)]
+
+    def _encode(self, batch: Tensor) -> Tensor:
+        """Return images (B, N, 2 + D + 1), see `_pack`, with what the network makes of descriptors in their place."""
+        xy, mask = batch[..., :2], _mask(batch)
+        states = self._model.encode(xy, batch[..., 2:-1], mask)
+        return torch.cat([xy, states, batch[..., -1:]], dim=-1)
 
     def _forward(self, batch: Tensor) -> Tensor:
         """Return for each feature of the first image its partner, -1 for none, and the confidence, (B, N, 2).
 
         Args:
-            batch: (B, 2, N, 2 + 256 + 1), of each image's features the normalized x y, the descriptor, and 1; rows of
+            batch: (B, 2, N, 2 + DIM + 1), of each image the normalized x y, the state of the network, and 1; rows of
                 zeros pad it to N.
         """
-        model = self._model
-        images = batch.flatten(0, 1)
-        real = images[:, :, -1]
-        # Without a mask, the layers of transformers attend only to earlier features.
-        mask = real.bool()[:, None, None, :]
-        turns = model.positional_encoder(images[:, :, :2])[0]
-        with torch.autocast(batch.device.type, self._dtype, enabled=self._dtype != torch.float32):
-            states = model.input_projection(images[:, :, 2:-1])
-            for layer in model.transformer_layers:
-                states = layer(states, turns, attention_mask=mask)[0]
-        logarithms = model.match_assignment_layers[-1](states.float(), real)[:, :-1, :-1]
-        scores, partners = logarithms.max(dim=2)
-        scores = scores.exp()
-        a, b = real.bool().unflatten(0, (-1, 2)).unbind(1)
-        first = torch.arange(a.shape[1], device=batch.device)
-        mutual = logarithms.argmax(dim=1).gather(1, partners) == first
-        # Rows of zeros find partners among themselves.
-        matched = mutual & (scores > self._min_score) & a & b.gather(1, partners)
-        partners = partners.float().where(matched, -1.0)  # exact: there are fewer than 2^24 features
-        scores = scores.where(matched | scores.isnan() & a, 0.0)
-        return torch.stack([partners, scores], dim=2)
+        count = batch.shape[2]
+        a, b = batch.unbind(1)
+        if len(batch) == 1:  # padding would be work for nothing
+            a, b = (image[:, : int(image[..., -1].sum())] for image in (a, b))
+        partners, scores = self._model((a[..., :2], b[..., :2]), (a[..., 2:-1], b[..., 2:-1]), (_mask(a), _mask(b)))
+        partners = partners.where(scores > self._min_score, -1)
+        result = torch.stack([partners.float(), scores], dim=2)  # exact: there are fewer than 2^24 features
+        return F.pad(result, (0, 0, 0, count - result.shape[1]), value=-1.0)
 
 
-def _build(transformers: Any) -> Any:
-    config = transformers.LightGlueConfig(keypoint_detector_config=transformers.SuperPointConfig())
-    model = transformers.LightGlueForKeypointMatching(config)
-    del model.keypoint_detector
-    return model
+def _mask(images: Tensor) -> Tensor | None:
+    """Return which rows of images (B, N, ... + 1) are real, (B, N); None: all."""
+    real = images[..., -1].bool()
+    return None if bool(real.all()) else real
 
 
-def _check(features: LocalFeatures) -> None:
-    kind, shape = features.descriptors.dtype, features.descriptors.shape
-    if kind == np.uint8 or shape[1:] != (DESCRIPTOR_LENGTH,):
-        raise ToolkitError(
-            f"LightGlue was trained with SuperPoint features, (N, {DESCRIPTOR_LENGTH}) unit vectors; found {kind} "
-            f"{shape}. Use the matcher `mutual` with other features."
-        )
-
-
-def _pack(pair: tuple[LocalFeatures, LocalFeatures], length: int) -> NDArray[np.float32]:
-    """Return the features of a pair as `_forward` takes them, (2, length, 259)."""
-    packed = np.zeros((2, length, 2 + DESCRIPTOR_LENGTH + 1), np.float32)
-    for rows, features in zip(packed, pair, strict=True):
-        size = np.array(features.image_size, np.float32)
-        # As in training: pixel centers at whole numbers, the longer side from -1 to 1.
-        rows[: len(features), :2] = (features.keypoints - 0.5 - size / 2) / (size.max() / 2)
-        rows[: len(features), 2:-1] = features.descriptors
-        rows[: len(features), -1] = 1
-    return packed
+def _pack(features: LocalFeatures) -> NDArray[np.float32]:
+    """Return the features of an image as `_encode` takes them, (N, 2 + D + 1): normalized x y, descriptor, and 1."""
+    size = np.array(features.image_size, np.float32)
+    # As in training: pixel centers at whole numbers, the longer side from -1 to 1.
+    xy = (features.keypoints - 0.5 - size / 2) / (size.max() / 2)
+    return np.concatenate([xy, features.descriptors, np.ones((len(xy), 1))], axis=1, dtype=np.float32)
 
 
 def _unpack(result: NDArray[np.float32]) -> PairMatches:

@@ -71,8 +71,8 @@ def create_matcher(name: str, **options: Any) -> Matcher:
 
     Args:
         name: a key of `MATCHERS`.
-        options: arguments of the matcher: `ratio` and `min_score` of `mutual`; `checkpoint`, `device`, `dtype` and
-            others of a network.
+        options: arguments of the matcher: `ratio` and `min_score` of `mutual`; `checkpoint`, `device`, `dtype`,
+            `features` and others of a network.
 
     Raises:
         ManifestError: unknown matcher.
@@ -201,6 +201,7 @@ def create_local_methods(
                 device=device,
                 dtype=dtype,
                 min_score=settings.matcher.min_confidence,
+                features=name,
             )
             methods.append(LocalMethod(name, extractor, network))
     return methods

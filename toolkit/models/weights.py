@@ -5,7 +5,7 @@ import json
 import os
 import pickle
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -326,7 +326,11 @@ def read_state_dict(path: str | Path) -> "dict[str, Tensor]":
 
 
 def load_checkpoint(
-    module: "nn.Module", checkpoint: "str | Path | Mapping[str, Tensor]", name: str = "", ignore: tuple[str, ...] = ()
+    module: "nn.Module",
+    checkpoint: "str | Path | Mapping[str, Tensor]",
+    name: str = "",
+    ignore: tuple[str, ...] = (),
+    rename: "Callable[[Mapping[str, Tensor]], dict[str, Tensor]]" = dict,
 ) -> None:
     """Load a checkpoint into a module and make it ready for inference: no gradients, evaluation mode.
 
@@ -338,6 +342,7 @@ def load_checkpoint(
         module: has the checkpoint's parameters and buffers, each with its shape and type.
         checkpoint: a file (see `read_state_dict`), or tensors by name.
         ignore: prefixes of keys that the checkpoint may have and the module does not need.
+        rename: returns the rest under the module's names.
 
     Raises:
         WeightsError: no checkpoint, or of another network; names the missing, unexpected, mis-shaped and mis-typed
@@ -347,7 +352,7 @@ def load_checkpoint(
         where, state = "the given dict", _tensors(checkpoint, "the given dict")
     else:
         where, state = str(checkpoint), read_state_dict(checkpoint)
-    state = {key: value for key, value in state.items() if not key.startswith(ignore)}
+    state = rename({key: value for key, value in state.items() if not key.startswith(ignore)})
     expected: dict[str, Tensor] = module.state_dict()
     common = [(key, state[key], own) for key, own in expected.items() if key in state]
     unexpected = [key for key in state if key not in expected]

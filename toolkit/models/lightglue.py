@@ -1,0 +1,282 @@
+"""The network LightGlue (Lindenberger, Sarlin and Pollefeys, ICCV 2023), with the key names of its authors' files.
+
+All layers run for all features: the network's early stopping and pruning are not used. Before use, `fold_` merges
+matrices of which only the product counts; the result is the same but for rounding.
+"""
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from toolkit.models.compute import has_onednn, linear
+
+DIM = 256
+"""Channels of a feature inside of the network."""
+_HEADS = 4
+_LAYERS = 9
+# Rows of the attention matrix at a time, per thread of the CPU: they shall stay in its cache.
+_ROWS = 128
+
+Rope = tuple[Tensor, Tensor]
+"""Cosines and signed sines of a rotary position embedding, each (B, N, 1, DIM / heads): see `_rotate`."""
+
+# Names in the checkpoints of the package `transformers`, and those of the first files of the authors.
+_NAMES = {
+    r"^positional_encoder\.projector": "posenc.Wr",
+    r"^input_projection": "input_proj",
+    r"^transformer_layers": "transformers",
+    r"(self|cross)_mlp\.fc1": r"\1_attn.ffn.0",
+    r"(self|cross)_mlp\.layer_norm": r"\1_attn.ffn.1",
+    r"(self|cross)_mlp\.fc2": r"\1_attn.ffn.3",
+    r"self_attention\.o_proj": "self_attn.out_proj",
+    r"cross_attention\.q_proj": "cross_attn.to_qk",
+    r"cross_attention\.v_proj": "cross_attn.to_v",
+    r"cross_attention\.o_proj": "cross_attn.to_out",
+    r"^match_assignment_layers": "log_assignment",
+    r"final_projection": "final_proj",
+    r"(token_confidence\.\d+\.token)\.(weight|bias)": r"\1.0.\2",
+    r"^(self|cross)_attn\.(\d+)": r"transformers.\2.\1_attn",
+}
+
+
+def official_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return a checkpoint under the names of `LightGlue`, be it the authors' or of the package `transformers`.
+
+    Names of neither stay as they are.
+    """
+    renamed = {}
+    for name, value in state.items():
+        for pattern, own in _NAMES.items():
+            name = re.sub(pattern, own, name)
+        renamed[name] = value
+    for name in [name for name in renamed if "self_attention.q_proj" in name]:
+        parts = [name.replace("q_proj", part) for part in ("q_proj", "k_proj", "v_proj")]
+        if all(part in renamed for part in parts):
+            # The rows of queries, keys and values alternate.
+            value = torch.stack([renamed.pop(part) for part in parts], dim=1).flatten(0, 1)
+            renamed[name.replace("self_attention.q_proj", "self_attn.Wqkv")] = value
+    for name in [name for name in renamed if "cross_attn.to_qk" in name]:
+        # Across images, queries and keys are the same. A file where they differ is of another network.
+        keys = name.replace("cross_attn.to_qk", "cross_attention.k_proj")
+        if keys in renamed and torch.equal(renamed[keys], renamed[name]):
+            del renamed[keys]
+    return renamed
+
+
+def _rotate(x: Tensor, rope: Rope) -> Tensor:
+    """Rotate each pair of channels of queries or keys (B, N, heads, D) by its own angle; returns the type of `x`.
+
+    The first half of the channels holds the first of each pair, whose sines are negative.
+    """
+    cosine, sine = rope
+    first, second = x.chunk(2, dim=-1)
+    swapped = torch.cat([second, first], dim=-1)
+    return torch.addcmul(x * cosine, swapped, sine).to(x.dtype)
+
+
+def _attend(queries: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None) -> Tensor:
+    """Return for each query the mean of values, weighted by the softmax of products with keys, (B, N, heads * D).
+
+    Args:
+        queries, keys, values: (B, N, heads, D) or (B, M, heads, D).
+        mask: (B, 1, 1, M), which keys count; None: all.
+    """
+    q, k, v = (part.transpose(1, 2).contiguous() for part in (queries, keys, values))
+    if mask is not None or not has_onednn(queries):
+        return F.scaled_dot_product_attention(q, k, v, attn_mask=mask, scale=1.0).transpose(1, 2).flatten(2)
+    # On a CPU this is 1.7 (float32) to 2.6 times (bfloat16) as fast as torch's, which uses slower matrix products.
+    gathered = torch.empty_like(queries, memory_format=torch.contiguous_format)
+    rows = _ROWS * max(2, torch.get_num_threads())
+    for image, of_image in enumerate(zip(q, k, v, strict=True)):
+        for head, (query, key, value) in enumerate(zip(*of_image, strict=True)):
+            for start in range(0, len(query), rows):
+                weights = linear(query[start : start + rows], key)
+                mean = linear(torch.softmax(weights, dim=-1, out=weights), value.t())
+                gathered[image, start : start + rows, head] = mean
+    return gathered.flatten(2)
+
+
+def _project(layer: nn.Linear, x: Tensor) -> Tensor:
+    return linear(x.to(layer.weight.dtype), layer.weight, layer.bias)
+
+
+class _Block(nn.Module):
+    """What self-attention and cross-attention have in common: how features take up what they gathered."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        layers = nn.Linear(2 * DIM, 2 * DIM), nn.LayerNorm(2 * DIM), nn.GELU(), nn.Linear(2 * DIM, DIM)
+        self.ffn: Any = nn.Sequential(*layers)
+
+    def _fold_(self, projection: nn.Linear) -> None:
+        """Merge the projection of what was gathered into the layer that follows it."""
+        layer = self.ffn[0]
+        first, second = layer.weight.double().chunk(2, dim=1)
+        layer.bias.data = (layer.bias + second @ projection.bias.double()).float()
+        layer.weight.data = torch.cat([first, second @ projection.weight.double()], dim=1).float()
+
+    def _update(self, states: Tensor, gathered: Tensor) -> Tensor:
+        """Return features (B, N, DIM), float32, with what they gathered, (B, N, DIM)."""
+        first, norm, _, last = self.ffn
+        hidden = _project(first, torch.cat([states.to(gathered.dtype), gathered], dim=-1))
+        return states + _project(last, F.gelu(norm(hidden)))
+
+
+class SelfBlock(_Block):
+    """Attention among the features of an image."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.Wqkv = nn.Linear(DIM, 3 * DIM)
+        self.out_proj = nn.Linear(DIM, DIM)
+
+    def fold_(self) -> None:
+        # The rows are heads x pairs of channels x 2 x (query, key, value). Queries, keys and values are put one after
+        # another, and of queries and keys the first channels of all pairs before the second ones: see `_rotate`.
+        rows = torch.arange(3 * DIM).view(_HEADS, -1, 2, 3)
+        queries_and_keys, values = rows[..., :2].permute(3, 0, 2, 1), rows[..., 2]
+        order = torch.cat([queries_and_keys.flatten(), values.flatten()])
+        scale = torch.ones(3 * DIM)
+        scale[:DIM] = (DIM // _HEADS) ** -0.5
+        self.Wqkv.weight.data = self.Wqkv.weight[order] * scale[:, None]
+        self.Wqkv.bias.data = self.Wqkv.bias[order] * scale
+        self._fold_(self.out_proj)
+
+    def forward(self, states: Tensor, rope: Rope, mask: Tensor | None) -> Tensor:
+        queries, keys, values = _project(self.Wqkv, states).unflatten(-1, (3, _HEADS, -1)).unbind(2)
+        return self._update(states, _attend(_rotate(queries, rope), _rotate(keys, rope), values, mask))
+
+
+class CrossBlock(_Block):
+    """Attention between the features of two images."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.to_qk = nn.Linear(DIM, DIM)
+        self.to_v = nn.Linear(DIM, DIM)
+        self.to_out = nn.Linear(DIM, DIM)
+
+    def fold_(self) -> None:
+        for parameter in self.to_qk.parameters():
+            parameter.data = parameter * (DIM // _HEADS) ** -0.25
+        self._fold_(self.to_out)
+
+    def forward(self, a: Tensor, b: Tensor, mask_a: Tensor | None, mask_b: Tensor | None) -> tuple[Tensor, Tensor]:
+        # Queries of an image are its keys too.
+        keys_a, values_a, keys_b, values_b = (
+            _project(layer, states).unflatten(-1, (_HEADS, -1))
+            for states in (a, b)
+            for layer in (self.to_qk, self.to_v)
+        )
+        a = self._update(a, _attend(keys_a, keys_b, values_b, mask_b))
+        return a, self._update(b, _attend(keys_b, keys_a, values_a, mask_a))
+
+
+class _Layer(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.self_attn = SelfBlock()
+        self.cross_attn = CrossBlock()
+
+
+class _Assignment(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.matchability = nn.Linear(DIM, 1)
+        self.final_proj = nn.Linear(DIM, DIM)
+
+
+class _Confidence(nn.Module):
+    """Part of the checkpoints: how sure a feature is of its match after a layer. Not used."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.token = nn.Sequential(nn.Linear(DIM, 1))
+
+
+class _PositionalEncoding(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.Wr = nn.Linear(2, DIM // _HEADS // 2, bias=False)
+
+
+class LightGlue(nn.Module):
+    """Matches the features of two images: `encode` each image, then give both to `forward`."""
+
+    def __init__(self, input_dim: int) -> None:
+        """`input_dim` is the length of the descriptors."""
+        super().__init__()
+        self.input_proj = nn.Identity() if input_dim == DIM else nn.Linear(input_dim, DIM)
+        self.posenc = _PositionalEncoding()
+        self.transformers: Any = nn.ModuleList(_Layer() for _ in range(_LAYERS))
+        self.log_assignment: Any = nn.ModuleList(_Assignment() for _ in range(_LAYERS))
+        self.token_confidence = nn.ModuleList(_Confidence() for _ in range(_LAYERS - 1))
+
+    @torch.no_grad()
+    def fold_(self, dtype: torch.dtype) -> None:
+        """Merge matrices, and convert those of the attention to the type to compute in. Call it once, on the CPU.
+
+        The tensors that were loaded are not changed: they may be a file's, or a caller's.
+        """
+        for layer in self.transformers:
+            for block in (layer.self_attn, layer.cross_attn):
+                block.fold_()
+                block.to(dtype)
+
+    def encode(self, keypoints: Tensor, descriptors: Tensor, mask: Tensor | None) -> Tensor:
+        """Return features (B, N, DIM), float32, as they are before they first see another image.
+
+        Args:
+            keypoints: (B, N, 2), from -1 to 1 along the longer side of the image.
+            descriptors: (B, N, input_dim).
+            mask: (B, N), which features are real; None: all.
+        """
+        mask = None if mask is None else mask[:, None, None]
+        return self.transformers[0].self_attn(self.input_proj(descriptors), self._rope(keypoints), mask)
+
+    def forward(
+        self,
+        keypoints: tuple[Tensor, Tensor],
+        encoded: tuple[Tensor, Tensor],
+        masks: tuple[Tensor | None, Tensor | None],
+    ) -> tuple[Tensor, Tensor]:
+        """Return for each feature of the first images its partner, -1 for none, and the confidence, each (B, N).
+
+        Args:
+            keypoints: of both images, as in `encode`.
+            encoded: what `encode` returned for both, (B, N, DIM) and (B, M, DIM).
+            masks: which features are real, (B, N) and (B, M), at least one of each image; None: all.
+        """
+        ropes = [self._rope(xy) for xy in keypoints]
+        attended = [None if mask is None else mask[:, None, None] for mask in masks]
+        a, b = encoded
+        for number, layer in enumerate(self.transformers):
+            if number:
+                a, b = (layer.self_attn(*inputs) for inputs in zip((a, b), ropes, attended, strict=True))
+            a, b = layer.cross_attn(a, b, *attended)
+        return self._assign(a, b, *masks)
+
+    def _assign(self, a: Tensor, b: Tensor, mask_a: Tensor | None, mask_b: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Return mutual best partners, see `forward`, by the sum of the log softmax over rows and over columns."""
+        layer = self.log_assignment[-1]
+        scores = layer.final_proj(a) @ (layer.final_proj(b) / DIM**0.5).mT
+        for mask, dim in ((mask_a, 2), (mask_b, 1)):
+            if mask is not None:  # not -inf, of which the softmax is NaN where nothing else is in a row
+                scores.masked_fill_(~mask.unsqueeze(dim), torch.finfo(scores.dtype).min / 4)
+        # Differences first: of sums of large numbers, the rounding would show in the confidence.
+        of_rows, of_columns = scores - scores.logsumexp(2, keepdim=True), scores.sub_(scores.logsumexp(1, keepdim=True))
+        matchable = F.logsigmoid(layer.matchability(a)), F.logsigmoid(layer.matchability(b)).mT
+        scores = of_rows.add_(of_columns).add_(matchable[0]).add_(matchable[1])
+        best, partners = scores.max(dim=2)
+        rows = torch.arange(a.shape[1], device=a.device)
+        mutual = scores.argmax(dim=1).gather(1, partners) == rows
+        return partners.where(mutual, -1), best.exp()
+
+    def _rope(self, keypoints: Tensor) -> Rope:
+        angles = F.linear(keypoints, self.posenc.Wr.weight)[:, :, None]
+        cosine, sine = angles.cos(), angles.sin()
+        return torch.cat([cosine, cosine], dim=-1), torch.cat([-sine, sine], dim=-1)
