@@ -126,17 +126,36 @@ def test_the_order_of_the_images_does_not_count(matcher: LightGlueMatcher) -> No
     assert {*map(tuple, forth.indices.tolist())} == {(i, j) for j, i in back.indices.tolist()}
 
 
-def test_a_batch_is_its_pairs_one_by_one(matcher: LightGlueMatcher) -> None:
+@pytest.mark.parametrize("at_once", [1, 3])
+def test_pairs_do_not_depend_on_each_other(
+    matcher: LightGlueMatcher, monkeypatch: pytest.MonkeyPatch, at_once: int
+) -> None:
+    """On a CPU, where each pair runs alone, not by a bit; in batches, as on a GPU, but for rounding."""
     counts = [(50, 80), (3, 120), (120, 120), (1, 1), (0, 70), (70, 0), (20, 21), (99, 5)]
     sizes = [(640, 480), (480, 640), (1920, 1440), (64, 64)]
     pairs = [
         (features(2 * k, a, sizes[k % 4]), features(2 * k + 1, b, sizes[(k + 1) % 4]))
         for k, (a, b) in enumerate(counts)
     ]
+    pairs += [(pairs[0][0], pairs[2][1]), (pairs[0][0], pairs[0][0]), pairs[0]]  # images that are in several pairs
+    alone = [matcher.match([pair])[0] for pair in pairs]
+    assert matcher._pairs_at_once == 1
+    monkeypatch.setattr(matcher, "_pairs_at_once", at_once)
     together = matcher.match(pairs)
-    assert sum(len(found) > 0 for found in together) >= 5
-    for pair, found in zip(pairs, together, strict=True):
-        assert_equal(found, matcher.match([pair])[0])
+    assert sum(len(found) > 0 for found in together) >= 8
+    for found, expected in zip(together, alone, strict=True):
+        assert_equal(found, expected)
+        if at_once == 1:
+            np.testing.assert_array_equal(found.scores, expected.scores)
+
+
+def test_an_image_in_several_pairs_is_encoded_once(matcher: LightGlueMatcher, monkeypatch: pytest.MonkeyPatch) -> None:
+    encoded = []
+    encode = matcher._model.encode
+    monkeypatch.setattr(matcher._model, "encode", lambda xy, *others: encoded.append(len(xy)) or encode(xy, *others))
+    query = features(0, 30)
+    matcher.match([(query, features(k, 30)) for k in range(1, 5)])
+    assert sum(encoded) == 5
 
 
 def test_what_does_not_fit_is_halved(
@@ -195,8 +214,12 @@ def test_the_threshold(state: State, matcher: LightGlueMatcher) -> None:
 
 def test_other_features_are_refused(matcher: LightGlueMatcher) -> None:
     sift = replace(features(0, 5), descriptors=np.zeros((5, 128), np.uint8))
-    with pytest.raises(ToolkitError, match=r"found uint8 \(5, 128\)\. Use the matcher `mutual`"):
-        matcher.match([(features(0, 5), sift)])
+    aliked = replace(features(0, 5), descriptors=np.zeros((5, 128), np.float16))
+    for other, found in ((sift, "uint8"), (aliked, "float16")):
+        with pytest.raises(ToolkitError, match=rf"superpoint, \(N, 256\).*found {found} \(5, 128\).*`mutual`"):
+            matcher.match([(features(0, 5), other)])
+    with pytest.raises(ManifestError, match=r"no weights for 'sift'\. Known: superpoint, aliked"):
+        LightGlueMatcher(device="cpu", features="sift")
 
 
 def test_weights_that_are_not_finite(state: State) -> None:

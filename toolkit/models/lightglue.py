@@ -274,6 +274,8 @@ class LightGlue(nn.Module):
         best, partners = scores.max(dim=2)
         rows = torch.arange(a.shape[1], device=a.device)
         mutual = scores.argmax(dim=1).gather(1, partners) == rows
+        if mask_a is not None:
+            mutual &= mask_a  # what pads one image may match what pads the other
         return partners.where(mutual, -1), best.exp()
 
     def _rope(self, keypoints: Tensor) -> Rope:
