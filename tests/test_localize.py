@@ -16,6 +16,7 @@ import pycolmap
 import pytest
 
 from tests.calls import call
+from tests.other_kind import add_other_kind
 from toolkit import geometry, localize
 from toolkit.capture import Capture, Trajectory
 from toolkit.capture.images import read_image
@@ -688,20 +689,39 @@ class ByContent:
         return self.simulated_predictor.predict([[named(view) for view in group] for group in groups])
 
 
+ESCALATES = {"features": {"kinds": ["sift"], "escalation": ["other"]}, "pnp": {"ok_inliers": 1_000_000}}
+"""No pose is sure, so each query is asked again with another kind of features."""
+
+
 @pytest.mark.parametrize("device", ["ios", "spot"])
-@pytest.mark.parametrize("method", ["pnp", "nearest", "vggt", "hybrid"])
+@pytest.mark.parametrize(
+    "method",
+    [
+        {"method": "pnp"},
+        {"method": "nearest"},
+        {"method": "vggt"},
+        {"method": "hybrid"},
+        {"map": None},
+        ESCALATES,
+        {**ESCALATES, "method": "hybrid"},
+        {**ESCALATES, "map": None},
+    ],
+    ids=["pnp", "nearest", "vggt", "hybrid", "no map", "escalates", "hybrid escalates", "no map escalates"],
+)
 def test_pictures_get_the_pose_of_the_run_byte_for_byte(
-    small_capture: Path, run: SceneFiles, monkeypatch: pytest.MonkeyPatch, method: str, device: str
+    small_capture: Path, run: SceneFiles, monkeypatch: pytest.MonkeyPatch, method: dict[str, Any], device: str
 ) -> None:
+    add_other_kind(monkeypatch)
     predictor = ByContent(Capture.open(small_capture), run.maps)
     monkeypatch.setattr(maps, "create_predictor", lambda *_, **__: predictor)
-    settings = {"method": method, "features": ["sift"], "seed": 3, "pnp": {"min_inliers": 11}}
-    settings |= {"predictor": {"num_references": 3}}
+    settings = {"features": ["sift"], "seed": 3, "pnp": {"min_inliers": 11}, "predictor": {"num_references": 3}}
+    settings |= method
     run_stage(small_capture, run, query_device=device, **settings)
     place = Map.open(run.run, run.scene, "ios")
     assert place.settings == LocalizeSettings.of(settings), "the run's own settings"
     session = Capture.open(small_capture)[f"{device}_query"]
     keyframes = session.keyframes(LIST)
+    quarter_turns = place.turns.of(session) if place.turns else np.zeros(len(session.images), int)
     lines = run.poses_txt("ios", device).read_text().splitlines()[1:]
     localized = LocalizedQueries(run.poses_dir / f"{run.poses_txt('ios', device).stem}.h5")
     for line, rows, key in zip(
@@ -711,9 +731,9 @@ def test_pictures_get_the_pose_of_the_run_byte_for_byte(
         cameras = [session.camera(sensor) for sensor in session.images["sensor_id"].iloc[rows]]
         rig = session.rig_from_cam(rows)
         estimate = (
-            localize_image(place, paths[0], cameras[0])
+            localize_image(place, paths[0], cameras[0], turns=quarter_turns[rows])
             if device == "ios"
-            else localize_image(place, paths, cameras, rig)
+            else localize_image(place, paths, cameras, rig, quarter_turns[rows])
         )
         text = ", ".join(repr(float(number)) for number in geometry.qt_from_pose(estimate.world_from_rig))
         assert text in line, f"{key.timestamp}"

@@ -39,6 +39,21 @@ def read_image(path: str | Path, gray: bool = False) -> NDArray[np.uint8]:
     return np.asarray(image if gray else image[:, :, ::-1], np.uint8)
 
 
+def pixels_of(image: str | Path | NDArray[np.uint8], gray: bool = False) -> NDArray[np.uint8]:
+    """Return the pixels of a file, see `read_image`, or those given, (H, W) or (H, W, 3) RGB, in gray or in color.
+
+    Raises:
+        ImageError: the file is missing or cannot be decoded, or pixels of another shape or type.
+    """
+    if isinstance(image, str | Path):
+        return read_image(image, gray)
+    if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)):
+        raise ImageError(f"Found pixels {image.shape} {image.dtype}: expected (H, W) or (H, W, 3) uint8.")
+    if gray == (image.ndim == 2):
+        return image
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY if gray else cv2.COLOR_GRAY2RGB), np.uint8)
+
+
 def read_for_display(path: str | Path) -> NDArray[np.uint8]:
     """Return an image, (H, W, 3) RGB; a gray image with the text `unreadable` if it cannot be read."""
     try:

@@ -170,6 +170,7 @@ def _mask(images: Tensor) -> Tensor | None:
 
 def _pack(features: LocalFeatures) -> NDArray[np.float32]:
     """Return the features of an image as `_encode` takes them, (N, 2 + D + 1): normalized x y, descriptor, and 1."""
+    features = features.turned(features.turns)  # as upright as the network knows images
     size = np.array(features.image_size, np.float32)
     # As in training: pixel centers at whole numbers, the longer side from -1 to 1.
     xy = (features.keypoints - 0.5 - size / 2) / (size.max() / 2)

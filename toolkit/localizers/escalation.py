@@ -2,10 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-from toolkit.capture.images import read_image
+from toolkit.capture.images import pixels_of
 from toolkit.features.features import LocalFeatures, extract_turned
 from toolkit.features.stores import as_stored
 from toolkit.localizers.base import Localizer, PoseEstimate, Query, References
@@ -59,8 +58,10 @@ class EscalatingLocalizer:
             if isinstance(known, str):
                 features.append(known)
                 continue
-            image = read_image(view.image) if isinstance(view.image, str | Path) else view.image
-            missing = self.second.on_demand[len(known) - len(self.second.mapped) :]
-            found = [extract_turned(method.extractor, [image], [view.turns])[0] for method, _ in missing]
+            missing = [method.extractor for method, _ in self.second.on_demand[len(known) - len(self.second.mapped) :]]
+            found = [
+                extract_turned(extractor, [pixels_of(view.image, not extractor.color)], [view.turns])[0]
+                for extractor in missing
+            ]
             features.append([*known, *map(as_stored, found)])
         return replace(query, features=features, network_matches=[])

@@ -3,7 +3,7 @@
 import json
 import logging
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -216,7 +216,7 @@ class Map:
     def retrieve(
         self,
         vectors: NDArray[np.float32],
-        pictures: Sequence[tuple[NDArray[np.uint8], NDArray[np.uint8]]] = (),
+        pictures: Sequence[Callable[[bool], NDArray[np.uint8]]] = (),
         cameras: Sequence[pycolmap.Camera] = (),
         turns: Sequence[int] = (),
     ) -> list[References]:
@@ -224,7 +224,7 @@ class Map:
 
         Args:
             vectors: (Q, D) what the embedder gave for them.
-            pictures: their pixels in color, (H, W, 3), and in gray, (H, W); of use to a run that reranks.
+            pictures: what returns their pixels, in color if it is given True; of use to a run that reranks.
             cameras, turns: their intrinsics, and the quarter turns that make them upright; likewise.
 
         Raises:
@@ -261,17 +261,15 @@ class Map:
     def _rerank(
         self,
         ranked: tuple[NDArray[np.int64], NDArray[np.float64]],
-        picture: tuple[NDArray[np.uint8], NDArray[np.uint8]],
+        picture: Callable[[bool], NDArray[np.uint8]],
         camera: pycolmap.Camera,
         turns: int,
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return rows of map images and their inliers in the order of verified matches, as the rerank stage does."""
         method, verifier = self._verification
         settings, rows = verifier.settings, ranked[0][: verifier.settings.topn]
-        pixels = picture[0 if method.extractor.color else 1]
-        features = as_stored(
-            extract_turned(method.extractor, [pixels], [turns if method.extractor.upright else 0])[0]
-        )
+        pixels = picture(method.extractor.color)
+        features = as_stored(extract_turned(method.extractor, [pixels], [turns if method.extractor.upright else 0])[0])
         readable = [index for index, row in enumerate(rows) if self.session.image_name(int(row)) in verifier.store]
         inliers = np.zeros(len(rows))
         inliers[readable], _ = verifier.verify(

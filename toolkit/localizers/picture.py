@@ -4,13 +4,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from toolkit.capture.images import read_image
+from toolkit.capture.images import pixels_of
 from toolkit.capture.turning import turn_image
 from toolkit.errors import ImageError
 from toolkit.features.features import LocalFeatures, SiftExtractor, extract_turned
@@ -54,12 +53,12 @@ def localize_image(
             f"Found {len(pictures)} pictures, {len(cameras)} cameras, {len(poses)} rig_from_cams and "
             f"{len(quarter_turns)} turns: expected as many, and at least one."
         )
-    pixels = [_read(picture, of) for picture, of in zip(pictures, cameras, strict=True)]
+    pixels = [_Pixels(picture, of) for picture, of in zip(pictures, cameras, strict=True)]
     learned = any(kind.extractor.upright for kind in (*place.kinds, *place.escalation))
     upright = learned or place.settings.predictor.upright
     views = [
-        View(f"picture {number}", color, of, in_map=False, turns=turn if upright else 0)
-        for number, ((color, _), of, turn) in enumerate(zip(pixels, cameras, quarter_turns, strict=True), start=1)
+        View(f"picture {number}", picture.image, of, in_map=False, turns=turn if upright else 0)
+        for number, (picture, of, turn) in enumerate(zip(pixels, cameras, quarter_turns, strict=True), start=1)
     ]
     none = [0] * len(pixels)
     features: list[list[LocalFeatures]] = []
@@ -67,8 +66,8 @@ def localize_image(
         # As a run reads them: the file of features rounds keypoints at the border.
         extracted = [
             [
-                as_stored(extract_turned(kind.extractor, [color if kind.extractor.color else gray], [turn])[0])
-                for (color, gray), turn in zip(pixels, quarter_turns if kind.extractor.upright else none, strict=True)
+                as_stored(extract_turned(kind.extractor, [picture.read(kind.extractor.color)], [turn])[0])
+                for picture, turn in zip(pixels, quarter_turns if kind.extractor.upright else none, strict=True)
             ]
             for kind in place.kinds
         ]
@@ -80,29 +79,32 @@ def localize_image(
         if features and sift.settings in settings:  # the features that are matched serve the embedder, too
             inputs = [kinds[settings.index(sift.settings)] for kinds in features]
         else:
-            inputs = [as_stored(found) for found in sift.extract([gray for _, gray in pixels])]
+            inputs = [as_stored(found) for found in sift.extract([picture.read(color=False) for picture in pixels])]
     else:
         turned = embedder.upright if place.embed_settings.upright is None else place.embed_settings.upright
         shown = zip(pixels, quarter_turns if turned else none, strict=True)
-        inputs = [embedder.prepare(turn_image(color, turn)) for (color, _), turn in shown]
-    references = place.retrieve(embedder.embed(inputs), pixels, cameras, quarter_turns)
+        inputs = [embedder.prepare(turn_image(picture.read(color=True), turn)) for picture, turn in shown]
+    references = place.retrieve(embedder.embed(inputs), [picture.read for picture in pixels], cameras, quarter_turns)
     with threadpool_limits(1, "blas"):  # sums stay in one order, as in a run
         return place.localizer.localize(Query(views, poses, features), references)
 
 
-def _read(picture: Picture, camera: pycolmap.Camera) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return the pixels of a picture in color, (H, W, 3), and in gray, (H, W), as a run reads them."""
-    if isinstance(picture, str | Path):
-        gray, color = read_image(picture, gray=True), read_image(picture)
-    elif picture.dtype != np.uint8 or picture.shape[2:] not in ((), (3,)):
-        raise ImageError(f"Found pixels {picture.shape} {picture.dtype}: expected (H, W) or (H, W, 3) uint8.")
-    elif picture.ndim == 2:
-        gray, color = picture, np.repeat(picture[:, :, None], 3, axis=2)
-    else:
-        gray, color = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.uint8), picture
-    if (camera.width, camera.height) != (gray.shape[1], gray.shape[0]):
-        raise ImageError(
-            f"The image is {gray.shape[1]} x {gray.shape[0]} pixels, its camera {camera.width} x {camera.height}. "
-            "Give the intrinsics of the image as it is stored."
-        )
-    return color, gray
+class _Pixels:
+    """The pixels of a picture, decoded when they are asked for."""
+
+    def __init__(self, image: Picture, camera: pycolmap.Camera) -> None:
+        self.image = Path(image) if isinstance(image, str) else image
+        self._camera = camera
+        self._decoded: dict[bool, NDArray[np.uint8]] = {}
+
+    def read(self, color: bool) -> NDArray[np.uint8]:
+        """Return the pixels in color, (H, W, 3), or in gray, (H, W), as a run reads them."""
+        if color not in self._decoded:
+            pixels = pixels_of(self.image, gray=not color)
+            if (self._camera.width, self._camera.height) != pixels.shape[1::-1]:
+                raise ImageError(
+                    f"The image is {pixels.shape[1]} x {pixels.shape[0]} pixels, its camera {self._camera.width} x "
+                    f"{self._camera.height}. Give the intrinsics of the image as it is stored."
+                )
+            self._decoded[color] = pixels
+        return self._decoded[color]
