@@ -1,0 +1,246 @@
+"""Points made for one query, and asking for more features only where a pose is not sure."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+from numpy.typing import NDArray
+
+from tests.queries import query_of
+from toolkit import geometry
+from toolkit.features.features import LocalFeatures
+from toolkit.features.matching import LocalMethod, PairMatches
+from toolkit.localizers.base import PoseEstimate, Query, References
+from toolkit.localizers.escalation import EscalatingLocalizer
+from toolkit.localizers.local_map import LocalMap
+from toolkit.localizers.matches import MappedFeatures
+from toolkit.localizers.on_demand import OnDemandLocalizer, PosedImages
+
+Floats = NDArray[np.float64]
+SIZE = (640, 480)
+POINTS = 300
+CAMERA = pycolmap.Camera(model="PINHOLE", width=SIZE[0], height=SIZE[1], params=[500, 500, 320, 240])
+
+
+def view_from(place: Sequence[float]) -> Floats:
+    """Return world_from_cam of a camera that looks at the origin, 5 m in front of it."""
+    forward = geometry.unit(-np.array(place, np.float64))
+    right = geometry.unit(np.cross([0.0, 1.0, 0.0], forward))
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    pose[:3, 3] = place
+    return pose
+
+
+MAP_POSES = np.stack([view_from((x, y, -5.0)) for x in (-1.2, 0.0, 1.2) for y in (-0.5, 0.5)])
+QUERY_POSE = view_from((0.4, 0.1, -4.5))
+
+
+class ByPoint:
+    """Matches features that are of the same point, whatever their descriptors; some wrongly if asked to."""
+
+    batch_size = 1
+    settings = {"name": "by point"}  # noqa: RUF012
+
+    def __init__(self, wrong: float = 0.0) -> None:
+        self.wrong = wrong
+
+    def match(self, pairs: Sequence[tuple[LocalFeatures, LocalFeatures]]) -> list[PairMatches]:
+        rng, found = np.random.default_rng(0), []
+        for a, b in pairs:  # the score of a feature is the number of its point
+            _, first, second = np.intersect1d(a.scores, b.scores, return_indices=True)
+            bad = rng.uniform(size=len(second)) < self.wrong
+            second[bad] = rng.permutation(second[bad])
+            found.append(PairMatches(np.column_stack([first, second]), np.ones(len(first), np.float32)))
+        return found
+
+
+class Scene:
+    """Points in a box, seen by map cameras and by a query camera."""
+
+    def __init__(self, alike: bool = True) -> None:
+        """`alike`: a point has the same descriptor in all map images."""
+        rng = np.random.default_rng(1)
+        self.points = rng.uniform((-1.5, -1, -1), (1.5, 1, 1), (POINTS, 3))
+        self.names = [f"ios_map/raw_data/{index}.jpg" for index in range(len(MAP_POSES))]
+        common = rng.normal(size=(POINTS, 128))
+        self.features = {
+            name: self._seen(pose, common if alike else rng.normal(size=(POINTS, 128)), rng)
+            for name, pose in zip(self.names, MAP_POSES, strict=True)
+        }
+        self.query = query_of([CAMERA], np.eye(4)[None], [self._seen(QUERY_POSE, common, rng)])
+        self.references = [References.of(range(len(MAP_POSES)))]
+
+    def _seen(self, world_from_cam: Floats, descriptors: Floats, rng: np.random.Generator) -> LocalFeatures:
+        pixels = CAMERA.img_from_cam(geometry.transform(geometry.invert(world_from_cam), self.points))
+        order = rng.permutation(POINTS)
+        return LocalFeatures(
+            (pixels + rng.normal(0, 0.3, pixels.shape))[order].astype(np.float32),
+            np.ones(POINTS, np.float32),
+            order.astype(np.float32),
+            geometry.unit(descriptors)[order].astype(np.float16),
+            SIZE,
+        )
+
+    def localizer(
+        self,
+        mapped: Sequence[MappedFeatures] = (),
+        source: Callable[[str], LocalFeatures] | None = None,
+        instants: Sequence[int] = range(len(MAP_POSES)),
+        wrong: float = 0.0,
+    ) -> OnDemandLocalizer:
+        cameras = [CAMERA] * len(self.names)
+        names = list(mapped[0].map.image_names) if mapped else self.names
+        posed = PosedImages(names, cameras, MAP_POSES, np.array(instants))
+        method: Any = LocalMethod("aliked", SimpleNamespace(), ByPoint(wrong))
+        return OnDemandLocalizer(posed, mapped, [(method, source or self.features.__getitem__)])
+
+
+def assert_right(estimate: PoseEstimate, most_m: float = 0.01) -> None:
+    assert estimate.world_from_rig is not None, estimate.status
+    rotation_deg, distance_m = geometry.pose_error(estimate.world_from_rig, QUERY_POSE)
+    assert rotation_deg < 0.1
+    assert distance_m < most_m
+
+
+@pytest.mark.parametrize("alike", [True, False])
+def test_no_map_is_needed(alike: bool) -> None:
+    """Where map images have nothing alike along epipolar lines, what the query shows of them makes the points."""
+    scene = Scene(alike)
+    estimate = scene.localizer().localize(scene.query, scene.references)
+    assert estimate.status == "ok"
+    assert_right(estimate)
+    assert len(np.unique(estimate.correspondences.points, axis=0)) > 0.9 * POINTS
+    assert set(estimate.correspondences.point_index) == {-1}, "they are in no file"
+    assert {name.split("/")[0] for name in estimate.correspondences.found_by} == {"aliked"}
+    assert set(estimate.references) <= set(range(len(MAP_POSES)))
+
+
+def test_wrong_matches_make_no_points() -> None:
+    """A third of the query's matches are wrong; two wrong ones that agree with the map's poses are rare."""
+    scene = Scene(alike=False)
+    estimate = scene.localizer(wrong=0.33).localize(scene.query, scene.references)
+    assert_right(estimate, 0.02)
+    used = estimate.correspondences
+    distances = np.linalg.norm(scene.points - used.points[used.inlier][:, None], axis=2).min(axis=1)
+    assert np.mean(distances < 0.05) > 0.95
+
+
+def test_the_cameras_of_a_rig_make_no_points_together() -> None:
+    scene = Scene()
+    estimate = scene.localizer(instants=[7] * len(MAP_POSES)).localize(scene.query, scene.references)
+    assert estimate.status == "failed: too few matches"
+
+
+def test_a_reference_without_features_is_left_out() -> None:
+    scene = Scene()
+
+    def source(name: str) -> LocalFeatures:
+        return LocalFeatures.none(SIZE) if name == scene.names[0] else scene.features[name]
+
+    assert_right(scene.localizer(source=source).localize(scene.query, scene.references))
+
+
+def test_references_of_one_query_image_only() -> None:
+    """A rig whose second image has no references, and whose third cannot be read."""
+    scene = Scene()
+    features = scene.query.features[0]
+    rig = query_of([CAMERA] * 3, np.stack([np.eye(4)] * 3), [features, features, "no such file"])
+    nothing = References.of([])
+    estimate = scene.localizer().localize(rig, [scene.references[0], nothing, scene.references[0]])
+    assert_right(estimate)
+    assert set(estimate.correspondences.camera) <= {0, 1}
+
+
+def test_points_of_the_map_keep_their_index() -> None:
+    """The map has points that the references do not see; those that they see are named as in the whole map."""
+    scene = Scene()
+    far = np.full((50, 3), 100.0)
+    keypoint = np.concatenate([np.argsort(scene.features[name].scores) for name in scene.names])
+    whole = LocalMap(
+        image_names=scene.names,
+        cameras=[CAMERA] * len(scene.names),
+        world_from_cams=MAP_POSES,
+        points=np.concatenate([far, scene.points]),
+        colors=np.zeros((50 + POINTS, 3), np.uint8),
+        obs_image=np.repeat(np.arange(len(MAP_POSES)), POINTS),
+        obs_keypoint=keypoint,
+        obs_point=np.tile(50 + np.arange(POINTS), len(MAP_POSES)),
+        noise_px=np.full(50 + POINTS, 0.3, np.float32),
+    )
+    mapped = MappedFeatures(whole, scene.features, matcher=ByPoint())
+    both = replace(scene.query, features=[[*scene.query.features[0], *scene.query.features[0]]])
+    estimate = scene.localizer([mapped]).localize(both, scene.references)
+    assert_right(estimate)
+    index = estimate.correspondences.point_index
+    kinds = np.array([name.split("/")[0] for name in estimate.correspondences.found_by])
+    assert set(index[kinds == "aliked"]) == {-1}
+    np.testing.assert_array_equal(
+        whole.points[index[kinds == "sift"]], estimate.correspondences.points[kinds == "sift"]
+    )
+    assert (kinds == "sift").sum() > 200
+
+
+class Scripted:
+    """A localizer that answers what it was told, and keeps what it was asked."""
+
+    batch_size = 1
+    image_names = ("a",)
+
+    def __init__(self, *answers: PoseEstimate) -> None:
+        self.answers, self.asked = list(answers), list[Query]()
+
+    def localize(self, query: Query, references: Sequence[References], prediction: Any = None) -> PoseEstimate:
+        self.asked.append(query)
+        return self.answers.pop(0)
+
+
+OK, LOW = PoseEstimate("ok", np.eye(4)), PoseEstimate("low_confidence", np.eye(4))
+FAILED = PoseEstimate("failed: no consistent pose")
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "status", "found_by"),
+    [
+        (OK, None, "ok", "pnp"),
+        (LOW, OK, "ok", "pnp+other"),
+        (FAILED, OK, "ok", "pnp+other"),
+        (LOW, LOW, "low_confidence", "pnp+other"),
+        (LOW, FAILED, "low_confidence", "pnp"),
+        (FAILED, FAILED, "failed: no consistent pose", "pnp"),
+    ],
+)
+def test_more_features_are_asked_where_a_pose_is_not_sure(
+    first: PoseEstimate, second: PoseEstimate | None, status: str, found_by: str
+) -> None:
+    scene = Scene()
+    extracted: list[NDArray[np.uint8]] = []
+
+    def extract(images: Sequence[NDArray[np.uint8]]) -> list[LocalFeatures]:
+        extracted.extend(images)
+        return [scene.features[scene.names[0]]] * len(images)
+
+    extractor = SimpleNamespace(extract=extract, color=False)
+    further = Scripted(*([] if second is None else [second]))
+    vars(further).update(mapped=[None], on_demand=[(SimpleNamespace(extractor=extractor), None)])
+    localizer: Any = EscalatingLocalizer(Scripted(first), further, "other")  # type: ignore[arg-type]
+    estimate = localizer.localize(scene.query, scene.references)
+    assert (estimate.status, estimate.found_by) == (status, found_by)
+    assert len(extracted) == len(further.asked) == (second is not None)
+    if further.asked:
+        assert [len(kinds) for kinds in further.asked[0].features] == [2]
+
+
+def test_a_query_with_all_features_is_not_asked_twice() -> None:
+    scene = Scene()
+    both = replace(scene.query, features=[[*scene.query.features[0], *scene.query.features[0]]])
+    for answer, asked in ((LOW, 0), (FAILED, 1)):
+        first, further = Scripted(LOW), Scripted(answer)
+        vars(further).update(mapped=[None], on_demand=[None])
+        localizer: Any = EscalatingLocalizer(first, further, "other")  # type: ignore[arg-type]
+        assert localizer.localize(both, scene.references).status == "low_confidence"
+        assert len(first.asked) == asked, "only where the further features give no pose"
