@@ -332,6 +332,43 @@ def test_a_killed_run_goes_on_where_it_was(
     assert without_times(run, device) == without_times(finished[0], device)
 
 
+@pytest.mark.parametrize("killed_at", [2, 4])
+def test_a_killed_run_goes_on_where_it_asks_for_more_features(
+    small_capture: Path, run: SceneFiles, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed_at: int
+) -> None:
+    """Each of the three queries is localized twice; a kill in the first round, or in the second, costs one query."""
+    add_other_kind(monkeypatch)
+    whole = SceneFiles(tmp_path / "whole", run.scene)
+    shutil.copytree(run.root, whole.root)
+    run_stage(small_capture, whole, query_device="ios", **ESCALATES)
+    with pytest.MonkeyPatch.context() as patch:
+        spy(patch, fail_at=killed_at, error=KeyboardInterrupt())
+        with pytest.raises(KeyboardInterrupt):
+            run_stage(small_capture, run, query_device="ios", **ESCALATES)
+    with pytest.MonkeyPatch.context() as patch:
+        calls = spy(patch)
+        run_stage(small_capture, run, query_device="ios", **ESCALATES)
+    assert len(calls) == 6 - killed_at
+    assert run.poses_txt("ios", "ios").read_bytes() == whole.poses_txt("ios", "ios").read_bytes()
+    table = pd.read_csv(run.poses_txt("ios", "ios").with_suffix(".csv"))
+    assert (table["method"] == "pnp+other").all()
+    assert (table["first_status"] == "low_confidence").all()
+    assert (table["seconds"] > table["first_seconds"]).all()
+    with pytest.MonkeyPatch.context() as patch:
+        assert not spy(patch)
+        assert run_stage(small_capture, run, query_device="ios", **ESCALATES)["skipped"].all()
+
+
+def test_a_sure_pose_asks_for_nothing_more(
+    small_capture: Path, run: SceneFiles, finished: tuple[SceneFiles, pd.DataFrame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add_other_kind(monkeypatch)
+    run_stage(small_capture, run, query_device="ios", features=ESCALATES["features"])
+    assert not list(run.features.glob("*/other*"))
+    assert run.poses_txt("ios", "ios").read_bytes() == finished[0].poses_txt("ios", "ios").read_bytes()
+    assert pd.read_csv(run.poses_txt("ios", "ios").with_suffix(".csv"))["first_status"].isna().all()
+
+
 def test_a_torn_part_costs_at_most_what_it_held(
     small_capture: Path,
     run: SceneFiles,
