@@ -442,7 +442,11 @@ def match_sessions(
         label, size = f"{matcher.settings['name']} {' '.join(sessions)}", matcher.batch_size
         with tqdm(total=len(todo), desc=label, unit="pair", disable=not todo) as bar:
             for batch in (todo[start : start + size] for start in range(0, len(todo), size)):
-                features = [(stores[0][name0], stores[1][name1]) for name0, name1, *_ in batch]
+                # One object for each image: the matcher computes once what depends on one image alone.
+                loaded = [
+                    {name: store[name] for name in {pair[side] for pair in batch}} for side, store in enumerate(stores)
+                ]
+                features = [(loaded[0][name0], loaded[1][name1]) for name0, name1, *_ in batch]
                 for pair, both, matches in zip(batch, features, matcher.match(features), strict=True):
                     write_matches(writer, *pair[2:], (len(both[0]), len(both[1])), matches)
                 bar.update(len(batch))
