@@ -117,9 +117,12 @@ KINDS: dict[str, FeatureKind] = {
         "toolkit.features.superpoint:SuperPointExtractor", ("lightglue", "mutual"), 1.0, 0.755,
         epipolar_min_score=0.755, guided_min_score=0.755, scale_octaves=float("inf"),
     ),
+    # Measured on photographs by day and by simulated night (STRECHA, STRECHA_HARD): of mutual matches above 0.7, 97 %
+    # and 93 % are right. Unrelated features score above 0.5 in 0.4 % of the searches within 0.7 degrees, 93 % of the
+    # true partners by night do, and with a wrong relative pose 0.1 % of the matches along epipolar lines are left.
     "aliked": FeatureKind(
-        "toolkit.features.aliked:AlikedExtractor", ("lightglue", "mutual"), 1.0, 0.8,
-        epipolar_min_score=0.8, guided_min_score=0.8, scale_octaves=float("inf"),
+        "toolkit.features.aliked:AlikedExtractor", ("lightglue", "mutual"), 1.0, 0.7,
+        epipolar_min_score=0.5, guided_min_score=0.5, scale_octaves=float("inf"),
     ),
 }  # fmt: skip
 """The kinds of local features that a manifest can name."""

@@ -16,6 +16,8 @@ from toolkit.manifest import AlikedSettings, SuperPointSettings
 from toolkit.models.compute import Fitting, resolve_device, resolve_precision
 from toolkit.models.weights import weights_digest
 
+# Few images keep a CPU busy; more at once take more memory and no less time.
+_BATCH = {"cpu": 2}
 _BATCH_ELSEWHERE = 16
 
 
@@ -32,8 +34,6 @@ class NetworkExtractor:
     """Key of the kind of features."""
     title: ClassVar[str]
     """Name of the network, for messages."""
-    cpu_batch: ClassVar[int]
-    """Images that keep a CPU busy; more at once take more memory and no less time."""
 
     def __init__(
         self,
@@ -43,11 +43,10 @@ class NetworkExtractor:
         batch_size: int | None,
         settings: AlikedSettings | SuperPointSettings,
     ) -> None:
-        """See the extractors."""
         self._values: Any = settings
         self._device = resolve_device(device)
         self._dtype = resolve_precision(dtype, self._device)
-        self.batch_size = batch_size or (self.cpu_batch if self._device.type == "cpu" else _BATCH_ELSEWHERE)
+        self.batch_size = batch_size or _BATCH.get(self._device.type, _BATCH_ELSEWHERE)
         model = self._load(checkpoint)
         self._weights = weights_digest(model)
         self._model: Any = model.to(self._device)

@@ -69,7 +69,6 @@ class SuperPointExtractor(NetworkExtractor):
     color = False
     name = "superpoint"
     title = "SuperPoint"
-    cpu_batch = 2
 
     def __init__(
         self,

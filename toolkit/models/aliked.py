@@ -130,18 +130,23 @@ class Aliked(nn.Module):
         # The authors' patches stay a pixel further from the right and the lower border than they need to.
         low = (keypoints.long() - _PATCH // 2).clamp(min=0).minimum(size - 1 - _PATCH)
         patch = low[:, None] + _grid(0, _PATCH, low)
-        features = self._features(levels, image, patch.flatten(0, 1)).view(len(keypoints), -1)
-        offsets = head.offsets(features).clamp(-max(levels.size) / 4, max(levels.size) / 4)
+        features, lengths = self._features(levels, image, patch.flatten(0, 1))
+        patches = (torch.cat(features, dim=1) / lengths[:, None]).view(len(keypoints), -1)
+        offsets = head.offsets(patches).clamp(-max(levels.size) / 4, max(levels.size) / 4)
         positions = keypoints[:, None] + offsets.view(len(keypoints), 2, -1).transpose(1, 2)
         indices, weights = _corners(positions.flatten(0, 1), (height, width))
         # Neighboring positions share pixels: each is put together once.
         pixels, rows = indices.unique(return_inverse=True)
-        table = self._features(levels, image, torch.stack([pixels % width, pixels // width], dim=1))
-        sampled = F.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
+        features, lengths = self._features(levels, image, torch.stack([pixels % width, pixels // width], dim=1))
+        weights = weights / lengths[rows]
+        sampled = torch.cat([_weighted_sum(table, rows, weights) for table in features], dim=1)
         return F.normalize(head(sampled.view(*positions.shape[:2], -1)), dim=1)
 
-    def _features(self, levels: "Levels", image: int, pixels: Tensor) -> Tensor:
-        """Return the normalized map of features of one image at whole pixels (N, 2), (N, D)."""
+    def _features(self, levels: "Levels", image: int, pixels: Tensor) -> tuple[list[Tensor], Tensor]:
+        """Return the features of one image at whole pixels (N, 2), level by level (N, D / 4), and their length (N,).
+
+        The authors' map has them side by side, divided by their length.
+        """
         fine = levels.fine[image].permute(1, 2, 0)
         x, y = (pixels + torch.tensor(levels.corner, device=pixels.device)).unbind(1)
         parts = [F.selu_(fine[y, x] @ self.conv1.weight[:, :, 0, 0].T)]
@@ -149,7 +154,8 @@ class Aliked(nn.Module):
             # Enlarging keeps the centers of the corners' pixels where they are.
             scale = [(small - 1) / (large - 1) for small, large in zip(level.shape[2:], fine.shape[:2], strict=True)]
             parts.append(sample(level[image, None], torch.stack([x * scale[1], y * scale[0]], dim=1)[None])[0])
-        return F.normalize(torch.cat(parts, dim=1), dim=1)
+        lengths = torch.stack([torch.linalg.vector_norm(part, dim=1) for part in parts]).norm(dim=0)
+        return parts, lengths.clamp(min=1e-12)
 
 
 @dataclass(frozen=True)
@@ -225,8 +231,12 @@ def sample(image: Tensor, positions: Tensor) -> Tensor:
     indices, weights = _corners(positions, (height, width))
     indices = indices + torch.arange(batch, device=image.device).view(-1, 1, 1) * (height * width)
     table = image.float().permute(0, 2, 3, 1).reshape(-1, channels)
-    values = F.embedding_bag(indices.flatten(0, 1), table, per_sample_weights=weights.flatten(0, 1), mode="sum")
-    return values.view(*positions.shape[:2], channels)
+    return _weighted_sum(table, indices.flatten(0, 1), weights.flatten(0, 1)).view(*positions.shape[:2], channels)
+
+
+def _weighted_sum(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+    """Return weighted sums of rows of a table (N, C), (M, C), by indices and weights (M, 4)."""
+    return F.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
 
 
 def _corners(positions: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
@@ -237,7 +247,8 @@ def _corners(positions: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]
         part = position - low
         index = torch.stack([low, low + 1], dim=-1)
         weight = torch.stack([1 - part, part], dim=-1) * ((index >= 0) & (index < length))
-        sides.append((index.clamp(0, length - 1).long(), weight))
+        # A position that is not a number has such weights, and any index.
+        sides.append((index.clamp(0, length - 1).nan_to_num(0).long(), weight))
     (rows, row_weights), (columns, column_weights) = sides
     indices = rows[..., :, None] * shape[1] + columns[..., None, :]
     return indices.flatten(-2), (row_weights[..., :, None] * column_weights[..., None, :]).flatten(-2)
