@@ -15,7 +15,7 @@ from torch.nn.utils.rnn import pad_sequence
 from toolkit.errors import ManifestError, ToolkitError
 from toolkit.features.features import LocalFeatures
 from toolkit.features.matching import MATCHER_WEIGHTS, PairMatches
-from toolkit.models.compute import Fitting, resolve_device, resolve_precision
+from toolkit.models.compute import Fitting, precision_of_matches, resolve_device
 from toolkit.models.lightglue import LightGlue, official_names
 from toolkit.models.weights import load_checkpoint, resolve_weights, weights_digest
 
@@ -66,7 +66,7 @@ class LightGlueMatcher:
         self._kind = features
         self._min_score = min_score
         self._device = resolve_device(device)
-        self._dtype = resolve_precision(dtype, self._device)
+        self._dtype = precision_of_matches(dtype, self._device)
         self.batch_size = batch_size or _BATCH.get(self._device.type, _BATCH_ELSEWHERE)
         self._pairs_at_once = 1 if self._device.type == "cpu" else self.batch_size
         source = MATCHER_WEIGHTS["lightglue", features]

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from toolkit.errors import ToolkitError
 from toolkit.features.features import LocalFeatures
 from toolkit.manifest import AlikedSettings, SuperPointSettings
-from toolkit.models.compute import Fitting, resolve_device, resolve_precision
+from toolkit.models.compute import Fitting, precision_of_matches, resolve_device
 from toolkit.models.weights import weights_digest
 
 # Few images keep a CPU busy; more at once take more memory and no less time.
@@ -45,7 +45,7 @@ class NetworkExtractor:
     ) -> None:
         self._values: Any = settings
         self._device = resolve_device(device)
-        self._dtype = resolve_precision(dtype, self._device)
+        self._dtype = precision_of_matches(dtype, self._device)
         self.batch_size = batch_size or _BATCH.get(self._device.type, _BATCH_ELSEWHERE)
         model = self._load(checkpoint)
         self._weights = weights_digest(model)

@@ -64,6 +64,13 @@ def resolve_precision(name: str, device: "torch.device") -> "torch.dtype":
     return torch.bfloat16 if device.type == "cpu" and cpu_multiplies_bfloat16() else torch.float32
 
 
+def precision_of_matches(name: str, device: "torch.device") -> "torch.dtype":
+    """Return the type in which networks for local features compute: as `resolve_precision`, but on a CPU `auto` is
+    float32, so that equal photographs give equal matches on any of them. bfloat16 changes a few percent of the matches.
+    """
+    return resolve_precision("float32" if name == "auto" and device.type == "cpu" else name, device)
+
+
 def cpu_multiplies_bfloat16() -> bool:
     """Tell whether this CPU has instructions for products of bfloat16 matrices: AMX or AVX512-BF16.
 
