@@ -98,7 +98,8 @@ def localize_pairs(
         workers: threads; 0 takes the number of cores, at most 8.
 
     Returns:
-        One row a pair: map_device, query_device, queries, ok, low_confidence, failed, seconds, skipped, path.
+        One row a pair: map_device, query_device, queries = ok + low_confidence + failed, escalated (those that further
+        features were asked for), seconds, skipped, path.
 
     Raises:
         ManifestError: unknown method, predictor, features or matcher, or a number that is not positive.
@@ -132,13 +133,15 @@ def localize_pairs(
                     _write_poses(pair, run.localize(record, about), settings)
                     write_sidecar(pair.file("txt"), record)
                 update_attributes(pair.file("h5"), about)
-                counts = pd.read_csv(pair.file("csv"))["status"].str.split(":").str[0].value_counts()
+                rows = pd.read_csv(pair.file("csv"))
+                counts = rows["status"].str.split(":").str[0].value_counts()
                 table.append(
                     {
                         "map_device": mapped,
                         "query_device": queried,
                         "queries": int(counts.sum()),
                         **{status: int(counts.get(status, 0)) for status in ("ok", "low_confidence", "failed")},
+                        "escalated": int(rows["first_status"].notna().sum()) if settings.features.escalation else 0,
                         "seconds": round(time.perf_counter() - started, 2),
                         "skipped": skipped,
                         "path": str(pair.file("txt")),
