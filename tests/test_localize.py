@@ -726,7 +726,7 @@ class ByContent:
         return self.simulated_predictor.predict([[named(view) for view in group] for group in groups])
 
 
-ESCALATES = {"features": {"kinds": ["sift"], "escalation": ["other"]}, "pnp": {"ok_inliers": 1_000_000}}
+ESCALATES = {"features": {"kinds": ["sift"], "escalation": ["other"]}, "pnp": {"ok_probability": 1.0}}
 """No pose is sure, so each query is asked again with another kind of features."""
 
 

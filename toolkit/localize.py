@@ -33,7 +33,7 @@ from toolkit.files import (
 )
 from toolkit.localizers.base import Localizer, NetworkMatches, PoseEstimate, Query, References, View
 from toolkit.localizers.correspondences import LocalizedQuery, query_group
-from toolkit.localizers.escalation import EscalatingLocalizer
+from toolkit.localizers.escalation import EscalatingLocalizer, is_sure
 from toolkit.localizers.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
 from toolkit.localizers.map import (
     Map,
@@ -56,7 +56,8 @@ log = logging.getLogger(__name__)
 
 COLUMNS = [
     "timestamp", "device_id", "status", "method", "num_inliers", "num_matches", "inlier_ratio", "num_guided",
-    "rmse_px", "rival_support", "position_std_m", "rotation_std_deg", "references", "seconds",
+    "rmse_px", "rival_support", "coverage", "agreement", "p_correct", "position_std_m", "rotation_std_deg",
+    "references", "seconds",
 ]  # fmt: skip
 PREDICTION_COLUMNS = ["scale_std", "rejected", "reason"]
 """Further columns of the methods that predict."""
@@ -316,10 +317,13 @@ class _PairRun:
                 rows[groups[number]] = row
                 writer.add(groups[number], arrays=localized.arrays(), note=row)
             further = {group: rows[group] for group, number in numbers.items() if len(self.rows[number])}
+            limit = self.place.settings.pnp.sure_position_std_m
             todo = [
-                numbers[group] for group, row in further.items() if row["status"] != "ok" and not row["first_status"]
+                numbers[group]
+                for group, row in further.items()
+                if not (row["first_status"] or is_sure(row["status"], row["position_std_m"], limit))
             ]
-            if first is not self.localizer and todo:
+            if isinstance(self.localizer, EscalatingLocalizer) and todo:
                 started = time.perf_counter()
                 for kind in self.place.escalation:
                     self._add_kind(kind, todo)
@@ -406,6 +410,9 @@ def _row(
         "num_guided": estimate.num_guided,
         "rmse_px": round(estimate.rmse_px, 4),
         "rival_support": round(estimate.rival_support, 4),
+        "coverage": round(estimate.coverage, 4),
+        "agreement": estimate.agreement,
+        "p_correct": round(estimate.p_correct, 4),
         "position_std_m": round(estimate.position_std_m, 6),
         "rotation_std_deg": round(estimate.rotation_std_deg, 6),
         "references": ";".join(localized.references),

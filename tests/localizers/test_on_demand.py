@@ -200,6 +200,7 @@ class Scripted:
 
 
 OK, LOW = PoseEstimate("ok", np.eye(4)), PoseEstimate("low_confidence", np.eye(4))
+VAGUE = replace(OK, covariance=np.eye(6))
 FAILED = PoseEstimate("failed: no consistent pose")
 
 
@@ -211,6 +212,8 @@ FAILED = PoseEstimate("failed: no consistent pose")
         (FAILED, OK, "ok", "pnp+other"),
         (LOW, LOW, "low_confidence", "pnp+other"),
         (LOW, FAILED, "low_confidence", "pnp"),
+        (VAGUE, OK, "ok", "pnp+other"),
+        (VAGUE, LOW, "ok", "pnp"),
         (FAILED, FAILED, "failed: no consistent pose", "pnp"),
     ],
 )
@@ -227,7 +230,7 @@ def test_more_features_are_asked_where_a_pose_is_not_sure(
     extractor = SimpleNamespace(extract=extract, color=False)
     further = Scripted(*([] if second is None else [second]))
     vars(further).update(mapped=[None], on_demand=[(SimpleNamespace(extractor=extractor), None)])
-    localizer: Any = EscalatingLocalizer(Scripted(first), further, "other")  # type: ignore[arg-type]
+    localizer: Any = EscalatingLocalizer(Scripted(first), further, "other", 0.05)  # type: ignore[arg-type]
     estimate = localizer.localize(scene.query, scene.references)
     assert (estimate.status, estimate.found_by) == (status, found_by)
     assert len(extracted) == len(further.asked) == (second is not None)
@@ -238,9 +241,9 @@ def test_more_features_are_asked_where_a_pose_is_not_sure(
 def test_a_query_with_all_features_is_not_asked_twice() -> None:
     scene = Scene()
     both = replace(scene.query, features=[[*scene.query.features[0], *scene.query.features[0]]])
-    for answer, asked in ((LOW, 0), (FAILED, 1)):
+    for answer, asked in ((OK, 0), (LOW, 1), (FAILED, 1)):
         first, further = Scripted(LOW), Scripted(answer)
         vars(further).update(mapped=[None], on_demand=[None])
-        localizer: Any = EscalatingLocalizer(first, further, "other")  # type: ignore[arg-type]
-        assert localizer.localize(both, scene.references).status == "low_confidence"
-        assert len(first.asked) == asked, "only where the further features give no pose"
+        localizer: Any = EscalatingLocalizer(first, further, "other", 0.05)  # type: ignore[arg-type]
+        assert localizer.localize(both, scene.references).status == ("ok" if answer is OK else "low_confidence")
+        assert len(first.asked) == asked, "only where the further features give no sure pose"

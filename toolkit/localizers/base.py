@@ -94,6 +94,12 @@ class PoseEstimate:
     rmse_px: float = float("nan")
     rival_support: float = 0.0
     """Guided matches of the best clearly different pose, relative to this one's; 0 where there is none."""
+    coverage: float = 0.0
+    """Share of the cells, 16 a query image, in which an inlier lies."""
+    agreement: int = 0
+    """Inliers of the second best kind of features; 0 if there is one kind."""
+    p_correct: float = float("nan")
+    """Probability that the pose is within 5 degrees and 0.5 m, see `confidence`; NaN where it was not matched."""
     references: tuple[int, ...] = ()
     """Map images that the pose rests on."""
     correspondences: Correspondences = field(default_factory=Correspondences)

@@ -11,15 +11,26 @@ from toolkit.localizers.base import Localizer, PoseEstimate, Query, References
 from toolkit.localizers.on_demand import OnDemandLocalizer
 
 
+def is_sure(status: str, position_std_m: float, limit_m: float) -> bool:
+    """Tell whether a pose needs no further features: it is `ok`, and precise."""
+    return status == "ok" and not position_std_m > limit_m  # unknown for a pose that does not rest on matches
+
+
 class EscalatingLocalizer:
-    """Asks one localizer first, and where its pose is not `ok` another that has more kinds of features.
+    """Asks one localizer first, and where its pose is not sure another that has more kinds of features.
 
     A query that already has features of all kinds is one that the first was asked about before.
     """
 
-    def __init__(self, first: Localizer, second: OnDemandLocalizer, names: str) -> None:
-        """The second's kinds of features begin with the first's; `names` are the others."""
-        self.first, self.second, self._names = first, second, names
+    def __init__(self, first: Localizer, second: OnDemandLocalizer, names: str, sure_position_std_m: float) -> None:
+        """
+        Args:
+            first: asked about every query.
+            second: its kinds of features begin with those of the first.
+            names: of the further kinds.
+            sure_position_std_m: see `PnpSettings`.
+        """
+        self.first, self.second, self._names, self._limit_m = first, second, names, sure_position_std_m
 
     @property
     def image_names(self) -> list[str]:
@@ -43,13 +54,16 @@ class EscalatingLocalizer:
         estimate = None
         if not has_all:
             estimate = self.first.localize(query, references, prediction)
-            if estimate.status == "ok":
+            if is_sure(estimate.status, estimate.position_std_m, self._limit_m):
                 return estimate
             query = self._with_all_features(query)
         escalated = self.second.localize(query, references)
-        if escalated.world_from_rig is not None:
-            return replace(escalated, found_by=f"{escalated.found_by}+{self._names}")
-        return self.first.localize(query, references, prediction) if estimate is None else estimate
+        escalated = replace(escalated, found_by=f"{escalated.found_by}+{self._names}")
+        if escalated.status == "ok":
+            return escalated
+        if estimate is None:
+            estimate = self.first.localize(query, references, prediction)
+        return escalated if _rank(escalated) >= max(_rank(estimate), 1) else estimate
 
     def _with_all_features(self, query: Query) -> Query:
         """Extract the features that the query lacks."""
@@ -65,3 +79,7 @@ class EscalatingLocalizer:
             ]
             features.append([*known, *map(as_stored, found)])
         return replace(query, features=features, network_matches=[])
+
+
+def _rank(estimate: PoseEstimate) -> int:
+    return {"ok": 2, "low_confidence": 1}.get(estimate.status, 0)

@@ -371,9 +371,8 @@ def _escalating(first: Localizer, settings: LocalizeSettings, map: Map) -> Local
     if not map.escalation:
         return first
     kinds = [*(map.kinds if settings.map is None else ()), *map.escalation]
-    return EscalatingLocalizer(
-        first, _on_demand(settings, map, kinds), "+".join(kind.name for kind in map.escalation)
-    )
+    names = "+".join(kind.name for kind in map.escalation)
+    return EscalatingLocalizer(first, _on_demand(settings, map, kinds), names, settings.pnp.sure_position_std_m)
 
 
 def _on_demand(settings: LocalizeSettings, map: Map, kinds: Sequence[LocalMethod]) -> OnDemandLocalizer:  # noqa: A002

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from toolkit import geometry
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import PoseEstimate, Prior, Query, References, agree
+from toolkit.localizers.confidence import EVIDENCE, probability_right
 from toolkit.localizers.correspondences import Correspondences
 from toolkit.localizers.matches import MapMatcher, MappedFeatures
 from toolkit.localizers.rig import Matches, RigQuery, least_squares_covariance
@@ -238,17 +239,28 @@ class PnpLocalizer:
             num_guided=len(guided),
             rmse_px=float(np.sqrt(np.mean(errors**2))) if len(errors) else float("nan"),
             rival_support=self._rival_support(hypotheses),
+            coverage=self._coverage(query, inliers),
+            agreement=self._agreement(inliers),
             references=tuple(shown),
             correspondences=self._correspondences(
                 every, np.concatenate([np.ones(len(guided), bool), others_agree]), len(guided), shown
             ),
         )
-        certain = (
-            independent >= settings.ok_inliers
-            and estimate.position_std_m <= settings.ok_position_std_m  # False where unknown
-            and estimate.rival_support <= settings.ok_rival_support
-        )
+        evidence = {name: getattr(estimate, name) for name in EVIDENCE}
+        estimate = replace(estimate, p_correct=float(probability_right(evidence)))
+        certain = estimate.p_correct >= settings.ok_probability and estimate.rival_support <= settings.ok_rival_support
         return estimate if certain else replace(estimate, status="low_confidence")
+
+    def _agreement(self, inliers: Matches) -> int:
+        """Return the number of points matched by the second best kind of features."""
+        counts = np.unique(self.matcher.kind_names(np.unique(inliers.point)), return_counts=True)[1]
+        return int(np.sort(counts)[-2]) if len(counts) > 1 else 0
+
+    def _coverage(self, query: RigQuery, inliers: Matches) -> float:
+        """Return the share of the cells of a 4 x 4 grid over each query image in which an inlier lies."""
+        sizes = np.array([(camera.width, camera.height) for camera in query.cameras])
+        cells = np.clip(4 * inliers.pixels / sizes[inliers.camera], 0, 3).astype(np.int64)
+        return len(np.unique(np.column_stack([inliers.camera, cells]), axis=0)) / (16 * len(sizes))
 
     def _correspondences(
         self, matches: Matches, inlier: NDArray[np.bool_], guided: int, references: Sequence[int]

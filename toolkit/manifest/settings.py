@@ -393,12 +393,14 @@ class PnpSettings(Settings):
     """Largest reprojection error of an inlier of the final pose."""
     min_inliers: Positive = 12
     """Fewer independently matched inliers than this are no pose."""
-    ok_inliers: Positive = 30
-    """Independently matched inliers that a pose needs to be `ok`: see `benchmarks/confidence.py`."""
+    ok_probability: Share = 0.99
+    """Probability of being right, within 5 degrees and 0.5 m, that a pose needs to be `ok`: see
+    `localizers/confidence.py`."""
     ok_rival_support: PositiveNumber = 0.8
     """Support of the best other pose, relative to this one's, up to which a pose is `ok`."""
-    ok_position_std_m: PositiveNumber = 0.1
-    """Largest standard deviation of the position for a pose to be `ok`, meters."""
+    sure_position_std_m: PositiveNumber = 0.05
+    """Largest standard deviation of the position, meters, with which a pose that is `ok` is precise enough that no
+    further features are asked."""
 
 
 class PredictorSettings(Settings):
