@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
-FIGURES = ("recall", "median_errors", "error_curves", "losses", "retrieval")
-ERROR_COLUMNS = ["map_device", "query_device", "timestamp", "device_id", "status", "num_inliers",
+FIGURES = ("recall", "median_errors", "error_curves", "losses", "reliability", "retrieval")
+ERROR_COLUMNS = ["map_device", "query_device", "timestamp", "device_id", "status", "num_inliers", "p_correct",
                  "rotation_error_deg", "translation_error_m"]  # fmt: skip
 LEAST_OVERLAP = 0.1
 """A first reference overlaps with the query if the query sees at least this share of the map points that it sees."""
@@ -183,7 +183,7 @@ def _queries_with_truth(session: Session, queries: str, messages: list[str]) -> 
 
 
 def _read_results(stem: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, str]:
-    """Return `keys` with columns pose (4, 4), status and num_inliers; and the state of the pair."""
+    """Return `keys` with columns pose (4, 4), status, num_inliers and p_correct; and the state of the pair."""
     path, table = stem.with_name(f"{stem.name}.txt"), stem.with_name(f"{stem.name}.csv")
     if not path.is_file():
         return None, "no poses file"
@@ -194,7 +194,7 @@ def _read_results(stem: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, 
     located = is_posed(poses)
     # A file of another tool has poses only; then a pose is a pose.
     status = np.where(located, "ok", "failed: no pose")
-    results = keys.assign(pose=list(poses), status=status, num_inliers=np.nan)
+    results = keys.assign(pose=list(poses), status=status, num_inliers=np.nan, p_correct=np.nan)
     if not table.is_file():
         return results, "evaluated"
     columns = ["timestamp", "device_id"]
@@ -203,8 +203,9 @@ def _read_results(stem: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, 
     except ArtifactError as error:
         return results, f"unreadable table of queries ({error})"
     details = keys.merge(details, how="left", on=columns)
-    if "num_inliers" in details:
-        results["num_inliers"] = details["num_inliers"].astype(float)
+    for name in ("num_inliers", "p_correct"):
+        if name in details:
+            results[name] = details[name].astype(float)
     results["status"] = details["status"].fillna(results["status"])
     listed = int(details["status"].notna().sum())
     if listed < len(keys):

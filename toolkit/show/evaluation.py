@@ -9,7 +9,17 @@ import pandas as pd
 
 from toolkit.capture.devices import color_of, in_order
 from toolkit.show.figures import ORANGE, SKY, VERMILLION, new_figure, number, percent, styled
-from toolkit.show.metrics import REASONS, THRESHOLDS, Threshold, parse_threshold, threshold_name
+from toolkit.show.metrics import (
+    REASONS,
+    THRESHOLDS,
+    WRONG,
+    Threshold,
+    is_below,
+    parse_threshold,
+    threshold_name,
+)
+
+RELIABILITY_BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, 1.0)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -53,6 +63,8 @@ def draw_evaluation(evaluation: Evaluation) -> dict[str, "Figure"]:
             "Median errors over all queries (∞: half of them have no pose)", "lower",
         )  # fmt: skip
         figures["error_curves"] = draw_error_curves(evaluation.errors, evaluation.thresholds)
+        if "p_correct" in evaluation.errors and evaluation.errors["p_correct"].notna().any():
+            figures["reliability"] = draw_reliability(evaluation.errors)
         if evaluation.losses["missed"].sum():
             figures["losses"] = draw_losses(evaluation.losses)
     retrieval = evaluation.retrieval
@@ -153,6 +165,44 @@ def draw_error_curves(errors: pd.DataFrame, thresholds: Sequence[Threshold] = TH
     axes[0, 0].legend(frameon=False, fontsize=9)
     figure.suptitle("How many queries have an error below x")
     return figure
+
+
+@styled
+def draw_reliability(errors: pd.DataFrame) -> "Figure":
+    """Draw how often poses are right, within `WRONG`, against how probable the localizer calls it.
+
+    Bars are intervals of 95 % (Wilson, 1927), the number is that of the poses.
+    """
+    errors = errors[errors["p_correct"].notna()]
+    right = is_below(errors["rotation_error_deg"].to_numpy(), errors["translation_error_m"].to_numpy(), WRONG)
+    stated = errors["p_correct"].to_numpy(float)
+    bin_of = np.digitize(stated, RELIABILITY_BINS[1:-1])
+    figure = new_figure(5.2, 4.6)
+    axis = figure.subplots()
+    axis.plot([0, 100], [0, 100], color="0.6", lw=1, ls=":")
+    for number_of_bin in np.unique(bin_of):
+        mine = bin_of == number_of_bin
+        count, share = int(mine.sum()), float(right[mine].mean())
+        low, high = wilson_interval(share, count)
+        x = 100 * stated[mine].mean()
+        axis.errorbar(
+            x, 100 * share, [[100 * max(share - low, 0)], [100 * max(high - share, 0)]], fmt="o", color=SKY, capsize=3
+        )
+        axis.annotate(str(count), (x, 100 * share), (6, -10), textcoords="offset points", fontsize=8, color="0.3")
+    axis.set_xlim(-3, 103)
+    axis.set_ylim(-3, 103)
+    axis.set_xlabel("stated probability of being right [%]")
+    axis.set_ylabel("poses that are right [%]")
+    axis.grid(alpha=0.25)
+    figure.suptitle("How far stated probabilities hold (right: {:g}°, {:g} m)".format(*WRONG))
+    return figure
+
+
+def wilson_interval(share: float, count: int, z: float = 1.96) -> tuple[float, float]:
+    """Return the interval (Wilson, 1927) of a share seen in `count` trials; z: its half width in deviations."""
+    middle = share + z**2 / (2 * count)
+    half = z * np.sqrt(share * (1 - share) / count + z**2 / (4 * count**2))
+    return float((middle - half) / (1 + z**2 / count)), float((middle + half) / (1 + z**2 / count))
 
 
 @styled

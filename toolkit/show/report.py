@@ -37,6 +37,11 @@ EVALUATION_FIGURES = {
         "Share of queries [%] with an error below x, in meters (top) and degrees (bottom). A curve ends where queries "
         "have no pose; dotted lines are the thresholds of the tables.",
     ),
+    "reliability": (
+        "Reliability",
+        "Share of poses that are right against the probability that was stated (p_correct), with intervals of 95 % and "
+        "the number of poses. On the dotted line both agree; ok means 99 % or more.",
+    ),
     "losses": (
         "Where accuracy was lost",
         "What the misses at each threshold come from, in % of the queries. No good reference: retrieval found no map "
