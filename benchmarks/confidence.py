@@ -1,22 +1,22 @@
-"""Which limits should decide that a pose is `ok`? Fitted on rendered captures where some queries go wrong.
+"""How probable is it that a pose is right? Fits the weights of `toolkit/localizers/confidence.py`.
 
     python benchmarks/confidence.py [--seeds 0 1 2] [--rooms 3] [--frames 6] [--rows ROWS.csv] [--out FILE.md]
+        [--run CAPTURE RUN]... [--held-out SCENE]...
 
 For each seed a capture is rendered with a sparse map, and with the same doors, windows, shelves, cabinets and crates in
 all rooms. Its queries are localized as they are, and darkened, blurred and half hidden; with references that see the
-same, with one such among wrong ones, and with none (the place is not found: every pose is wrong). Each row says what
-the localizer knows (inliers, support of the best rival, standard deviation of the position), and whether the pose was
-wrong: beyond 5 degrees or 0.5 m. Limits are then compared by
+same, with one such among wrong ones, and with none (the place is not found: every pose is wrong). `--run` adds the
+queries of a finished run of a capture with ground truth. Each row says what the localizer knows of a pose, and whether
+it is wrong: beyond 5 degrees or 0.5 m.
 
-    accepted  share of the queries whose pose they call ok,
-    wrong     share of those that are wrong, with the upper end of its one-sided 95 % interval (Clopper, Pearson 1934).
-
-The rule: of the limits whose upper end is at most 0.5 %, those that accept most; of equals, the strictest. It takes 598
-accepted poses without a wrong one to show 0.5 %. Rows are kept in --rows after each map, and a further call adds seeds.
+A logistic regression is fitted, with a ridge of 1 on standardized terms, and tried on what it was not fitted on: on
+each scene (seed or run) by the weights of the others, and on the scenes held out by the weights of all. The tables tell
+how many poses each stated probability has, and how many of them are right; and of those that are called `ok` (99 % or
+more) how many are wrong, with the upper end of the one-sided 95 % interval (Clopper, Pearson 1934). Rows are kept in
+--rows after each map, and a further call adds seeds.
 """
 
 import argparse
-import itertools
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -33,11 +33,9 @@ if TYPE_CHECKING:
     from toolkit.localizers.pnp import PnpLocalizer
 
 WRONG = (5.0, 0.5)  # degrees, meters
-LARGEST_SHARE_WRONG = 0.005
 CONFIDENCE = 0.95
-INLIERS = (12, 15, 20, 25, 30, 40, 50, 60)
-RIVAL_SUPPORT = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
-POSITION_STD_M = (0.02, 0.05, 0.1, 0.2, 0.5)
+OK = 0.99
+BINS = (0.0, 0.1, 0.5, 0.9, 0.99, 1.0)
 DEGRADATIONS = ("none", "dark", "blurred", "hidden", "dark, hidden")
 REFERENCES = ("right", "one right", "wrong")
 DEVICES = ("ios", "hl", "spot")
@@ -84,6 +82,7 @@ def localize_session(
     from toolkit.features.features import SiftExtractor
     from toolkit.geometry import pose_error
     from toolkit.localizers.base import Query, References, View
+    from toolkit.localizers.confidence import EVIDENCE
 
     extractor = SiftExtractor()
     keyframes = session.keyframes("keyframes_original")
@@ -112,15 +111,15 @@ def localize_session(
                     References.of(choose_references(pose, poses, chosen, rng)) for pose in world_from_cams
                 ]
                 found = localizer.localize(query, references)
-                row = {"seed": seed, "session": session.id, "query": index, "images": how, "references": chosen}
+                row = {"scene": f"seed {seed}", "seed": seed, "session": session.id}
+                row |= {"query": index, "images": how, "references": chosen}
                 row |= {"status": found.status, "posed": found.world_from_rig is not None, "wrong": False}
                 row |= {"rotation_error_deg": float("nan"), "translation_error_m": float("nan")}
                 if found.world_from_rig is not None:
                     rotation_deg, distance_m = pose_error(found.world_from_rig, truth[index])
                     row["wrong"] = bool(rotation_deg > WRONG[0] or distance_m > WRONG[1])
                     row |= {"rotation_error_deg": float(rotation_deg), "translation_error_m": float(distance_m)}
-                row |= {"inliers": found.num_inliers, "rival_support": found.rival_support}
-                found_rows.append(row | {"position_std_m": found.position_std_m})
+                found_rows.append(row | {name: getattr(found, name) for name in EVIDENCE})
         return found_rows
 
     return prefetch(localize, range(len(rows_of_queries)), workers)
@@ -152,69 +151,106 @@ def measure(
         ]
 
 
-def judge(rows: pd.DataFrame, limits: tuple[float, float, float]) -> dict[str, float]:
-    """Return what limits (least inliers, largest support of a rival, largest deviation) accept, and how wrong it is."""
+def rows_of_run(capture_path: Path, run: Path) -> pd.DataFrame:
+    """Return a row for each query of all pairs of a finished run."""
+    from toolkit.capture import Capture, Trajectory
+    from toolkit.evaluate import pose_errors
+    from toolkit.files import SceneFiles
+
+    capture = Capture.open(capture_path)
+    tables = []
+    for path in sorted(SceneFiles(run, capture.name).poses_dir.glob("*.csv")):
+        truth = capture[f"{path.stem.rpartition('_query_')[2]}_query"].ground_truth
+        assert truth is not None, f"{capture_path} has no ground truth"
+        table = pd.read_csv(path, dtype={"device_id": str})
+        rotation_deg, distance_m = pose_errors(Trajectory.read(path.with_suffix(".txt")), truth, table)
+        wrong = (rotation_deg > WRONG[0]) | (distance_m > WRONG[1])
+        tables.append(table.assign(scene=capture.name, posed=np.isfinite(distance_m), wrong=wrong))
+    return pd.concat(tables, ignore_index=True)
+
+
+def fit(rows: pd.DataFrame, ridge: float = 1.0) -> NDArray[np.float64]:
+    """Return the weights of `terms` that tell right poses from wrong ones best."""
+    from scipy.optimize import minimize
+
+    from toolkit.localizers.confidence import EVIDENCE, terms
+
+    rows = rows[rows["posed"]]
+    x = terms({name: rows[name].to_numpy(np.float64) for name in EVIDENCE})
+    known = np.isfinite(x).all(axis=1)
+    x, right = x[known], ~rows["wrong"].to_numpy(bool)[known]
+    mean, spread = x.mean(axis=0), np.maximum(x.std(axis=0), 1e-9)
+    mean[0], spread[0] = 0.0, 1.0
+    z, sign = (x - mean) / spread, np.where(right, 1.0, -1.0)
+
+    def loss(weights: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        margin = sign * (z @ weights)
+        penalty = np.concatenate([[0.0], weights[1:]])
+        slope = -sign / (1 + np.exp(np.clip(margin, -500, 500)))
+        return float(np.logaddexp(0, -margin).sum() + ridge / 2 * penalty @ penalty), z.T @ slope + ridge * penalty
+
+    scaled = minimize(loss, np.zeros(x.shape[1]), jac=True, method="BFGS").x / spread
+    scaled[0] -= scaled[1:] @ mean[1:]
+    return np.asarray(scaled, np.float64)
+
+
+def stated(rows: pd.DataFrame, weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the probability of each row, 0 where there is no pose or no deviation."""
+    from toolkit.localizers.confidence import EVIDENCE, probability_right
+
+    evidence = {name: rows[name].to_numpy(np.float64) for name in EVIDENCE}
+    return np.where(rows["posed"], probability_right(evidence, weights), 0.0)
+
+
+def judge(rows: pd.DataFrame, probability: NDArray[np.float64]) -> dict[str, float]:
+    """Return what is called `ok`, and how wrong it is."""
     from scipy.stats import beta
 
-    accepted = rows["posed"] & (rows["inliers"] >= limits[0]) & (rows["rival_support"] <= limits[1])
-    accepted &= rows["position_std_m"] <= limits[2]  # False for NaN
-    count, wrong = int(accepted.sum()), int((accepted & rows["wrong"]).sum())
+    from toolkit.manifest import PnpSettings
+
+    accepted = (probability >= OK) & (rows["rival_support"] <= PnpSettings().ok_rival_support)
+    wrong, count = int((accepted & rows["wrong"]).sum()), int(accepted.sum())
+    right = int((rows["posed"] & ~rows["wrong"]).sum())
     upper = float(beta.ppf(CONFIDENCE, wrong + 1, count - wrong)) if count > wrong else 1.0
-    return {"accepted": count, "share": count / max(len(rows), 1), "wrong": wrong, "upper": upper}
+    return {"accepted": count, "wrong": wrong, "upper": upper, "right": right, "found": (count - wrong) / max(right, 1)}
 
 
-def fit(rows: pd.DataFrame) -> tuple[float, float, float] | None:
-    """Return the limits that the rule chooses; None where there are too few rows to show any."""
-    allowed = []
-    for limits in itertools.product(INLIERS, RIVAL_SUPPORT, POSITION_STD_M):
-        judged = judge(rows, limits)
-        if judged["upper"] <= LARGEST_SHARE_WRONG:
-            allowed.append((judged["accepted"], limits[0], -limits[1], -limits[2], limits))
-    return max(allowed)[-1] if allowed else None
+def markdown(rows: pd.DataFrame, held_out: list[str]) -> str:
+    """Return the weights, and how they hold on scenes that they were not fitted on."""
+    from toolkit.localizers.confidence import WEIGHTS
 
-
-def markdown(rows: pd.DataFrame) -> str:
-    """Return what went wrong, what the present limits and others make of it, and what the rule chooses."""
-    from toolkit.localizers.pnp import PnpSettings
-
-    settings = PnpSettings()
-    present = (float(settings.ok_inliers), settings.ok_rival_support, settings.ok_position_std_m)
-    groups = rows.groupby(["images", "references"], sort=False)
-    table = [
-        [str(images), str(chosen), f"{len(part)}", f"{part['posed'].sum()}", f"{part['wrong'].sum()}",
-         f"{(part['status'] == 'ok').sum()}", f"{((part['status'] == 'ok') & part['wrong']).sum()}"]
-        for (images, chosen), part in groups
-    ]  # fmt: skip
-    header = ["images", "references", "queries", "posed", "wrong", "ok", "ok and wrong"]
-    text = [f"{len(rows)} queries, seeds {', '.join(map(str, sorted(rows['seed'].unique())))}:", ""]
-    text += [markdown_table(header, table), ""]
-    varied = [present]
-    for axis, values in enumerate((INLIERS, RIVAL_SUPPORT, POSITION_STD_M)):
-        varied += [(*present[:axis], value, *present[axis + 1 :]) for value in values if value != present[axis]]
-    certain = rows[(rows["status"] == "ok") & ~rows["wrong"]]
-    ratio = certain["translation_error_m"] / certain["position_std_m"]
-    low, middle, high = ratio.quantile([0.25, 0.5, 0.9])
-    text += [
-        f"Position errors of right ok poses, in stated standard deviations: quartile {low:.2f}, median {middle:.2f}, "
-        f"90 % below {high:.2f} (were they Gaussian and round: 0.64, 0.89, 1.44).",
-        "",
-    ]
-    chosen = fit(rows)
-    marked = [("present", present), *(("", limits) for limits in varied[1:])]
-    marked += [("by the rule", chosen)] if chosen else []
+    learned, other = rows[~rows["scene"].isin(held_out)], rows[rows["scene"].isin(held_out)]
+    weights = fit(learned)
+    probability = pd.Series(0.0, rows.index)
+    for scene, part in learned.groupby("scene"):
+        rest = learned[learned["scene"] != scene]
+        probability[part.index] = stated(part, fit(rest) if len(rest) else weights)
+    probability[other.index] = stated(other, weights)
+    text = [f"{len(rows)} queries, weights fitted on {len(learned)}:", ""]
+    text += [markdown_table(["term", "weight"], [[n, f"{w:.4f}"] for n, w in zip(WEIGHTS, weights, strict=True)]), ""]
     table = []
-    for name, limits in marked:
-        judged = judge(rows, limits)
-        cells = [name, f"{limits[0]:g}", f"{limits[1]:g}", f"{limits[2]:g}", f"{100 * judged['share']:.1f} %"]
-        table.append([*cells, f"{judged['wrong']:.0f} of {judged['accepted']:.0f}", f"{100 * judged['upper']:.2f} %"])
-    text += [markdown_table(["limits", "inliers", "rival", "std m", "accepted", "wrong", "at most"], table)]
-    if chosen is None:
-        text += ["", f"No limits are shown to be wrong at most {100 * LARGEST_SHARE_WRONG:g} %: too few rows."]
+    for scene, part in [*rows.groupby("scene"), ("all", rows)]:
+        judged = judge(part, probability[part.index].to_numpy())
+        name = f"{scene} (held out)" if scene in held_out else str(scene)
+        table.append([name, f"{len(part)}", f"{part['posed'].sum()}", f"{(part['posed'] & part['wrong']).sum()}",
+                      f"{judged['accepted']}", f"{judged['wrong']}", f"{100 * judged['upper']:.2f} %",
+                      f"{100 * judged['found']:.1f} %"])  # fmt: skip
+    header = ["scene", "queries", "posed", "wrong", "ok", "ok and wrong", "at most", "right ones called ok"]
+    text += [markdown_table(header, table), ""]
+    posed = rows[rows["posed"]]
+    bins = pd.cut(probability[posed.index], BINS, include_lowest=True)
+    table = []
+    for interval, part in posed.groupby(bins, observed=True):
+        shares = (probability[part.index].mean(), (~part["wrong"]).mean())
+        table.append([str(interval), f"{len(part)}", *(f"{100 * share:.1f} %" for share in shares)])
+    text += [markdown_table(["stated", "poses", "on average", "right"], table)]
     return "\n".join(text) + "\n"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--run", type=Path, nargs=2, action="append", default=[], help="a capture and a run of it")
+    parser.add_argument("--held-out", action="append", default=[], help="scene that nothing is fitted on")
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2], help="captures to render (default: 0 1 2)")
     parser.add_argument("--rooms", type=int, default=3, help="rooms of each (default: %(default)s)")
     parser.add_argument("--frames", type=int, default=6, help="map frames a room and device (default: %(default)s)")
@@ -238,7 +274,8 @@ def main() -> None:
                 rows = pd.concat([rows, pd.DataFrame(part).assign(**made)], ignore_index=True)
                 if options.rows is not None:
                     rows.to_csv(options.rows, index=False)
-    text = markdown(rows)
+    rows = pd.concat([rows, *(rows_of_run(*run) for run in options.run)], ignore_index=True)
+    text = markdown(rows, options.held_out)
     print(text)
     write_out(options.out, text, {"rows": rows.to_dict("records")})
 

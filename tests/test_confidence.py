@@ -1,4 +1,4 @@
-"""The rule by which the limits of an `ok` pose are chosen."""
+"""The fit of the probability that a pose is right."""
 
 import importlib.util
 from pathlib import Path
@@ -7,6 +7,8 @@ from types import ModuleType
 import numpy as np
 import pandas as pd
 import pytest
+
+from toolkit.localizers.confidence import WEIGHTS
 
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "confidence.py"
 
@@ -25,28 +27,51 @@ def confidence() -> ModuleType:
 
 
 def rows(count: int, **columns: object) -> pd.DataFrame:
-    plain = {"posed": True, "wrong": False, "inliers": 100, "rival_support": 0.0, "position_std_m": 0.01}
+    plain = {"scene": "a", "posed": True, "wrong": False, "num_inliers": 100, "inlier_ratio": 0.5, "coverage": 0.5}
+    plain |= {"rival_support": 0.0, "agreement": 0, "position_std_m": 0.01, "rotation_std_deg": 0.1}
     return pd.DataFrame([plain | columns] * count)
 
 
-def test_598_right_poses_show_half_a_percent_and_597_do_not(confidence: ModuleType) -> None:
-    limits = (30, 0.8, 0.1)
-    enough, too_few = (confidence.judge(rows(count), limits) for count in (598, 597))
-    assert enough["upper"] <= 0.005 < too_few["upper"]
-    assert confidence.fit(rows(597)) is None
-    assert confidence.fit(rows(598)) == (60, 0.5, 0.02), "of equals, the strictest"
-
-
-def test_limits_shut_out_what_is_wrong_and_no_more(confidence: ModuleType) -> None:
-    wrong = rows(20, wrong=True, inliers=24, rival_support=0.3)
-    contested = rows(20, wrong=True, rival_support=0.85)
-    right = rows(700, inliers=26, rival_support=0.75, position_std_m=0.15)
-    assert confidence.fit(pd.concat([wrong, contested, right])) == (25, 0.8, 0.2)
+def test_the_fit_finds_the_weights_that_made_the_rows(confidence: ModuleType) -> None:
+    rng = np.random.default_rng(0)
+    made = rows(20_000)
+    made["num_inliers"] = rng.integers(10, 400, len(made))
+    made["rival_support"] = rng.uniform(0, 1, len(made))
+    odds = -4 + 2 * np.log(made["num_inliers"]) - 5 * made["rival_support"]
+    made["wrong"] = rng.uniform(size=len(made)) > 1 / (1 + np.exp(-odds))
+    weights = dict(zip(WEIGHTS, confidence.fit(made), strict=True))
+    assert weights["log_inliers"] == pytest.approx(2, abs=0.15)
+    assert weights["rival_support"] == pytest.approx(-5, abs=0.4)
+    probability = confidence.stated(made, np.array(list(weights.values())))
+    for low, high in ((0.2, 0.5), (0.5, 0.8), (0.8, 0.95), (0.95, 1)):
+        part = (probability >= low) & (probability < high)
+        assert (~made["wrong"][part]).mean() == pytest.approx(probability[part].mean(), abs=0.03)
 
 
 def test_what_is_not_known_is_not_accepted(confidence: ModuleType) -> None:
-    unknown = pd.concat([rows(5, position_std_m=np.nan), rows(5, posed=False)])
-    assert confidence.judge(unknown, (12, 1.0, 0.5))["accepted"] == 0
+    unknown = pd.concat([rows(5, position_std_m=np.nan), rows(5, posed=False)], ignore_index=True)
+    sure = np.array([100.0, *[0.0] * 7])
+    assert confidence.judge(unknown, confidence.stated(unknown, sure))["accepted"] == 0
+    assert confidence.judge(rows(5, rival_support=0.9), confidence.stated(rows(5), sure))["accepted"] == 0
+
+
+def test_the_share_of_wrong_ones_is_bounded(confidence: ModuleType) -> None:
+    sure = np.ones(598)
+    assert confidence.judge(rows(598), sure)["upper"] <= 0.005 < confidence.judge(rows(597), sure[:597])["upper"]
+    one = pd.concat([rows(597), rows(1, wrong=True)], ignore_index=True)
+    judged = confidence.judge(one, sure)
+    assert (judged["wrong"], judged["found"]) == (1, 1.0)
+
+
+def test_scenes_are_judged_by_weights_of_others(confidence: ModuleType) -> None:
+    parts = [
+        rows(40, scene=scene, wrong=wrong, num_inliers=20 if wrong else 200)
+        for scene in ("a", "b", "c")
+        for wrong in (False, True)
+    ]
+    text = confidence.markdown(pd.concat(parts, ignore_index=True), ["c"])
+    assert "weights fitted on 160" in text
+    assert "c (held out)" in text
 
 
 def test_degradations_keep_the_picture_and_make_it_worse(confidence: ModuleType) -> None:

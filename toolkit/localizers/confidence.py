@@ -7,6 +7,7 @@ captures and on photographs made dark, blurred, foggy and half hidden, and tells
 from collections.abc import Mapping
 
 import numpy as np
+from scipy.special import expit
 
 from toolkit.geometry import Floats
 
@@ -45,8 +46,12 @@ def terms(evidence: Mapping[str, Floats | float]) -> Floats:
     return np.stack(columns, axis=-1)
 
 
-def probability_right(evidence: Mapping[str, Floats | float]) -> Floats:
-    """Return the probability that poses are right, of the shape of the evidence; 0 where the deviation is unknown."""
-    with np.errstate(over="ignore"):
-        probability = 1 / (1 + np.exp(-(terms(evidence) @ np.array(list(WEIGHTS.values())))))
-    return np.asarray(np.nan_to_num(probability, nan=0.0), np.float64)
+def probability_right(evidence: Mapping[str, Floats | float], weights: Floats | None = None) -> Floats:
+    """Return the probability that poses are right, of the shape of the evidence; 0 where the deviation is unknown.
+
+    Args:
+        evidence: as for `terms`.
+        weights: (8,); None: those of `WEIGHTS`.
+    """
+    weights = np.array(list(WEIGHTS.values())) if weights is None else weights
+    return np.asarray(np.nan_to_num(expit(terms(evidence) @ weights), nan=0.0), np.float64)
