@@ -126,9 +126,9 @@ def test_the_order_of_the_images_does_not_count(matcher: LightGlueMatcher) -> No
     assert {*map(tuple, forth.indices.tolist())} == {(i, j) for j, i in back.indices.tolist()}
 
 
-@pytest.mark.parametrize("at_once", [1, 3])
+@pytest.mark.parametrize("by_itself", [True, False])
 def test_pairs_do_not_depend_on_each_other(
-    matcher: LightGlueMatcher, monkeypatch: pytest.MonkeyPatch, at_once: int
+    matcher: LightGlueMatcher, monkeypatch: pytest.MonkeyPatch, by_itself: bool
 ) -> None:
     """On a CPU, where each pair runs alone, not by a bit; in batches, as on a GPU, but for rounding."""
     counts = [(50, 80), (3, 120), (120, 120), (1, 1), (0, 70), (70, 0), (20, 21), (99, 5)]
@@ -139,13 +139,13 @@ def test_pairs_do_not_depend_on_each_other(
     ]
     pairs += [(pairs[0][0], pairs[2][1]), (pairs[0][0], pairs[0][0]), pairs[0]]  # images that are in several pairs
     alone = [matcher.match([pair])[0] for pair in pairs]
-    assert matcher._pairs_at_once == 1
-    monkeypatch.setattr(matcher, "_pairs_at_once", at_once)
+    assert matcher._alone
+    monkeypatch.setattr(matcher, "_alone", by_itself)
     together = matcher.match(pairs)
     assert sum(len(found) > 0 for found in together) >= 8
     for found, expected in zip(together, alone, strict=True):
         assert_equal(found, expected)
-        if at_once == 1:
+        if by_itself:
             np.testing.assert_array_equal(found.scores, expected.scores)
 
 
@@ -162,7 +162,7 @@ def test_what_does_not_fit_is_halved(
     state: State, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     matcher = LightGlueMatcher(state, device="cpu", dtype="float32", batch_size=4)
-    monkeypatch.setattr(matcher, "_pairs_at_once", 4)
+    monkeypatch.setattr(matcher, "_alone", False)
     pairs = [(features(k, 20 + k), features(k + 1, 40 - k)) for k in range(5)]
     expected = matcher.match(pairs)
     assign = matcher._model._assign

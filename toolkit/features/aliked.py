@@ -1,7 +1,6 @@
 """ALIKED (Zhao et al., IEEE Transactions on Instrumentation and Measurement, 2023): learned local features."""
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import torch
@@ -10,7 +9,7 @@ from torch import Tensor
 from toolkit.features.network import NetworkExtractor
 from toolkit.manifest import AlikedSettings
 from toolkit.models.aliked import Aliked, find_keypoints
-from toolkit.models.compute import resolve_device
+from toolkit.models.compute import in_single_threads, resolve_device
 from toolkit.models.weights import ALIKED, resolve_weights
 
 
@@ -44,7 +43,6 @@ class AlikedExtractor(NetworkExtractor):
             ToolkitError: no such device on this machine.
         """
         on_cpu = resolve_device(device).type == "cpu"
-        dtype = "float32" if on_cpu and dtype == "auto" else dtype
         batch_size = batch_size or (torch.get_num_threads() if on_cpu else None)
         super().__init__(checkpoint, device, dtype, batch_size, settings or AlikedSettings())
 
@@ -55,16 +53,10 @@ class AlikedExtractor(NetworkExtractor):
         return Aliked.from_checkpoint(checkpoint, model)
 
     def _forward(self, batch: Tensor) -> Tensor:
-        if batch.device.type != "cpu" or len(batch) == 1:
-            return self._run(batch)
-        # Threads wait for each other less with an image each than within the operations on all.
-        threads = torch.get_num_threads()
-        with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            rows = list(pool.map(self._run, batch.split(1)))
-        torch.set_num_threads(threads)  # also of threads that are not started yet
-        return torch.cat(rows)
+        if batch.device.type == "cpu":
+            return torch.cat(in_single_threads(self._run, batch.split(1)))
+        return self._run(batch)
 
-    @torch.inference_mode()  # each thread has a mode of its own
     def _run(self, batch: Tensor) -> Tensor:
         settings, model = self._values, self._model
         pixels = batch.permute(0, 3, 1, 2).float() / 255

@@ -1,7 +1,7 @@
 """LightGlue (Lindenberger, Sarlin and Pollefeys, ICCV 2023): matches the learned features of two images."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +9,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn import functional as F
 from torch.nn.utils.rnn import pad_sequence
 
 from toolkit.errors import ManifestError, ToolkitError
 from toolkit.features.features import LocalFeatures
 from toolkit.features.matching import MATCHER_WEIGHTS, PairMatches
-from toolkit.models.compute import Fitting, precision_of_matches, resolve_device
+from toolkit.models.compute import Fitting, in_single_threads, precision_of_matches, resolve_device
 from toolkit.models.lightglue import LightGlue, official_names
 from toolkit.models.weights import load_checkpoint, resolve_weights, weights_digest
 
@@ -30,8 +29,8 @@ class LightGlueMatcher:
     Every pair goes through all layers with all its features. The network could stop early or drop features where it
     is confident. Its authors advise against that where accuracy counts.
 
-    On a CPU pairs run one after another: that is as quick, takes less memory, and the matches of a pair do not depend
-    on the others. Elsewhere rounding depends on them.
+    On a CPU each thread matches pairs by itself: the matches of a pair do not depend on the others. Elsewhere rounding
+    depends on them.
     """
 
     def __init__(
@@ -68,7 +67,7 @@ class LightGlueMatcher:
         self._device = resolve_device(device)
         self._dtype = precision_of_matches(dtype, self._device)
         self.batch_size = batch_size or _BATCH.get(self._device.type, _BATCH_ELSEWHERE)
-        self._pairs_at_once = 1 if self._device.type == "cpu" else self.batch_size
+        self._alone = self._device.type == "cpu"
         source = MATCHER_WEIGHTS["lightglue", features]
         if checkpoint is None or isinstance(checkpoint, str | Path):
             checkpoint = resolve_weights(source, checkpoint)
@@ -109,17 +108,26 @@ class LightGlueMatcher:
         uses = Counter(id(features) for number in order for features in pairs[number])
         encoded: dict[int, Tensor] = {}
         with torch.inference_mode():
-            for start in range(0, len(order), self._pairs_at_once):
-                part = order[start : start + self._pairs_at_once]
+            for start in range(0, len(order), self.batch_size):
+                part = order[start : start + self.batch_size]
                 images = [features for number in part for features in pairs[number]]
                 self._encode_new(images, encoded)
-                batch = pad_sequence([encoded[id(features)] for features in images], batch_first=True)
-                results = self._fitting_pairs(batch.unflatten(0, (-1, 2))).cpu().numpy()
-                for number, result in zip(part, results, strict=True):
-                    matches[number] = _unpack(result)
+                states = [encoded[id(features)] for features in images]
+                for number, result in zip(part, self._match(states), strict=True):
+                    matches[number] = _unpack(result.cpu().numpy())
                 uses.subtract(map(id, images))
                 encoded = {key: value for key, value in encoded.items() if uses[key]}
         return matches
+
+    def _match(self, states: Sequence[Tensor]) -> Iterable[Tensor]:
+        """Return what `_forward` finds for pairs of images that follow each other, of what `_encode` makes of them."""
+        if not self._alone:
+            return self._fitting_pairs(pad_sequence(list(states), batch_first=True).unflatten(0, (-1, 2)))
+        return in_single_threads(self._match_one, zip(states[::2], states[1::2], strict=True))
+
+    def _match_one(self, pair: tuple[Tensor, Tensor]) -> Tensor:
+        a, b = (image[None] for image in pair)
+        return self._forward_pairs(a, b)[0]
 
     def _check(self, features: LocalFeatures) -> None:
         dtype, shape, expected = features.descriptors.dtype, features.descriptors.shape, _DESCRIPTOR_LENGTHS[self._kind]
@@ -132,7 +140,12 @@ class LightGlueMatcher:
     def _encode_new(self, images: Sequence[LocalFeatures], encoded: dict[int, Tensor]) -> None:
         """Add, for images that `encoded` lacks, what `_forward` takes, (N, 2 + DIM + 1), by the object's id."""
         new = list({id(features): features for features in images if id(features) not in encoded}.values())
-        count = 2 * self._pairs_at_once if self._pairs_at_once > 1 else 1
+        if self._alone:
+            packed = [torch.from_numpy(_pack(features))[None] for features in new]
+            for features, rows in zip(new, in_single_threads(self._encode, packed), strict=True):
+                encoded[id(features)] = rows[0]
+            return
+        count = 2 * self.batch_size
         for start in range(0, len(new), count):
             part = new[start : start + count]
             batch = pad_sequence([torch.from_numpy(_pack(features)) for features in part], batch_first=True)
@@ -152,14 +165,12 @@ class LightGlueMatcher:
             batch: (B, 2, N, 2 + DIM + 1), of each image the normalized x y, the state of the network, and 1; rows of
                 zeros pad it to N.
         """
-        count = batch.shape[2]
-        a, b = batch.unbind(1)
-        if len(batch) == 1:  # padding would be work for nothing
-            a, b = (image[:, : int(image[..., -1].sum())] for image in (a, b))
+        return self._forward_pairs(*batch.unbind(1))
+
+    def _forward_pairs(self, a: Tensor, b: Tensor) -> Tensor:
         partners, scores = self._model((a[..., :2], b[..., :2]), (a[..., 2:-1], b[..., 2:-1]), (_mask(a), _mask(b)))
         partners = partners.where(scores > self._min_score, -1)
-        result = torch.stack([partners.float(), scores], dim=2)  # exact: there are fewer than 2^24 features
-        return F.pad(result, (0, 0, 0, count - result.shape[1]), value=-1.0)
+        return torch.stack([partners.float(), scores], dim=2)  # exact: there are fewer than 2^24 features
 
 
 def _mask(images: Tensor) -> Tensor | None:

@@ -3,13 +3,17 @@
 import logging
 import platform
 import re
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from toolkit.errors import ManifestError, ToolkitError
 
 if TYPE_CHECKING:
     import torch
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 log = logging.getLogger(__name__)
 
@@ -110,6 +114,25 @@ def linear(x: "torch.Tensor", weight: "torch.Tensor", bias: "torch.Tensor | None
         product: torch.Tensor = torch.ops.mkldnn._linear_pointwise(x.contiguous(), weight, bias, "none", [], "")
         return product
     return F.linear(x, weight, bias)
+
+
+def in_single_threads(run: "Callable[[Item], Result]", items: "Iterable[Item]") -> "list[Result]":
+    """Return `run(item)` of each item on the CPU: several at a time, each with a single thread of torch.
+
+    Threads within operations wait for each other, long where cores are shared; and what they compute differs in the
+    last digits with their number. Items by themselves do neither.
+    """
+    import torch
+
+    def run_one(item: Item) -> Result:
+        with torch.inference_mode():  # each thread has a mode of its own
+            return run(item)
+
+    threads = torch.get_num_threads()
+    with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        results = list(pool.map(run_one, items))
+    torch.set_num_threads(threads)  # also of threads that are not started yet
+    return results
 
 
 class Fitting:
