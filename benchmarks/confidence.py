@@ -9,11 +9,11 @@ same, with one such among wrong ones, and with none (the place is not found: eve
 queries of a finished run of a capture with ground truth. Each row says what the localizer knows of a pose, and whether
 it is wrong: beyond 5 degrees or 0.5 m.
 
-A logistic regression is fitted, with a ridge of 1 on standardized terms, and tried on what it was not fitted on: on
-each scene (seed or run) by the weights of the others, and on the scenes held out by the weights of all. The tables tell
-how many poses each stated probability has, and how many of them are right; and of those that are called `ok` (99 % or
-more) how many are wrong, with the upper end of the one-sided 95 % interval (Clopper, Pearson 1934). Rows are kept in
---rows after each map, and a further call adds seeds.
+A logistic regression is fitted, with a ridge of 1 on standardized terms and the sign of each weight given, and tried on
+what it was not fitted on: on each scene (seed or run) by the weights of the others, and on the scenes held out by the
+weights of all. The tables tell how many poses each stated probability has, and how many of them are right; and of those
+that are called `ok` (99 % or more) how many are wrong, with the upper end of the one-sided 95 % interval (Clopper,
+Pearson 1934). Rows are kept in --rows after each map, and a further call adds seeds.
 """
 
 import argparse
@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 WRONG = (5.0, 0.5)  # degrees, meters
 CONFIDENCE = 0.95
 OK = 0.99
+SIGNS = (0, 1, 1, 1, -1, -1, -1, 1)
+"""Of the weights: more inliers never make a pose less probable, whatever some hundred rows say."""
 BINS = (0.0, 0.1, 0.5, 0.9, 0.99, 1.0)
 DEGRADATIONS = ("none", "dark", "blurred", "hidden", "dark, hidden")
 REFERENCES = ("right", "one right", "wrong")
@@ -189,7 +191,8 @@ def fit(rows: pd.DataFrame, ridge: float = 1.0) -> NDArray[np.float64]:
         slope = -sign / (1 + np.exp(np.clip(margin, -500, 500)))
         return float(np.logaddexp(0, -margin).sum() + ridge / 2 * penalty @ penalty), z.T @ slope + ridge * penalty
 
-    scaled = minimize(loss, np.zeros(x.shape[1]), jac=True, method="BFGS").x / spread
+    bounds = [(None, None) if s == 0 else (0, None) if s > 0 else (None, 0) for s in SIGNS]
+    scaled = minimize(loss, np.zeros(x.shape[1]), jac=True, method="L-BFGS-B", bounds=bounds).x / spread
     scaled[0] -= scaled[1:] @ mean[1:]
     return np.asarray(scaled, np.float64)
 

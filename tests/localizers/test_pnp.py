@@ -268,11 +268,24 @@ def test_eight_matches_are_no_pose(room: World, rig: bool) -> None:
     assert estimate.world_from_rig is None
 
 
-def test_between_least_and_ok_a_pose_is_of_low_confidence(room: World) -> None:
+def test_few_inliers_among_many_matches_are_of_low_confidence(room: World) -> None:
+    """Twenty inliers are enough where nearly all matches agree, and not where most do not."""
     seen = room.look(PINHOLE, QUERY, limit=20)
-    estimate = ask(room.localizer(), [PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
-    assert estimate.status == "low_confidence"
-    assert geometry.pose_error(estimate.world_from_rig, QUERY)[1] < 0.1
+    alone = ask(room.localizer(), [PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
+    rng = np.random.default_rng(0)
+    others = stored(rng, room.descriptors[rng.choice(1200, 400, replace=False)])  # matches, but nothing in its place
+    mixed = LocalFeatures(
+        np.concatenate([seen.keypoints, rng.uniform([0, 0], [640, 480], (400, 2)).astype(np.float32)]),
+        np.concatenate([seen.scales, np.ones(400, np.float32)]),
+        np.ones(len(seen) + 400, np.float32),
+        np.concatenate([seen.descriptors, others]),
+        (640, 480),
+    )
+    among_many = ask(room.localizer(), [PINHOLE], np.eye(4)[None], [mixed], [REFERENCES])
+    assert (alone.status, among_many.status) == ("ok", "low_confidence")
+    assert 0 < among_many.p_correct < 0.99 <= alone.p_correct <= 1
+    for estimate in (alone, among_many):
+        assert geometry.pose_error(estimate.world_from_rig, QUERY)[1] < 0.1
 
 
 @pytest.mark.parametrize("seed", range(3))
