@@ -273,11 +273,11 @@ def test_few_inliers_among_many_matches_are_of_low_confidence(room: World) -> No
     seen = room.look(PINHOLE, QUERY, limit=20)
     alone = ask(room.localizer(), [PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
     rng = np.random.default_rng(0)
-    others = stored(rng, room.descriptors[rng.choice(1200, 400, replace=False)])  # matches, but nothing in its place
+    others = stored(rng, room.descriptors[rng.integers(0, 1200, 900)])  # matches, but nothing in its place
     mixed = LocalFeatures(
-        np.concatenate([seen.keypoints, rng.uniform([0, 0], [640, 480], (400, 2)).astype(np.float32)]),
-        np.concatenate([seen.scales, np.ones(400, np.float32)]),
-        np.ones(len(seen) + 400, np.float32),
+        np.concatenate([seen.keypoints, rng.uniform([0, 0], [640, 480], (900, 2)).astype(np.float32)]),
+        np.concatenate([seen.scales, np.ones(900, np.float32)]),
+        np.ones(len(seen) + 900, np.float32),
         np.concatenate([seen.descriptors, others]),
         (640, 480),
     )

@@ -188,7 +188,10 @@ def draw_reliability(errors: pd.DataFrame) -> "Figure":
         axis.errorbar(
             x, 100 * share, [[100 * max(share - low, 0)], [100 * max(high - share, 0)]], fmt="o", color=SKY, capsize=3
         )
-        axis.annotate(str(count), (x, 100 * share), (6, -10), textcoords="offset points", fontsize=8, color="0.3")
+        offset, side = ((-6, -10), "right") if x > 90 else ((6, -10), "left")
+        axis.annotate(
+            str(count), (x, 100 * share), offset, textcoords="offset points", ha=side, fontsize=8, color="0.3"
+        )
     axis.set_xlim(-3, 103)
     axis.set_ylim(-3, 103)
     axis.set_xlabel("stated probability of being right [%]")

@@ -1,0 +1,26 @@
+"""Figures of an evaluation: what they count."""
+
+import pandas as pd
+import pytest
+
+from toolkit.show.evaluation import draw_reliability, wilson_interval
+
+
+def test_wilson_interval() -> None:
+    """Known values: 8 of 10 (Newcombe, Statistics in Medicine 1998, formula 3), and the ends."""
+    assert wilson_interval(0.8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)
+    assert wilson_interval(1.0, 4)[1] == pytest.approx(1.0)
+    assert wilson_interval(0.0, 4)[0] == pytest.approx(0.0)
+
+
+def test_the_share_of_right_poses_stands_over_what_was_stated() -> None:
+    """Of four poses of 60 % three are right; one of 99.5 % is wrong; what has no probability is left out."""
+    errors = pd.DataFrame({
+        "p_correct": [0.6, 0.6, 0.6, 0.6, 0.995, float("nan")],
+        "rotation_error_deg": [1, 1, 1, 9, 1, 1],
+        "translation_error_m": [0.1, 0.1, 0.4, 0.1, 0.7, 0.1],
+    })  # fmt: skip
+    (axis,) = draw_reliability(errors).axes
+    points = [tuple(line.get_xydata()[0]) for line in axis.lines if line.get_marker() == "o"]
+    assert points == [pytest.approx((60, 75)), pytest.approx((99.5, 0))]
+    assert [text.get_text() for text in axis.texts] == ["4", "1"]
