@@ -16,14 +16,14 @@ EVIDENCE = (
 )  # fmt: skip
 """What is asked of a pose: attributes of `PoseEstimate` and columns of `poses/<pair>.csv`."""
 WEIGHTS: dict[str, float] = {
-    "constant": -2.3166,
-    "log_inliers": 1.4062,
-    "inlier_ratio": 7.4164,
-    "coverage": 2.5656,
-    "rival_support": -2.7592,
-    "log_position_std": -0.3795,
-    "log_rotation_std": 0.0,
-    "log_agreement": 0.0,
+    "constant": -2.1948,
+    "log_inliers": 1.2564,
+    "inlier_ratio": 2.2838,
+    "coverage": 4.7817,
+    "rival_support": -2.8002,
+    "log_position_std": -0.0932,
+    "log_rotation_std": -0.6491,
+    "log_agreement": 0.4397,
 }
 """Of the terms that `terms` returns."""
 
