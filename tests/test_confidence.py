@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from toolkit.localizers.confidence import WEIGHTS
+from toolkit.localizers.confidence import WEIGHTS, probability_right
 
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "confidence.py"
 
@@ -46,6 +46,21 @@ def test_the_fit_finds_the_weights_that_made_the_rows(confidence: ModuleType) ->
     for low, high in ((0.2, 0.5), (0.5, 0.8), (0.8, 0.95), (0.95, 1)):
         part = (probability >= low) & (probability < high)
         assert (~made["wrong"][part]).mean() == pytest.approx(probability[part].mean(), abs=0.03)
+
+
+def test_more_evidence_is_never_less_probable() -> None:
+    plain = {"num_inliers": 30, "inlier_ratio": 0.2, "coverage": 0.4, "rival_support": 0.5, "position_std_m": 0.05}
+    plain |= {"rotation_std_deg": 0.2, "agreement": 5}
+    better = {"num_inliers": 60, "inlier_ratio": 0.5, "coverage": 0.8, "rival_support": 0.1, "position_std_m": 0.01}
+    better |= {"rotation_std_deg": 0.05, "agreement": 50}
+    for name, value in better.items():
+        assert probability_right(plain | {name: value}) >= probability_right(plain), name
+    assert 0 < probability_right(plain) < probability_right(better) <= 1
+    assert probability_right(plain | {"position_std_m": np.nan}) == 0
+    together = {name: np.array([value, better[name]]) for name, value in plain.items()}
+    np.testing.assert_array_equal(
+        probability_right(together), [probability_right(plain), probability_right(better)]
+    )
 
 
 def test_what_is_not_known_is_not_accepted(confidence: ModuleType) -> None:

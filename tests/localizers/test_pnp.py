@@ -268,24 +268,22 @@ def test_eight_matches_are_no_pose(room: World, rig: bool) -> None:
     assert estimate.world_from_rig is None
 
 
-def test_few_inliers_among_many_matches_are_of_low_confidence(room: World) -> None:
-    """Fourteen inliers are enough where all matches agree, and not where most do not."""
-    seen = room.look(PINHOLE, QUERY, limit=14)
-    alone = ask(room.localizer(), [PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
-    rng = np.random.default_rng(0)
-    others = stored(rng, room.descriptors[rng.choice(1200, 600, replace=False)])  # matches, but nothing in its place
-    mixed = LocalFeatures(
-        np.concatenate([seen.keypoints, rng.uniform([0, 0], [640, 480], (600, 2)).astype(np.float32)]),
-        np.concatenate([seen.scales, np.ones(600, np.float32)]),
-        np.ones(len(seen) + 600, np.float32),
-        np.concatenate([seen.descriptors, others]),
-        (640, 480),
-    )
-    among_many = ask(room.localizer(), [PINHOLE], np.eye(4)[None], [mixed], [REFERENCES])
-    assert (alone.status, among_many.status) == ("ok", "low_confidence")
-    assert 0 < among_many.p_correct < 0.99 <= alone.p_correct <= 1
-    for estimate in (alone, among_many):
-        assert geometry.pose_error(estimate.world_from_rig, QUERY)[1] < 0.1
+@pytest.mark.parametrize(("above", "status"), [(-1e-6, "ok"), (1e-6, "low_confidence")])
+def test_ok_is_a_probability(room: World, above: float, status: str) -> None:
+    seen = room.look(PINHOLE, QUERY, limit=20)
+    estimate = ask(room.localizer(), [PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
+    assert 0.9 < estimate.p_correct < 1
+    localizer = room.localizer(ok_probability=estimate.p_correct + above)
+    again = ask(localizer, [PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
+    assert (again.status, again.p_correct) == (status, estimate.p_correct)
+    assert geometry.pose_error(again.world_from_rig, QUERY)[1] < 0.1
+
+
+def test_inliers_all_over_the_image_cover_it(room: World) -> None:
+    seen = room.look(PINHOLE, QUERY)
+    assert ask(room.localizer(), [PINHOLE], np.eye(4)[None], [seen], [REFERENCES]).coverage == 1
+    left = seen.take(np.flatnonzero(seen.keypoints[:, 0] < 320))
+    assert ask(room.localizer(), [PINHOLE], np.eye(4)[None], [left], [REFERENCES]).coverage == 0.5
 
 
 @pytest.mark.parametrize("seed", range(3))
