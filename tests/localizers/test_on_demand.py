@@ -145,6 +145,25 @@ def test_a_reference_without_features_is_left_out() -> None:
     assert_right(scene.localizer(source=source).localize(scene.query, scene.references))
 
 
+def test_matches_from_a_file_lack_what_could_not_be_read() -> None:
+    scene = Scene()
+    pairs = {
+        name: ByPoint().match([(scene.query.features[0][0], scene.features[name])])[0]  # type: ignore[list-item]
+        for name in scene.names[1:]
+    }
+
+    def source(name: str) -> LocalFeatures:
+        return scene.features[name] if name in pairs else LocalFeatures.none(SIZE)
+
+    query = replace(scene.query, network_matches=[[pairs.__getitem__]])
+    assert_right(scene.localizer(source=source).localize(query, scene.references))
+
+
+def test_without_references_there_is_no_pose() -> None:
+    scene = Scene()
+    assert scene.localizer().localize(scene.query, [References.of([])]).status == "failed: no references"
+
+
 def test_references_of_one_query_image_only() -> None:
     """A rig whose second image has no references, and whose third cannot be read."""
     scene = Scene()

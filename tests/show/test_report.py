@@ -246,3 +246,18 @@ def test_torn_or_missing_run_is_an_error_that_says_so(tmp_path):
     (tmp_path / "run.json").write_text('{"name": ')
     with pytest.raises(ArtifactError, match="not whole JSON"):
         write_report(tmp_path)
+
+
+def test_what_escalation_gave_and_took():
+    statuses = pd.DataFrame({
+        "status": ["ok", "ok", "ok", "low_confidence", "failed: no references"],
+        "first_status": [None, "low_confidence", "failed: too few matches", "low_confidence", "failed: no references"],
+        "seconds": [1.0, 4.0, 5.0, 6.0, 3.0],
+        "first_seconds": [None, 1.0, 1.0, 1.0, 1.0],
+    })  # fmt: skip
+    (sentence,) = report._escalation(statuses)
+    assert sentence == (
+        "4 were not sure and escalated to further features: 2 are ok now, 1 of those without a pose found one. "
+        "That took 14 s, 3.50 s a query."
+    )
+    assert report._escalation(statuses.iloc[:1]) == []

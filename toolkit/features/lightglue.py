@@ -100,7 +100,7 @@ class LightGlueMatcher:
         """
         for features in (features for pair in pairs for features in pair):
             self._check(features)
-        matches = [PairMatches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32)) for _ in pairs]
+        matches = [PairMatches.none() for _ in pairs]
         # Pairs with similar numbers of features go together, as all are padded to the largest. The largest come first,
         # so that a batch that does not fit the memory shows at once.
         sizes = [-max(len(a), len(b)) for a, b in pairs]

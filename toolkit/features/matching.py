@@ -36,6 +36,10 @@ class PairMatches:
     scores: NDArray[np.float32]
     """(K,) larger is better: cosine similarity of the descriptors, or the confidence of a network."""
 
+    @classmethod
+    def none(cls) -> "PairMatches":
+        return cls(np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
+
     def __len__(self) -> int:
         return len(self.indices)
 

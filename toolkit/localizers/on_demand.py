@@ -134,7 +134,8 @@ class OnDemandLocalizer:
             names = [self.posed.names[index] for index in retrieved.images]
             before: NetworkMatches | None = query.network_matches[camera][number] if query.network_matches else None
             if before is not None:
-                found[camera] = {name: before(name) for name in names}
+                # What could not be read has no matches, not even none.
+                found[camera] = {name: before(name) if len(features[name]) else PairMatches.none() for name in names}
             elif not isinstance(of_image, str):
                 pairs += [(camera, name) for name in names]
                 to_match += [(of_image[number], features[name]) for name in names]

@@ -337,7 +337,7 @@ def _escalation(statuses: pd.DataFrame) -> list[str]:
     sure = (asked["status"] == "ok").sum()
     posed = (asked["first_status"].str.startswith("failed") & ~asked["status"].str.startswith("failed")).sum()
     seconds = (asked["seconds"] - asked["first_seconds"]).sum()
-    found = f", {posed} that had no pose have one" if posed else ""
+    found = f", {posed} of those without a pose found one" if posed else ""
     return [
         f"{len(asked)} were not sure and escalated to further features: {sure} are ok now{found}. "
         f"That took {number(seconds)} s, {number(seconds / len(asked))} s a query."
