@@ -13,8 +13,6 @@ OTHER = FeatureKind(
 
 
 class OtherExtractor(SiftExtractor):
-    upright = True
-
     def __init__(self, *_: object, settings: None) -> None:
         super().__init__()
 

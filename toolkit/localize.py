@@ -17,8 +17,17 @@ from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import default_workers, prefetch
 from toolkit.errors import ToolkitError
+from toolkit.features.features import KINDS
 from toolkit.features.groups import GroupWriter
-from toolkit.features.matching import LocalMethod, MutualMatcher, create_local_methods, resolve_auto
+from toolkit.features.matching import (
+    AnyMethod,
+    DeferredMethod,
+    LocalMethod,
+    MutualMatcher,
+    create_local_methods,
+    resolve_auto,
+    weights_files,
+)
 from toolkit.features.stores import FeatureStore, MatchStore, extract_session, match_sessions
 from toolkit.files import (
     file_fingerprint,
@@ -181,7 +190,7 @@ class _Pair:
         self,
         settings: LocalizeSettings,
         kinds: Sequence[LocalMethod],
-        escalation: Sequence[LocalMethod],
+        escalation: Sequence[DeferredMethod],
         predictor: Predictor | None,
     ) -> dict[str, Any]:
         """Return what the poses depend on."""
@@ -201,8 +210,14 @@ class _Pair:
             "keyframes": fingerprint([keyframes["timestamp"].astype(str).tolist(), keyframes["device_id"].tolist()]),
         }
         if escalation:
-            record["escalation"] = [[kind.extractor.settings, kind.matcher.settings] for kind in escalation]
-        if predictor is not None or any(kind.extractor.upright for kind in (*kinds, *escalation)):
+            record["escalation"] = {
+                "features": settings.features.model_dump(exclude={"checkpoint"}),
+                "matcher": settings.matcher.model_dump(exclude={"checkpoint"}),
+                "weights": [file_fingerprint(path) for path in weights_files(settings)],
+            }
+        if predictor is not None or any(
+            KINDS[name].upright for name in (*settings.features.kinds, *settings.features.escalation)
+        ):
             record["world_up"] = settings.world_up
         if predictor is not None:
             record |= {
@@ -231,9 +246,7 @@ class _PairRun:
         self.rows = pair.session.rows_of_keyframes(keyframes)
         """Of each query, the rows of its images."""
         index_of = {name: index for index, name in enumerate(localizer.image_names)}
-        self.references = {
-            key: References.of(*_indices(rows, index_of)) for key, rows in pair.references().items()
-        }
+        self.references = {key: References.of(*_indices(rows, index_of)) for key, rows in pair.references().items()}
         """Of each query image, by timestamp and sensor."""
         self.stores: list[FeatureStore] = []
         self.matches: list[MatchStore | None] = []
@@ -241,7 +254,7 @@ class _PairRun:
             for kind in place.kinds:
                 self._add_kind(kind, range(len(self.keys)))
 
-    def _add_kind(self, kind: LocalMethod, numbers: Sequence[int]) -> None:
+    def _add_kind(self, kind: AnyMethod, numbers: Sequence[int]) -> None:
         """Extract features of the images of queries, and match them with their references where that takes a network.
 
         Where the map has no points of the kind, the features of the references are extracted, too.
@@ -261,13 +274,11 @@ class _PairRun:
         of_map = next((mapped.features for mapped in place.mapped if mapped.name == kind.name), None)
         if of_map is None:
             references = dict.fromkeys(name for _, name in names)
-            of_map = place.on_demand[kind.name].prepare(references, self.workers, self.skip_existing)
+            of_map = place.on_demand(kind).prepare(references, self.workers, self.skip_existing)
         matches = None
         if isinstance(of_map, FeatureStore) and not isinstance(kind.matcher, MutualMatcher):
             sessions = session.id, f"{place.device}_map"
-            matches = match_sessions(
-                (store, of_map), names, kind.matcher, place.map_dir, sessions, self.skip_existing
-            )
+            matches = match_sessions((store, of_map), names, kind.matcher, place.map_dir, sessions, self.skip_existing)
         self.stores.append(store)
         self.matches.append(matches)
 

@@ -24,6 +24,7 @@ from toolkit.capture import Capture, Session
 from toolkit.capture.images import default_workers, prefetch
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.errors import ArtifactError
+from toolkit.features.features import KINDS
 from toolkit.features.groups import GroupWriter
 from toolkit.features.matching import LocalMethod, create_local_methods, resolve_auto
 from toolkit.features.stores import FeatureStore, extract_session
@@ -85,7 +86,7 @@ def rerank_pairs(
     settings = resolve_auto(RerankSettings.of(settings))
     capture = Capture.from_sessions_root(sessions_root)
     (method,) = create_local_methods(settings)
-    turns = upright_turns(capture, settings.world_up) if method.extractor.upright else None
+    turns = upright_turns(capture, settings.world_up) if KINDS[method.name].upright else None
     workers = workers or default_workers()
     table = []
     cv2_threads = cv2.getNumThreads()

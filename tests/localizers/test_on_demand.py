@@ -248,7 +248,7 @@ def test_more_features_are_asked_where_a_pose_is_not_sure(
 
     extractor = SimpleNamespace(extract=extract, color=False)
     further = Scripted(*([] if second is None else [second]))
-    vars(further).update(mapped=[None], on_demand=[(SimpleNamespace(extractor=extractor), None)])
+    vars(further).update(mapped=[None], on_demand=[(SimpleNamespace(name="sift", extractor=extractor), None)])
     localizer: Any = EscalatingLocalizer(Scripted(first), further, "other", 0.05)  # type: ignore[arg-type]
     estimate = localizer.localize(scene.query, scene.references)
     assert (estimate.status, estimate.found_by) == (status, found_by)

@@ -310,7 +310,7 @@ def test_auto_is_what_the_machine_has(
     assert kinds(compute_device="cpu") == (["sift"], ["aliked"])
     assert kinds(features=["sift"]) == (["sift"], [])
     assert kinds(features=["sift", "aliked"]) == (["sift", "aliked"], [])
-    monkeypatch.setattr("toolkit.features.matching.resolve_device", torch.device)
+    monkeypatch.setattr("toolkit.models.compute.resolve_device", torch.device)
     assert kinds(compute_device="cuda") == (["sift", "aliked"], []), "on a GPU both from the start"
     assert resolve_auto(RerankSettings()).features.kinds == ["sift"]
     assert hub.requests == []

@@ -67,8 +67,6 @@ class LocalFeatures:
 class Extractor(Protocol):
     """What extracts local features of one kind."""
 
-    upright: bool
-    """Whether it was trained with upright photographs, so that images are turned upright for it."""
     color: bool
     """Whether `extract` takes images (H, W, 3) RGB, else (H, W) gray."""
     batch_size: int
@@ -102,6 +100,8 @@ class FeatureKind:
     """Least score of a match near where a pose projects a map point."""
     scale_octaves: float
     """A keypoint's size may differ from the size that the map predicts by a factor of two to this power."""
+    upright: bool = True
+    """Whether it was learned from upright photographs, so that images are turned upright for it."""
 
 
 KINDS: dict[str, FeatureKind] = {
@@ -109,7 +109,7 @@ KINDS: dict[str, FeatureKind] = {
     # the geometry restricts the candidates, the higher is the least score.
     "sift": FeatureKind(
         "toolkit.features.features:SiftExtractor", ("mutual",), 0.85, -1.0, epipolar_min_score=0.6,
-        guided_min_score=0.75, scale_octaves=1.0,
+        guided_min_score=0.75, scale_octaves=1.0, upright=False,
     ),
     # Scores of unrelated patches scatter about 0, and look-alikes are common: the usual test is a distance below 0.7
     # (hloc's NN-superpoint), which is a cosine of 1 - 0.7^2 / 2, and no ratio test. All keypoints have one size.
@@ -181,7 +181,6 @@ def stretch_contrast(gray: NDArray[np.uint8], max_gain: float = 8.0) -> NDArray[
 class SiftExtractor:
     """Extracts RootSIFT features; one instance may be used by several threads."""
 
-    upright = False
     color = False
     batch_size = 1
     threaded = True

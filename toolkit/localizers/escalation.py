@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 from toolkit.capture.images import pixels_of
-from toolkit.features.features import LocalFeatures, extract_turned
+from toolkit.features.features import KINDS, LocalFeatures, extract_turned
 from toolkit.features.stores import as_stored
 from toolkit.localizers.base import Localizer, PoseEstimate, Query, References
 from toolkit.localizers.on_demand import OnDemandLocalizer
@@ -72,12 +72,12 @@ class EscalatingLocalizer:
             if isinstance(known, str):
                 features.append(known)
                 continue
-            missing = [method.extractor for method, _ in self.second.on_demand[len(known) - len(self.second.mapped) :]]
-            found = [
-                extract_turned(extractor, [pixels_of(view.image, not extractor.color)], [view.turns])[0]
-                for extractor in missing
-            ]
-            features.append([*known, *map(as_stored, found)])
+            found = []
+            for method, _ in self.second.on_demand[len(known) - len(self.second.mapped) :]:
+                pixels = pixels_of(view.image, gray=not method.extractor.color)
+                turns = view.turns if KINDS[method.name].upright else 0
+                found.append(as_stored(extract_turned(method.extractor, [pixels], [turns])[0]))
+            features.append([*known, *found])
         return replace(query, features=features, network_matches=[])
 
 

@@ -5,7 +5,7 @@ import logging
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,8 @@ from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import Embedder, create_embedder, load_embeddings
 from toolkit.embedders.search import search
 from toolkit.errors import ArtifactError
-from toolkit.features.features import KINDS, extract_turned
-from toolkit.features.matching import LocalMethod, create_local_methods
+from toolkit.features.features import KINDS, LocalFeatures, extract_turned
+from toolkit.features.matching import AnyMethod, DeferredMethod, LocalMethod, create_local_methods, weights_files
 from toolkit.features.stores import FeatureStore, OnDemandFeatures, as_stored, extract_session
 from toolkit.features.verification import Verifier
 from toolkit.files import SceneFiles, file_fingerprint, fingerprint, image_name, write_atomic
@@ -63,7 +63,7 @@ class Map:
     """How local features are extracted and matched; none for `nearest`."""
     mapped: Sequence[MappedFeatures] = ()
     """The map's features of each kind, with their points; none where `settings.map` is null."""
-    escalation: Sequence[LocalMethod] = ()
+    escalation: Sequence[DeferredMethod] = ()
     """Further kinds, asked where the pose is not `ok` without them; the map has no points of theirs."""
     features_dir: Path | None = None
     """Folder of all local features."""
@@ -83,7 +83,7 @@ class Map:
         map_dir: Path,
         workers: int = 1,
         skip_existing: bool = True,
-        escalation: Sequence[LocalMethod] = (),
+        escalation: Sequence[DeferredMethod] = (),
     ) -> "Map":
         """Extract the features of a map session and triangulate its points, or load what is there."""
         session, mapped = capture[f"{device}_map"], []
@@ -156,13 +156,18 @@ class Map:
         """What makes the capture's images upright; None where no network asks for it."""
         return turns_for(self.settings, [*self.kinds, *self.escalation], self.capture)
 
+    def on_demand(self, kind: AnyMethod) -> OnDemandFeatures:
+        """Return the features of map images of a kind without points."""
+        if kind.name not in self._on_demand:
+            assert self.features_dir is not None
+            upright = self.turns is not None and KINDS[kind.name].upright
+            turns = self.turns.of(self.session) if self.turns is not None and upright else None
+            self._on_demand[kind.name] = OnDemandFeatures(self.session, self.features_dir, kind.extractor, turns)
+        return self._on_demand[kind.name]
+
     @cached_property
-    def on_demand(self) -> dict[str, OnDemandFeatures]:
-        """Features of map images of the kinds without points, by the name of the kind."""
-        kinds = [*(self.kinds if self.settings.map is None else ()), *self.escalation]
-        assert self.features_dir is not None
-        turns = None if self.turns is None else self.turns.of(self.session)
-        return {kind.name: OnDemandFeatures(self.session, self.features_dir, kind.extractor, turns) for kind in kinds}
+    def _on_demand(self) -> dict[str, OnDemandFeatures]:
+        return {}
 
     @cached_property
     def localizer(self) -> Localizer:
@@ -269,7 +274,8 @@ class Map:
         method, verifier = self._verification
         settings, rows = verifier.settings, ranked[0][: verifier.settings.topn]
         pixels = picture(method.extractor.color)
-        features = as_stored(extract_turned(method.extractor, [pixels], [turns if method.extractor.upright else 0])[0])
+        turns = turns if KINDS[method.name].upright else 0
+        features = as_stored(extract_turned(method.extractor, [pixels], [turns])[0])
         readable = [index for index, row in enumerate(rows) if self.session.image_name(int(row)) in verifier.store]
         inliers = np.zeros(len(rows))
         inliers[readable], _ = verifier.verify(
@@ -323,9 +329,9 @@ def open_predictor(settings: LocalizeSettings, capture: Capture, map_dir: Path) 
     return predictor
 
 
-def turns_for(settings: LocalizeSettings, kinds: Sequence[LocalMethod], capture: Capture) -> Turns | None:
+def turns_for(settings: LocalizeSettings, kinds: Sequence[AnyMethod], capture: Capture) -> Turns | None:
     """Return what makes images upright, if a network is to see them so."""
-    upright = (settings.predicts and settings.predictor.upright) or any(kind.extractor.upright for kind in kinds)
+    upright = (settings.predicts and settings.predictor.upright) or any(KINDS[kind.name].upright for kind in kinds)
     return upright_turns(capture, settings.world_up) if upright else None
 
 
@@ -370,30 +376,44 @@ def _escalating(first: Localizer, settings: LocalizeSettings, map: Map) -> Local
     """Return a localizer that asks further kinds of features where the first is not sure, if there are any."""
     if not map.escalation:
         return first
-    kinds = [*(map.kinds if settings.map is None else ()), *map.escalation]
+    kinds: list[AnyMethod] = [*(map.kinds if settings.map is None else ()), *map.escalation]
     names = "+".join(kind.name for kind in map.escalation)
     return EscalatingLocalizer(first, _on_demand(settings, map, kinds), names, settings.pnp.sure_position_std_m)
 
 
-def _on_demand(settings: LocalizeSettings, map: Map, kinds: Sequence[LocalMethod]) -> OnDemandLocalizer:  # noqa: A002
+def _on_demand(
+    settings: LocalizeSettings,
+    map: Map,
+    kinds: Sequence[AnyMethod],
+) -> OnDemandLocalizer:
     """Return what localizes with the points of the map, and with those of kinds that are made for each query."""
     names = map.mapped[0].map.image_names if map.mapped else None
     return OnDemandLocalizer(
         PosedImages.of_session(map.session, names),
         map.mapped,
-        [(kind, map.on_demand[kind.name]) for kind in kinds],
+        [(kind, partial(_features_of, map, kind)) for kind in kinds],
         settings.map,
         settings.pnp,
         settings.seed,
     )
 
 
-def create_methods(settings: LocalizeSettings) -> tuple[list[LocalMethod], list[LocalMethod]]:
-    """Return the kinds of features that every query needs, and those that are asked where it is not sure."""
+def _features_of(map: Map, kind: AnyMethod, name: str) -> LocalFeatures:  # noqa: A002
+    return map.on_demand(kind)(name)
+
+
+def create_methods(settings: LocalizeSettings) -> tuple[list[LocalMethod], list[DeferredMethod]]:
+    """Return the kinds of features that every query needs, and those that are asked where it is not sure.
+
+    Raises:
+        WeightsError: a network has no weights.
+    """
     if settings.method == "nearest":
         return [], []
     further = settings.features.escalation if settings.method in ("pnp", "hybrid") else []
-    return create_local_methods(settings), create_local_methods(settings, further)
+    if further:
+        weights_files(settings)
+    return create_local_methods(settings), [DeferredMethod(settings, name) for name in further]
 
 
 def label(settings: LocalizeSettings, found_by: str) -> str:

@@ -17,7 +17,7 @@ from toolkit import geometry
 from toolkit.capture import Session
 from toolkit.capture.cameras import rays_of
 from toolkit.features.features import KINDS, LocalFeatures
-from toolkit.features.matching import LocalMethod, PairMatches
+from toolkit.features.matching import AnyMethod, PairMatches
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import NetworkMatches, PoseEstimate, Query, References
 from toolkit.localizers.local_map import LocalMap
@@ -66,7 +66,7 @@ class OnDemandLocalizer:
         self,
         posed: PosedImages,
         mapped: Sequence[MappedFeatures],
-        on_demand: Sequence[tuple[LocalMethod, FeatureSource]],
+        on_demand: Sequence[tuple[AnyMethod, FeatureSource]],
         map_settings: MapSettings | None = None,
         settings: PnpSettings | None = None,
         seed: int = 0,
@@ -123,7 +123,7 @@ class OnDemandLocalizer:
         query: Query,
         references: Sequence[References],
         features: Mapping[str, LocalFeatures],
-        method: LocalMethod,
+        method: AnyMethod,
         number: int,
     ) -> list[dict[str, PairMatches]]:
         """Return for each query image its matches with its references of one kind, that with the given number."""

@@ -12,7 +12,8 @@ from threadpoolctl import threadpool_limits
 from toolkit.capture.images import pixels_of
 from toolkit.capture.turning import turn_image
 from toolkit.errors import ImageError
-from toolkit.features.features import LocalFeatures, SiftExtractor, extract_turned
+from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor, extract_turned
+from toolkit.features.matching import AnyMethod
 from toolkit.features.stores import as_stored
 from toolkit.localizers.base import PoseEstimate, Query, View
 from toolkit.localizers.map import Map
@@ -54,7 +55,8 @@ def localize_image(
             f"{len(quarter_turns)} turns: expected as many, and at least one."
         )
     pixels = [_Pixels(picture, of) for picture, of in zip(pictures, cameras, strict=True)]
-    learned = any(kind.extractor.upright for kind in (*place.kinds, *place.escalation))
+    kinds: list[AnyMethod] = [*place.kinds, *place.escalation]
+    learned = any(KINDS[kind.name].upright for kind in kinds)
     upright = learned or place.settings.predictor.upright
     views = [
         View(f"picture {number}", picture.image, of, in_map=False, turns=turn if upright else 0)
@@ -67,7 +69,7 @@ def localize_image(
         extracted = [
             [
                 as_stored(extract_turned(kind.extractor, [picture.read(kind.extractor.color)], [turn])[0])
-                for picture, turn in zip(pixels, quarter_turns if kind.extractor.upright else none, strict=True)
+                for picture, turn in zip(pixels, quarter_turns if KINDS[kind.name].upright else none, strict=True)
             ]
             for kind in place.kinds
         ]

@@ -3,8 +3,10 @@
 import logging
 import platform
 import re
+import sys
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from toolkit.errors import ManifestError, ToolkitError
@@ -66,6 +68,15 @@ def resolve_precision(name: str, device: "torch.device") -> "torch.dtype":
     if device.type == "cuda":
         return torch.bfloat16 if torch.cuda.get_device_capability(device) >= (8, 0) else torch.float16
     return torch.bfloat16 if device.type == "cpu" and cpu_multiplies_bfloat16() else torch.float32
+
+
+def has_accelerator(name: str) -> bool:
+    """Tell whether a device is, or `auto` would be, another than the CPU; imports torch only if there may be one."""
+    if name == "auto" and sys.platform == "linux":
+        drivers = ("nvidiactl", "kfd", "dxg")
+        if not any(Path("/dev", driver).exists() for driver in drivers):
+            return False
+    return resolve_device(name).type != "cpu"
 
 
 def precision_of_matches(name: str, device: "torch.device") -> "torch.dtype":
