@@ -135,11 +135,11 @@ def test_prefetch_raises_at_the_turn_of_the_item() -> None:
             raise ImageError("three")
         return item
 
-    got = []
+    got, before = [], threading.active_count()
     with pytest.raises(ImageError, match="three"):
         got.extend(prefetch(fails_at_three, range(50), workers=2, ahead=4))
     assert got == [0, 1, 2]
-    assert threading.active_count() < 20  # and the pool is gone
+    assert threading.active_count() <= before, "the pool is gone"
 
 
 def test_a_picture_of_an_unreadable_image_is_a_placeholder(tmp_path: Path) -> None:

@@ -383,7 +383,7 @@ def _escalating(first: Localizer, settings: LocalizeSettings, map: Map) -> Local
 
 def _on_demand(
     settings: LocalizeSettings,
-    map: Map,
+    map: Map,  # noqa: A002
     kinds: Sequence[AnyMethod],
 ) -> OnDemandLocalizer:
     """Return what localizes with the points of the map, and with those of kinds that are made for each query."""
