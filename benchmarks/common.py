@@ -1,4 +1,4 @@
-"""What several benchmarks do alike: cores, fresh processes, tables, results in files."""
+"""What several benchmarks do alike: cores, fresh processes, parts of captures, tables, results in files."""
 
 import argparse
 import json
@@ -24,6 +24,17 @@ def in_own_process(function: Callable[..., Any], *arguments: Any) -> Any:
     """Return what a function returns in a fresh process, so that memory and warm caches are its own."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         return pool.submit(function, *arguments).result()
+
+
+def part_of_capture(capture: Path, mapped: str, asked: str, folder: Path) -> Path:
+    """Return a capture of the same name with the map of one device and the queries of one, or of `all`, as links."""
+    sessions = folder / capture.name / "sessions"
+    sessions.mkdir(parents=True)
+    for session in (capture / "sessions").iterdir():
+        device, _, split = session.name.rpartition("_")
+        if {"map": mapped, "query": asked}.get(split, "all") in ("all", device):
+            (sessions / session.name).symlink_to(session)
+    return sessions.parent
 
 
 def markdown_table(header: list[str], rows: list[list[str]]) -> str:

@@ -1,10 +1,11 @@
-"""hloc + SIFT on a job that localize.py writes; runs under an interpreter of its own, without the toolkit.
+"""hloc on a job that localize.py writes; runs under an interpreter of its own, without the toolkit.
 
-    python benchmarks/hloc_worker.py HLOC [JOB RESULT]
+    python benchmarks/hloc_worker.py HLOC FEATURES [JOB RESULT]
 
-HLOC is a checkout of cvg/Hierarchical-Localization, JOB and RESULT are JSON files; without them, only what hloc needs
-is checked. Everything that is timed is hloc's own public functions with its own settings: conf "sift", conf
-"NN-ratio", pairs from poses, triangulation from known poses, PnP for every query image.
+HLOC is a checkout of cvg/Hierarchical-Localization, FEATURES is sift or aliked, JOB and RESULT are JSON files; without
+them, only what hloc needs is checked. Everything that is timed is hloc's own public functions with its own settings:
+conf "sift" with "NN-ratio", or "aliked-n16" with "aliked+lightglue"; pairs from poses, triangulation from known poses,
+PnP for every query image.
 """
 
 import json
@@ -19,6 +20,8 @@ from typing import Any
 
 # From 4.2.1 on COLMAP passes over matches without a two-view configuration. hloc sets none: its map would be empty.
 PYCOLMAP = "4.2.0"
+CONFS = {"sift": ("sift", "NN-ratio"), "aliked": ("aliked-n16", "aliked+lightglue")}
+"""hloc's confs of extraction and matching, by features."""
 
 
 class Clock:
@@ -42,12 +45,15 @@ def cpu_seconds() -> float:
     return sum(usage.ru_utime + usage.ru_stime for usage in usages)
 
 
-def import_hloc(checkout: str) -> None:
+def import_hloc(checkout: str, kind: str) -> None:
     """Put hloc on the path and import what is used of it; exits with a sentence where that is not possible."""
     sys.path.insert(0, checkout)
     try:
         import kornia.feature.laf  # noqa: F401
-    except ImportError:  # only for descriptors other than SIFT's
+    except ImportError as error:
+        if kind == "aliked":
+            sys.exit(f"{sys.executable}: {error}. benchmarks/README.md has the needs of hloc with ALIKED.")
+        # SIFT's descriptors need none of it
         laf: Any = types.ModuleType("kornia.feature.laf")
         laf.extract_patches_from_pyramid = laf.laf_from_center_scale_ori = None
         for name in ("kornia", "kornia.feature"):
@@ -56,8 +62,16 @@ def import_hloc(checkout: str) -> None:
     try:
         import pycolmap
         from hloc import extract_features, localize_sfm, match_features, pairs_from_poses, triangulation  # noqa: F401
-        from hloc.extractors import dog  # noqa: F401
-        from hloc.matchers import nearest_neighbor  # noqa: F401
+
+        if kind == "aliked":
+            import hloc_aliked
+
+            sys.modules["lightglue"] = hloc_aliked
+            from hloc.extractors import aliked  # noqa: F401
+            from hloc.matchers import lightglue  # noqa: F401
+        else:
+            from hloc.extractors import dog  # noqa: F401
+            from hloc.matchers import nearest_neighbor  # noqa: F401
     except ImportError as error:
         sys.exit(f"{sys.executable} cannot import hloc from {checkout}: {error}. benchmarks/README.md has its needs.")
     if pycolmap.__version__ != PYCOLMAP:
@@ -83,7 +97,9 @@ def write_model(path: Path, images: list[dict[str, Any]]) -> None:
     model.write(path)
 
 
-def build_map(job: dict[str, Any], device: str, features: Path, out: Path, clock: Clock) -> tuple[Any, int]:
+def build_map(
+    job: dict[str, Any], device: str, matcher: str, features: Path, out: Path, clock: Clock
+) -> tuple[Any, int]:
     """Match and triangulate one map; returns the reconstruction and how many pairs were matched."""
     from hloc import match_features, pairs_from_poses, triangulation
 
@@ -92,7 +108,7 @@ def build_map(job: dict[str, Any], device: str, features: Path, out: Path, clock
     write_model(model, job["maps"][device])
     with clock("map: match"):
         pairs_from_poses.main(model, pairs, job["map_pairs"])
-        match_features.main(match_features.confs["NN-ratio"], pairs, features, matches=matches)
+        match_features.main(match_features.confs[matcher], pairs, features, matches=matches)
     with clock("map: triangulate"):
         reconstruction = triangulation.main(folder / "sfm", model, Path(job["image_dir"]), pairs, features, matches)
     if not reconstruction.num_points3D():
@@ -102,7 +118,7 @@ def build_map(job: dict[str, Any], device: str, features: Path, out: Path, clock
 
 
 def localize(
-    pair: dict[str, Any], reconstruction: Any, features: Path, out: Path, clock: Clock
+    pair: dict[str, Any], reconstruction: Any, matcher: str, features: Path, out: Path, clock: Clock
 ) -> dict[str, dict[str, Any]]:
     """Localize each query image, as hloc.localize_sfm.main does; it would name poses by file name alone."""
     import pycolmap
@@ -112,7 +128,7 @@ def localize(
     pairs, matches = out / f"{pair['name']}.txt", out / f"{pair['name']}.h5"
     pairs.write_text("\n".join(f"{query['name']} {name}" for query in pair["queries"] for name in query["references"]))
     with clock("localize: match"):
-        match_features.main(match_features.confs["NN-ratio"], pairs, features, matches=matches)
+        match_features.main(match_features.confs[matcher], pairs, features, matches=matches)
     poses = {}
     with clock("localize: pose"):
         ids = {image.name: index for index, image in reconstruction.images.items()}
@@ -137,23 +153,31 @@ def main() -> None:
         print(__doc__)
         return
     clock = Clock()
+    checkout, kind = sys.argv[1:3]
     with clock("imports"):
-        import_hloc(sys.argv[1])
-    if len(sys.argv) == 2:
+        import_hloc(checkout, kind)
+    if len(sys.argv) == 3:
         return
     import torch
     from hloc import extract_features
 
-    job, result = json.loads(Path(sys.argv[2]).read_text()), Path(sys.argv[3])
+    job, result = json.loads(Path(sys.argv[3]).read_text()), Path(sys.argv[4])
+    extractor, matcher = CONFS[kind]
+    if kind == "aliked":
+        import hloc_aliked
+
+        hloc_aliked.WEIGHTS.update(job["weights"])
     out = result.parent / "hloc"
     out.mkdir()
     torch.set_num_threads(job["threads"])
     with clock("local features"):
         features = extract_features.main(
-            extract_features.confs["sift"], Path(job["image_dir"]), out, image_list=job["extract"]
+            extract_features.confs[extractor], Path(job["image_dir"]), out, image_list=job["extract"]
         )
-    maps = {device: build_map(job, device, features, out, clock) for device in job["maps"]}
-    poses = {pair["name"]: localize(pair, maps[pair["map"]][0], features, out, clock) for pair in job["pairs"]}
+    maps = {device: build_map(job, device, matcher, features, out, clock) for device in job["maps"]}
+    poses = {
+        pair["name"]: localize(pair, maps[pair["map"]][0], matcher, features, out, clock) for pair in job["pairs"]
+    }
     counts = {
         "images extracted": len(job["extract"]),
         "map pairs": sum(pairs for _, pairs in maps.values()),

@@ -1,14 +1,16 @@
-"""Time, memory and accuracy of all map x query pairs of a capture, from nothing, beside hloc + SIFT.
+"""Time, memory and accuracy of map x query pairs of a capture, from nothing, beside hloc with SIFT or with ALIKED.
 
-    python benchmarks/localize.py [--capture PATH] [--hloc CHECKOUT [--hloc-python PYTHON] | --plain] [--threads 2]
+    python benchmarks/localize.py [--capture PATH] [--map DEVICE] [--query DEVICE] [--threads 2]
+                                  [--hloc CHECKOUT [--hloc-python PYTHON] [--hloc-features aliked] | --plain]
 
 Both do the same job on the same cores, one right after the other, each in a fresh process and an empty folder: local
 features once an image, a map of each device triangulated from its known poses, and a pose for each query of the
-keyframe list in each map. hloc gets the toolkit's retrieved references for nothing. Wall seconds mean little while
+keyframe list in each map. The toolkit runs with its defaults; hloc with SIFT, or with ALIKED + LightGlue on the
+toolkit's weights, and gets the toolkit's retrieved references for nothing. Wall seconds mean little while
 others use the machine; CPU seconds mean more. Without a capture, a small one is rendered.
 
-With --plain, the toolkit is compared with itself: one RANSAC a query, with no guided matching and no search for
-rivals. Features and maps are the same, and count for both as they were measured once.
+With --plain, the toolkit is compared with itself: SIFT and one RANSAC a query, with no guided matching and no search
+for rivals. Features and maps are the same, and count for both as they were measured once.
 """
 
 import argparse
@@ -26,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import add_out, check_out, in_own_process, limit_cores, markdown_table, write_out
+from common import add_out, check_out, in_own_process, limit_cores, markdown_table, part_of_capture, write_out
 from numpy.typing import NDArray
 
 HLOC_WORKER = Path(__file__).with_name("hloc_worker.py")
@@ -39,6 +41,8 @@ STAGES = {
     "localize": ["localize", "localize: match", "localize: pose"],
     "imports, not in the total": ["imports"],
 }
+LIMITS = ((1, 0.1), (5, 0.5), (5, 1))
+"""Recall is counted at these degrees and meters."""
 
 
 @dataclass
@@ -66,20 +70,23 @@ class Measurement:
 def run_toolkit(sessions_root: Path, run: Path, queries: str, threads: int) -> dict[str, Any]:
     """Run the stages in this process, which should be a fresh one; returns the fields of a `Measurement`."""
     start = _clocks()
+    import torch  # noqa: F401  # the stages import it when they need it
+
     from toolkit import embed, localize, retrieve
+    from toolkit.features import stores
     from toolkit.files import SceneFiles
     from toolkit.localizers import map as map_module
     from toolkit.localizers.local_map import LocalMap
 
     imported = _clocks()
     files = SceneFiles(run, sessions_root.parent.name)
-    inner = _time_parts(embed, localize, map_module)
+    inner = _time_parts(embed, localize, map_module, stores)
     started = _clocks()
     table = embed.embed_sessions(sessions_root, files.embeddings, features_dir=files.features)
     embedded, features = _clocks(), inner["features"]
     retrieve.retrieve_pairs(sessions_root, files.embeddings, out_jsonl=files.retrieval_dir, queries=queries)
     retrieved = _clocks()
-    localize.localize_pairs(
+    localized_pairs = localize.localize_pairs(
         sessions_root,
         files.retrieval_dir,
         files.poses_dir,
@@ -104,7 +111,12 @@ def run_toolkit(sessions_root: Path, run: Path, queries: str, threads: int) -> d
         "cpu": {stage: float(clocks[1]) for stage, clocks in stages.items()},
         "peak_mb": peak_mb,
         "peak_child_mb": resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024,
-        "counts": {"images extracted": int(table["embedded"].sum()), "map points": sum(len(m.points) for m in maps)},
+        "counts": {
+            "images extracted": int(table["embedded"].sum()),
+            "map points": sum(len(m.points) for m in maps),
+            "poses ok": int(localized_pairs["ok"].sum()),
+            "queries escalated": int(localized_pairs["escalated"].sum()),
+        },
     }
 
 
@@ -146,7 +158,7 @@ def measure_toolkit(sessions_root: Path, run: Path, queries: str, threads: int) 
     return measured
 
 
-PLAIN: dict[str, Any] = {"guided_radii_deg": (), "clear_inlier_ratio": 0.0}
+PLAIN: dict[str, Any] = {"features": ["sift"], "pnp": {"guided_radii_deg": (), "clear_inlier_ratio": 0.0}}
 
 
 def localize_plainly(sessions_root: Path, run: Path, queries: str, threads: int) -> list[float]:
@@ -159,7 +171,7 @@ def localize_plainly(sessions_root: Path, run: Path, queries: str, threads: int)
     inner = _time_parts(localize, map_module)
     started = _clocks()
     folders = (files.retrieval_dir, run / "plain_poses", files.features, files.maps)
-    localize.localize_pairs(sessions_root, *folders, {"pnp": PLAIN}, queries=queries, workers=threads)
+    localize.localize_pairs(sessions_root, *folders, PLAIN, queries=queries, workers=threads)
     return [float(value) for value in _clocks() - started - inner["features"] - inner["map"]]
 
 
@@ -173,11 +185,14 @@ def measure_plain(ours: Measurement, sessions_root: Path, run: Path, queries: st
     return measured
 
 
-def write_job(path: Path, sessions_root: Path, run: Path, queries: str, threads: int, map_pairs: int) -> None:
+def write_job(
+    path: Path, kind: str, sessions_root: Path, run: Path, queries: str, threads: int, map_pairs: int
+) -> None:
     """Write what hloc is asked: posed map images, query images, and the references that the toolkit retrieved."""
     from toolkit import geometry
     from toolkit.capture import Capture, Session
     from toolkit.files import SceneFiles, pair_name
+    from toolkit.models.weights import ALIKED, ALIKED_LIGHTGLUE, resolve_weights
 
     capture = Capture.from_sessions_root(sessions_root)
 
@@ -221,6 +236,9 @@ def write_job(path: Path, sessions_root: Path, run: Path, queries: str, threads:
         "pairs": pairs,
         "extract": list(dict.fromkeys(names)),
     }
+    if kind == "aliked":
+        sources = {"ALIKED": ALIKED["aliked-n16"], "LightGlue": ALIKED_LIGHTGLUE}
+        job["weights"] = {name: str(resolve_weights(source)) for name, source in sources.items()}
     path.write_text(json.dumps(job))
 
 
@@ -258,14 +276,14 @@ def write_device_poses(out: Path, sessions_root: Path, queries: str, poses: dict
 
 
 def measure_hloc(
-    checkout: str, python: str, sessions_root: Path, run: Path, queries: str, threads: int, map_pairs: int
+    checkout: str, python: str, kind: str, sessions_root: Path, run: Path, queries: str, threads: int, map_pairs: int
 ) -> Measurement:
     """Measure hloc in a process of its own, on the references in the toolkit's run folder."""
     job, result, log = run / "job.json", run / "result.json", run / "hloc.log"
-    write_job(job, sessions_root, run, queries, threads, map_pairs)
+    write_job(job, kind, sessions_root, run, queries, threads, map_pairs)
     before = os.getloadavg()[0]
     with open(log, "w", encoding="utf-8") as stream:
-        command = [python, str(HLOC_WORKER), checkout, str(job), str(result)]
+        command = [python, str(HLOC_WORKER), checkout, kind, str(job), str(result)]
         ended = subprocess.run(command, stdout=stream, stderr=subprocess.STDOUT, check=False)
     if ended.returncode:
         tail = "\n".join(log.read_text(errors="replace").splitlines()[-15:])
@@ -279,7 +297,7 @@ def measure_hloc(
 
 
 def accuracy(sessions_root: Path, poses_dir: Path, queries: str) -> list[dict[str, Any]]:
-    """Return queries, median errors and recall at (1 deg, 0.1 m) of each pair, and of all queries together."""
+    """Return queries, median errors and recall of each pair, and of all queries together."""
     from toolkit.evaluate import evaluate_scene
 
     evaluation = evaluate_scene(sessions_root, poses_dir, None, None, queries=queries)
@@ -296,7 +314,7 @@ def accuracy(sessions_root: Path, poses_dir: Path, queries: str) -> list[dict[st
                 "queries": len(part),
                 "median_rotation_deg": float(np.median(rotation_deg)),
                 "median_translation_cm": 100 * float(np.median(translation_m)),
-                "recall_1deg_0.1m": float(np.mean((rotation_deg < 1) & (translation_m < 0.1))),
+                "recall": [float(np.mean((rotation_deg < deg) & (translation_m < m))) for deg, m in LIMITS],
             }
         )
     return rows
@@ -335,24 +353,30 @@ def markdown(capture: str, threads: int, ours: Measurement, theirs: Measurement 
     if ours.pairs:
         header = ["map", "query", "queries"]
         for name in names:
-            header += [f"{name}: deg", "cm", "@(1°, 0.1 m) %"]
+            header += [f"{name}: deg", "cm", "recall %"]
         rows = []
         for results in zip(*(tool.pairs for tool in tools), strict=True):
             cells = [results[0]["map"], results[0]["query"], str(results[0]["queries"])]
             for result in results:
                 cells += [f"{result['median_rotation_deg']:.3f}", f"{result['median_translation_cm']:.2f}"]
-                cells += [f"{100 * result['recall_1deg_0.1m']:.1f}"]
+                cells += [" / ".join(f"{100 * recall:.1f}" for recall in result["recall"])]
             rows.append(cells)
-        text += ["", "Median errors and recall:", "", markdown_table(header, rows)]
+        limits = " / ".join(f"({deg}°, {m} m)" for deg, m in LIMITS)
+        text += ["", f"Median errors, and recall at {limits}:", "", markdown_table(header, rows)]
     return "\n".join(text) + "\n"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--capture", type=Path, help="capture folder, with sessions/ in it; default: render one")
+    parser.add_argument("--map", default="all", help="map device, to measure a part of the capture (default: all)")
+    parser.add_argument("--query", default="all", help="query device, likewise (default: all)")
     parser.add_argument("--queries", default="keyframes_pruned_subsampled", help="keyframe list (default: %(default)s)")
     parser.add_argument("--threads", type=int, default=2, help="cores for each tool (default: %(default)s)")
-    parser.add_argument("--hloc", help="checkout of cvg/Hierarchical-Localization, to run hloc + SIFT too")
+    parser.add_argument("--hloc", help="checkout of cvg/Hierarchical-Localization, to run hloc too")
+    parser.add_argument(
+        "--hloc-features", choices=["sift", "aliked"], default="sift", help="local features of hloc (default: sift)"
+    )
     parser.add_argument("--plain", action="store_true", help="compare with the toolkit's plain setting instead")
     parser.add_argument("--hloc-python", default=sys.executable, help="interpreter with hloc's needs (default: this)")
     parser.add_argument("--hloc-map-pairs", type=int, default=20, help="partners of a map image (default: %(default)s)")
@@ -367,7 +391,8 @@ def main() -> None:
     from toolkit.errors import ToolkitError
 
     checkout = str(Path(options.hloc).resolve()) if options.hloc else ""
-    if checkout and subprocess.run([options.hloc_python, str(HLOC_WORKER), checkout], check=False).returncode:
+    kind = options.hloc_features
+    if checkout and subprocess.run([options.hloc_python, str(HLOC_WORKER), checkout, kind], check=False).returncode:
         sys.exit(1)
     ours: list[Measurement] = []
     theirs: list[Measurement] = []
@@ -377,8 +402,11 @@ def main() -> None:
             from toolkit.synthetic import render_capture
 
             capture = render_capture(Path(folder) / "RENDERED", rooms=2, frames=12, seed=0, progress=False)
+        capture = capture.resolve()
+        if (options.map, options.query) != ("all", "all"):
+            capture = part_of_capture(capture, options.map, options.query, Path(folder) / "part")
         try:
-            sessions_root = Capture.open(capture.resolve()).path / "sessions"
+            sessions_root = Capture.open(capture).path / "sessions"
         except ToolkitError as error:
             sys.exit(str(error))
         for turn in range(options.repeat):
@@ -387,14 +415,14 @@ def main() -> None:
             print(f"toolkit {ours[-1].total:.1f} s", file=sys.stderr)
             if checkout:
                 arguments = (sessions_root, run, options.queries, options.threads, options.hloc_map_pairs)
-                theirs.append(measure_hloc(checkout, options.hloc_python, *arguments))
+                theirs.append(measure_hloc(checkout, options.hloc_python, kind, *arguments))
                 print(f"hloc {theirs[-1].total:.1f} s", file=sys.stderr)
             elif options.plain:
                 theirs.append(measure_plain(ours[-1], sessions_root, run, options.queries, options.threads))
                 print(f"plain {theirs[-1].total:.1f} s", file=sys.stderr)
     best = min(ours, key=lambda measured: measured.total)
     other = min(theirs, key=lambda measured: measured.total) if theirs else None
-    label = "plain" if options.plain else "hloc + SIFT"
+    label = "plain" if options.plain else {"sift": "hloc + SIFT", "aliked": "hloc + ALIKED + LightGlue"}[kind]
     text = markdown(sessions_root.parent.name, options.threads, best, other, label)
     results = {"toolkit": vars(best) | {"total": best.total}}
     if other:
