@@ -1,6 +1,7 @@
 """Real photographs: how accurate the poses are, against the numbers of hloc + SIFT. Minutes; see CONTRIBUTING."""
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -10,11 +11,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from toolkit.capture import Capture
+from toolkit import geometry
+from toolkit.capture import Capture, Trajectory
 from toolkit.embed import embed_sessions
-from toolkit.evaluate import Evaluation, evaluate_scene
+from toolkit.evaluate import Evaluation, evaluate_scene, pose_errors, recall
 from toolkit.files import SceneFiles
-from toolkit.localize import localize_pairs
+from toolkit.localize import Map, localize_image, localize_pairs
 from toolkit.retrieve import retrieve_pairs
 
 pytestmark = pytest.mark.slow
@@ -120,3 +122,34 @@ def test_retrieval_finds_views_of_the_same_place(run_of: Callable[[str], Run], s
             hits.append((distance_m < 8) & (poses[:, :3, 2] @ world_from_query[:3, 2] > np.cos(np.radians(45))))
         assert np.mean(np.any(hits, axis=1)) == 1, path.stem
         assert np.mean(np.any(np.array(hits)[:, :5], axis=1)) >= 0.95, path.stem
+
+
+def test_learned_features_find_what_sift_is_not_sure_of(
+    captures_root: Path, run_of: Callable[[str], Run], learned_weights: None, tmp_path: Path
+) -> None:
+    """By night, in the phone's map: all poses are right and sure, and a picture gets the pose of the run."""
+    with_sift = run_of("STRECHA_HARD").files
+    sessions, files = captures_root / "STRECHA_HARD" / "sessions", SceneFiles(tmp_path, "STRECHA_HARD")
+    for folder in ("embeddings", "features", "retrieval", "map"):
+        shutil.copytree(with_sift.root / folder, files.root / folder)
+    settings = {"compute_device": "cpu"}
+    places = (files.retrieval_dir, files.poses_dir, files.features, files.maps)
+    table = localize_pairs(sessions, *places, settings, map_device="ios", query_device="ios")
+    assert 2 <= table["escalated"].item() <= 6
+    assert table["ok"].item() == table["queries"].item() == 25
+    session = Capture.from_sessions_root(sessions)["ios_query"]
+    poses = Trajectory.read(files.poses_txt("ios", "ios"))
+    keyframes = session.keyframes("keyframes_pruned_subsampled")
+    rotation_deg, translation_m = pose_errors(poses, session.ground_truth, keyframes)
+    assert recall(rotation_deg, translation_m, [(1.0, 0.1)]) == [1.0]
+    rows = pd.read_csv(files.poses_txt("ios", "ios").with_suffix(".csv"))
+    escalated = rows["first_status"].notna()
+    assert (rows["method"][escalated] == "pnp+aliked").all()
+    assert (rows["p_correct"] >= 0.99).all()
+    place = Map.open(tmp_path, "STRECHA_HARD", "ios")
+    number = int(np.flatnonzero(escalated)[0])
+    (row,) = session.rows_of_keyframes(keyframes)[number]
+    camera = session.camera(session.images["sensor_id"].iloc[row])
+    turns = place.turns.of(session, row).tolist()
+    estimate = localize_image(place, session.image_path(int(row)), camera, turns=turns)
+    np.testing.assert_array_equal(geometry.qt_from_pose(estimate.world_from_rig), poses.qt[number])
