@@ -1,5 +1,7 @@
 """LightGlue: the same as the package's own forward, batches that change nothing, and what is refused."""
 
+import subprocess
+import sys
 from dataclasses import replace
 from typing import Any
 
@@ -246,3 +248,29 @@ def test_other_weights(state: State) -> None:
         LightGlueMatcher(detector, "cpu")
     assert "251 missing: posenc.Wr.weight, transformers.0" in str(caught.value)
     assert "24 unexpected: encoder.conv_blocks.0.conv_a.weight" in str(caught.value)
+
+
+MANY_SHAPES = """
+import numpy as np, psutil
+from toolkit.features.features import LocalFeatures
+from toolkit.features.matching import create_matcher
+
+def features(count):
+    descriptors = rng.normal(size=(count, 128)) / 11
+    keypoints, ones = rng.uniform(0, 640, (count, 2)), np.ones(count, np.float32)
+    return LocalFeatures(keypoints.astype(np.float32), ones, ones, descriptors.astype(np.float16), (640, 640))
+
+rng = np.random.default_rng(0)
+matcher = create_matcher("lightglue", device="cpu", features="aliked")
+for call in range(12):
+    matcher.match([(features(200 + 7 * call), features(100 + 5 * call))] * 2)
+    if call == 3:
+        before = psutil.Process().memory_info().rss
+print((psutil.Process().memory_info().rss - before) // 2**20)
+"""
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_with_the_numbers_of_features(learned_weights: None) -> None:
+    done = subprocess.run([sys.executable, "-c", MANY_SHAPES], capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 60, "megabytes; 80 and more where all shapes are kept"

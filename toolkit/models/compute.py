@@ -1,6 +1,7 @@
 """Devices and precisions that networks run in, and batches that do not fit the memory of the device."""
 
 import logging
+import os
 import platform
 import re
 import sys
@@ -14,6 +15,9 @@ from toolkit.errors import ManifestError, ToolkitError
 if TYPE_CHECKING:
     import torch
 
+# oneDNN keeps what it made for each shape, and images differ in their numbers of features: 1,024 shapes, its default,
+# take gigabytes. It reads this when it is first used.
+os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "64")
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
