@@ -332,7 +332,7 @@ class _PairRun:
             todo = [
                 numbers[group]
                 for group, row in further.items()
-                if not (row["first_status"] or is_sure(row["status"], row["position_std_m"], limit))
+                if not (row.get("first_status") or is_sure(row["status"], row["position_std_m"], limit))
             ]
             if isinstance(self.localizer, EscalatingLocalizer) and todo:
                 started = time.perf_counter()
