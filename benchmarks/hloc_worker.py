@@ -107,7 +107,7 @@ def build_map(
     model, pairs, matches = folder / "model", folder / "pairs.txt", folder / "matches.h5"
     write_model(model, job["maps"][device])
     with clock("map: match"):
-        pairs_from_poses.main(model, pairs, job["map_pairs"])
+        pairs_from_poses.main(model, pairs, min(job["map_pairs"], len(job["maps"][device]) - 1))
         match_features.main(match_features.confs[matcher], pairs, features, matches=matches)
     with clock("map: triangulate"):
         reconstruction = triangulation.main(folder / "sfm", model, Path(job["image_dir"]), pairs, features, matches)
