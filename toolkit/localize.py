@@ -261,7 +261,7 @@ class _PairRun:
         """
         session, place = self.pair.session, self.place
         rows = np.unique(np.concatenate([*(self.rows[number] for number in numbers), np.zeros(0, np.int64)]))
-        turns = None if place.turns is None else place.turns.of(session)
+        turns = place.turns_of(kind, session)
         store = extract_session(session, self.features_dir, kind.extractor, rows, self.workers, turns=turns)
         images = session.images.iloc[rows]
         keys = zip(images["timestamp"].tolist(), images["sensor_id"].tolist(), strict=True)
@@ -287,7 +287,9 @@ class _PairRun:
         session, rows = self.pair.session, self.rows[number]
         images = session.images.iloc[rows]
         keys = list(zip(images["timestamp"].tolist(), images["sensor_id"].tolist(), strict=True))
-        turns = np.zeros(len(rows), int) if self.place.turns is None else self.place.turns.of(session, rows)
+        # Local features were turned when they were extracted: only a network that predicts looks at the views.
+        shown = self.place.turns if self.place.settings.predicts else None
+        turns = np.zeros(len(rows), int) if shown is None else shown.of(session, rows)
         names = [session.image_name(int(row)) for row in rows]
         views = [
             View(name, session.path.parent / name, session.camera(sensor), in_map=False, turns=int(turn))

@@ -86,18 +86,18 @@ class Map:
         escalation: Sequence[DeferredMethod] = (),
     ) -> "Map":
         """Extract the features of a map session and triangulate its points, or load what is there."""
-        session, mapped = capture[f"{device}_map"], []
-        turns = turns_for(settings, [*kinds, *escalation], capture)
+        session, mapped = capture[f"{device}_map"], list[MappedFeatures]()
+        root = capture.path / "sessions"
+        place = cls(device, root, map_dir, settings, kinds, mapped, escalation, features_dir)
         for kind in kinds if settings.map is not None else ():
-            turned = None if turns is None else turns.of(session)
-            store = extract_session(session, features_dir, kind.extractor, workers=workers, turns=turned)
+            turns = place.turns_of(kind, session)
+            store = extract_session(session, features_dir, kind.extractor, workers=workers, turns=turns)
             inputs = fingerprint([session_fingerprint(session), store.fingerprint])
             path = map_path(map_dir, session.id, kind.name)
             assert settings.map is not None
             local_map = build_map(session, store, path, settings.map, settings.seed, skip_existing, inputs, workers)
             mapped.append(MappedFeatures(local_map, store, KINDS[kind.name], kind.matcher, kind.name))
-        root = capture.path / "sessions"
-        return cls(device, root, map_dir, settings, kinds, mapped, escalation, features_dir)
+        return place
 
     @classmethod
     def open(cls, run: str | Path, scene: str, device: str) -> "Map":
@@ -156,12 +156,17 @@ class Map:
         """What makes the capture's images upright; None where no network asks for it."""
         return turns_for(self.settings, [*self.kinds, *self.escalation], self.capture)
 
+    def turns_of(self, kind: AnyMethod, session: Session) -> NDArray[np.int64] | None:
+        """Return the turns that make a session's images upright for a kind of features; None: it does not need them."""
+        if not KINDS[kind.name].upright or self.turns is None:
+            return None
+        return self.turns.of(session)
+
     def on_demand(self, kind: AnyMethod) -> OnDemandFeatures:
         """Return the features of map images of a kind without points."""
         if kind.name not in self._on_demand:
             assert self.features_dir is not None
-            upright = self.turns is not None and KINDS[kind.name].upright
-            turns = self.turns.of(self.session) if self.turns is not None and upright else None
+            turns = self.turns_of(kind, self.session)
             self._on_demand[kind.name] = OnDemandFeatures(self.session, self.features_dir, kind.extractor, turns)
         return self._on_demand[kind.name]
 
