@@ -177,3 +177,17 @@ def test_paths_of_a_scene_are_the_contract() -> None:
     assert scene.poses_txt("spot", "ios") == root / "poses" / "HYDRO_map_spot_query_ios.txt"
     assert scene.poses_csv("spot", "ios") == root / "poses" / "HYDRO_map_spot_query_ios.csv"
     assert (scene.evaluation, scene.visualization) == (root / "evaluation", root / "visualization")
+
+
+def test_what_killed_writers_left_is_swept_and_nothing_else(tmp_path: Path) -> None:
+    script = (
+        "import os, sys; from toolkit.files import write_atomic\n"
+        "with write_atomic(sys.argv[1]) as t:\n    os.kill(os.getpid(), 9)"
+    )
+    subprocess.run([sys.executable, "-c", script, str(tmp_path / "deep" / "a.txt")], cwd=Path(files.__file__).parents[1], check=False)
+    assert len(list((tmp_path / "deep").iterdir())) == 1
+    with files.write_atomic(tmp_path / "deep" / "b.txt") as temporary:
+        (tmp_path / ".mine.partial").touch()
+        files.sweep_partials(tmp_path)
+        assert temporary.exists()
+        assert {path.name for path in tmp_path.rglob("*")} == {"deep", ".mine.partial", temporary.name}

@@ -3,10 +3,13 @@
 import hashlib
 import json
 import os
+import platform
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +25,9 @@ def write_atomic(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=f".partial{path.suffix}", dir=path.parent)
+    # Process and machine are in the name: `sweep_partials` then knows what nobody writes any more.
+    prefix = f".{path.name}.{os.getpid()}-{_machine()}-"
+    handle, name = tempfile.mkstemp(prefix=prefix, suffix=f".partial{path.suffix}", dir=path.parent)
     os.close(handle)
     temporary = Path(name)
     try:
@@ -35,6 +40,23 @@ def write_atomic(path: str | Path) -> Iterator[Path]:
     finally:
         with suppress(FileNotFoundError):
             temporary.unlink()
+
+
+def sweep_partials(folder: str | Path) -> None:
+    """Remove what killed writers of this machine left at and below a folder; what is still being written stays."""
+    import psutil
+
+    for path in Path(folder).rglob(".*.partial*"):
+        writer = re.search(rf"\.(\d+)-{_machine()}-[^.]*\.partial", path.name)
+        if writer and not psutil.pid_exists(int(writer[1])):
+            with suppress(OSError):
+                path.unlink()
+
+
+@cache
+def _machine() -> str:
+    """Return 8 hex digits that tell this machine from others that share its disks."""
+    return hashlib.sha256(platform.node().encode()).hexdigest()[:8]
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -26,7 +26,7 @@ from toolkit.embedders import resolve_name
 from toolkit.errors import ManifestError
 from toolkit.exchange.download import is_unfinished
 from toolkit.features.matching import local_weights, resolve_auto
-from toolkit.files import SceneFiles, files_fingerprint, fingerprint, write_text
+from toolkit.files import SceneFiles, files_fingerprint, fingerprint, sweep_partials, write_text
 from toolkit.manifest import (
     STAGES,
     EmbedSettings,
@@ -143,6 +143,7 @@ def _run(manifest: Manifest, manifest_path: str | Path, only: str | None, force:
         run_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ManifestError(f"output_root: {run_dir} cannot be made ({error.strerror}). Choose another.") from None
+    sweep_partials(run_dir)
     jobs = [
         job
         for capture in captures

@@ -1,0 +1,111 @@
+"""A run that is killed again and again ends with the files of one that was left alone."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from tests.conftest import REPOSITORY
+from tests.show.test_recordings import read_back
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name != "posix", reason="needs fork and SIGKILL")]
+
+STAGES = ("embed", "retrieve", "rerank", "localize", "evaluate", "visualize")
+SIGNALS = [signal.SIGKILL] * 5 + [signal.SIGTERM]
+"""A round each, in which every stage is stopped once: 30 kills, and 6 friendly requests."""
+
+
+class Runs:
+    """Runs of one manifest, each in a process of its own that can be killed."""
+
+    def __init__(self, manifest: Path) -> None:
+        environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        self.log = manifest.with_suffix(".log")
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "tests.unattended", str(manifest)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=REPOSITORY, env=environment,
+        )  # fmt: skip
+
+    def run(self, **asked: Any) -> dict[str, Any]:
+        assert self._process.stdin
+        assert self._process.stdout
+        self._process.stdin.write(json.dumps(asked) + "\n")
+        self._process.stdin.flush()
+        return json.loads(self._process.stdout.readline())
+
+    def close(self) -> None:
+        self._process.communicate()
+
+
+@pytest.fixture
+def runs(tmp_path: Path, made_once: Any) -> Iterator[Runs]:
+    from toolkit.synthetic import render_capture
+
+    def make(folder: Path) -> None:
+        render_capture(folder / "TINY", rooms=1, frames=3, seed=0, progress=False)
+
+    capture = made_once("tiny", make) / "TINY"
+    manifest = tmp_path / "run.yaml"
+    manifest.write_text(
+        f"captures: ['{capture}']\noutput_root: {tmp_path}\npairs: [[ios, spot]]\n"
+        "rerank: true\nvisualize: {samples: 1}\n"
+    )
+    started = Runs(manifest)
+    yield started
+    started.close()
+
+
+def recorded(path: Path) -> dict[str, list[str]]:
+    """Return what a recording holds; its start and the order of its chunks change from run to run."""
+    return {
+        entity: sorted(map(repr, entries)) for entity, entries in read_back(path).items() if entity != "/__properties"
+    }
+
+
+def products(run: Path) -> dict[str, object]:
+    """Return the content of every end product of a run by its path, without what tells the time."""
+    found: dict[str, object] = {}
+    for path in sorted(run.rglob("*")):
+        name = path.relative_to(run).as_posix()
+        if path.is_dir() or path.suffix in (".ipynb", ".html") or path.name.endswith((".meta.json", ".lock")):
+            continue
+        if name == "run.json" or "/.stages/" in name:
+            continue
+        if path.suffix == ".rrd":
+            found[name] = recorded(path)
+        elif path.suffix == ".csv" and path.parent.name == "poses":
+            found[name] = pd.read_csv(path).drop(columns="seconds").to_csv()
+        else:
+            found[name] = path.read_bytes()
+    return found
+
+
+def test_thirty_kills_at_random_moments_leave_the_same_files(runs: Runs, tmp_path: Path) -> None:
+    run, rng = tmp_path / "run", random.Random(0)
+    whole = runs.run()
+    assert whole["status"] == 0, runs.log.read_text()
+    expected = products(run)
+    assert len(expected) > 20
+    for number, how in enumerate(SIGNALS):
+        run.rename(tmp_path / f"whole-{number}")
+        for stage in STAGES:
+            event = rng.randint(1, whole["events"][stage])
+            delay_s = rng.choice([0.0, rng.uniform(0.0, 0.3)])
+            ended = runs.run(stage=stage, event=event, delay_s=delay_s, signal=how)
+            assert ended["stopped"], f"{stage} had no operation {event}: {runs.log.read_text()}"
+            if ended["status"] == 0:
+                break  # the signal came after the end
+        assert runs.run()["status"] == 0, runs.log.read_text()
+        found = products(run)
+        assert found.keys() == expected.keys()
+        different = [name for name in expected if found[name] != expected[name]]
+        assert not different, f"round {number}"
+        assert json.loads((run / "run.json").read_text())["status"] == "done"

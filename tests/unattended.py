@@ -1,0 +1,125 @@
+"""Runs that can be killed at a chosen moment, without the seconds that kernels take to start.
+
+`python -m tests.unattended MANIFEST` imports all that a run needs, and then forks a process for each line of its
+standard input, a JSON object {stage, event, delay_s, signal}: the process runs the manifest, the real notebooks' cells
+executed in it, and is sent the signal `delay_s` after its file operation number `event` in that stage; `{}` lets it run
+to its end. One line of JSON comes back: {stopped, status, events}: whether the signal was sent, how the process ended,
+and, of one that ended well, the number of file operations of each stage.
+"""
+
+import json
+import os
+import select
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import nbformat
+from nbformat.v4 import new_output
+
+# Imported before the first fork, all that the cells need.
+from toolkit import embed, evaluate, localize, notebook, pipeline, rerank, retrieve, visualize  # noqa: F401
+from toolkit.files import write_atomic
+from toolkit.show import explore, report  # noqa: F401
+
+CHANGES = {"os.rename", "os.remove", "os.mkdir", "os.rmdir"}
+"""Audit events that change a folder; `open` for writing is the other."""
+STAGE_OF = {path.name: path.stem.partition("_")[2] for path in notebook.NOTEBOOKS.glob("*.ipynb")}
+
+
+class Events:
+    """Counts the operations on files below a folder by stage, and tells when one of them is about to happen."""
+
+    def __init__(self, folder: Path, stage: str | None, event: int, tell: int) -> None:
+        """`tell`: a file descriptor that gets a byte at operation number `event`, from 1, of `stage`."""
+        self.counts = Counter[str]()
+        self.stage = ""
+        self._folder, self._told = str(folder), (stage, event, tell)
+        sys.addaudithook(self._hook)
+
+    def _hook(self, name: str, arguments: tuple[Any, ...]) -> None:
+        writes = bool(arguments[2] & (os.O_WRONLY | os.O_RDWR)) if name == "open" else name in CHANGES
+        if writes and str(arguments[0]).startswith(self._folder):
+            self.counts[self.stage] += 1
+            stage, event, tell = self._told
+            if (self.stage, self.counts[self.stage]) == (stage, event):
+                os.write(tell, b"!")
+
+
+def execute_cells(
+    events: Events, path: Path, output: Path, parameters: dict[str, Any], progress: object = None
+) -> tuple[Any, float]:
+    """Do what `toolkit.notebook.execute` does, in this process; of what cells display, counts alone are kept."""
+    import IPython.display
+
+    events.stage = STAGE_OF[path.name]
+    notebook.check_parameters(path, parameters)
+    content = nbformat.read(path, as_version=4)
+    outputs: list[Any] = []
+
+    def display(data: Any = None, raw: bool = False, **_: Any) -> None:
+        if raw:
+            outputs.append(new_output("display_data", data=data))
+
+    IPython.display.display = display
+    variables: dict[str, Any] = {"display": display}
+    for cell in content.cells:
+        if cell.cell_type == "code":
+            source = "\n".join(line for line in cell.source.split("\n") if not line.startswith("%"))
+            exec(compile(source, path.name, "exec"), variables)
+            if "parameters" in cell.metadata.get("tags", []):
+                variables |= parameters
+    content.cells[-1].outputs = outputs
+    with write_atomic(output) as temporary:
+        nbformat.write(content, temporary)
+    return content, 1.0
+
+
+def run_in_child(manifest: Path, asked: dict[str, Any], tell: int, answer: int) -> None:
+    """Run a manifest, and write the number of operations to the file descriptor `answer`."""
+    os.setsid()
+    log = os.open(manifest.with_suffix(".log"), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    os.dup2(log, 1)
+    os.dup2(log, 2)
+    events = Events(manifest.parent / manifest.stem, asked.get("stage"), asked.get("event", 0), tell)
+    pipeline.execute = lambda *arguments: execute_cells(events, *arguments)
+    pipeline.run(manifest)
+    os.write(answer, json.dumps(events.counts).encode())
+
+
+def attempt(manifest: Path, asked: dict[str, Any]) -> dict[str, Any]:
+    """Run a manifest in a process of its own, and kill that at the moment asked for."""
+    (told, tell), (result, answer) = os.pipe(), os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            run_in_child(manifest, asked, tell, answer)
+            os._exit(0)
+        except BaseException:
+            import traceback
+
+            traceback.print_exc()
+            os._exit(1)
+    os.close(tell)
+    os.close(answer)
+    select.select([told], [], [])
+    stopped = os.read(told, 1) == b"!"  # else it has ended
+    if stopped:
+        time.sleep(asked["delay_s"])
+        os.kill(child, asked["signal"])
+    counts = os.read(result, 1 << 16)
+    _, status = os.waitpid(child, 0)
+    os.close(told)
+    os.close(result)
+    return {"stopped": stopped, "status": status, "events": json.loads(counts or b"{}")}
+
+
+if __name__ == "__main__":
+    import matplotlib as mpl
+    import matplotlib.pyplot
+
+    mpl.use("Agg")
+    for line in sys.stdin:
+        print(json.dumps(attempt(Path(sys.argv[1]), json.loads(line))), flush=True)
