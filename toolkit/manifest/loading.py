@@ -1,5 +1,6 @@
 """Read a manifest: inheritance, paths and variables, `--set`."""
 
+import itertools
 import os
 import re
 from collections.abc import Callable, Iterable
@@ -13,6 +14,9 @@ from toolkit.errors import ManifestError
 from toolkit.manifest.manifest import Manifest
 from toolkit.manifest.messages import explain
 from toolkit.manifest.settings import expand, merge
+
+MOST_VALUES = 100_000
+"""A manifest of more values is no manifest, but aliases of aliases that fill the memory."""
 
 
 def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
@@ -110,20 +114,50 @@ def _anchor(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _read_yaml(path: Path, heir: Path | None = None) -> dict[str, Any]:
+    asked = f"{heir}: inherits {path}" if heir else f"{path}"
     try:
-        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
+        raw = _parse_yaml(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         if heir:
             raise ManifestError(f"{heir}: inherits {path}, and there is no such file. Correct `inherits`.") from None
         raise ManifestError(f"{path}: no such manifest. data_manifests/demo.yaml is an example.") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise ManifestError(f"{path}: cannot be read as a text file ({error}).") from None
+        raise ManifestError(f"{asked}: cannot be read as a text file ({error}).") from None
     except yaml.YAMLError as error:
         text = str(error).replace('"<unicode string>"', str(path))
-        raise ManifestError(f"{path}: not valid YAML. {text}") from None
+        raise ManifestError(f"{asked}: not valid YAML. {text}") from None
     if not isinstance(raw, dict):
         raise ManifestError(f"{path}: found {type(raw).__name__}, expected `key: value` lines.")
     return raw
+
+
+def _parse_yaml(text: str) -> Any:
+    """Return what a YAML text holds.
+
+    Raises:
+        yaml.YAMLError: it is not valid, or is far larger than it looks: aliases of aliases, or of what they stand in.
+    """
+    loader = yaml.SafeLoader(text)
+    try:
+        node = loader.get_single_node()
+        if node is None:
+            return None
+        if _size(node, {}) > MOST_VALUES:
+            raise yaml.YAMLError(f"Its aliases stand for more than {MOST_VALUES:,} values.")
+        return loader.construct_document(node)
+    except RecursionError:
+        raise yaml.YAMLError("It is nested too deeply, or an alias stands within what it stands for.") from None
+    except (ValueError, LookupError, AttributeError, TypeError) as error:  # 2024-99-99, or !!int of no number
+        raise yaml.YAMLError(f"A value is not of the type that it seems to have ({error}).") from None
+
+
+def _size(node: yaml.Node, known: dict[int, int]) -> int:
+    """Return how many values a node stands for; `known` has it for nodes that were counted, by their id."""
+    if id(node) not in known:
+        parts = node.value if isinstance(node, yaml.CollectionNode) else []
+        children = itertools.chain.from_iterable(part if isinstance(part, tuple) else (part,) for part in parts)
+        known[id(node)] = 1 + sum(_size(child, known) for child in children)
+    return known[id(node)]
 
 
 def _read_override(override: str) -> dict[str, Any]:
@@ -132,7 +166,7 @@ def _read_override(override: str) -> dict[str, Any]:
     if not equals or not key.strip():
         raise ManifestError(f"--set {override}: expected key=value, for example localize.method=nearest.")
     try:
-        value = yaml.safe_load(text)
+        value = _parse_yaml(text)
     except yaml.YAMLError as error:
         raise ManifestError(f"--set {override}: the value is not valid YAML. {error}") from None
     for section in reversed(key.strip().split(".")):
@@ -158,4 +192,10 @@ def _expand(text: str, folder: Path, where: str) -> Path:
             f"{where}: {text!r} uses the variable ${unset[1]}, which is not set. "
             f"Set it (export {unset[1]}=...) or write the folder itself."
         )
-    return Path(os.path.normpath(folder / Path(expanded).expanduser()))
+    try:
+        path = Path(expanded).expanduser()
+    except RuntimeError:
+        raise ManifestError(f"{where}: {text!r}: there is no such user here. Write the folder itself.") from None
+    if "\0" in expanded:
+        raise ManifestError(f"{where}: {text!r} is no path: it has a zero byte in it.")
+    return Path(os.path.normpath(folder / path))
