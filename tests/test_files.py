@@ -184,7 +184,8 @@ def test_what_killed_writers_left_is_swept_and_nothing_else(tmp_path: Path) -> N
         "import os, sys; from toolkit.files import write_atomic\n"
         "with write_atomic(sys.argv[1]) as t:\n    os.kill(os.getpid(), 9)"
     )
-    subprocess.run([sys.executable, "-c", script, str(tmp_path / "deep" / "a.txt")], cwd=Path(files.__file__).parents[1], check=False)
+    command = [sys.executable, "-c", script, str(tmp_path / "deep" / "a.txt")]
+    subprocess.run(command, cwd=Path(files.__file__).parents[1], check=False)
     assert len(list((tmp_path / "deep").iterdir())) == 1
     with files.write_atomic(tmp_path / "deep" / "b.txt") as temporary:
         (tmp_path / ".mine.partial").touch()

@@ -223,7 +223,7 @@ def read_references(path: str | Path, *needed: str) -> list[dict[str, Any]]:
             f"No references: {path} is missing. Run the retrieve stage first "
             "(python -m toolkit run MANIFEST --only retrieve)."
         ) from None
-    except (ValueError, TypeError, OverflowError) as error:
+    except (ValueError, TypeError, OverflowError, RecursionError) as error:
         raise ArtifactError(f"{path}, line {number}: not a retrieval row ({error}). Retrieve again.") from None
     return rows
 

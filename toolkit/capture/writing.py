@@ -41,7 +41,8 @@ def write_session(
         ground_truth: goes to proc/alignment_trajectories.txt.
 
     Raises:
-        ValueError: a value has a comma or line break, which the format cannot hold.
+        ValueError: a value that the format cannot hold: with a comma, a line break or spaces at an end, or # at the
+            start of a line.
     """
     path = Path(path)
     write_table(path / "sensors.txt", "sensor_id, name, sensor_type, [sensor_params]+", map(_line, sensors))
@@ -73,8 +74,10 @@ def _line(values: Sequence[Any]) -> str:
     # repr of a float is the shortest text that reads back as the same number
     texts = [repr(float(value)) if isinstance(value, float) else str(value) for value in values]
     for text in texts:
-        if "," in text or "\n" in text:
-            raise ValueError(f"The capture format cannot hold a comma or line break: {text!r}.")
+        if "," in text or "\n" in text or text != text.strip(" \t\r\v\f"):
+            raise ValueError(f"The capture format cannot hold a comma, a line break or spaces at an end: {text!r}.")
+    if texts[0].startswith("#"):
+        raise ValueError(f"A line of the capture format that starts with # is a comment: {texts[0]!r}.")
     return ", ".join(texts)
 
 
