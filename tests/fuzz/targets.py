@@ -30,6 +30,7 @@ from toolkit.files import read_references
 from toolkit.localizers.correspondences import Correspondences, LocalizedQueries, LocalizedQuery
 from toolkit.manifest import load_manifest
 
+
 @dataclass(frozen=True)
 class Target:
     """A kind of files."""
