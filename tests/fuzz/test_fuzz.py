@@ -11,7 +11,7 @@ from tests.conftest import REPOSITORY
 from tests.fuzz.targets import TARGETS, found_inputs
 
 
-@pytest.mark.parametrize(("target", "path"), found_inputs(), ids=lambda value: getattr(value, "name", value))
+@pytest.mark.parametrize(("target", "path"), list(found_inputs()), ids=lambda value: getattr(value, "name", value))
 def test_what_was_found_is_mended(target: str, path: Path) -> None:
     TARGETS[target].check(path.read_bytes())
 

@@ -12,6 +12,8 @@ params` (params separated by spaces) are the camera itself. Columns may stand in
 import os
 import re
 import shutil
+import subprocess
+import sys
 import tempfile
 from collections import Counter
 from collections.abc import Mapping
@@ -36,6 +38,8 @@ SUBSESSION = "import"
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 POSE_DIRECTIONS = ("world_from_cam", "cam_from_world")
 PLACING = ("link", "copy")
+PROBE_S = 3600
+"""How long COLMAP may take to read a model; one of a million images takes minutes."""
 _CAMERA_COLUMNS = ("model", "width", "height", "params")
 
 
@@ -308,18 +312,43 @@ def _start(capture: str | Path, device: str, split: str, folder: Path, placing: 
     return _Draft(session, folder, placing)
 
 
+_PROBE = """
+import os, sys, pycolmap
+size = sum(entry.stat().st_size for entry in os.scandir(sys.argv[1]))
+if sys.platform == "linux":
+    import resource
+    used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + (1 << 30) + 50 * size,) * 2)
+try:
+    model = pycolmap.Reconstruction(sys.argv[1])
+    [image.cam_from_world() for image in model.images.values() if image.has_pose]
+except MemoryError:
+    sys.exit("a file is damaged: it asks for more memory than its size can mean")
+except Exception as error:
+    sys.exit(str(error) or type(error).__name__)
+"""
+
+
 def _read_model(folder: Path) -> pycolmap.Reconstruction:
+    """Read a model. A process of its own tries first: COLMAP ends the process, or fills the memory, at damaged files."""
+    if not folder.is_dir():
+        raise CaptureError(f"{folder}: no such folder. Expected one with a COLMAP model.")
+    for path in folder.glob("*.bin"):
+        if path.stat().st_size < 8:
+            raise CaptureError(f"{path}: no part of a COLMAP model: it is cut short. Export the model again.")
     try:
-        for path in folder.glob("*.bin"):
-            if path.stat().st_size < 8:  # else COLMAP takes what is not there for the count, and reserves terabytes
-                raise ValueError(f"{path.name} is cut short")
-        return pycolmap.Reconstruction(str(folder))
-    except (ValueError, RuntimeError, MemoryError) as error:  # the last where a file is cut short
-        reason = str(error).strip().split("\n")[0]
+        tried = subprocess.run(
+            [sys.executable, "-c", _PROBE, str(folder)], capture_output=True, timeout=PROBE_S, check=False
+        )
+        said = [line for line in tried.stderr.decode(errors="replace").split("\n") if line.strip(" *")]
+        reason = said[0].strip()[:300] if said else f"COLMAP ended with status {tried.returncode}"
+    except subprocess.TimeoutExpired:
+        tried, reason = None, f"COLMAP was not done with it after {PROBE_S} s"
+    if tried is None or tried.returncode:
         raise CaptureError(
-            f"{folder}: no COLMAP model can be read here ({reason}). Expected cameras, images, points3D as .bin or "
-            ".txt."
-        ) from None
+            f"{folder}: no COLMAP model can be read here ({reason}). Expected cameras, images, points3D as .bin or .txt."
+        )
+    return pycolmap.Reconstruction(str(folder))
 
 
 # Cameras
