@@ -330,7 +330,7 @@ except Exception as error:
 
 
 def _read_model(folder: Path) -> pycolmap.Reconstruction:
-    """Read a model. A process of its own tries first: COLMAP ends the process, or fills the memory, at damaged files."""
+    """Read a model, first in a process of its own: at damaged files COLMAP ends the process, or fills the memory."""
     if not folder.is_dir():
         raise CaptureError(f"{folder}: no such folder. Expected one with a COLMAP model.")
     for path in folder.glob("*.bin"):
@@ -346,7 +346,8 @@ def _read_model(folder: Path) -> pycolmap.Reconstruction:
         tried, reason = None, f"COLMAP was not done with it after {PROBE_S} s"
     if tried is None or tried.returncode:
         raise CaptureError(
-            f"{folder}: no COLMAP model can be read here ({reason}). Expected cameras, images, points3D as .bin or .txt."
+            f"{folder}: no COLMAP model can be read here ({reason}). Expected cameras, images, points3D as .bin or "
+            ".txt."
         )
     return pycolmap.Reconstruction(str(folder))
 
