@@ -69,7 +69,7 @@ def test_an_image_of_one_pixel_is_an_image(size: tuple[int, int], tmp_path: Path
 
 @pytest.mark.parametrize(
     "content",
-    [b"GIF89a", b"\x89PNG\r\n\x1a\n", b"RIFF\x10\0\0\0WEBPVP8 ", b"II*\0\x08\0\0\0", b"BM", b"P6 9 9 255\n", b"\0" * 999,
+    [b"GIF89a", b"\x89PNG\r\n", b"RIFF\x10\0\0\0WEBPVP8 ", b"II*\0\x08\0\0\0", b"BM", b"P6 9 9 255\n", b"\0" * 999,
      encoded(gray(), "PNG")[8:], encoded(gray(), "PNG").replace(b"IDAT", b"XDAT")],
 )  # fmt: skip
 def test_a_beginning_of_an_image_is_none(content: bytes, tmp_path: Path) -> None:
