@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from toolkit import files
+from toolkit.errors import ArtifactError
 
 
 def test_a_failing_writer_leaves_the_old_file_and_no_litter(tmp_path: Path) -> None:
@@ -166,6 +167,72 @@ def test_a_record_of_another_version_is_not_current(tmp_path: Path) -> None:
     record = json.loads(files.sidecar_path(path).read_text())
     assert record["settings"] == {"a": 1}
     files.sidecar_path(path).write_text(json.dumps(record | {"version": "0.0.0"}))
+    assert not files.is_current(path, {"a": 1})
+
+
+def flip(path: Path) -> None:
+    """Change one bit; size and time of change stay."""
+    data, state = bytearray(path.read_bytes()), path.stat()
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    os.utime(path, ns=(state.st_atime_ns, state.st_mtime_ns))
+    files._checksum.cache_clear()  # clocks of file systems are coarse
+
+
+@pytest.mark.parametrize("which", ["a.npy", "a.csv"])
+def test_an_artifact_is_current_only_as_it_was_written(
+    tmp_path: Path, which: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    path, table = tmp_path / "a.npy", tmp_path / "a.csv"
+    path.write_bytes(b"vectors")
+    table.write_text("rows")
+    files.write_sidecar(path, {"a": 1}, [table])
+    assert files.is_current(path, {"a": 1})
+    files.require_whole(path)
+    files.require_whole(table, of=path)
+    flip(tmp_path / which)
+    assert not files.is_current(path, {"a": 1})
+    assert f"{tmp_path / which} is damaged (its content" in caplog.text
+    with pytest.raises(ArtifactError, match=rf"{which} is damaged.*delete .*a\.npy\.meta\.json"):
+        files.require_whole(tmp_path / which, of=path)
+    other = path if which == "a.csv" else table
+    files.require_whole(other, of=path)
+    (tmp_path / which).unlink()
+    assert not files.is_current(path, {"a": 1})
+    files.sidecar_path(path).unlink()
+    files.require_whole(other, of=path)  # another tool's
+
+
+def test_a_file_is_read_once_for_its_checksum(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"x" * 100)
+    files._checksum.cache_clear()
+    assert files.checksum(path) == files.checksum(path)
+    assert files._checksum.cache_info().misses == 1
+    path.write_bytes(b"x" * 101)
+    files.checksum(path)
+    assert files._checksum.cache_info().misses == 2
+
+
+def test_what_is_unfinished_is_used_but_not_reused(tmp_path: Path) -> None:
+    path = tmp_path / "poses" / "map_a.txt"
+    files.write_text(path, "x")
+    assert not files.any_unfinished(tmp_path)
+    files.write_sidecar(path, {"a": 1}, unfinished=True)
+    files.require_whole(path)
+    assert not files.is_current(path, {"a": 1})
+    assert files.any_unfinished(tmp_path)
+    assert files.any_unfinished(tmp_path, "map_a")
+    assert not files.any_unfinished(tmp_path, "map_b")
+
+
+@pytest.mark.parametrize("found", [{}, {"../a": [1, None]}, {"a": 3}, ["a"], {"a": ["1", 2]}, {"a": [None, None]}])
+def test_a_record_with_other_files_than_its_own_is_damaged(tmp_path: Path, found: object) -> None:
+    path = tmp_path / "a"
+    path.write_text("x")
+    files.write_sidecar(path, {"a": 1})
+    record = json.loads(files.sidecar_path(path).read_text()) | {"files": found}
+    files.sidecar_path(path).write_text(json.dumps(record))
     assert not files.is_current(path, {"a": 1})
 
 

@@ -2,19 +2,24 @@
 
 import hashlib
 import json
+import logging
 import os
 import platform
 import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
+import xxhash
+
 from toolkit import __version__
 from toolkit.errors import ArtifactError
+
+log = logging.getLogger(__name__)
 
 
 @contextmanager
@@ -89,40 +94,135 @@ def files_fingerprint(paths: list[Path]) -> str:
     return fingerprint(rows)
 
 
+def checksum(path: str | Path) -> str:
+    """Return the XXH3 of a file's content, 32 hex digits; a process reads each state of a file once.
+
+    It tells damage from what was written, at the speed of memory; it is no protection against intent.
+    """
+    stat = os.stat(path)  # noqa: PTH116 - the key of a cache, asked for often
+    return _checksum(str(path), stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns)
+
+
+@lru_cache(maxsize=1 << 16)
+def _checksum(path: str, *state: int) -> str:
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, xxhash.xxh3_128).hexdigest()
+
+
 def sidecar_path(path: str | Path) -> Path:
     """Return where the record of what an artifact was made from is kept: `<name>.meta.json` beside it."""
     path = Path(path)
     return path.with_name(path.name + ".meta.json")
 
 
-def write_sidecar(path: str | Path, settings: dict[str, Any]) -> None:
-    """Record the settings and inputs that the artifact `path` was made from.
+def write_sidecar(
+    path: str | Path,
+    settings: dict[str, Any],
+    others: Iterable[str | Path] = (),
+    *,
+    checksums: bool = True,
+    unfinished: bool = False,
+) -> None:
+    """Record the settings and inputs that the artifact `path` was made from, and what its content is.
 
     Call it after the artifact stands: an artifact without a matching record is made again.
+
+    Args:
+        others: further files beside it that are part of the artifact.
+        checksums: False for a file that has checksums of its parts in itself; its size is recorded.
+        unfinished: something of the artifact is to be tried again: it is there to be used, but not reused.
     """
-    size = Path(path).stat().st_size
-    record = {"version": __version__, "fingerprint": fingerprint(settings), "bytes": size, "settings": settings}
+    files = [Path(path), *map(Path, others)]
+    record = {
+        "version": __version__,
+        "fingerprint": fingerprint(settings),
+        "files": {file.name: [file.stat().st_size, checksum(file) if checksums else None] for file in files},
+        **({"unfinished": True} if unfinished else {}),
+        "settings": settings,
+    }
     write_text(sidecar_path(path), json.dumps(record, indent=1, default=_jsonable) + "\n")
 
 
 def read_sidecar(path: str | Path) -> dict[str, Any] | None:
-    """Return the settings that the artifact `path` was made from; None unless it is whole and of this version."""
-    try:
-        record = json.loads(sidecar_path(path).read_text(encoding="utf-8"))
-        current = {"version": __version__, "bytes": Path(path).stat().st_size}
-    except (OSError, ValueError):
-        return None
-    if not isinstance(record, dict) or any(record.get(key) != value for key, value in current.items()):
-        return None
+    """Return the settings that the artifact `path` was made from; None unless it is whole and of this version.
+
+    A warning says what of it is damaged or missing.
+    """
+    record = _read_record(path)
     settings = record.get("settings")
-    whole = isinstance(settings, dict) and record.get("fingerprint") == fingerprint(settings)
-    return settings if whole else None
+    if record.get("version") != __version__ or record.get("unfinished") or not isinstance(settings, dict):
+        return None
+    if not record.get("files"):  # of a toolkit that kept no checksums
+        return None
+    damage = _damage(path, record)
+    if not damage and record.get("fingerprint") != fingerprint(settings):
+        damage = f"{sidecar_path(path)} is damaged"
+    if damage:
+        log.warning("%s: not reused.", damage)
+    return None if damage else settings
 
 
 def is_current(path: str | Path, settings: dict[str, Any]) -> bool:
     """Tell whether the artifact `path` is whole and was made by this version from exactly these settings."""
+    wanted = fingerprint(settings)
+    if _read_record(path).get("fingerprint") != wanted:  # before its content is read
+        return False
     found = read_sidecar(path)
-    return found is not None and fingerprint(found) == fingerprint(settings)
+    return found is not None and fingerprint(found) == wanted
+
+
+def require_whole(path: str | Path, of: str | Path | None = None) -> None:
+    """Refuse a file that is not as its record says that it was written; one without a record is another tool's.
+
+    Args:
+        of: the artifact that the file is part of, where that has the record.
+
+    Raises:
+        ArtifactError: what is damaged, and what to do.
+    """
+    artifact = Path(of or path)
+    if damage := _damage(artifact, _read_record(artifact), Path(path).name):
+        raise ArtifactError(
+            f"{damage}. Run the stage that makes it again. If it was changed on purpose, delete "
+            f"{sidecar_path(artifact)}: it is then taken as it is."
+        )
+
+
+def any_unfinished(folder: str | Path, part: str = "") -> bool:
+    """Tell whether artifacts below a folder, those that have `part` in their path, hold what is to be tried again."""
+    records = (path for path in Path(folder).rglob("*.meta.json") if part in path.relative_to(folder).as_posix())
+    return any(_read_record(path.with_name(path.name.removesuffix(".meta.json"))).get("unfinished") for path in records)
+
+
+def _read_record(path: str | Path) -> dict[str, Any]:
+    try:
+        record = json.loads(sidecar_path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        log.warning("%s cannot be read (%s): %s is not reused.", sidecar_path(path), error, path)
+        return {}
+    return record if isinstance(record, dict) else {}
+
+
+def _damage(path: str | Path, record: dict[str, Any], only: str | None = None) -> str:
+    """Return what is wrong with the files of an artifact, or with the one named `only`; empty: nothing."""
+    try:
+        for name, (size, expected) in record.get("files", {}).items():
+            file = Path(path).with_name(name)
+            if only not in (None, name):
+                continue
+            if not file.is_file():
+                return f"{file} is missing"
+            if (found := file.stat().st_size) != size:
+                return f"{file} is damaged ({found} bytes; {size} were written)"
+            if expected is not None and checksum(file) != expected:
+                return f"{file} is damaged (its content is not what was written)"
+    except OSError as error:
+        return f"{error.filename or path} cannot be read ({error.strerror})"
+    except (ValueError, TypeError, AttributeError):
+        return f"{sidecar_path(path)} is damaged"
+    return ""
 
 
 def _jsonable(value: Any) -> Any:
@@ -208,7 +308,7 @@ def read_references(path: str | Path, *needed: str) -> list[dict[str, Any]]:
         needed: further keys that each row must have.
 
     Raises:
-        ArtifactError: the file is missing, or a line of it is no such row.
+        ArtifactError: the file is missing or damaged, or a line of it is no such row.
     """
     rows: list[dict[str, Any]] = []
     keys, number = {"timestamp", "sensor_id", "topk", *needed}, 0
@@ -225,6 +325,7 @@ def read_references(path: str | Path, *needed: str) -> list[dict[str, Any]]:
         ) from None
     except (ValueError, TypeError, OverflowError, RecursionError) as error:
         raise ArtifactError(f"{path}, line {number}: not a retrieval row ({error}). Retrieve again.") from None
+    require_whole(path)
     return rows
 
 

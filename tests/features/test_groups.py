@@ -1,16 +1,19 @@
 """Files of groups: several writers at once, and files that are torn."""
 
 import logging
+import os
 import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
+from toolkit.errors import DamagedError
 from toolkit.features import groups
 from toolkit.features.groups import GroupWriter, read_index
 
@@ -183,3 +186,166 @@ def test_groups_made_by_something_else_are_replaced_without_a_warning(
         with h5py.File(path) as file:
             assert (list(file), file.attrs["by"]) == ([], made_by["name"]), "a file without groups is a file"
     assert not caplog.text
+
+
+def damage(path: Path, name: str) -> None:
+    """Change one byte of an array; size and time of change stay."""
+    stat = path.stat()
+    with h5py.File(path) as file:
+        place = file[name].id.get_offset()
+    with path.open("r+b") as stream:
+        stream.seek(place)
+        byte = stream.read(1)[0]
+        stream.seek(place)
+        stream.write(bytes([byte ^ 4]))
+    os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+
+
+def test_a_damaged_group_is_noticed_and_made_again_alone(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path, made = tmp_path / "file.h5", list[str]()
+
+    @groups.heals
+    def stage() -> dict[str, list[float]]:
+        with GroupWriter(path, MADE_BY, {"by": "us"}) as writer:
+            todo = [name for name in ("a/x", "a/y", "b") if name not in writer.notes()]
+            for name in todo:
+                writer.add(name, arrays={"values": np.arange(3.0)}, note=name)
+            made.extend(todo)
+            writer.finish()
+        with h5py.File(path) as file:
+            return {name: groups.read_group(file, name)["values"].tolist() for name in ("a/x", "a/y", "b")}
+
+    first = stage()
+    damage(path, "a/y/values")
+    made.clear()
+    assert stage() == first
+    assert made == ["a/y"]
+    assert f"{path}: 1 of 3 groups are damaged, first a/y" in caplog.text
+    with h5py.File(path) as file:
+        assert file.attrs["by"] == "us"
+    made.clear()
+    assert stage() == first
+    assert made == []
+
+
+def test_damage_that_comes_back_is_an_error(tmp_path: Path) -> None:
+    path = tmp_path / "file.h5"
+    with GroupWriter(path, MADE_BY) as writer:
+        add(writer, "a", "b")
+        writer.finish()
+
+    @groups.heals
+    def stage() -> None:
+        with h5py.File(path) as file:
+            groups.read_group(file, "a")
+
+    damage(path, "a/values")
+    with pytest.raises(DamagedError, match="damaged at a"):  # forgotten, and not made again
+        stage()
+    with h5py.File(tmp_path / "theirs.h5", "w") as file:
+        file["a"] = 1
+    path = tmp_path / "theirs.h5"
+    with pytest.raises(DamagedError, match=r"theirs\.h5"):
+        stage()
+    assert path.exists(), "no run made it, so no run touches it"
+
+
+def test_any_array_comes_back_with_its_checksum(tmp_path: Path) -> None:
+    arrays = {
+        "empty": np.zeros((0, 2), np.float32), "number": np.array(3), "half": np.ones(3, np.float16),
+        "flags": np.array([True, False]), "texts": np.array(["ä", ""], object).astype(h5py.string_dtype()),
+        "strided": np.arange(12).reshape(3, 4)[:, ::2],
+    }  # fmt: skip
+    path = tmp_path / "file.h5"
+    with GroupWriter(path, MADE_BY) as writer:
+        writer.add("a", arrays=arrays)
+        writer.finish()
+    with h5py.File(path) as file:
+        found = groups.read_group(file, "a")
+    assert found.keys() == arrays.keys()
+    assert found["texts"].tolist() == ["ä".encode(), b""]
+    for name in arrays.keys() - {"texts"}:
+        np.testing.assert_array_equal(found[name], arrays[name])
+        assert found[name].dtype == arrays[name].dtype
+
+
+def external(file: h5py.File) -> None:
+    file["a/values"] = h5py.ExternalLink("other.h5", "/secret")
+
+
+def soft(file: h5py.File) -> None:
+    file["secret"] = np.arange(3)
+    file["a/values"] = h5py.SoftLink("/secret")
+
+
+def linked_group(file: h5py.File) -> None:
+    file["a"] = h5py.ExternalLink("other.h5", "/")
+
+
+def external_storage(file: h5py.File) -> None:
+    file.create_dataset("a/values", (3,), "u1", external=[("other.h5", 0, 3)])
+
+
+def virtual(file: h5py.File) -> None:
+    layout = h5py.VirtualLayout((3,), "i8")
+    layout[:] = h5py.VirtualSource("other.h5", "secret", (3,))
+    file.create_virtual_dataset("a/values", layout)
+
+
+def huge(file: h5py.File) -> None:
+    file.create_dataset("a/values", (1 << 40, 1 << 20), "f4", chunks=(1024, 1024))
+
+
+def many(file: h5py.File) -> None:
+    for number in range(20):
+        file.create_dataset(f"a/{number}", (1 << 20,), "f4", chunks=(1024,))
+
+
+def texts(file: h5py.File) -> None:
+    file.create_dataset("a/values", (1 << 20,), h5py.string_dtype())
+
+
+def compound(file: h5py.File) -> None:
+    file["a/values"] = np.zeros(3, [("x", "f4"), ("y", "i8")])
+
+
+def references(file: h5py.File) -> None:
+    file.create_dataset("a/values", data=[file.ref], dtype=h5py.ref_dtype)
+
+
+def ragged(file: h5py.File) -> None:
+    file.create_dataset("a/values", (3,), h5py.vlen_dtype(np.int64))
+
+
+def nothing(file: h5py.File) -> None:
+    file["a/values"] = h5py.Empty("f4")
+
+
+def array_instead_of_group(file: h5py.File) -> None:
+    file["a"] = np.zeros(3)
+
+
+@pytest.mark.parametrize("make", [
+    external, soft, linked_group, external_storage, virtual, huge, many, texts, compound, references, ragged, nothing,
+    array_instead_of_group,
+])  # fmt: skip
+def test_what_a_group_must_not_be_is_refused_by_name(tmp_path: Path, make: Callable[[h5py.File], None]) -> None:
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["secret"] = np.arange(3)
+    with h5py.File(tmp_path / "file.h5", "w", libver="latest") as file:
+        make(file)
+    with h5py.File(tmp_path / "file.h5") as file:
+        assert groups.has_group(file, "a")
+        with pytest.raises(DamagedError, match=r"file\.h5 is damaged at a "):
+            groups.read_group(file, "a")
+
+
+def test_names_of_groups_are_found_without_following_links(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "file.h5", "w", libver="latest") as file:
+        file["x/y/1.jpg/keypoints"] = np.zeros((3, 2))
+        file["x/0.jpg/keypoints"] = np.zeros((3, 2))
+        file["x/self"] = file["x"]
+        file["out"] = h5py.ExternalLink("other.h5", "/")
+        file["/".join(["deep"] * 3000)] = np.zeros(3)
+    with h5py.File(tmp_path / "file.h5") as file:
+        assert groups.group_names_of(file, "keypoints") == ["x/0.jpg", "x/y/1.jpg"]

@@ -94,5 +94,5 @@ def test_a_missing_torn_or_incomplete_file_says_what_to_do(stored: LocalizedQuer
         LocalizedQueries(torn)
     with h5py.File(stored.path, "a") as file:
         del file["5/phone/references"]
-    with pytest.raises(ArtifactError, match=r"pair\.h5 is damaged at 5/phone.*Localize again"):
+    with pytest.raises(ArtifactError, match=r"pair\.h5 is damaged at 5/phone.*run its stage again"):
         LocalizedQueries(stored.path)[5, "phone"]

@@ -3,25 +3,41 @@
 HDF5 itself is not: a file that was open for writing when its writer died cannot be read. So a run writes what it makes
 to hidden parts, each of which is complete or absent, and joins them to the file when it ends; the next run takes up the
 parts that a stopped run left. The record beside the file tells for each group what it was made from.
+
+Each group has a checksum, which is verified when the group is read: a file may be too large to be read at every start.
+What turns out to be damaged is made again, see `heals`.
 """
 
 import logging
+import math
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, field
+from functools import wraps
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import h5py
+import numpy as np
+import xxhash
 from filelock import FileLock, Timeout
 from numpy.typing import NDArray
 
+from toolkit.errors import DamagedError, first_line
 from toolkit.files import fingerprint, read_sidecar, sidecar_path, write_atomic, write_sidecar
 
 log = logging.getLogger(__name__)
+
+HDF5_ERRORS = (OSError, RuntimeError, LookupError, ValueError, TypeError, OverflowError)
+"""What HDF5 and h5py raise where a file is torn, of another format, or holds what numpy cannot."""
+CHECKSUM = b"xxh3"
+"""Attribute of a group: XXH3 of its name and its arrays. Files of other tools have none."""
+MOST_BYTES = 1 << 26
+MOST_TEXTS = 1 << 12
+"""Memory for the arrays of a group, bytes: at most this or the size of the file; and texts in an array of them."""
 
 PART_GROUPS = 64
 PART_SECONDS = 5.0
@@ -49,6 +65,159 @@ class Index:
         self.notes |= later.notes
 
 
+def read_group(file: h5py.File, name: str) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a group, of this toolkit's files or of another's.
+
+    Memory is taken only for what can be in the file: numbers and texts that it has itself, under its own names. A few
+    bytes could ask for more memory than there is, or for the content of other files.
+
+    Raises:
+        DamagedError: the file has no such group, or it is not what was written.
+    """
+    # By h5py's lower layer: the upper one takes twice as long, and there are as many groups as pairs of images.
+    try:
+        group = _open_owned(file.id, name.encode())
+        if not isinstance(group, h5py.h5g.GroupID):
+            raise ValueError("it is no group")
+        room, arrays = max(MOST_BYTES, file.id.get_filesize()), dict[str, NDArray[Any]]()
+        for key in group:
+            item = _open_owned(group, key)
+            if isinstance(item, h5py.h5d.DatasetID):
+                room -= _bytes_of(item)
+                if room < 0:
+                    raise ValueError(f"{key.decode()} of shape {item.shape} is larger than the file")
+                arrays[key.decode()] = h5py.Dataset(item)[()] if item.dtype.kind == "O" else _read(item)
+        if h5py.h5a.exists(group, CHECKSUM):
+            expected = np.zeros((), np.uint64)
+            h5py.h5a.open(group, CHECKSUM).read(expected)
+            if int(expected) != group_checksum(name, arrays):
+                raise ValueError("its content is not what was written")
+    except HDF5_ERRORS as error:
+        raise DamagedError(
+            Path(file.filename),
+            f"{file.filename} is damaged at {name} ({first_line(error)}). If a run made it, run its stage again with "
+            "--force: what is damaged is made again.",
+        ) from None
+    return arrays
+
+
+def _open_owned(place: Any, name: bytes) -> Any:
+    """Return what a file or a group has under a name; refuses links to other places and other files."""
+    for prefix in _prefixes(name):
+        if place.links.get_info(prefix).type != h5py.h5l.TYPE_HARD:
+            raise ValueError(f"{prefix.decode()} is a link to elsewhere")
+    return h5py.h5o.open(place, name)
+
+
+def _prefixes(name: bytes) -> Iterator[bytes]:
+    """Yield a/b/c as a, a/b, a/b/c."""
+    end = name.find(b"/")
+    while end >= 0:
+        yield name[:end]
+        end = name.find(b"/", end + 1)
+    yield name
+
+
+def _bytes_of(item: Any) -> int:
+    """Return the memory that an array of numbers or texts takes; refuses other types, and data that lie elsewhere."""
+    made = item.get_create_plist()
+    if made.get_layout() == h5py.h5d.VIRTUAL or made.get_external_count():
+        raise ValueError("its data are in another file")
+    kind, shape = item.dtype, item.shape
+    count = math.prod(shape or ())
+    if h5py.check_string_dtype(kind) is not None:
+        if count > MOST_TEXTS:
+            raise ValueError(f"it has {count} texts in an array; expected at most {MOST_TEXTS}")
+    elif shape is None or kind.kind not in "biuf":
+        raise ValueError(f"it has an array of the type {kind}; expected numbers or texts")
+    return int(count * kind.itemsize)
+
+
+def _read(item: Any) -> NDArray[Any]:
+    array = np.empty(item.shape, item.dtype)
+    item.read(h5py.h5s.ALL, h5py.h5s.ALL, array)
+    return array
+
+
+def group_names_of(file: h5py.File, array: str) -> list[str]:
+    """Return the names of the groups that hold an array of this name, in the order of names; links are not followed."""
+    names, seen, stack = list[str](), set[Any](), [""]
+    while stack:
+        name = stack.pop()
+        group = file[name or "/"]
+        if not isinstance(group, h5py.Group) or (place := h5py.h5o.get_info(group.id).addr) in seen:
+            continue
+        seen.add(place)
+        if name and array in group:
+            names.append(name)
+        links = group.id.links
+        below = [key for key in group if links.get_info(key.encode()).type == h5py.h5l.TYPE_HARD]
+        stack += [f"{name}/{key}".lstrip("/") for key in reversed(below) if key != array]
+    return names
+
+
+def has_group(file: h5py.File, name: str) -> bool:
+    """Tell whether a file has something under a name, without following links to elsewhere."""
+    links = file.id.links
+    try:
+        for prefix in _prefixes(name.encode()):
+            if not links.exists(prefix):
+                return False
+            if links.get_info(prefix).type != h5py.h5l.TYPE_HARD:
+                break
+    except HDF5_ERRORS:
+        return True  # refused when it is read, as such a link is
+    return True
+
+
+def group_checksum(name: str, arrays: Mapping[str, Any]) -> int:
+    """Return the XXH3 of a group, 64 bits; texts count as their UTF-8."""
+    digest = xxhash.xxh3_64(name.encode())
+    for key in sorted(arrays):
+        array = np.asarray(arrays[key])
+        digest.update(f"\0{key}\0{array.dtype.str}{array.shape}".encode())
+        if array.dtype.kind == "O":
+            texts = (text if isinstance(text, bytes) else str(text).encode() for text in array.ravel())
+            digest.update(b"\0".join(texts))
+        else:
+            digest.update(np.ascontiguousarray(array).data)
+    return digest.intdigest()
+
+
+P = ParamSpec("P")
+Result = TypeVar("Result")
+
+
+def heals(stage: Callable[P, Result]) -> Callable[P, Result]:
+    """Make a stage start again where it meets damaged groups of a file that a run made; it goes on where it was.
+
+    The groups are forgotten, so that the stage makes them again, as if they had never been there.
+    """
+
+    @wraps(stage)
+    def run(*args: P.args, **kwargs: P.kwargs) -> Result:
+        met = set[Path]()
+        while True:
+            try:
+                return stage(*args, **kwargs)
+            except DamagedError as error:
+                if error.path in met or not forget_damaged(error.path):
+                    raise
+                met.add(error.path)
+
+    return run
+
+
+def forget_damaged(path: Path) -> bool:
+    """Forget the damaged groups of a file; False if no run made it, so that nothing would make them again."""
+    record = read_sidecar(path)
+    if record is None or "made_by" not in record:
+        return False
+    with GroupWriter(path, record["made_by"]) as writer:
+        writer.drop_damaged()
+    return True
+
+
 def read_index(path: Path, made_by: Mapping[str, Any]) -> Index | None:
     """Return what a file holds; None if it is absent, torn, or was made by other settings."""
     record = read_sidecar(path)
@@ -59,6 +228,12 @@ def read_index(path: Path, made_by: Mapping[str, Any]) -> Index | None:
             return Index(record["groups"], record["failed"], record.get("notes", {}))
     except (OSError, KeyError):
         return None
+
+
+def _is_of_another(path: Path, made_by: Mapping[str, Any]) -> bool:
+    """Tell whether a file is whole but made by other settings: it is replaced without a word."""
+    record = read_sidecar(path)
+    return record is not None and fingerprint(record.get("made_by")) != fingerprint(made_by)
 
 
 class GroupWriter:
@@ -84,7 +259,7 @@ class GroupWriter:
         self._locked, self._writing = ExitStack(), ExitStack()
         self._wait_for_others()
         self._whole = read_index(path, made_by)
-        if path.exists() and read_sidecar(path) is None:
+        if self._whole is None and path.exists() and not _is_of_another(path, made_by):
             log.warning("%s is torn, or of another version of the toolkit: what it held is made again.", path)
         for part in sorted(self._folder.glob("[!.]*.h5")):
             index = read_index(part, made_by)
@@ -130,6 +305,8 @@ class GroupWriter:
         group = file.create_group(name)
         for key, array in (arrays or {}).items():
             group[key] = array
+        checksum = h5py.h5a.create(group.id, CHECKSUM, h5py.h5t.NATIVE_UINT64, h5py.h5s.create(h5py.h5s.SCALAR))
+        checksum.write(np.array(group_checksum(name, arrays or {}), np.uint64))
         for key, values in (attributes or {}).items():
             group[key].attrs.update(values)
         index.groups[name] = made_from
@@ -153,7 +330,7 @@ class GroupWriter:
         for path, index in self._parts.items():
             with h5py.File(path, "r") as file:
                 for name in index.groups:
-                    yield name, {key: array[()] for key, array in file[name].items()}
+                    yield name, read_group(file, name)
 
     def finish(self) -> None:
         """Join all parts to the file; without any group the file is empty."""
@@ -161,8 +338,50 @@ class GroupWriter:
             self._part()
         self._close_part()
         if self._parts:
-            self._join()
+            try:
+                self._join()
+            except HDF5_ERRORS:
+                if self._whole is not None and self.drop_damaged():
+                    raise DamagedError(self.path, f"{self.path} was damaged. Run its stage again.") from None
+                raise
         self._remove_parts()
+
+    def drop_damaged(self) -> list[str]:
+        """Read all groups of the file, forget those that are damaged, and return their names."""
+        if self._whole is None:
+            return []
+        names = list(self._whole.groups)
+        try:
+            with h5py.File(self.path, "r") as source:
+                damaged = [name for name in names if not _is_whole(source, name)]
+        except HDF5_ERRORS:
+            damaged = names
+        if not damaged:
+            return []
+        log.warning("%s: %d of %d groups are damaged, first %s; they are made again.",
+                    self.path, len(damaged), len(names), damaged[0])  # fmt: skip
+        if damaged == names:
+            self._whole = None
+            for path in (self.path, sidecar_path(self.path)):
+                path.unlink(missing_ok=True)
+        else:
+            for name in damaged:
+                del self._whole.groups[name]
+                self._whole.notes.pop(name, None)
+            with (
+                write_atomic(self.path) as temporary,
+                h5py.File(temporary, "w", libver="latest") as file,
+                h5py.File(self.path, "r") as source,
+            ):
+                file.attrs.update(source.attrs)
+                for name in self._whole.groups:
+                    source.copy(name, file, name)
+            self._write_record(self._whole)
+        self.index = Index()
+        for index in (self._whole, *self._parts.values()):
+            if index is not None:
+                self.index.update(index)
+        return damaged
 
     def discard(self) -> None:
         """Forget all groups, also those of the file: `finish` replaces it by what is added from now on."""
@@ -197,9 +416,12 @@ class GroupWriter:
                     with h5py.File(part, "r") as source:
                         for name in index.groups:
                             source.copy(name, file, name)
-        write_sidecar(self.path, {"made_by": self._made_by, **asdict(joined)})
+        self._write_record(joined)
         self._whole, self.index = joined, joined
         self._parts = {}
+
+    def _write_record(self, index: Index) -> None:
+        write_sidecar(self.path, {"made_by": self._made_by, **asdict(index)}, checksums=False)
 
     def _wait_for_others(self) -> None:
         """Hold the file against other writers until the context ends. A killed process holds nothing."""
@@ -242,6 +464,14 @@ class GroupWriter:
             self._parts[path] = index
             self.index.update(index)
             self._part_closed = time.monotonic()
+
+
+def _is_whole(file: h5py.File, name: str) -> bool:
+    try:
+        read_group(file, name)
+    except DamagedError:
+        return False
+    return True
 
 
 def _remove_quietly(path: Path) -> None:

@@ -27,9 +27,9 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Session
 from toolkit.capture.images import prefetch, read_image
-from toolkit.errors import ArtifactError, ImageError
+from toolkit.errors import ArtifactError, DamagedError, ImageError, first_line
 from toolkit.features.features import DESCRIPTOR_SCALE, KINDS, Extractor, LocalFeatures, SiftExtractor, extract_turned
-from toolkit.features.groups import GroupWriter
+from toolkit.features.groups import HDF5_ERRORS, GroupWriter, group_names_of, has_group, read_group
 from toolkit.features.matching import Matcher, PairMatches
 from toolkit.files import files_fingerprint, fingerprint, read_sidecar
 from toolkit.geometry import Ints
@@ -48,8 +48,6 @@ _HALF_PIXEL = np.float32(0.5)
 _HALVES = (np.arange(256) / DESCRIPTOR_SCALE).astype(np.float16)
 _BYTES = np.zeros(1 << 16, np.uint8)
 _BYTES[_HALVES.view(np.uint16)] = np.arange(256)
-# What HDF5 raises where a file is torn or of another format.
-_HDF5_ERRORS = (OSError, RuntimeError, KeyError)
 
 
 def features_path(out: str | Path, session_id: str, settings: Mapping[str, Any]) -> Path:
@@ -86,10 +84,17 @@ def _from_arrays(arrays: Mapping[str, NDArray[Any]], offset: np.float32, quantiz
     keypoints = arrays["keypoints"].astype(np.float32, copy=False) + offset
     descriptors, (width, height) = arrays["descriptors"], arrays["image_size"]
     ones = np.ones(len(keypoints), np.float32)
+    scales, scores = arrays.get("scales", ones), arrays.get("scores", ones)
+    shapes = [keypoints.shape, scales.shape, scores.shape, descriptors.shape]
+    count = shapes[0][0] if keypoints.ndim == 2 else 0
+    if shapes != [(count, 2), (count,), (count,), (*descriptors.shape[:1], count)]:
+        raise ValueError(f"keypoints, scales, scores and descriptors have the shapes {shapes}")
+    if descriptors.dtype.kind != "f" or (quantized and descriptors.dtype != np.float16):
+        raise ValueError(f"descriptors are of the type {descriptors.dtype}")
     return LocalFeatures(
         keypoints,
-        arrays.get("scales", ones).astype(np.float32, copy=False),
-        arrays.get("scores", ones).astype(np.float32, copy=False),
+        scales.astype(np.float32, copy=False),
+        scores.astype(np.float32, copy=False),
         _transposed(np.take(_BYTES, descriptors.view(np.uint16)) if quantized else descriptors),
         (int(width), int(height)),
         int(arrays.get("turns", 0)),
@@ -132,19 +137,18 @@ class FeatureStore(Mapping[str, LocalFeatures]):
         """Open a file of features, the toolkit's or hloc's, whatever it was made from.
 
         Raises:
-            ArtifactError: it is missing, torn, or holds no features.
+            ArtifactError: it is missing, torn, or holds no features. What is damaged in it is a `DamagedError` when
+                it is asked for.
         """
         record = read_sidecar(path)
         if record is not None and "groups" in record:
             failed = {name: reason for name, (_, reason) in record["failed"].items()}
             return cls(Path(path), record["groups"], failed, record["made_by"])
-        items: list[str] = []
         try:
             with h5py.File(path, "r") as file:
-                file.visit(items.append)
-        except OSError as error:
+                names = group_names_of(file, "keypoints")
+        except HDF5_ERRORS as error:
             raise ArtifactError(f"Local features {path} cannot be read ({error}). Extract them again.") from None
-        names = [item.removesuffix("/keypoints") for item in items if item.endswith("/keypoints")]
         if not names:
             raise ArtifactError(
                 f"{path} holds no local features; expected a group for each image with `keypoints` and `descriptors`."
@@ -181,28 +185,28 @@ class FeatureStore(Mapping[str, LocalFeatures]):
         if name not in self.made_from:
             raise KeyError(name)
         with self._lock:
-            try:
-                group = (self._file or self._open(name))[name]
-                arrays = {key: item[()] for key, item in group.items() if isinstance(item, h5py.Dataset)}
-            except _HDF5_ERRORS as error:
-                raise ArtifactError(
-                    f"Local features {self.path} are damaged at {name} ({error}). Delete the file: it is made again."
-                ) from None
+            if self._file is None:
+                self._open(name)
+            arrays = read_group(self._file, name)
         try:
             return _from_arrays(arrays, self._offset, self._quantized)
-        except KeyError as error:
-            raise ArtifactError(
-                f"{self.path}: {name} has no {error}; expected the layout of hloc. If a run made the file, delete it: "
-                "it is made again."
+        except (LookupError, ValueError) as error:
+            raise DamagedError(
+                self.path, f"{self.path}: {name} is not in the layout of hloc ({first_line(error)})."
             ) from None
 
-    def _open(self, name: str) -> h5py.File:
+    def _open(self, name: str) -> None:
         """Open the file; what holds for one image holds for all."""
-        file = h5py.File(self.path, "r")
-        self._offset = _HALF_PIXEL - np.float32(file.attrs.get(PIXEL_CENTER, 0.0))
-        self._quantized = file[name]["descriptors"].attrs.get(SCALE) == DESCRIPTOR_SCALE
+        try:
+            file = h5py.File(self.path, "r")
+            read_group(file, name)  # refuses links to elsewhere
+            self._offset = _HALF_PIXEL - np.float32(file.attrs.get(PIXEL_CENTER, 0.0))
+            self._quantized = bool(file[name]["descriptors"].attrs.get(SCALE) == DESCRIPTOR_SCALE)
+        except HDF5_ERRORS as error:
+            raise DamagedError(
+                self.path, f"Local features {self.path} cannot be read ({first_line(error)}). Extract them again."
+            ) from None
         self._file = file
-        return file
 
 
 def extract_session(
@@ -380,19 +384,21 @@ class MatchStore:
                 try:
                     self._file = h5py.File(self.path, "r")
                 except OSError as error:
-                    raise ArtifactError(f"Matches {self.path} cannot be read ({error}). Match again.") from None
-            candidates = [(of(*names[::step]), step) for step in (1, -1) for of in (_own_group, _shared_group)]
-            try:
-                present = [(self._file[group], step) for group, step in candidates if group in self._file]
-                arrays = [present[0][0][key][()] for key in ("matches0", "matching_scores0")] if present else []
-            except _HDF5_ERRORS as error:
-                raise ArtifactError(
-                    f"Matches {self.path} are damaged at {' and '.join(names)} ({error}). Delete the file: it is made "
-                    "again."
-                ) from None
-        if not present:
-            raise KeyError(names)
-        (partners, scores), (_, step) = arrays, present[0]
+                    raise DamagedError(
+                        self.path, f"Matches {self.path} cannot be read ({first_line(error)}). Match again."
+                    ) from None
+            candidates = ((of(*names[::step]), step) for step in (1, -1) for of in (_own_group, _shared_group))
+            group, step = next(((group, step) for group, step in candidates if has_group(self._file, group)), ("", 0))
+            if not group:
+                raise KeyError(names)
+            arrays = read_group(self._file, group)
+        partners, scores = (arrays.get(key, np.zeros(())) for key in ("matches0", "matching_scores0"))
+        if partners.ndim != 1 or partners.dtype.kind not in "iu" or scores.shape != partners.shape:
+            raise DamagedError(
+                self.path,
+                f"{self.path}: {group} is not in the layout of hloc; expected matches0 (N,), whole numbers, and "
+                f"matching_scores0 (N,), found {', '.join(f'{key} {array.shape}' for key, array in arrays.items())}.",
+            )
         first = np.flatnonzero(partners >= 0)
         indices = np.stack([first, partners[first].astype(np.int64)], axis=1)
         return PairMatches(indices[:, ::step], scores[first].astype(np.float32))

@@ -15,7 +15,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from toolkit.errors import ArtifactError
+from toolkit.errors import ArtifactError, DamagedError, first_line
+from toolkit.features.groups import HDF5_ERRORS, has_group, read_group
 from toolkit.geometry import Floats, Ints
 
 MAPS = "maps"
@@ -96,31 +97,33 @@ class LocalizedQueries(Mapping[tuple[int, str], LocalizedQuery]):
         self.path = Path(path)
         try:
             self._file = h5py.File(self.path, "r")
-        except OSError as error:
+            maps = json.loads(self._file.attrs.get(MAPS, "[]"))
+        except HDF5_ERRORS as error:
             raise ArtifactError(
                 f"{self.path}: the correspondences of the poses cannot be read ({error}). Localize again."
             ) from None
-        self.maps: list[str] = json.loads(self._file.attrs.get(MAPS, "[]"))
+        self.maps: list[str] = maps
         """Names of the triangulated maps that `point_index` counts through."""
 
     def __contains__(self, key: object) -> bool:
-        return isinstance(key, tuple) and len(key) == 2 and query_group(*key) in self._file
+        return isinstance(key, tuple) and len(key) == 2 and has_group(self._file, query_group(*key))
 
     def __getitem__(self, key: tuple[int, str]) -> LocalizedQuery:
         name = query_group(*key)
-        if name not in self._file:
+        if not has_group(self._file, name):
             raise KeyError(key)
         try:
-            stored = {name: item[()] for name, item in self._file[name].items()}
+            stored = read_group(self._file, name)
             labels = np.array([label.decode() for label in stored.pop("found_by_labels")], np.str_)
             codes = stored.pop("found_by").astype(np.int64)
             names = {key: [text.decode() for text in stored.pop(key)] for key in _NAMES}
             wide = {"f": np.float64, "i": np.int64, "b": np.bool_}
-            arrays = {key: array.astype(wide[array.dtype.kind]) for key, array in stored.items()}
-        except (OSError, RuntimeError, KeyError) as error:  # what HDF5 raises for what is not its format
-            raise ArtifactError(f"{self.path} is damaged at {name} ({error}). Localize again.") from None
-        found_by = labels[codes] if len(labels) else np.zeros(0, "U1")
-        return LocalizedQuery(**names, correspondences=Correspondences(**arrays, found_by=found_by))
+            arrays: dict[str, Any] = {key: array.astype(wide[array.dtype.kind]) for key, array in stored.items()}
+            found_by = labels[codes] if len(labels) else np.zeros(0, "U1")
+            return LocalizedQuery(**names, correspondences=Correspondences(**arrays, found_by=found_by))
+        except (LookupError, ValueError, TypeError, AttributeError) as error:
+            raise DamagedError(self.path, f"{self.path}: {name} is not as a run writes it ({first_line(error)}). "
+                               "Localize again.") from None  # fmt: skip
 
     def __iter__(self) -> Iterator[tuple[int, str]]:
         for timestamp, group in self._file.items():
