@@ -19,7 +19,7 @@ from safetensors.torch import save_file
 
 from toolkit import notebook, pipeline
 from toolkit.errors import ManifestError, ToolkitError, WeightsError
-from toolkit.files import SceneFiles
+from toolkit.files import SceneFiles, write_sidecar, write_text
 from toolkit.manifest import STAGES, LocalizeSettings, RerankSettings, load_manifest
 from toolkit.pipeline import StageError
 
@@ -142,6 +142,42 @@ def test_a_stage_runs_again_only_when_something_has_changed(
     assert go("retrieve.topk=3") == {"embed": reused, "retrieve": done}
     (place / "P/sessions/ios_map/images.txt").write_text("# changed\n")
     assert go("retrieve.topk=3", only="embed")["embed"] == done
+
+
+def test_damage_in_what_a_stage_left_makes_it_run_again(place: Path, go: Callable[..., dict[str, str]]) -> None:
+    go()
+    jsonl = place / "runs/run/P/retrieval/P_map_all_query_all.jsonl"
+    state = jsonl.stat()
+    jsonl.write_text("11")
+    os.utime(jsonl, ns=(state.st_atime_ns, state.st_mtime_ns))
+    assert go() == {"embed": "reused", "retrieve": "done"}
+    assert jsonl.read_text() == "10"
+    assert go() == {"embed": "reused", "retrieve": "reused"}
+    (place / "runs/run/notebooks/P_02_embed.ipynb").write_text("")
+    assert go()["embed"] == "done"
+
+
+def test_a_damaged_map_makes_the_localize_stage_run_again(place: Path) -> None:
+    files = SceneFiles(place / "runs", "P")
+    job = pipeline.Job("localize", files, LocalizeSettings(), {"map_device": "ios"}, "map_ios_query_hl")
+    for name in ("ios_map.npz", "hl_map.npz"):
+        write_text(files.maps / name, "points")
+    before = job.outputs()
+    (files.maps / "hl_map.npz").write_text("paints")
+    assert job.outputs() == before, "of another job"
+    (files.maps / "ios_map.npz").write_text("paints")
+    assert job.outputs() != before
+
+
+def test_a_stage_with_something_to_try_again_is_not_reused(place: Path, go: Callable[..., dict[str, str]]) -> None:
+    jsonl = place / "runs/run/P/retrieval/P_map_all_query_all.jsonl"
+    write_text(jsonl, "10")
+    write_sidecar(jsonl, {}, unfinished=True)  # as the stage would
+    assert go() == {"embed": "done", "retrieve": "done"}
+    assert go() == {"embed": "reused", "retrieve": "done"}
+    write_sidecar(jsonl, {})
+    assert go() == {"embed": "reused", "retrieve": "done"}
+    assert go() == {"embed": "reused", "retrieve": "reused"}
 
 
 def test_some_pairs_take_an_execution_each(place: Path, go: Callable[..., dict[str, str]]) -> None:

@@ -11,6 +11,7 @@ import pytest
 from tests.test_embed import HL_RIG, write_tiny_capture
 from toolkit.embed import embed_sessions
 from toolkit.errors import ArtifactError, CaptureError, ManifestError
+from toolkit.files import sidecar_path
 from toolkit.retrieve import load_embeddings, retrieve_pairs, search
 
 BACKENDS = ["faiss", "torch"]
@@ -161,6 +162,9 @@ def test_embeddings_that_do_not_fit(tiny: Path, tmp_path: Path) -> None:
     matrix, table = load_embeddings(folder)
     assert table["subsession"].unique().tolist() == ["ios_a"]
     np.save(folder / "ios_a.npy", matrix[:, :3])
+    with pytest.raises(ArtifactError, match=r"ios_a\.npy is damaged"):
+        retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", query_device="hl", skip_existing=False)
+    sidecar_path(folder / "ios_a.npy").unlink()  # another tool's, from now on
     with pytest.raises(ArtifactError, match="model"):
         retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", query_device="hl", skip_existing=False)
     np.save(folder / "ios_a.npy", np.full_like(matrix, np.nan))

@@ -20,7 +20,7 @@ from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import Embedder, create_embedder, resolve_name
 from toolkit.errors import ImageError, ManifestError, ToolkitError
 from toolkit.features.features import LocalFeatures, SiftExtractor
-from toolkit.features.groups import GroupWriter
+from toolkit.features.groups import GroupWriter, heals
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import (
     file_fingerprint,
@@ -43,6 +43,7 @@ VOCABULARY_IMAGES = 2048
 """Map images that the vocabulary is learned from at most, spread evenly: bounds time and memory."""
 
 
+@heals
 def embed_sessions(
     sessions_root: str | Path,
     out_dir: str | Path,
@@ -106,7 +107,7 @@ def embed_sessions(
             "normalize": settings.normalize,
             "dtype": settings.dtype,
         }
-        skipped = skip_existing and (folder / "manifest.csv").exists() and is_current(matrix_path, record)
+        skipped = skip_existing and is_current(matrix_path, record)
         if skipped:
             embedded = len(np.load(matrix_path, mmap_mode="r"))
         else:
@@ -116,9 +117,9 @@ def embed_sessions(
                     batches.discard()
                 failed = _embed(embedder, part, batches, settings, store_of)
                 embedded = len(part.rows) - len(failed)
-                _write_tables(folder, capture.name, part, failed)
+                tables = _write_tables(folder, capture.name, part, failed)
                 write_matrix(matrix_path, batches, embedded, embedder.dim, settings.dtype)
-                write_sidecar(matrix_path, record)
+                write_sidecar(matrix_path, record, tables)
                 batches.discard()
         table.append(
             {
@@ -341,7 +342,7 @@ def _images_fingerprint(session: Session, rows: NDArray[np.intp]) -> str:
     return fingerprint([keys, session.device_ids[rows].tolist(), files])
 
 
-def _write_tables(folder: Path, capture: str, part: _Subsession, failed: dict[int, str]) -> None:
+def _write_tables(folder: Path, capture: str, part: _Subsession, failed: dict[int, str]) -> list[Path]:
     """Write the manifest of the embedded images, and the table of the unreadable ones where there are any."""
     session, images = part.session, part.session.images.iloc[part.rows]
     table = pd.DataFrame(
@@ -364,3 +365,4 @@ def _write_tables(folder: Path, capture: str, part: _Subsession, failed: dict[in
     embedded = table[table["reason"] == ""].drop(columns="reason").reset_index(drop=True)
     with write_atomic(folder / "manifest.csv") as temporary:
         embedded.to_csv(temporary, index_label="row_index")
+    return [folder / "manifest.csv", *([unreadable] if failed else [])]

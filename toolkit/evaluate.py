@@ -15,7 +15,7 @@ from toolkit.capture.cameras import in_view, view_bounds
 from toolkit.capture.devices import in_order
 from toolkit.capture.tables import read_query_table
 from toolkit.errors import ArtifactError, CaptureError, ToolkitError
-from toolkit.files import image_name, pair_name, read_references, write_atomic, write_sidecar
+from toolkit.files import image_name, pair_name, read_references, require_whole, write_atomic, write_sidecar
 from toolkit.geometry import Floats, invert, transform
 from toolkit.manifest import EvaluateSettings
 from toolkit.show.evaluation import Evaluation, draw_evaluation
@@ -155,16 +155,18 @@ def evaluate_scene(
 def write_evaluation(evaluation: Evaluation, out_dir: str | Path, settings: dict[str, Any]) -> None:
     """Write the tables as CSV, the figures as PNG, and beside recall.csv how they were made."""
     out = Path(out_dir)
-    for name in ("recall", "errors", "retrieval", "losses", "overlap"):
-        with write_atomic(out / f"{name}.csv") as temporary:
-            getattr(evaluation, name).to_csv(temporary, index=False)
+    made = [out / f"{name}.csv" for name in ("recall", "errors", "retrieval", "losses", "overlap")]
+    for path in made:
+        with write_atomic(path) as temporary:
+            getattr(evaluation, path.stem).to_csv(temporary, index=False)
     figures = draw_evaluation(evaluation)
     for name in FIGURES:
         if name in figures:
             save_figure(figures[name], out / f"{name}.png")
+            made.append(out / f"{name}.png")
         else:  # one of an earlier evaluation would mislead
             (out / f"{name}.png").unlink(missing_ok=True)
-    write_sidecar(out / "recall.csv", settings)
+    write_sidecar(out / "recall.csv", settings, made[1:])
     logger.info("Evaluated %d of %d pairs: %s", (evaluation.recall["state"] == "evaluated").sum(),
                 len(evaluation.recall), out / "recall.csv")  # fmt: skip
 
@@ -188,7 +190,10 @@ def _read_results(stem: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, 
     if not path.is_file():
         return None, "no poses file"
     try:
+        require_whole(path)
         poses = poses_of(Trajectory.read(path), keys)
+    except ArtifactError as error:
+        return None, str(error)
     except CaptureError as error:
         return None, f"unreadable poses file ({error})"
     located = is_posed(poses)
@@ -199,6 +204,7 @@ def _read_results(stem: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, 
         return results, "evaluated"
     columns = ["timestamp", "device_id"]
     try:
+        require_whole(table, of=path)
         details = read_query_table(table, ["status"]).drop_duplicates(columns)
     except ArtifactError as error:
         return results, f"unreadable table of queries ({error})"

@@ -26,7 +26,15 @@ from toolkit.embedders import resolve_name
 from toolkit.errors import ManifestError
 from toolkit.exchange.download import is_unfinished
 from toolkit.features.matching import local_weights, resolve_auto
-from toolkit.files import SceneFiles, files_fingerprint, fingerprint, sweep_partials, write_text
+from toolkit.files import (
+    SceneFiles,
+    any_unfinished,
+    checksum,
+    files_fingerprint,
+    fingerprint,
+    sweep_partials,
+    write_text,
+)  # fmt: skip
 from toolkit.manifest import (
     STAGES,
     EmbedSettings,
@@ -86,7 +94,12 @@ class Job:
     def outputs(self) -> str:
         """Return what identifies the files that the job has made."""
         folder = stage_outputs(self.files, self.stage)
-        return tree_fingerprint(folder, self.label) if folder else ""
+        found = tree_fingerprint(folder, self.label, content=True) if folder else ""
+        if self.stage != "localize":
+            return found
+        device = self.parameters.get("map_device", "all")
+        maps = sorted(self.files.maps.glob(f"{'*' if device == 'all' else device}_map*.npz"))
+        return fingerprint([found, [[path.name, checksum(path)] for path in maps]])
 
     def forget(self) -> None:
         """Remove the records of what the outputs were made from, so that the stage reuses none of them."""
@@ -181,10 +194,11 @@ def _run(manifest: Manifest, manifest_path: str | Path, only: str | None, force:
     return run_dir
 
 
-def tree_fingerprint(folder: Path, part: str = "") -> str:
-    """Return 16 hex digits for the files below a folder: their paths, sizes and times of change.
+def tree_fingerprint(folder: Path, part: str = "", content: bool = False) -> str:
+    """Return 16 hex digits for the files below a folder: their paths, sizes, and times of change or their content.
 
-    With `part`, of those that have it in their path.
+    With `part`, of those that have it in their path. Damage leaves size and time as they are; to read the content takes
+    a second for some gigabytes that the system has in memory.
     """
     rows = []
     for root, folders, names in os.walk(folder, followlinks=True):
@@ -193,8 +207,8 @@ def tree_fingerprint(folder: Path, part: str = "") -> str:
         for name in sorted(names):
             if part in f"{place}/{name}":
                 with suppress(FileNotFoundError):
-                    stat = os.stat(f"{root}/{name}")  # noqa: PTH116 - a Path for each is 5 times slower
-                    rows.append([place, name, stat.st_size, stat.st_mtime_ns])
+                    stat = os.stat(file := f"{root}/{name}")  # noqa: PTH116 - a Path for each is 5 times slower
+                    rows.append([place, name, stat.st_size, checksum(file) if content else stat.st_mtime_ns])
     return fingerprint(rows)
 
 
@@ -354,7 +368,7 @@ def _code_fingerprint() -> str:
 def _reusable(job: Job, wanted: str) -> dict[str, Any] | None:
     """Return the row of the execution that made what is there, if it would be the same now."""
     record = _read_json(job.record)
-    if record.get("inputs") != wanted or record.get("outputs") != job.outputs() or not job.notebook.is_file():
+    if record.get("inputs") != wanted or record.get("outputs") != job.outputs() or not _read_json(job.notebook):
         return None
     return {**record["row"], "status": "reused"}
 
@@ -382,7 +396,10 @@ def _run_job(job: Job, wanted: str, force: bool, head: str, log: "RunLog", say: 
     memory = max(memory, counts.pop("peak_memory_mb", 0.0))
     row |= {"status": "done", "seconds": round(seconds, 2), "startup_seconds": round(seconds - work, 2)}
     row |= {"work_seconds": round(work, 2), "peak_memory_mb": round(memory), "counts": counts}
-    record = {"made": datetime.now(UTC).isoformat(), "inputs": wanted, "outputs": job.outputs(), "row": row}
+    folder = stage_outputs(job.files, job.stage)
+    # What is to be tried again is not recorded as done.
+    outputs = "" if folder and any_unfinished(folder, job.label) else job.outputs()
+    record = {"made": datetime.now(UTC).isoformat(), "inputs": wanted, "outputs": outputs, "row": row}
     write_text(job.record, json.dumps(record, indent=1) + "\n")
     summary = ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in counts.items())
     line.end(f"{summary}{summary and '; '}{work:.1f} s + {seconds - work:.1f} s start-up, {memory:.0f} MB")

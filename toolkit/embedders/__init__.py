@@ -10,6 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from toolkit.errors import ArtifactError, ManifestError
+from toolkit.files import require_whole
 from toolkit.models.weights import MEGALOC, find_weights
 
 
@@ -86,7 +87,7 @@ def load_embeddings(folder: str | Path) -> tuple[NDArray[np.float32], pd.DataFra
         (N, D) float32; a table of its rows: row_index, device_id, sensor_id, timestamp, abs_path, subsession.
 
     Raises:
-        ArtifactError: there are none, or files do not fit together.
+        ArtifactError: there are none, one is damaged, or files do not fit together.
     """
     folder = Path(folder)
     manifests = sorted(folder.rglob("manifest.csv"))
@@ -98,6 +99,8 @@ def load_embeddings(folder: str | Path) -> tuple[NDArray[np.float32], pd.DataFra
     tables = []
     for manifest in manifests:
         path = manifest.parent / f"{manifest.parent.name}.npy"
+        for part in (path, manifest):
+            require_whole(part, of=path)
         try:
             matrix = np.load(path).astype(np.float32, copy=False)
             table = pd.read_csv(manifest, dtype={"device_id": str, "sensor_id": str, "abs_path": str})

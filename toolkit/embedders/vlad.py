@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 from toolkit.errors import ArtifactError, ToolkitError
 from toolkit.features.features import LocalFeatures
 from toolkit.features.matching import unit_descriptors
-from toolkit.files import file_fingerprint, write_atomic
+from toolkit.files import file_fingerprint, require_whole, write_atomic
 from toolkit.geometry import unit
 from toolkit.manifest import VladSettings
 
@@ -112,6 +112,7 @@ class Vlad:
     @classmethod
     def load(cls, vocabulary: str | Path) -> "Vlad":
         """Read a vocabulary that `save` wrote."""
+        require_whole(vocabulary)
         try:
             with np.load(vocabulary) as stored:
                 arrays = {name: stored[name] for name in stored.files}

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from toolkit import geometry
 from toolkit.capture.cameras import camera_text, parse_camera, projection_jacobian
 from toolkit.errors import ArtifactError
-from toolkit.files import write_atomic
+from toolkit.files import require_whole, write_atomic
 
 Floats = NDArray[np.float64]
 
@@ -182,8 +182,9 @@ class LocalMap:
         """Read a map.
 
         Raises:
-            ArtifactError: the file is missing or torn.
+            ArtifactError: the file is missing or damaged.
         """
+        require_whole(path)
         try:
             with np.load(path) as arrays:
                 data = {name: arrays[name] for name in arrays.files}
