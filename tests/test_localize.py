@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
 
+import cv2
 import h5py
 import numpy as np
 import pandas as pd
@@ -279,19 +280,72 @@ def test_a_keyframe_that_is_listed_twice_has_two_rows(capture: Path, run: SceneF
 def test_an_image_that_was_not_retrieved_for_is_a_row(small_capture: Path, run: SceneFiles) -> None:
     path = run.retrieval("ios", "ios")
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
+    with pytest.raises(ArtifactError, match=r"\.jsonl is damaged"):
+        run_stage(small_capture, run, query_device="ios")
+    sidecar_path(path).unlink()
     run_stage(small_capture, run, query_device="ios")
     assert rows_of(run, "ios")["status"].tolist()[-1] == "failed: no references"
 
 
 def test_an_exception_in_one_query_does_not_end_the_run(
-    small_capture: Path, run: SceneFiles, monkeypatch: pytest.MonkeyPatch
+    small_capture: Path, run: SceneFiles, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     calls = spy(monkeypatch, fail_at=1, error=ZeroDivisionError("by chance"))
     run_stage(small_capture, run, query_device="ios")
     status = rows_of(run, "ios")["status"]
     assert len(calls) == 3
-    assert (status == "failed: ZeroDivisionError: by chance").sum() == 1
+    assert (status == "failed: internal: ZeroDivisionError: by chance").sum() == 1
     assert (status == "ok").sum() == 2
+    assert "Traceback" in caplog.text
+
+
+def test_a_fault_of_the_toolkit_is_tried_again_by_the_next_run(
+    small_capture: Path, run: SceneFiles, finished: tuple[SceneFiles, pd.DataFrame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        spy(patch, fail_at=1, error=TypeError("a slip"))
+        run_stage(small_capture, run, query_device="ios")
+    calls = spy(monkeypatch)
+    table = run_stage(small_capture, run, query_device="ios")
+    assert len(calls) == 1, "of that query alone"
+    assert not table["skipped"].item()
+    assert run.poses_txt("ios", "ios").read_bytes() == finished[0].poses_txt("ios", "ios").read_bytes()
+    localized = LocalizedQueries(run.poses_txt("ios", "ios").with_suffix(".h5"))
+    assert all(query.correspondences.inlier.any() for query in localized.values())
+    assert run_stage(small_capture, run, query_device="ios")["skipped"].item()
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError("no room"),
+        OSError(5, "input/output error"),
+        ArtifactError("torn"),
+        RuntimeError("CUDA out of memory. Tried to allocate 2 GiB"),
+        cv2.error("Insufficient memory (Failed to allocate 3 bytes)"),
+    ],
+)
+def test_what_is_no_property_of_a_query_ends_the_stage_and_what_is_done_is_kept(
+    small_capture: Path, run: SceneFiles, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        spy(patch, fail_at=1, error=error)
+        with pytest.raises(type(error)):
+            run_stage(small_capture, run, query_device="ios")
+    assert not run.poses_txt("ios", "ios").exists()
+    calls = spy(monkeypatch)
+    run_stage(small_capture, run, query_device="ios")
+    assert len(calls) == 2, "the first was done"
+
+
+@pytest.mark.parametrize("error", [ImageError("dark.jpg: torn"), np.linalg.LinAlgError("singular")])
+def test_what_is_a_property_of_a_query_is_its_result(
+    small_capture: Path, run: SceneFiles, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    spy(monkeypatch, fail_at=1, error=error)
+    run_stage(small_capture, run, query_device="ios")
+    assert rows_of(run, "ios")["status"].tolist()[1] == f"failed: {type(error).__name__}: {error}"
+    assert run_stage(small_capture, run, query_device="ios")["skipped"].item()
 
 
 # -------------------------------------------------------------------------------------- reuse, resume, order
@@ -403,10 +457,10 @@ def test_a_run_killed_at_its_end_leaves_no_files_of_two_runs(small_capture: Path
 
     write_sidecar = groups.write_sidecar
 
-    def killed(written: Path, *content: Any) -> None:
+    def killed(written: Path, *content: Any, **more: Any) -> None:
         if torn == "the table" or written == path:
             raise KeyboardInterrupt
-        write_sidecar(written, *content)
+        write_sidecar(written, *content, **more)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(*((localize, "_write_poses") if torn == "the table" else (groups, "write_sidecar")), killed)
@@ -469,6 +523,7 @@ def test_a_finished_pair_is_reused_until_something_changes(
     assert not again()
     path = run.retrieval("ios", "ios")
     path.write_text(path.read_text() + path.read_text().splitlines(keepends=True)[-1])
+    sidecar_path(path).unlink()
     assert not again()
     assert again()
 

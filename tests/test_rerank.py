@@ -14,7 +14,7 @@ from tests.calls import call
 from toolkit import rerank
 from toolkit.capture import Capture
 from toolkit.embed import embed_sessions
-from toolkit.errors import ArtifactError, ManifestError
+from toolkit.errors import ArtifactError, ManifestError, ToolkitError
 from toolkit.evaluate import overlap_in_view, overlap_table
 from toolkit.features import verification
 from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor
@@ -162,6 +162,7 @@ def run(capture: Path, files: SceneFiles, **more: Any) -> Any:
 
 def write(path: Path, rows: list[dict[str, Any]]) -> None:
     path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    sidecar_path(path).unlink(missing_ok=True)  # changed on purpose
 
 
 def reranked(files: SceneFiles) -> Path:
@@ -242,15 +243,34 @@ def test_a_query_that_fails_keeps_the_order_of_retrieval(
     def broken(*_: Any) -> Any:
         raise RuntimeError("no such luck")
 
+    before = MutualMatcher.match
     monkeypatch.setattr(MutualMatcher, "match", broken)
     table = run(small_capture, files)
     found = read_references(reranked(files))
     assert table["kept"].item() == table["queries"].item() == len(rows)
     assert "no reference" in found[0]["reason"]
     for old, new in zip(rows[1:], found[1:], strict=True):
-        assert new["reason"] == "RuntimeError: no such luck"
+        assert new["reason"] == "internal: RuntimeError: no such luck"
         assert [hit["path"] for hit in new["topk"]] == [hit["path"] for hit in old["topk"][:4]]
         assert all(hit["score"] == 0 for hit in new["topk"])
+    monkeypatch.setattr(MutualMatcher, "match", before)
+    again = run(small_capture, files)
+    assert not again["skipped"].item(), "what a fault of the toolkit left undone is tried again"
+    assert again["kept"].item() < table["kept"].item()
+    assert run(small_capture, files)["skipped"].item()
+    assert not list(files.reranked_dir.glob(".*"))
+
+
+@pytest.mark.parametrize("error", [MemoryError("no room"), OSError(5, "input/output error"), ToolkitError("no device")])
+def test_what_is_no_property_of_a_query_ends_the_stage(
+    small_capture: Path, files: SceneFiles, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def broken(*_: Any) -> Any:
+        raise error
+
+    monkeypatch.setattr(MutualMatcher, "match", broken)
+    with pytest.raises(type(error)):
+        run(small_capture, files, skip_existing=False)
 
 
 def test_a_network_matches_all_references_of_a_query_at_once(

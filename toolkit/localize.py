@@ -1,5 +1,6 @@
 """The localize stage: references and local features in, one pose a query device out."""
 
+import json
 import logging
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,9 +17,9 @@ from tqdm.auto import tqdm
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import default_workers, prefetch
-from toolkit.errors import ToolkitError
+from toolkit.errors import INTERNAL, ToolkitError, reason_of
 from toolkit.features.features import KINDS
-from toolkit.features.groups import GroupWriter
+from toolkit.features.groups import GroupWriter, heals
 from toolkit.features.matching import (
     AnyMethod,
     DeferredMethod,
@@ -36,12 +37,13 @@ from toolkit.files import (
     is_current,
     pair_name,
     read_references,
+    read_sidecar,
     sidecar_path,
     write_atomic,
     write_sidecar,
 )
 from toolkit.localizers.base import Localizer, NetworkMatches, PoseEstimate, Query, References, View
-from toolkit.localizers.correspondences import LocalizedQuery, query_group
+from toolkit.localizers.correspondences import MAPS, LocalizedQuery, query_group
 from toolkit.localizers.escalation import EscalatingLocalizer, is_sure
 from toolkit.localizers.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
 from toolkit.localizers.map import (
@@ -76,6 +78,7 @@ ESCALATION_COLUMNS = ["first_status", "first_seconds"]
 empty: they were not asked."""
 
 
+@heals
 def localize_pairs(
     sessions_root: str | Path,
     retrieval_dir: str | Path,
@@ -131,7 +134,9 @@ def localize_pairs(
                 pair = _Pair(capture, mapped, queried, Path(retrieval_dir), Path(out_dir), queries)
                 record = pair.record(settings, kinds, escalation, predictor)
                 about = attributes(settings, kinds, capture, mapped, pair.retrieval_dir)
-                skipped = skip_existing and pair.is_current(record)
+                maps = [Path(map_dir) / name for name in json.loads(about[MAPS])]
+                skipped = skip_existing and pair.is_current(record, maps)
+                unfinished = False
                 if not skipped:
                     if localizer is None:
                         place = Map.build(
@@ -140,9 +145,12 @@ def localize_pairs(
                         )  # fmt: skip
                         localizer = create_localizer(settings, place, predictor)
                     run = _PairRun(pair, place, localizer, Path(features_dir), workers, skip_existing)
-                    _write_poses(pair, run.localize(record, about), settings)
-                    write_sidecar(pair.file("txt"), record)
-                update_attributes(pair.file("h5"), about)
+                    localized = run.localize(record, about)
+                    _write_poses(pair, localized, settings)
+                    unfinished = any(map(_is_internal, localized))
+                if update_attributes(pair.file("h5"), about) or not skipped:
+                    files = pair.file("csv"), pair.file("h5")
+                    write_sidecar(pair.file("txt"), record, files, unfinished=unfinished)
                 rows = pd.read_csv(pair.file("csv"))
                 counts = rows["status"].str.split(":").str[0].value_counts()
                 table.append(
@@ -178,9 +186,9 @@ class _Pair:
     def file(self, suffix: str) -> Path:
         return self.out_dir / f"{self.retrieval.stem}.{suffix}"
 
-    def is_current(self, record: dict[str, Any]) -> bool:
-        others = self.file("csv").exists() and self.file("h5").exists()
-        return is_current(self.file("txt"), record) and others
+    def is_current(self, record: dict[str, Any], maps: Sequence[Path]) -> bool:
+        """Tell whether the pair is done; its maps are part of what there is to see of it."""
+        return is_current(self.file("txt"), record) and None not in map(read_sidecar, maps)
 
     @property
     def session(self) -> Session:
@@ -319,22 +327,25 @@ class _PairRun:
         """Localize the queries that a killed run has not; returns a row for each, in the list's order."""
         path = self.pair.file("h5")
         groups = [query_group(*key) for key in self.keys]
+        again: dict[str, dict[str, Any]] = {}  # rows of queries that are not recorded as done
         with GroupWriter(path, record, about) as writer:
             if not self.skip_existing:
                 writer.discard()
+            writer.drop_damaged()
             numbers = {group: number for number, group in enumerate(groups)}  # a list may name a query twice
             rows = writer.notes()
             first = self.localizer.first if isinstance(self.localizer, EscalatingLocalizer) else self.localizer
             todo = [number for group, number in numbers.items() if group not in rows]
             for number, row, localized in self._localized(first, todo):
                 rows[groups[number]] = row
-                writer.add(groups[number], arrays=localized.arrays(), note=row)
+                self._add(writer, groups[number], row, localized, again)
             further = {group: rows[group] for group, number in numbers.items() if len(self.rows[number])}
             limit = self.place.settings.pnp.sure_position_std_m
+            further = {group: row for group, row in further.items() if not (group in again or row.get("first_status"))}
             todo = [
                 numbers[group]
                 for group, row in further.items()
-                if not (row.get("first_status") or is_sure(row["status"], row["position_std_m"], limit))
+                if not is_sure(row["status"], row["position_std_m"], limit)
             ]
             if isinstance(self.localizer, EscalatingLocalizer) and todo:
                 started = time.perf_counter()
@@ -345,13 +356,26 @@ class _PairRun:
                     before = rows[groups[number]]
                     row |= {"first_status": before["status"], "first_seconds": before["seconds"]}
                     row["seconds"] = round(row["seconds"] + before["seconds"] + shared, 4)
-                    writer.add(groups[number], arrays=localized.arrays(), note=row)
+                    self._add(writer, groups[number], row, localized, again)
             # From here until the new poses are there, a kill must not leave poses of one run with a file of another.
             for poses in (self.pair.file("txt"), sidecar_path(self.pair.file("txt"))):
                 poses.unlink(missing_ok=True)
             writer.finish()
-            rows = writer.notes()
+            rows = writer.notes() | again
         return [rows[group] for group in groups]
+
+    def _add(
+        self,
+        writer: GroupWriter,
+        group: str,
+        row: dict[str, Any],
+        localized: LocalizedQuery,
+        again: dict[str, dict[str, Any]],
+    ) -> None:
+        """Record a query as done, unless a fault of the toolkit is in its row."""
+        if _is_internal(row):
+            again[group] = row
+        writer.add(group, arrays=localized.arrays(), note=None if group in again else row)
 
     def _localized(
         self, localizer: Localizer, numbers: Sequence[int]
@@ -386,8 +410,7 @@ class _PairRun:
             else:
                 estimate = PoseEstimate("failed: no images of this device at this time")
         except Exception as error:  # one bad query never ends a run
-            log.exception("localizing %s", query.views[0].name)
-            estimate = PoseEstimate(f"failed: {type(error).__name__}: {error}")
+            estimate = PoseEstimate(f"failed: {reason_of(error, f'localizing {query.views[0].name}')}")
         names = self.localizer.image_names
         localized = LocalizedQuery(
             [view.name for view in query.views],
@@ -404,6 +427,10 @@ def _indices(rows: list[dict[str, Any]], index_of: Mapping[str, int]) -> tuple[l
     """Return indices and scores of retrieved map images; those that the map does not have are left out."""
     known = [(index_of[name], float(row["score"])) for row in rows if (name := image_name(row["path"])) in index_of]
     return [index for index, _ in known], [score for _, score in known]
+
+
+def _is_internal(row: Mapping[str, Any]) -> bool:
+    return INTERNAL in row["status"] or INTERNAL in row["reason"]
 
 
 def _row(

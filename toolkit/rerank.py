@@ -23,9 +23,9 @@ from tqdm.auto import tqdm
 from toolkit.capture import Capture, Session
 from toolkit.capture.images import default_workers, prefetch
 from toolkit.capture.upright import Turns, upright_turns
-from toolkit.errors import ArtifactError
+from toolkit.errors import INTERNAL, ArtifactError, reason_of
 from toolkit.features.features import KINDS
-from toolkit.features.groups import GroupWriter
+from toolkit.features.groups import GroupWriter, heals
 from toolkit.features.matching import LocalMethod, create_local_methods, resolve_auto
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.features.verification import Verifier
@@ -44,6 +44,7 @@ from toolkit.manifest import RerankSettings
 log = logging.getLogger(__name__)
 
 
+@heals
 def rerank_pairs(
     sessions_root: str | Path,
     retrieval_dir: str | Path,
@@ -162,8 +163,7 @@ class _Pair:
             try:
                 return index, self._reranked(queries[index], verifier, *stores)
             except Exception as error:  # one bad query never ends a run
-                log.exception("reranking %s", queries[index]["path"])
-                return index, self._kept(queries[index], f"{type(error).__name__}: {error}")
+                return index, self._kept(queries[index], reason_of(error, f"reranking {queries[index]['path']}"))
 
         with GroupWriter(self.path, self.record) as progress:
             if not skip_existing:
@@ -174,12 +174,17 @@ class _Pair:
             label = f"rerank {self.query_session.device} in {self.map_session.device}"
             # A network matches the references of one query as a batch, and keeps the device busy by that.
             threads = workers if self.method.extractor.threaded else 1
+            again: dict[str, dict[str, Any]] = {}  # rows of queries that are not recorded as done
             for index, row in tqdm(prefetch(rerank, todo, threads), total=len(todo), desc=label, unit="image"):
-                progress.add(str(index), note=row)
-            rows = progress.notes()
+                if row["reason"].startswith(INTERNAL):
+                    again[str(index)] = row
+                else:
+                    progress.add(str(index), note=row)
+            rows = progress.notes() | again
             write_text(self.path, "".join(json.dumps(rows[str(index)]) + "\n" for index in range(len(queries))))
-            write_sidecar(self.path, self.record)
-            progress.discard()
+            write_sidecar(self.path, self.record, unfinished=bool(again))
+            if not again:
+                progress.discard()
 
     def _rows(self, session: Session, images: Sequence[dict[str, Any]]) -> Ints:
         """Return the rows of `session.images` of images in the retrieval file; refuse one that the session lacks."""

@@ -192,7 +192,7 @@ class Failing(SimulatedPredictor):
 @pytest.mark.parametrize(
     ("how", "reason"),
     [
-        ("raise", "failed: RuntimeError: out of luck"),
+        ("raise", "failed: internal: RuntimeError: out of luck"),
         ("query", "failed: the predicted camera is not finite"),
         ("references", "failed: references 0, 1, 2, 3, 4 left out: not finite; no usable reference"),
     ],

@@ -10,7 +10,7 @@ from toolkit import geometry
 from toolkit.capture import Session
 from toolkit.capture.depths import DepthMaps, SeenDepth, lifted
 from toolkit.capture.upright import Turns
-from toolkit.errors import ImageError, ToolkitError
+from toolkit.errors import reason_of
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.alignment import Alignment, align_to_map, is_trustworthy, query_pose
 from toolkit.localizers.base import PoseEstimate, Query, References, View
@@ -92,7 +92,8 @@ class FeedForwardLocalizer:
         Nothing that goes wrong with one query is raised or touches another: its answer says `failed: <reason>`.
 
         Raises:
-            ToolkitError: what no other query would do better with: no such device, other weights, too little memory.
+            Exception: what no other query would do better with: no such device, other weights, too little memory; see
+                `errors.reason_of`.
         """
         chosen = [[self._choose(retrieved) for retrieved in references] for _, references in queries]
         groups = {
@@ -145,12 +146,9 @@ class FeedForwardLocalizer:
         try:
             return [*self.predictor.predict(groups)] if groups else []
         except Exception as error:  # one bad query never ends a run
-            if isinstance(error, ToolkitError) and not isinstance(error, ImageError):
-                raise
-            if len(groups) > 1:
-                return [prediction for group in groups for prediction in self._predict([group])]
-            log.exception("predicting %s", groups[0][0].name)
-            return [f"{type(error).__name__}: {error}"]
+            if len(groups) == 1:
+                return [reason_of(error, f"predicting {groups[0][0].name}")]
+        return [prediction for group in groups for prediction in self._predict([group])]
 
     def _camera_answer(self, references: Ints, prediction: Prediction | str) -> CameraAnswer:
         if isinstance(prediction, str):
@@ -158,8 +156,7 @@ class FeedForwardLocalizer:
         try:
             return self._align(references, prediction)
         except Exception as error:  # a prediction may be anything
-            log.exception("aligning a prediction")
-            return CameraAnswer(references, prediction, reason=f"{type(error).__name__}: {error}")
+            return CameraAnswer(references, prediction, reason=reason_of(error, "aligning a prediction"))
 
     def _align(self, references: Ints, prediction: Prediction) -> CameraAnswer:
         model = np.asarray(prediction.model_from_cams, np.float64)

@@ -18,12 +18,21 @@ from toolkit.capture import Capture, Session
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import Embedder, create_embedder, load_embeddings
 from toolkit.embedders.search import search
-from toolkit.errors import ArtifactError
+from toolkit.errors import ArtifactError, ToolkitError
 from toolkit.features.features import KINDS, LocalFeatures, extract_turned
+from toolkit.features.groups import HDF5_ERRORS
 from toolkit.features.matching import AnyMethod, DeferredMethod, LocalMethod, create_local_methods, weights_files
 from toolkit.features.stores import FeatureStore, OnDemandFeatures, as_stored, extract_session
 from toolkit.features.verification import Verifier
-from toolkit.files import SceneFiles, file_fingerprint, fingerprint, image_name, write_atomic
+from toolkit.files import (
+    SceneFiles,
+    file_fingerprint,
+    fingerprint,
+    image_name,
+    read_sidecar,
+    write_atomic,
+    write_sidecar,
+)  # fmt: skip
 from toolkit.geometry import unit
 from toolkit.localizers.base import Localizer, References
 from toolkit.localizers.correspondences import MAPS
@@ -125,7 +134,7 @@ class Map:
                 settings = LocalizeSettings.of(json.loads(file.attrs[SETTINGS]))
                 sessions_root, names = Path(file.attrs[SESSIONS_ROOT]), json.loads(file.attrs[MAPS])
                 reranked = Path(file.attrs[RETRIEVAL]).name == files.reranked_dir.name
-        except (OSError, KeyError, ValueError) as error:
+        except (*HDF5_ERRORS, ToolkitError) as error:
             raise ArtifactError(f"{newest} does not tell how it was made ({error}). Localize again.") from None
         kinds, escalation = create_methods(settings)
         mapped = [
@@ -447,13 +456,17 @@ def attributes(
     }
 
 
-def update_attributes(path: Path, attributes: Mapping[str, str]) -> None:
+def update_attributes(path: Path, attributes: Mapping[str, str]) -> bool:
     """Bring the attributes of a file up to date that was made by settings of the same effect, or of a capture that
-    has moved since."""
+    has moved since; tell whether there was need to."""
     with h5py.File(path, "r") as file:
         current = {name: file.attrs.get(name) for name in attributes} == dict(attributes)
     if not current:
+        record = read_sidecar(path)
         with write_atomic(path) as temporary:
             shutil.copyfile(path, temporary)
             with h5py.File(temporary, "a", libver="latest") as file:
                 file.attrs.update(attributes)
+        if record is not None:
+            write_sidecar(path, record, checksums=False)
+    return not current
