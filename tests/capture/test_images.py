@@ -1,7 +1,10 @@
 """Decoding, its errors, and the prefetching iterator."""
 
+import os
+import struct
 import threading
 import time
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,8 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from toolkit.capture.images import default_workers, prefetch, read_for_display, read_image
-from toolkit.errors import ImageError
+from toolkit.capture import read_depth
+from toolkit.capture.images import default_workers, prefetch, read_for_display, read_image, stored_size
+from toolkit.errors import CaptureError, ImageError
 
 
 @pytest.fixture
@@ -148,3 +152,53 @@ def test_a_picture_of_an_unreadable_image_is_a_placeholder(tmp_path: Path) -> No
         shown = read_for_display(tmp_path / name)
         assert shown.ndim == 3
         assert shown.std() > 0, "it says so"
+
+
+def png_of_zeros(width: int, height: int) -> bytes:
+    """Return a PNG of some hundred bytes that claims to have many pixels."""
+    header = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
+    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(bytes(1000))), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+    )
+
+
+@pytest.mark.parametrize("size", [(40_000, 40_000), (20_000, 14_000)])
+def test_a_small_file_of_too_many_pixels_is_not_decoded(tmp_path: Path, size: tuple[int, int]) -> None:
+    """OpenCV raises an error of its own for the first, and would take 0.8 GB for the other."""
+    (tmp_path / "bomb.png").write_bytes(png_of_zeros(*size))
+    with pytest.raises(ImageError, match=rf"{size[0]} x {size[1]} pixels, more than .*bomb\.png"):
+        read_image(tmp_path / "bomb.png")
+    assert stored_size(tmp_path / "bomb.png") == size
+
+
+@pytest.mark.parametrize("kind", ["pipe", "pipe by a link", "device", "circle of links", "sparse", "long name", "NUL"])
+def test_what_is_no_plain_file_is_neither_waited_for_nor_read(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "a.jpg"
+    if kind.startswith("pipe"):
+        os.mkfifo(tmp_path / "pipe")
+        path.symlink_to("pipe")
+        path = tmp_path / "pipe" if kind == "pipe" else path
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    elif kind == "circle of links":
+        path.symlink_to("a.jpg")
+    elif kind == "sparse":
+        with open(path, "wb") as stream:
+            stream.truncate(1 << 40)
+    else:
+        path = tmp_path / ("x" * 300 if kind == "long name" else "a\0b.jpg")
+    for read in (read_image, stored_size, read_depth):
+        with pytest.raises((ImageError, CaptureError)):
+            read(path)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png"])
+def test_an_image_without_its_last_bytes_is_refused_one_with_more_is_not(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a.{suffix}"
+    data = noise_file(path)
+    path.write_bytes(data[:-20])
+    with pytest.raises(ImageError, match="cannot be decoded"):
+        read_image(path)
+    path.write_bytes(data + bytes(100) + b"what some cameras add")
+    assert read_image(path).shape == (200, 300, 3)

@@ -1,20 +1,107 @@
 """Decode images, with errors that say whether a file is missing or unreadable."""
 
 import os
+import stat
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 import cv2
 import numpy as np
+import PIL.Image
 from numpy.typing import NDArray
+from PIL import JpegImagePlugin, PngImagePlugin
 
 from toolkit.errors import ImageError
 
 T = TypeVar("T")
 R = TypeVar("R")
+
+MOST_BYTES = 1 << 30
+"""Of a file that is read as an image."""
+MOST_PIXELS = 1 << 28
+"""Of an image that is decoded: 268 million, 0.8 GB in color. A file of some kilobytes can hold many more."""
+# Not all by `PIL.Image.open`: its limit of pixels is below what telephones take by now.
+_HEADER_READERS: dict[bytes, Callable[[Any], PIL.Image.Image]] = {
+    b"\xff\xd8": JpegImagePlugin.JpegImageFile,
+    b"\x89PNG\r\n\x1a\n": PngImagePlugin.PngImageFile,
+    b"": PIL.Image.open,
+}
+_HEADER_ERRORS = (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError)
+
+
+def read_file(path: str | Path) -> bytes:
+    """Return the content of the file of an image.
+
+    Raises:
+        ImageError: there is none; it is a folder, a pipe or a device; it cannot be read, or is too large.
+    """
+    with _open(path) as stream:
+        return stream.read()
+
+
+@contextmanager
+def _open(path: str | Path) -> Iterator[BinaryIO]:
+    try:
+        found = os.stat(path)  # noqa: PTH116 - half the time of a Path's
+        if not stat.S_ISREG(found.st_mode):  # to open a pipe waits for ever, a device has no end
+            raise ImageError(f"Image cannot be read: {path} is a folder, a pipe or a device, expected a file")
+        if found.st_size > MOST_BYTES:
+            size = f"{found.st_size:,} bytes, expected {MOST_BYTES:,} at most"
+            raise ImageError(f"Image cannot be read: {path} has {size}")
+        with open(path, "rb") as stream:
+            yield stream
+    except FileNotFoundError:
+        raise ImageError(f"Image not found: {path}") from None
+    except (OSError, ValueError) as error:  # the latter for a name that no file can have
+        raise ImageError(f"Image cannot be read: {path} ({error})") from None
+
+
+def stored_size(path: str | Path) -> tuple[int, int]:
+    """Return width and height of an image file, from its header.
+
+    Raises:
+        ImageError: see `read_file`; or it has no header of an image.
+    """
+    with _open(path) as stream:
+        try:
+            return _header_size(stream)
+        except _HEADER_ERRORS as error:
+            raise ImageError(f"Image cannot be decoded ({error}): {path}") from None
+
+
+def _header_size(stream: BinaryIO) -> tuple[int, int]:
+    first = stream.read(8)
+    stream.seek(0)
+    return next(read for start, read in _HEADER_READERS.items() if first.startswith(start))(stream).size
+
+
+def decode(path: str | Path, flags: int) -> NDArray[Any]:
+    """Return the pixels of an image file as OpenCV decodes it with `flags`.
+
+    Raises:
+        ImageError: see `read_file`; or it is no image, is cut short, or has more than `MOST_PIXELS`.
+    """
+    data = read_file(path)
+    try:
+        width, height = _header_size(BytesIO(data))
+    except PIL.Image.DecompressionBombError as error:
+        raise ImageError(f"Image cannot be decoded ({error}): {path}") from None
+    except _HEADER_ERRORS:
+        width = height = 0  # OpenCV says whether it is an image
+    if width * height > MOST_PIXELS:
+        raise ImageError(f"Image cannot be decoded ({width} x {height} pixels, more than {MOST_PIXELS:,}): {path}")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    except cv2.error as error:
+        raise ImageError(f"Image cannot be decoded ({error.err}): {path}") from None
+    if image is None:
+        raise ImageError(f"Image cannot be decoded ({len(data)} bytes; expected a whole JPEG or PNG): {path}")
+    return np.asarray(image)
 
 
 def read_image(path: str | Path, gray: bool = False) -> NDArray[np.uint8]:
@@ -23,19 +110,9 @@ def read_image(path: str | Path, gray: bool = False) -> NDArray[np.uint8]:
     EXIF orientation is not applied: a capture's intrinsics belong to the pixels as they are in the file.
 
     Raises:
-        ImageError: the file is missing, or is not an image that can be decoded.
+        ImageError: the file is missing, or is not an image that can be decoded; see `decode`.
     """
-    path = Path(path)
-    flags = (cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR) | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        data = np.fromfile(path, np.uint8)
-    except FileNotFoundError:
-        raise ImageError(f"Image not found: {path}") from None
-    except OSError as error:
-        raise ImageError(f"Image cannot be read: {path} ({error})") from None
-    image = cv2.imdecode(data, flags) if data.size else None
-    if image is None:
-        raise ImageError(f"Image cannot be decoded ({data.size} bytes; expected a whole JPEG or PNG): {path}")
+    image = decode(path, (cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR) | cv2.IMREAD_IGNORE_ORIENTATION)
     return np.asarray(image if gray else image[:, :, ::-1], np.uint8)
 
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.tables import ALIGNED, times_of, write_table
 from toolkit.capture.trajectory import Trajectory
-from toolkit.errors import CaptureError
+from toolkit.errors import CaptureError, ImageError
 from toolkit.files import write_atomic
 from toolkit.geometry import qt_from_pose
 
@@ -85,14 +85,19 @@ def read_depth(path: str | Path) -> NDArray[np.float32]:
     """Return a depth map, (H, W) float32 meters along the camera's z axis, 0 where unknown.
 
     Raises:
-        CaptureError: the file is missing or is not a 16-bit image.
+        CaptureError: the file cannot be read or is not a 16-bit image.
     """
     import cv2
 
-    depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if Path(path).exists() else None
-    if depth is None or depth.dtype != np.uint16 or depth.ndim != 2:
-        fault = "no 16-bit image of one channel" if Path(path).exists() else "no such file"
-        raise CaptureError(f"Depth map {path}: {fault}. Expected a 16-bit PNG in millimeters.")
+    from toolkit.capture.images import decode
+
+    try:
+        depth = decode(path, cv2.IMREAD_UNCHANGED)
+    except ImageError as error:
+        fault = f"no 16-bit image of one channel ({error})" if "not found" not in str(error) else "no such file"
+        raise CaptureError(f"Depth map {path}: {fault}. Expected a 16-bit PNG in millimeters.") from None
+    if depth.dtype != np.uint16 or depth.ndim != 2:
+        raise CaptureError(f"Depth map {path}: no 16-bit image of one channel. Expected a 16-bit PNG in millimeters.")
     return (depth / np.float32(DEPTH_SCALE)).astype(np.float32)
 
 

@@ -15,7 +15,7 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import DEPTH_SCALE, Capture, Session, Trajectory
 from toolkit.capture.devices import color_of
-from toolkit.capture.images import default_workers, prefetch, read_for_display, read_image
+from toolkit.capture.images import decode, default_workers, prefetch, read_for_display, read_image
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import ArtifactError, CaptureError, ImageError
 from toolkit.files import file_fingerprint, files_fingerprint, write_sidecar
@@ -386,8 +386,11 @@ def _names(table: pd.DataFrame, column: str, frame: list[str], kind: str) -> pd.
 def _load(shot: _Shot, image_size: int, quality: int) -> _Shot:
     """Read a picture or depth map and make it small; in a thread."""
     if shot.is_depth:
-        depth = cv2.imread(str(shot.path), cv2.IMREAD_UNCHANGED)
-        if depth is None or depth.dtype != np.uint16 or depth.ndim != 2:
+        try:
+            depth = decode(shot.path, cv2.IMREAD_UNCHANGED)
+        except ImageError:
+            return shot
+        if depth.dtype != np.uint16 or depth.ndim != 2:
             return shot
         scale = min(1.0, image_size / 2 / max(depth.shape))
         width, height = (max(1, round(scale * side)) for side in depth.shape[::-1])

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
+from toolkit.capture.images import read_file
 from toolkit.errors import ImageError
 from toolkit.geometry import Floats, Ints
 from toolkit.models.vit import PATCH
@@ -102,11 +104,9 @@ def _open(source: Source) -> Image.Image:
         image = Image.fromarray(source)
     else:
         try:
-            with Image.open(source) as opened:
+            with Image.open(BytesIO(read_file(source))) as opened:
                 opened.load()
                 image = opened
-        except FileNotFoundError:
-            raise ImageError(f"Image not found: {source}") from None
         except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
             raise ImageError(f"Image cannot be decoded: {source} ({error}); expected a whole image file.") from None
     if image.mode == "RGBA":
