@@ -89,7 +89,7 @@ def files_fingerprint(paths: list[Path]) -> str:
         try:
             stat = path.stat()
             rows.append([path.name, stat.st_size, stat.st_mtime_ns])
-        except (FileNotFoundError, NotADirectoryError):
+        except OSError:  # missing, or a name, a link or a folder that cannot be followed
             rows.append([path.name, None, None])
     return fingerprint(rows)
 
@@ -231,6 +231,10 @@ def _jsonable(value: Any) -> Any:
     if hasattr(value, "item"):  # a numpy scalar
         return value.item()
     raise TypeError(f"Settings must be JSON: {value!r} is a {type(value).__name__}.")
+
+
+RUN_FILES = ("notebooks", "report.html", "run.json", "run.log", "submission.csv", "submission.zip")
+"""What lies in a run folder beside its scenes, none of which can have such a name."""
 
 
 @dataclass(frozen=True)

@@ -300,8 +300,8 @@ class _PairRun:
         turns = np.zeros(len(rows), int) if shown is None else shown.of(session, rows)
         names = [session.image_name(int(row)) for row in rows]
         views = [
-            View(name, session.path.parent / name, session.camera(sensor), in_map=False, turns=int(turn))
-            for name, (_, sensor), turn in zip(names, keys, turns, strict=True)
+            View(name, session.image_path(int(row)), session.camera(sensor), in_map=False, turns=int(turn))
+            for row, name, (_, sensor), turn in zip(rows, names, keys, turns, strict=True)
         ]
         query = Query(
             views,

@@ -21,6 +21,7 @@ from typing import Any
 
 from toolkit import __version__
 from toolkit.capture.devices import extra_devices, table_record
+from toolkit.capture.names import allow_outside
 from toolkit.embedders import WEIGHTS as EMBEDDER_WEIGHTS
 from toolkit.embedders import resolve_name
 from toolkit.errors import ManifestError
@@ -135,7 +136,8 @@ def run(
     manifest = load_manifest(manifest_path, overrides)
     if only is not None and only not in manifest.stages:
         raise ManifestError(f"--only {only}: {manifest_path} has no section `{only}`, so the stage is off.")
-    with extra_devices([device.model_dump(exclude_none=True) for device in manifest.extra_devices]):
+    devices = [device.model_dump(exclude_none=True) for device in manifest.extra_devices]
+    with extra_devices(devices), allow_outside(manifest.allow_outside):
         return _run(manifest, manifest_path, only, force, say)
 
 

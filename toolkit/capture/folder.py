@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from toolkit.capture.devices import SPLITS, in_order, session_id, session_of
+from toolkit.capture.names import require_name
 from toolkit.capture.session import Session
 from toolkit.errors import CaptureError
 
@@ -12,7 +13,8 @@ class Capture:
     """A capture folder: its sessions, each read when first asked for."""
 
     def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
+        path = Path(path)
+        self.path = path.resolve() if path.name == ".." else path  # the folder is to have a name
         if not self.path.is_dir():
             raise CaptureError(f"No such capture folder: {self.path}. Expected a folder that holds `sessions/`.")
         self._root = self.path / "sessions"
@@ -21,10 +23,13 @@ class Capture:
                 f"{self.path} is not a capture: it has no folder `sessions`. Expected "
                 f"{self.path.name}/sessions/<device>_<map|query>/images.txt."
             )
+        require_name(self.name, "capture", self.path.parent)
         self._folders: dict[str, Path] = {}
         for folder in sorted(self._root.iterdir()):
             name = session_id(folder.name)
             is_session = any((folder / file).exists() for file in ("sensors.txt", "images.txt"))
+            if is_session:
+                require_name(folder.name, "session", self._root)
             if is_session and (name not in self._folders or folder.name == name):
                 self._folders[name] = folder
         self.session_ids = sorted(self._folders)
@@ -86,6 +91,18 @@ class Capture:
     def folder(self, session_id: str) -> Path:
         """Return the folder of a session."""
         return self._folders[session_id]
+
+    def image_path(self, name: str) -> Path:
+        """Return the file of an image by its name, as `Session.image_name` gives it.
+
+        Raises:
+            CaptureError: no session lists it.
+        """
+        session = self[session_id(name.partition("/")[0])]
+        row = session.row_of_name.get(name)
+        if row is None:
+            raise CaptureError(f"{session.path / 'images.txt'}: has no image {name!r}. Run the stages of it again.")
+        return session.image_path(row)
 
     def __getitem__(self, session_id: str) -> Session:
         if session_id not in self.session_ids:

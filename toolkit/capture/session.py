@@ -12,7 +12,7 @@ A session may hold 200,000 images, sensors and rigs. So tables stay columns (Arr
 Python code loops over rows while a session is read.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +25,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.cameras import parse_camera
 from toolkit.capture.devices import session_id, session_of
+from toolkit.capture.names import (
+    HOW_TO_ALLOW,
+    bad_names,
+    is_linked_here,
+    leads_out,
+    links_out,
+    outside_allowed,
+    require_name,
+    roots_of,
+)
 from toolkit.capture.rigs import find_rigs
 from toolkit.capture.tables import (
     ALIGNED,
@@ -80,10 +90,13 @@ class Session:
         self._strict = strict
         if not self.path.is_dir():
             raise CaptureError(f"No such session folder: {self.path}.")
+        require_name(self.path.name, "session", self.path.parent)
+        self._links_allowed = outside_allowed() or is_linked_here(self.path)
         self._sensor_table = self._read("sensors.txt", extra=True)
         self.sensors = self._sensor_table.frame("sensor_id", "name", "sensor_type")
         self.sensors["params"] = as_pandas(self._sensor_table.columns["extra"])
-        self.images = self._records("images.txt", "image_path")
+        self._image_table = self._read("images.txt")
+        self.images = _records(self._image_table, "image_path")
         self.rigs: pd.DataFrame | None = None
         self._rig_qt = np.zeros((0, 7))
         if (self.path / "rigs.txt").exists():
@@ -112,22 +125,33 @@ class Session:
         return len(self.images)
 
     def _read(self, file: str, extra: bool = False) -> TextTable:
-        table = read_table(self.path / file, COLUMNS.get(file, COLUMNS["keyframes"]), self._strict, extra)
+        path = self.path / file
+        if not self._links_allowed and (target := leads_out(path, self._roots)):
+            raise CaptureError(
+                f"{path}: is a link to {target}, outside of the capture. Copy the file, or, if the link is yours: "
+                f"{HOW_TO_ALLOW}."
+            )
+        table = read_table(path, COLUMNS.get(file, COLUMNS["keyframes"]), self._strict, extra)
         if not self._strict:
             self.tables[file] = table
         return table
 
-    def _records(self, file: str, column: str) -> pd.DataFrame:
-        return self._read(file).frame("timestamp", "sensor_id", column).rename(columns={column: "path"})
-
     def _trajectory(self, file: str) -> Trajectory | None:
         return Trajectory.from_table(self._read(file)) if (self.path / file).exists() else None
+
+    @cached_property
+    def _roots(self) -> list[Path]:
+        return roots_of(self.path)
 
     # Files
 
     def image_path(self, row: int) -> Path:
-        """Return the file of an image."""
-        return self.path / RAW_DATA / self.images["path"].iloc[row]
+        """Return the file of an image.
+
+        Raises:
+            CaptureError: links put an image of the session outside of the capture.
+        """
+        return self._raw_data / self.images["path"].iloc[row]
 
     def image_name(self, row: int) -> str:
         """Return the name of an image in the whole capture: its path relative to sessions/."""
@@ -145,8 +169,36 @@ class Session:
 
     @cached_property
     def depths(self) -> pd.DataFrame | None:
-        """Table [timestamp, sensor_id, path] of depths.txt, or None."""
-        return self._records("depths.txt", "depth_path") if (self.path / "depths.txt").exists() else None
+        """Table [timestamp, sensor_id, path] of depths.txt, or None.
+
+        Raises:
+            CaptureError: a line is malformed, or links put a depth map outside of the capture.
+        """
+        if not (self.path / "depths.txt").exists():
+            return None
+        table = self._read("depths.txt")
+        self._require_no_link_out(table, "depth_path")
+        return _records(table, "depth_path")
+
+    @cached_property
+    def _raw_data(self) -> Path:
+        """The folder of the images, after a look at what would cost time where they are not read."""
+        self._require_no_link_out(self._image_table, "image_path")
+        return self.path / RAW_DATA
+
+    def _require_no_link_out(self, table: TextTable, column: str) -> None:
+        for row, target in self.links_out(table.frame(column)[column]).items() if self._strict else ():
+            raise CaptureError(
+                f"{table.where(row)}: {RAW_DATA}/{table.columns[column][row].as_py()} is a link to {target}, outside "
+                f"of the capture. Copy the file, or, if the link is yours: {HOW_TO_ALLOW}."
+            )
+
+    def links_out(self, paths: "pd.Series[str]") -> dict[int, Path]:
+        """Return which of the paths below raw_data/ links put outside of the capture, and their targets.
+
+        None where that is allowed, and in a session that `import` filled with links here.
+        """
+        return {} if self._links_allowed else links_out(self.path / RAW_DATA, paths, self._roots)
 
     @cached_property
     def camera_rows(self) -> Ints:
@@ -221,8 +273,13 @@ class Session:
     def subsessions(self) -> list[str]:
         """The recordings in the session: proc/subsessions.txt, else the first folders of image paths."""
         if (self.path / SUBSESSIONS).exists():
-            return self._read(SUBSESSIONS).columns["subsession"].to_pylist()
+            return self._checked(self._read(SUBSESSIONS).columns["subsession"].to_pylist(), SUBSESSIONS)
         return sorted(set(self._subsession_of_image))
+
+    def _checked(self, subsessions: Sequence[str], file: str) -> list[str]:
+        for name in subsessions if self._strict else ():
+            require_name(name, "subsession", self.path / file)
+        return list(subsessions)
 
     def subsession_of(self, rows: Rows = None) -> Strings:
         """Return the subsession of images, (n,) str: the longest that starts path or sensor id, else ""."""
@@ -233,7 +290,9 @@ class Session:
         columns = [as_strings(self.images[name]) for name in ("sensor_id", "path")]
         if not (self.path / SUBSESSIONS).exists():
             parts = pc.split_pattern(columns[1], "/", max_splits=1)
-            first = pc.if_else(pc.greater(pc.list_value_length(parts), 1), pc.list_element(parts, 0), self.id)
+            in_folder = pc.and_(pc.greater(pc.list_value_length(parts), 1), pc.invert(bad_names(columns[1])))
+            first = pc.if_else(in_folder, pc.list_element(parts, 0), self.id)  # a path that leads out has none
+            self._checked(pc.unique(first).to_pylist(), "images.txt")
             return first.to_numpy(zero_copy_only=False)
         subsessions = np.full(len(self.images), "", object)
         for name in sorted(self.subsessions, key=len):
@@ -385,6 +444,10 @@ class Session:
         """
         index, photographs = self._image_index
         return [photographs[rows] for rows in index.find_all(times_of(keyframes), keyframes["device_id"])]
+
+
+def _records(table: TextTable, column: str) -> pd.DataFrame:
+    return table.frame("timestamp", "sensor_id", column).rename(columns={column: "path"})
 
 
 def _selection(rows: Rows) -> Any:

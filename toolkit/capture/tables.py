@@ -6,6 +6,7 @@ file into blocks of whole lines; Arrow splits and converts two blocks at a time.
 an error message can name the line.
 """
 
+import errno
 import os
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -20,14 +21,15 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from toolkit.capture.names import EXPECTED_NAME, HOW_TO_ALLOW, bad_names, outside_allowed
 from toolkit.errors import ArtifactError, CaptureError
 from toolkit.files import write_atomic
 from toolkit.geometry import Floats, Ints
 
 Columns = Sequence[tuple[str, str]]
 
-# Column types: an integer, a finite number, a text that must not be empty, any text.
-INTEGER, NUMBER, ID, TEXT = "integer", "finite number", "id", "text"
+# Column types: an integer, a finite number, a name, the path of an image, any text.
+INTEGER, NUMBER, ID, PATH, TEXT = "integer", "finite number", "id", "path", "text"
 POSE_NAMES = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
 POSE = tuple((name, NUMBER) for name in POSE_NAMES)
 ALIGNED = "proc/alignment_trajectories.txt"
@@ -35,8 +37,8 @@ _TRAJECTORY: Columns = (("timestamp", INTEGER), ("device_id", ID), *POSE)
 COLUMNS: dict[str, Columns] = {
     "sensors.txt": (("sensor_id", ID), ("name", TEXT), ("sensor_type", ID)),
     "rigs.txt": (("rig_id", ID), ("sensor_id", ID), *POSE),
-    "images.txt": (("timestamp", INTEGER), ("sensor_id", ID), ("image_path", ID)),
-    "depths.txt": (("timestamp", INTEGER), ("sensor_id", ID), ("depth_path", ID)),
+    "images.txt": (("timestamp", INTEGER), ("sensor_id", ID), ("image_path", PATH)),
+    "depths.txt": (("timestamp", INTEGER), ("sensor_id", ID), ("depth_path", PATH)),
     "trajectories.txt": _TRAJECTORY,
     ALIGNED: _TRAJECTORY,
     "proc/subsessions.txt": (("subsession", ID),),
@@ -96,7 +98,7 @@ def read_table(path: Path, columns: Columns, strict: bool = True, extra: bool = 
         empty = {name: pa.array([], _ARROW_TYPES[kind]) for name, kind in [*columns, ("extra", TEXT)]}
         return TextTable(path, empty, np.zeros(0, np.int64), [(0, message)], False)
     except OSError as error:
-        raise CaptureError(f"File cannot be read: {path} ({error}).") from None
+        raise CaptureError(f"File cannot be read: {path} ({error.strerror}). Expected a text file.") from None
 
     def parse(span: tuple[int, int]) -> _Block:
         start, end = span
@@ -138,7 +140,7 @@ class _Block:
     has_extra: bool
 
 
-_ARROW_TYPES = {INTEGER: pa.int64(), NUMBER: pa.float64(), ID: pa.large_string(), TEXT: pa.large_string()}
+_ARROW_TYPES = {INTEGER: pa.int64(), NUMBER: pa.float64()} | dict.fromkeys((ID, PATH, TEXT), pa.large_string())
 # Small enough that two in flight cost little memory, large enough to hide the overhead.
 _BLOCK_BYTES = 1 << 20
 
@@ -150,6 +152,8 @@ def _layout(columns: Columns) -> str:
 def _line_blocks(path: Path) -> list[tuple[int, int]]:
     """Cut a file into spans of bytes that end at line ends."""
     borders = [0]
+    if path.exists() and not path.is_file():  # to open a pipe waits for ever, a device has no end
+        raise OSError(errno.EINVAL, "it is no file")
     with open(path, "rb") as stream:
         size = stream.seek(0, os.SEEK_END)
         while borders[-1] < size:
@@ -215,15 +219,20 @@ def _parse_block(data: bytes, first: bool, columns: Columns, keep_extra: bool) -
     return _Block(arrays, lines, len(ends), sorted(problems), has_extra)
 
 
-_EXPECTED = {INTEGER: "an integer (microseconds)", NUMBER: "a finite number", ID: "a text that is not empty"}
+_EXPECTED = {
+    INTEGER: "an integer (microseconds)",
+    NUMBER: "a finite number",
+    ID: EXPECTED_NAME,
+    PATH: f"{EXPECTED_NAME}, below raw_data/ (if you list files that lie elsewhere yourself, {HOW_TO_ALLOW})",
+}
 
 
 def convert(column: pa.Array, kind: str) -> tuple[pa.Array, NDArray[np.bool_]]:
     """Return a column converted to its type, and which values are wrong (0 or empty there)."""
     if kind == TEXT:
         return column, np.zeros(len(column), bool)
-    if kind == ID:
-        return column, pc.equal(column, "").to_numpy(zero_copy_only=False)
+    if kind in (ID, PATH):
+        return column, bad_names(column, kind == PATH and outside_allowed()).to_numpy(zero_copy_only=False)
     wrong = np.zeros(len(column), bool)
     try:
         converted = column.cast(_ARROW_TYPES[kind])

@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
+from toolkit.capture.names import require_name
 from toolkit.errors import CaptureError
 
 # Files of a session, with the column whose values begin with the subsession: `<subsession>/<sensor>`.
@@ -38,7 +39,7 @@ def arrange(sessions: str | Path, names: Mapping[str, str]) -> list[str]:
         names: for each new name, `<device>_<map or query>`, the session's name in the data set.
 
     Raises:
-        CaptureError: a session to split has no subsession of a device.
+        CaptureError: a session to split has no subsession of a device, or one whose name leads out of it.
     """
     sessions = Path(sessions)
     notes = []
@@ -61,6 +62,8 @@ def arrange(sessions: str | Path, names: Mapping[str, str]) -> list[str]:
 def _split(old: Path, new: list[Path]) -> list[str]:
     """Split a session into one of each device; return what was left out."""
     unclaimed = subsessions = set(_subsessions(old))
+    for name in subsessions:
+        require_name(name, "subsession", old / "proc" / "subsessions.txt")
     for session in new:
         device = session.name.rpartition("_")[0]
         own = {name for name in subsessions if name.startswith(f"{device}_")}

@@ -28,6 +28,7 @@ import pycolmap
 from toolkit.capture import RAW_DATA, Trajectory, parse_camera, write_session
 from toolkit.capture.devices import SPLITS
 from toolkit.capture.exif import ORIENTATION, exif_camera, read_header, read_number, time_taken
+from toolkit.capture.names import EXPECTED_NAME, is_bad_name, note_linked_here
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.geometry import Floats, invert, make_pose, pose_from_qt
@@ -137,6 +138,8 @@ class _Draft:
                     target.symlink_to(os.path.abspath(source))  # noqa: PTH100 - a link in the source stays one
             self._write_tables(part, times)
             table.to_csv(part / "proc" / "import.csv", index=False)
+            if self.placing == "link":
+                note_linked_here(part)
             part.rename(self.session)
         return ImportReport(self.session, table, self.notes)
 
@@ -165,10 +168,12 @@ class _Draft:
     def _problem(self, image: _Image) -> str:
         """Set what an image's header says; return why the image cannot be used, or nothing."""
         name = PurePosixPath(image.name)
-        if "," in image.name or "\n" in image.name:
-            return "the capture format cannot hold the comma or line break in its name"
-        if name.is_absolute() or ".." in name.parts:
+        if "," in image.name:
+            return "the capture format cannot hold the comma in its name"
+        if image.name.startswith("/") or ".." in name.parts:
             return "not a path inside the folder of images"
+        if is_bad_name(image.name):
+            return f"the capture format cannot hold this name, expected {EXPECTED_NAME}"
         try:
             size, exif = read_header(self.folder / name)
         except ImageError as error:

@@ -118,8 +118,9 @@ class FeedForwardLocalizer:
     def view(self, index: int) -> View:
         """Return a map image as a network is shown it."""
         name = self.map.image_names[index]
-        turns = int(self._turns[self._session.row_of_name[name]])
-        return View(name, self._session.path.parent / name, self.map.cameras[index], in_map=True, turns=turns)
+        row = self._session.row_of_name[name]
+        turns = int(self._turns[row])
+        return View(name, self._session.image_path(row), self.map.cameras[index], in_map=True, turns=turns)
 
     def _choose(self, references: References) -> Ints:
         """Return the references of one query image to use."""

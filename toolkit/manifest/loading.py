@@ -11,6 +11,7 @@ import yaml
 from pydantic import ValidationError
 
 from toolkit.errors import ManifestError
+from toolkit.files import RUN_FILES
 from toolkit.manifest.manifest import Manifest
 from toolkit.manifest.messages import explain
 from toolkit.manifest.settings import expand, merge
@@ -58,6 +59,12 @@ def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
 
         raise ManifestError(explain(error, Manifest, source, origin)) from None
     names = [Path(capture).name for capture in manifest.captures]
+    for name, capture in zip(names, manifest.captures, strict=True):
+        if name in RUN_FILES:
+            raise ManifestError(
+                f"{source}: captures: the results of {capture} would go where a run has its own {name}. Rename the "
+                "folder, or give a link of another name to it."
+            )
     if twice := {name for name in names if names.count(name) > 1}:
         raise ManifestError(
             f"{source}: captures: two folders are called {sorted(twice)[0]!r}, so their results would "

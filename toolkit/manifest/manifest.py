@@ -120,6 +120,8 @@ class Manifest(Settings):
     """Or: a capture to render."""
     dataset: DatasetSettings | None = None
     """Where to get the captures from, if they can be downloaded."""
+    allow_outside: bool = False
+    """Take images that `..`, absolute paths or links put outside of their capture: for captures of your own."""
     output_root: str = "../runs"
     """Results go to <output_root>/<name>."""
     extra_devices: list[ExtraDevice] = []

@@ -143,7 +143,7 @@ def _draw_rows(
     sessions_root: str | Path, jsonl: str | Path, rows: list[list[dict[str, Any]]], references: int
 ) -> "Figure":
     """Draw a line a query: its image, then its first references as each of its rows has them."""
-    sessions_root = Path(sessions_root)
+    capture = Capture.from_sessions_root(sessions_root)
     map_device, _, query_device = Path(jsonl).stem.rpartition("_map_")[2].partition("_query_")
     width = 1 + references * max((len(row) for row in rows), default=1)
     figure = new_figure(2.2 * width, 1.9 * len(rows))
@@ -158,7 +158,7 @@ def _draw_rows(
                 title = f"{hit['score']} inliers, was {hit['retrieval_rank']}" if verified else f"{hit['score']:.2f}"
                 shown.append((axis, hit, f"{map_device} {title}"))
         for axis, entry, title in shown:
-            axis.imshow(read_for_display(sessions_root / image_name(entry["path"])))
+            axis.imshow(read_for_display(capture.image_path(image_name(entry["path"]))))
             axis.set_title(title, fontsize=8)
     return figure
 
