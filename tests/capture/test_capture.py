@@ -213,6 +213,15 @@ def test_files_as_programs_write_them(tmp_path: Path) -> None:
         ("trajectories.txt", "2, cam, 1, 0, 0, 0, 0, one, 0", "found ty = 'one'"),
         ("proc/alignment_trajectories.txt", "2, cam, inf, 0, 0, 0, 0, 0, 0", "found qw = 'inf'"),
         ("images.txt", b"2, c\xe4m, a.jpg", "found bytes that are not UTF-8"),
+        ("images.txt", "0x10, cam, a.jpg", "found timestamp = '0x10'"),
+        ("images.txt", "0X1F, cam, a.jpg", "found timestamp = '0X1F'"),
+        ("trajectories.txt", "2, cam, 1, 0, 0, 0, 1e308, 0, 0", "found tx = '1e308'"),
+        ("rigs.txt", "rig, cam, 1, 0, 0, 0, 0, 0, -1e13", "found tz = '-1e13'"),
+        ("trajectories.txt", "2, cam, 1e200, 0, 0, 0, 0, 0, 0", "found a quaternion without end"),
+        ("images.txt", "2, cam, a.jpg\r3, cam, b.jpg", "found a carriage return within the line"),
+        ("images.txt", "1, cam, b.jpg", "timestamp 1, sensor_id 'cam' again, with other values than in line 3"),
+        ("rigs.txt", "rig, cam, 1, 0, 0, 0, 5, 0, 0", "rig_id 'rig', sensor_id 'cam' again, with other values than"),
+        ("trajectories.txt", "1, cam, 1, 0, 0, 0, 5, 0, 0", "timestamp 1, device_id 'cam' again, with other values"),
     ],
 )
 def test_a_malformed_line_is_named(tmp_path: Path, file: str, line: str | bytes, message: str) -> None:
@@ -227,7 +236,61 @@ def test_a_malformed_line_is_named(tmp_path: Path, file: str, line: str | bytes,
         Session.open(path)
     text = str(caught.value)
     assert f"{path / file}, line 4: {message}" in text
-    assert "python -m toolkit check" in text
+    assert "python -m toolkit check" in text or " again, " in text
+
+
+def test_a_file_whose_lines_end_in_carriage_returns_is_not_empty(tmp_path: Path) -> None:
+    """It is one line, which begins with `#`."""
+    path = write(tmp_path / "ios_map", {"images.txt": "# timestamp, sensor_id, image_path\r1, cam, a/1.jpg\r"})
+    with pytest.raises(CaptureError, match=r"images\.txt, line 1: found a carriage return"):
+        Session.open(path)
+
+
+def test_a_pipe_as_a_text_file_is_not_waited_for(tmp_path: Path) -> None:
+    path = write(tmp_path / "ios_map", {})
+    os.mkfifo(path / "rigs.txt")
+    with pytest.raises(CaptureError, match=r"rigs\.txt \(it is no file\)"):
+        Session.open(path)
+
+
+def test_a_line_that_is_there_twice_counts_once_and_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    camera = "cam, , camera, PINHOLE, 64, 48, 50, 50, 32, 24\n"
+    path = write(
+        tmp_path / "ios_query",
+        {
+            "sensors.txt": camera * 2,
+            "images.txt": "2, cam, a/2.jpg\n1, cam, a/1.jpg\n2, cam, a/2.jpg\n",
+            "rigs.txt": "rig, cam, 1, 0, 0, 0, 0, 0, 0\n" * 3,
+            "proc/keyframes_pruned.txt": "1, rig\n2, rig\n1, rig\n",
+            "proc/alignment_trajectories.txt": "1, rig, 1, 0, 0, 0, 0, 0, 0\n" * 2,
+        },
+    )
+    session = Session.open(path)
+    assert session.camera("cam").width == 64
+    assert session.images["timestamp"].tolist() == [2, 1]
+    assert session.keyframes("pruned")["timestamp"].tolist() == [1, 2]
+    assert session.keyframes("all")["timestamp"].tolist() == [1]
+    assert session.rig_from_sensor_table.shape == (1, 4, 4)
+    for told in (
+        *("sensors.txt, line 2: sensor_id 'cam' again, as in line 1; each counts once", "images.txt, line 3: "),
+        "rigs.txt, line 2: rig_id 'rig', sensor_id 'cam' again, as in line 1, and 1 more",
+        "keyframes_pruned.txt, line 3",
+    ):
+        assert told in caplog.text
+    assert caplog.text.count("keyframes_pruned.txt, line 3") == 1
+
+
+def test_two_cameras_of_one_name_are_refused(tmp_path: Path) -> None:
+    camera = "cam, , camera, PINHOLE, 64, 48, 50, 50, 32, 24\n"
+    session = Session.open(write(tmp_path / "ios_map", {"sensors.txt": camera + camera.replace("50, 50", "60, 60")}))
+    with pytest.raises(CaptureError, match=r"sensors\.txt, line 2: sensor_id 'cam' again, with other values"):
+        session.camera("cam")
+
+
+def test_an_image_under_two_keys_is_refused(tmp_path: Path) -> None:
+    session = Session.open(write(tmp_path / "ios_map", {"images.txt": "1, cam, a/1.jpg\n2, cam, a/1.jpg\n"}))
+    with pytest.raises(CaptureError, match=r"images\.txt, line 2: found the image 'a/1\.jpg' again"):
+        session.image_path(0)
 
 
 def test_line_numbers_hold_across_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -269,6 +332,11 @@ def test_every_camera_model_of_colmap_opens(tmp_path: Path) -> None:
         ("PINHOLE, 64, 48, 50, 50, 32, x", "expected numbers after the model"),
         ("PINHOLE, 64, 48, 50, 50, 32, nan", "finite"),
         ("PINHOLE, 64.5, 48, 50, 50, 32, 24", "found image size 64.5 x 48"),
+        ("PINHOLE, -64, 48, 50, 50, 32, 24", "found image size -64 x 48"),
+        ("PINHOLE, 64, 48, -50, 50, 32, 24", "found a focal length that is not positive"),
+        ("PINHOLE, 64, 48, 50, 50, 3200, 24", "found a principal point at 3200"),
+        ("SIMPLE_RADIAL, 64, 48, 50, 32, -49, 0", "found a principal point at -49"),
+        ("PINHOLE, 64, 48, 5_0, 50, 32, 24", "expected numbers after the model"),
         ("", "found camera model ''"),
     ],
 )

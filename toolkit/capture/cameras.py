@@ -28,7 +28,7 @@ def parse_camera(sensor_type: str, params: str) -> pycolmap.Camera:
     count = len(pycolmap.Camera.create_from_model_name(0, model, 1.0, 1, 1).params)
     try:
         # The benchmark writes whole numbers without a point, other tools `960.0`.
-        numbers = np.array([float(value) for value in values if value], np.float64)
+        numbers = np.array([float(value.replace("_", " ")) for value in values if value], np.float64)
     except ValueError as error:
         raise ValueError(f"found {params!r}, expected numbers after the model ({error}).") from None
     if len(numbers) != count + 2 or not np.all(np.isfinite(numbers)):
@@ -42,6 +42,12 @@ def parse_camera(sensor_type: str, params: str) -> pycolmap.Camera:
     camera = pycolmap.Camera(model=model, width=int(width), height=int(height), params=numbers[2:])
     if any(camera.params[index] <= 0 for index in camera.focal_length_idxs()):
         raise ValueError(f"found a focal length that is not positive in {params!r}, expected pixels.")
+    for index, size in zip(camera.principal_point_idxs(), (width, height), strict=False):
+        if not -size <= camera.params[index] <= 2 * size:
+            raise ValueError(
+                f"found a principal point at {camera.params[index]:g} in {params!r}, more than the size of the image "
+                f"({size:g}) away from it; expected pixels."
+            )
     return camera
 
 

@@ -47,6 +47,7 @@ from toolkit.capture.tables import (
     as_pandas,
     as_strings,
     codes_of,
+    key_of,
     read_table,
     times_of,
 )
@@ -107,6 +108,7 @@ class Session:
         aligned = self._trajectory(ALIGNED)
         self.ground_truth = self.trajectory if aligned is None and self.split == "map" else aligned
         self._cameras: dict[str, pycolmap.Camera] = {}
+        self._keyframes: dict[str, pd.DataFrame] = {}
 
     @classmethod
     def open(cls, path: str | Path) -> "Session":
@@ -134,7 +136,22 @@ class Session:
         table = read_table(path, COLUMNS.get(file, COLUMNS["keyframes"]), self._strict, extra)
         if not self._strict:
             self.tables[file] = table
-        return table
+            return table
+        if file in ("trajectories.txt", ALIGNED):
+            table.repeated(key_of(file))  # a pose that is there twice is found once; its covariance stays in the file
+            return table
+        return table if file == "sensors.txt" else table.without_repeated(key_of(file))  # sensors: see `_sensor_rows`
+
+    def _require_different(self, images: TextTable) -> None:
+        """Refuse images of one path: whatever is made of an image goes by its path."""
+        if not self._strict:
+            return
+        for row in np.flatnonzero(images.frame("image_path").duplicated())[:1].tolist():
+            path = images.columns["image_path"][row].as_py()
+            raise CaptureError(
+                f"{images.where(row)}: found the image {path!r} again, under another timestamp or sensor. Remove one "
+                "of the two lines, or give the other its own file."
+            )
 
     def _trajectory(self, file: str) -> Trajectory | None:
         return Trajectory.from_table(self._read(file)) if (self.path / file).exists() else None
@@ -149,7 +166,7 @@ class Session:
         """Return the file of an image.
 
         Raises:
-            CaptureError: links put an image of the session outside of the capture.
+            CaptureError: an image of the session is listed under two keys, or links put one outside of the capture.
         """
         return self._raw_data / self.images["path"].iloc[row]
 
@@ -183,6 +200,7 @@ class Session:
     @cached_property
     def _raw_data(self) -> Path:
         """The folder of the images, after a look at what would cost time where they are not read."""
+        self._require_different(self._image_table)
         self._require_no_link_out(self._image_table, "image_path")
         return self.path / RAW_DATA
 
@@ -236,7 +254,10 @@ class Session:
 
     @cached_property
     def _sensor_rows(self) -> dict[str, int]:
-        return {sensor: row for row, sensor in enumerate(self._sensor_table.columns["sensor_id"].to_pylist())}
+        rows = {sensor: row for row, sensor in enumerate(self._sensor_table.columns["sensor_id"].to_pylist())}
+        if len(rows) < len(self._sensor_table) and self._strict:
+            self._sensor_table.without_repeated(key_of("sensors.txt"))  # tells, or raises
+        return rows
 
     def _sensor_row(self, sensor_id: str) -> int:
         row = self._sensor_rows.get(sensor_id)
@@ -322,7 +343,8 @@ class Session:
         """
         if name == "all" and self.ground_truth is not None:
             truth = self.ground_truth
-            return pd.DataFrame({"timestamp": truth.timestamps, "device_id": as_pandas(truth.arrow_ids)}, copy=False)
+            keys = pd.DataFrame({"timestamp": truth.timestamps, "device_id": as_pandas(truth.arrow_ids)}, copy=False)
+            return keys.drop_duplicates(ignore_index=True)
         if name == "all":
             keys = pd.DataFrame({"timestamp": times_of(self.images), "device_id": as_pandas(self._devices[0])})
             return keys.drop_duplicates(ignore_index=True)
@@ -332,7 +354,9 @@ class Session:
                 f"Session {self.id} has no keyframe list {name!r}; available: "
                 f"{', '.join([*files, 'all'])} (from {self.path / 'proc'}/keyframes_*.txt)."
             )
-        return self._read(files[short]).frame("timestamp", "device_id")
+        if short not in self._keyframes:
+            self._keyframes[short] = self._read(files[short]).frame("timestamp", "device_id")
+        return self._keyframes[short].copy()
 
     # Devices and poses
 

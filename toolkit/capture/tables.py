@@ -7,10 +7,11 @@ an error message can name the line.
 """
 
 import errno
+import logging
 import os
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -26,12 +27,16 @@ from toolkit.errors import ArtifactError, CaptureError
 from toolkit.files import write_atomic
 from toolkit.geometry import Floats, Ints
 
+log = logging.getLogger(__name__)
+
 Columns = Sequence[tuple[str, str]]
 
-# Column types: an integer, a finite number, a name, the path of an image, any text.
-INTEGER, NUMBER, ID, PATH, TEXT = "integer", "finite number", "id", "path", "text"
+# Column types: an integer, a finite number, a length of a position, a name, the path of an image, any text.
+INTEGER, NUMBER, METERS, ID, PATH, TEXT = "integer", "finite number", "meters", "id", "path", "text"
+FARTHEST_M = 1e12
+"""Farther than any place; the squares of numbers near the largest one would not be finite."""
 POSE_NAMES = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
-POSE = tuple((name, NUMBER) for name in POSE_NAMES)
+POSE = tuple((name, NUMBER if name.startswith("q") else METERS) for name in POSE_NAMES)
 ALIGNED = "proc/alignment_trajectories.txt"
 _TRAJECTORY: Columns = (("timestamp", INTEGER), ("device_id", ID), *POSE)
 COLUMNS: dict[str, Columns] = {
@@ -45,6 +50,12 @@ COLUMNS: dict[str, Columns] = {
     "keyframes": (("timestamp", INTEGER), ("device_id", ID)),
 }
 """The columns of each file of a session: names and types."""
+
+
+def key_of(file: str) -> list[str]:
+    """Return the columns that identify a row of a file of a session."""
+    columns = COLUMNS.get(file, COLUMNS["keyframes"])
+    return [name for name, _ in columns[: 1 if file in ("sensors.txt", "proc/subsessions.txt") else 2]]
 
 
 @dataclass
@@ -75,6 +86,44 @@ class TextTable:
     def where(self, row: int) -> str:
         """Return file and line of a row, for messages."""
         return f"{self.path}, line {self.lines[row]}"
+
+    def repeated(self, key: list[str]) -> Ints:
+        """Return the rows that repeat the key of an earlier one, ascending.
+
+        Raises:
+            CaptureError: one of them says something else than the earlier one.
+        """
+        if key[0] == "timestamp" and np.all(np.diff(self.columns["timestamp"].to_numpy()) > 0):
+            return np.zeros(0, np.int64)  # as most are; ids need not be looked at
+        again = np.flatnonzero(self.frame(*key).duplicated())
+        if len(again):
+            other = again[~self.frame(*self.columns).duplicated().to_numpy()[again]]
+            for row in other[:1].tolist():
+                raise CaptureError(
+                    f"{self.where(row)}: {self._shown(row, key)} again, with other values than in line "
+                    f"{self._first_line(row, key)}. Remove one of the two."
+                )
+        return again
+
+    def without_repeated(self, key: list[str]) -> "TextTable":
+        """Return the table without lines that repeat an earlier one, which are told; see `repeated`."""
+        again = self.repeated(key)
+        if not len(again):
+            return self
+        more = f", and {len(again) - 1} more such lines" if len(again) > 1 else ""
+        first = int(again[0])
+        log.warning("%s: %s again, as in line %d%s; each counts once.", self.where(first), self._shown(first, key),
+                    self._first_line(first, key), more)  # fmt: skip
+        kept = np.delete(np.arange(len(self)), again)
+        columns = {name: column.take(pa.array(kept)) for name, column in self.columns.items()}
+        return replace(self, columns=columns, lines=self.lines[kept])
+
+    def _shown(self, row: int, names: list[str]) -> str:
+        return ", ".join(f"{name} {self.columns[name][row].as_py()!r}" for name in names)
+
+    def _first_line(self, row: int, key: list[str]) -> int:
+        frame = self.frame(*key)
+        return int(self.lines[np.flatnonzero((frame == frame.iloc[row]).all(axis=1))[0]])
 
 
 def read_table(path: Path, columns: Columns, strict: bool = True, extra: bool = False) -> TextTable:
@@ -140,7 +189,9 @@ class _Block:
     has_extra: bool
 
 
-_ARROW_TYPES = {INTEGER: pa.int64(), NUMBER: pa.float64()} | dict.fromkeys((ID, PATH, TEXT), pa.large_string())
+_ARROW_TYPES = {INTEGER: pa.int64(), NUMBER: pa.float64(), METERS: pa.float64()} | dict.fromkeys(
+    (ID, PATH, TEXT), pa.large_string()
+)
 # Small enough that two in flight cost little memory, large enough to hide the overhead.
 _BLOCK_BYTES = 1 << 20
 
@@ -175,12 +226,14 @@ def _parse_block(data: bytes, first: bool, columns: Columns, keep_extra: bool) -
         data = "\n".join(repaired).encode()
     if not data.endswith(b"\n"):
         data += b"\n"
+    if b"\r" in data and data.count(b"\r") > data.count(b"\r\n"):
+        data = b"\n".join(_without_returns(line, number, problems) for number, line in enumerate(data.split(b"\n"), 1))
     ends = np.flatnonzero(np.frombuffer(data, np.uint8) == ord("\n"))
     offsets = np.zeros(len(ends) + 1, np.int64)
     offsets[1:] = ends + 1
     text = pa.LargeStringArray.from_buffers(len(ends), pa.py_buffer(offsets), pa.py_buffer(data))
     text = pc.ascii_trim_whitespace(text)
-    # A line that is not UTF-8 is reported already; `_decode` made it a comment.
+    # What is reported already was made a comment.
     kept = pc.invert(pc.or_(pc.starts_with(text, "#"), pc.equal(text, "")))
     text, lines = text.filter(kept), np.flatnonzero(kept.to_numpy(zero_copy_only=False)) + 1
 
@@ -210,9 +263,13 @@ def _parse_block(data: bytes, first: bool, columns: Columns, keep_extra: bool) -
         arrays["extra"] = pc.if_else(pa.array(counts > width), extra, "")
     if columns[-len(POSE) :] == POSE:
         q = np.stack([arrays[name].to_numpy() for name, _ in POSE[:4]], axis=1)
-        zero = (np.einsum("ij,ij->i", q, q) < 1e-12) & ~bad
-        problems += [(int(lines[row]), "found a zero quaternion, expected length 1") for row in np.flatnonzero(zero)]
-        bad |= zero
+        with np.errstate(over="ignore"):
+            squared = np.einsum("ij,ij->i", q, q)
+        of_wrong_length = {"a zero quaternion": squared < 1e-12, "a quaternion without end": squared > FARTHEST_M**2}
+        for fault, wrong in of_wrong_length.items():
+            rows = np.flatnonzero(wrong & ~bad)
+            problems += [(int(lines[row]), f"found {fault}, expected length 1") for row in rows]
+            bad |= wrong
     if bad.any():
         good_rows = pa.array(~bad)
         arrays, lines = {name: array.filter(good_rows) for name, array in arrays.items()}, lines[~bad]
@@ -222,6 +279,7 @@ def _parse_block(data: bytes, first: bool, columns: Columns, keep_extra: bool) -
 _EXPECTED = {
     INTEGER: "an integer (microseconds)",
     NUMBER: "a finite number",
+    METERS: f"a finite number of meters, at most {FARTHEST_M:.0e}",
     ID: EXPECTED_NAME,
     PATH: f"{EXPECTED_NAME}, below raw_data/ (if you list files that lie elsewhere yourself, {HOW_TO_ALLOW})",
 }
@@ -245,7 +303,12 @@ def convert(column: pa.Array, kind: str) -> tuple[pa.Array, NDArray[np.bool_]]:
                 wrong[row] = True
                 scalars.append(0)
         converted = pa.array(scalars, _ARROW_TYPES[kind])
-    if kind == NUMBER:
+    if kind == INTEGER:  # Arrow takes 0x10 for 16
+        for prefix in ("0x", "0X"):
+            wrong |= pc.starts_with(column, prefix).to_numpy(zero_copy_only=False)
+    elif kind == METERS:
+        wrong |= ~(np.abs(converted.to_numpy()) <= FARTHEST_M)
+    else:
         wrong |= ~np.isfinite(converted.to_numpy())
     return converted, wrong
 
@@ -256,6 +319,13 @@ def _decode(line: bytes, number: int, problems: list[tuple[int, str]]) -> str:
     except UnicodeDecodeError as error:
         problems.append((number, f"found bytes that are not UTF-8 ({error.reason}), expected UTF-8 text"))
         return "#"
+
+
+def _without_returns(line: bytes, number: int, problems: list[tuple[int, str]]) -> bytes:
+    if b"\r" not in line.removesuffix(b"\r"):
+        return line
+    problems.append((number, "found a carriage return within the line, expected each line to end in a line feed"))
+    return b"#"
 
 
 def _shorten(text: object) -> str:

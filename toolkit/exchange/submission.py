@@ -19,7 +19,7 @@ import pandas as pd
 
 from toolkit.capture import COLUMNS, Capture, Trajectory
 from toolkit.capture.check import UNIT_TOLERANCE
-from toolkit.capture.tables import KeyIndex, read_query_table, read_table
+from toolkit.capture.tables import read_query_table, read_table
 from toolkit.errors import ArtifactError, CaptureError, ManifestError, ToolkitError
 from toolkit.files import SceneFiles, file_fingerprint, read_references, write_atomic, write_sidecar
 from toolkit.geometry import invert, qt_from_pose, unit
@@ -273,7 +273,7 @@ def _fill_entry(
         both = " and ".join(str(files.poses_txt(*pair)) for files in with_poses)
         raise ArtifactError(f"Two runs have poses of the same pair: {both}. Give one of the two runs.")
     files = with_poses[0]
-    keyframes = _read_keyframes(captures[entry.scene], entry.query_device, queries)
+    keyframes = captures[entry.scene][f"{entry.query_device}_query"].keyframes(queries)
     timestamps, device_ids = keyframes["timestamp"].to_numpy(np.int64), keyframes["device_id"]
     poses = _read_poses(files.poses_txt(*pair))
     statuses, sources[entry.name] = _statuses(files.poses_csv(*pair)), file_fingerprint(files.poses_txt(*pair))
@@ -298,20 +298,6 @@ def _fill_entry(
     counts = entry.counts()
     notes = {"left_out": "left out", "filled": "filled", "not_asked": "not asked"}
     entry.state = ", ".join(f"{counts[name]} {what}" for name, what in notes.items() if counts[name]) or "complete"
-
-
-def _read_keyframes(capture: Capture, device: str, queries: str) -> pd.DataFrame:
-    """Read the list of query keyframes to answer; refuses one that has a key twice."""
-    session = capture[f"{device}_query"]
-    keyframes = session.keyframes(queries)
-    repeated = KeyIndex(keyframes["timestamp"].to_numpy(np.int64), keyframes["device_id"]).repeated()
-    if len(repeated):
-        time, name = keyframes.iloc[repeated[0]][["timestamp", "device_id"]]
-        raise CaptureError(
-            f"{session.path}: list {queries!r} has the key (timestamp {time}, device {name!r}) twice; expected once. "
-            "`python -m toolkit check CAPTURE` names the lines."
-        )
-    return keyframes
 
 
 def _read_poses(path: Path) -> Trajectory:
