@@ -70,11 +70,14 @@ def report(run_dir: Annotated[Path, typer.Argument(metavar="RUN", help="Run fold
 
 
 @app.command()
-def check(capture: Annotated[Path, typer.Argument(help="Capture folder, with sessions/ in it.")]) -> None:
+def check(
+    capture: Annotated[Path, typer.Argument(help="Capture folder, with sessions/ in it.")],
+    deep: Annotated[bool, typer.Option("--deep", help="Decode every image, not its header alone.")] = False,
+) -> None:
     """Show what a capture holds and every inconsistency, with file and line."""
     from toolkit.capture.check import check_capture
 
-    report = check_capture(capture)
+    report = check_capture(capture, deep)
     print(report.text())
     if not report.ok:
         raise typer.Exit(1)

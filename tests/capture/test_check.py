@@ -1,8 +1,11 @@
+import os
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from PIL import Image
 
 from toolkit.capture import Trajectory, write_session
 from toolkit.capture.check import check_capture
@@ -21,17 +24,17 @@ def capture(tmp_path: Path) -> Path:
     images = [(t, f"s/{c}", f"s/{c}/{t}.jpg") for t in (10, 20) for c in "ab"]
     sensors = [("s/a", "", *PINHOLE), ("s/b", "", *PINHOLE), ("imu", "", "imu")]
     rigs = [(f"s/rig_{t}", f"s/{c}", identity) for t in (10, 20) for c in "ab"]
-    poses = Trajectory([10, 20], ["s/rig_10", "s/rig_20"], [identity] * 2, [np.eye(6)] * 2)
-    keyframes = pd.DataFrame({"timestamp": [10, 20], "device_id": ["s/rig_10", "s/rig_20"]})
+    farther = [0.8, 0.6, 0, 0, 1, 0, 0]
+    poses = Trajectory([10, 20], ["s/rig_10", "s/rig_20"], [identity, farther], [np.eye(6)] * 2)
+    listed = pd.DataFrame({"timestamp": [10, 20], "device_id": ["s/rig_10", "s/rig_20"]})
+    keyframes = {"pruned": listed, "pruned_subsampled": listed}
     write_session(root / "hl_map", sensors, rigs, poses, images, subsessions=["s"])
-    write_session(
-        root / "hl_query", sensors, rigs, None, images, None, ["s"], {"pruned": keyframes}, ground_truth=poses
-    )
+    write_session(root / "hl_query", sensors, rigs, None, images, None, ["s"], keyframes, ground_truth=poses)
     for session in ("hl_map", "hl_query"):
         for _, _, path in images:
             file = root / session / "raw_data" / path
             file.parent.mkdir(parents=True, exist_ok=True)
-            file.touch()
+            Image.new("RGB", (64, 48)).save(file)
     return tmp_path / "PLACE"
 
 
@@ -120,6 +123,13 @@ def test_a_good_capture_has_no_problems(capture: Path) -> None:
         ("hl_query/proc/keyframes_pruned.txt", "30, s/rig_10", ":3: error: keyframe without image (timestamp 30"),
         ("hl_query/proc/keyframes_pruned.txt", "ten, s/rig_10", ":3: error: found timestamp = 'ten'"),
         ("hl_query/proc/keyframes_new.txt", "10, s/a", ":1: warning: keyframe without ground truth (timestamp 10"),
+        ("hl_map/images.txt", "30, s/a, s/a/10.jpg", ":6: error: raw_data/s/a/10.jpg is listed again, under"),
+        ("hl_map/images.txt", "30, s/a, ../x.jpg", ":6: error: found image_path = '../x.jpg'"),
+        ("hl_map/images.txt", "0x1e, s/a, s/a/30.jpg", ":6: error: found timestamp = '0x1e'"),
+        ("hl_map/images.txt", "30, s/a, s/a\r40, s/a, s/b", ":6: error: found a carriage return within the line"),
+        ("hl_map/sensors.txt", "c, , camera, PINHOLE, 9, 9, -5, 5, 4, 4", ":5: error: found a focal length that is"),
+        ("hl_map/sensors.txt", "c, , camera, PINHOLE, 9, 9, 5, 5, 40, 4", ":5: error: found a principal point at 40"),
+        ("hl_map/trajectories.txt", "10, s/a, 1, 0, 0, 0, 1e308, 0, 0", ":4: error: found tx = '1e308'"),
         ("hl_map/proc/subsessions.txt", "t", ":2: warning: subsession 't' has no images"),
         ("hl_map/proc/subsessions.txt", "s", ":2: error: duplicate key (subsession 's')"),
     ],
@@ -159,6 +169,75 @@ def test_a_long_list_of_problems_can_be_cut(capture: Path) -> None:
     assert f"... and {count - 2} more: python -m toolkit check {capture}" in lines
     assert "more:" not in report.text()
     assert "more:" not in report.text(most=count)
+
+
+def test_images_are_looked_at(capture: Path) -> None:
+    raw = capture / "sessions" / "hl_map" / "raw_data" / "s"
+    Image.new("RGB", (48, 64)).save(raw / "a" / "10.jpg")
+    (raw / "b" / "10.jpg").unlink()
+    os.mkfifo(raw / "b" / "10.jpg")
+    (raw / "a" / "20.jpg").write_bytes(b"")
+    whole = (raw / "b" / "20.jpg").read_bytes()
+    (raw / "b" / "20.jpg").write_bytes(whole[:-30])
+    expected = {
+        2: "s/a/10.jpg has 48 x 64 pixels, its sensor 's/a' 64 x 48",
+        3: "is a folder, a pipe or a device, expected a file",
+        4: "Image cannot be decoded (",
+    }
+    for deep in (False, True):  # only decoding shows that an image is cut short
+        lines = expected | ({5: "Image cannot be decoded ("} if deep else {})
+        errors = check_capture(capture, deep).errors
+        assert {(problem.file, problem.line) for problem in errors} == {("images.txt", line) for line in lines}
+        for problem in errors:
+            assert lines[problem.line] in problem.message
+
+
+def walk(capture: Path, step: list[float], turn: float = 0.01, frames: int = 12) -> None:
+    """Let the map be of one camera that is moved by `step` meters and turned by `turn` from frame to frame."""
+    angles = turn * np.arange(frames)
+    qt = np.zeros((frames, 7))
+    qt[:, 0], qt[:, 2], qt[:, 4:] = np.cos(angles), np.sin(angles), np.outer(np.arange(frames), step)
+    session = capture / "sessions" / "hl_map"
+    rows = [(time, "s/a", f"s/a/{time}.jpg") for time in range(frames)]
+    for _, _, path in rows:
+        Image.new("RGB", (64, 48)).save(session / "raw_data" / path)
+    shutil.rmtree(session / "proc", ignore_errors=True)
+    (session / "rigs.txt").unlink(missing_ok=True)
+    poses = Trajectory(np.arange(frames), ["s/a"] * frames, qt)
+    write_session(session, [("s/a", "", *PINHOLE)], None, poses, rows, subsessions=["s"])
+
+
+def test_poses_that_cannot_be_right_are_found(capture: Path) -> None:
+    walk(capture, [0, 0, 0.5])
+    assert found(capture) == []
+    assert "up in the world" in check_capture(capture).text()
+    walk(capture, [0, 0, 0])
+    assert any("trajectories.txt: error: all 12 images stand in one place" in line for line in found(capture))
+    walk(capture, [0, 0, -0.5])
+    assert any("trajectories.txt: warning: cameras move backwards" in line for line in found(capture))
+    walk(capture, [0, 0, 0.5], turn=0)
+    assert any("trajectories.txt: warning: all 12 images look exactly one way" in line for line in found(capture))
+
+
+def test_a_session_without_images_is_noted(capture: Path) -> None:
+    (capture / "sessions" / "hl_map" / "images.txt").write_text("# timestamp, sensor_id, image_path\n")
+    assert "hl_map/images.txt: warning: lists no image" in found(capture)
+
+
+def test_queries_without_a_list_are_noted(capture: Path) -> None:
+    (capture / "sessions" / "hl_query" / "proc" / "keyframes_pruned_subsampled.txt").unlink()
+    (line,) = found(capture)
+    assert line.startswith("hl_query/proc/keyframes_pruned_subsampled.txt: warning: no such list")
+    assert "there: pruned." in line
+
+
+def test_a_session_that_cannot_be_read_does_not_hide_the_others(capture: Path, tmp_path: Path) -> None:
+    append(capture, "hl_query/images.txt", "bad\n")
+    (capture / "sessions" / "hl_map" / "sensors.txt").rename(tmp_path / "sensors.txt")
+    (capture / "sessions" / "hl_map" / "sensors.txt").symlink_to(tmp_path / "sensors.txt")
+    lines = found(capture)
+    assert any(line.startswith("hl_map/: error: ") and "is a link to" in line for line in lines)
+    assert any(line.startswith("hl_query/images.txt:6: error: found 1 value") for line in lines)
 
 
 def test_depth_that_was_rendered_for_a_photograph_is_known(capture: Path) -> None:

@@ -88,6 +88,7 @@ def test_a_name_that_could_leave_its_folder_is_refused_at_its_line(
     folder = session_of(tmp_path, **{file: text.format(name)})
     with pytest.raises(CaptureError, match=rf"{file.replace('_', '/', 1)}\.txt, line 2: found "):
         read_all(folder)
+    assert any(f"{file.replace('_', '/', 1)}.txt:2: error: found " in line for line in errors_of(folder))
 
 
 @pytest.mark.parametrize("name", GOOD)
@@ -125,6 +126,7 @@ def test_names_too_long_for_files_are_refused(tmp_path: Path) -> None:
     name = "ä" * 101  # 202 bytes, of which outputs need 240
     with pytest.raises(CaptureError, match=r"subsessions\.txt: the subsession .* more than 200 bytes"):
         read_all(session_of(tmp_path / "1", proc_subsessions=f"{name}\n"))
+    assert any("too long a name" in line for line in errors_of(tmp_path / "1" / "PLACE" / "sessions" / "ios_map"))
     with pytest.raises(CaptureError, match=r"images\.txt: the subsession .* more than 200 bytes"):
         read_all(session_of(tmp_path / "2", images=f"1, s/cam, {name}/1.png\n"))
     folder = session_of(tmp_path / "3", images=f"1, s/cam, s/{'x' * 300}.png\n")
@@ -208,7 +210,9 @@ def test_a_link_out_of_the_capture_is_refused_with_its_line(tmp_path: Path, secr
         session.image_path(0)
     with pytest.raises(CaptureError, match="allow_outside: true"):
         extract_session(session, tmp_path / "features")
+    assert any("images.txt:1: error: raw_data/s/1.png is a link to" in line for line in errors_of(folder))
     with allow_outside():
+        assert errors_of(folder) == []
         assert len(extract_session(Session.open(folder), tmp_path / "features", progress=False).failed) == 0
 
 
@@ -222,6 +226,7 @@ def test_depth_maps_and_texts_are_not_read_outside_either(tmp_path: Path) -> Non
     with pytest.raises(CaptureError, match=r"rigs\.txt: is a link to ") as caught:
         Session.open(folder)
     assert "root:x" not in str(caught.value)
+    assert any("rigs.txt: is a link to" in line for line in errors_of(folder))
 
 
 def test_links_within_the_capture_and_to_its_disk_are_followed(tmp_path: Path) -> None:
@@ -240,6 +245,7 @@ def test_links_within_the_capture_and_to_its_disk_are_followed(tmp_path: Path) -
     capture = Capture.open(tmp_path / "PLACE")
     for name in capture:
         capture[name].image_path(0).read_bytes()
+    assert check_capture(tmp_path / "PLACE").errors == []
 
 
 @pytest.mark.parametrize("path", ["../../../../home/s/1.png", "{home}/s/1.png", "s/../../../../../home/s/1.png"])
@@ -275,6 +281,7 @@ def test_links_that_import_made_are_the_user_s_own(tmp_path: Path) -> None:
     picture(tmp_path / "photos" / "1.png")
     folder = import_images(tmp_path / "photos", tmp_path / "PLACE", camera="PINHOLE, 64, 48, 50, 50, 32, 24").session
     assert Session.open(folder).image_path(0).is_symlink()
+    assert errors_of(folder) == []
     (tmp_path / "PLACE").rename(tmp_path / "MOVED")
     moved = tmp_path / "MOVED" / "sessions" / folder.name
     assert Session.open(moved).image_path(0).is_symlink()

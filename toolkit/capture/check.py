@@ -10,13 +10,24 @@ import pandas as pd
 from toolkit.capture.cameras import CAMERA_TYPES, parse_camera
 from toolkit.capture.devices import OTHER_SESSIONS, SPLITS, kinds
 from toolkit.capture.folder import Capture
+from toolkit.capture.images import default_workers, prefetch, read_image, stored_size
+from toolkit.capture.names import HOW_TO_ALLOW, has_long_part
 from toolkit.capture.session import RAW_DATA, SUBSESSIONS, Session
-from toolkit.capture.tables import ALIGNED, COLUMNS, POSE_NAMES, KeyIndex, read_table, times_of
+from toolkit.capture.tables import ALIGNED, COLUMNS, POSE_NAMES, KeyIndex, key_of, read_table, times_of
 from toolkit.capture.trajectory import Trajectory
+from toolkit.capture.world_up import estimate_world_up, posed_photographs
+from toolkit.capture.writing import read_depth
+from toolkit.errors import CaptureError, ImageError
+from toolkit.geometry import unit
 
 ERROR, WARNING = "error", "warning"
 UNUSED = {"wifi": "wifi.txt", "bluetooth": "bt.txt", "point clouds": "pointclouds.txt"}
 """Files of the format that the toolkit does not read; it ignores sensors of these kinds."""
+ASKED = "pruned_subsampled"
+"""The list of keyframes that manifests ask for, unless they say otherwise."""
+SAME_PLACE_M = 1e-6
+WALK = 10
+"""Steps of a camera that say which way it goes."""
 UNIT_TOLERANCE = 1e-3  # of the length of a quaternion; one further off is no rotation, or lost digits
 
 
@@ -73,8 +84,11 @@ class CheckReport:
         return "\n\n".join(parts)
 
 
-def check_capture(path: str | Path) -> CheckReport:
-    """Read every session of a capture and list all inconsistencies.
+def check_capture(path: str | Path, deep: bool = False) -> CheckReport:
+    """Read every session of a capture and the headers of its images, and list all inconsistencies.
+
+    Args:
+        deep: decode each image and depth map, too.
 
     Raises:
         CaptureError: the folder is not a capture at all.
@@ -82,8 +96,12 @@ def check_capture(path: str | Path) -> CheckReport:
     capture = Capture.open(path)
     report = CheckReport(capture.path)
     for session_id in capture.session_ids:
-        checker = _SessionCheck(capture.folder(session_id))
-        checker.run()
+        try:
+            checker = _SessionCheck(capture.folder(session_id), deep)
+            checker.run()
+        except CaptureError as error:  # of what keeps the whole session from being read
+            report.problems.append(Problem(session_id, "", 0, str(error), ERROR))
+            continue
         report.tables[session_id] = checker.summary()
         report.problems += checker.problems
     return report
@@ -92,10 +110,13 @@ def check_capture(path: str | Path) -> CheckReport:
 class _SessionCheck:
     """Collects the problems of one session."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, deep: bool) -> None:
         self.session = Session(path, strict=False)
+        self.deep = deep
         self.problems: list[Problem] = []
         self.missing: dict[str, int] = {}
+        self.sizes: dict[str, tuple[int, int]] = {}
+        """Width and height of the images of each sensor that is a camera."""
         self.sensors = self._rows("sensors.txt")
         self.rig_ids = self.session.rigs["rig_id"] if self.session.rigs is not None else pd.Series([], dtype=object)
         self.cameras = self.sensors[self.sensors["sensor_type"] == "camera"]["sensor_id"]
@@ -107,6 +128,10 @@ class _SessionCheck:
 
     def _add(self, file: str, line: int, message: str, severity: str = ERROR) -> None:
         self.problems.append(Problem(self.session.id, file, int(line), message, severity))
+
+    @property
+    def _has_errors(self) -> bool:
+        return any(problem.severity == ERROR for problem in self.problems)
 
     def _add_rows(self, file: str, rows: pd.DataFrame, message: str, severity: str = ERROR) -> None:
         """Report some rows of a file; `{column}` in the message stands for the row's value."""
@@ -122,6 +147,8 @@ class _SessionCheck:
         elif session.device not in [*known, *(device for device, _ in OTHER_SESSIONS.values())]:
             message = f"device {session.device!r} is none of {', '.join(known)}; it takes part. Meant? Else rename it"
             self._add("", 0, message, WARNING)
+        if not len(session.images) and not session.tables["images.txt"].problems:
+            self._add("images.txt", 0, "lists no image", WARNING)
         _ = session.subsessions, session.depths, [session.keyframes(name) for name in session.keyframe_files]
         for file in session.tables:
             self._check_rows(file, self._rows(file))
@@ -136,8 +163,14 @@ class _SessionCheck:
             self._check_images_have_poses()
         for file in session.keyframe_files.values():
             self._check_keyframes(file, self._rows(file))
+        if session.split == "query" and ASKED not in session.keyframe_files:
+            there = ", ".join(session.keyframe_files) or "none"
+            message = f"no such list, the default for queries; there: {there}. Set `queries` in the manifest, or add it"
+            self._add(f"proc/keyframes_{ASKED}.txt", 0, message, WARNING)
         if SUBSESSIONS in session.tables:
             self._check_subsessions()
+        if session.split == "map" and not self._has_errors:
+            self._check_places()
         order = {file: place for place, file in enumerate(session.tables)}
         self.problems.sort(key=lambda problem: (order.get(problem.file, -1), problem.line))
 
@@ -145,7 +178,7 @@ class _SessionCheck:
         """Check what does not depend on the kind of file: malformed lines, keys, ids and quaternions."""
         for line, message in self.session.tables[file].problems:
             self._add(file, line, message)
-        key = list(rows.columns[: 1 if file in ("sensors.txt", SUBSESSIONS) else 2])
+        key = key_of(file)
         shown = ", ".join(f"{name} {{{name}!r}}" for name in key)
         self._add_rows(file, rows[rows.duplicated(key)], f"duplicate key ({shown})")
         if "sensor_id" in rows:
@@ -167,25 +200,61 @@ class _SessionCheck:
         return rows["device_id"].isin(self.rig_ids) | rows["device_id"].isin(self.sensors["sensor_id"])
 
     def _check_cameras(self) -> None:
-        verdicts: dict[tuple[str, str], str] = {}
+        verdicts: dict[tuple[str, str], str | tuple[int, int]] = {}
         rows = self.sensors[self.sensors["sensor_type"].isin(CAMERA_TYPES)]
-        for line, kind, params in zip(rows.index, rows["sensor_type"], rows["extra"], strict=True):
+        for line, sensor, _, kind, params in rows.itertuples(name=None):
             if (kind, params) not in verdicts:
                 try:
-                    parse_camera(kind, params)
-                    verdicts[kind, params] = ""
+                    camera = parse_camera(kind, params)
+                    verdicts[kind, params] = camera.width, camera.height
                 except ValueError as error:
                     verdicts[kind, params] = str(error).rstrip(".")
-            if verdicts[kind, params]:
-                self._add("sensors.txt", line, verdicts[kind, params])
+            verdict = verdicts[kind, params]
+            if isinstance(verdict, str):
+                self._add("sensors.txt", line, verdict)
+            else:
+                self.sizes[sensor] = verdict
 
     def _check_files(self, file: str, rows: pd.DataFrame) -> None:
         others = self.sensors[~self.sensors["sensor_type"].isin(CAMERA_TYPES)]["sensor_id"]
         self._add_rows(file, rows[rows["sensor_id"].isin(others)], "sensor {sensor_id!r} of an image is no camera")
         path = rows.columns[2]
-        missing = rows[~_exist(self.session.path / RAW_DATA, rows[path])]
+        again = rows.duplicated(path) & ~rows.duplicated(key_of(file))
+        self._add_rows(file, rows[again], f"{RAW_DATA}/{{{path}}} is listed again, under another key")
+        outside = self.session.links_out(rows[path])
+        for row, target in outside.items():
+            shown = f"{RAW_DATA}/{rows[path].iloc[row]}"
+            self._add(file, rows.index[row], f"{shown} is a link to {target}, outside of the capture; {HOW_TO_ALLOW}")
+        inside = np.ones(len(rows), bool)
+        inside[list(outside)] = False
+        exist = _exist(self.session.path / RAW_DATA, rows[path])
+        missing = rows[~exist & inside]
         self.missing[file] = len(missing)
         self._add_rows(file, missing, f"missing file {RAW_DATA}/{{{path}}}")
+        self._check_content(file, rows[exist & inside])
+
+    def _check_content(self, file: str, rows: pd.DataFrame) -> None:
+        """Open the files of rows; those of photographs have the size of their camera."""
+        root, read = self.session.path / RAW_DATA, read_depth if file == "depths.txt" else read_image
+        is_photograph = rows["sensor_id"].isin(self.cameras) & (file == "images.txt")
+
+        def fault(item: tuple[str, str, bool]) -> str:
+            path, sensor, photograph = item
+            try:
+                size = stored_size(root / path)
+                if self.deep:
+                    read(root / path)
+            except (ImageError, CaptureError) as error:
+                return str(error)
+            expected = self.sizes.get(sensor, size) if photograph else size
+            stored, said = (f"{width} x {height}" for width, height in (size, expected))
+            return "" if size == expected else f"{path} has {stored} pixels, its sensor {sensor!r} {said}"
+
+        items = zip(rows[rows.columns[2]], rows["sensor_id"], is_photograph, strict=True)
+        workers = default_workers()
+        for line, message in zip(rows.index, prefetch(fault, items, workers, ahead=4 * workers), strict=True):
+            if message:
+                self._add(file, line, message)
 
     def _check_trajectory(self, file: str, trajectory: Trajectory) -> None:
         session, rows = self.session, self._rows(file)
@@ -222,8 +291,30 @@ class _SessionCheck:
             without = session.ground_truth.index.find(times_of(rows), rows["device_id"]) < 0
             self._add_rows(file, rows[known & without], f"keyframe without ground truth {shown}", WARNING)
 
+    def _check_places(self) -> None:
+        """Look for poses of a map that are well written and cannot be right."""
+        session = self.session
+        poses, rows = posed_photographs(session)
+        order = np.lexsort((times_of(session.images)[rows], session.subsession_of(rows).astype(str)))
+        poses, recording = poses[order], session.subsession_of(rows)[order]
+        if len(poses) < 3:
+            return
+        file = "trajectories.txt"
+        if np.ptp(poses[:, :3, 3], axis=0).max() < SAME_PLACE_M:
+            self._add(file, 0, f"all {len(poses)} images stand in one place: nothing can be triangulated")
+        elif np.ptp(poses[:, :3, :3], axis=0).max() < 1e-9:
+            self._add(file, 0, f"all {len(poses)} images look exactly one way: are rotations lost?", WARNING)
+        steps = np.diff(poses[:, :3, 3], axis=0)
+        walked = (np.linalg.norm(steps, axis=1) > SAME_PLACE_M) & (recording[1:] == recording[:-1])
+        forward = np.sum(unit(steps[walked]) * poses[1:][walked, :3, 2], axis=1)
+        if len(forward) >= WALK and np.median(forward) < -np.cos(np.radians(45)):
+            message = "cameras move backwards: do their z axes point forward, as OpenCV's, or backward, as OpenGL's?"
+            self._add(file, 0, message, WARNING)
+
     def _check_subsessions(self) -> None:
         of_image, rows = self.session.subsession_of(), self._rows(SUBSESSIONS)
+        long = rows["subsession"].map(lambda name: has_long_part(name, "subsession")).astype(bool)
+        self._add_rows(SUBSESSIONS, rows[long], "subsession {subsession!r} has too long a name for files")
         empty = rows[~rows["subsession"].isin(of_image)]
         self._add_rows(SUBSESSIONS, empty, "subsession {subsession!r} has no images", WARNING)
         message = "image {image_path} is in no subsession of proc/subsessions.txt"
@@ -261,6 +352,8 @@ class _SessionCheck:
             else:
                 posed = np.sum(trajectory.index.find(times, session.device_ids) >= 0)
                 add(what, len(trajectory), f"{posed:,} of {len(times):,} images have one", note)
+        if session.split == "map" and not self._has_errors and len(posed_photographs(session)[1]):
+            add("up in the world", None, estimate_world_up([session]).reason)
         add("depth maps", None if session.depths is None else len(session.depths), missing("depths.txt"))
         images = pd.Series(session.subsession_of()).value_counts()
         shown = [f"{name} ({images.get(name, 0):,} images)" for name in session.subsessions[:6]]
