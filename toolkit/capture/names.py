@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -53,12 +54,30 @@ def allow_outside(allowed: bool = True) -> Iterator[None]:
 
 def bad_names(names: pa.Array, may_leave: bool = False) -> pa.Array:
     """Tell which names are refused; those that `may_leave` may be absolute and have parts that begin with a dot."""
+    if _are_plain(names):
+        return pa.array(np.zeros(len(names), bool))
     return pc.match_substring_regex(names, f"{_CONTROL}|^$" if may_leave else f"{_CONTROL}|{_PART}")
+
+
+def _are_plain(names: pa.Array) -> bool:
+    """Tell whether all names are surely good, as those of most files are, at a fraction of the time of the pattern."""
+    if not len(names):
+        return True
+    places = np.frombuffer(names.buffers()[1], np.int64)[names.offset : names.offset + len(names) + 1]
+    if not np.all(places[1:] > places[:-1]):
+        return False
+    letters = np.frombuffer(names.buffers()[2], np.uint8)[places[0] : places[-1]]
+    if letters.min() < ord(" ") or letters.max() > ord("~"):
+        return False
+    slash, starts = letters == ord("/"), places[:-1] - places[0]
+    opens = slash | (letters == ord("."))  # what no part begins with
+    return not (np.any(slash[:-1] & opens[1:]) or np.any(opens[starts]) or np.any(slash[starts - 1]))
 
 
 def is_bad_name(name: str) -> bool:
     """Tell whether a name is refused; also one that is not Unicode, which has surrogates."""
-    return re.search("[\ud800-\udfff]", name) is not None or bool(bad_names(pa.array([name]))[0].as_py())
+    broken = re.search("[\ud800-\udfff]", name) is not None
+    return broken or bool(bad_names(pa.array([name], pa.large_string()))[0].as_py())
 
 
 def has_long_part(name: str, kind: str) -> bool:
