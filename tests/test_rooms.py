@@ -15,6 +15,7 @@ LEVELS: list[tuple[str, ...]] = [
     ("capture",),
     ("models",),
     ("manifest",),
+    ("runs",),
     ("features",),
     ("embedders",),
     ("localizers",),

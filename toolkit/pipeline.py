@@ -6,20 +6,17 @@ executed still reuses what it finds finished.
 """
 
 import hashlib
-import importlib.metadata
 import json
 import os
-import platform
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from toolkit import __version__
 from toolkit.capture.devices import extra_devices, table_record
 from toolkit.capture.names import allow_outside
 from toolkit.embedders import WEIGHTS as EMBEDDER_WEIGHTS
@@ -62,10 +59,7 @@ from toolkit.notebook import (
     stage_outputs,
     work_seconds,
 )
-
-# Distributions whose versions may change results.
-_VERSIONS = ("numpy", "pycolmap", "faiss-cpu", "opencv-python-headless", "pandas", "pillow", "torch", "rerun-sdk")
-
+from toolkit.runs.record import RunLog, read_json
 
 
 @dataclass(frozen=True)
@@ -172,7 +166,7 @@ def _run(manifest: Manifest, manifest_path: str | Path, only: str | None, force:
             force or not _reusable(job, _inputs_of(job, inputs[job.files.scene]))
         ):
             _require_weights(job.stage, job.settings)
-    log = RunLog(run_dir, manifest, inputs)
+    log = RunLog(run_dir, manifest, inputs, _code_fingerprint())
     try:
         for i, job in enumerate(jobs, 1):
             wanted = _inputs_of(job, inputs[job.files.scene])
@@ -346,7 +340,7 @@ def _inputs_of(job: Job, capture: str) -> str:
     parameters = {name: value for name, value in job.parameters.items() if name != "skip_existing"}
     source = hashlib.sha256(notebook_path(job.stage).read_bytes()).hexdigest()
     upstream = [
-        _read_json(record).get("made")
+        read_json(record).get("made")
         for stage in UPSTREAM[job.stage]
         for record in sorted(job.record.parent.glob(f"{stage}*.json"))
     ]
@@ -369,13 +363,13 @@ def _code_fingerprint() -> str:
 
 def _reusable(job: Job, wanted: str) -> dict[str, Any] | None:
     """Return the row of the execution that made what is there, if it would be the same now."""
-    record = _read_json(job.record)
-    if record.get("inputs") != wanted or record.get("outputs") != job.outputs() or not _read_json(job.notebook):
+    record = read_json(job.record)
+    if record.get("inputs") != wanted or record.get("outputs") != job.outputs() or not read_json(job.notebook):
         return None
     return {**record["row"], "status": "reused"}
 
 
-def _run_job(job: Job, wanted: str, force: bool, head: str, log: "RunLog", say: Say) -> dict[str, Any]:
+def _run_job(job: Job, wanted: str, force: bool, head: str, log: RunLog, say: Say) -> dict[str, Any]:
     """Execute a job and return its row of `run.json`."""
     line = StatusLine(head, say)
     row: dict[str, Any] = {"stage": job.stage, "scene": job.files.scene, "part": job.label}
@@ -406,85 +400,6 @@ def _run_job(job: Job, wanted: str, force: bool, head: str, log: "RunLog", say: 
     summary = ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in counts.items())
     line.end(f"{summary}{summary and '; '}{work:.1f} s + {seconds - work:.1f} s start-up, {memory:.0f} MB")
     return row
-
-
-@dataclass
-class RunLog:
-    """The content of `run.json`, written anew after every stage.
-
-    A reused stage keeps the seconds and memory of the execution that made it; `total_seconds` and
-    `work_seconds` are of what this run executed, `peak_memory_mb` is of all its stages.
-    """
-
-    run_dir: Path
-    manifest: Manifest
-    inputs: dict[str, str]
-    """Fingerprint of each scene's capture."""
-    status: str = "running"
-    error: str | None = None
-    rows: list[dict[str, Any]] = field(default_factory=list)
-    started: float = field(default_factory=time.perf_counter)
-    created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
-
-    def add(self, row: dict[str, Any]) -> None:
-        """Add a stage that has ended."""
-        self.rows.append(row)
-        self.write()
-
-    def write(self) -> None:
-        """Write `run.json` as things stand."""
-        rows = self._all_rows()
-        work = sum(row.get("work_seconds", 0.0) for row in rows if row["status"] == "done")
-        content = {
-            "name": self.manifest.name,
-            "status": self.status,
-            "error": self.error,
-            "created": self.created,
-            "manifest": self.manifest.model_dump(mode="json", exclude_none=True),
-            "versions": _versions(),
-            "machine": _machine(),
-            "code": _code_fingerprint(),
-            "scenes": list(self.inputs),
-            "inputs": self.inputs,
-            "stages": rows,
-            "total_seconds": round(time.perf_counter() - self.started, 2),
-            "work_seconds": round(work, 2),
-            "peak_memory_mb": max((row.get("peak_memory_mb", 0) for row in rows), default=0),
-        }
-        write_text(self.run_dir / "run.json", json.dumps(content, indent=1) + "\n")
-
-    def _all_rows(self) -> list[dict[str, Any]]:
-        """Return this run's rows and, for stages that `--only` left alone, those of their records."""
-        mine = {(row["scene"], row["stage"]) for row in self.rows}
-        rows = list(self.rows)
-        for scene in self.inputs:
-            for record in sorted((self.run_dir / scene / ".stages").glob("*.json")):
-                row = _read_json(record).get("row")
-                if row and row["stage"] in self.manifest.stages and (scene, row["stage"]) not in mine:
-                    rows.append({**row, "status": "reused"})
-        scenes = list(self.inputs)
-        return sorted(rows, key=lambda row: (scenes.index(row["scene"]), STAGES.index(row["stage"])))
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}
-
-
-def _versions() -> dict[str, str]:
-    versions = {"toolkit": __version__, "python": platform.python_version()}
-    for name in _VERSIONS:
-        with suppress(importlib.metadata.PackageNotFoundError):
-            versions[name] = importlib.metadata.version(name)
-    return versions
-
-
-def _machine() -> dict[str, Any]:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {"cores": cores, "python": platform.python_version(), "platform": platform.platform()}
 
 
 def _write_report(run_dir: Path) -> None:
