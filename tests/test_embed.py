@@ -17,7 +17,7 @@ from toolkit.capture.turning import turned_from_cam
 from toolkit.embed import VECTORS, embed_sessions, write_matrix
 from toolkit.embedders import load_embeddings
 from toolkit.embedders.megaloc import MegaLocEmbedder
-from toolkit.errors import ArtifactError, ManifestError, ToolkitError, WeightsError
+from toolkit.errors import ArtifactError, CaptureError, ManifestError, ToolkitError, WeightsError
 from toolkit.features.groups import GroupWriter
 from toolkit.geometry import invert, qt_from_pose
 from toolkit.models.megaloc import MegaLoc
@@ -351,3 +351,31 @@ def test_a_torn_matrix_is_made_anew(tiny: Path, tmp_path: Path) -> None:
     path.write_bytes(whole[:100])
     embed_sessions(tiny / "sessions", tmp_path / "e", device="ios")
     assert path.read_bytes() == whole
+
+
+def test_an_unusable_session_stops_no_other(tmp_path: Path) -> None:
+    capture = write_tiny_capture(tmp_path / "TINY")
+    (capture / "sessions" / "hl_map" / "images.txt").write_text("a line\n")
+    table = embed_sessions(capture / "sessions", tmp_path / "embeddings").set_index("session")
+    assert "hl_map/images.txt, line 1" in table["reason"]["hl_map"]
+    assert table["images"]["hl_map"] == 0
+    others = table.drop("hl_map")
+    assert (others["reason"] == "").all()
+    assert others["embedded"].gt(0).all()
+    (capture / "sessions" / "hl_query" / "images.txt").write_text("a line\n")
+    with pytest.raises(CaptureError, match="line 1"):
+        embed_sessions(capture / "sessions", tmp_path / "embeddings", device="hl")
+
+
+def test_a_session_without_a_readable_image_stops_no_other(tmp_path: Path) -> None:
+    capture = write_tiny_capture(tmp_path / "TINY")
+    for session in ("hl_map", "ios_query"):
+        shutil.rmtree(capture / "sessions" / session / "raw_data")
+    table = embed_sessions(capture / "sessions", tmp_path / "embeddings").set_index("session")
+    assert table["embedded"].eq(0).to_dict() == {
+        "ios_map": False, "ios_query": True, "hl_map": True, "hl_query": False
+    }  # fmt: skip
+    found = retrieve_pairs(tmp_path / "TINY" / "sessions", tmp_path / "embeddings")
+    reasons = found.set_index(["map_device", "query_device"])["reason"]
+    assert (reasons["ios"] == "").all()
+    assert reasons["hl"].str.contains("hl_map").all()

@@ -10,7 +10,7 @@ import pytest
 from tests.calls import call
 from tests.localized import write_queries
 from toolkit.capture import Trajectory, write_session
-from toolkit.errors import ToolkitError
+from toolkit.errors import CaptureError, ToolkitError
 from toolkit.evaluate import draw_evaluation, evaluate_scene, pose_errors, recall
 from toolkit.geometry import make_pose, pose_error
 from toolkit.localizers.local_map import LocalMap
@@ -302,3 +302,19 @@ def test_overlap_is_judged_by_the_maps_that_the_poses_were_found_with(scene, tmp
     (row,) = evaluate_ios(scene, map_dir=tmp_path).overlap.to_dict("records")
     assert [row["points"], row["images"]] == ["map", 4]
     assert row["retrieved"] == 0.25  # the point lies before the first query's camera; the others stand 10 m aside
+
+
+def test_an_unusable_session_or_pair_is_a_row_with_the_reason(scene, tmp_path):
+    sessions, poses, references = scene
+    (sessions / "hl_query" / "images.txt").write_text("a line\n")
+    (poses / "TINY_map_hl_query_ios.left_out.json").write_text('{"reason": "a dragon"}')
+    result = evaluate_scene(sessions, poses, references, tmp_path / "out")
+    state = result.recall.set_index(["map_device", "query_device"])["state"]
+    assert state["ios", "ios"] == "evaluated"
+    assert state["hl", "ios"] == "left out: a dragon"
+    assert "hl_query/images.txt, line 1" in state["ios", "hl"]
+    reasons = result.pairs.set_index(["map_device", "query_device"])["reason"]
+    assert reasons["ios", "ios"] == ""
+    assert reasons["hl", "ios"] == "a dragon"
+    with pytest.raises(CaptureError, match="line 1"):
+        evaluate_scene(sessions, poses, references, None, query_device="hl")

@@ -162,14 +162,15 @@ def test_embeddings_that_do_not_fit(tiny: Path, tmp_path: Path) -> None:
     matrix, table = load_embeddings(folder)
     assert table["subsession"].unique().tolist() == ["ios_a"]
     np.save(folder / "ios_a.npy", matrix[:, :3])
+    asked = {"map_device": "ios", "query_device": "hl", "skip_existing": False}
     with pytest.raises(ArtifactError, match=r"ios_a\.npy is damaged"):
-        retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", query_device="hl", skip_existing=False)
+        retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", **asked)
     sidecar_path(folder / "ios_a.npy").unlink()  # another tool's, from now on
     with pytest.raises(ArtifactError, match="model"):
-        retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", query_device="hl", skip_existing=False)
+        retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", **asked)
     np.save(folder / "ios_a.npy", np.full_like(matrix, np.nan))
     with pytest.raises(ArtifactError, match="NaN"):
-        retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", query_device="hl", skip_existing=False)
+        retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", **asked)
     np.save(folder / "ios_a.npy", matrix[1:])
     with pytest.raises(ArtifactError, match=r"ios_a\.npy"):
         load_embeddings(folder)
@@ -178,4 +179,31 @@ def test_embeddings_that_do_not_fit(tiny: Path, tmp_path: Path) -> None:
     manifest["abs_path"] = manifest["abs_path"].str.replace("1000", "9")
     manifest.to_csv(folder / "manifest.csv", index=False)
     with pytest.raises(ArtifactError, match=r"cam/9\.png"):
-        retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", query_device="hl", skip_existing=False)
+        retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", **asked)
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "left_out", "named"),
+    [
+        ("hl_query/images.txt", "a line\n", [("hl", "hl"), ("ios", "hl")], r"hl_query/images\.txt, line 1"),
+        ("hl_query/proc/keyframes_pruned_subsampled.txt", None, [("hl", "hl"), ("ios", "hl")], "keyframe list"),
+        ("hl_map/trajectories.txt", None, [("hl", "hl"), ("hl", "ios")], "hl_map has a pose"),
+        ("hl_map/sensors.txt", None, [("hl", "hl"), ("hl", "ios")], r"sensors\.txt"),
+    ],
+)
+def test_an_unusable_session_stops_its_own_pairs_alone(
+    tiny: Path, tmp_path: Path, file: str, content: str | None, left_out: list[tuple[str, str]], named: str
+) -> None:
+    path = tiny / "sessions" / file
+    before = path.read_text()
+    path.unlink() if content is None else path.write_text(content)
+    table = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings")
+    lost = table[table["reason"] != ""]
+    assert sorted(zip(lost["map_device"], lost["query_device"], strict=True)) == left_out
+    assert lost["reason"].str.contains(named).all()
+    assert (lost["queries"] == 0).all()
+    done = table[table["reason"] == ""]
+    assert len(done) == 2
+    assert all(len(lines(path)) == count > 0 for path, count in zip(done["path"], done["queries"], strict=True))
+    path.write_text(before)
+    assert (retrieve_pairs(tiny / "sessions", tmp_path / "embeddings")["reason"] == "").all()

@@ -87,3 +87,16 @@ def test_only_the_pairs_asked_for_and_none_without_poses(small_capture, drawn, t
     pairs = [["ios", "hl"], ["hl", "hl"]]
     table = visualize_scene(small_capture / "sessions", tmp_path, None, tmp_path / "out", QUICK, pairs=pairs)
     assert table["query_device"].tolist() == ["hl"]
+
+
+def test_a_pair_that_was_left_out_has_its_reason_and_no_pictures(small_capture, drawn, tmp_path):
+    capture, out = Capture.open(small_capture), tmp_path / "out"
+    write_pair(capture, tmp_path, "ios", "ios", queries_of(capture, "ios", 1))
+    (tmp_path / "SMALL_map_ios_query_hl.left_out.json").write_text('{"reason": "a dragon"}')
+    out.mkdir()
+    stale = [out / "SMALL_map_ios_query_hl.png", out / "localization_SMALL_map_ios_query_hl_1.png"]
+    for path in stale:
+        path.touch()
+    table = visualize_scene(small_capture / "sessions", tmp_path, None, out, QUICK, map_device="ios")
+    assert table.set_index("query_device")["reason"].to_dict() == {"ios": "", "hl": "a dragon"}
+    assert not any(path.exists() for path in stale)

@@ -18,7 +18,7 @@ from toolkit.capture.images import default_workers, prefetch, read_image
 from toolkit.capture.turning import turn_image
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import Embedder, create_embedder, resolve_name
-from toolkit.errors import ImageError, ManifestError, ToolkitError
+from toolkit.errors import CaptureError, ImageError, ManifestError, ToolkitError
 from toolkit.features.features import LocalFeatures, SiftExtractor
 from toolkit.features.groups import GroupWriter, heals
 from toolkit.features.stores import FeatureStore, extract_session
@@ -70,9 +70,10 @@ def embed_sessions(
 
     Returns:
         One row a subsession: session, subsession, images, embedded, unreadable, turned, seconds, skipped, model,
-        dim.
+        dim, reason; and one for each session that cannot be read, with the `reason`.
 
     Raises:
+        CaptureError: no session can be read.
         ManifestError: a parameter is not valid.
         WeightsError: a learned model has no weights, or other ones; before any work.
     """
@@ -80,12 +81,13 @@ def embed_sessions(
     out_dir = Path(out_dir)
     features_dir = Path(features_dir) if features_dir is not None else out_dir.parent / "features"
     capture = Capture.from_sessions_root(sessions_root)
-    parts = _subsessions(capture, device, subsession)
+    parts, left_out = _subsessions(capture, device, subsession)
     embedder = _open_embedder(capture, settings, out_dir, features_dir, skip_existing)
     if (turns := _turns(capture, embedder, settings)) is not None:
         parts = [replace(part, turns=turns.of(part.session, part.rows)) for part in parts]
     if subsession == "all":
-        _remove_former(out_dir, _session_names(capture, device), parts)
+        names = [name for name in _session_names(capture, device) if name not in left_out]
+        _remove_former(out_dir, names, parts)
 
     @cache
     def store_of(session_id: str) -> FeatureStore:
@@ -133,8 +135,11 @@ def embed_sessions(
                 "skipped": skipped,
                 "model": embedder.name,
                 "dim": embedder.dim,
+                "reason": "",
             }
         )
+    nothing = {name: type(value)() for name, value in table[0].items()}
+    table += [{**nothing, "session": name, "reason": reason} for name, reason in left_out.items()]
     made_with = settings.model_copy(update={"model": embedder.name})
     write_text(out_dir / "settings.json", made_with.model_dump_json(indent=1) + "\n")
     return pd.DataFrame(table)
@@ -183,14 +188,19 @@ def _session_names(capture: Capture, device: str) -> list[str]:
     return [name for name in names if name in capture]
 
 
-def _subsessions(capture: Capture, device: str, subsession: str) -> list[_Subsession]:
-    """Return the subsessions to embed, whose images are not turned."""
+def _subsessions(capture: Capture, device: str, subsession: str) -> tuple[list[_Subsession], dict[str, str]]:
+    """Return the subsessions to embed, whose images are not turned, and why sessions cannot be read."""
     if device not in ("auto", "all", *capture.devices):
         raise ManifestError(f"device is {device!r}; {capture.name} has {', '.join(capture.devices)} (or `auto`).")
     names = _session_names(capture, device)
-    parts = []
-    for session in (capture[name] for name in names):
-        rows = session.camera_rows
+    parts, left_out = list[_Subsession](), dict[str, str]()
+    for id_ in names:
+        try:
+            session, rows = capture[id_], capture[id_].camera_rows
+        except CaptureError as error:
+            log.warning("%s is left out: %s", id_, error)
+            left_out[id_], first = str(error), error
+            continue
         of_row = session.subsession_of(rows)
         # Images outside every listed subsession are embedded too, under the session's name.
         of_row = np.where(of_row == "", session.id, of_row)
@@ -198,10 +208,12 @@ def _subsessions(capture: Capture, device: str, subsession: str) -> list[_Subses
             members = rows[of_row == name]
             parts.append(_Subsession(session, name, members, np.zeros(len(members), np.int64)))
     chosen = [part for part in parts if subsession in ("all", part.name)]
+    if not parts and left_out:
+        raise first
     if not chosen:
         known = ", ".join(part.name for part in parts)
         raise ManifestError(f"No images of subsession {subsession!r} in {', '.join(names)}; known: {known}.")
-    return chosen
+    return chosen, left_out
 
 
 def _remove_former(out_dir: Path, names: list[str], parts: list[_Subsession]) -> None:
@@ -222,10 +234,11 @@ def _vocabulary(
     """Learn the VLAD vocabulary from the map images of all devices, unless a current one is there."""
     from toolkit.embedders.vlad import Vlad
 
-    maps = [capture[name] for name in capture if capture[name].split == "map"]
+    maps = capture.usable("map")
     if not maps:
         raise ToolkitError(
-            f"{capture.path}/sessions has no <device>_map session; `vlad` learns its vocabulary from the map."
+            f"{capture.path}/sessions has no <device>_map session that can be read; `vlad` learns its vocabulary from "
+            "the map."
         )
     every = [(session.id, int(row)) for session in maps for row in session.camera_rows]
     chosen: dict[str, list[int]] = {}

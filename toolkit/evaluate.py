@@ -18,6 +18,7 @@ from toolkit.errors import ArtifactError, CaptureError, ToolkitError
 from toolkit.files import image_name, pair_name, read_references, require_whole, write_atomic, write_sidecar
 from toolkit.geometry import Floats, invert, transform
 from toolkit.manifest import EvaluateSettings
+from toolkit.runs.pairs import LEFT_OUT, left_out
 from toolkit.show.evaluation import Evaluation, draw_evaluation
 from toolkit.show.figures import save_figure
 from toolkit.show.localized import load_maps, map_files
@@ -87,6 +88,7 @@ def evaluate_scene(
 
     Raises:
         ToolkitError: an unknown device or `at`, or no pair to evaluate.
+        CaptureError: no pair can be evaluated.
     """
     if at not in ("device", "camera"):
         raise ToolkitError(f"Unknown at={at!r}. Known: device, camera.")
@@ -100,13 +102,21 @@ def evaluate_scene(
     messages: list[str] = []
     references_dir = retrieval_dir and (reranked_dir or retrieval_dir)
     for query in capture.devices_with("query", query_device):
-        session = capture[f"{query}_query"]
-        keys, truth = _queries_with_truth(session, queries, messages)
-        for map_ in map_devices:
-            if pairs is not None and [map_, query] not in map(list, pairs):
-                continue
+        asked = [map_ for map_ in map_devices if pairs is None or [map_, query] in map(list, pairs)]
+        reason = ""
+        try:
+            session = capture[f"{query}_query"]
+            keys, truth = _queries_with_truth(session, queries, messages)
+        except CaptureError as error:
+            reason = str(error)
+        for map_ in asked:
             pair = {"map_device": map_, "query_device": query}
             name = pair_name(capture.name, map_, query)
+            if cause := reason or left_out(poses_dir, name) or _unreadable(capture, f"{map_}_map"):
+                messages.append(f"{name} was left out: {cause}")
+                for kind in ("recall", "losses"):
+                    rows[kind].append({**pair, "state": f"{LEFT_OUT}{cause}"})
+                continue
             if not len(keys):
                 for table in rows.values():
                     table.append({**pair, "state": "no ground truth"})
@@ -130,6 +140,8 @@ def evaluate_scene(
             errors.append(frame.assign(**pair))
             rows["recall"].append({**pair, "state": state, **_summary(frame, limits)})
             rows["losses"] += [{**pair, "state": state, **row} for row in _losses(frame, limits)]
+    if rows["recall"] and all(row["state"].startswith(LEFT_OUT) for row in rows["recall"]):
+        raise CaptureError(messages[0])
     folders = {"retrieved": retrieval_dir, "reranked": reranked_dir}
     evaluation = Evaluation(
         _table(pd.DataFrame(rows["recall"]), "queries"),
@@ -150,6 +162,15 @@ def evaluate_scene(
         record = {"poses": str(poses_dir), "queries": queries, "at": at, **settings.model_dump()}
         write_evaluation(evaluation, out_dir, record | {"messages": evaluation.messages})
     return evaluation
+
+
+def _unreadable(capture: Capture, session_id: str) -> str:
+    """Return why a session cannot be read; "" if it can."""
+    try:
+        capture[session_id]
+    except CaptureError as error:
+        return str(error)
+    return ""
 
 
 def write_evaluation(evaluation: Evaluation, out_dir: str | Path, settings: dict[str, Any]) -> None:
@@ -402,12 +423,16 @@ def overlap_table(
             if references and (pairs is None or [map_, query] in map(list, pairs)):
                 name = pair_name(capture.name, map_, query)
                 poses = None if poses_dir is None else Path(poses_dir) / name
-                local_map = load(map_files(map_dir, f"{map_}_map", poses))
                 row: dict[str, Any] = {"map_device": map_, "query_device": query, "state": "evaluated"}
-                for column, folder in references.items():
-                    path = Path(folder) / f"{name}.jsonl"
-                    row |= _overlap(path, column, capture[f"{query}_query"], capture[f"{map_}_map"], local_map)
                 rows.append(row)
+                try:
+                    sessions = capture[f"{query}_query"], capture[f"{map_}_map"]
+                except CaptureError as error:
+                    row["state"] = f"{LEFT_OUT}{error}"
+                    continue
+                local_map = load(map_files(map_dir, f"{map_}_map", poses))
+                for column, folder in references.items():
+                    row |= _overlap(Path(folder) / f"{name}.jsonl", column, *sessions, local_map)
     return _table(pd.DataFrame(rows), "images", "points")
 
 

@@ -5,7 +5,8 @@ import logging
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ from toolkit.files import (
     sidecar_path,
     write_atomic,
     write_sidecar,
+    write_text,
 )
 from toolkit.localizers.base import Localizer, NetworkMatches, PoseEstimate, Query, References, View
 from toolkit.localizers.correspondences import MAPS, LocalizedQuery, query_group
@@ -60,6 +62,7 @@ from toolkit.localizers.mapping import map_settings
 from toolkit.localizers.picture import localize_image
 from toolkit.localizers.prediction import Predictor
 from toolkit.manifest import LocalizeSettings
+from toolkit.runs.pairs import PairRows
 
 __all__ = ["COLUMNS", "PREDICTION_COLUMNS", "Map", "explain_query", "localize_image", "localize_pairs"]
 
@@ -112,39 +115,42 @@ def localize_pairs(
 
     Returns:
         One row a pair: map_device, query_device, queries = ok + low_confidence + failed, escalated (those that further
-        features were asked for), seconds, skipped, path.
+        features were asked for), seconds, skipped, path, reason. A pair that cannot be done has zeros and the `reason`.
 
     Raises:
         ManifestError: unknown method, predictor, features or matcher, or a number that is not positive.
         WeightsError: the network has no weights, before any work is done.
-        CaptureError: unknown device or list.
-        ArtifactError: the retrieval of a pair is missing.
+        CaptureError: unknown device; or no pair can be done, e.g. for want of the list.
+        ArtifactError: no pair can be done; of one, the retrieval is missing.
     """
     settings = resolve_auto(LocalizeSettings.of(settings))
     capture = Capture.from_sessions_root(sessions_root)
     workers = workers or default_workers()
     kinds, escalation = create_methods(settings)
     predictor = open_predictor(settings, capture, Path(map_dir)) if settings.predicts else None
-    table = []
+    table = PairRows(capture.name, Path(out_dir), Path(retrieval_dir))
+
+    @lru_cache(maxsize=1)
+    def open_map(device: str) -> tuple[Map, Localizer]:
+        place = Map.build(
+            capture, device, settings, kinds, Path(features_dir), Path(map_dir), workers, skip_existing, escalation
+        )
+        return place, create_localizer(settings, place, predictor)
+
+    devices = product(capture.devices_with("map", map_device), capture.devices_with("query", query_device))
     with threadpool_limits(1, "blas"):  # queries are the parallel dimension, and sums stay in one order
-        for mapped in capture.devices_with("map", map_device):
-            localizer: Localizer | None = None
-            for queried in capture.devices_with("query", query_device):
+        for mapped, queried in devices:
+            pair = _Pair(capture, mapped, queried, Path(retrieval_dir), Path(out_dir), queries)
+            with table.row(mapped, queried) as row:
+                table.check_upstream()
                 started = time.perf_counter()
-                pair = _Pair(capture, mapped, queried, Path(retrieval_dir), Path(out_dir), queries)
                 record = pair.record(settings, kinds, escalation, predictor)
                 about = attributes(settings, kinds, capture, mapped, pair.retrieval_dir)
                 maps = [Path(map_dir) / name for name in json.loads(about[MAPS])]
                 skipped = skip_existing and pair.is_current(record, maps)
                 unfinished = False
                 if not skipped:
-                    if localizer is None:
-                        place = Map.build(
-                            capture, mapped, settings, kinds, Path(features_dir), Path(map_dir), workers,
-                            skip_existing, escalation,
-                        )  # fmt: skip
-                        localizer = create_localizer(settings, place, predictor)
-                    run = _PairRun(pair, place, localizer, Path(features_dir), workers, skip_existing)
+                    run = _PairRun(pair, *open_map(mapped), Path(features_dir), workers, skip_existing)
                     localized = run.localize(record, about)
                     _write_poses(pair, localized, settings)
                     unfinished = any(map(_is_internal, localized))
@@ -153,19 +159,19 @@ def localize_pairs(
                     write_sidecar(pair.file("txt"), record, files, unfinished=unfinished)
                 rows = pd.read_csv(pair.file("csv"))
                 counts = rows["status"].str.split(":").str[0].value_counts()
-                table.append(
-                    {
-                        "map_device": mapped,
-                        "query_device": queried,
-                        "queries": int(counts.sum()),
-                        **{status: int(counts.get(status, 0)) for status in ("ok", "low_confidence", "failed")},
-                        "escalated": int(rows["first_status"].notna().sum()) if settings.features.escalation else 0,
-                        "seconds": round(time.perf_counter() - started, 2),
-                        "skipped": skipped,
-                        "path": str(pair.file("txt")),
-                    }
-                )
-    return pd.DataFrame(table)
+                row |= {
+                    "queries": int(counts.sum()),
+                    **{status: int(counts.get(status, 0)) for status in ("ok", "low_confidence", "failed")},
+                    "escalated": int(rows["first_status"].notna().sum()) if settings.features.escalation else 0,
+                    "seconds": round(time.perf_counter() - started, 2),
+                    "skipped": skipped,
+                    "path": str(pair.file("txt")),
+                }
+            if row["reason"]:
+                pair.remove_poses()
+    frame = table.frame()
+    write_text(Path(out_dir) / "settings.json", settings.model_dump_json(indent=1) + "\n")
+    return frame
 
 
 @dataclass(frozen=True)
@@ -189,6 +195,11 @@ class _Pair:
     def is_current(self, record: dict[str, Any], maps: Sequence[Path]) -> bool:
         """Tell whether the pair is done; its maps are part of what there is to see of it."""
         return is_current(self.file("txt"), record) and None not in map(read_sidecar, maps)
+
+    def remove_poses(self) -> None:
+        """Remove poses that an earlier run found; what they rest on is kept, and gives them again without work."""
+        for poses in (self.file("txt"), sidecar_path(self.file("txt")), self.file("csv")):
+            poses.unlink(missing_ok=True)
 
     @property
     def session(self) -> Session:

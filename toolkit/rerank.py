@@ -40,6 +40,7 @@ from toolkit.files import (
 )  # fmt: skip
 from toolkit.geometry import Ints
 from toolkit.manifest import RerankSettings
+from toolkit.runs.pairs import PairRows
 
 log = logging.getLogger(__name__)
 
@@ -76,20 +77,21 @@ def rerank_pairs(
 
     Returns:
         One row a pair: map_device, query_device, queries (images) = confirmed + kept, changed (confirmed ones that have
-        another first reference than before), seconds, skipped, path.
+        another first reference than before), seconds, skipped, path, reason. A pair that cannot be done has zeros and
+        the `reason`.
 
     Raises:
         ManifestError: topk is below 1 or above topn; unknown features, or a matcher that does not suit them.
         WeightsError: a network has no weights.
         CaptureError: unknown device.
-        ArtifactError: the retrieval of a pair is missing, torn, or of another capture.
+        ArtifactError: no pair can be done; of one, the retrieval is missing, torn, or of another capture.
     """
     settings = resolve_auto(RerankSettings.of(settings))
     capture = Capture.from_sessions_root(sessions_root)
     (method,) = create_local_methods(settings)
     turns = upright_turns(capture, settings.world_up) if KINDS[method.name].upright else None
     workers = workers or default_workers()
-    table = []
+    table = PairRows(capture.name, Path(out_dir), Path(retrieval_dir))
     cv2_threads = cv2.getNumThreads()
     cv2.setNumThreads(1)  # queries are the parallel dimension, and sums stay in one order
     try:
@@ -97,22 +99,23 @@ def rerank_pairs(
             for devices in product(
                 capture.devices_with("map", map_device), capture.devices_with("query", query_device)
             ):
-                started = time.perf_counter()
-                sessions = capture[f"{devices[0]}_map"], capture[f"{devices[1]}_query"]
-                name = f"{pair_name(capture.name, *devices)}.jsonl"
-                pair = _Pair(*sessions, Path(retrieval_dir) / name, Path(out_dir) / name, method, settings)
-                skipped = skip_existing and is_current(pair.path, pair.record)
-                if not skipped:
-                    pair.rerank(Path(features_dir), workers, skip_existing, turns)
-                table.append(
-                    {"map_device": devices[0], "query_device": devices[1]}
-                    | _counts(read_references(pair.path))
-                    | {"seconds": round(time.perf_counter() - started, 2), "skipped": skipped, "path": str(pair.path)}
-                )
+                with table.row(*devices) as row:
+                    table.check_upstream()
+                    started = time.perf_counter()
+                    sessions = capture[f"{devices[0]}_map"], capture[f"{devices[1]}_query"]
+                    name = f"{pair_name(capture.name, *devices)}.jsonl"
+                    pair = _Pair(*sessions, Path(retrieval_dir) / name, Path(out_dir) / name, method, settings)
+                    skipped = skip_existing and is_current(pair.path, pair.record)
+                    if not skipped:
+                        pair.rerank(Path(features_dir), workers, skip_existing, turns)
+                    row |= _counts(read_references(pair.path))
+                    row |= {"seconds": round(time.perf_counter() - started, 2), "skipped": skipped}
+                    row["path"] = str(pair.path)
     finally:
         cv2.setNumThreads(cv2_threads)
+    frame = table.frame()
     write_text(Path(out_dir) / "settings.json", settings.model_dump_json(indent=1) + "\n")
-    return pd.DataFrame(table)
+    return frame
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,8 @@ import logging
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache, lru_cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ from tqdm.auto import tqdm
 from toolkit.capture import Capture, Session
 from toolkit.embedders import load_embeddings
 from toolkit.embedders.search import Backend, search
-from toolkit.errors import ArtifactError, ManifestError, ToolkitError
+from toolkit.errors import ArtifactError, CaptureError, ManifestError
 from toolkit.files import (
     file_fingerprint,
     fingerprint,
@@ -29,6 +31,7 @@ from toolkit.files import (
 )  # fmt: skip
 from toolkit.geometry import Ints, unit
 from toolkit.manifest import RetrieveSettings
+from toolkit.runs.pairs import PairRows
 
 __all__ = ["retrieve_pairs", "search"]
 
@@ -61,10 +64,12 @@ def retrieve_pairs(
     Returns:
         One row a pair: map_device, query_device, keyframes, keyframes_missing (no image of theirs has an
         embedding), queries and images_missing (images of the keyframes, with and without an embedding),
-        database, unposed (map images left out for want of a pose), seconds, skipped, path.
+        database, unposed (map images left out for want of a pose), seconds, skipped, path, reason. A pair that
+        cannot be done has zeros and the `reason`.
 
     Raises:
-        ToolkitError: see the message: unknown device or list, embeddings missing or of different dimensions.
+        ToolkitError: see the message: unknown device; or no pair can be done: no such list, embeddings missing or of
+            different dimensions.
     """
     settings = RetrieveSettings.of(settings)
     capture = Capture.from_sessions_root(sessions_root)
@@ -75,17 +80,24 @@ def retrieve_pairs(
     pairs = len(map_devices) * len(query_devices)
     if out.suffix == ".jsonl" and pairs != 1:
         raise ManifestError(f"out_jsonl is one file ({out}) for {pairs} pairs; give a folder.")
-    loaded_queries = [_load_queries(capture[f"{device}_query"], embeddings, queries) for device in query_devices]
-    table = []
-    for device in map_devices:
-        session = capture[f"{device}_map"]
-        database = _load_database(session, embeddings)
-        for query in loaded_queries:
+    folder = out.parent if out.suffix == ".jsonl" else out
+    table = PairRows(capture.name, folder)
+
+    @cache
+    def load_queries(device: str) -> _Images:
+        return _load_queries(capture[f"{device}_query"], embeddings, queries)
+
+    @lru_cache(maxsize=1)
+    def load_database(device: str) -> _Images:
+        return _load_database(capture[f"{device}_map"], embeddings)
+
+    for device, queried in product(map_devices, query_devices):
+        with table.row(device, queried) as row:
+            query, database = load_queries(queried), load_database(device)
             started = time.perf_counter()
-            name = f"{pair_name(capture.name, device, query.session.device)}.jsonl"
-            path = out if out.suffix == ".jsonl" else out / name
+            path = out if out.suffix == ".jsonl" else out / f"{pair_name(capture.name, device, queried)}.jsonl"
             record = {
-                "map": _inputs(session, embeddings),
+                "map": _inputs(database.session, embeddings),
                 "query": _inputs(query.session, embeddings),
                 "rows": fingerprint(query.rows.tolist()),
                 "topk": settings.topk,
@@ -95,24 +107,20 @@ def retrieve_pairs(
             if not skipped:
                 _write_pair(path, query, database, settings)
                 write_sidecar(path, record)
-            table.append(
-                {
-                    "map_device": device,
-                    "query_device": query.session.device,
-                    "keyframes": query.keyframes,
-                    "keyframes_missing": query.keyframes_missing,
-                    "queries": len(query.rows),
-                    "images_missing": query.images_missing,
-                    "database": len(database.rows),
-                    "unposed": database.unposed,
-                    "seconds": round(time.perf_counter() - started, 3),
-                    "skipped": skipped,
-                    "path": str(path),
-                }
-            )
-    folder = out.parent if out.suffix == ".jsonl" else out
+            row |= {
+                "keyframes": query.keyframes,
+                "keyframes_missing": query.keyframes_missing,
+                "queries": len(query.rows),
+                "images_missing": query.images_missing,
+                "database": len(database.rows),
+                "unposed": database.unposed,
+                "seconds": round(time.perf_counter() - started, 3),
+                "skipped": skipped,
+                "path": str(path),
+            }
+    frame = table.frame()
     write_text(folder / "settings.json", settings.model_dump_json(indent=1) + "\n")
-    return pd.DataFrame(table)
+    return frame
 
 
 @dataclass(frozen=True)
@@ -150,7 +158,7 @@ def _load_database(session: Session, embeddings: Path) -> _Images:
     images = _load(session, embeddings)
     posed = np.isfinite(session.world_from_cam(images.rows)).reshape(-1, 16).all(axis=1)
     if not posed.any():
-        raise ToolkitError(f"No embedded image of {session.id} has a pose ({session.path / 'trajectories.txt'}).")
+        raise CaptureError(f"No embedded image of {session.id} has a pose ({session.path / 'trajectories.txt'}).")
     if not posed.all():
         log.warning("%s: %d of %d images have no pose and are left out", session.id, np.sum(~posed), posed.size)
     return replace(images.take(np.flatnonzero(posed)), unposed=int(np.sum(~posed)))

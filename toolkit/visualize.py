@@ -13,6 +13,7 @@ from toolkit.capture import Capture
 from toolkit.errors import ArtifactError
 from toolkit.files import pair_name
 from toolkit.manifest import VisualizeSettings
+from toolkit.runs.pairs import PairRows, left_out
 from toolkit.show.localization_view import record_localizations
 from toolkit.show.localized import LocalizedPair, support_of, sure_points
 from toolkit.show.metrics import is_posed, worst_first
@@ -53,7 +54,8 @@ def visualize_scene(
         pairs: only these [map device, query device]; None: all.
 
     Returns:
-        One row a pair: map_device, query_device, queries, localized, seconds, still, recording.
+        One row a pair: map_device, query_device, queries, localized, seconds, still, recording, reason. A pair
+        that cannot be drawn has zeros and the `reason`.
 
     Raises:
         ArtifactError: there are no poses at all.
@@ -62,43 +64,34 @@ def visualize_scene(
     capture, out = Capture.from_sessions_root(sessions_root), Path(out_dir)
     maps = capture.devices_with("map", map_device)
     asked = [(m, q) for m in maps for q in capture.devices_with("query", query_device)]
-    present = [
+    asked = [
         (m, q)
         for m, q in asked
-        if (pairs is None or [m, q] in map(list, pairs)) and _poses(capture, poses_dir, m, q).is_file()
+        if (pairs is None or [m, q] in map(list, pairs))
+        and (_poses(capture, poses_dir, m, q).is_file() or left_out(poses_dir, pair_name(capture.name, m, q)))
     ]
-    if not present:
+    if not asked:
         raise ArtifactError(f"{poses_dir}: no poses of {capture.name} for the devices asked for. Localize them first.")
-    table, worst = [], []
-    for m, q in tqdm(present, desc="visualize", unit="pair"):
-        started = time.perf_counter()
-        pair = LocalizedPair.open(capture, m, q, poses_dir, map_dir)
-        shown, cloud, map_poses = pair.localizations, sure_points(pair.local_map), pair.map_session.world_from_cam()
-        still, recording = out / f"{pair.name}.png", out / f"{pair.name}.rrd"
-        draw_scene_png(
-            *(*cloud, map_poses, shown.estimated, shown.true, still),
-            up=settings.world_up,
-            title=f"{q} queries in the {m} map, seen from above",
-            map_tracks=session_tracks(pair.map_session),
-            query_tracks=session_tracks(pair.query_session),
-        )
-        order = shown.worst_first().tolist()
-        chosen = np.unique(np.linspace(0, len(order) - 1, min(settings.samples, len(order))).round().astype(int))
-        for number, k in enumerate((order[place] for place in chosen), start=1):
-            title = f"{q} query in the {m} map: {pair.table['status'].iloc[k]}"
-            draw_localization(pair.details(k), out / f"localization_{pair.name}_{number}.png", title)
-        if settings.recordings:
-            details = ((k, pair.details(k)) for k in sorted(order[: settings.matched_queries]))
-            record_localizations(recording, pair.name, map_poses, *cloud, shown, details, up=settings.world_up)
-        candidates = order[:WORST]
-        rows = shown.ranked.iloc[candidates]
-        worst.append(rows.assign(pair=f"{q} in the {m} map", details=[pair.details(k) for k in candidates]))
-        pair.queries.close()
-        table.append({
-            "map_device": m, "query_device": q, "queries": len(pair.table),
-            "localized": int(is_posed(pair.world_from_rig).sum()), "seconds": round(time.perf_counter() - started, 3),
-            "still": str(still), "recording": str(recording) if settings.recordings else "",
-        })  # fmt: skip
+    table, worst = PairRows(capture.name, out, Path(poses_dir)), []
+    for m, q in tqdm(asked, desc="visualize", unit="pair"):
+        with table.row(m, q) as row:
+            table.check_upstream()
+            started = time.perf_counter()
+            pair = LocalizedPair.open(capture, m, q, poses_dir, map_dir)
+            worst.append(_draw_pair(pair, out, settings))
+            row |= {
+                "queries": len(pair.table),
+                "localized": int(is_posed(pair.world_from_rig).sum()),
+                "seconds": round(time.perf_counter() - started, 3),
+                "still": str(out / f"{pair.name}.png"),
+                "recording": str(out / f"{pair.name}.rrd") if settings.recordings else "",
+            }
+        if row["reason"]:
+            name = pair_name(capture.name, m, q)  # pictures of an earlier run would mislead
+            for stale in (*out.glob(f"{name}.png"), *out.glob(f"{name}.rrd"), *out.glob(f"localization_{name}_*.png")):
+                stale.unlink()
+    frame = table.frame()
+    present = [(row["map_device"], row["query_device"]) for row in table.rows if not row["reason"]]
     _draw_worst(out / f"worst_{capture.name}.png", capture.name, pd.concat(worst, ignore_index=True))
     if settings.session_recordings:
         sides = dict.fromkeys((*((m, "map") for m, _ in present), *((q, "query") for _, q in present)))
@@ -120,7 +113,34 @@ def visualize_scene(
                 world_up=settings.world_up,
                 progress=False,
             )
-    return pd.DataFrame(table)
+    return frame
+
+
+def _draw_pair(pair: LocalizedPair, out: Path, settings: VisualizeSettings) -> pd.DataFrame:
+    """Draw and record a pair; return its worst queries, rows of `Localizations.ranked` with their details."""
+    m, q = pair.map_session.device, pair.query_session.device
+    shown, cloud, map_poses = pair.localizations, sure_points(pair.local_map), pair.map_session.world_from_cam()
+    still, recording = out / f"{pair.name}.png", out / f"{pair.name}.rrd"
+    draw_scene_png(
+        *(*cloud, map_poses, shown.estimated, shown.true, still),
+        up=settings.world_up,
+        title=f"{q} queries in the {m} map, seen from above",
+        map_tracks=session_tracks(pair.map_session),
+        query_tracks=session_tracks(pair.query_session),
+    )
+    order = shown.worst_first().tolist()
+    chosen = np.unique(np.linspace(0, len(order) - 1, min(settings.samples, len(order))).round().astype(int))
+    for number, k in enumerate((order[place] for place in chosen), start=1):
+        title = f"{q} query in the {m} map: {pair.table['status'].iloc[k]}"
+        draw_localization(pair.details(k), out / f"localization_{pair.name}_{number}.png", title)
+    if settings.recordings:
+        details = ((k, pair.details(k)) for k in sorted(order[: settings.matched_queries]))
+        record_localizations(recording, pair.name, map_poses, *cloud, shown, details, up=settings.world_up)
+    candidates = order[:WORST]
+    rows = shown.ranked.iloc[candidates]
+    rows = rows.assign(pair=f"{q} in the {m} map", details=[pair.details(k) for k in candidates])
+    pair.queries.close()
+    return rows
 
 
 def _poses(capture: Capture, poses_dir: str | Path, map_device: str, query_device: str) -> Path:

@@ -195,6 +195,15 @@ def test_a_stopped_run_names_the_stage(tmp_path):
     assert "stopped before its end. Stage localize of S: interrupted." in text_of(write_report(run).read_text())
 
 
+def test_what_was_left_out_has_its_reason(tmp_path):
+    lost = [{"what": "hl queries in the ios map", "reason": "images.txt, line 3: a <dragon>."}]
+    rows = [{"scene": "S", "stage": stage, "status": "done", "left_out": lost} for stage in ("retrieve", "localize")]
+    run = write_run(tmp_path / "b", status="incomplete", error="1 of 9 pairs failed", stages=rows)
+    text = text_of(write_report(run).read_text())
+    assert "More failed than the manifest tolerates. 1 of 9 pairs failed" in text
+    assert "S hl queries in the ios map images.txt, line 3: a &lt;dragon&gt;. retrieve, localize" in text
+
+
 def test_every_scene_has_room_for_pictures(full, monkeypatch):
     second = SceneFiles(full, "OTHER")
     write_png(second.visualization / "map.png", caption="the other map")

@@ -1,5 +1,6 @@
 """The folder of a capture: its sessions by name."""
 
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -7,6 +8,8 @@ from toolkit.capture.devices import SPLITS, in_order, session_id, session_of
 from toolkit.capture.names import require_name
 from toolkit.capture.session import Session
 from toolkit.errors import CaptureError
+
+log = logging.getLogger(__name__)
 
 
 class Capture:
@@ -110,8 +113,23 @@ class Capture:
                 f"Capture {self.path} has no session {session_id!r}; known: {', '.join(self.session_ids)}."
             )
         if session_id not in self._sessions:
-            self._sessions[session_id] = Session.open(self._folders[session_id])
+            try:
+                self._sessions[session_id] = Session.open(self._folders[session_id])
+            except OSError as error:
+                raise CaptureError(
+                    f"{self._folders[session_id]}: {error.filename or 'a file'} cannot be read ({error.strerror})."
+                ) from None
         return self._sessions[session_id]
+
+    def usable(self, split: str) -> list[Session]:
+        """Return the sessions of a split that can be read; those that cannot are logged, with the reason."""
+        sessions = []
+        for name in (name for name in self.session_ids if session_of(self._folders[name].name)[1] == split):
+            try:
+                sessions.append(self[name])
+            except CaptureError as error:
+                log.warning("%s is not used: %s", name, error)
+        return sessions
 
     def __contains__(self, session_id: object) -> bool:
         return session_id in self.session_ids

@@ -190,7 +190,7 @@ def quarter_turns(maps: Sequence[Session], world_up: WorldUp | ArrayLike | None 
 
 def upright_turns(capture: Capture, world_up: ArrayLike | None = None) -> Turns:
     """Return the turns learned from all map sessions of a capture; see `quarter_turns`."""
-    return quarter_turns([capture[name] for name in capture if capture[name].split == "map"], world_up)
+    return quarter_turns(capture.usable("map"), world_up)
 
 
 def _from_rigs(session: Session, sensors: pd.Series, turns: Ints, ups: Floats) -> Ints:

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from toolkit.capture.devices import color_of, in_order
+from toolkit.runs.pairs import LEFT_OUT
 from toolkit.show.figures import ORANGE, SKY, VERMILLION, new_figure, number, percent, styled
 from toolkit.show.metrics import (
     REASONS,
@@ -42,6 +43,14 @@ class Evaluation:
     thresholds: tuple[Threshold, ...] = THRESHOLDS
     messages: list[str] = field(default_factory=list)
     """What was not evaluated, and why; empty where all was."""
+
+    @property
+    def pairs(self) -> pd.DataFrame:
+        """The pairs, with the `reason` of those that had to be left out."""
+        state = self.recall["state"].astype(str)
+        left_out = state.str.startswith(LEFT_OUT)
+        reason = state.str.removeprefix(LEFT_OUT).where(left_out, "")
+        return self.recall[["map_device", "query_device"]].assign(reason=reason)
 
 
 @styled

@@ -12,6 +12,7 @@ from toolkit.capture import Capture, Session
 from toolkit.capture.devices import color_of
 from toolkit.capture.images import read_for_display
 from toolkit.capture.world_up import up_of_cameras
+from toolkit.errors import CaptureError
 from toolkit.files import image_name, read_references
 from toolkit.geometry import Floats, unit
 from toolkit.show.figures import GREEN, ORANGE, VERMILLION, new_figure, styled
@@ -25,25 +26,38 @@ MAX_PLACES = 4
 
 
 def describe(capture: Capture, queries: str = "keyframes_pruned_subsampled") -> pd.DataFrame:
-    """Return one row a session: counts of images, posed images, rigs, subsessions and queries asked."""
-    rows = [
-        {
-            "session": session.id, "device": session.device, "split": session.split,
-            "images": len(session.images), "subsessions": len(session.subsessions),
-            "cameras": int(session.sensors["sensor_type"].eq("camera").sum()),
-            "rigs": 0 if session.rigs is None else session.rigs["rig_id"].nunique(),
-            "with pose": len(_poses(session)),
-            "queries": len(session.keyframes(queries)) if session.split == "query" else 0,
-        }
-        for session in map(capture.__getitem__, capture)
-    ]  # fmt: skip
+    """Return one row a session: counts of images, posed images, rigs, subsessions and queries asked.
+
+    What makes a session unusable for later stages is its `reason`.
+    """
+    rows = []
+    for name in capture:
+        device, _, split = name.rpartition("_")
+        row: dict[str, Any] = {"session": name, "device": device, "split": split}
+        row |= dict.fromkeys(("images", "subsessions", "cameras", "rigs", "with pose", "queries"), 0)
+        row["reason"] = ""
+        rows.append(row)
+        try:
+            session = capture[name]
+            row |= {
+                "images": len(session.images), "subsessions": len(session.subsessions),
+                "cameras": int(session.sensors["sensor_type"].eq("camera").sum()),
+                "rigs": 0 if session.rigs is None else session.rigs["rig_id"].nunique(),
+                "with pose": len(_poses(session)),
+            }  # fmt: skip
+            if split == "query":
+                row["queries"] = len(session.keyframes(queries))
+            elif not row["with pose"]:
+                row["reason"] = "a map without poses"
+        except CaptureError as error:
+            row["reason"] = str(error)
     return pd.DataFrame(rows).set_index("session")
 
 
 @styled
 def draw_samples(capture: Capture, count: int = 4) -> "Figure":
     """Return a figure of `count` images of each session, evenly spread over the recording."""
-    names = [name for name in capture if len(capture[name])]
+    names = [session.id for session in _usable(capture) if len(session)]
     figure = new_figure(2.4 * count, 1.9 * len(names))
     axes = figure.subplots(len(names), count, squeeze=False)
     for line, name in zip(axes, names, strict=True):
@@ -63,7 +77,7 @@ def draw_top_view(capture: Capture, up: ArrayLike | None = None) -> "Figure":
         capture: what to draw; cameras far from all others get a panel of their own.
         up: (3,) direction that is up; None: estimated from how the cameras are held.
     """
-    poses = {name: _poses(capture[name]) for name in capture}
+    poses = {session.id: _poses(session) for session in _usable(capture)}
     everything = np.concatenate(list(poses.values()))
     axes, labels = ground_axes(up_of_cameras(everything) if up is None else up)
     centers = everything[:, :3, 3] @ axes.T
@@ -195,6 +209,10 @@ def _descriptors(session: Path, limit: int) -> NDArray[np.float32]:
     step = max(1, -(-total // limit))
     rows = np.concatenate([np.asarray(part[::step], np.float32) for part in parts])
     return unit(rows)
+
+
+def _usable(capture: Capture) -> list[Session]:
+    return sorted([*capture.usable("map"), *capture.usable("query")], key=lambda session: session.id)
 
 
 def _poses(session: Session) -> Floats:

@@ -132,7 +132,8 @@ def write_report(run_dir: str | Path) -> Path:
         run=run,
         scenes=scenes,
         stages=_stages(run, run_dir),
-        stopped=[row for row in run["stages"] if row.get("status") in ("failed", "interrupted")],
+        stopped=[row for row in run["stages"] if row.get("status") in ("failed", "interrupted", "skipped")],
+        not_done=_not_done(run),
         summary=_summary(run),
         manifest=_json(run["manifest"]),
         parameters=[(_stage_name(row), _json(row["parameters"])) for row in run["stages"] if row.get("parameters")],
@@ -205,6 +206,19 @@ def _stages(run: dict[str, Any], run_dir: Path) -> Table:
         ])  # fmt: skip
     caption = "Time and peak memory of every stage; a name leads to its executed notebook"
     return Table(caption, ["scene", "stage", "status", "time", "of it work", "peak memory", "counts"], rows)
+
+
+def _not_done(run: dict[str, Any]) -> Table | None:
+    """Return what the stages left out, and why."""
+    found: dict[tuple[str, str, str], list[str]] = {}
+    for row in run["stages"]:
+        for one in row.get("left_out") or ():
+            key = str(row.get("scene") or ""), str(one.get("what", "")), str(one.get("reason", ""))
+            found.setdefault(key, []).append(str(row.get("stage", "")))
+    if not found:
+        return None
+    rows = [[*map(Cell, key), Cell(", ".join(dict.fromkeys(stages)))] for key, stages in found.items()]
+    return Table("Left out, and why", ["scene", "what", "reason", "stages"], rows)
 
 
 # A scene

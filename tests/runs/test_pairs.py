@@ -1,0 +1,68 @@
+"""Pairs that cannot be done: the others are, and the reason is kept where later stages find it."""
+
+from pathlib import Path
+
+import pytest
+
+from toolkit.errors import CaptureError, ManifestError
+from toolkit.runs.pairs import PairRows, left_out, left_out_of, way_out
+from toolkit.runs.record import failures
+
+
+def test_a_pair_that_cannot_be_done_is_a_row_with_the_reason(tmp_path: Path) -> None:
+    table = PairRows("P", tmp_path)
+    with table.row("ios", "hl"):
+        raise CaptureError("images.txt, line 3: a dragon.")
+    with table.row("ios", "ios") as row:
+        row |= {"queries": 3, "seconds": 0.1, "skipped": True, "path": "x"}
+    frame = table.frame()
+    assert frame.to_dict("list") == {
+        "map_device": ["ios", "ios"], "query_device": ["hl", "ios"], "queries": [0, 3], "seconds": [0.0, 0.1],
+        "skipped": [False, True], "path": ["", "x"], "reason": ["images.txt, line 3: a dragon.", ""],
+    }  # fmt: skip
+    (lost,) = left_out_of(frame)
+    assert (lost["what"], lost["reason"]) == ("hl queries in the ios map", "images.txt, line 3: a dragon.")
+
+    later = PairRows("P", tmp_path / "later", tmp_path)
+    for query in ("hl", "ios"):
+        with later.row("ios", query) as row:
+            later.check_upstream()
+            row["queries"] = 1
+    assert later.frame()["reason"].tolist() == ["images.txt, line 3: a dragon.", ""]
+    with table.row("ios", "hl"):
+        pass
+    assert left_out(tmp_path, "P_map_ios_query_hl") == "", "done again, it has no reason any more"
+
+
+def test_where_no_pair_can_be_done_the_first_error_is_raised(tmp_path: Path) -> None:
+    table = PairRows("P", tmp_path)
+    for query in ("hl", "ios"):
+        with table.row("ios", query):
+            raise CaptureError(query)
+    with pytest.raises(CaptureError, match="hl"):
+        table.frame()
+
+
+def test_an_error_of_the_settings_or_a_bug_stops_at_once(tmp_path: Path) -> None:
+    table = PairRows("P", tmp_path)
+    for error in (ManifestError("topk"), KeyError("a bug"), MemoryError()):
+        with pytest.raises(type(error)), table.row("ios", "hl"):
+            raise error
+
+
+def test_the_way_out_names_the_device() -> None:
+    assert "`devices: [ios, spot]`" in way_out([("ios", "hl"), ("hl", "hl")], ["ios", "hl", "spot"])
+    assert "`devices:`" in way_out([("ios", "hl"), ("spot", "spot")], ["ios", "hl", "spot"])
+
+
+def test_failures_are_counted_once() -> None:
+    lost = [{"what": "", "reason": "x"}]
+    rows = [
+        {"scene": "P", "stage": "embed", "counts": {"images": 9, "unreadable": 2}, "asked": 6, "left_out": lost},
+        {"scene": "P", "stage": "retrieve", "asked": 9, "left_out": lost * 5},
+        {"scene": "P", "stage": "localize", "counts": {"queries": 7, "failed": 1}, "asked": 9, "left_out": lost * 5},
+        {"scene": "Q", "stage": "localize", "counts": {"queries": 3, "failed": 0}, "asked": 4, "left_out": []},
+    ]
+    assert failures(rows) == {
+        "images": {"failed": 2, "of": 9}, "queries": {"failed": 1, "of": 10}, "pairs": {"failed": 5, "of": 13}
+    }  # fmt: skip
