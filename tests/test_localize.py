@@ -1,8 +1,10 @@
 """The localize stage from files to files, on a rendered capture: poses, rows, resuming, and single pictures."""
 
 import json
+import os
 import re
 import shutil
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +17,7 @@ import numpy as np
 import pandas as pd
 import pycolmap
 import pytest
+import torch
 
 from tests.calls import call
 from tests.other_kind import add_other_kind
@@ -34,6 +37,7 @@ from toolkit.localizers import map as maps
 from toolkit.localizers.base import PoseEstimate, Query, View
 from toolkit.localizers.correspondences import LocalizedQueries
 from toolkit.localizers.local_map import LocalMap
+from toolkit.localizers.picture import pixels_from
 from toolkit.localizers.pnp import PnpLocalizer
 from toolkit.localizers.prediction import Prediction
 from toolkit.localizers.simulated import SimulatedPredictor
@@ -581,13 +585,33 @@ def test_a_picture_may_be_pixels(small_capture: Path, opened: Map) -> None:
     assert distance_m < 0.01
 
 
+def camera_of(params: list[float], width: int = 10) -> pycolmap.Camera:
+    camera = pycolmap.Camera(model="PINHOLE", width=width, height=20, params=[10, 10, 5, 10])
+    camera.params = params
+    return camera
+
+
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"image": np.zeros((20, 10), np.float32)}, "float32"),
-        ({"image": np.zeros((20, 10, 1), np.uint8)}, r"\(20, 10, 1\)"),
+        ({"image": np.full((20, 10), np.nan)}, r"\(20, 10\) float64 from nan"),
+        ({"image": np.full((20, 10), -1)}, "int64 from -1"),
+        ({"image": np.full((20, 10), 300.0)}, "to 300"),
         ({"image": np.zeros((20, 10, 4), np.uint8)}, r"\(20, 10, 4\)"),
+        ({"image": np.zeros((20, 10), complex)}, "complex"),
+        ({"image": np.zeros((0, 10), np.uint8)}, r"\(0, 10\)"),
+        ({"image": np.zeros(20, np.uint8)}, r"\(20,\)"),
+        ({"image": None}, "None"),
+        ({"image": b"bytes"}, "bytes"),
+        ({"image": [[1, 2], [3]]}, "list"),
         ({"image": ["1.jpg", "2.jpg"]}, "2 pictures, 1 cameras"),
+        ({"camera": "PINHOLE, 10, 20, 10, 10, 5, 10"}, "camera: found 'PINHOLE.*parse_camera"),
+        ({"camera": None}, "camera: found None"),
+        ({"camera": camera_of([10, 10, 5])}, "camera: found 3 parameters"),
+        ({"camera": camera_of([-10, 10, 5, 10])}, "camera: found a focal length"),
+        ({"camera": camera_of([np.nan, 10, 5, 10])}, "camera: .*finite"),
+        ({"camera": camera_of([10, 10, 5, 10], width=11)}, "10 x 20 pixels, its camera 11 x 20"),
+        ({"rig_from_cams": np.eye(3)}, r"rig_from_cams: found \(3, 3\)"),
         ({"image": [], "camera": []}, "0 pictures"),
         ({"image": "12345.jpg", "camera": []}, "1 pictures, 0 cameras"),
         ({"turns": [1, 2]}, "2 turns"),
@@ -597,6 +621,31 @@ def test_what_is_no_picture_is_refused(opened: Map, changed: dict, message: str)
     camera = pycolmap.Camera(model="PINHOLE", width=10, height=20, params=[10, 10, 5, 10])
     with pytest.raises(ImageError, match=message):
         localize_image(opened, **({"image": np.zeros((20, 10), np.uint8), "camera": camera} | changed))
+
+
+def test_what_other_libraries_call_an_image_is_the_same_picture() -> None:
+    from PIL import Image
+
+    color = np.random.default_rng(0).integers(0, 256, (20, 10, 3), np.uint8)
+    gray = color[:, :, 0]
+    for same in (
+        color.astype(np.float32) / 255, color.astype(float), color.astype(np.int64), color.astype(np.uint16) * 257,
+        np.moveaxis(color, 2, 0), np.moveaxis(color, 2, 0).astype(np.float32) / 255, torch.from_numpy(color),
+        color.tolist(), Image.fromarray(color), Image.fromarray(color).convert("RGBA"),
+    ):  # fmt: skip
+        np.testing.assert_array_equal(pixels_from(same), color)
+    for same in (gray[:, :, None], gray[None], gray.tolist(), Image.fromarray(gray), gray.astype(np.uint16) << 8):
+        np.testing.assert_array_equal(pixels_from(same), gray)
+    np.testing.assert_array_equal(pixels_from(gray > 99), np.where(gray > 99, 255, 0))
+
+
+def test_pixels_of_other_types_get_the_pose_of_their_file(small_capture: Path, opened: Map) -> None:
+    session = Capture.open(small_capture)["ios_query"]
+    path, camera = session.image_path(0), session.camera(session.images["sensor_id"].iloc[0])
+    pixels = read_image(path)
+    expected = localize_image(opened, pixels, camera).world_from_rig
+    answer = localize_image(opened, np.moveaxis(pixels, 2, 0).astype(np.float32) / 255, camera)
+    np.testing.assert_array_equal(answer.world_from_rig, expected)
 
 
 @pytest.mark.parametrize("upright", [None, False])
@@ -687,9 +736,49 @@ def test_a_localizer_of_another_method_sees_images_upright_as_its_settings_say(
     assert directions == [[0, 0, 1]]
 
 
-def test_the_map_of_an_unfinished_run(finished: tuple[SceneFiles, pd.DataFrame]) -> None:
-    with pytest.raises(ArtifactError, match="'hl'"):
+def test_an_unknown_run_scene_or_device_is_told_with_the_known_ones(
+    finished: tuple[SceneFiles, pd.DataFrame], tmp_path: Path
+) -> None:
+    with pytest.raises(ArtifactError, match=r"'hl'.*Known: ios\."):
         Map.open(finished[0].run, finished[0].scene, "hl")
+    with pytest.raises(ArtifactError, match=r"'SMAL'.*Did you mean 'SMALL'\?"):
+        Map.open(finished[0].run, "SMAL", "ios")
+    (tmp_path / "demo").mkdir()
+    (tmp_path / "demo" / "run.json").touch()
+    with pytest.raises(ArtifactError, match=r"dem: no such run.*Known: demo\."):
+        Map.open(tmp_path / "dem", "SMALL", "ios")
+
+
+def test_the_settings_of_the_last_run_count_whatever_the_clock_says(small_capture: Path, run: SceneFiles) -> None:
+    run_stage(small_capture, run, query_device="hl", seed=1)
+    run_stage(small_capture, run, query_device="ios", seed=2)
+    future = time.time_ns() + 10**15
+    os.utime(run.poses_dir / "SMALL_map_ios_query_hl.h5", ns=(future, future))
+    assert Map.open(run.run, run.scene, "ios").settings.seed == 2
+
+
+def test_an_unusable_session_stops_its_own_pairs_alone(capture: Path, run: SceneFiles) -> None:
+    run_stage(capture, run, query_device="hl")
+    hl = capture / "sessions" / "hl_query" / "images.txt"
+    before, poses = hl.read_text(), run.poses_txt("ios", "hl").read_bytes()
+    hl.write_text("a line\n")
+    table = run_stage(capture, run).set_index("query_device")
+    assert "hl_query/images.txt, line 1" in table["reason"]["hl"]
+    assert (table["reason"].drop("hl") == "").all()
+    assert table["ok"].drop("hl").gt(0).all()
+    assert not run.poses_txt("ios", "hl").exists(), "poses of another capture than this"
+    hl.write_text(before)
+    table = run_stage(capture, run).set_index("query_device")
+    assert (table["reason"] == "").all()
+    assert run.poses_txt("ios", "hl").read_bytes() == poses
+
+
+def test_a_pair_that_retrieval_left_out_has_its_reason(small_capture: Path, run: SceneFiles) -> None:
+    (run.retrieval_dir / "SMALL_map_ios_query_hl.left_out.json").write_text('{"reason": "a dragon"}')
+    table = run_stage(small_capture, run).set_index("query_device")
+    assert table["reason"].to_dict() == {"ios": "", "hl": "a dragon", "spot": ""}
+    with pytest.raises(ArtifactError, match="a dragon"):
+        run_stage(small_capture, run, query_device="hl")
 
 
 def test_a_torn_file_of_correspondences_is_named(run: SceneFiles, finished: tuple[SceneFiles, pd.DataFrame]) -> None:

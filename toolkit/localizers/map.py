@@ -2,8 +2,10 @@
 
 import json
 import logging
+import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -47,7 +49,7 @@ from toolkit.localizers.on_demand import OnDemandLocalizer, PosedImages
 from toolkit.localizers.pnp import PnpLocalizer
 from toolkit.localizers.prediction import Predictor
 from toolkit.localizers.predictors import create_predictor
-from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings
+from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings, nearest
 
 log = logging.getLogger(__name__)
 
@@ -118,24 +120,16 @@ class Map:
             device: `ios`, `hl`, `spot`.
 
         Raises:
-            ArtifactError: nothing was localized in this map yet, or files of the run are missing.
+            ArtifactError: no such run, scene or device (the known ones are named), or files of the run are missing.
             WeightsError: the run used a network whose weights are not there any more.
         """
         files = SceneFiles(Path(run), scene)
         pairs = sorted(files.poses_dir.glob(f"{scene}_map_{device}_query_*.h5"))
         if not pairs:
-            raise ArtifactError(
-                f"{files.poses_dir}: no poses of queries in the map of {device!r}. Localize first: "
-                "python -m toolkit run MANIFEST."
-            )
-        newest = max(pairs, key=lambda path: path.stat().st_mtime_ns)
-        try:
-            with h5py.File(newest, "r") as file:
-                settings = LocalizeSettings.of(json.loads(file.attrs[SETTINGS]))
-                sessions_root, names = Path(file.attrs[SESSIONS_ROOT]), json.loads(file.attrs[MAPS])
-                reranked = Path(file.attrs[RETRIEVAL]).name == files.reranked_dir.name
-        except (*HDF5_ERRORS, ToolkitError) as error:
-            raise ArtifactError(f"{newest} does not tell how it was made ({error}). Localize again.") from None
+            raise ArtifactError(f"{_unknown(files, device)} Localize first: python -m toolkit run MANIFEST.")
+        settings, found, names = _last_localized(files, pairs)
+        sessions_root = Path(found[SESSIONS_ROOT])
+        reranked = Path(found[RETRIEVAL]).name == files.reranked_dir.name
         kinds, escalation = create_methods(settings)
         mapped = [
             MappedFeatures(
@@ -302,6 +296,40 @@ class Map:
         return rows[order], inliers[order]
 
 
+def _unknown(files: SceneFiles, device: str) -> str:
+    """Return which of run, scene and device is unknown, and the known ones."""
+    run = files.run
+    if not run.is_dir():
+        return f"{run}: no such run. {nearest(run.name, [path.parent.name for path in run.parent.glob('*/run.json')])}"
+    scenes = [path.parent.name for path in run.glob("*/poses")]
+    if files.scene not in scenes:
+        return f"{run}: no poses of the scene {files.scene!r}. {nearest(files.scene, scenes)}"
+    maps = (re.fullmatch(r"(.+)_query_.+", path.stem.partition("_map_")[2]) for path in files.poses_dir.glob("*.h5"))
+    devices = {match[1] for match in maps if match}
+    return f"{files.poses_dir}: no poses of queries in the map of {device!r}. {nearest(device, devices)}"
+
+
+def _last_localized(files: SceneFiles, pairs: Sequence[Path]) -> tuple[LocalizeSettings, dict[str, Any], list[str]]:
+    """Return settings, attributes and names of the maps of the last run; pairs that it did not do may have others.
+
+    Times of change do not tell which that is: clocks are set back.
+    """
+    last = None
+    with suppress(ArtifactError):  # of an earlier version
+        last = LocalizeSettings.of(_read_settings(files.poses_dir / "settings.json"))
+    answers, unknown = [], ""
+    for pair in pairs:
+        try:
+            with h5py.File(pair, "r") as file:
+                found = dict(file.attrs)
+                answers.append((LocalizeSettings.of(json.loads(found[SETTINGS])), found, json.loads(found[MAPS])))
+        except (*HDF5_ERRORS, ToolkitError) as error:
+            unknown = f"{pair} does not tell how it was made ({error}). Localize again."
+    if not answers:
+        raise ArtifactError(unknown)
+    return next((answer for answer in answers if answer[0] == last), answers[-1])
+
+
 def _read_settings(path: Path) -> dict[str, Any]:
     """Return the settings that a stage left beside its results.
 
@@ -330,7 +358,7 @@ def open_predictor(settings: LocalizeSettings, capture: Capture, map_dir: Path) 
     name = settings.predictor.name
     predictor = create_predictor(
         name,
-        sessions=[capture[key] for key in capture.session_ids] if name == "simulated" else (),
+        sessions=[*capture.usable("map"), *capture.usable("query")] if name == "simulated" else (),
         map_dir=map_dir,
         features=settings.features.kinds[0],
         checkpoint=settings.predictor.checkpoint,

@@ -9,6 +9,7 @@ import pycolmap
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from toolkit.capture.cameras import camera_text, parse_camera
 from toolkit.capture.images import pixels_of
 from toolkit.capture.turning import turn_image
 from toolkit.errors import ImageError
@@ -18,7 +19,8 @@ from toolkit.features.stores import as_stored
 from toolkit.localizers.base import PoseEstimate, Query, View
 from toolkit.localizers.map import Map
 
-Picture = str | Path | NDArray[np.uint8]
+Picture = Any
+"""A file (str, Path), or pixels: see `pixels_from`."""
 
 
 def localize_image(
@@ -32,7 +34,7 @@ def localize_image(
 
     Args:
         place: an open map, see `Map.open`; it stays as it is.
-        image: a file, or pixels (H, W) or (H, W, 3) RGB uint8; of a rig a sequence of C.
+        image: a file, or pixels as `pixels_from` takes them; of a rig a sequence of C.
         camera: its intrinsics, with the size of the picture; of a rig C of them.
         rig_from_cams: (C, 4, 4) of a rig.
         turns: for each picture, the counter-clockwise quarter turns that bring gravity down; None: it is upright. Of
@@ -42,12 +44,17 @@ def localize_image(
         The estimate: `world_from_rig` (of a single picture world_from_cam), (4, 4), or None where `status` says why.
 
     Raises:
-        ImageError: a file cannot be read, or its size is not the camera's.
+        ImageError: a file cannot be read, or its size is not the camera's; no picture, camera or pose.
         ArtifactError: files of the run are missing.
     """
-    pictures: list[Any] = [image] if isinstance(image, str | Path | np.ndarray) else list(image)
-    cameras = [camera] if isinstance(camera, pycolmap.Camera) else list(camera)
-    poses = np.eye(4)[None] if rig_from_cams is None else np.asarray(rig_from_cams, np.float64).reshape(-1, 4, 4)
+    pictures = list(image) if _are_several(image) else [image]
+    cameras: list[Any] = list(camera) if isinstance(camera, list | tuple) else [camera]
+    for of in cameras:
+        _check_camera(of)
+    poses = np.eye(4)[None] if rig_from_cams is None else np.asarray(rig_from_cams, np.float64)
+    if poses.shape[-2:] != (4, 4) or not np.isfinite(poses).all():
+        raise ImageError(f"rig_from_cams: found {poses.shape}, expected (C, 4, 4) finite numbers, a pose a camera.")
+    poses = poses.reshape(-1, 4, 4)
     quarter_turns = [0] * len(cameras) if turns is None else list(turns)
     if not 0 < len(pictures) == len(cameras) == len(poses) == len(quarter_turns):
         raise ImageError(
@@ -91,11 +98,70 @@ def localize_image(
         return place.localizer.localize(Query(views, poses, features), references)
 
 
+def pixels_from(image: Any) -> NDArray[np.uint8]:
+    """Return pixels as they are worked on, (H, W) or (H, W, 3) RGB uint8, from what other libraries call an image.
+
+    Args:
+        image: an array or tensor (H, W), (H, W, 1), (H, W, 3), (1, H, W) or (3, H, W), a nest of lists, or a Pillow
+            image. uint8 and other integers from 0 to 255; uint16 from 0 to 65535; floats from 0 to 1 or, if one is
+            larger, to 255; bool.
+
+    Raises:
+        ImageError: anything else; names what was found.
+    """
+    expected = "Expected a file or the pixels of a picture: (H, W) or (H, W, 3) RGB, uint8."
+    if image is None or isinstance(image, bytes | dict | set):
+        raise ImageError(f"Found {image if image is None else type(image).__name__} for a picture. {expected}")
+    if hasattr(image, "getbands"):  # of Pillow
+        image = image if image.mode in ("1", "L", "RGB", "F") or image.mode.startswith("I") else image.convert("RGB")
+    try:
+        pixels = np.asarray(image)
+    except (ValueError, TypeError, RuntimeError) as error:  # lists of different lengths; a tensor on a GPU
+        raise ImageError(f"Found a {type(image).__name__} that is no array ({error}). {expected}") from None
+    found = f"{pixels.shape} {pixels.dtype}"
+    if pixels.ndim == 3 and pixels.shape[0] in (1, 3) and pixels.shape[2] not in (1, 3):
+        pixels = np.moveaxis(pixels, 0, 2)
+    if pixels.ndim == 3 and pixels.shape[2] == 1:
+        pixels = pixels[:, :, 0]
+    of_a_picture = pixels.ndim in (2, 3) and pixels.shape[2:] in ((), (3,)) and pixels.size
+    if not of_a_picture or pixels.dtype.kind not in "buif":
+        raise ImageError(f"Found pixels {found}. {expected}")
+    if pixels.dtype == np.uint8:
+        return pixels
+    if pixels.dtype == bool:
+        return pixels.astype(np.uint8) * np.uint8(255)
+    if pixels.dtype == np.uint16:
+        return (pixels >> 8).astype(np.uint8)  # as a file with 16 bits is decoded
+    least, most = pixels.min(), pixels.max()
+    if not (least >= 0 and most <= 255):
+        raise ImageError(f"Found pixels {found} from {least:g} to {most:g}; expected 0 to 1, or 0 to 255.")
+    scale = 255 if pixels.dtype.kind == "f" and most <= 1 else 1
+    return np.round(pixels * scale).astype(np.uint8)
+
+
+def _are_several(image: Any) -> bool:
+    """Tell whether this is a sequence of pictures, rather than one, which may be a nest of lists."""
+    return isinstance(image, list | tuple) and not (image and isinstance(image[0], list | tuple | int | float))
+
+
+def _check_camera(camera: Any) -> None:
+    """Refuse what is no camera, or one that no picture can have been taken with."""
+    if not isinstance(camera, pycolmap.Camera):
+        raise ImageError(
+            f"camera: found {camera!r}, a {type(camera).__name__}; expected a pycolmap.Camera, such as "
+            "parse_camera('camera', 'PINHOLE, 640, 480, 500, 500, 320, 240') of toolkit.capture makes."
+        )
+    try:
+        parse_camera("camera", camera_text(camera))
+    except ValueError as error:
+        raise ImageError(f"camera: {error}") from None
+
+
 class _Pixels:
     """The pixels of a picture, decoded when they are asked for."""
 
     def __init__(self, image: Picture, camera: pycolmap.Camera) -> None:
-        self.image = Path(image) if isinstance(image, str) else image
+        self.image = Path(image) if isinstance(image, str | Path) else pixels_from(image)
         self._camera = camera
         self._decoded: dict[bool, NDArray[np.uint8]] = {}
 

@@ -15,7 +15,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
     """Return a sentence that names the nearest of the known names, and lists them all."""
     known = sorted(known)
     match = difflib.get_close_matches(name.lower(), known, n=1, cutoff=0.5)
-    return (f"Did you mean {match[0]!r}? " if match else "") + f"Known: {', '.join(known)}."
+    return (f"Did you mean {match[0]!r}? " if match else "") + f"Known: {', '.join(known) or 'none'}."
 
 
 def nested_model(annotation: Any) -> type[BaseModel] | None:
