@@ -1,11 +1,21 @@
 """The command line: `python -m toolkit run|settings|report|check|record|download|submit|import|export|demo-data`."""
 
+import json
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from types import FrameType
+from typing import Annotated, Any
 
 import typer
 
-from toolkit.errors import ManifestError, ToolkitError
+from toolkit.errors import IncompleteError, ManifestError, ToolkitError, exit_code, sentence
 
 app = typer.Typer(
     help="Tell where photographs were taken, in a map of posed photographs.",
@@ -20,10 +30,16 @@ export_app = typer.Typer(help="Write what other tools read.", no_args_is_help=Tr
 app.add_typer(import_app, name="import")
 app.add_typer(export_app, name="export")
 
+USAGE, INTERRUPTED = 2, 130
+"""Exit codes of typer: a wrong option, Ctrl-C."""
+
 Device = Annotated[str, typer.Option(help="The kind of device: ios, hl, spot or another name.")]
 Placing = Annotated[str, typer.Option("--images", metavar="link|copy", help="Link the images, or copy them.")]
 Run = Annotated[Path, typer.Argument(help="Run folder.")]
 Scene = Annotated[str, typer.Argument(help="Name of the capture.")]
+Json = Annotated[
+    bool, typer.Option("--json", help="Print a summary as JSON, and nothing else, to stdout; the rest to stderr.")
+]
 
 
 @app.command()
@@ -35,16 +51,31 @@ def run(
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Replace a setting, e.g. localize.method=nearest."),
     ] = None,
+    as_json: Json = False,
 ) -> None:
-    """Run the notebooks of a manifest, resuming what is done, and write a report."""
-    from toolkit import pipeline
+    """Run the notebooks of a manifest, resuming what is done, and write a report.
 
+    Exit codes: 0 done; 1 something to mend, as the message says; 2 done, but more images, queries or pairs failed than
+    the manifest tolerates (`tolerate_failed`); 3 a bug; 130 or 143 interrupted.
+    """
+    from toolkit import pipeline
+    from toolkit.runs.record import summary
+
+    tell = partial(print, file=sys.stderr) if as_json else print
     try:
-        run_dir = pipeline.run(manifest, only=only, force=force, overrides=overrides or ())
-    except KeyboardInterrupt:
-        print("Interrupted. The same command goes on from here.")
-        raise typer.Exit(130) from None
-    print(f"Report: {run_dir / 'report.html'}")
+        run_dir = pipeline.run(manifest, only=only, force=force, overrides=overrides or (), say=tell)
+    except BaseException as error:
+        if as_json:
+            status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+            how = {"status": status, "exit_code": exit_code(error), "error": sentence(error)}
+            _print_json(_summary_of_stopped(manifest, overrides or ()) | how)
+        raise
+    tell(f"Report: {run_dir / 'report.html'}")
+    done = summary(run_dir)
+    if as_json:
+        _print_json(done)
+    if done["exit_code"] != 0:
+        raise IncompleteError(done["error"])
 
 
 @app.command()
@@ -73,12 +104,16 @@ def report(run_dir: Annotated[Path, typer.Argument(metavar="RUN", help="Run fold
 def check(
     capture: Annotated[Path, typer.Argument(help="Capture folder, with sessions/ in it.")],
     deep: Annotated[bool, typer.Option("--deep", help="Decode every image, not its header alone.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Show what a capture holds and every inconsistency, with file and line."""
     from toolkit.capture.check import check_capture
 
     report = check_capture(capture, deep)
-    print(report.text())
+    if as_json:
+        _print_json({"capture": str(capture), "ok": report.ok, "problems": [asdict(one) for one in report.problems]})
+    else:
+        print(report.text())
     if not report.ok:
         raise typer.Exit(1)
 
@@ -132,11 +167,7 @@ def download(
     from toolkit.exchange.download import download
 
     names = [name.strip() for name in sessions.split(",") if name.strip()]
-    try:
-        reports = download(manifest, names, keep_archives, dry_run, overrides or ())
-    except KeyboardInterrupt:
-        print("Interrupted. The same command goes on from here.")
-        raise typer.Exit(130) from None
+    reports = download(manifest, names, keep_archives, dry_run, overrides or ())
     if not all(report.ok for report in reports):
         raise typer.Exit(1)
 
@@ -255,18 +286,47 @@ def record(
     print(f"Open it: {done.command}")
 
 
+def _summary_of_stopped(manifest: Path, overrides: Sequence[str]) -> dict[str, Any]:
+    """Return the summary of a run that this process has begun; nothing if it did not get so far."""
+    from toolkit.manifest import load_manifest
+    from toolkit.runs.record import RECORD, read_json, summary
+
+    with suppress(ToolkitError, OSError):
+        content = load_manifest(manifest, overrides)
+        run_dir = Path(content.output_root) / content.name
+        if read_json(run_dir / RECORD).get("pid") == os.getpid():
+            return summary(run_dir)
+    return {}
+
+
+def _print_json(content: dict[str, Any]) -> None:
+    print(json.dumps(content, indent=1, default=str))
+
+
 def main() -> None:
-    """Run the command line; an error meant for the user is one paragraph, not a traceback."""
+    """Run the command line; an error is a sentence, with a traceback only where the toolkit itself is at fault."""
+
+    received: list[int] = []
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        raise KeyboardInterrupt(number)
+
+    for name in ("SIGTERM", "SIGHUP"):  # as Ctrl-C, unless they are ignored, as `nohup` wants it
+        if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) == signal.SIG_DFL:
+            signal.signal(getattr(signal, name), stop)
     try:
         app(prog_name="python -m toolkit")
-    except ToolkitError as error:
-        raise SystemExit(f"Error: {error}") from None
-    except OSError as error:
-        if error.filename is None:
-            raise
-        path = error.filename2 or error.filename
-        todo = "See that it can be read and written, or name another."
-        raise SystemExit(f"Error: {path}: {error.strerror}. {todo}") from None
+    except SystemExit as end:  # typer has told what there is to tell
+        if end.code != INTERRUPTED:
+            raise SystemExit(1 if end.code == USAGE else end.code) from None
+        error: BaseException = KeyboardInterrupt(*received)
+    except Exception as other:
+        error = other
+    if exit_code(error) == 3 and not isinstance(error, ToolkitError):
+        traceback.print_exception(error)
+    print(f"{'' if isinstance(error, KeyboardInterrupt) else 'Error: '}{sentence(error)}", file=sys.stderr)
+    raise SystemExit(exit_code(error))
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ def write_atomic(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     # Process and machine are in the name: `sweep_partials` then knows what nobody writes any more.
-    prefix = f".{path.name}.{os.getpid()}-{_machine()}-"
+    prefix = f".{path.name}.{process_tag()}-"
     handle, name = tempfile.mkstemp(prefix=prefix, suffix=f".partial{path.suffix}", dir=path.parent)
     os.close(handle)
     temporary = Path(name)
@@ -47,13 +47,26 @@ def write_atomic(path: str | Path) -> Iterator[Path]:
             temporary.unlink()
 
 
-def sweep_partials(folder: str | Path) -> None:
-    """Remove what killed writers of this machine left at and below a folder; what is still being written stays."""
+def process_tag() -> str:
+    """Return `<process>-<machine>`, for the names of what a process removes when it ends: see `is_left_over`."""
+    return f"{os.getpid()}-{_machine()}"
+
+
+def is_left_over(name: str) -> bool:
+    """Tell whether a temporary file or folder, with `.<process_tag()>-` in its name, is of a killed process.
+
+    Only of this machine: of others it is not known which processes they run.
+    """
     import psutil
 
+    writer = re.search(rf"\.(\d{{1,9}})-{_machine()}-", name)
+    return writer is not None and not psutil.pid_exists(int(writer[1]))
+
+
+def sweep_partials(folder: str | Path) -> None:
+    """Remove what killed writers of this machine left at and below a folder; what is still being written stays."""
     for path in Path(folder).rglob(".*.partial*"):
-        writer = re.search(rf"\.(\d+)-{_machine()}-[^.]*\.partial", path.name)
-        if writer and not psutil.pid_exists(int(writer[1])):
+        if is_left_over(path.name):
             with suppress(OSError):
                 path.unlink()
 

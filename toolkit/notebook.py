@@ -5,25 +5,33 @@ the pipeline what was done.
 """
 
 import ast
+import logging
 import os
 import re
 import shutil
 import sys
 import tempfile
-import threading
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import tqdm.auto
 import tqdm.std
 
 from toolkit import errors
-from toolkit.errors import ManifestError, ToolkitError
-from toolkit.files import SceneFiles
-from toolkit.manifest import OPTIONAL, DemoData, nearest
+from toolkit.errors import ManifestError, StageError, shortage
+from toolkit.files import SceneFiles, process_tag
+from toolkit.manifest import OPTIONAL, DemoData, Manifest, nearest
+from toolkit.runs.folder import LOG_VARIABLE, log_to
+from toolkit.runs.kernel import MemoryWatch, end_children, kernel_class, kernel_error
+from toolkit.runs.pairs import left_out_of
 from toolkit.show import TEXT_BARS
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from papermill.exceptions import PapermillExecutionError
+
+log = logging.getLogger(__name__)
 
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
 Say = Callable[..., None]
@@ -73,9 +81,12 @@ def start(stage: str, sessions_root: str | None = None, **folders: str | None) -
             the repository. What an earlier stage should have left in such a folder is made when absent.
 
     Raises:
-        ManifestError: papermill was given a parameter that the notebook does not have.
+        ManifestError: papermill was given a parameter that the notebook does not have, or one is of a wrong type.
     """
-    _refuse_injected(stage)
+    if run_log := os.environ.get(LOG_VARIABLE):
+        logging.captureWarnings(True)
+        log_to(Path(run_log))
+    _check_own_parameters(stage)
     sessions, root = sessions_or_demo(sessions_root), _root()
     scene = sessions.parent.name
     files = SceneFiles(root / "runs" / scene, scene)
@@ -109,8 +120,13 @@ def _root() -> Path:
     return NOTEBOOKS.parent if NOTEBOOKS.is_dir() else Path.cwd()
 
 
-def finish(**counts: Any) -> None:
-    """Show what a notebook did and hand it to the pipeline, with the peak memory of this process."""
+def finish(table: "pd.DataFrame | None" = None, **counts: Any) -> None:
+    """Show what a notebook did and hand it to the pipeline, with the peak memory of this process.
+
+    Args:
+        table: of the stage; its rows with a `reason` are what was left out.
+        **counts: what was done.
+    """
     import resource
 
     from IPython.display import display
@@ -119,8 +135,12 @@ def finish(**counts: Any) -> None:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
     plain = {name: value.item() if hasattr(value, "item") else value for name, value in counts.items()}
     text = ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in plain.items())
+    text += f"; peak memory {peak:.0f} MB"
     content = {**plain, "peak_memory_mb": round(peak, 1)}
-    display({"text/plain": f"{text}; peak memory {peak:.0f} MB", COUNTS_MIME: content}, raw=True)
+    if table is not None:
+        content |= {"asked": len(table), "left_out": left_out_of(table)}
+        text = "\n".join([text, *(f"left out: {one['what']}: {one['reason']}" for one in content["left_out"])])
+    display({"text/plain": text, COUNTS_MIME: content}, raw=True)
 
 
 def notebook_path(stage: str) -> Path:
@@ -217,13 +237,43 @@ def _run_stage(stage: str, sessions: Path, files: SceneFiles) -> None:
         localize_pairs(sessions, files.retrieval_dir, files.poses_dir, files.features, files.maps)
 
 
-def _refuse_injected(stage: str) -> None:
-    """Refuse unknown parameters among those papermill has injected into the running notebook."""
+def _check_own_parameters(stage: str) -> None:
+    """Refuse parameters of the running notebook that do not fit, and unknown ones that papermill has injected."""
     ipython = sys.modules.get("IPython")
     shell = ipython.get_ipython() if ipython else None
     for source in shell.user_ns.get("In", []) if shell else []:
         if source.startswith("# Parameters\n"):
             check_parameters(notebook_path(stage), _literals(source))
+    check_values(stage, shell.user_ns if shell else {})
+
+
+def check_values(stage: str, values: Mapping[str, Any]) -> None:
+    """Refuse parameters of a wrong type, before any work.
+
+    Args:
+        values: of the notebook's parameters, by their names; others are passed over.
+
+    Raises:
+        ManifestError: naming the parameter, what was found and what was expected.
+    """
+    path = notebook_path(stage)
+    section = type(Manifest(name="x", captures=["x"]).stage(stage))
+    given = {name: (default, values[name]) for name, default in notebook_parameters(path).items() if name in values}
+    settings = given.pop("settings", ({}, {}))[1]
+    section.of({name: value for name, (_, value) in given.items() if name in section.model_fields}, settings)
+    for name, (default, value) in given.items():
+        if name in section.model_fields:
+            continue
+        if name == "pairs":
+            pairs = value if isinstance(value, list | tuple) else [value]
+            fits = value is None or all(isinstance(pair, list | tuple) and len(pair) == 2 for pair in pairs)
+            wanted = 'None or a list such as [["ios", "hl"]]'
+        elif default is None:
+            fits, wanted = value is None or isinstance(value, str | Path), "None or the path of a folder, a text"
+        else:
+            fits, wanted = isinstance(value, type(default)), f"a {type(default).__name__} such as {default!r}"
+        if not fits:
+            raise ManifestError(f"{name}: found {value!r}, expected {wanted}. It is a parameter of {path.name}.")
 
 
 def _literals(source: str) -> dict[str, Any]:
@@ -237,10 +287,6 @@ def _literals(source: str) -> dict[str, Any]:
     return values
 
 
-class StageError(ToolkitError):
-    """A stage stopped; the message holds the failing cell's error and the path of the executed notebook."""
-
-
 class StatusLine:
     """The line of a running stage; on a terminal it ends in the stage's own progress bar, which it is fed."""
 
@@ -249,6 +295,7 @@ class StatusLine:
         # Elsewhere, and for a caller with a `say` of its own, the line is written once.
         self.live = say is print and sys.stdout.isatty()
         say(f"{head} ...", end="", flush=True)
+        log.info("%s ...", head)
 
     def write(self, text: str) -> None:
         """Take what the kernel writes to stderr; the last line of it is shown."""
@@ -263,6 +310,7 @@ class StatusLine:
     def end(self, text: str) -> None:
         """Replace the progress by what came of it."""
         self.say(f"\r{self.head}  {text}\033[K" if self.live else f"  {text}")
+        log.info("%s  %s", self.head, text)
 
 
 def execute(
@@ -286,16 +334,19 @@ def execute(
     check_parameters(path, parameters)
     # papermill takes seconds to import, and a run that reuses everything does not need it.
     import papermill
+    from jupyter_client.kernelspec import NoSuchKernel
     from nbclient.exceptions import DeadKernelError
     from papermill.exceptions import PapermillExecutionError
     from traitlets.config import Config
 
     output.parent.mkdir(parents=True, exist_ok=True)
     partial = output.with_name(f".{output.stem}.partial.ipynb")
-    sockets = tempfile.TemporaryDirectory(prefix="kernel-")
-    # Sockets in the file system: other users of the machine cannot listen in. Their paths have to be short.
-    ipc = os.name == "posix" and len(sockets.name) < 80
-    memory = MemoryWatch()
+    # For the connection file and the sockets. Sockets in the file system: other users of the machine cannot listen in;
+    # their paths have to be short.
+    folder = tempfile.TemporaryDirectory(prefix=f"kernel.{process_tag()}-", ignore_cleanup_errors=True)
+    ipc = os.name == "posix" and len(folder.name) < 80
+    sockets = {"transport": "ipc", "ip": f"{folder.name}/s"} if ipc else {}
+    memory, kernels = MemoryWatch(), kernel_class()
     os.environ[TEXT_BARS] = "1"
     try:
         notebook = papermill.execute_notebook(
@@ -308,25 +359,35 @@ def execute(
             # What the kernel has to say of its own shutdown is of no use to anybody.
             extra_arguments=["--log-level=CRITICAL"],
             cwd=str(output.parent),
-            config=Config({"KernelManager": {"transport": "ipc", "ip": f"{sockets.name}/s"}} if ipc else {}),
+            kernel_manager_class=kernels,
+            config=Config({"KernelManager": {"connection_file": f"{folder.name}/kernel.json"} | sockets}),
         )
     except PapermillExecutionError as error:
-        known = {name for name, kind in vars(errors).items() if isinstance(kind, type)}
-        text = error.evalue if error.ename in known else f"{error.ename}: {error.evalue}"
-        raise StageError(f"{text}\nThe executed notebook shows where: {output}") from None
-    except DeadKernelError:
-        raise StageError(
-            "The notebook's kernel died; when the system ends it, memory is the usual reason "
-            f"({memory.stop():.0f} MB were in use).\nThe executed notebook shows where: {output}"
-        ) from None
+        raise _cell_error(error, output) from None
+    except (DeadKernelError, RuntimeError, NoSuchKernel) as error:
+        raise kernel_error(error, kernels.ended_by, memory.stop(), output) from error
     finally:
         del os.environ[TEXT_BARS]
+        end_children(folder.name)
         memory.stop()
-        sockets.cleanup()
+        folder.cleanup()
         if partial.exists():
             _tidy_streams(partial)
             partial.replace(output)
     return notebook, memory.stop()
+
+
+def _cell_error(error: "PapermillExecutionError", output: Path) -> StageError:
+    """Return what to tell of a failing cell; its traceback goes to the log."""
+    trace = re.sub(r"\x1b\[[0-9;]*m", "", "\n".join(error.traceback))
+    log.debug("The failing cell:\n%s", trace)
+    where = f"\nThe executed notebook shows where: {output}"
+    kind = getattr(errors, error.ename, None)
+    if isinstance(kind, type) and issubclass(kind, errors.ToolkitError):
+        return StageError(f"{error.evalue}{where}", of_the_data=issubclass(kind, errors.OF_THE_DATA))
+    if text := shortage(error.ename, error.evalue) or shortage("", "\n".join(re.findall(r"errno.*", trace, re.I))):
+        return StageError(f"{text}{where}")
+    return StageError(f"{errors.BUG}{error.ename}: {error.evalue}. This is a bug.{where}", internal=True)
 
 
 def _tidy_streams(path: Path) -> None:
@@ -366,33 +427,3 @@ def handed_counts(notebook: Any) -> dict[str, Any]:
             if COUNTS_MIME in output.get("data", {}):
                 return dict(output["data"][COUNTS_MIME])
     return {}
-
-
-class MemoryWatch(threading.Thread):
-    """Samples the memory of this process and its children, so that workers of a kernel count as well."""
-
-    def __init__(self) -> None:
-        super().__init__(daemon=True)
-        self._ended = threading.Event()
-        self._peak_mb = 0.0
-        self.start()
-
-    def run(self) -> None:
-        """Sample until stopped."""
-        import psutil
-
-        me = psutil.Process()
-        while not self._ended.wait(0.5):
-            total = 0
-            for process in [me, *me.children(recursive=True)]:
-                with suppress(psutil.Error):
-                    info = process.memory_full_info()
-                    # Proportional set size: pages shared between forked workers count once.
-                    total += getattr(info, "pss", info.rss)
-            self._peak_mb = max(self._peak_mb, total / 2**20)
-
-    def stop(self) -> float:
-        """End the sampling and return the highest sum seen, in MB."""
-        self._ended.set()
-        self.join()
-        return self._peak_mb

@@ -7,6 +7,7 @@ executed still reuses what it finds finished.
 
 import hashlib
 import json
+import logging
 import os
 import time
 from collections.abc import Iterable, Iterator
@@ -21,7 +22,7 @@ from toolkit.capture.devices import extra_devices, table_record
 from toolkit.capture.names import allow_outside
 from toolkit.embedders import WEIGHTS as EMBEDDER_WEIGHTS
 from toolkit.embedders import resolve_name
-from toolkit.errors import ManifestError
+from toolkit.errors import ManifestError, StageError, exit_code, sentence
 from toolkit.exchange.download import is_unfinished
 from toolkit.features.matching import local_weights, resolve_auto
 from toolkit.files import (
@@ -30,7 +31,6 @@ from toolkit.files import (
     checksum,
     files_fingerprint,
     fingerprint,
-    sweep_partials,
     write_text,
 )  # fmt: skip
 from toolkit.manifest import (
@@ -48,7 +48,6 @@ from toolkit.models.weights import VGGT, WeightsSource, check_weights, find_weig
 from toolkit.notebook import (
     UPSTREAM,
     Say,
-    StageError,
     StatusLine,
     check_parameters,
     execute,
@@ -59,7 +58,11 @@ from toolkit.notebook import (
     stage_outputs,
     work_seconds,
 )
-from toolkit.runs.record import RunLog, read_json
+from toolkit.runs.folder import LOG, held
+from toolkit.runs.pairs import pair_text, way_out
+from toolkit.runs.record import RunLog, failures, read_json
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -85,6 +88,11 @@ class Job:
     @property
     def record(self) -> Path:
         return self.files.root / ".stages" / f"{self.stage}{self.label and '_' + self.label}.json"
+
+    @property
+    def pair(self) -> dict[str, str]:
+        """Map and query device of a job of one pair; empty for any other job."""
+        return {name: self.parameters[name] for name in ("map_device", "query_device") if self.label.startswith("map_")}
 
     def outputs(self) -> str:
         """Return what identifies the files that the job has made."""
@@ -147,12 +155,24 @@ def _run(manifest: Manifest, manifest_path: str | Path, only: str | None, force:
     for stage in stages:
         if not any(run_dir.glob(f"*/.stages/{stage}*.json")):
             _require_weights(stage, manifest.stage(stage))
-    captures = _captures(manifest)
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ManifestError(f"output_root: {run_dir} cannot be made ({error.strerror}). Choose another.") from None
-    sweep_partials(run_dir)
+    with held(run_dir):
+        try:
+            _run_stages(manifest, stages, run_dir, force, say)
+        except BaseException as error:
+            log.debug("stopped", exc_info=error)
+            if exit_code(error) != 3 or isinstance(error, StageError):
+                raise
+            text = f"{sentence(error)} The traceback is in {run_dir / LOG}."
+            raise StageError(text, internal=True) from error
+    return run_dir
+
+
+def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: bool, say: Say) -> None:
+    captures = _captures(manifest)
     jobs = [
         job
         for capture in captures
@@ -166,28 +186,89 @@ def _run(manifest: Manifest, manifest_path: str | Path, only: str | None, force:
             force or not _reusable(job, _inputs_of(job, inputs[job.files.scene]))
         ):
             _require_weights(job.stage, job.settings)
-    log = RunLog(run_dir, manifest, inputs, _code_fingerprint())
+    record = RunLog(run_dir, manifest, inputs, _code_fingerprint())
     try:
+        record.write()
+        failed: list[tuple[Job, StageError]] = []
         for i, job in enumerate(jobs, 1):
-            wanted = _inputs_of(job, inputs[job.files.scene])
             head = f"[{i}/{len(jobs)}] {job.stage:<9} {job.name}"
-            if not force and (row := _reusable(job, wanted)):
-                say(f"{head}  reused")
-            else:
-                row = _run_job(job, wanted, force, head, log, say)
-            log.add(row)
-        log.status = "done"
-    except StageError as error:
-        log.status, log.error = "failed", str(error)
-        raise
-    except KeyboardInterrupt:
-        log.status = "interrupted"
-        raise
-    finally:
-        log.write()
-        # Also of a run that stopped: the page of an earlier one would say that all is well.
+            try:
+                _run_or_reuse(job, inputs[job.files.scene], failed, force, head, record, say)
+            except StageError as error:
+                if not error.of_the_data:
+                    raise
+                failed.append((job, error))  # other captures and pairs may do
+        last = [row["status"] for row in record.rows if row["stage"] == stages[-1]]
+        if failed and not {"done", "reused"} & set(last):
+            raise failed[0][1]
+        record.end(incomplete=_not_tolerated(manifest, failed, record, _devices(manifest, captures)))
         _write_report(run_dir)
-    return run_dir
+    except BaseException as error:
+        record.end(error)
+        try:
+            # Also of a run that stopped: the page of an earlier one would say that all is well.
+            _write_report(run_dir)
+        except Exception:
+            log.exception("the report of the stopped run could not be written")
+        raise
+
+
+def _run_or_reuse(
+    job: Job, capture: str, failed: list[tuple[Job, StageError]], force: bool, head: str, record: RunLog, say: Say
+) -> None:
+    """Execute a job, or say why not, and add its row to the record."""
+    wanted = _inputs_of(job, capture)
+    if cause := next((other for other, _ in failed if _builds_on(job, other)), None):
+        said = f"skipped: {cause.stage} has failed"
+        row = {"stage": job.stage, "scene": job.files.scene, "part": job.label, "status": "skipped", "error": said}
+    elif not force and (reusable := _reusable(job, wanted)):
+        row, said = reusable, "reused"
+    else:
+        row, said = _run_job(job, wanted, force, head, record, say), ""
+    if said:
+        say(f"{head}  {said}")
+        log.info("%s  %s", head, said)
+    record.add(row)
+
+
+def _builds_on(job: Job, other: Job) -> bool:
+    """Tell whether a job makes no sense where another one has failed."""
+    upstream = set(UPSTREAM[job.stage])
+    for stage in reversed(STAGES):
+        upstream |= set(UPSTREAM[stage]) if stage in upstream else set()
+    return job.files == other.files and other.stage in upstream and other.label in ("", job.label)
+
+
+def _devices(manifest: Manifest, captures: list[Path]) -> list[str]:
+    """Return the devices that take part."""
+    from toolkit.capture import Capture
+
+    present = dict.fromkeys(device for capture in captures for device in Capture.open(capture).devices)
+    return [device for device in present if manifest.devices == "auto" or device in manifest.devices]
+
+
+def _not_tolerated(
+    manifest: Manifest, failed: list[tuple[Job, StageError]], record: RunLog, devices: list[str]
+) -> str | None:
+    """Return what of a run that has ended failed beyond what its manifest tolerates; None: nothing."""
+    lines = [f"{job.stage} {job.name}: {error}" for job, error in failed if not job.label]
+    rows = record.all_rows()
+    for kind, counts in failures(rows).items():
+        tolerated = getattr(manifest.tolerate_failed, kind)
+        if counts["failed"] > tolerated * counts["of"]:
+            lines.append(
+                f"{counts['failed']} of {counts['of']} {kind} failed; tolerate_failed.{kind} is {tolerated:g}."
+            )
+    lost = [one | {"scene": row["scene"]} for row in rows for one in row.get("left_out", ())]
+    found: dict[str, list[str]] = {}
+    for one in lost:
+        found.setdefault(one["reason"], []).append(f"{one['what']} of {one['scene']}")
+    reasons = [f"{', '.join(dict.fromkeys(whats))}: {reason}" for reason, whats in found.items()]
+    if not lines:
+        return None
+    pairs = [(one["map_device"], one["query_device"]) for one in lost if "map_device" in one]
+    ways = [way_out(pairs, devices)] if pairs else []
+    return "\n".join([*lines, *reasons, *ways])
 
 
 def tree_fingerprint(folder: Path, part: str = "", content: bool = False) -> str:
@@ -366,14 +447,16 @@ def _reusable(job: Job, wanted: str) -> dict[str, Any] | None:
     record = read_json(job.record)
     if record.get("inputs") != wanted or record.get("outputs") != job.outputs() or not read_json(job.notebook):
         return None
-    return {**record["row"], "status": "reused"}
+    # What was left out is tried again: what mends it, such as a permission, does not always show in a fingerprint.
+    return None if record["row"].get("left_out") else {**record["row"], "status": "reused"}
 
 
-def _run_job(job: Job, wanted: str, force: bool, head: str, log: RunLog, say: Say) -> dict[str, Any]:
+def _run_job(job: Job, wanted: str, force: bool, head: str, record: RunLog, say: Say) -> dict[str, Any]:
     """Execute a job and return its row of `run.json`."""
     line = StatusLine(head, say)
     row: dict[str, Any] = {"stage": job.stage, "scene": job.files.scene, "part": job.label}
     row |= {"notebook": str(job.notebook.relative_to(job.files.run)), "parameters": job.parameters}
+    row |= {"asked": 1} if job.pair else {}
     # No record while the stage runs: what it was killed in, it runs again.
     job.record.unlink(missing_ok=True)
     if force:
@@ -384,21 +467,28 @@ def _run_job(job: Job, wanted: str, force: bool, head: str, log: RunLog, say: Sa
     except BaseException as error:
         status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
         line.end(status)
-        log.add(row | {"status": status, "seconds": round(time.perf_counter() - started, 2)})
+        row |= {"status": status, "seconds": round(time.perf_counter() - started, 2), "error": sentence(error)}
+        if job.pair:
+            row["left_out"] = [job.pair | {"what": pair_text(job.pair), "reason": sentence(error)}]
+        with suppress(OSError):  # the disk may be what is wrong
+            record.add(row)
         raise
     seconds = time.perf_counter() - started
     work = work_seconds(notebook)
     counts = handed_counts(notebook)
     memory = max(memory, counts.pop("peak_memory_mb", 0.0))
+    row |= {name: counts.pop(name) for name in ("left_out", "asked") if name in counts}
     row |= {"status": "done", "seconds": round(seconds, 2), "startup_seconds": round(seconds - work, 2)}
     row |= {"work_seconds": round(work, 2), "peak_memory_mb": round(memory), "counts": counts}
     folder = stage_outputs(job.files, job.stage)
     # What is to be tried again is not recorded as done.
     outputs = "" if folder and any_unfinished(folder, job.label) else job.outputs()
-    record = {"made": datetime.now(UTC).isoformat(), "inputs": wanted, "outputs": outputs, "row": row}
-    write_text(job.record, json.dumps(record, indent=1) + "\n")
+    made = {"made": datetime.now(UTC).isoformat(), "inputs": wanted, "outputs": outputs, "row": row}
+    write_text(job.record, json.dumps(made, indent=1) + "\n")
     summary = ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in counts.items())
     line.end(f"{summary}{summary and '; '}{work:.1f} s + {seconds - work:.1f} s start-up, {memory:.0f} MB")
+    for one in row.get("left_out", ()):
+        say(f"  left out: {one['what']}: {one['reason']}")
     return row
 
 

@@ -18,6 +18,7 @@ from toolkit.manifest.settings import (
     RerankSettings,
     RetrieveSettings,
     Settings,
+    Share,
     VisualizeSettings,
 )
 
@@ -37,6 +38,17 @@ class DemoData(Settings):
     """Frames a room and map session; queries have half."""
     seed: Natural = 0
     """Another seed, another place."""
+
+
+class Tolerance(Settings):
+    """What share may fail before a run that came to its end has the exit code 2."""
+
+    images: Share = 0.0
+    """Images that cannot be read."""
+    queries: Share = 0.5
+    """Queries without a pose: a hard query is a result; a majority of them, the sign of something wrong."""
+    pairs: Share = 0.0
+    """Pairs of devices that had to be left out."""
 
 
 class ExtraDevice(Settings):
@@ -136,6 +148,8 @@ class Manifest(Settings):
     """The same seed gives the same poses."""
     world_up: Direction | None = None
     """Direction that is up in the captures' world; null: estimated from the map's cameras where it is needed."""
+    tolerate_failed: Tolerance = Tolerance()
+    """What may fail: the rest is done all the same, and the exit code tells."""
     explore: ExploreSettings = ExploreSettings()
     """What notebook 01 shows."""
     embed: EmbedSettings = EmbedSettings()

@@ -5,6 +5,7 @@ import json
 import os
 import platform
 import time
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -12,9 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from toolkit import __version__
+from toolkit.errors import exit_code, sentence
 from toolkit.files import write_text
 from toolkit.manifest import STAGES, Manifest
 
+RECORD = "run.json"
 # Distributions whose versions may change results.
 _VERSIONS = ("numpy", "pycolmap", "faiss-cpu", "opencv-python-headless", "pandas", "pillow", "torch", "rerun-sdk")
 
@@ -34,7 +37,9 @@ class RunLog:
     code: str
     """Fingerprint of the toolkit's code."""
     status: str = "running"
+    """`running`, `done`, `incomplete` (more failed than the manifest tolerates), `failed`, or `interrupted`."""
     error: str | None = None
+    exit_code: int | None = None
     rows: list[dict[str, Any]] = field(default_factory=list)
     started: float = field(default_factory=time.perf_counter)
     created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
@@ -44,15 +49,38 @@ class RunLog:
         self.rows.append(row)
         self.write()
 
+    def end(self, error: BaseException | None = None, incomplete: str | None = None) -> None:
+        """Write how the run ended; where even that does not fit on a disk no record is left, rather than a wrong one.
+
+        Args:
+            error: what stopped it.
+            incomplete: what failed, of a run that came to its end.
+        """
+        self.status, self.error, self.exit_code = ("incomplete", incomplete, 2) if incomplete else ("done", None, 0)
+        if error is not None:
+            self.status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+            self.error, self.exit_code = sentence(error), exit_code(error)
+        try:
+            self.write()
+        except OSError:
+            with suppress(OSError):
+                (self.run_dir / RECORD).unlink(missing_ok=True)  # on a full disk, this also makes room
+                self.write()
+            if error is None:
+                raise
+
     def write(self) -> None:
         """Write `run.json` as things stand."""
-        rows = self._all_rows()
+        rows = self.all_rows()
         work = sum(row.get("work_seconds", 0.0) for row in rows if row["status"] == "done")
         content = {
             "name": self.manifest.name,
             "status": self.status,
+            "exit_code": self.exit_code,
             "error": self.error,
+            "failed": failures(rows),
             "created": self.created,
+            "pid": os.getpid(),
             "manifest": self.manifest.model_dump(mode="json", exclude_none=True),
             "versions": _versions(),
             "machine": _machine(),
@@ -64,9 +92,9 @@ class RunLog:
             "work_seconds": round(work, 2),
             "peak_memory_mb": max((row.get("peak_memory_mb", 0) for row in rows), default=0),
         }
-        write_text(self.run_dir / "run.json", json.dumps(content, indent=1) + "\n")
+        write_text(self.run_dir / RECORD, json.dumps(content, indent=1) + "\n")
 
-    def _all_rows(self) -> list[dict[str, Any]]:
+    def all_rows(self) -> list[dict[str, Any]]:
         """Return this run's rows and, for stages that `--only` left alone, those of their records."""
         mine = {(row["scene"], row["stage"]) for row in self.rows}
         rows = list(self.rows)
@@ -77,6 +105,35 @@ class RunLog:
                     rows.append({**row, "status": "reused"})
         scenes = list(self.inputs)
         return sorted(rows, key=lambda row: (scenes.index(row["scene"]), STAGES.index(row["stage"])))
+
+
+def failures(rows: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
+    """Return how many images, queries and pairs failed, and of how many, by the rows of the stages of a run."""
+    found = {kind: {"failed": 0, "of": 0} for kind in ("images", "queries", "pairs")}
+    pairs: dict[tuple[str, str], list[int]] = {}
+    for row in rows:
+        counts = row.get("counts") or {}
+        for kind, stage, name in (("images", "embed", "unreadable"), ("queries", "localize", "failed")):
+            if row["stage"] == stage and {kind, name} <= counts.keys():
+                found[kind]["failed"] += counts[name]
+                found[kind]["of"] += counts[kind]
+        of_stage = pairs.setdefault((row["scene"], row["stage"]), [0, 0])
+        of_stage[0] += len(row.get("left_out", ()))
+        of_stage[1] += row.get("asked", 0)
+    for scene in dict.fromkeys(scene for scene, _ in pairs):  # the same pair fails in every stage
+        failed, asked = max(counts for (of, _), counts in pairs.items() if of == scene)
+        found["pairs"]["failed"] += failed
+        found["pairs"]["of"] += asked
+    return found
+
+
+def summary(run_dir: Path) -> dict[str, Any]:
+    """Return what `--json` prints of a run: how it ended, what failed, and what each stage did."""
+    record = read_json(run_dir / RECORD)
+    kept = ("name", "status", "exit_code", "error", "failed", "created", "total_seconds")
+    of_stage = ("scene", "stage", "part", "status", "seconds", "counts", "left_out", "error")
+    stages = [{key: row[key] for key in of_stage if key in row} for row in record.get("stages", ())]
+    return {key: record.get(key) for key in kept} | {"run": str(run_dir), "stages": stages}
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 
 from toolkit.errors import CaptureError
+from toolkit.files import is_left_over, process_tag
 from toolkit.geometry import Floats, invert, pose_from_qt, qt_from_pose
 from toolkit.synthetic.devices import DEVICES, Device, walks
 from toolkit.synthetic.light import paint
@@ -210,10 +211,10 @@ def render_capture(
         )
     out.parent.mkdir(parents=True, exist_ok=True)
     # A killed rendering leaves only a hidden folder beside OUT, which the next rendering clears away.
-    for stale in out.parent.glob(f".{out.name}.rendering-*"):
-        if time.time() - stale.stat().st_mtime > 3600:
+    for stale in out.parent.glob(f".{out.name}.rendering.*"):
+        if is_left_over(stale.name):
             shutil.rmtree(stale, ignore_errors=True)
-    partial_out = Path(tempfile.mkdtemp(prefix=f".{out.name}.rendering-", dir=out.parent))
+    partial_out = Path(tempfile.mkdtemp(prefix=f".{out.name}.rendering.{process_tag()}-", dir=out.parent))
     threads = cv2.getNumThreads()
     try:
         cv2.setNumThreads(1)  # the renderer's pool has a thread a core

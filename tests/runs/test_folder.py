@@ -1,0 +1,94 @@
+"""The run folder: one run at a time, what killed runs left, and the log."""
+
+import json
+import logging
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from toolkit.errors import ToolkitError
+from toolkit.files import is_left_over, process_tag, write_atomic
+from toolkit.runs.folder import LOG, held
+
+
+@pytest.fixture(scope="module")
+def dead() -> int:
+    """The id of a process that has ended."""
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    return process.pid
+
+
+def test_a_second_run_is_told_who_works_in_the_folder(tmp_path: Path) -> None:
+    with held(tmp_path), pytest.raises(ToolkitError, match=rf"{os.getpid()} on {socket.gethostname()}, since 20"):
+        with held(tmp_path):
+            pass
+    with held(tmp_path):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == [LOG]
+
+
+def test_the_lock_of_a_killed_run_is_taken_over(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    script = (
+        "import os; from pathlib import Path; from toolkit.runs.folder import held\n"
+        f"with held(Path({str(tmp_path)!r})): os.kill(os.getpid(), 9)"
+    )
+    assert subprocess.run([sys.executable, "-c", script]).returncode == -9
+    killed = json.loads((tmp_path / ".run.lock.json").read_text())["pid"]
+    with held(tmp_path):
+        assert json.loads((tmp_path / ".run.lock.json").read_text())["pid"] == os.getpid()
+    assert f"The run of process {killed} " in (tmp_path / LOG).read_text()
+
+
+def test_what_a_killed_run_left_is_removed_and_what_lives_is_kept(tmp_path: Path, dead: int) -> None:
+    machine = process_tag().partition("-")[2]
+    left = [f".poses.txt.{dead}-{machine}-abcd1234.partial.txt", ".P_04.partial.ipynb"]
+    kept = [f".poses.txt.{process_tag()}-abcd1234.partial.txt", f".x.{dead}-00000000-a.partial", "poses.txt"]
+    place = tmp_path / "notebooks"
+    place.mkdir(parents=True)
+    for name in left + kept:
+        (place / name).touch()
+    sockets = Path(tempfile.mkdtemp(prefix=f"kernel.{dead}-{machine}-"))
+    mine = Path(tempfile.mkdtemp(prefix=f"kernel.{process_tag()}-"))
+    (sockets / "s-1").touch()
+    (tmp_path / "run.json").write_text('{"status": "running", "name": "a"}')
+    try:
+        with held(tmp_path):
+            record = json.loads((tmp_path / "run.json").read_text())
+        assert record["status"] == "interrupted"
+        assert "killed" in record["error"]
+        assert sorted(path.name for path in place.iterdir()) == sorted(kept)
+        assert not sockets.exists()
+        assert mine.exists()
+    finally:
+        mine.rmdir()
+
+
+def test_temporary_names_tell_whose_they_are(tmp_path: Path) -> None:
+    with write_atomic(tmp_path / "a.csv") as temporary:
+        assert process_tag() in temporary.name
+        assert not is_left_over(temporary.name)
+        temporary.touch()
+
+
+def test_the_log_has_times_and_debug_messages_and_the_terminal_warnings_alone(tmp_path: Path) -> None:
+    script = (
+        "import logging; from pathlib import Path; from toolkit.runs.folder import held\n"
+        f"with held(Path({str(tmp_path)!r})):\n"
+        "    logging.getLogger('toolkit.x').debug('a detail')\n"
+        "    logging.getLogger('toolkit.x').warning('take care')\n"
+        "    logging.getLogger('else').info('noise')\n"
+    )
+    shown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stderr
+    assert shown == "take care\n"
+    lines = (tmp_path / LOG).read_text().splitlines()
+    assert [line.split(" ", 4)[3:] for line in lines] == [
+        ["DEBUG", "toolkit.x: a detail"], ["WARNING", "toolkit.x: take care"]
+    ]  # fmt: skip
+    assert lines[0].startswith("20")
+    assert logging.getLogger("toolkit").level == logging.NOTSET
