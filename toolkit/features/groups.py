@@ -86,7 +86,8 @@ def read_group(file: h5py.File, name: str) -> dict[str, NDArray[Any]]:
                 room -= _bytes_of(item)
                 if room < 0:
                     raise ValueError(f"{key.decode()} of shape {item.shape} is larger than the file")
-                arrays[key.decode()] = h5py.Dataset(item)[()] if item.dtype.kind == "O" else _read(item)
+                texts = item.dtype.kind == "O"
+                arrays[key.decode()] = np.asarray(h5py.Dataset(item)[()], object) if texts else _read(item)
         if h5py.h5a.exists(group, CHECKSUM):
             expected = np.zeros((), np.uint64)
             h5py.h5a.open(group, CHECKSUM).read(expected)
@@ -141,18 +142,20 @@ def _read(item: Any) -> NDArray[Any]:
 
 def group_names_of(file: h5py.File, array: str) -> list[str]:
     """Return the names of the groups that hold an array of this name, in the order of names; links are not followed."""
-    names, seen, stack = list[str](), set[Any](), [""]
+    names, seen, stack = list[str](), set[Any](), [b""]
     while stack:
         name = stack.pop()
-        group = file[name or "/"]
-        if not isinstance(group, h5py.Group) or (place := h5py.h5o.get_info(group.id).addr) in seen:
-            continue
-        seen.add(place)
-        if name and array in group:
-            names.append(name)
-        links = group.id.links
-        below = [key for key in group if links.get_info(key.encode()).type == h5py.h5l.TYPE_HARD]
-        stack += [f"{name}/{key}".lstrip("/") for key in reversed(below) if key != array]
+        group = h5py.h5o.open(file.id, name or b"/")
+        if name and array.encode() in group:
+            names.append(name.decode())
+        below = []
+        for key in group:
+            if group.links.get_info(key).type == h5py.h5l.TYPE_HARD:
+                item = h5py.h5o.get_info(group, key)
+                if item.type == h5py.h5o.TYPE_GROUP and item.addr not in seen:
+                    seen.add(item.addr)
+                    below.append(b"%b/%b" % (name, key) if name else key)
+        stack += reversed(below)
     return names
 
 

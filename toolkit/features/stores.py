@@ -190,7 +190,7 @@ class FeatureStore(Mapping[str, LocalFeatures]):
             arrays = read_group(self._file, name)
         try:
             return _from_arrays(arrays, self._offset, self._quantized)
-        except (LookupError, ValueError) as error:
+        except HDF5_ERRORS as error:
             raise DamagedError(
                 self.path, f"{self.path}: {name} is not in the layout of hloc ({first_line(error)})."
             ) from None

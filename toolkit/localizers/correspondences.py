@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from toolkit.errors import ArtifactError, DamagedError, first_line
-from toolkit.features.groups import HDF5_ERRORS, has_group, read_group
+from toolkit.features.groups import HDF5_ERRORS, group_names_of, has_group, read_group
 from toolkit.geometry import Floats, Ints
 
 MAPS = "maps"
@@ -53,6 +53,15 @@ class Correspondences:
     def in_camera(self, camera: int) -> Ints:
         """Return the indices of the correspondences of one query image."""
         return np.flatnonzero(self.camera == camera)
+
+
+_ARRAYS = tuple(Correspondences.__dataclass_fields__)
+
+
+def _shape_of(name: str, found: Correspondences) -> tuple[int, ...]:
+    count = len(found.view_of) if name.startswith("view_") else len(found.camera)
+    width = {"pixels": 2, "points": 3, "view_pixels": 2}.get(name)
+    return (count,) if width is None else (count, width)
 
 
 @dataclass(frozen=True)
@@ -120,18 +129,25 @@ class LocalizedQueries(Mapping[tuple[int, str], LocalizedQuery]):
             wide = {"f": np.float64, "i": np.int64, "b": np.bool_}
             arrays: dict[str, Any] = {key: array.astype(wide[array.dtype.kind]) for key, array in stored.items()}
             found_by = labels[codes] if len(labels) else np.zeros(0, "U1")
-            return LocalizedQuery(**names, correspondences=Correspondences(**arrays, found_by=found_by))
-        except (LookupError, ValueError, TypeError, AttributeError) as error:
+            found = Correspondences(**{name: arrays[name] for name in arrays if name in _ARRAYS}, found_by=found_by)
+            if wrong := [name for name in _ARRAYS if getattr(found, name).shape != _shape_of(name, found)]:
+                raise ValueError(f"{wrong[0]} has the shape {getattr(found, wrong[0]).shape}")
+            return LocalizedQuery(**names, correspondences=found)
+        except (*HDF5_ERRORS, AttributeError) as error:
             raise DamagedError(self.path, f"{self.path}: {name} is not as a run writes it ({first_line(error)}). "
                                "Localize again.") from None  # fmt: skip
 
     def __iter__(self) -> Iterator[tuple[int, str]]:
-        for timestamp, group in self._file.items():
-            for name in group:
-                yield int(timestamp), unquote(name)
+        try:
+            keys = [name.split("/") for name in group_names_of(self._file, "camera")]
+            yield from [(int(timestamp), unquote(device)) for timestamp, device in keys]
+        except HDF5_ERRORS as error:
+            raise DamagedError(
+                self.path, f"{self.path}: its queries cannot be listed ({first_line(error)}). Localize again."
+            ) from None
 
     def __len__(self) -> int:
-        return sum(len(group) for group in self._file.values())
+        return len(list(iter(self)))
 
     def close(self) -> None:
         """Close the file."""
