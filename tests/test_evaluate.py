@@ -12,6 +12,7 @@ from tests.localized import write_queries
 from toolkit.capture import Trajectory, write_session
 from toolkit.errors import CaptureError, ToolkitError
 from toolkit.evaluate import draw_evaluation, evaluate_scene, pose_errors, recall
+from toolkit.files import write_sidecar
 from toolkit.geometry import make_pose, pose_error
 from toolkit.localizers.local_map import LocalMap
 
@@ -209,6 +210,18 @@ def test_poses_of_another_tool_need_no_table(scene):
 def test_a_damaged_table_of_queries_is_named(scene):
     (scene[1] / f"TINY_{IOS}.csv").write_text("")
     assert evaluate_ios(scene).recall["state"].item().startswith("unreadable table of queries (")
+
+
+@pytest.mark.parametrize("suffix", ["txt", "csv"])
+def test_results_that_are_not_as_they_were_written_are_not_counted_as_evaluated(scene, suffix):
+    stem = scene[1] / f"TINY_{IOS}"
+    write_sidecar(stem.with_suffix(".txt"), {}, [stem.with_suffix(".csv")])
+    assert evaluate_ios(scene).recall["state"].item() == "evaluated"
+    path = stem.with_suffix(f".{suffix}")
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
+    assert f"{path.name} is damaged" in evaluate_ios(scene).recall["state"].item()
+    path.unlink()
+    assert evaluate_ios(scene).recall["state"].item() != "evaluated"
 
 
 def test_table_of_other_queries_is_named_stale(scene):

@@ -221,11 +221,11 @@ def _read_results(stem: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, 
     # A file of another tool has poses only; then a pose is a pose.
     status = np.where(located, "ok", "failed: no pose")
     results = keys.assign(pose=list(poses), status=status, num_inliers=np.nan, p_correct=np.nan)
-    if not table.is_file():
-        return results, "evaluated"
     columns = ["timestamp", "device_id"]
     try:
         require_whole(table, of=path)
+        if not table.is_file():
+            return results, "evaluated"
         details = read_query_table(table, ["status"]).drop_duplicates(columns)
     except ArtifactError as error:
         return results, f"unreadable table of queries ({error})"
