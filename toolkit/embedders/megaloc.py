@@ -15,7 +15,7 @@ from toolkit.errors import ManifestError, ToolkitError
 from toolkit.models.compute import Fitting, resolve_device, resolve_precision
 from toolkit.models.megaloc import PATCH, MegaLoc
 from toolkit.models.vit import IMAGENET_MEAN, IMAGENET_STD
-from toolkit.models.weights import MEGALOC, resolve_weights, weights_digest
+from toolkit.models.weights import MEGALOC, given_or_resolved, weights_digest
 
 
 class MegaLocEmbedder:
@@ -51,10 +51,9 @@ class MegaLocEmbedder:
         self._size = image_size
         self._device = resolve_device(device)
         self._dtype = resolve_precision(dtype_compute, self._device)
-        if checkpoint is None or isinstance(checkpoint, str | Path):
-            checkpoint = resolve_weights(MEGALOC, checkpoint)
+        weights: Path | Mapping[str, Tensor] | MegaLoc = given_or_resolved(MEGALOC, checkpoint)
         # A network that is given stays the caller's, with its type and device.
-        model = deepcopy(checkpoint) if isinstance(checkpoint, MegaLoc) else MegaLoc.from_checkpoint(checkpoint)
+        model = deepcopy(weights) if isinstance(weights, MegaLoc) else MegaLoc.from_checkpoint(weights)
         self._weights = weights_digest(model)
         self.dim = model.dim
         self._model = model.to(self._device, self._dtype).eval()

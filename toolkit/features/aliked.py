@@ -10,7 +10,7 @@ from toolkit.features.network import NetworkExtractor
 from toolkit.manifest import AlikedSettings
 from toolkit.models.aliked import Aliked, find_keypoints
 from toolkit.models.compute import in_single_threads, resolve_device
-from toolkit.models.weights import ALIKED, resolve_weights
+from toolkit.models.weights import ALIKED, given_or_resolved
 
 
 class AlikedExtractor(NetworkExtractor):
@@ -48,9 +48,7 @@ class AlikedExtractor(NetworkExtractor):
 
     def _load(self, checkpoint: str | Path | Mapping[str, Tensor] | None) -> Aliked:
         model = self._values.model
-        if not isinstance(checkpoint, Mapping):
-            checkpoint = resolve_weights(ALIKED[model], checkpoint)
-        return Aliked.from_checkpoint(checkpoint, model)
+        return Aliked.from_checkpoint(given_or_resolved(ALIKED[model], checkpoint), model)
 
     def _forward(self, batch: Tensor) -> Tensor:
         if batch.device.type == "cpu":

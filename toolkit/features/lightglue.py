@@ -16,7 +16,7 @@ from toolkit.features.features import LocalFeatures
 from toolkit.features.matching import MATCHER_WEIGHTS, PairMatches
 from toolkit.models.compute import Fitting, in_single_threads, precision_of_matches, resolve_device
 from toolkit.models.lightglue import LightGlue, official_names
-from toolkit.models.weights import load_checkpoint, resolve_weights, weights_digest
+from toolkit.models.weights import given_or_resolved, load_checkpoint, weights_digest
 
 _DESCRIPTOR_LENGTHS = {"superpoint": 256, "aliked": 128}
 _BATCH = {"cpu": 8}
@@ -69,13 +69,11 @@ class LightGlueMatcher:
         self.batch_size = batch_size or _BATCH.get(self._device.type, _BATCH_ELSEWHERE)
         self._alone = self._device.type == "cpu"
         source = MATCHER_WEIGHTS["lightglue", features]
-        if checkpoint is None or isinstance(checkpoint, str | Path):
-            checkpoint = resolve_weights(source, checkpoint)
         with torch.device("meta"):
             model = LightGlue(_DESCRIPTOR_LENGTHS[features])
         # The hub's file has a copy of SuperPoint, and the authors' newer code stores thresholds of early stopping.
         ignore = ("keypoint_detector.", "confidence_thresholds")
-        load_checkpoint(model, checkpoint, source.model, ignore, official_names)
+        load_checkpoint(model, given_or_resolved(source, checkpoint), source.model, ignore, official_names)
         self._weights = weights_digest(model)
         model.fold_(self._dtype)
         self._model = model.to(self._device)

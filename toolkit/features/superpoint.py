@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from toolkit.errors import ToolkitError
 from toolkit.features.network import NetworkExtractor
 from toolkit.manifest import SuperPointSettings
-from toolkit.models.weights import SUPERPOINT, WeightsSource, load_checkpoint, resolve_weights
+from toolkit.models.weights import SUPERPOINT, WeightsSource, given_or_resolved, load_checkpoint
 
 DESCRIPTOR_LENGTH = 256
 # Side of the cells of the network's coarsest grid, pixels.
@@ -57,9 +57,7 @@ def load_network(
     """
     with torch.device("meta"):
         network = build(import_transformers(source.model))
-    if checkpoint is None or isinstance(checkpoint, str | Path):
-        checkpoint = resolve_weights(source, checkpoint)
-    load_checkpoint(network, checkpoint, source.model, ignore)
+    load_checkpoint(network, given_or_resolved(source, checkpoint), source.model, ignore)
     return network
 
 

