@@ -3,7 +3,7 @@
 import json
 import logging
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import product
@@ -46,7 +46,7 @@ from toolkit.files import (
 )
 from toolkit.localizers.base import Localizer, NetworkMatches, PoseEstimate, Query, References, View
 from toolkit.localizers.correspondences import MAPS, LocalizedQuery, query_group
-from toolkit.localizers.escalation import EscalatingLocalizer, is_sure
+from toolkit.localizers.escalation import EscalatingLocalizer, can_gain, is_better, is_sure
 from toolkit.localizers.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
 from toolkit.localizers.map import (
     Map,
@@ -252,6 +252,10 @@ class _Pair:
         return {(int(row["timestamp"]), str(row["sensor_id"])): row["topk"] for row in rows}
 
 
+_Task = tuple[int, Query, list[References], Any, float]
+"""A query's number, the query, its references, what a network says of it, and the seconds that took."""
+
+
 class _PairRun:
     """The queries of a pair on their way through a localizer."""
 
@@ -347,27 +351,12 @@ class _PairRun:
             rows = writer.notes()
             first = self.localizer.first if isinstance(self.localizer, EscalatingLocalizer) else self.localizer
             todo = [number for group, number in numbers.items() if group not in rows]
-            for number, row, localized in self._localized(first, todo):
+            for number, row, localized in self._localized(first.localize, self._predicted(first, todo), len(todo)):
                 rows[groups[number]] = row
                 self._add(writer, groups[number], row, localized, again)
-            further = {group: rows[group] for group, number in numbers.items() if len(self.rows[number])}
-            limit = self.place.settings.pnp.sure_position_std_m
-            further = {group: row for group, row in further.items() if not (group in again or row.get("first_status"))}
-            todo = [
-                numbers[group]
-                for group, row in further.items()
-                if not is_sure(row["status"], row["position_std_m"], limit)
-            ]
-            if isinstance(self.localizer, EscalatingLocalizer) and todo:
-                started = time.perf_counter()
-                for kind in self.place.escalation:
-                    self._add_kind(kind, todo)
-                shared = (time.perf_counter() - started) / len(todo)
-                for number, row, localized in self._localized(self.localizer, todo):
-                    before = rows[groups[number]]
-                    row |= {"first_status": before["status"], "first_seconds": before["seconds"]}
-                    row["seconds"] = round(row["seconds"] + before["seconds"] + shared, 4)
-                    self._add(writer, groups[number], row, localized, again)
+            if isinstance(self.localizer, EscalatingLocalizer):
+                of_number = {number: rows[group] for group, number in numbers.items() if group not in again}
+                self._escalate(self.localizer, writer, of_number, again)
             # From here until the new poses are there, a kill must not leave poses of one run with a file of another.
             for poses in (self.pair.file("txt"), sidecar_path(self.pair.file("txt"))):
                 poses.unlink(missing_ok=True)
@@ -388,17 +377,49 @@ class _PairRun:
             again[group] = row
         writer.add(group, arrays=localized.arrays(), note=None if group in again else row)
 
+    def _escalate(
+        self,
+        localizer: EscalatingLocalizer,
+        writer: GroupWriter,
+        rows: Mapping[int, dict[str, Any]],
+        again: dict[str, dict[str, Any]],
+    ) -> None:
+        """Ask with further features where the rows, by number of the query, tell that its pose is not sure."""
+        limit = self.place.settings.pnp.sure_position_std_m
+        todo = [
+            number
+            for number, row in rows.items()
+            if not (row.get("first_status") or is_sure(row["status"], row["position_std_m"], limit))
+            and can_gain(*self.query(number))
+        ]
+        if not todo:
+            return
+        started = time.perf_counter()
+        for kind in self.place.escalation:
+            self._add_kind(kind, todo)
+        shared = (time.perf_counter() - started) / len(todo)
+        tasks = ((number, *self.query(number), None, shared) for number in todo)
+        for number, row, localized in self._localized(localizer.escalate, tasks, len(todo)):
+            before, group = rows[number], query_group(*self.keys[number])
+            both = {
+                "first_status": before["status"],
+                "first_seconds": before["seconds"],
+                "seconds": round(before["seconds"] + row["seconds"], 4),
+            }
+            if _is_internal(row) or is_better(row["status"], before["status"]):
+                self._add(writer, group, row | both, localized, again)
+            else:
+                writer.annotate(group, before | both)
+
     def _localized(
-        self, localizer: Localizer, numbers: Sequence[int]
+        self, localize: Callable[..., PoseEstimate], tasks: Iterator[_Task], count: int
     ) -> Iterator[tuple[int, dict[str, Any], LocalizedQuery]]:
         """Yield queries with their rows and correspondences."""
-        answers = prefetch(partial(self._localize, localizer), self._predicted(localizer, numbers), self.workers)
+        answers = prefetch(partial(self._localize, localize), tasks, self.workers)
         label = f"localize {self.pair.query_device} in {self.pair.map_device}"
-        return iter(tqdm(answers, total=len(numbers), desc=label, unit="query", disable=not numbers))
+        return iter(tqdm(answers, total=count, desc=label, unit="query", disable=not count))
 
-    def _predicted(
-        self, localizer: Localizer, numbers: Sequence[int]
-    ) -> Iterator[tuple[int, Query, list[References], Any, float]]:
+    def _predicted(self, localizer: Localizer, numbers: Sequence[int]) -> Iterator[_Task]:
         """Yield queries with what a network says of them, asked for some at a time, and the seconds that took."""
         size = localizer.batch_size
         for start in range(0, len(numbers), size):
@@ -411,13 +432,13 @@ class _PairRun:
                 yield number, *query, prediction, seconds
 
     def _localize(
-        self, localizer: Localizer, task: tuple[int, Query, list[References], Any, float]
+        self, localize: Callable[..., PoseEstimate], task: _Task
     ) -> tuple[int, dict[str, Any], LocalizedQuery]:
         number, query, references, prediction, seconds = task
         started = time.perf_counter() - seconds
         try:
             if query.views:
-                estimate = localizer.localize(query, references, prediction)
+                estimate = localize(query, references, prediction)
             else:
                 estimate = PoseEstimate("failed: no images of this device at this time")
         except Exception as error:  # one bad query never ends a run

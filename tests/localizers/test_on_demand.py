@@ -257,12 +257,12 @@ def test_more_features_are_asked_where_a_pose_is_not_sure(
         assert [len(kinds) for kinds in further.asked[0].features] == [2]
 
 
-def test_a_query_with_all_features_is_not_asked_twice() -> None:
+@pytest.mark.parametrize("lacks", ["references", "readable image"])
+def test_a_query_that_nothing_can_help_is_not_asked_again(lacks: str) -> None:
     scene = Scene()
-    both = replace(scene.query, features=[[*scene.query.features[0], *scene.query.features[0]]])
-    for answer, asked in ((OK, 0), (LOW, 1), (FAILED, 1)):
-        first, further = Scripted(LOW), Scripted(answer)
-        vars(further).update(mapped=[None], on_demand=[None])
-        localizer: Any = EscalatingLocalizer(first, further, "other", 0.05)  # type: ignore[arg-type]
-        assert localizer.localize(both, scene.references).status == ("ok" if answer is OK else "low_confidence")
-        assert len(first.asked) == asked, "only where the further features give no sure pose"
+    query = scene.query if lacks == "references" else replace(scene.query, features=["no image"])
+    references = [References.of([])] if lacks == "references" else scene.references
+    first, further = Scripted(FAILED), Scripted()
+    localizer: Any = EscalatingLocalizer(first, further, "other", 0.05)  # type: ignore[arg-type]
+    assert localizer.localize(query, references) is FAILED
+    assert not further.asked

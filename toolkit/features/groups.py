@@ -317,6 +317,11 @@ class GroupWriter:
             index.notes[name] = note
         self._close_if_full(index)
 
+    def annotate(self, name: str, note: Any) -> None:
+        """Replace the note of a group that is there, and leave its arrays."""
+        _, index = self._part()
+        index.notes[name] = note
+
     def fail(self, name: str, made_from: str, reason: str) -> None:
         """Note why there is no such group."""
         _, index = self._part()

@@ -16,11 +16,21 @@ def is_sure(status: str, position_std_m: float, limit_m: float) -> bool:
     return status == "ok" and not position_std_m > limit_m  # unknown for a pose that does not rest on matches
 
 
-class EscalatingLocalizer:
-    """Asks one localizer first, and where its pose is not sure another that has more kinds of features.
+def can_gain(query: Query, references: Sequence[References]) -> bool:
+    """Tell whether further features could find a pose: an image that can be read has references."""
+    return any(
+        not isinstance(features, str) and len(retrieved.images)
+        for features, retrieved in zip(query.features, references, strict=True)
+    )
 
-    A query that already has features of all kinds is one that the first was asked about before.
-    """
+
+def is_better(status: str, first_status: str) -> bool:
+    """Tell whether a pose by all features is taken, rather than the one that was found before; statuses of both."""
+    return _rank(status) >= max(_rank(first_status), 1)
+
+
+class EscalatingLocalizer:
+    """Asks one localizer first, and where its pose is not sure another that has more kinds of features."""
 
     def __init__(self, first: Localizer, second: OnDemandLocalizer, names: str, sure_position_std_m: float) -> None:
         """
@@ -49,21 +59,16 @@ class EscalatingLocalizer:
 
         `found_by` names the further kinds if the pose rests on the matches of all kinds.
         """
-        kinds = len(self.second.mapped) + len(self.second.on_demand)
-        has_all = any(not isinstance(features, str) and len(features) == kinds for features in query.features)
-        estimate = None
-        if not has_all:
-            estimate = self.first.localize(query, references, prediction)
-            if is_sure(estimate.status, estimate.position_std_m, self._limit_m):
-                return estimate
-            query = self._with_all_features(query)
+        estimate = self.first.localize(query, references, prediction)
+        if is_sure(estimate.status, estimate.position_std_m, self._limit_m) or not can_gain(query, references):
+            return estimate
+        escalated = self.escalate(self._with_all_features(query), references)
+        return escalated if is_better(escalated.status, estimate.status) else estimate
+
+    def escalate(self, query: Query, references: Sequence[References], prediction: None = None) -> PoseEstimate:
+        """Return the pose by the matches of all kinds of features, all of which the query has; see `localize`."""
         escalated = self.second.localize(query, references)
-        escalated = replace(escalated, found_by=f"{escalated.found_by}+{self._names}")
-        if escalated.status == "ok":
-            return escalated
-        if estimate is None:
-            estimate = self.first.localize(query, references, prediction)
-        return escalated if _rank(escalated) >= max(_rank(estimate), 1) else estimate
+        return replace(escalated, found_by=f"{escalated.found_by}+{self._names}")
 
     def _with_all_features(self, query: Query) -> Query:
         """Extract the features that the query lacks."""
@@ -81,5 +86,5 @@ class EscalatingLocalizer:
         return replace(query, features=features, network_matches=[])
 
 
-def _rank(estimate: PoseEstimate) -> int:
-    return {"ok": 2, "low_confidence": 1}.get(estimate.status, 0)
+def _rank(status: str) -> int:
+    return {"ok": 2, "low_confidence": 1}.get(status, 0)
