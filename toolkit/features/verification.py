@@ -11,6 +11,7 @@ from scipy.special import gammaln
 
 from toolkit.features.features import LocalFeatures
 from toolkit.features.matching import Matcher
+from toolkit.geometry import Floats, Ints
 from toolkit.manifest import RerankSettings
 
 MAP_IMAGES_KEPT = 256
@@ -74,9 +75,25 @@ def count_inliers(
 ) -> int:
     """Return how many matches agree with one essential matrix, or 0 where chance would give as many.
 
-    Matches that share a keypoint with another inlier count once. The essential matrix is that of D. Nister, "An
-    Efficient Solution to the Five-Point Relative Pose Problem", PAMI 2004, drawn in the order of the matches' scores
-    (O. Chum, J. Matas, "Matching with PROSAC", CVPR 2005).
+    Matches that share a keypoint with another inlier count once. Arguments as of `verified_matches`.
+    """
+    agree, _ = verified_matches(camera_a, pixels_a, camera_b, pixels_b, scores, settings, tests)
+    return min(len(np.unique(np.asarray(pixels)[agree], axis=0)) for pixels in (pixels_a, pixels_b))
+
+
+def verified_matches(
+    camera_a: pycolmap.Camera,
+    pixels_a: NDArray[np.floating],
+    camera_b: pycolmap.Camera,
+    pixels_b: NDArray[np.floating],
+    scores: NDArray[np.floating],
+    settings: RerankSettings,
+    tests: int = 1,
+) -> tuple[Ints, Floats]:
+    """Return which matches agree with one essential matrix, (A,), and that (3, 3); none where chance gives as many.
+
+    The essential matrix is that of D. Nister, "An Efficient Solution to the Five-Point Relative Pose Problem", PAMI
+    2004, drawn in the order of the matches' scores (O. Chum, J. Matas, "Matching with PROSAC", CVPR 2005).
 
     Args:
         camera_a, camera_b: intrinsics, with their distortion.
@@ -84,14 +101,15 @@ def count_inliers(
         scores: (K,) how sure the matches are.
         tests: how many pairs are looked at together; among more, chance does more.
     """
+    nothing = np.zeros(0, np.int64), np.zeros((3, 3))
     if len(scores) < 6:  # five always agree
-        return 0
+        return nothing
     order = np.argsort(-scores, kind="stable")
     pixels_a, pixels_b = (np.asarray(pixels, np.float64)[order] for pixels in (pixels_a, pixels_b))
     rays_a, rays_b = np.asarray(camera_a.cam_from_img(pixels_a)), np.asarray(camera_b.cam_from_img(pixels_b))
     finite = np.isfinite(rays_a).all(axis=1) & np.isfinite(rays_b).all(axis=1)  # far out, distortion has no inverse
     if finite.sum() < 6:
-        return 0
+        return nothing
     options = cv2.UsacParams()
     options.sampler = cv2.SAMPLING_PROSAC
     options.score = cv2.SCORE_METHOD_MSAC
@@ -103,11 +121,13 @@ def count_inliers(
     options.isParallel = False
     options.threshold = float(np.tan(np.radians(settings.max_error_deg)))
     pinhole = np.eye(3), np.eye(3), np.zeros(5), np.zeros(5)  # the rays are calibrated already
-    _, mask = cv2.findEssentialMat(rays_a[finite], rays_b[finite], *pinhole, options)
+    essential, mask = cv2.findEssentialMat(rays_a[finite], rays_b[finite], *pinhole, options)
     agree = np.flatnonzero(finite)[:0] if mask is None else np.flatnonzero(finite)[np.ravel(mask) > 0]
     inliers = min(len(np.unique(pixels[agree], axis=0)) for pixels in (pixels_a, pixels_b))
     chance = max(_chance(camera, options.threshold) for camera in (camera_a, camera_b))
-    return inliers if is_meaningful(inliers, len(scores), chance, tests) else 0
+    if not is_meaningful(inliers, len(scores), chance, tests):
+        return nothing
+    return order[agree], np.asarray(essential[:3], np.float64)
 
 
 def is_meaningful(inliers: int, matches: int, chance: float, tests: int = 1) -> bool:
