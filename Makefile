@@ -44,6 +44,8 @@ test-browser: $(INSTALLED)  ## the report and the notebooks' viewer in a real br
 	$(BIN)/python -m pytest -m browser -rs
 
 test-rest: $(INSTALLED)  ## the browser tests and the slow ones together, for they share a finished run
+	@$(BIN)/python -m pip install $(PIP_ARGS) --quiet --constraint constraints.txt --editable '.[dev,fuzz]' || \
+	  echo "The fuzzers cannot be installed here: their tests are skipped."
 	$(PYTEST) -m "browser or slow" -rs
 
 docs-images: $(INSTALLED)  ## draw the pictures of the documentation from a demo run; first: make browser-setup

@@ -214,3 +214,22 @@ def test_python_examples_run(
     assert names["scores"].shape == (2, 3)
     assert len(names["matches"].indices) > 20
     assert np.median(names["translation_m"]) < 0.05
+
+
+# Faults
+
+
+def test_every_fault_of_the_page_has_a_test_that_exists() -> None:
+    lines = [line for line in (ROOT / "docs" / "reliability.md").read_text().splitlines() if line.startswith("| ")]
+    faults = [row for row in ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines) if row[0] != "fault"]
+    assert len(faults) >= 40
+    assert len({row[0] for row in faults}) == len(faults), "a fault is one row"
+    for row in faults:
+        assert len(row) == 5, row
+        assert all(row), row
+        named = re.findall(r"`([\w/]+\.py)::(\w+)`", row[4])
+        assert named, row
+        for file, name in named:
+            source = ROOT / "tests" / file
+            assert source.is_file(), f"{row[0]}: no file tests/{file}"
+            assert re.search(rf"^def {name}\(", source.read_text(), re.MULTILINE), f"{row[0]}: {file} has no {name}"

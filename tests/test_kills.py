@@ -54,9 +54,10 @@ def runs(tmp_path: Path, made_once: Any) -> Iterator[Runs]:
 
     capture = made_once("tiny", make) / "TINY"
     manifest = tmp_path / "run.yaml"
+    # SIFT alone: networks do not work in forked processes.
     manifest.write_text(
         f"captures: ['{capture}']\noutput_root: {tmp_path}\npairs: [[ios, spot]]\n"
-        "rerank: true\nvisualize: {samples: 1}\n"
+        "rerank: {features: sift}\nlocalize: {features: [sift]}\nvisualize: {samples: 1}\n"
     )
     started = Runs(manifest)
     yield started
