@@ -69,7 +69,7 @@ def evaluate_scene(
 ) -> Evaluation:
     """Evaluate the poses of all pairs of a scene and write tables and figures.
 
-    A pair whose poses are missing, or whose query session has no ground truth, gets a row that says so.
+    A pair whose poses are missing, that has no queries, or none with ground truth, gets a row that says so.
 
     Args:
         sessions_root: folder `sessions/` of the capture.
@@ -118,8 +118,9 @@ def evaluate_scene(
                     rows[kind].append({**pair, "state": f"{LEFT_OUT}{cause}"})
                 continue
             if not len(keys):
+                no_queries = truth is not None and session.keyframes(queries).empty
                 for table in rows.values():
-                    table.append({**pair, "state": "no ground truth"})
+                    table.append({**pair, "state": "no queries" if no_queries else "no ground truth"})
                 continue
             good = None
             if references_dir is not None:

@@ -39,8 +39,8 @@ SUBSESSION = "import"
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 POSE_DIRECTIONS = ("world_from_cam", "cam_from_world")
 PLACING = ("link", "copy")
-PROBE_S = 3600
-"""How long COLMAP may take to read a model; one of a million images takes minutes."""
+PROBE_S = 60
+"""How long COLMAP may take to read a model, besides 10 s a megabyte; at damaged files it may take for ever."""
 _CAMERA_COLUMNS = ("model", "width", "height", "params")
 
 
@@ -341,14 +341,15 @@ def _read_model(folder: Path) -> pycolmap.Reconstruction:
     for path in folder.glob("*.bin"):
         if path.stat().st_size < 8:
             raise CaptureError(f"{path}: no part of a COLMAP model: it is cut short. Export the model again.")
+    limit_s = PROBE_S + 1e-5 * sum(path.stat().st_size for path in folder.iterdir())
     try:
         tried = subprocess.run(
-            [sys.executable, "-c", _PROBE, str(folder)], capture_output=True, timeout=PROBE_S, check=False
+            [sys.executable, "-c", _PROBE, str(folder)], capture_output=True, timeout=limit_s, check=False
         )
         said = [line for line in tried.stderr.decode(errors="replace").split("\n") if line.strip(" *")]
         reason = said[0].strip()[:300] if said else f"COLMAP ended with status {tried.returncode}"
     except subprocess.TimeoutExpired:
-        tried, reason = None, f"COLMAP was not done with it after {PROBE_S} s"
+        tried, reason = None, f"COLMAP was not done with it after {limit_s:.0f} s"
     if tried is None or tried.returncode:
         raise CaptureError(
             f"{folder}: no COLMAP model can be read here ({reason}). Expected cameras, images, points3D as .bin or "

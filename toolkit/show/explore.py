@@ -159,7 +159,11 @@ def _draw_rows(
     """Draw a line a query: its image, then its first references as each of its rows has them."""
     capture = Capture.from_sessions_root(sessions_root)
     map_device, _, query_device = Path(jsonl).stem.rpartition("_map_")[2].partition("_query_")
-    width = 1 + references * max((len(row) for row in rows), default=1)
+    if not rows:
+        figure = new_figure(4, 1)
+        figure.text(0.5, 0.5, f"no queries of {query_device}", ha="center", va="center")
+        return figure
+    width = 1 + references * max(len(row) for row in rows)
     figure = new_figure(2.2 * width, 1.9 * len(rows))
     axes = figure.subplots(len(rows), width, squeeze=False)
     for line, row in zip(axes, rows, strict=True):
