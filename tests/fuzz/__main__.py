@@ -34,7 +34,7 @@ def main() -> None:
         (corpus / f"seed-{number:04}").write_bytes(seed)
     options = [
         f"-max_total_time={asked.seconds}", f"-artifact_prefix={asked.keep}/{asked.target}-", "-timeout=20",
-        "-rss_limit_mb=4096", "-max_len=32768", "-print_final_stats=1", "-seed=1",
+        "-rss_limit_mb=4096", "-max_len=32768", "-print_final_stats=1", "-seed=1", "-report_slow_units=30",
     ]  # fmt: skip
     logging.disable()
     place = workplace()
