@@ -432,6 +432,14 @@ def test_depth_maps(session: Session, tmp_path: Path) -> None:
         read_depth(tmp_path / "bad.png")
 
 
+def test_the_file_of_an_image_is_found_by_its_name(tmp_path: Path) -> None:
+    path = write(tmp_path / "PLACE" / "sessions" / "query_phone", {})
+    capture = Capture.open(tmp_path / "PLACE")
+    assert capture.image_path("query_phone/raw_data/a/1.jpg") == path / "raw_data" / "a" / "1.jpg"
+    with pytest.raises(CaptureError, match=r"images\.txt: has no image 'query_phone/raw_data/\.\./2\.jpg'"):
+        capture.image_path("query_phone/raw_data/../2.jpg")
+
+
 def test_capture_opens_sessions_lazily(tmp_path: Path) -> None:
     root = tmp_path / "PLACE" / "sessions"
     write(root / "spot_query", {})
