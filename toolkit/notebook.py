@@ -366,6 +366,10 @@ def execute(
         raise _cell_error(error, output) from None
     except (DeadKernelError, RuntimeError, NoSuchKernel) as error:
         raise kernel_error(error, kernels.ended_by, memory.stop(), output) from error
+    except KeyboardInterrupt:
+        # Of the tasks that are left behind asyncio would print tracebacks.
+        logging.getLogger("asyncio").setLevel(logging.CRITICAL)
+        raise
     finally:
         del os.environ[TEXT_BARS]
         end_children(folder.name)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from toolkit.errors import CaptureError, ManifestError
+from toolkit.errors import CaptureError, DamagedError, ManifestError
 from toolkit.runs.pairs import PairRows, left_out, left_out_of, way_out
 from toolkit.runs.record import failures
 
@@ -45,7 +45,7 @@ def test_where_no_pair_can_be_done_the_first_error_is_raised(tmp_path: Path) -> 
 
 def test_an_error_of_the_settings_or_a_bug_stops_at_once(tmp_path: Path) -> None:
     table = PairRows("P", tmp_path)
-    for error in (ManifestError("topk"), KeyError("a bug"), MemoryError()):
+    for error in (ManifestError("topk"), KeyError("a bug"), MemoryError(), DamagedError(tmp_path, "made again")):
         with pytest.raises(type(error)), table.row("ios", "hl"):
             raise error
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import pandas as pd
 
-from toolkit.errors import OF_THE_DATA, ArtifactError
+from toolkit.errors import OF_THE_DATA, ArtifactError, DamagedError
 from toolkit.files import pair_name, write_text
 from toolkit.runs.record import read_json
 
@@ -47,6 +47,8 @@ class PairRows:
             yield row
             row["reason"] = ""
             note.unlink(missing_ok=True)
+        except DamagedError:
+            raise  # what is damaged is made again, see `features.groups.heals`
         except OF_THE_DATA as error:
             log.warning("%s is left out: %s", name, error)
             row.update({"reason": str(error)})
