@@ -2,7 +2,6 @@
 
 import json
 import logging
-import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -304,8 +303,8 @@ def _unknown(files: SceneFiles, device: str) -> str:
     scenes = [path.parent.name for path in run.glob("*/poses")]
     if files.scene not in scenes:
         return f"{run}: no poses of the scene {files.scene!r}. {nearest(files.scene, scenes)}"
-    maps = (re.fullmatch(r"(.+)_query_.+", path.stem.partition("_map_")[2]) for path in files.poses_dir.glob("*.h5"))
-    devices = {match[1] for match in maps if match}
+    pairs = [path.stem.removeprefix(f"{files.scene}_map_") for path in files.poses_dir.glob("*.h5")]
+    devices = {pair.partition("_query_")[0] for pair in pairs}
     return f"{files.poses_dir}: no poses of queries in the map of {device!r}. {nearest(device, devices)}"
 
 
