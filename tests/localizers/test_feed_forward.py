@@ -209,6 +209,19 @@ def test_one_bad_query_is_a_failed_answer_and_the_others_go_on(world: World, how
         np.testing.assert_array_equal(answers[index].estimate.world_from_rig, good[index].estimate.world_from_rig)
 
 
+@pytest.mark.parametrize("error", [RuntimeError("CUDA error: an illegal access"), MemoryError(), OSError(5, "disk")])
+def test_what_a_device_refuses_is_no_answer_to_a_query(
+    world: World, error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> list[Prediction]:
+        raise error
+
+    monkeypatch.setattr(SimulatedPredictor, "predict", refuse)
+    queries, _ = world.queries("ios")
+    with pytest.raises(type(error)):
+        world.localizer(world.predictor(**LOW)).predict(queries)
+
+
 def test_a_rig_goes_on_without_a_camera_that_fails(world: World) -> None:
     queries, true = world.queries("spot")
     predictor = Failing(world.sessions, world.files.maps, **LOW)  # type: ignore[arg-type]
