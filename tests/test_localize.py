@@ -462,6 +462,7 @@ def test_a_query_without_references_asks_for_nothing_more(
     add_other_kind(monkeypatch)
     rows = [json.loads(line) | {"topk": []} for line in run.retrieval("ios", "ios").read_text().splitlines()]
     run.retrieval("ios", "ios").write_text("\n".join(map(json.dumps, rows)))
+    sidecar_path(run.retrieval("ios", "ios")).unlink()
     table = run_stage(small_capture, run, query_device="ios", **ESCALATES)
     assert (table["escalated"].item(), table["failed"].item()) == (0, len(rows_of(run, "ios")))
     assert not list(run.features.glob("*/other*"))
