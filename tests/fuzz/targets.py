@@ -25,7 +25,7 @@ from toolkit.capture.tables import read_query_table
 from toolkit.errors import ToolkitError
 from toolkit.exchange import interchange
 from toolkit.exchange.interchange import import_colmap, import_images
-from toolkit.features.groups import CHECKSUM, GroupWriter
+from toolkit.features.groups import GroupWriter
 from toolkit.features.stores import FeatureStore
 from toolkit.files import read_references
 from toolkit.localizers.correspondences import Correspondences, LocalizedQueries, LocalizedQuery
@@ -281,8 +281,6 @@ def check_hdf5(data: bytes) -> None:
     path.write_bytes(data[1:] if data[0] % 2 == 0 else healthy_hdf5())
     if data[0] % 2:
         with h5py.File(path, "a") as file:
-            for name in HDF5_NAMES:  # as in a file of another tool
-                del file[name].attrs[CHECKSUM]
             for array, edit, size in zip(data[1::3], data[2::3], data[3::3], strict=False):
                 name, place = HDF5_ARRAYS[array % len(HDF5_ARRAYS)], HDF5_NAMES[array // 128]
                 try:
