@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import h5py
 import pandas as pd
 import pytest
 
@@ -71,6 +72,20 @@ def recorded(path: Path) -> dict[str, list[str]]:
     }
 
 
+def arrays_of(path: Path) -> dict[str, object]:
+    """Return arrays and attributes of an HDF5 file; the order of its bytes changes with the parts it is joined from."""
+    with h5py.File(path) as file:
+        found: dict[str, object] = {"": repr(sorted(file.attrs.items()))}
+
+        def add(name: str, item: h5py.Dataset | h5py.Group) -> None:
+            found[name] = repr(sorted(item.attrs.items()))
+            if isinstance(item, h5py.Dataset):
+                found[name] = (found[name], item.shape, item.dtype.str, item[()].tolist())
+
+        file.visititems(add)
+    return found
+
+
 def products(run: Path) -> dict[str, object]:
     """Return the content of every end product of a run by its path, without what tells the time."""
     found: dict[str, object] = {}
@@ -82,6 +97,8 @@ def products(run: Path) -> dict[str, object]:
             continue
         if path.suffix == ".rrd":
             found[name] = recorded(path)
+        elif path.suffix == ".h5":
+            found[name] = arrays_of(path)
         elif path.suffix == ".csv" and path.parent.name == "poses":
             found[name] = pd.read_csv(path).drop(columns="seconds").to_csv()
         else:
