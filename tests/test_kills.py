@@ -93,7 +93,7 @@ def products(run: Path) -> dict[str, object]:
         name = path.relative_to(run).as_posix()
         if path.is_dir() or path.suffix in (".ipynb", ".html") or path.name.endswith((".meta.json", ".lock")):
             continue
-        if name == "run.json" or "/.stages/" in name:
+        if name in ("run.json", "run.log") or "/.stages/" in name:
             continue
         if path.suffix == ".rrd":
             found[name] = recorded(path)
