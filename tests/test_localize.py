@@ -18,6 +18,7 @@ import pandas as pd
 import pycolmap
 import pytest
 import torch
+from numpy.testing import assert_allclose
 
 from tests.calls import call
 from tests.other_kind import add_other_kind
@@ -26,11 +27,12 @@ from toolkit.capture import Capture, Trajectory
 from toolkit.capture.images import read_image
 from toolkit.embed import embed_sessions
 from toolkit.errors import ArtifactError, CaptureError, ImageError, ManifestError, ToolkitError
+from toolkit.evaluate import evaluate_scene
 from toolkit.features import groups
 from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor, SiftSettings
 from toolkit.features.matching import MATCHERS, MutualMatcher, unit_descriptors
 from toolkit.features.stores import extract_session
-from toolkit.files import SceneFiles, sidecar_path
+from toolkit.files import SceneFiles, map_record_path, read_map_record, sidecar_path
 from toolkit.localize import COLUMNS, Map, localize_image, localize_pairs
 from toolkit.localizers import create_localizer
 from toolkit.localizers import map as maps
@@ -146,7 +148,8 @@ def test_rows_say_how_a_pose_came_about(finished: tuple[SceneFiles, pd.DataFrame
 def test_a_finished_run_leaves_no_partial_files(finished: tuple[SceneFiles, pd.DataFrame]) -> None:
     names = {path.name for path in finished[0].poses_dir.iterdir()}
     stems = [finished[0].poses_txt("ios", device).stem for device in DEVICES]
-    assert names == {stem + end for stem in stems for end in (".txt", ".csv", ".h5", ".txt.meta.json", ".h5.meta.json")}
+    ends = ".txt", ".csv", ".h5", ".txt.meta.json", ".h5.meta.json"
+    assert names == {stem + end for stem in stems for end in ends} | {f"{finished[0].scene}_map_ios.json"}
 
 
 def test_nearest_is_the_pose_of_the_best_reference_and_labeled(small_capture: Path, run: SceneFiles) -> None:
@@ -211,7 +214,7 @@ def test_a_map_of_an_older_format_is_built_anew(small_capture: Path, run: SceneF
         old = {name: arrays[name] for name in arrays.files if name != "noise_px"}
     np.savez(path, **old)
     for record in (sidecar_path(path), sidecar_path(run.poses_txt("ios", "ios"))):
-        record.write_text(record.read_text().replace('"format": 2', '"format": 1'))
+        record.write_text(record.read_text().replace('"format": 3', '"format": 2'))
     table = run_stage(small_capture, run, query_device="ios")
     assert not table["skipped"].any()
     assert (LocalMap.load(path).noise_px > 0).all()
@@ -1096,3 +1099,71 @@ def test_what_a_network_has_matched_is_kept(small_capture: Path, run: SceneFiles
 def test_wrong_features_are_refused(small_capture: Path, run: SceneFiles, options: dict, text: str) -> None:
     with pytest.raises(ManifestError, match=text):
         run_stage(small_capture, run, **options)
+
+
+# ------------------------------------------------------------------------------- maps that are wrong, and unitless
+
+
+def with_poses(capture: Path, change: Callable[[np.ndarray], np.ndarray], *files: str) -> None:
+    """Change the poses in files of a capture's sessions, given as paths."""
+    for file in files:
+        path = capture / "sessions" / file
+        before = Trajectory.read(path)
+        poses = geometry.qt_from_pose(change(geometry.pose_from_qt(before.qt)))
+        ids = before.arrow_ids
+        path.unlink()
+        Trajectory(before.timestamps, ids, poses).write(path)
+
+
+def test_no_pose_is_ok_in_a_map_that_contradicts_its_images(
+    capture: Path, run: SceneFiles, caplog: pytest.LogCaptureFixture
+) -> None:
+    with_poses(capture, lambda poses: poses @ np.diag([1.0, -1, -1, 1]), "ios_map/trajectories.txt")
+    table = run_stage(capture, run, query_device="ios")
+    assert table["map_poses"].item() == "inconsistent"
+    assert table["ok"].item() == 0
+    said = read_map_record(map_record_path(run.poses_dir, run.scene, "ios"))
+    assert "OpenGL" in said["text"]
+    assert said["text"] in caplog.text
+    place = Map.open(run.run, run.scene, "ios")
+    right = PoseEstimate("ok", world_from_rig=np.eye(4))
+    assert place.judged(right).status.startswith("low_confidence: ")
+    assert "OpenGL" in place.judged(right).reason
+    session = Capture.open(capture)["ios_query"]
+    picture = localize_image(place, session.image_path(0), session.camera(session.images["sensor_id"].iloc[0]))
+    assert picture.status != "ok"
+
+
+def test_a_map_does_not_hang_on_the_unit_of_length(
+    capture: Path, run: SceneFiles, finished: tuple[SceneFiles, pd.DataFrame]
+) -> None:
+    poses, statuses = [], []
+    files = "ios_map/trajectories.txt", "ios_query/proc/alignment_trajectories.txt"
+    for factor in (1.0, 100.0):
+        if factor != 1:
+            with_poses(capture, lambda poses: _times(poses, factor), *files)  # noqa: B023 - called at once
+        table = run_stage(capture, run, query_device="ios", unit=None)
+        assert table["map_poses"].item() == "consistent"
+        found = Trajectory.read(run.poses_txt("ios", "ios"))
+        poses.append(_times(geometry.pose_from_qt(found.qt), 1 / factor))
+        statuses.append(rows_of(run, "ios")["status"].tolist())
+    assert statuses[0] == statuses[1]
+    assert set(statuses[0]) == {"ok"}
+    assert_allclose(poses[1], poses[0], atol=1e-4)
+    assert_allclose(poses[0][:, :3, 3], Trajectory.read(finished[0].poses_txt("ios", "ios")).qt[:, 4:], atol=0.05)
+
+
+def test_errors_without_a_unit_are_relative_to_the_depth(capture: Path, run: SceneFiles) -> None:
+    files = "ios_map/trajectories.txt", "ios_query/proc/alignment_trajectories.txt"
+    with_poses(capture, lambda poses: _times(poses, 100.0), *files)
+    run_stage(capture, run, query_device="ios", unit=None)
+    found = evaluate_scene(
+        capture / "sessions", run.poses_dir, run.retrieval_dir, None, query_device="ios", map_device="ios", queries=LIST
+    )
+    assert found.unit == "L"
+    assert found.recall["recall@(1deg,0.1L)"].item() == 1.0
+    assert found.recall["median_translation_m"].item() < 0.05
+
+
+def _times(poses: np.ndarray, factor: float) -> np.ndarray:
+    return geometry.make_pose(poses[:, :3, :3], factor * poses[:, :3, 3])

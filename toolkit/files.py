@@ -315,6 +315,20 @@ def pair_name(scene: str, map_device: str, query_device: str) -> str:
     return f"{scene}_map_{map_device}_query_{query_device}"
 
 
+def map_record_path(poses_dir: str | Path, scene: str, map_device: str) -> Path:
+    """Return where the localize stage says what is known of a map."""
+    return Path(poses_dir) / f"{scene}_map_{map_device}.json"
+
+
+def read_map_record(path: str | Path) -> dict[str, Any]:
+    """Return what the localize stage says of a map; where it says nothing: that its poses are meters."""
+    try:
+        found = dict(json.loads(Path(path).read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
+        found = {}
+    return {"unit": "m", "depth": None, "verdict": "unknown", "text": "", "wrong": []} | found
+
+
 def read_references(path: str | Path, *needed: str) -> list[dict[str, Any]]:
     """Return the rows of a file of references, one a query image.
 

@@ -36,7 +36,9 @@ from toolkit.files import (
     fingerprint,
     image_name,
     is_current,
+    map_record_path,
     pair_name,
+    read_map_record,
     read_references,
     read_sidecar,
     sidecar_path,
@@ -44,7 +46,15 @@ from toolkit.files import (
     write_sidecar,
     write_text,
 )
-from toolkit.localizers.base import Localizer, NetworkMatches, PoseEstimate, Query, References, View
+from toolkit.localizers.base import (
+    Localizer,
+    NetworkMatches,
+    PoseEstimate,
+    Query,
+    References,
+    ScaledLocalizer,
+    View,
+)
 from toolkit.localizers.correspondences import MAPS, LocalizedQuery, query_group
 from toolkit.localizers.escalation import EscalatingLocalizer, can_gain, is_better, is_sure
 from toolkit.localizers.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
@@ -99,7 +109,8 @@ def localize_pairs(
     """Localize the queries of every pair of devices.
 
     Writes for each pair `<pair>.txt`, the poses; `<pair>.csv`, how each came about; and `<pair>.h5`, the
-    correspondences that each rests on (`localizers.correspondences`).
+    correspondences that each rests on (`localizers.correspondences`). Of each map, `<scene>_map_<device>.json` says
+    whether its poses are those of its images.
 
     Args:
         sessions_root: `<capture>/sessions`.
@@ -115,7 +126,8 @@ def localize_pairs(
 
     Returns:
         One row a pair: map_device, query_device, queries = ok + low_confidence + failed, escalated (those that further
-        features were asked for), seconds, skipped, path, reason. A pair that cannot be done has zeros and the `reason`.
+        features were asked for), map_poses (`consistent` with the map's images, `inconsistent` or `unknown`), seconds,
+        skipped, path, reason. A pair that cannot be done has zeros and the `reason`.
 
     Raises:
         ManifestError: unknown method, predictor, features or matcher, or a number that is not positive.
@@ -150,12 +162,14 @@ def localize_pairs(
                 skipped = skip_existing and pair.is_current(record, maps)
                 unfinished = False
                 if not skipped:
-                    run = _PairRun(pair, *open_map(mapped), Path(features_dir), workers, skip_existing)
+                    place, localizer = open_map(mapped)
+                    run = _PairRun(pair, place, localizer, Path(features_dir), workers, skip_existing)
                     localized = run.localize(record, about)
+                    write_text(pair.about_map, json.dumps(place.record(), indent=1) + "\n")
                     _write_poses(pair, localized, settings)
                     unfinished = any(map(_is_internal, localized))
                 if update_attributes(pair.file("h5"), about) or not skipped:
-                    files = pair.file("csv"), pair.file("h5")
+                    files = pair.file("csv"), pair.file("h5"), pair.about_map
                     write_sidecar(pair.file("txt"), record, files, unfinished=unfinished)
                 rows = pd.read_csv(pair.file("csv"))
                 counts = rows["status"].str.split(":").str[0].value_counts()
@@ -163,6 +177,7 @@ def localize_pairs(
                     "queries": int(counts.sum()),
                     **{status: int(counts.get(status, 0)) for status in ("ok", "low_confidence", "failed")},
                     "escalated": int(rows["first_status"].notna().sum()) if settings.features.escalation else 0,
+                    "map_poses": read_map_record(pair.about_map)["verdict"],
                     "seconds": round(time.perf_counter() - started, 2),
                     "skipped": skipped,
                     "path": str(pair.file("txt")),
@@ -188,6 +203,10 @@ class _Pair:
     @property
     def retrieval(self) -> Path:
         return self.retrieval_dir / f"{pair_name(self.capture.name, self.map_device, self.query_device)}.jsonl"
+
+    @property
+    def about_map(self) -> Path:
+        return map_record_path(self.out_dir, self.capture.name, self.map_device)
 
     def file(self, suffix: str) -> Path:
         return self.out_dir / f"{self.retrieval.stem}.{suffix}"
@@ -222,6 +241,7 @@ class _Pair:
             "map": settings.map and map_settings(settings.map, settings.seed),
             "features": [kind.extractor.settings for kind in kinds],
             "matchers": [kind.matcher.settings for kind in kinds],
+            "unit": settings.unit,
             "retrieval": file_fingerprint(self.retrieval),
             "map_session": session_fingerprint(map_session),
             "query_session": session_fingerprint(self.session),
@@ -385,7 +405,7 @@ class _PairRun:
         again: dict[str, dict[str, Any]],
     ) -> None:
         """Ask with further features where the rows, by number of the query, tell that its pose is not sure."""
-        limit = self.place.settings.pnp.sure_position_std_m
+        limit = self.place.sure_position_std
         todo = [
             number
             for number, row in rows.items()
@@ -438,7 +458,7 @@ class _PairRun:
         started = time.perf_counter() - seconds
         try:
             if query.views:
-                estimate = localize(query, references, prediction)
+                estimate = self.place.judged(localize(query, references, prediction))
             else:
                 estimate = PoseEstimate("failed: no images of this device at this time")
         except Exception as error:  # one bad query never ends a run
@@ -549,6 +569,8 @@ def explain_query(
     kinds = create_local_methods(settings)
     place = Map.build(capture, map_device, settings, kinds, Path(features_dir), Path(map_dir))
     localizer = create_localizer(settings, place)
+    if isinstance(localizer, ScaledLocalizer):
+        localizer = localizer.inner
     assert isinstance(localizer, FeedForwardLocalizer)
     pair = _Pair(capture, map_device, query_device, Path(retrieval_dir), Path(retrieval_dir), queries)
     query, references = _PairRun(pair, place, localizer, Path(features_dir), 1, True).query(index)

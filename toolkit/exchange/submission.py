@@ -286,7 +286,7 @@ def _fill_entry(
     for index, (key, row) in enumerate(zip(zip(timestamps.tolist(), device_ids, strict=True), rows, strict=True)):
         status = statuses.get(key, "no row in the run's table")
         if row >= 0:
-            qt[index], origins[index] = poses.qt[row], "low_confidence" if status == "low_confidence" else "ok"
+            qt[index], origins[index] = poses.qt[row], "low_confidence" if status.startswith("low_confidence") else "ok"
         elif key in nearest:
             qt[index], origins[index], reasons[index] = qt_from_pose(nearest[key]), FILLED, status
         else:

@@ -49,6 +49,13 @@ class Query:
     network_matches: Sequence[list[NetworkMatches | None]] = field(default_factory=list)
     """Of each image and kind the matches with references that were made before; empty: none were."""
 
+    def scaled(self, factor: float) -> "Query":
+        """Return the query with the lengths of its rig times a factor."""
+        if factor == 1.0:
+            return self
+        poses = geometry.make_pose(self.rig_from_cams[:, :3, :3], factor * self.rig_from_cams[:, :3, 3])
+        return replace(self, rig_from_cams=poses)
+
     def part(self, images: Sequence[int]) -> "Query":
         """Return the query with some of its images alone."""
         return replace(
@@ -114,6 +121,19 @@ class PoseEstimate:
     reason: str = ""
     """Of a prediction: what was left out or is unknown."""
 
+    def scaled(self, factor: float) -> "PoseEstimate":
+        """Return the estimate with all lengths times a factor."""
+        if factor == 1.0:
+            return self
+        pose, covariance, used = self.world_from_rig, self.covariance, self.correspondences
+        if pose is not None:
+            pose = geometry.make_pose(pose[:3, :3], factor * pose[:3, 3])
+        if covariance is not None:
+            stretch = np.repeat([1.0, factor], 3)
+            covariance = covariance * np.outer(stretch, stretch)
+        used = replace(used, points=factor * used.points)
+        return replace(self, world_from_rig=pose, covariance=covariance, correspondences=used)
+
     @property
     def position_std_m(self) -> float:
         return float(np.sqrt(np.trace(self.covariance[3:, 3:]))) if self.covariance is not None else float("nan")
@@ -167,6 +187,34 @@ class Localizer(Protocol):
             references: of each image.
             prediction: what `predict` returned for the query; None: it is asked here where it is needed.
         """
+
+
+class ScaledLocalizer:
+    """A localizer of a map whose lengths are other multiples of the unit than those that limits are meant for."""
+
+    def __init__(self, inner: Localizer, length: float) -> None:
+        """
+        Args:
+            inner: of the map with all lengths divided by `length`.
+            length: see `Survey.length`.
+        """
+        self.inner, self._length = inner, length
+
+    @property
+    def image_names(self) -> list[str]:
+        return self.inner.image_names
+
+    @property
+    def batch_size(self) -> int:
+        return self.inner.batch_size
+
+    def predict(self, queries: Sequence[tuple[Query, Sequence[References]]]) -> list[Any]:
+        """Return what a network says of each query, in lengths of the inner localizer; see `Localizer`."""
+        return self.inner.predict([(query.scaled(1 / self._length), references) for query, references in queries])
+
+    def localize(self, query: Query, references: Sequence[References], prediction: Any = None) -> PoseEstimate:
+        """Return one pose for the cameras of a rig, or for a single camera; see `Localizer`."""
+        return self.inner.localize(query.scaled(1 / self._length), references, prediction).scaled(self._length)
 
 
 def agree(world_from_rig: Floats | None, other: Floats | None) -> bool:

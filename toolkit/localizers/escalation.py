@@ -32,15 +32,19 @@ def is_better(status: str, first_status: str) -> bool:
 class EscalatingLocalizer:
     """Asks one localizer first, and where its pose is not sure another that has more kinds of features."""
 
-    def __init__(self, first: Localizer, second: OnDemandLocalizer, names: str, sure_position_std_m: float) -> None:
+    def __init__(
+        self, first: Localizer, second: OnDemandLocalizer, names: str, sure_position_std_m: float, length: float = 1.0
+    ) -> None:
         """
         Args:
             first: asked about every query.
             second: its kinds of features begin with those of the first.
             names: of the further kinds.
             sure_position_std_m: see `PnpSettings`.
+            length: what the lengths of the second are multiples of.
         """
         self.first, self.second, self._names, self._limit_m = first, second, names, sure_position_std_m
+        self._length = length
 
     @property
     def image_names(self) -> list[str]:
@@ -67,7 +71,7 @@ class EscalatingLocalizer:
 
     def escalate(self, query: Query, references: Sequence[References], prediction: None = None) -> PoseEstimate:
         """Return the pose by the matches of all kinds of features, all of which the query has; see `localize`."""
-        escalated = self.second.localize(query, references)
+        escalated = self.second.localize(query.scaled(1 / self._length), references).scaled(self._length)
         return replace(escalated, found_by=f"{escalated.found_by}+{self._names}")
 
     def _with_all_features(self, query: Query) -> Query:

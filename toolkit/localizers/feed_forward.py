@@ -61,13 +61,16 @@ class FeedForwardLocalizer:
         predictor: Predictor,
         settings: PredictorSettings | None = None,
         turns: Turns | None = None,
+        length: float = 1.0,
     ):
-        """`session` has the map's images and depth maps; `turns` makes images upright, None leaves them as they are."""
+        """`session` has the map's images and depth maps, whose depths are divided by `length`; `turns` makes images
+        upright, None leaves them as they are."""
         self.map = local_map
         self.predictor = predictor
         self.settings = settings or PredictorSettings()
         self._session = session
         self._depths = DepthMaps(session)
+        self._length = length
         self._upright = turns is not None
         self._turns = np.zeros(len(session.images), np.int64) if turns is None else turns.of(session)
 
@@ -200,7 +203,8 @@ class FeedForwardLocalizer:
 
     def seen_depth(self, image: int) -> SeenDepth:
         """Return what the capture's depth maps say of a map image."""
-        return self._depths.of(self._session.row_of_name[self.map.image_names[image]])
+        seen = self._depths.of(self._session.row_of_name[self.map.image_names[image]])
+        return replace(seen, depth_m=seen.depth_m / self._length)
 
 
 def _combine(query: Query, cameras: tuple[CameraAnswer, ...]) -> PoseEstimate:

@@ -1,7 +1,8 @@
 """The triangulated map as arrays: posed images, points, and which keypoint of which image sees which point."""
 
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,42 @@ from toolkit.errors import ArtifactError
 from toolkit.files import require_whole, write_atomic
 
 Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """How well the poses of a map agree with its images."""
+
+    verdict: str = "unknown"
+    """`consistent`, `inconsistent` or `unknown`: too few matches to tell."""
+    pairs: int = 0
+    """Image pairs whose matches were verified without poses ..."""
+    agreeing: int = 0
+    """... and of these, such as the poses agree with."""
+    fits: str = ""
+    """Of an inconsistent map: the convention under which the poses would agree; empty: none of those tried."""
+    seen_by_three: float = 0.0
+    """Share of the points that at least three images see."""
+    wrong: list[str] = field(default_factory=list)
+    """Images whose poses contradict those of the others."""
+
+    @property
+    def text(self) -> str:
+        """What people should know, in a sentence or two; empty where all is well."""
+        if self.verdict == "inconsistent":
+            cause = f"They would as: {self.fits}." if self.fits else (
+                "No usual convention fits: do the poses, names and intrinsics belong to these images?"
+            )  # fmt: skip
+            return (
+                "the poses of the map contradict its images: of "
+                f"{self.pairs} image pairs whose matches were verified, {self.agreeing} agree with them. {cause}"
+            )
+        if self.wrong:
+            shown = ", ".join(self.wrong[:8]) + (f" and {len(self.wrong) - 8} more" if len(self.wrong) > 8 else "")
+            return f"{len(self.wrong)} map images have poses that contradict the others: {shown}"
+        if self.verdict == "unknown":
+            return f"too few matches to tell whether the poses of the map are right ({self.pairs} verified image pairs)"
+        return ""
 
 
 @dataclass(frozen=True)
@@ -42,6 +79,9 @@ class LocalMap:
     obs_point: NDArray[np.int64]
     noise_px: NDArray[np.float32]
     """(P,) standard deviation of the observations of each point, by axis; all of one kind of features have the same."""
+    length: float = 1.0
+    """What localizers take as a meter, in the unit of the poses; see `Survey.length`."""
+    consistency: Consistency = field(default_factory=Consistency)
 
     @cached_property
     def index_of(self) -> dict[str, int]:
@@ -133,6 +173,13 @@ class LocalMap:
         )
         return part, points
 
+    def scaled(self, factor: float) -> "LocalMap":
+        """Return the map with all lengths times a factor."""
+        if factor == 1.0:
+            return self
+        poses = geometry.make_pose(self.world_from_cams[:, :3, :3], factor * self.world_from_cams[:, :3, 3])
+        return replace(self, world_from_cams=poses, points=factor * self.points, length=factor * self.length)
+
     @classmethod
     def pooled(cls, maps: Sequence["LocalMap"]) -> "LocalMap":
         """Return one map of maps of one session, each triangulated from another kind of features.
@@ -164,6 +211,8 @@ class LocalMap:
             obs_keypoint=np.concatenate([one.obs_keypoint for one in maps])[order],
             obs_point=point[order],
             noise_px=np.concatenate([one.noise_px for one in maps]),
+            length=maps[0].length,
+            consistency=maps[0].consistency,
         )
 
     def save(self, path: str | Path) -> None:
@@ -174,6 +223,8 @@ class LocalMap:
         }
         for name in ("world_from_cams", "points", "colors", "obs_image", "obs_keypoint", "obs_point", "noise_px"):
             arrays[name] = getattr(self, name)
+        arrays["length"] = np.float64(self.length)
+        arrays["consistency"] = np.array(json.dumps(asdict(self.consistency)))
         with write_atomic(path) as temporary, open(temporary, "wb") as stream:
             np.savez(stream, **arrays)
 
@@ -189,7 +240,13 @@ class LocalMap:
             with np.load(path) as arrays:
                 data = {name: arrays[name] for name in arrays.files}
             names, cameras = data.pop("image_names").tolist(), data.pop("cameras").tolist()
-            return cls(image_names=names, cameras=[parse_camera("camera", text) for text in cameras], **data)
+            return cls(
+                image_names=names,
+                cameras=[parse_camera("camera", text) for text in cameras],
+                length=float(data.pop("length")),
+                consistency=Consistency(**json.loads(str(data.pop("consistency")))),
+                **data,
+            )
         except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile) as error:
             raise ArtifactError(
                 f"The triangulated map {path} cannot be read ({error}). Build it with the localize stage."

@@ -5,7 +5,7 @@ import logging
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -35,12 +35,12 @@ from toolkit.files import (
     write_sidecar,
 )  # fmt: skip
 from toolkit.geometry import unit
-from toolkit.localizers.base import Localizer, References
+from toolkit.localizers.base import Localizer, PoseEstimate, References, ScaledLocalizer
 from toolkit.localizers.correspondences import MAPS
 from toolkit.localizers.escalation import EscalatingLocalizer
 from toolkit.localizers.feed_forward import FeedForwardLocalizer
 from toolkit.localizers.hybrid import HybridLocalizer
-from toolkit.localizers.local_map import LocalMap, map_path
+from toolkit.localizers.local_map import Consistency, LocalMap, map_path
 from toolkit.localizers.mapping import build_map
 from toolkit.localizers.matches import MappedFeatures
 from toolkit.localizers.nearest import NearestLocalizer
@@ -48,6 +48,7 @@ from toolkit.localizers.on_demand import OnDemandLocalizer, PosedImages
 from toolkit.localizers.pnp import PnpLocalizer
 from toolkit.localizers.prediction import Predictor
 from toolkit.localizers.predictors import create_predictor
+from toolkit.localizers.survey import NOMINAL_DEPTH
 from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings, nearest
 
 log = logging.getLogger(__name__)
@@ -105,8 +106,13 @@ class Map:
             inputs = fingerprint([session_fingerprint(session), store.fingerprint])
             path = map_path(map_dir, session.id, kind.name)
             assert settings.map is not None
-            local_map = build_map(session, store, path, settings.map, settings.seed, skip_existing, inputs, workers)
+            metric = settings.unit is not None
+            local_map = build_map(
+                session, store, path, settings.map, settings.seed, skip_existing, inputs, workers, metric
+            )
             mapped.append(MappedFeatures(local_map, store, KINDS[kind.name], kind.matcher, kind.name))
+        if mapped and place.consistency.text:
+            log.warning("%s: %s", session.id, place.consistency.text)
         return place
 
     @classmethod
@@ -175,6 +181,33 @@ class Map:
     @cached_property
     def _on_demand(self) -> dict[str, OnDemandFeatures]:
         return {}
+
+    @property
+    def consistency(self) -> Consistency:
+        """How well the poses of the map agree with its images; unknown where no map is triangulated."""
+        return self.mapped[0].map.consistency if self.mapped else Consistency()
+
+    @property
+    def length(self) -> float:
+        """What localizers take as a meter, in the unit of the poses; see `Survey.length`."""
+        return self.mapped[0].map.length if self.mapped else 1.0
+
+    @property
+    def sure_position_std(self) -> float:
+        """The setting `sure_position_std_m` in the unit of the poses."""
+        return self.settings.pnp.sure_position_std_m * (1.0 if self.settings.unit else self.length)
+
+    def record(self) -> dict[str, Any]:
+        """Return what is known of the map, as JSON."""
+        depth = self.length * NOMINAL_DEPTH if self.settings.unit is None else None
+        return {"unit": self.settings.unit, "depth": depth, "text": self.consistency.text, **asdict(self.consistency)}
+
+    def judged(self, estimate: PoseEstimate) -> PoseEstimate:
+        """Return an estimate as it is, or with low confidence in a map whose poses contradict its images."""
+        if self.consistency.verdict != "inconsistent" or estimate.world_from_rig is None:
+            return estimate
+        reason = "; ".join(filter(None, [estimate.reason, self.consistency.text]))
+        return replace(estimate, status="low_confidence: the poses of the map contradict its images", reason=reason)
 
     @cached_property
     def localizer(self) -> Localizer:
@@ -401,25 +434,43 @@ def create_localizer(settings: LocalizeSettings, map: Map, predictor: Predictor 
         )
     if settings.map is None:
         return _escalating(_on_demand(settings, map, map.kinds), settings, map)
-    pnp = PnpLocalizer(map.mapped, settings.pnp, settings.seed)
+    length = map.length
+    pnp = PnpLocalizer(_in_lengths(map), settings.pnp, settings.seed)
     if not settings.predicts:
-        return _escalating(pnp, settings, map)
+        return _escalating(_scaled(pnp, length), settings, map)
     predictor = predictor or open_predictor(settings, map.capture, map.map_dir)
-    local_map = map.mapped[0].map
     turns = map.turns if settings == map.settings else turns_for(settings, map.kinds, map.capture)
     if not settings.predictor.upright:
         turns = None
-    feed_forward = FeedForwardLocalizer(local_map, map.session, predictor, settings.predictor, turns)
-    return feed_forward if settings.method == "vggt" else _escalating(HybridLocalizer(pnp, feed_forward), settings, map)
+    local_map = map.mapped[0].map.scaled(1 / length)
+    feed_forward = FeedForwardLocalizer(local_map, map.session, predictor, settings.predictor, turns, length)
+    if settings.method == "vggt":
+        return _scaled(feed_forward, length)
+    return _escalating(_scaled(HybridLocalizer(pnp, feed_forward), length), settings, map)
+
+
+def _scaled(localizer: Localizer, length: float) -> Localizer:
+    return localizer if length == 1.0 else ScaledLocalizer(localizer, length)
+
+
+def _in_lengths(map: Map) -> list[MappedFeatures]:  # noqa: A002
+    """Return the map's features with their points in multiples of its length."""
+    if map.length == 1.0:
+        return list(map.mapped)
+    return [
+        MappedFeatures(one.map.scaled(1 / map.length), one.features, one.kind, one.matcher, one.name)
+        for one in map.mapped
+    ]
 
 
 def _escalating(first: Localizer, settings: LocalizeSettings, map: Map) -> Localizer:  # noqa: A002
-    """Return a localizer that asks further kinds of features where the first is not sure, if there are any."""
-    if not map.escalation:
+    """Return a localizer that asks further kinds of features where the first is not sure, if there are any; a map
+    that is wrong itself makes no pose sure."""
+    if not map.escalation or map.consistency.verdict == "inconsistent":
         return first
     kinds: list[AnyMethod] = [*(map.kinds if settings.map is None else ()), *map.escalation]
     names = "+".join(kind.name for kind in map.escalation)
-    return EscalatingLocalizer(first, _on_demand(settings, map, kinds), names, settings.pnp.sure_position_std_m)
+    return EscalatingLocalizer(first, _on_demand(settings, map, kinds), names, map.sure_position_std, map.length)
 
 
 def _on_demand(
@@ -430,8 +481,8 @@ def _on_demand(
     """Return what localizes with the points of the map, and with those of kinds that are made for each query."""
     names = map.mapped[0].map.image_names if map.mapped else None
     return OnDemandLocalizer(
-        PosedImages.of_session(map.session, names),
-        map.mapped,
+        PosedImages.of_session(map.session, names, map.length),
+        _in_lengths(map),
         [(kind, partial(_features_of, map, kind)) for kind in kinds],
         settings.map,
         settings.pnp,

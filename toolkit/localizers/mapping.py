@@ -11,6 +11,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
+from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
 from toolkit import geometry
@@ -24,12 +25,15 @@ from toolkit.features.matching import PairMatches, match_along_epipolar_lines, u
 from toolkit.features.stores import FeatureStore, MatchStore, group_names, matches_path, write_matches
 from toolkit.files import fingerprint, is_current, write_sidecar
 from toolkit.localizers.local_map import LocalMap
+from toolkit.localizers.survey import Survey, SurveyedImages
 from toolkit.manifest import MapSettings
 
 Floats = NDArray[np.float64]
 
 
-_MAP_FORMAT = 2
+DEPTHS = (2.0, 4.0, 8.0, 16.0)
+"""Depths at which views are compared, "meters"."""
+_MAP_FORMAT = 3
 """Raised when the same settings give another file: maps of before are then built anew."""
 
 
@@ -38,13 +42,13 @@ def select_pairs(
     cameras: Sequence[pycolmap.Camera],
     groups: NDArray[np.int64],
     per_image: int = 20,
-    depths_m: Sequence[float] = (2.0, 4.0, 8.0, 16.0),
+    length: float = 1.0,
 ) -> NDArray[np.int64]:
     """Choose the image pairs of a map that are worth matching, from the poses alone.
 
-    A pair is good if each camera sees what the other sees, under an angle that triangulates well. The depth of the
-    scene is not known, so points are laid at several depths into each view, and the share is counted that the other
-    camera sees too, weighted by the angle between the two lines of sight.
+    A pair is good if each camera sees what the other sees, under an angle that triangulates well. The depth of each
+    view is not known, so points are laid at several depths into it, and the share is counted that the other camera sees
+    too, weighted by the angle between the two lines of sight.
 
     Args:
         world_from_cams: (N, 4, 4).
@@ -52,7 +56,7 @@ def select_pairs(
         groups: (N,) images of one group (the cameras of one rig at one instant) are never paired: they have
             next to no baseline.
         per_image: partners an image.
-        depths_m: depths at which points are laid, meters.
+        length: in the unit of the poses, of the "meter" that `DEPTHS` are in; see `Survey.length`.
 
     Returns:
         (P, 2) indices, i < j, sorted.
@@ -60,6 +64,7 @@ def select_pairs(
     n = len(world_from_cams)
     if n < 2:
         return np.zeros((0, 2), np.int64)
+    world_from_cams = geometry.make_pose(world_from_cams[:, :3, :3], world_from_cams[:, :3, 3] / length)
     cams_from_world = geometry.invert(world_from_cams)
     centers = world_from_cams[:, :3, 3]
     bounds = np.stack([view_bounds(camera) for camera in cameras])  # (N, 4)
@@ -68,7 +73,7 @@ def select_pairs(
     steps = np.linspace(0.1, 0.9, 5)
     for i in range(n):
         # Far away cameras share no view at the depths considered; 200 candidates are plenty for 20 partners.
-        _, near = tree.query(centers[i], k=min(n, 200), distance_upper_bound=2 * max(depths_m))
+        _, near = tree.query(centers[i], k=min(n, 200), distance_upper_bound=2 * max(DEPTHS))
         near = near[near < n]
         near = near[(groups[near] != groups[i]) & (near != i)]
         if not len(near):
@@ -76,7 +81,7 @@ def select_pairs(
         x = bounds[i, 0] + steps * (bounds[i, 1] - bounds[i, 0])
         y = bounds[i, 2] + steps * (bounds[i, 3] - bounds[i, 2])
         rays = np.stack([*np.meshgrid(x, y), np.ones((len(y), len(x)))], -1).reshape(-1, 3)
-        points = geometry.transform(world_from_cams[i], (rays * np.asarray(depths_m)[:, None, None]).reshape(-1, 3))
+        points = geometry.transform(world_from_cams[i], (rays * np.asarray(DEPTHS)[:, None, None]).reshape(-1, 3))
         seen = in_view(geometry.transform(cams_from_world[near], points[None]), bounds[near])
         to_i = geometry.unit(centers[i] - points)
         to_j = geometry.unit(centers[near][:, None] - points)
@@ -297,6 +302,7 @@ def build_map(
     skip_existing: bool = True,
     inputs: str = "",
     workers: int = 1,
+    metric: bool = True,
 ) -> LocalMap:
     """Triangulate the map of a session from its poses, or load the one at `path` if it is current.
 
@@ -311,12 +317,13 @@ def build_map(
         skip_existing: reuse the file if it was made from the same features, poses and settings.
         inputs: fingerprint of what the features and poses were made from.
         workers: threads.
+        metric: the poses are in meters; else limits are relative to the depth of the scene.
 
     Raises:
         ArtifactError: no image has both a pose and features.
     """
     settings = settings or MapSettings()
-    map_record = {"map": map_settings(settings, seed), "inputs": inputs}
+    map_record = {"map": map_settings(settings, seed), "inputs": inputs, "metric": metric}
     if skip_existing and is_current(path, map_record):
         with suppress(ArtifactError):  # torn behind our back: build it anew
             return LocalMap.load(path)
@@ -330,8 +337,15 @@ def build_map(
         raise ArtifactError(f"Session {session.id} has no image with both a pose and local features; nothing to map.")
     sensor_ids = session.images["sensor_id"].to_numpy()
     cameras = [session.camera(sensor_ids[row]) for row in rows]
-    pairs = select_pairs(poses[rows], cameras, instants(session, rows), settings.pairs_per_image)
     names = [names[row] for row in rows]
+    rig_from_cams, groups = session.rig_from_cam(rows), instants(session, rows)
+    world_from_rigs = poses[rows] @ geometry.invert(rig_from_cams)
+    surveyed = SurveyedImages(names, cameras, world_from_rigs, rig_from_cams, groups, sensor_ids[rows].tolist())
+    kind = feature_kind(features.settings.get("name", "sift"))
+    with threadpool_limits(1, "blas"):
+        survey = Survey(surveyed, lambda index: features[names[index]], kind.min_score, kind.ratio)
+    length = survey.length(metric)
+    pairs = select_pairs(poses[rows], cameras, groups, settings.pairs_per_image, length)
     keypoints = [features[name].keypoints for name in names]
     matcher = _matcher(features, settings)
     made_by = {"features": [features.settings] * 2, "matcher": matcher}
@@ -342,7 +356,11 @@ def build_map(
         writer.finish()
     kept = MatchStore(matches_file)
     matches = [kept[names[i], names[j]].indices for i, j in pairs]
-    local_map = triangulate(names, cameras, poses[rows], keypoints, pairs, matches, settings, seed)
+    near = geometry.make_pose(poses[rows][:, :3, :3], poses[rows][:, :3, 3] / length)
+    local_map = triangulate(names, cameras, near, keypoints, pairs, matches, settings, seed).scaled(length)
+    local_map = replace(
+        local_map, world_from_cams=poses[rows], length=length, consistency=survey.consistency(local_map)
+    )
     local_map = _colored(local_map, session, rows, keypoints)
     local_map.save(path)
     write_sidecar(path, map_record)

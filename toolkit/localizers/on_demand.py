@@ -42,8 +42,8 @@ class PosedImages:
     """(N,) images that one rig took at one instant have the same number; they are not paired."""
 
     @classmethod
-    def of_session(cls, session: Session, names: list[str] | None = None) -> "PosedImages":
-        """Return images of a session, by name; None: all camera images with a pose."""
+    def of_session(cls, session: Session, names: list[str] | None = None, length: float = 1.0) -> "PosedImages":
+        """Return images of a session, by name; None: all camera images with a pose. Lengths are divided by `length`."""
         if names is None:
             rows = session.camera_rows
             rows = rows[np.isfinite(session.world_from_cam(rows)).reshape(-1, 16).all(axis=1)]
@@ -51,7 +51,9 @@ class PosedImages:
         else:
             rows = np.array([session.row_of_name[name] for name in names], np.int64)
         cameras = [session.camera(sensor) for sensor in session.images["sensor_id"].to_numpy()[rows]]
-        return cls(names, cameras, session.world_from_cam(rows), instants(session, rows))
+        poses = session.world_from_cam(rows)
+        poses[:, :3, 3] /= length
+        return cls(names, cameras, poses, instants(session, rows))
 
 
 class OnDemandLocalizer:

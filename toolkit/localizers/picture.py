@@ -95,7 +95,7 @@ def localize_image(
         inputs = [embedder.prepare(turn_image(picture.read(color=True), turn)) for picture, turn in shown]
     references = place.retrieve(embedder.embed(inputs), [picture.read for picture in pixels], cameras, quarter_turns)
     with threadpool_limits(1, "blas"):  # sums stay in one order, as in a run
-        return place.localizer.localize(Query(views, poses, features), references)
+        return place.judged(place.localizer.localize(Query(views, poses, features), references))
 
 
 def pixels_from(image: Any) -> NDArray[np.uint8]:

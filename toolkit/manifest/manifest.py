@@ -19,6 +19,7 @@ from toolkit.manifest.settings import (
     RetrieveSettings,
     Settings,
     Share,
+    Unit,
     VisualizeSettings,
 )
 
@@ -150,6 +151,8 @@ class Manifest(Settings):
     """Direction that is up in the captures' world; null: estimated from the map's cameras where it is needed."""
     tolerate_failed: Tolerance = Tolerance()
     """What may fail: the rest is done all the same, and the exit code tells."""
+    unit: Unit = "m"
+    """Unit of the captures' poses; null: not known. Limits are then relative to the depth of what a map shows."""
     explore: ExploreSettings = ExploreSettings()
     """What notebook 01 shows."""
     embed: EmbedSettings = EmbedSettings()
@@ -202,7 +205,7 @@ class Manifest(Settings):
         """Return the settings of one stage, also of one that is off, with what the manifest says for all stages."""
         section: Settings = getattr(self, stage) or RerankSettings()
         known, update = type(section).model_fields, dict[str, Any]()
-        for key in {"seed", "world_up"} & known.keys() & self.model_fields_set - section.model_fields_set:
+        for key in {"seed", "world_up", "unit"} & known.keys() & self.model_fields_set - section.model_fields_set:
             update[key] = getattr(self, key)
         if stage == "retrieve" and self.rerank is not None and "topk" not in section.model_fields_set:
             update["topk"] = self.rerank.topn

@@ -30,6 +30,7 @@ def _check_direction(direction: list[float]) -> list[float]:
     return direction
 
 
+Unit = Literal["m"] | None
 Direction = Annotated[list[float], Field(min_length=3, max_length=3), AfterValidator(_check_direction)]
 
 
@@ -452,11 +453,19 @@ class LocalizeSettings(Settings):
     """Of RANSAC. The same seed gives the same poses, whatever the number of threads."""
     world_up: Direction | None = None
     """Direction that is up in the map's world; null: estimated from its cameras."""
+    unit: Unit = "m"
+    """Unit of the capture's poses; null: not known, and limits are relative to the depth of what the map shows."""
 
     @property
     def predicts(self) -> bool:
         """Whether the method asks a network for cameras."""
         return self.method in ("vggt", "hybrid")
+
+    @model_validator(mode="after")
+    def _a_map_or_meters(self) -> Self:
+        if self.unit is None and self.map is None:
+            raise ValueError("unit and map are null; the depth that limits are relative to is that of a map")
+        return self
 
 
 class EvaluateSettings(Settings):

@@ -1,6 +1,6 @@
 """How good poses are: errors, recall, why queries are lost, and which queries are the worst."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +20,25 @@ WRONG: Threshold = (5, 0.5)
 """An `ok` pose beyond this is a false promise: downstream users ask for the share of those."""
 NO_REFERENCE, NO_POSE, WRONG_POSE = REASONS = ("no good reference", "no pose", "wrong pose")
 """Why a query misses a threshold."""
+
+
+UNKNOWN_UNIT = "L"
+"""What stands for the meter where the unit of the poses is not known: a tenth of the median depth of what a map
+shows."""
+
+
+def length_unit(record: Mapping[str, Any]) -> tuple[str, float]:
+    """Return the unit that lengths in a map are shown in, and its length in the unit of the poses.
+
+    Args:
+        record: what the localize stage says of the map, see `files.read_map_record`.
+    """
+    return ("m", 1.0) if record["unit"] or not record["depth"] else (UNKNOWN_UNIT, record["depth"] / 10)
+
+
+def unit_of(threshold: str) -> str:
+    """Return the unit of a threshold's name, or of that of a column."""
+    return UNKNOWN_UNIT if threshold.endswith(f"{UNKNOWN_UNIT})") else "m"
 
 
 def pose_errors(
@@ -77,15 +96,15 @@ def is_below(rotation_deg: Floats, translation_m: Floats, threshold: Threshold) 
     return (rotation_deg < threshold[0]) & (translation_m < threshold[1])
 
 
-def threshold_name(threshold: Threshold) -> str:
+def threshold_name(threshold: Threshold, unit: str = "m") -> str:
     """Return `(1deg,0.1m)`, the name of a threshold in tables."""
-    return f"({threshold[0]:g}deg,{threshold[1]:g}m)"
+    return f"({threshold[0]:g}deg,{threshold[1]:g}{unit})"
 
 
 def parse_threshold(name: str) -> Threshold:
     """Return the threshold of a name such as `(5deg,0.5m)` or `recall@(5deg,0.5m)`."""
     degrees, _, meters = name.rpartition("@")[2].strip("()").partition(",")
-    return float(degrees.removesuffix("deg")), float(meters.removesuffix("m"))
+    return float(degrees.removesuffix("deg")), float(meters.rstrip(f"m{UNKNOWN_UNIT}"))
 
 
 def worst_first(queries: pd.DataFrame, threshold: Threshold = THRESHOLDS[0]) -> Ints:
@@ -107,7 +126,7 @@ def worst_first(queries: pd.DataFrame, threshold: Threshold = THRESHOLDS[0]) -> 
         return np.where(np.isnan(values), unknown, values)
 
     ok = ~queries["status"].str.startswith("failed").to_numpy(bool)
-    sure = (queries["status"] != "low_confidence").to_numpy(bool)
+    sure = ~queries["status"].str.startswith("low_confidence").to_numpy(bool)
     rotation, translation = column("rotation_error_deg", -1) / threshold[0], column("translation_error_m", -1)
     error = np.maximum(rotation, translation / threshold[1])
     # The last key counts most.

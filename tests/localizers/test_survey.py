@@ -1,0 +1,152 @@
+"""Whether the poses of a map are those of its images: what is noticed, what it is called, and what is not alarming."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from toolkit import geometry
+from toolkit.capture import Capture, Trajectory
+from toolkit.features.features import KINDS, SiftExtractor
+from toolkit.features.stores import FeatureStore
+from toolkit.geometry import Floats
+from toolkit.localizers.local_map import Consistency, LocalMap
+from toolkit.localizers.mapping import build_map, instants
+from toolkit.localizers.survey import Survey, SurveyedImages
+
+Change = Callable[[Floats], Floats]
+OPENGL = np.diag([1.0, -1.0, -1.0])
+ROLLED = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+
+
+def turned(axes: Floats) -> Change:
+    """Return what gives cameras other axes."""
+    return lambda poses: geometry.make_pose(poses[:, :3, :3] @ axes, poses[:, :3, 3])
+
+
+def inverted_opengl(poses: Floats) -> Floats:
+    return geometry.invert(turned(OPENGL)(poses))
+
+
+def scaled(factor: float) -> Change:
+    return lambda poses: geometry.make_pose(poses[:, :3, :3], factor * poses[:, :3, 3])
+
+
+def mirrored(poses: Floats) -> Floats:
+    flip = np.diag([1.0, -1.0, 1.0, 1.0])
+    return flip @ poses @ flip
+
+
+def quaternions_in_another_order(poses: Floats) -> Floats:
+    quaternions = np.roll(geometry.rotation_to_quaternion(poses[:, :3, :3]), -1, axis=-1)
+    return geometry.make_pose(geometry.quaternion_to_rotation(quaternions), poses[:, :3, 3])
+
+
+def shuffled(poses: Floats) -> Floats:
+    return poses[np.random.default_rng(0).permutation(len(poses))]
+
+
+def upright_otherwise(poses: Floats) -> Floats:
+    """Turn and move the world: no fault."""
+    world = geometry.make_pose(Rotation.from_euler("xyz", [90, 10, -40], degrees=True).as_matrix(), [5.0, -200.0, 30.0])
+    return world @ poses
+
+
+def survey_of(capture: Path, features: Path, device: str, change: Change, count: int | None = None) -> Survey:
+    """Return the survey of the first images of a map whose poses were changed."""
+    session = Capture.open(capture)[f"{device}_map"]
+    store = FeatureStore.of_session(features, session.id, SiftExtractor().settings)
+    rows = np.arange(len(session.images))[:count]
+    rig_from_cams = session.rig_from_cam(rows)
+    names, sensors = [session.image_name(int(row)) for row in rows], session.images["sensor_id"].tolist()[:count]
+    images = SurveyedImages(
+        names,
+        [session.camera(sensor) for sensor in sensors],
+        change(session.world_from_cam(rows) @ geometry.invert(rig_from_cams)),
+        rig_from_cams,
+        instants(session, rows),
+        sensors,
+    )
+    return Survey(images, lambda index: store[names[index]], KINDS["sift"].min_score, KINDS["sift"].ratio)
+
+
+def consistency_of(survey: Survey) -> Consistency:
+    """Return the verdict over a map without points, in which every image has an equal part."""
+    images, none = survey.images, np.zeros(0, np.int64)
+    empty = np.zeros((0, 3))
+    return survey.consistency(
+        LocalMap(
+            list(images.names), list(images.cameras), images.world_from_cams, empty, empty.astype(np.uint8),
+            none, none, none, np.zeros(0, np.float32),
+        )
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("change", [np.array, upright_otherwise, scaled(100)], ids=["right", "upright", "scaled"])
+@pytest.mark.parametrize("device", ["ios", "hl", "spot"])
+def test_right_poses_are_consistent(small_capture: Path, small_features: Path, device: str, change: Change) -> None:
+    found = consistency_of(survey_of(small_capture, small_features, device, change))
+    assert found.verdict == "consistent"
+    assert found.agreeing > 0.9 * found.pairs
+    assert not found.text
+
+
+@pytest.mark.parametrize(
+    ("device", "change", "fits"),
+    [
+        ("ios", turned(OPENGL), "camera axes as in OpenGL (x right, y up, z backward)"),
+        ("ios", geometry.invert, "poses of cam_from_world"),
+        ("hl", geometry.invert, "poses of cam_from_world"),
+        ("ios", inverted_opengl, "poses of cam_from_world, camera axes as in OpenGL"),
+        ("spot", mirrored, "a mirrored world"),
+        ("ios", turned(ROLLED), "images turned by -90 degrees"),
+        ("ios", quaternions_in_another_order, "quaternions in the order x, y, z, w"),
+        ("ios", shuffled, ""),
+    ],
+    ids=["opengl", "inverted", "inverted rig", "both", "mirrored", "rolled", "quaternions", "shuffled"],
+)
+def test_the_convention_that_would_fit_is_found(
+    small_capture: Path, small_features: Path, device: str, change: Change, fits: str
+) -> None:
+    found = consistency_of(survey_of(small_capture, small_features, device, change))
+    assert found.verdict == "inconsistent"
+    assert found.fits.startswith(fits)
+    assert bool(found.fits) == bool(fits)
+    assert found.text
+
+
+def test_a_few_images_tell_nothing(small_capture: Path, small_features: Path) -> None:
+    found = consistency_of(survey_of(small_capture, small_features, "ios", turned(OPENGL), count=3))
+    assert found.verdict == "unknown"
+    assert "too few" in found.text
+
+
+def test_lengths_follow_the_depth_of_the_scene(small_capture: Path, small_features: Path) -> None:
+    survey = survey_of(small_capture, small_features, "ios", np.array)
+    assert survey.length(metric=True) == 1.0, "a room is of a usual depth"
+    assert survey.typical_depth() == pytest.approx(5, abs=2)
+    for factor in (0.01, 100.0):
+        other = survey_of(small_capture, small_features, "ios", scaled(factor))
+        assert other.length(metric=False) == pytest.approx(factor * survey.length(metric=False), rel=1e-9)
+        assert 2 <= other.typical_depth() / other.length(metric=True) <= 16
+
+
+def test_a_single_wrong_pose_is_listed(small_capture: Path, small_features: Path, tmp_path: Path) -> None:
+    capture = Path(shutil.copytree(small_capture, tmp_path / small_capture.name))
+    path = capture / "sessions" / "ios_map" / "trajectories.txt"
+    before = Trajectory.read(path)
+    poses = geometry.pose_from_qt(before.qt)
+    wrong = 2
+    poses[wrong] = upright_otherwise(poses[wrong : wrong + 1])[0]
+    path.unlink()
+    Trajectory(before.timestamps, before.arrow_ids, geometry.qt_from_pose(poses)).write(path)
+    session = Capture.open(capture)["ios_map"]
+    store = FeatureStore.of_session(small_features, session.id, SiftExtractor().settings)
+    found = build_map(session, store, tmp_path / "ios_map.npz").consistency
+    assert found.verdict == "consistent"
+    assert found.wrong == [session.image_name(wrong)]
+    assert found.wrong[0] in found.text
+    assert LocalMap.load(tmp_path / "ios_map.npz").consistency == found
