@@ -15,7 +15,16 @@ from toolkit.capture.cameras import in_view, view_bounds
 from toolkit.capture.devices import in_order
 from toolkit.capture.tables import read_query_table
 from toolkit.errors import ArtifactError, CaptureError, ToolkitError
-from toolkit.files import image_name, pair_name, read_references, require_whole, write_atomic, write_sidecar
+from toolkit.files import (
+    image_name,
+    map_record_path,
+    pair_name,
+    read_map_record,
+    read_references,
+    require_whole,
+    write_atomic,
+    write_sidecar,
+)
 from toolkit.geometry import Floats, invert, transform
 from toolkit.manifest import EvaluateSettings
 from toolkit.runs.pairs import LEFT_OUT, left_out
@@ -31,6 +40,7 @@ from toolkit.show.metrics import (
     Threshold,
     is_below,
     is_posed,
+    length_unit,
     pose_errors,
     poses_of,
     recall,
@@ -69,7 +79,8 @@ def evaluate_scene(
 ) -> Evaluation:
     """Evaluate the poses of all pairs of a scene and write tables and figures.
 
-    A pair whose poses are missing, that has no queries, or none with ground truth, gets a row that says so.
+    A pair whose poses are missing, that has no queries, or none with ground truth, gets a row that says so. Where the
+    unit of the poses is not known, meters are `metrics.UNKNOWN_UNIT`: also in columns that end in `_m`.
 
     Args:
         sessions_root: folder `sessions/` of the capture.
@@ -100,6 +111,7 @@ def evaluate_scene(
     rows: dict[str, list[dict[str, Any]]] = {"recall": [], "retrieval": [], "losses": []}
     errors: list[pd.DataFrame] = []
     messages: list[str] = []
+    unit = "m"
     references_dir = retrieval_dir and (reranked_dir or retrieval_dir)
     for query in capture.devices_with("query", query_device):
         asked = [map_ for map_ in map_devices if pairs is None or [map_, query] in map(list, pairs)]
@@ -111,6 +123,7 @@ def evaluate_scene(
             reason = str(error)
         for map_ in asked:
             pair = {"map_device": map_, "query_device": query}
+            unit, length = length_unit(read_map_record(map_record_path(poses_dir, capture.name, map_)))
             name = pair_name(capture.name, map_, query)
             if cause := reason or left_out(poses_dir, name) or _unreadable(capture, f"{map_}_map"):
                 messages.append(f"{name} was left out: {cause}")
@@ -125,7 +138,9 @@ def evaluate_scene(
             good = None
             if references_dir is not None:
                 path = Path(references_dir) / f"{name}.jsonl"
-                row, good = _retrieval_recall(path, keys, truth, capture[f"{map_}_map"], settings.retrieval_ks, near)
+                row, good = _retrieval_recall(
+                    path, keys, truth, capture[f"{map_}_map"], settings.retrieval_ks, near, length
+                )
                 rows["retrieval"].append({**pair, **row})
                 if good is None:
                     messages.append(f"{name}: {row['state']}, so a miss is not put down to retrieval.")
@@ -137,10 +152,10 @@ def evaluate_scene(
                 continue
             if state != "evaluated":
                 messages.append(f"{name}: {state}.")
-            frame = _errors_of(results, keys, truth, session, good, limits, at)
+            frame = _errors_of(results, keys, truth, session, good, limits, at, unit, length)
             errors.append(frame.assign(**pair))
-            rows["recall"].append({**pair, "state": state, **_summary(frame, limits)})
-            rows["losses"] += [{**pair, "state": state, **row} for row in _losses(frame, limits)]
+            rows["recall"].append({**pair, "state": state, **_summary(frame, limits, unit)})
+            rows["losses"] += [{**pair, "state": state, **row} for row in _losses(frame, limits, unit)]
     if rows["recall"] and all(row["state"].startswith(LEFT_OUT) for row in rows["recall"]):
         raise CaptureError(messages[0])
     folders = {"retrieved": retrieval_dir, "reranked": reranked_dir}
@@ -156,6 +171,7 @@ def evaluate_scene(
         ),
         limits,
         list(dict.fromkeys(messages)),
+        unit,
     )
     for message in evaluation.messages:
         logger.warning(message)
@@ -251,8 +267,11 @@ def _errors_of(
     good: NDArray[np.bool_] | None,
     thresholds: Sequence[Threshold],
     at: str,
+    unit: str,
+    length: float,
 ) -> pd.DataFrame:
-    """Return the rows of the table `errors` of a pair; `good` says which queries have a good reference."""
+    """Return the rows of the table `errors` of a pair; `good` says which queries have a good reference,
+    `length` what the unit of lengths in it is, in that of the poses."""
     estimated, true = np.stack(results["pose"].to_list()), poses_of(truth, keys)  # type: ignore[arg-type]
     frame = results.drop(columns="pose")
     if good is not None:
@@ -265,16 +284,17 @@ def _errors_of(
         frame = frame.iloc[device].reset_index(drop=True)
         frame.insert(2, "sensor_id", session.images["sensor_id"].to_numpy()[images])
     rotation_deg, translation_m = pose_errors(estimated, true)
+    translation_m /= length
     frame["rotation_error_deg"], frame["translation_error_m"] = rotation_deg, translation_m
     no_reference = np.zeros(len(frame), bool) if good is None else ~frame["good_reference"].to_numpy(bool)
     reason = np.select([no_reference, ~np.isfinite(rotation_deg)], [NO_REFERENCE, NO_POSE], WRONG_POSE)
     for threshold in thresholds:
         hit = is_below(rotation_deg, translation_m, threshold)
-        frame[f"loss@{threshold_name(threshold)}"] = np.where(hit, "", reason)
+        frame[f"loss@{threshold_name(threshold, unit)}"] = np.where(hit, "", reason)
     return frame
 
 
-def _summary(frame: pd.DataFrame, thresholds: Sequence[Threshold]) -> dict[str, Any]:
+def _summary(frame: pd.DataFrame, thresholds: Sequence[Threshold], unit: str) -> dict[str, Any]:
     """Return what the table `recall` says of a pair."""
     rotation_deg, translation_m = (frame[name].to_numpy(float) for name in ERROR_COLUMNS[-2:])
     status = frame["status"].str.split(":").str[0]
@@ -284,17 +304,17 @@ def _summary(frame: pd.DataFrame, thresholds: Sequence[Threshold]) -> dict[str, 
         "queries": len(frame),
         "localized": int(np.isfinite(rotation_deg).sum()),
         **{name: int((status == name).sum()) for name in ("ok", "low_confidence", "failed")},
-        **{f"recall@{threshold_name(t)}": share for t, share in zip(thresholds, shares, strict=True)},
+        **{f"recall@{threshold_name(t, unit)}": share for t, share in zip(thresholds, shares, strict=True)},
         "median_rotation_deg": float(np.median(rotation_deg)),
         "median_translation_m": float(np.median(translation_m)),
         "ok_wrong": float(np.mean(wrong)),
     }
 
 
-def _losses(frame: pd.DataFrame, thresholds: Sequence[Threshold]) -> list[dict[str, Any]]:
+def _losses(frame: pd.DataFrame, thresholds: Sequence[Threshold], unit: str) -> list[dict[str, Any]]:
     """Return what the table `losses` says of a pair, a row a threshold."""
     rows = []
-    for name in map(threshold_name, thresholds):
+    for name in (threshold_name(threshold, unit) for threshold in thresholds):
         reasons = {reason: int((frame[f"loss@{name}"] == reason).sum()) for reason in REASONS}
         rows.append({"threshold": name, "queries": len(frame), "missed": sum(reasons.values()), **reasons})
     return rows
@@ -319,6 +339,7 @@ def _retrieval_recall(
     map_session: Session,
     ks: Sequence[int],
     limits: tuple[float, float],
+    length: float,
 ) -> tuple[dict[str, Any], NDArray[np.bool_] | None]:
     """Return a row of the retrieval table, and for each query whether it has any good reference."""
     if not path.is_file():
@@ -336,9 +357,10 @@ def _retrieval_recall(
         state = f"unreadable retrieval file ({type(error).__name__}: {error})"
         return {"state": state, "queries": len(keys)}, None
     cameras = poses_of(truth, index) @ device_from_cam  # type: ignore[arg-type]
-    near = _is_near(references, cameras[:, None], limits)
+    reach = limits[0] * length, limits[1]
+    near = _is_near(references, cameras[:, None], reach)
     best = np.where(near.any(1), near.argmax(1), np.inf)
-    in_map = _near_any(cameras, map_session.world_from_cam(), limits)
+    in_map = _near_any(cameras, map_session.world_from_cam(), reach)
     # A query device has a good reference where any of its cameras has one.
     frame = index.assign(rank=best, in_map=in_map).groupby(["timestamp", "device_id"], as_index=False)
     by_device = keys.merge(frame.agg(rank=("rank", "min"), in_map=("in_map", "any")), how="left")

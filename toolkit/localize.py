@@ -169,7 +169,7 @@ def localize_pairs(
                     _write_poses(pair, localized, settings)
                     unfinished = any(map(_is_internal, localized))
                 if update_attributes(pair.file("h5"), about) or not skipped:
-                    files = pair.file("csv"), pair.file("h5"), pair.about_map
+                    files = pair.file("csv"), pair.file("h5")
                     write_sidecar(pair.file("txt"), record, files, unfinished=unfinished)
                 rows = pd.read_csv(pair.file("csv"))
                 counts = rows["status"].str.split(":").str[0].value_counts()
@@ -213,7 +213,8 @@ class _Pair:
 
     def is_current(self, record: dict[str, Any], maps: Sequence[Path]) -> bool:
         """Tell whether the pair is done; its maps are part of what there is to see of it."""
-        return is_current(self.file("txt"), record) and None not in map(read_sidecar, maps)
+        there = self.about_map.exists() and None not in map(read_sidecar, maps)
+        return there and is_current(self.file("txt"), record)
 
     def remove_poses(self) -> None:
         """Remove poses that an earlier run found; what they rest on is kept, and gives them again without work."""

@@ -127,18 +127,20 @@ def _draw_pair(pair: LocalizedPair, out: Path, settings: VisualizeSettings) -> p
         title=f"{q} queries in the {m} map, seen from above",
         map_tracks=session_tracks(pair.map_session),
         query_tracks=session_tracks(pair.query_session),
+        unit=pair.unit,
     )
     order = shown.worst_first().tolist()
     chosen = np.unique(np.linspace(0, len(order) - 1, min(settings.samples, len(order))).round().astype(int))
     for number, k in enumerate((order[place] for place in chosen), start=1):
         title = f"{q} query in the {m} map: {pair.table['status'].iloc[k]}"
-        draw_localization(pair.details(k), out / f"localization_{pair.name}_{number}.png", title)
+        draw_localization(pair.details(k), out / f"localization_{pair.name}_{number}.png", title, pair.unit)
     if settings.recordings:
         details = ((k, pair.details(k)) for k in sorted(order[: settings.matched_queries]))
         record_localizations(recording, pair.name, map_poses, *cloud, shown, details, up=settings.world_up)
     candidates = order[:WORST]
     rows = shown.ranked.iloc[candidates]
-    rows = rows.assign(pair=f"{q} in the {m} map", details=[pair.details(k) for k in candidates])
+    details_of = [pair.details(k) for k in candidates]
+    rows = rows.assign(unit=pair.unit[0], pair=f"{q} in the {m} map", details=details_of)
     pair.queries.close()
     return rows
 
@@ -157,5 +159,5 @@ def _draw_worst(path: Path, scene: str, candidates: pd.DataFrame) -> None:
         if row["details"].has_matches or row.get("num_inliers", 0) > 0:
             about.append(support_of(row))
         errors = row["rotation_error_deg"], row["translation_error_m"]
-        shown.append(WorstQuery(row["pair"], ", ".join(about), row["details"], *errors))
+        shown.append(WorstQuery(row["pair"], ", ".join(about), row["details"], *errors, row["unit"]))
     draw_worst(shown, path, f"{scene}: the {len(shown)} worst queries of all pairs")

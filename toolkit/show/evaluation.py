@@ -18,6 +18,7 @@ from toolkit.show.metrics import (
     is_below,
     parse_threshold,
     threshold_name,
+    unit_of,
 )
 
 RELIABILITY_BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, 1.0)
@@ -43,6 +44,8 @@ class Evaluation:
     thresholds: tuple[Threshold, ...] = THRESHOLDS
     messages: list[str] = field(default_factory=list)
     """What was not evaluated, and why; empty where all was."""
+    unit: str = "m"
+    """Of lengths: m, or `metrics.UNKNOWN_UNIT`."""
 
     @property
     def pairs(self) -> pd.DataFrame:
@@ -60,7 +63,8 @@ def draw_evaluation(evaluation: Evaluation) -> dict[str, "Figure"]:
     done = evaluation.recall
     done = done.dropna(subset=["localized"]) if "localized" in done else done.iloc[:0]
     if len(done):
-        columns = [(f"recall@{threshold_name(t)}", f"recall @ {t[0]:g}°, {t[1]:g} m", 100.0, "%")
+        unit = evaluation.unit
+        columns = [(f"recall@{threshold_name(t, unit)}", f"recall @ {_limit(t, unit)}", 100.0, "%")
                    for t in evaluation.thresholds]  # fmt: skip
         figures["recall"] = draw_matrices(
             done, columns, "Share of queries localized within the threshold", "higher", (0, 100)
@@ -68,12 +72,12 @@ def draw_evaluation(evaluation: Evaluation) -> dict[str, "Figure"]:
         figures["median_errors"] = draw_matrices(
             done,
             [("median_rotation_deg", "median rotation error", 1.0, "°"),
-             ("median_translation_m", "median translation error", 100.0, "cm")],
+             ("median_translation_m", "median translation error", *((100.0, "cm") if unit == "m" else (1.0, unit)))],
             "Median errors over all queries (∞: half of them have no pose)", "lower",
         )  # fmt: skip
-        figures["error_curves"] = draw_error_curves(evaluation.errors, evaluation.thresholds)
+        figures["error_curves"] = draw_error_curves(evaluation.errors, evaluation.thresholds, unit)
         if "p_correct" in evaluation.errors and evaluation.errors["p_correct"].notna().any():
-            figures["reliability"] = draw_reliability(evaluation.errors)
+            figures["reliability"] = draw_reliability(evaluation.errors, unit)
         if evaluation.losses["missed"].sum():
             figures["losses"] = draw_losses(evaluation.losses)
     retrieval = evaluation.retrieval
@@ -84,9 +88,13 @@ def draw_evaluation(evaluation: Evaluation) -> dict[str, "Figure"]:
         figures["retrieval"] = draw_matrices(
             evaluated, [(k, f"in the first {k.removeprefix('recall@')}", 100.0, "%") for k in ks]
             + [("in_map", "anywhere in the map", 100.0, "%")],
-            f"Share of queries with a reference within {radius:g} m and {angle:g}°", "higher", (0, 100),
+            f"Share of queries with a reference within {radius:g} {evaluation.unit} and {angle:g}°", "higher", (0, 100),
         )  # fmt: skip
     return figures
+
+
+def _limit(threshold: Threshold, unit: str) -> str:
+    return f"{threshold[0]:g}°, {threshold[1]:g} {unit}"
 
 
 @styled
@@ -138,7 +146,7 @@ def draw_matrices(
 
 
 @styled
-def draw_error_curves(errors: pd.DataFrame, thresholds: Sequence[Threshold] = THRESHOLDS) -> "Figure":
+def draw_error_curves(errors: pd.DataFrame, thresholds: Sequence[Threshold] = THRESHOLDS, unit: str = "m") -> "Figure":
     """Draw cumulative distributions of the errors: a column a query device, a line a map device.
 
     A curve ends at the share of queries that have a pose. Dotted lines are the recall thresholds.
@@ -146,7 +154,9 @@ def draw_error_curves(errors: pd.DataFrame, thresholds: Sequence[Threshold] = TH
     queries, maps = in_order(errors["query_device"]), in_order(errors["map_device"])
     figure = new_figure(3.6 * len(queries) + 0.8, 6.0)
     axes = figure.subplots(2, len(queries), squeeze=False, sharey=True, sharex="row")
-    quantities = [("translation_error_m", "translation error [m]", 1), ("rotation_error_deg", "rotation error [°]", 0)]
+    quantities = [
+        ("translation_error_m", f"translation error [{unit}]", 1), ("rotation_error_deg", "rotation error [°]", 0)
+    ]  # fmt: skip
     for row, (column, label, part) in enumerate(quantities):
         finite = errors[column].to_numpy(float)
         finite = np.maximum(finite[np.isfinite(finite)], 1e-4)
@@ -177,7 +187,7 @@ def draw_error_curves(errors: pd.DataFrame, thresholds: Sequence[Threshold] = TH
 
 
 @styled
-def draw_reliability(errors: pd.DataFrame) -> "Figure":
+def draw_reliability(errors: pd.DataFrame, unit: str = "m") -> "Figure":
     """Draw how often poses are right, within `WRONG`, against how probable the localizer calls it.
 
     Bars are intervals of 95 % (Wilson, 1927), the number is that of the poses.
@@ -206,7 +216,7 @@ def draw_reliability(errors: pd.DataFrame) -> "Figure":
     axis.set_xlabel("stated probability of being right [%]")
     axis.set_ylabel("poses that are right [%]")
     axis.grid(alpha=0.25)
-    figure.suptitle("How far stated probabilities hold (right: {:g}°, {:g} m)".format(*WRONG))
+    figure.suptitle(f"How far stated probabilities hold (right: {_limit(WRONG, unit)})")
     return figure
 
 
@@ -236,7 +246,7 @@ def draw_losses(losses: pd.DataFrame) -> "Figure":
         for y, value in enumerate(left):
             axis.text(value + 0.012 * widest, y, f"{value:.0f}", va="center", fontsize=8, color="0.3")
         axis.set_xlim(0, widest)
-        axis.set_title("missed @ {:g}°, {:g} m".format(*parse_threshold(threshold)), fontsize=10)
+        axis.set_title(f"missed @ {_limit(parse_threshold(threshold), unit_of(threshold))}", fontsize=10)
         axis.set_xlabel("queries [%]")
         axis.grid(axis="x", alpha=0.25)
     axes[0].set_yticks(range(len(pairs)), [f"{q} in {m} map" for m, q in pairs])

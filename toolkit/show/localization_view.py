@@ -238,7 +238,7 @@ def describe(queries: Localizations, k: int) -> str:
     row = queries.ranked.iloc[k]
     parts = [str(queries.names[k]), str(row["status"])]
     if np.isfinite(row["translation_error_m"]):
-        parts.append(f"off by {row['rotation_error_deg']:.2g}°, {row['translation_error_m']:.3g} m")
+        parts.append(f"off by {row['rotation_error_deg']:.2g}°, {row['translation_error_m']:.3g} {queries.unit[0]}")
     if row.get("num_inliers", 0) > 0:
         parts.append(support_of(row))
     return ", ".join(parts)

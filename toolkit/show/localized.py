@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.tables import read_query_table
 from toolkit.errors import ArtifactError
-from toolkit.files import pair_name
+from toolkit.files import map_record_path, pair_name, read_map_record
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.correspondences import Correspondences, LocalizedQueries, LocalizedQuery
 from toolkit.localizers.local_map import LocalMap
-from toolkit.show.metrics import is_posed, pose_errors, worst_first
+from toolkit.show.metrics import is_posed, length_unit, pose_errors, worst_first
 
 if TYPE_CHECKING:
     import pycolmap
@@ -149,12 +149,14 @@ class Localizations:
     """The same, true; NaN where it is not known."""
     nearest_reference: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     """World position (Q, 3) of the first reference of queries without a pose; NaN where there is none."""
+    unit: tuple[str, float] = ("m", 1.0)
+    """What lengths are shown in, see `metrics.length_unit`."""
 
     @cached_property
     def ranked(self) -> pd.DataFrame:
-        """The table with the errors: `rotation_error_deg`, `translation_error_m`; infinite without a pose."""
-        rotation_deg, translation_m = pose_errors(self.estimated, self.true)
-        return self.table.assign(rotation_error_deg=rotation_deg, translation_error_m=translation_m)
+        """The table with the errors: `rotation_error_deg`, `translation_error_m` in `unit`; infinite without a pose."""
+        rotation_deg, translation = pose_errors(self.estimated, self.true)
+        return self.table.assign(rotation_error_deg=rotation_deg, translation_error_m=translation / self.unit[1])
 
     def worst_first(self) -> Ints:
         """Return the rows from the worst to the best (`metrics.worst_first`)."""
@@ -177,6 +179,8 @@ class LocalizedPair:
     queries: LocalizedQueries
     local_map: LocalMap | None
     """The triangulated maps that the run used, pooled."""
+    unit: tuple[str, float] = ("m", 1.0)
+    """What lengths are shown in, see `metrics.length_unit`."""
 
     @classmethod
     def open(
@@ -196,7 +200,8 @@ class LocalizedPair:
         poses = Trajectory.read(Path(f"{stem}.txt")).lookup(table["timestamp"].to_numpy(), table["device_id"])
         local_map = load_maps(map_files(map_dir, f"{map_device}_map", stem))
         queries = LocalizedQueries(Path(f"{stem}.h5"))
-        return cls(name, capture[f"{map_device}_map"], session, table, rows, poses, queries, local_map)
+        unit = length_unit(read_map_record(map_record_path(poses_dir, capture.name, map_device)))
+        return cls(name, capture[f"{map_device}_map"], session, table, rows, poses, queries, local_map, unit)
 
     def localized(self, k: int) -> LocalizedQuery:
         """Return what the pose of query k rests on; nothing where the stage could not even begin."""
@@ -215,7 +220,8 @@ class LocalizedPair:
             if names:
                 centers[k] = self.map_session.world_from_cam([self.map_session.row_of_name[names[0]]])[0, :3, 3]
         names = [session.image_name(int(row)) for row in first]
-        return Localizations(names, self.table, estimated, session.world_from_cam(first, ground_truth=True), centers)
+        true = session.world_from_cam(first, ground_truth=True)
+        return Localizations(names, self.table, estimated, true, centers, self.unit)
 
     def details(self, k: int) -> QueryDetails:
         """Return images, correspondences and references of query k."""

@@ -1,6 +1,7 @@
 """The page a person reads after a run: report.html, one file that needs nothing else."""
 
 import base64
+import glob
 import io
 import json
 import math
@@ -14,19 +15,15 @@ from urllib.parse import quote
 import pandas as pd
 
 from toolkit.errors import ArtifactError
-from toolkit.files import SceneFiles, sidecar_path, write_text
+from toolkit.files import SceneFiles, read_map_record, sidecar_path, write_text
 from toolkit.show.figures import number, percent
-from toolkit.show.metrics import REASONS, THRESHOLDS, WRONG, parse_threshold, worst_first
+from toolkit.show.metrics import REASONS, THRESHOLDS, WRONG, parse_threshold, unit_of, worst_first
 
 # All pictures of a page together, before base64 makes them a third larger: the page stays below 10 MB.
 PICTURE_BUDGET = 7_000_000
 MAX_WIDTH = 1600
 WORST, MOST_REASONS = 10, 12
 """Rows listed of a scene: the worst queries, and the reasons of queries without a pose."""
-MEDIANS = (
-    ("median_rotation_deg", "Median rotation error [°]", 1.0),
-    ("median_translation_m", "Median translation error [cm]", 100.0),
-)
 # Figures that say more than the page's own tables: a heading, and how to read it.
 STATUS_COLUMNS = [
     "timestamp", "device_id", "status", "num_inliers", "position_std_m", "seconds", "first_status", "first_seconds"
@@ -233,8 +230,18 @@ def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> dict[str, An
     thresholds = [column for column in recall.columns if column.startswith("recall@")]
     statuses = _read_statuses(files, messages)
     messages += _messages(files.evaluation / "recall.csv") if len(recall) else []
+    unit = unit_of(thresholds[0]) if thresholds else "m"
+    small, factor = ("cm", 100.0) if unit == "m" else (unit, 1.0)
+    if unit != "m":
+        messages.append(f"The unit of the poses is not known: {unit} is a tenth of the median depth that a map shows.")
+    medians = ("median_rotation_deg", "Median rotation error [°]", 1.0), (
+        "median_translation_m", f"Median translation error [{small}]", factor
+    )  # fmt: skip
+    for path in sorted(files.poses_dir.glob(f"{glob.escape(files.scene)}_map_*.json")):
+        record = read_map_record(path)
+        messages += [f"{path.stem}: {record['text']}"] if record["text"] else []
     verdict, headlines = _verdict(recall, errors, statuses, thresholds)
-    matrices, note = _retrieval(retrieval, headlines)
+    matrices, note = _retrieval(retrieval, headlines, unit)
     stills = sorted(files.visualization.glob("*.png"), key=_natural)
     worst = [path for path in stills if path.name.startswith("worst")]
     samples = [path for path in stills if path.name.startswith("localization")]
@@ -251,7 +258,7 @@ def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> dict[str, An
         ],
         "medians": [
             _matrix(recall, column, title, lambda v, f=factor: number(v * f))
-            for column, title, factor in (MEDIANS if thresholds else ())
+            for column, title, factor in (medians if thresholds else ())
         ],
         "pairs": _pairs(recall, thresholds) if len(recall) else None,
         "losses": _losses(losses),
@@ -328,7 +335,8 @@ def _verdict(
         headlines.append((f"{percent(done[column].mean())} %", f"mean recall at {_threshold(column)}"))
     if len(errors):
         rotation_deg, translation_m = errors[["rotation_error_deg", "translation_error_m"]].median()
-        headlines.append((_length(translation_m), f"median error of position; {number(rotation_deg)}° of rotation"))
+        length = _length(translation_m, unit_of(thresholds[0]))
+        headlines.append((length, f"median error of position; {number(rotation_deg)}° of rotation"))
     strict = thresholds[0]
     weakest = done.loc[done[strict].idxmin()]
     share, limit = percent(weakest[strict]), _threshold(strict)
@@ -339,7 +347,8 @@ def _verdict(
         verdict.append(f"Weakest pair at {limit}: {pair}, {share} %.")
     if "ok_wrong" in done:
         wrong = float((done["ok_wrong"] * done["queries"]).sum() / done["queries"].sum())
-        headlines.append((f"{percent(wrong)} %", "called ok, but beyond {:g}°, {:g} m".format(*WRONG)))
+        what = f"called ok, but beyond {WRONG[0]:g}°, {WRONG[1]:g} {unit_of(strict)}"
+        headlines.append((f"{percent(wrong)} %", what))
     return verdict, headlines
 
 
@@ -374,7 +383,9 @@ def _pairs(recall: pd.DataFrame, thresholds: list[str]) -> Table:
         columns[name] = name.replace("_", " "), lambda count: "–" if pd.isna(count) else f"{count:.0f}"
     columns |= {name: (f"recall {_threshold(name)}", _share) for name in thresholds}
     columns["median_rotation_deg"] = "median [°]", number
-    columns["median_translation_m"] = "median [cm]", lambda meters: number(100 * meters)
+    unit = unit_of(thresholds[0]) if thresholds else "m"
+    small, factor = ("cm", 100) if unit == "m" else (unit, 1)
+    columns["median_translation_m"] = f"median [{small}]", lambda length: number(factor * length)
     columns["ok_wrong"] = "ok but wrong", lambda share: _share(share).text
     columns["state"] = "note", lambda state: "" if state == "evaluated" else str(state)
     shown = {name: column for name, column in columns.items() if name in recall}
@@ -429,10 +440,11 @@ def _worst(queries: pd.DataFrame, thresholds: list[str]) -> Table | None:
         return None
     has_truth = "rotation_error_deg" in queries
     threshold = parse_threshold(thresholds[0]) if thresholds else THRESHOLDS[0]
+    unit = unit_of(thresholds[0]) if thresholds else "m"
     worst = queries.iloc[worst_first(queries, threshold)[:WORST]]
     if has_truth:
         caption = f"The {len(worst)} worst, by the larger of rotation error / {threshold[0]:g}° and "
-        caption += f"translation error / {threshold[1]:g} m"
+        caption += f"translation error / {threshold[1]:g} {unit}"
     else:
         caption = f"The {len(worst)} least supported; there is no ground truth to compare with"
     columns = ["query", *(["off by", "why"] if has_truth else []), "status", "inliers", "device", "timestamp [µs]"]
@@ -442,7 +454,7 @@ def _worst(queries: pd.DataFrame, thresholds: list[str]) -> Table | None:
         if has_truth:
             rotation_deg, translation_m = row["rotation_error_deg"], row["translation_error_m"]
             located = math.isfinite(rotation_deg)
-            texts += [f"{number(rotation_deg)}°, {_length(translation_m)}" if located else "no pose", _why(row)]
+            texts += [f"{number(rotation_deg)}°, {_length(translation_m, unit)}" if located else "no pose", _why(row)]
         inliers = "–" if pd.isna(row["num_inliers"]) else f"{row['num_inliers']:.0f}"
         texts += [str(row["status"]).replace("_", " "), inliers, str(row["device_id"]), str(row["timestamp"])]
         rows.append([Cell(text) for text in texts])
@@ -456,7 +468,7 @@ def _why(row: dict[str, Any]) -> str:
     return missed[-1] if missed else "within every threshold" if losses else ""
 
 
-def _retrieval(retrieval: pd.DataFrame, headlines: list[tuple[str, str]]) -> tuple[list[Matrix], str]:
+def _retrieval(retrieval: pd.DataFrame, headlines: list[tuple[str, str]], unit: str) -> tuple[list[Matrix], str]:
     ks = [column for column in retrieval.columns if column.startswith("recall@")]
     done = retrieval.dropna(subset=ks) if ks else retrieval.iloc[:0]
     if not len(done):
@@ -466,7 +478,8 @@ def _retrieval(retrieval: pd.DataFrame, headlines: list[tuple[str, str]]) -> tup
     matrices = [_matrix(retrieval, c, titles[c], percent, lambda v: 0.9 * v) for c in titles if c in done]
     first = ks[-1].removeprefix("recall@")
     headlines.append((f"{percent(done[ks[-1]].mean())} %", f"have a good reference in the first {first}"))
-    note = f"A good reference stands within {done['radius_m'].iloc[0]:g} m of the query's true camera and looks the "
+    reach = f"{done['radius_m'].iloc[0]:g} {unit}"
+    note = f"A good reference stands within {reach} of the query's true camera and looks the "
     return matrices, f"{note}same way to within {done['angle_deg'].iloc[0]:g}°."
 
 
@@ -508,8 +521,10 @@ def _share(share: float) -> Cell:
     return Cell("–") if math.isnan(share) else Cell(f"{percent(share)} %", 0.9 * share)
 
 
-def _length(meters: float) -> str:
-    return f"{number(100 * meters)} cm" if meters < 1 else f"{number(meters)} m" if meters < math.inf else "∞"
+def _length(length: float, unit: str) -> str:
+    if unit == "m" and length < 1:
+        return f"{number(100 * length)} cm"
+    return f"{number(length)} {unit}" if length < math.inf else "∞"
 
 
 def _seconds(seconds: float | None) -> str:
@@ -522,7 +537,7 @@ def _seconds(seconds: float | None) -> str:
 
 def _threshold(name: str) -> str:
     degrees, meters = parse_threshold(name)
-    return f"{degrees:g}°, {meters:g}\N{NO-BREAK SPACE}m"
+    return f"{degrees:g}°, {meters:g}\N{NO-BREAK SPACE}{unit_of(name)}"
 
 
 class _Album:

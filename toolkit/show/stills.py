@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.images import read_for_display
 from toolkit.capture.world_up import up_of_cameras
-from toolkit.geometry import Floats, Ints, pose_error, project
+from toolkit.geometry import Floats, Ints, make_pose, pose_error, project
 from toolkit.show.figures import ESTIMATED, GREEN, MAP, TRUE, error_bar, error_colors, new_figure, save_figure, styled
 from toolkit.show.localized import QueryDetails
 from toolkit.show.metrics import is_posed
@@ -36,6 +36,8 @@ class WorstQuery:
     rotation_deg: float = np.nan
     translation_m: float = np.nan
     """Its errors; NaN without a pose, or where the truth is not known."""
+    unit: str = "m"
+    """Of lengths."""
 
 
 @styled
@@ -52,6 +54,7 @@ def draw_scene_png(
     max_points: int = 60_000,
     map_tracks: Sequence[Floats] = (),
     query_tracks: Sequence[Floats] = (),
+    unit: tuple[str, float] = ("m", 1.0),
 ) -> "Figure":
     """Draw the map from above with estimated and true queries, one panel a place; return the figure.
 
@@ -67,10 +70,14 @@ def draw_scene_png(
         max_points: points drawn at most in all, a regular choice.
         map_tracks: ways of the map's devices, (n, 3) each, drawn as lines.
         query_tracks: true ways of the query devices.
+        unit: what lengths are shown in, see `metrics.length_unit`.
     """
     map_poses = np.asarray(map_poses, np.float64)
     map_poses = map_poses[is_posed(map_poses)]
     axes, labels = ground_axes(up_of_cameras(map_poses) if up is None else up)
+    labels = [label.replace("[m]", f"[{unit[0]}]") for label in labels]
+    points, map_poses, estimated, true = points / unit[1], *(_in(unit, poses) for poses in (map_poses, estimated, true))
+    map_tracks, query_tracks = ([track / unit[1] for track in tracks] for tracks in (map_tracks, query_tracks))
     step = len(points) // max_points + 1
     cloud, shades = points[::step] @ axes.T, None if colors is None else colors[::step]
     cameras, estimated_xy, true_xy = (poses[:, :3, 3] @ axes.T for poses in (map_poses, estimated, true))
@@ -130,7 +137,9 @@ def draw_scene_png(
 
 
 @styled
-def draw_localization(query: QueryDetails, out: str | Path | None = None, title: str = "") -> "Figure":
+def draw_localization(
+    query: QueryDetails, out: str | Path | None = None, title: str = "", unit: tuple[str, float] = ("m", 1.0)
+) -> "Figure":
     """Draw the first image of a query beside its references, with what its pose rests on; return the figure.
 
     Green dots are inliers' points as the pose projects them, a white line leads from each to where it was measured;
@@ -141,6 +150,7 @@ def draw_localization(query: QueryDetails, out: str | Path | None = None, title:
         query: what was localized; its first image is drawn.
         out: PNG to write; None: no file.
         title: of the figure; the errors are added to it where the true pose is known.
+        unit: what lengths are shown in, see `metrics.length_unit`.
     """
     query = query.of_first_camera()
     shown, references = query.cameras[0], query.captioned_references()
@@ -178,8 +188,9 @@ def draw_localization(query: QueryDetails, out: str | Path | None = None, title:
         _dots(panel, _on(image.pixels[image.inlier]), s=5, c=GREEN, lw=0)
         _frame(panel, "0.6" if agrees else ESTIMATED, picture.shape[1], picture.shape[0])
     if located and is_posed(shown.world_from_cam_true):
-        rotation, meters = pose_error(shown.world_from_cam, shown.world_from_cam_true)
-        title = f"{title}{' · ' if title else ''}off by {float(rotation):.2g}°, {_length(float(meters))}"
+        rotation, distance = pose_error(shown.world_from_cam, shown.world_from_cam_true)
+        off = f"{float(rotation):.2g}°, {_length(float(distance) / unit[1], unit[0])}"
+        title = f"{title}{' · ' if title else ''}off by {off}"
     figure.suptitle(title)
     if out is not None:
         save_figure(figure, out, title)
@@ -207,7 +218,7 @@ def draw_worst(
     for rank, (axis, query) in enumerate(zip(panels, queries, strict=False), start=1):
         _draw_side_by_side(axis, query.details)
         known = np.isfinite(query.translation_m)
-        off = f"off by {query.rotation_deg:.2g}°, {_length(query.translation_m)}; " if known else ""
+        off = f"off by {query.rotation_deg:.2g}°, {_length(query.translation_m, query.unit)}; " if known else ""
         axis.set_title(f"{rank}. {query.pair}: {off}{query.reason}", fontsize=8, loc="left", wrap=True)
     legend = "left: query, right: its best reference; lines: inliers (green) and rejected matches (orange) of both"
     figure.suptitle(f"{title}\n({legend})")
@@ -252,8 +263,13 @@ def _frame(axis: "Axes", color: str, width: int, height: int) -> None:
     axis.spines[:].set(color=color, linewidth=1.5, visible=True)
 
 
-def _length(meters: float) -> str:
-    return f"{100 * meters:.2g} cm" if meters < 0.995 else f"{meters:.3g} m"
+def _length(length: float, unit: str) -> str:
+    return f"{100 * length:.2g} cm" if unit == "m" and length < 0.995 else f"{length:.3g} {unit}"
+
+
+def _in(unit: tuple[str, float], poses: Floats) -> Floats:
+    """Return poses with lengths in a unit."""
+    return make_pose(poses[..., :3, :3], poses[..., :3, 3] / unit[1])
 
 
 def _dots(axis: "Axes", xy: Floats, **style: Any) -> None:
