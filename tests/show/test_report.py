@@ -270,3 +270,16 @@ def test_what_escalation_gave_and_took():
         "That took 14 s, 3.50 s a query."
     )
     assert report._escalation(statuses.iloc[:1]) == []
+
+
+def test_what_is_known_of_a_map_is_said_and_lengths_without_a_unit_are_no_meters(full):
+    scene = next(path.parent for path in full.glob("*/poses"))
+    for name in ("recall", "errors", "losses"):
+        path = scene / "evaluation" / f"{name}.csv"
+        path.write_text(path.read_text().replace("m)", "L)"))
+    said = "the poses of the map contradict its images"
+    (scene / "poses" / f"{scene.name}_map_ios.json").write_text(json.dumps({"unit": None, "depth": 30.0, "text": said}))
+    text = text_of(write_report(full).read_text())
+    assert f"_map_ios: {said}" in text
+    assert "45 % mean recall at 1°, 0.1 L" in text
+    assert not re.search(r"\d\s*(cm|m)\b|\[c?m\]", text)

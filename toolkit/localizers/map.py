@@ -48,13 +48,15 @@ from toolkit.localizers.on_demand import OnDemandLocalizer, PosedImages
 from toolkit.localizers.pnp import PnpLocalizer
 from toolkit.localizers.prediction import Predictor
 from toolkit.localizers.predictors import create_predictor
-from toolkit.localizers.survey import NOMINAL_DEPTH
+from toolkit.localizers.survey import NOMINAL_DEPTH, USUAL_DEPTHS_M
 from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings, nearest
 
 log = logging.getLogger(__name__)
 
 SETTINGS = "settings"
 SESSIONS_ROOT = "sessions_root"
+ODD_DEPTHS_M = (0.1, 200.0)
+"""A map whose median depth is beyond these may be in another unit."""
 RETRIEVAL = "retrieval_dir"
 """Attributes of `poses/<pair>.h5`: the settings that the pair was localized with, the capture's `sessions`, and the
 folder of the references."""
@@ -111,8 +113,8 @@ class Map:
                 session, store, path, settings.map, settings.seed, skip_existing, inputs, workers, metric
             )
             mapped.append(MappedFeatures(local_map, store, KINDS[kind.name], kind.matcher, kind.name))
-        if mapped and place.consistency.text:
-            log.warning("%s: %s", session.id, place.consistency.text)
+        if mapped and place.remarks:
+            log.warning("%s: %s", session.id, place.remarks)
         return place
 
     @classmethod
@@ -197,10 +199,20 @@ class Map:
         """The setting `sure_position_std_m` in the unit of the poses."""
         return self.settings.pnp.sure_position_std_m * (1.0 if self.settings.unit else self.length)
 
+    @property
+    def remarks(self) -> str:
+        """What people should know of the map; empty where all is well."""
+        parts, depth = [self.consistency.text], self.length * USUAL_DEPTHS_M[int(self.length > 1)]
+        plausible = self.consistency.verdict != "inconsistent"
+        if plausible and self.settings.unit and self.length != 1 and not ODD_DEPTHS_M[0] < depth < ODD_DEPTHS_M[1]:
+            odd = f"the map shows what is {depth:.3g} m away in the median"
+            parts.append(f"{odd}: if its poses are not in meters, write `unit: null` in the manifest")
+        return "; ".join(filter(None, parts))
+
     def record(self) -> dict[str, Any]:
         """Return what is known of the map, as JSON."""
         depth = self.length * NOMINAL_DEPTH if self.settings.unit is None else None
-        return {"unit": self.settings.unit, "depth": depth, "text": self.consistency.text, **asdict(self.consistency)}
+        return {"unit": self.settings.unit, "depth": depth, "text": self.remarks, **asdict(self.consistency)}
 
     def judged(self, estimate: PoseEstimate) -> PoseEstimate:
         """Return an estimate as it is, or with low confidence in a map whose poses contradict its images."""

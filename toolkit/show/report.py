@@ -31,8 +31,8 @@ STATUS_COLUMNS = [
 EVALUATION_FIGURES = {
     "error_curves": (
         "Error curves",
-        "Share of queries [%] with an error below x, in meters (top) and degrees (bottom). A curve ends where queries "
-        "have no pose; dotted lines are the thresholds of the tables.",
+        "Share of queries [%] with an error of position (top) and rotation (bottom) below x. A curve ends where "
+        "queries have no pose; dotted lines are the thresholds of the tables.",
     ),
     "reliability": (
         "Reliability",
