@@ -201,7 +201,9 @@ class Map:
 
     @property
     def remarks(self) -> str:
-        """What people should know of the map; empty where all is well."""
+        """What people should know of the map; empty where all is well, or nothing was triangulated."""
+        if not self.mapped:
+            return ""
         parts, depth = [self.consistency.text], self.length * USUAL_DEPTHS_M[int(self.length > 1)]
         plausible = self.consistency.verdict != "inconsistent"
         if plausible and self.settings.unit and self.length != 1 and not ODD_DEPTHS_M[0] < depth < ODD_DEPTHS_M[1]:
