@@ -149,7 +149,8 @@ def test_a_finished_run_leaves_no_partial_files(finished: tuple[SceneFiles, pd.D
     names = {path.name for path in finished[0].poses_dir.iterdir()}
     stems = [finished[0].poses_txt("ios", device).stem for device in DEVICES]
     ends = ".txt", ".csv", ".h5", ".txt.meta.json", ".h5.meta.json"
-    assert names == {stem + end for stem in stems for end in ends} | {f"{finished[0].scene}_map_ios.json"}
+    of_the_map = {f"{finished[0].scene}_map_ios.json", "settings.json"}
+    assert names == {stem + end for stem in stems for end in ends} | of_the_map
 
 
 def test_nearest_is_the_pose_of_the_best_reference_and_labeled(small_capture: Path, run: SceneFiles) -> None:
