@@ -14,7 +14,7 @@ from tests.queries import ask, rests_on
 from toolkit import geometry
 from toolkit.features.features import DESCRIPTOR_SCALE, KINDS, LocalFeatures
 from toolkit.features.matching import MutualMatcher, PairMatches
-from toolkit.localizers.base import PoseEstimate
+from toolkit.localizers.base import CAMERA, PoseEstimate
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.matches import MappedFeatures
 from toolkit.localizers.pnp import VIEWS, PnpLocalizer
@@ -184,6 +184,27 @@ def test_exact_pixels_give_the_exact_pose(room: World) -> None:
     check(estimate, QUERY, 1e-4, 1e-5)
 
 
+def wrong(camera: pycolmap.Camera, factor: float) -> pycolmap.Camera:
+    """Return the camera as one states it whose focal length is off."""
+    params = np.array(camera.params) * [factor, factor, *[1.0] * (len(camera.params) - 2)]
+    return pycolmap.Camera(model=camera.model.name, width=camera.width, height=camera.height, params=params)
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+def test_a_wrong_focal_length_is_doubted_and_its_deviation_is_honest(room: World, model: str) -> None:
+    camera = CAMERAS[model]
+    seen = room.look(camera, QUERY)
+    estimate = ask(room.localizer(), [wrong(camera, 1.1)], np.eye(4)[None], [seen], [REFERENCES])
+    assert estimate.status == CAMERA
+    assert estimate.misfit
+    assert estimate.focals_px == pytest.approx([camera.mean_focal_length()], rel=0.01)
+    assert "the focal length that fits" in estimate.reason
+    assert estimate.world_from_rig is not None
+    error_m = float(geometry.pose_error(estimate.world_from_rig, QUERY)[1])
+    assert error_m > 0.1
+    assert estimate.position_std_m == pytest.approx(error_m, rel=0.2)
+
+
 RIG_FROM_CAMS = np.stack(
     [
         facing(0.3, 0.1, 0.0, yaw_deg=15),
@@ -198,7 +219,18 @@ def test_the_pose_of_a_rig_is_the_rigs(room: World) -> None:
     features = [room.look(c, QUERY @ r) for c, r in zip(RIG_CAMERAS, RIG_FROM_CAMS, strict=True)]
     estimate = ask(room.localizer(), RIG_CAMERAS, RIG_FROM_CAMS, features, [REFERENCES] * 3)
     check(estimate, QUERY)
+    assert not estimate.misfit
     assert set(rests_on(estimate)[0]) == {0, 1, 2}
+
+
+def test_of_a_rig_the_wrong_camera_is_named_by_its_place_among_the_images(room: World) -> None:
+    """An image without features is left out, and is counted."""
+    features: list = [room.look(c, QUERY @ r) for c, r in zip(RIG_CAMERAS, RIG_FROM_CAMS, strict=True)]
+    cameras = [RIG_CAMERAS[0], wrong(RIG_CAMERAS[1], 0.9), RIG_CAMERAS[2]]
+    estimate = ask(room.localizer(), cameras, RIG_FROM_CAMS, ["unreadable", *features[1:]], [REFERENCES] * 3)
+    assert estimate.status == CAMERA
+    assert np.isnan(np.array(estimate.focals_px)[[0, 2]]).all()
+    assert estimate.focals_px[1] == pytest.approx(PINHOLE.mean_focal_length(), rel=0.01)
 
 
 def test_one_camera_off_the_rigs_center_gives_the_rigs_pose(room: World) -> None:

@@ -17,6 +17,9 @@ from toolkit.localizers.correspondences import Correspondences
 
 CONFIRMED = (5.0, 0.5)  # degrees, meters: further apart, two answers contradict each other
 
+CAMERA = "low_confidence: camera?"
+"""Status of a pose whose matches contradict the intrinsics of the query."""
+
 NetworkMatches = Callable[[str], PairMatches]
 """Returns the matches of a query image with a map image, given by its name, that a network made before."""
 
@@ -87,7 +90,7 @@ class PoseEstimate:
     """The answer for one query device: a pose, or why there is none."""
 
     status: str
-    """`ok`, `low_confidence`, or `failed: <reason>`."""
+    """`ok`, `low_confidence`, `low_confidence: <reason>?`, or `failed: <reason>`."""
     world_from_rig: Floats | None = None
     """(4, 4); for a single camera the rig is the camera."""
     covariance: Floats | None = None
@@ -119,7 +122,12 @@ class PoseEstimate:
     rejected: tuple[int, ...] = ()
     """References whose predicted places contradict the others'."""
     reason: str = ""
-    """Of a prediction: what was left out or is unknown."""
+    """What intrinsics fit the query better than the stated; of a prediction, what was left out or is unknown."""
+    misfit: bool = False
+    """Whether the matches contradict the intrinsics of the query, see `misfit`: more features cannot mend that. Where
+    the contradiction is small, it shows in the covariance alone."""
+    focals_px: tuple[float, ...] = ()
+    """Of each query image the focal length that fits, if that is what contradicts, else NaN; empty: nothing does."""
 
     def scaled(self, factor: float) -> "PoseEstimate":
         """Return the estimate with all lengths times a factor."""
@@ -215,6 +223,11 @@ class ScaledLocalizer:
     def localize(self, query: Query, references: Sequence[References], prediction: Any = None) -> PoseEstimate:
         """Return one pose for the cameras of a rig, or for a single camera; see `Localizer`."""
         return self.inner.localize(query.scaled(1 / self._length), references, prediction).scaled(self._length)
+
+
+def rank(status: str) -> int:
+    """Return 2 for `ok`, 1 for a pose of low confidence, 0 for none."""
+    return {"ok": 2, "low_confidence": 1}.get(status.split(":")[0], 0)
 
 
 def agree(world_from_rig: Floats | None, other: Floats | None) -> bool:

@@ -7,7 +7,7 @@ from typing import Any
 from toolkit.capture.images import pixels_of
 from toolkit.features.features import KINDS, LocalFeatures, extract_turned
 from toolkit.features.stores import as_stored
-from toolkit.localizers.base import Localizer, PoseEstimate, Query, References
+from toolkit.localizers.base import Localizer, PoseEstimate, Query, References, rank
 from toolkit.localizers.on_demand import OnDemandLocalizer
 
 
@@ -26,7 +26,7 @@ def can_gain(query: Query, references: Sequence[References]) -> bool:
 
 def is_better(status: str, first_status: str) -> bool:
     """Tell whether a pose by all features is taken, rather than the one that was found before; statuses of both."""
-    return _rank(status) >= max(_rank(first_status), 1)
+    return rank(status) >= max(rank(first_status), 1)
 
 
 class EscalatingLocalizer:
@@ -64,7 +64,8 @@ class EscalatingLocalizer:
         `found_by` names the further kinds if the pose rests on the matches of all kinds.
         """
         estimate = self.first.localize(query, references, prediction)
-        if is_sure(estimate.status, estimate.position_std_m, self._limit_m) or not can_gain(query, references):
+        sure = is_sure(estimate.status, estimate.position_std_m, self._limit_m)
+        if sure or estimate.misfit or not can_gain(query, references):  # further features do not mend a camera
             return estimate
         escalated = self.escalate(self._with_all_features(query), references)
         return escalated if is_better(escalated.status, estimate.status) else estimate
@@ -88,7 +89,3 @@ class EscalatingLocalizer:
                 found.append(as_stored(extract_turned(method.extractor, [pixels], [turns])[0]))
             features.append([*known, *found])
         return replace(query, features=features, network_matches=[])
-
-
-def _rank(status: str) -> int:
-    return {"ok": 2, "low_confidence": 1}.get(status, 0)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from toolkit.localizers.base import PoseEstimate, Prior, Query, References, agree
+from toolkit.localizers.base import PoseEstimate, Prior, Query, References, agree, rank
 from toolkit.localizers.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
 from toolkit.localizers.lifting import DepthLifter
 from toolkit.localizers.pnp import PnpLocalizer
@@ -51,7 +51,7 @@ class HybridLocalizer:
         prior = _prior(predicted)
         priors = () if prior is None else (prior,)
         estimate = self.pnp.localize(query, references, None, priors)
-        if estimate.status != "ok":
+        if estimate.status != "ok" and not estimate.misfit:
             lifted = self.lifter.localize(query, references, answer, priors)
             estimate = estimate if lifted is None else _better(estimate, lifted)
         if predicted.world_from_rig is None:
@@ -67,8 +67,7 @@ class HybridLocalizer:
 
 def _better(matched: PoseEstimate, lifted: PoseEstimate) -> PoseEstimate:
     """Return the pose with the better status, else the lifted one only if clearly more matches support it."""
-    rank = {"ok": 2, "low_confidence": 1}
-    rank_matched, rank_lifted = rank.get(matched.status, 0), rank.get(lifted.status, 0)
+    rank_matched, rank_lifted = rank(matched.status), rank(lifted.status)
     clearly_more = matched.num_guided <= TIE * lifted.num_guided
     return lifted if rank_lifted > rank_matched or (rank_lifted == rank_matched > 0 and clearly_more) else matched
 

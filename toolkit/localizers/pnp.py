@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from toolkit import geometry
 from toolkit.geometry import Floats, Ints
-from toolkit.localizers.base import PoseEstimate, Prior, Query, References, agree
+from toolkit.localizers.base import CAMERA, PoseEstimate, Prior, Query, References, agree
 from toolkit.localizers.confidence import EVIDENCE, probability_right
 from toolkit.localizers.correspondences import Correspondences
 from toolkit.localizers.matches import MapMatcher, MappedFeatures
+from toolkit.localizers.misfit import find_misfit
 from toolkit.localizers.rig import Matches, RigQuery, least_squares_covariance
 from toolkit.manifest import PnpSettings
 
@@ -74,7 +75,9 @@ class PnpLocalizer:
                 return PoseEstimate(f"failed: no readable image ({'; '.join(map(str, query.features))})")
             estimate = self.localize(query.part(usable), [references[index] for index in usable], None, priors)
             used = replace(estimate.correspondences, camera=np.array(usable, np.int64)[estimate.correspondences.camera])
-            return replace(estimate, correspondences=used)
+            focals_px = np.full(len(query.features), np.nan)
+            focals_px[usable] = estimate.focals_px or np.nan
+            return replace(estimate, correspondences=used, focals_px=tuple(focals_px.tolist()))
         if not any(len(retrieved.images) for retrieved in references):
             return PoseEstimate("failed: no references")
         rig = RigQuery(
@@ -92,7 +95,34 @@ class PnpLocalizer:
             estimate = PoseEstimate(status, num_matches=len(matches), correspondences=self._rejected(matches))
         for prior in priors:
             estimate = self._compare(rig, matches, hypotheses, estimate, references, prior)
-        return estimate
+        return self._with_misfit(rig, matches, estimate)
+
+    def _with_misfit(self, query: RigQuery, matches: Matches, estimate: PoseEstimate) -> PoseEstimate:
+        """Return the estimate, doubted where matches made without the pose contradict the cameras.
+
+        The pose stays that of the stated intrinsics; its covariance then reaches to where those that fit would put it.
+        """
+        if estimate.world_from_rig is None:
+            return estimate
+        misfit = find_misfit(
+            query,
+            geometry.invert(estimate.world_from_rig),
+            matches[self.map.track_lengths[matches.point] > 1],  # the depth of others is not known from the map alone
+            self.map.points,
+            self.settings.ransac_max_error_deg,
+            focal_alone=estimate.rival_support > self.settings.ok_rival_support,
+        )
+        if misfit is None:
+            return estimate
+        covariance = estimate.covariance
+        return replace(
+            estimate,
+            status=CAMERA if misfit.doubtful else estimate.status,
+            covariance=None if covariance is None else covariance + np.outer(misfit.shift, misfit.shift),
+            misfit=True,
+            focals_px=misfit.focals_px(query.cameras),
+            reason=misfit.reason(query.cameras),
+        )
 
     def _compare(
         self,
