@@ -129,6 +129,27 @@ def test_counts_balance(small_capture: Path, finished: tuple[SceneFiles, pd.Data
         assert not row.skipped
 
 
+def test_a_wrong_focal_length_is_doubted_and_said_once_a_camera(
+    capture: Path, run: SceneFiles, caplog: pytest.LogCaptureFixture
+) -> None:
+    sensors = capture / "sessions" / "ios_query" / "sensors.txt"
+    text = sensors.read_text()
+    for line in text.splitlines():
+        if ", camera, " in line:
+            *start, focal_x, focal_y, x, y = line.split(", ")
+            wrong = [f"{1.1 * float(focal)}" for focal in (focal_x, focal_y)]
+            text = text.replace(line, ", ".join([*start, *wrong, x, y]))
+    sensors.write_text(text)
+    run_stage(capture, run, query_device="ios")
+    found = rows_of(run, "ios")
+    assert not (found["status"] == "ok").any()
+    doubted = found[found["status"] == "low_confidence: camera?"]
+    assert len(doubted) > len(found) / 2
+    assert doubted["focal_px"].notna().all()
+    assert doubted["reason"].str.contains("the focal length that fits").all()
+    assert [record for record in caplog.messages if "ios_query/sensors.txt" in record]
+
+
 def test_rows_say_how_a_pose_came_about(finished: tuple[SceneFiles, pd.DataFrame]) -> None:
     found = rows_of(finished[0], "hl")
     ok = found[found["status"] == "ok"]

@@ -18,6 +18,7 @@ from tqdm.auto import tqdm
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import default_workers, prefetch
+from toolkit.capture.tables import read_query_table
 from toolkit.errors import INTERNAL, ToolkitError, reason_of
 from toolkit.features.features import KINDS
 from toolkit.features.groups import GroupWriter, heals
@@ -69,10 +70,12 @@ from toolkit.localizers.map import (
     update_attributes,
 )
 from toolkit.localizers.mapping import map_settings
+from toolkit.localizers.misfit import LEAST_SIZE, SIGNIFICANCE
 from toolkit.localizers.picture import localize_image
 from toolkit.localizers.prediction import Predictor
 from toolkit.manifest import LocalizeSettings
 from toolkit.runs.pairs import PairRows
+from toolkit.show.metrics import camera_messages
 
 __all__ = ["COLUMNS", "PREDICTION_COLUMNS", "Map", "explain_query", "localize_image", "localize_pairs"]
 
@@ -81,9 +84,9 @@ log = logging.getLogger(__name__)
 COLUMNS = [
     "timestamp", "device_id", "status", "method", "num_inliers", "num_matches", "inlier_ratio", "num_guided",
     "rmse_px", "rival_support", "coverage", "agreement", "p_correct", "position_std_m", "rotation_std_deg",
-    "references", "seconds",
+    "references", "seconds", "focal_px", "reason",
 ]  # fmt: skip
-PREDICTION_COLUMNS = ["scale_std", "rejected", "reason"]
+PREDICTION_COLUMNS = ["scale_std", "rejected"]
 """Further columns of the methods that predict."""
 
 ESCALATION_COLUMNS = ["first_status", "first_seconds"]
@@ -149,6 +152,7 @@ def localize_pairs(
         )
         return place, create_localizer(settings, place, predictor)
 
+    asked: dict[str, list[pd.DataFrame]] = {}
     devices = product(capture.devices_with("map", map_device), capture.devices_with("query", query_device))
     with threadpool_limits(1, "blas"):  # queries are the parallel dimension, and sums stay in one order
         for mapped, queried in devices:
@@ -171,7 +175,8 @@ def localize_pairs(
                 if update_attributes(pair.file("h5"), about) or not skipped:
                     files = pair.file("csv"), pair.file("h5")
                     write_sidecar(pair.file("txt"), record, files, unfinished=unfinished)
-                rows = pd.read_csv(pair.file("csv"))
+                rows = read_query_table(pair.file("csv"), ["status"])
+                asked.setdefault(queried, []).append(rows)
                 counts = rows["status"].str.split(":").str[0].value_counts()
                 row |= {
                     "queries": int(counts.sum()),
@@ -184,6 +189,9 @@ def localize_pairs(
                 }
             if row["reason"]:
                 pair.remove_poses()
+    for queried, tables in asked.items():
+        for message in camera_messages(capture[f"{queried}_query"], tables):
+            log.warning(message)
     frame = table.frame()
     write_text(Path(out_dir) / "settings.json", settings.model_dump_json(indent=1) + "\n")
     return frame
@@ -239,6 +247,7 @@ class _Pair:
         record: dict[str, Any] = {
             "method": settings.method,
             "pnp": settings.pnp.model_dump() | {"seed": settings.seed},
+            "misfit": [SIGNIFICANCE, LEAST_SIZE],
             "map": settings.map and map_settings(settings.map, settings.seed),
             "features": [kind.extractor.settings for kind in kinds],
             "matchers": [kind.matcher.settings for kind in kinds],
@@ -410,7 +419,7 @@ class _PairRun:
         todo = [
             number
             for number, row in rows.items()
-            if not (row.get("first_status") or is_sure(row["status"], row["position_std_m"], limit))
+            if not (row.get("first_status") or row["misfit"] or is_sure(row["status"], row["position_std_m"], limit))
             and can_gain(*self.query(number))
         ]
         if not todo:
@@ -492,6 +501,7 @@ def _row(
     """Return a query's line of the table, with its pose and covariance as JSON."""
     pose = None if estimate.world_from_rig is None else geometry.qt_from_pose(estimate.world_from_rig).tolist()
     covariance = None if estimate.covariance is None else estimate.covariance.ravel().tolist()
+    focals = estimate.focals_px if np.isfinite(estimate.focals_px).any() else ()
     return {
         "timestamp": key[0],
         "device_id": key[1],
@@ -510,9 +520,11 @@ def _row(
         "rotation_std_deg": round(estimate.rotation_std_deg, 6),
         "references": ";".join(localized.references),
         "seconds": round(time.perf_counter() - started, 4),
+        "focal_px": ";".join("" if np.isnan(focal) else f"{focal:.1f}" for focal in focals),
         "scale_std": round(estimate.scale_std, 6),
         "rejected": ";".join(localized.rejected),
         "reason": estimate.reason,
+        "misfit": estimate.misfit,
         "first_status": None,
         "first_seconds": None,
         "qt": pose,

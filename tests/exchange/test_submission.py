@@ -58,7 +58,8 @@ def make_poses(run: Path, scene: str, mapped: str, query: str, times: tuple[int,
     qt = np.array([pose_of(scene, query, time) for time in times]).reshape(-1, 7)
     covariances = np.tile(np.eye(6), (len(times), 1, 1)) if len(times) else None
     Trajectory(times, ids, qt, covariances).write(files.poses_txt(mapped, query))
-    statuses = ["low_confidence" if time == 300 else "ok" if time in times else "failed: no match" for time in TIMES]
+    posed = {time: "low_confidence: camera?" if time == 300 else "ok" for time in times}
+    statuses = [posed.get(time, "failed: no match") for time in TIMES]
     pd.DataFrame(
         {"timestamp": TIMES, "device_id": [device_of(query, time) for time in TIMES], "status": statuses}
     ).to_csv(files.poses_csv(mapped, query), index=False)

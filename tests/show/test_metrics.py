@@ -1,13 +1,15 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pandas as pd
 
-from toolkit.show.metrics import parse_threshold, threshold_name, worst_first
+from toolkit.show.metrics import camera_messages, parse_threshold, threshold_name, worst_first
 
 
 def test_without_truth_failed_and_weak_queries_come_first():
     """A sheet of 18 phone pictures once began with the query of the most inliers and left out the weakest."""
     queries = pd.DataFrame({
-        "status": ["ok", "ok", "low_confidence", "failed: too few inliers", "ok", "low_confidence"],
+        "status": ["ok", "ok", "low_confidence: camera?", "failed: too few inliers", "ok", "low_confidence"],
         "num_inliers": [593, 20, 30, np.nan, 20, 12],
         "position_std_m": [0.01, 0.02, 0.5, np.nan, 0.3, 0.1],
     })  # fmt: skip
@@ -19,7 +21,7 @@ def test_without_truth_failed_and_weak_queries_come_first():
 
 def test_with_truth_the_larger_error_in_units_of_the_threshold_decides():
     queries = pd.DataFrame({
-        "status": ["ok", "low_confidence", "failed", "ok"],
+        "status": ["ok", "low_confidence: camera?", "failed", "ok"],
         "num_inliers": [9, 8, 0, 500],
         "rotation_error_deg": [2.0, 0.1, np.inf, 0.1],
         "translation_error_m": [0.01, 0.15, np.inf, 0.4],
@@ -31,3 +33,25 @@ def test_with_truth_the_larger_error_in_units_of_the_threshold_decides():
 
 def test_names_of_thresholds_are_read_back():
     assert parse_threshold(f"recall@{threshold_name((5, 0.5))}") == (5, 0.5)
+
+
+def test_a_camera_that_does_not_fit_most_of_its_queries_is_named_once():
+    """A phone with a camera for each picture, and a rig of which one camera is off in one of three answers."""
+    names = ["phone/cam_630003697552", "phone/cam_630007005828", "rig/left", "rig/right", "rig/left", "rig/right"]
+    stated = {"phone/cam_630003697552": 500.0, "phone/cam_630007005828": 510.0, "rig/left": 400.0, "rig/right": 400.0}
+    session = SimpleNamespace(
+        id="ios_query",
+        images=pd.DataFrame({"sensor_id": names}),
+        camera=lambda name: SimpleNamespace(mean_focal_length=lambda: stated[name]),
+        rows_of_keyframes=lambda table: [np.array(rows) for rows in ([0], [1], [2, 3], [4, 5])][: len(table)],
+    )
+    doubted = "low_confidence: camera?"
+    first = pd.DataFrame({
+        "status": [doubted, doubted, doubted, doubted], "focal_px": ["450.0", "459.0", "361.0;440.0", "359.0;"],
+    })  # fmt: skip
+    second = pd.DataFrame({"status": ["ok", "failed: no match", "ok", "ok"], "focal_px": np.full(4, np.nan)})
+    messages = camera_messages(session, [first, second])  # type: ignore[arg-type]
+    assert [message.split(":")[0] for message in messages] == ["camera phone/cam", "camera rig/left"]
+    assert "0.900 times those in ios_query/sensors.txt (median of 2 answers)" in messages[0]
+    assert "360 px (median of 2 answers), ios_query/sensors.txt says 400 px" in messages[1]
+    assert camera_messages(session, [second.drop(columns="focal_px")]) == []  # type: ignore[arg-type]

@@ -1,5 +1,6 @@
 """How good poses are: errors, recall, why queries are lost, and which queries are the worst."""
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from toolkit.geometry import Floats, Ints, pose_error
 
 if TYPE_CHECKING:
-    from toolkit.capture import Trajectory
+    from toolkit.capture import Session, Trajectory
 
 Threshold = tuple[float, float]
 """Degrees and meters."""
@@ -131,3 +132,42 @@ def worst_first(queries: pd.DataFrame, threshold: Threshold = THRESHOLDS[0]) -> 
     error = np.maximum(rotation, translation / threshold[1])
     # The last key counts most.
     return np.lexsort((-column("position_std_m", np.inf), column("num_inliers", 0), sure, -error, ok))
+
+
+def camera_messages(session: "Session", tables: Sequence[pd.DataFrame]) -> list[str]:
+    """Return a sentence for each camera whose focal length does not fit most of its queries.
+
+    Cameras whose names differ only in a time at the end, as those of a phone that has one for each picture, are one.
+
+    Args:
+        session: of the queries.
+        tables: `poses/<pair>.csv` of pairs with these queries: timestamp, device_id, status and focal_px.
+    """
+    posed: dict[str, int] = {}
+    found: dict[str, list[tuple[float, float]]] = {}
+    sensors = session.images["sensor_id"].to_numpy()
+    for table in tables:
+        focals = table["focal_px"] if "focal_px" in table else pd.Series("", table.index)
+        statuses = table["status"].fillna("failed")
+        for images, status, text in zip(session.rows_of_keyframes(table), statuses, focals.astype(str), strict=True):
+            if status.startswith("failed"):
+                continue
+            doubted = text.split(";") if status.startswith("low_confidence: ") else []
+            of_images = pd.to_numeric(pd.Series(doubted, dtype=str).reindex(range(len(images))), errors="coerce")
+            for sensor_id, focal_px in zip(sensors[images], of_images, strict=True):
+                name = re.sub(r"[_-]\d{6,}$", "", sensor_id)
+                posed[name] = posed.get(name, 0) + 1
+                if focal_px > 0:
+                    stated_px = session.camera(sensor_id).mean_focal_length()
+                    found.setdefault(name, []).append((focal_px, stated_px))
+    messages = []
+    for name, pairs in found.items():
+        if len(pairs) < posed[name] / 2:
+            continue
+        fitted, stated = np.array(pairs).T
+        file, of = f"{session.id}/sensors.txt", f"(median of {len(pairs)} answers)"
+        fits = f"the focal length that fits is {np.median(fitted):.0f} px {of}, {file} says {stated[0]:.0f} px"
+        if np.ptp(stated) > 0:
+            fits = f"the focal lengths that fit are {np.median(fitted / stated):.3f} times those in {file} {of}"
+        messages.append(f"camera {name}: {fits}. Correct it and localize again.")
+    return messages
