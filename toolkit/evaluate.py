@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -38,6 +39,7 @@ from toolkit.show.metrics import (
     WRONG,
     WRONG_POSE,
     Threshold,
+    camera_messages,
     is_below,
     is_posed,
     length_unit,
@@ -55,9 +57,11 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
-FIGURES = ("recall", "median_errors", "error_curves", "losses", "reliability", "retrieval")
+FIGURES = ("recall", "median_errors", "error_curves", "losses", "reliability", "deviations", "retrieval")
 ERROR_COLUMNS = ["map_device", "query_device", "timestamp", "device_id", "status", "num_inliers", "p_correct",
-                 "rotation_error_deg", "translation_error_m"]  # fmt: skip
+                 "position_std_m", "rotation_error_deg", "translation_error_m"]  # fmt: skip
+DETAILS = ("num_inliers", "p_correct", "position_std_m")
+"""Columns of a pair's table that are compared with its errors."""
 LEAST_OVERLAP = 0.1
 """A first reference overlaps with the query if the query sees at least this share of the map points that it sees."""
 
@@ -119,6 +123,7 @@ def evaluate_scene(
         try:
             session = capture[f"{query}_query"]
             keys, truth = _queries_with_truth(session, queries, messages)
+            messages += camera_messages(session, _query_tables(poses_dir, capture.name, asked, query))
         except CaptureError as error:
             reason = str(error)
         for map_ in asked:
@@ -222,8 +227,18 @@ def _queries_with_truth(session: Session, queries: str, messages: list[str]) -> 
     return keys[has_truth].reset_index(drop=True), truth
 
 
+def _query_tables(poses_dir: str | Path, scene: str, map_devices: Sequence[str], query: str) -> list[pd.DataFrame]:
+    """Return the readable tables of a query device's pairs."""
+    tables = []
+    for map_ in map_devices:
+        path = Path(poses_dir) / f"{pair_name(scene, map_, query)}.csv"
+        with suppress(ArtifactError):  # `_read_results` says so
+            tables += [read_query_table(path, ["status"])] if path.is_file() else []
+    return tables
+
+
 def _read_results(stem: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, str]:
-    """Return `keys` with columns pose (4, 4), status, num_inliers and p_correct; and the state of the pair."""
+    """Return `keys` with columns pose (4, 4), status and those of `DETAILS`; and the state of the pair."""
     path, table = stem.with_name(f"{stem.name}.txt"), stem.with_name(f"{stem.name}.csv")
     if not path.is_file():
         return None, "no poses file"
@@ -237,7 +252,7 @@ def _read_results(stem: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, 
     located = is_posed(poses)
     # A file of another tool has poses only; then a pose is a pose.
     status = np.where(located, "ok", "failed: no pose")
-    results = keys.assign(pose=list(poses), status=status, num_inliers=np.nan, p_correct=np.nan)
+    results = keys.assign(pose=list(poses), status=status, **dict.fromkeys(DETAILS, np.nan))
     columns = ["timestamp", "device_id"]
     try:
         require_whole(table, of=path)
@@ -247,7 +262,7 @@ def _read_results(stem: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, 
     except ArtifactError as error:
         return results, f"unreadable table of queries ({error})"
     details = keys.merge(details, how="left", on=columns)
-    for name in ("num_inliers", "p_correct"):
+    for name in DETAILS:
         if name in details:
             results[name] = details[name].astype(float)
     results["status"] = details["status"].fillna(results["status"])

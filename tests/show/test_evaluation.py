@@ -1,9 +1,10 @@
 """Figures of an evaluation: what they count."""
 
+import numpy as np
 import pandas as pd
 import pytest
 
-from toolkit.show.evaluation import draw_reliability, wilson_interval
+from toolkit.show.evaluation import draw_deviations, draw_reliability, wilson_interval
 
 
 def test_wilson_interval() -> None:
@@ -24,3 +25,16 @@ def test_the_share_of_right_poses_stands_over_what_was_stated() -> None:
     points = [tuple(line.get_xydata()[0]) for line in axis.lines if line.get_marker() == "o"]
     assert points == [pytest.approx((60, 75)), pytest.approx((99.5, 0))]
     assert [text.get_text() for text in axis.texts] == ["4", "1"]
+
+
+def test_errors_stand_over_the_deviations_that_were_stated() -> None:
+    """One of two `ok` poses is off by ten stated deviations; what has no deviation or no pose is left out."""
+    errors = pd.DataFrame({
+        "status": ["ok", "ok", "low_confidence: camera?", "low_confidence", "failed: no match"],
+        "position_std_m": [0.01, 0.01, 0.5, float("nan"), float("nan")],
+        "translation_error_m": [0.005, 0.1, 0.4, 2.0, float("inf")],
+    })  # fmt: skip
+    (axis,) = draw_deviations(errors).axes
+    points = {line.get_label(): line.get_xydata() for line in axis.lines if line.get_alpha()}
+    assert list(points) == ["ok: 2, 50 % above", "low confidence: 1, 0 % above"]
+    np.testing.assert_allclose(np.concatenate(list(points.values())), [(0.01, 0.005), (0.01, 0.1), (0.5, 0.4)])

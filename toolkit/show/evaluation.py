@@ -21,6 +21,8 @@ from toolkit.show.metrics import (
     unit_of,
 )
 
+BEYOND = 5
+"""Stated deviations beyond which an error is no chance."""
 RELIABILITY_BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, 1.0)
 
 if TYPE_CHECKING:
@@ -78,6 +80,8 @@ def draw_evaluation(evaluation: Evaluation) -> dict[str, "Figure"]:
         figures["error_curves"] = draw_error_curves(evaluation.errors, evaluation.thresholds, unit)
         if "p_correct" in evaluation.errors and evaluation.errors["p_correct"].notna().any():
             figures["reliability"] = draw_reliability(evaluation.errors, unit)
+        if "position_std_m" in evaluation.errors and evaluation.errors["position_std_m"].gt(0).any():
+            figures["deviations"] = draw_deviations(evaluation.errors, unit)
         if evaluation.losses["missed"].sum():
             figures["losses"] = draw_losses(evaluation.losses)
     retrieval = evaluation.retrieval
@@ -217,6 +221,38 @@ def draw_reliability(errors: pd.DataFrame, unit: str = "m") -> "Figure":
     axis.set_ylabel("poses that are right [%]")
     axis.grid(alpha=0.25)
     figure.suptitle(f"How far stated probabilities hold (right: {_limit(WRONG, unit)})")
+    return figure
+
+
+@styled
+def draw_deviations(errors: pd.DataFrame, unit: str = "m") -> "Figure":
+    """Draw how far poses are off against the standard deviation that the localizer states of their position.
+
+    A line joins the medians of a tenth of the poses each. Where the errors are Gaussian, they lie a little below the
+    stated deviation, and hardly any pose is above the upper line.
+    """
+    errors = errors[errors["position_std_m"].gt(0) & np.isfinite(errors["translation_error_m"])]
+    stated, actual = (errors[name].to_numpy(float).clip(1e-5) for name in ("position_std_m", "translation_error_m"))
+    ok = (errors["status"] == "ok").to_numpy(bool)
+    figure = new_figure(5.2, 4.6)
+    axis = figure.subplots()
+    low, high = min(stated.min(), actual.min()) / 1.5, max(stated.max(), actual.max()) * 1.5
+    axis.plot([low, high], [low, high], color="0.6", lw=1, ls=":", label="error = stated deviation")
+    axis.plot([low, high], [BEYOND * low, BEYOND * high], color="0.6", lw=1, ls="--", label=f"{BEYOND} times that")
+    for part, name, color in ((ok, "ok", SKY), (~ok, "low confidence", ORANGE)):
+        if part.any():
+            beyond = float(np.mean(actual[part] > BEYOND * stated[part]))
+            label = f"{name}: {part.sum()}, {percent(beyond)} % above"
+            axis.plot(stated[part], actual[part], "o", ms=3.5, alpha=0.5, mew=0, color=color, label=label)
+    tenths = [part for part in np.array_split(np.argsort(stated), 10) if len(part)]
+    middles = np.array([(np.median(stated[part]), np.median(actual[part])) for part in tenths])
+    axis.plot(*middles.T, color="0.15", lw=1.5, marker="o", ms=3, label="median of a tenth of the poses")
+    axis.set(xscale="log", yscale="log", xlim=(low, high), ylim=(low, high))
+    axis.set_xlabel(f"stated standard deviation of the position [{unit}]")
+    axis.set_ylabel(f"error of the position [{unit}]")
+    axis.grid(alpha=0.25)
+    axis.legend(frameon=False, fontsize=8, loc="upper left")
+    figure.suptitle("How far stated deviations hold")
     return figure
 
 

@@ -39,6 +39,11 @@ EVALUATION_FIGURES = {
         "Share of poses that are right against the probability that was stated (p_correct), with intervals of 95 % and "
         "the number of poses. On the dotted line both agree; ok means 99 % or more.",
     ),
+    "deviations": (
+        "Stated and actual deviation",
+        "Error of each pose's position [m] against the standard deviation that was stated of it (position_std_m), and "
+        "the median of each tenth of the poses. Above the dashed line, poses are off by more than five deviations.",
+    ),
     "losses": (
         "Where accuracy was lost",
         "What the misses at each threshold come from, in % of the queries. No good reference: retrieval found no map "
