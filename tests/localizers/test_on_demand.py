@@ -221,7 +221,7 @@ class Scripted:
 OK, LOW = PoseEstimate("ok", np.eye(4)), PoseEstimate("low_confidence", np.eye(4))
 VAGUE = replace(OK, covariance=np.eye(6))
 FAILED = PoseEstimate("failed: no consistent pose")
-CAMERA = PoseEstimate("low_confidence: camera?", np.eye(4), misfit=True)
+DOUBTED = PoseEstimate("low_confidence: camera?", np.eye(4), misfit=True)
 SLIGHT = replace(VAGUE, misfit=True)  # a misfit that shows in the covariance alone
 
 
@@ -229,9 +229,9 @@ SLIGHT = replace(VAGUE, misfit=True)  # a misfit that shows in the covariance al
     ("first", "second", "status", "found_by"),
     [
         (OK, None, "ok", "pnp"),
-        (CAMERA, None, "low_confidence: camera?", "pnp"),
+        (DOUBTED, None, "low_confidence: camera?", "pnp"),
         (SLIGHT, None, "ok", "pnp"),
-        (FAILED, CAMERA, "low_confidence: camera?", "pnp+other"),
+        (FAILED, DOUBTED, "low_confidence: camera?", "pnp+other"),
         (LOW, OK, "ok", "pnp+other"),
         (FAILED, OK, "ok", "pnp+other"),
         (LOW, LOW, "low_confidence", "pnp+other"),
