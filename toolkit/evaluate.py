@@ -300,6 +300,8 @@ def _errors_of(
         frame.insert(2, "sensor_id", session.images["sensor_id"].to_numpy()[images])
     rotation_deg, translation_m = pose_errors(estimated, true)
     translation_m /= length
+    if "position_std_m" in frame:
+        frame["position_std_m"] /= length
     frame["rotation_error_deg"], frame["translation_error_m"] = rotation_deg, translation_m
     no_reference = np.zeros(len(frame), bool) if good is None else ~frame["good_reference"].to_numpy(bool)
     reason = np.select([no_reference, ~np.isfinite(rotation_deg)], [NO_REFERENCE, NO_POSE], WRONG_POSE)
