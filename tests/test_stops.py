@@ -11,6 +11,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import psutil
@@ -358,3 +359,10 @@ def test_notebook_parameters_of_a_wrong_type_are_named(stage: str, values: dict[
 @pytest.mark.parametrize("stage", ["explore", "embed", "retrieve", "rerank", "localize", "evaluate", "visualize"])
 def test_notebook_parameters_as_committed_fit(stage: str) -> None:
     notebook.check_values(stage, notebook.notebook_parameters(notebook.notebook_path(stage)))
+
+
+def test_a_notebook_looks_at_its_parameters_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    shell = SimpleNamespace(user_ns={"In": [""], "topk": "ten"})
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
+    with pytest.raises(ManifestError, match="topk"):
+        notebook.start("retrieve", sessions_root="nowhere/sessions", out_jsonl="nowhere")
