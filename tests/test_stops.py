@@ -205,6 +205,8 @@ def test_a_signal_ends_the_run_its_kernels_and_sockets(place: Path, number: sign
     code += "Path(out_jsonl).write_text(str(os.getpid()))\ntime.sleep(600)"
     write_notebook(place / "notebooks", "retrieve", PARAMETERS, code)
     script = (
+        # A shell that starts the tests in the background has them ignore Ctrl-C.
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
         "import sys; from pathlib import Path; from toolkit import __main__, notebook, pipeline;"
         f"notebook.NOTEBOOKS = Path({str(place / 'notebooks')!r}); pipeline.STAGES = ('retrieve',);"
         f"sys.argv = ['toolkit', 'run', {str(place / 'run.yaml')!r}, '--only', 'retrieve', '--json']; __main__.main()"

@@ -747,10 +747,12 @@ def test_a_run_says_what_to_download(manifest: Path) -> None:
         pipeline.run(manifest)
 
 
-def test_the_command_line(hub: FakeHub, manifest: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_line(
+    hub: FakeHub, manifest: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     from typer.testing import CliRunner
 
-    from toolkit.__main__ import app
+    from toolkit.__main__ import app, main
 
     result = CliRunner().invoke(app, ["download", str(manifest), "--sessions", "ios_map, ios_query", "--dry-run"])
     assert result.exit_code == 0, result.output
@@ -765,9 +767,11 @@ def test_the_command_line(hub: FakeHub, manifest: Path, monkeypatch: pytest.Monk
         raise KeyboardInterrupt
 
     monkeypatch.setattr(module, "download", interrupted)
-    result = CliRunner().invoke(app, ["download", str(manifest)])
-    assert result.exit_code == 130
-    assert "goes on from here" in result.output
+    monkeypatch.setattr("sys.argv", ["toolkit", "download", str(manifest)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 130
+    assert "goes on from here" in capsys.readouterr().err
 
 
 def hub_of(capture: Path) -> Files:

@@ -220,8 +220,10 @@ class Map:
         """Return an estimate as it is, or with low confidence in a map whose poses contradict its images."""
         if self.consistency.verdict != "inconsistent" or estimate.world_from_rig is None:
             return estimate
-        reason = "; ".join(filter(None, [estimate.reason, self.consistency.text]))
-        return replace(estimate, status="low_confidence: the poses of the map contradict its images", reason=reason)
+        # In such a map no camera can be judged.
+        reason = "; ".join(filter(None, ["" if estimate.misfit else estimate.reason, self.consistency.text]))
+        status = "low_confidence: the poses of the map contradict its images"
+        return replace(estimate, status=status, reason=reason, focals_px=())
 
     @cached_property
     def localizer(self) -> Localizer:

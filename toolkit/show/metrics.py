@@ -147,9 +147,10 @@ def camera_messages(session: "Session", tables: Sequence[pd.DataFrame]) -> list[
     found: dict[str, list[tuple[float, float]]] = {}
     sensors = session.images["sensor_id"].to_numpy()
     for table in tables:
-        focals = table["focal_px"] if "focal_px" in table else pd.Series("", table.index)
+        focals = (table["focal_px"] if "focal_px" in table else pd.Series("", table.index)).astype(object)
+        texts = focals.where(focals.notna(), "").astype(str)
         statuses = table["status"].fillna("failed")
-        for images, status, text in zip(session.rows_of_keyframes(table), statuses, focals.astype(str), strict=True):
+        for images, status, text in zip(session.rows_of_keyframes(table), statuses, texts, strict=True):
             if status.startswith("failed"):
                 continue
             doubted = text.split(";") if status.startswith("low_confidence: ") else []
