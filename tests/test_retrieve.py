@@ -10,8 +10,11 @@ import pytest
 
 from tests.test_embed import HL_RIG, write_tiny_capture
 from toolkit.embed import embed_sessions
+from toolkit.embedders import StoredVectors
+from toolkit.embedders import search as search_module
 from toolkit.errors import ArtifactError, CaptureError, ManifestError
 from toolkit.files import sidecar_path
+from toolkit.geometry import unit
 from toolkit.retrieve import load_embeddings, retrieve_pairs, search
 
 BACKENDS = ["faiss", "torch"]
@@ -40,6 +43,32 @@ def test_equal_scores_come_by_index(backend: str) -> None:
         assert indices[row].tolist() == same[:6].tolist()
     assert indices[3].tolist() == list(range(6))
     assert not scores[3].any()
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float16])
+@pytest.mark.parametrize("normalize", [True, False])
+def test_vectors_on_disk_are_searched_block_by_block(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dtype: type, normalize: bool
+) -> None:
+    rng = np.random.default_rng(0)
+    sizes, dim = (13, 0, 1, 40), 24
+    parts = [(rng.normal(size=(size, dim)) * rng.uniform(0.5, 2)).astype(dtype) for size in sizes]
+    parts[3][20:30] = parts[3][5]  # ties across blocks
+    for number, part in enumerate(parts):
+        np.save(tmp_path / f"{number}.npy", part)
+    chosen = np.array([0, 2, 3, 4, 5, 12, 13, *range(15, 54)])
+    stack = np.concatenate(parts).astype(np.float32)[chosen]
+    starts = (0, *np.cumsum(sizes).tolist())
+    stored = StoredVectors(tuple(tmp_path / f"{n}.npy" for n in range(4)), starts, dim, chosen, normalize)
+    np.testing.assert_array_equal(stored[:], unit(stack) if normalize else stack)
+    np.testing.assert_array_equal(stored[np.array([1, 8, 40])], stored[:][[1, 8, 40]])
+    query = np.concatenate([rng.normal(size=(9, dim)), parts[3][5:6], np.zeros((1, dim))])
+    expected = search(query, stored[:], 12)
+    monkeypatch.setattr(search_module, "_BLOCK_BYTES", 7 * 4 * dim)
+    for backend in BACKENDS:
+        scores, indices = search(query, stored, 12, backend)
+        np.testing.assert_array_equal(indices, expected[1])
+        np.testing.assert_array_equal(scores, expected[0])
 
 
 def test_search_limits() -> None:

@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
-from toolkit.embedders import load_embeddings
+from toolkit.embedders import StoredVectors, load_embeddings, open_embeddings
 from toolkit.embedders.search import Backend, search
 from toolkit.errors import ArtifactError, CaptureError, ManifestError
 from toolkit.files import (
@@ -29,11 +28,11 @@ from toolkit.files import (
     write_sidecar,
     write_text,
 )  # fmt: skip
-from toolkit.geometry import Ints, unit
+from toolkit.geometry import Ints
 from toolkit.manifest import RetrieveSettings
 from toolkit.runs.pairs import PairRows
 
-__all__ = ["retrieve_pairs", "search"]
+__all__ = ["load_embeddings", "retrieve_pairs", "search"]
 
 log = logging.getLogger(__name__)
 
@@ -85,11 +84,11 @@ def retrieve_pairs(
 
     @cache
     def load_queries(device: str) -> _Images:
-        return _load_queries(capture[f"{device}_query"], embeddings, queries)
+        return _load_queries(capture[f"{device}_query"], embeddings, queries, settings.normalize)
 
     @lru_cache(maxsize=1)
     def load_database(device: str) -> _Images:
-        return _load_database(capture[f"{device}_map"], embeddings)
+        return _load_database(capture[f"{device}_map"], embeddings, settings.normalize)
 
     for device, queried in product(map_devices, query_devices):
         with table.row(device, queried) as row:
@@ -129,7 +128,7 @@ class _Images:
 
     session: Session
     rows: Ints
-    vectors: NDArray[np.float32]
+    vectors: StoredVectors
     table: pd.DataFrame
     keyframes: int = 0
     keyframes_missing: int = 0
@@ -138,12 +137,12 @@ class _Images:
 
     def take(self, chosen: Ints) -> "_Images":
         table = self.table.iloc[chosen].reset_index(drop=True)
-        return replace(self, rows=self.rows[chosen], vectors=self.vectors[chosen], table=table)
+        return replace(self, rows=self.rows[chosen], vectors=self.vectors.choose(chosen), table=table)
 
 
-def _load(session: Session, embeddings: Path) -> _Images:
+def _load(session: Session, embeddings: Path, normalize: bool) -> _Images:
     folder = embeddings / session.id
-    vectors, table = load_embeddings(folder)
+    vectors, table = open_embeddings(folder)
     names = table["abs_path"].str.split(f"/sessions/{session.path.name}/raw_data/", n=1, regex=False).str[-1]
     rows = pd.Index(session.images["path"]).get_indexer(names)
     if (rows < 0).any():
@@ -151,11 +150,11 @@ def _load(session: Session, embeddings: Path) -> _Images:
             f"{folder}: {(rows < 0).sum()} embedded images are not in {session.path / 'images.txt'}, first "
             f"{table['abs_path'][int(np.argmax(rows < 0))]}. They are of another capture: embed again."
         )
-    return _Images(session, rows, vectors, table)
+    return _Images(session, rows, replace(vectors, normalize=normalize), table)
 
 
-def _load_database(session: Session, embeddings: Path) -> _Images:
-    images = _load(session, embeddings)
+def _load_database(session: Session, embeddings: Path, normalize: bool) -> _Images:
+    images = _load(session, embeddings, normalize)
     posed = np.isfinite(session.world_from_cam(images.rows)).reshape(-1, 16).all(axis=1)
     if not posed.any():
         raise CaptureError(f"No embedded image of {session.id} has a pose ({session.path / 'trajectories.txt'}).")
@@ -164,9 +163,9 @@ def _load_database(session: Session, embeddings: Path) -> _Images:
     return replace(images.take(np.flatnonzero(posed)), unposed=int(np.sum(~posed)))
 
 
-def _load_queries(session: Session, embeddings: Path, queries: str) -> _Images:
+def _load_queries(session: Session, embeddings: Path, queries: str, normalize: bool) -> _Images:
     keyframes = session.keyframes(queries)
-    images = _load(session, embeddings)
+    images = _load(session, embeddings, normalize)
     rows_of_each = session.rows_of_keyframes(keyframes)
     position = np.full(len(session.images), -1)
     position[images.rows] = np.arange(len(images.rows))
@@ -187,18 +186,15 @@ def _load_queries(session: Session, embeddings: Path, queries: str) -> _Images:
 
 def _write_pair(path: Path, query: _Images, database: _Images, settings: RetrieveSettings) -> None:
     pair = f"map {database.session.id}, query {query.session.id}"
-    if query.vectors.shape[1] != database.vectors.shape[1]:
+    if query.vectors.dim != database.vectors.dim:
         raise ArtifactError(
-            f"{pair}: the map's embeddings have {database.vectors.shape[1]} dimensions, the query's "
-            f"{query.vectors.shape[1]}. They are of different models: embed both again with one."
+            f"{pair}: the map's embeddings have {database.vectors.dim} dimensions, the query's "
+            f"{query.vectors.dim}. They are of different models: embed both again with one."
         )
-    queries, references = query.vectors, database.vectors
-    if settings.normalize:
-        queries, references = unit(queries), unit(references)
     backend: Backend = "faiss" if settings.use_faiss else "torch"
     try:
         scores, indices = search(
-            queries, references, settings.topk, backend, settings.compute_device, settings.faiss_gpu
+            query.vectors[:], database.vectors, settings.topk, backend, settings.compute_device, settings.faiss_gpu
         )
     except ValueError as error:
         raise ArtifactError(f"{pair}: {error}") from error

@@ -1,21 +1,30 @@
 """Exact nearest neighbors among global descriptors, by whatever library is quick at it."""
 
+from collections.abc import Callable, Iterator
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from toolkit.embedders.stored import StoredVectors
 from toolkit.errors import ToolkitError
 from toolkit.geometry import Ints
 from toolkit.models.compute import resolve_device
 
 Backend = Literal["faiss", "torch"]
-_BLOCK_BYTES = 64 << 20
+_BLOCK_BYTES = 128 << 20
+"""Of the rows of the database, in float32, that are in memory at a time."""
+_MORE = 16
+"""Candidates beyond k: the backend's rounding may exchange neighbors in rank."""
+
+_Found = tuple[NDArray[np.float32], Ints]
+_Best = Callable[[NDArray[np.float32], int], _Found]
+_Vectors = NDArray[np.float32] | StoredVectors
 
 
 def search(
     query: ArrayLike,
-    database: ArrayLike,
+    database: ArrayLike | StoredVectors,
     k: int,
     backend: Backend = "faiss",
     compute_device: str = "cpu",
@@ -23,12 +32,12 @@ def search(
 ) -> tuple[NDArray[np.float32], Ints]:
     """Return the rows of the database with the largest dot products, best first; equal ones by index.
 
-    The backend finds candidates; their scores are then computed alike for all backends, so that the result
-    does not depend on it.
+    The database is read in blocks, once. The backend finds candidates; their scores are then computed alike for all
+    backends, so that the result does not depend on it.
 
     Args:
         query: (Q, D), any float type.
-        database: (N, D).
+        database: (N, D); `StoredVectors` stay on disk.
         k: how many; at most N are returned.
         backend: `faiss` or `torch`.
         compute_device: where torch computes: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
@@ -40,32 +49,27 @@ def search(
     Raises:
         ValueError: shapes do not fit, k is below 1, or a value is not finite.
     """
-    query, database = _matrix(query, "query"), _matrix(database, "database")
-    if query.shape[1] != database.shape[1]:
-        raise ValueError(f"query has {query.shape[1]} dimensions, the database {database.shape[1]}.")
+    query = _matrix(query, "query")
+    vectors = database if isinstance(database, StoredVectors) else _matrix(database, "database")
+    if query.shape[1] != vectors.shape[1]:
+        raise ValueError(f"query has {query.shape[1]} dimensions, the database {vectors.shape[1]}.")
     if k < 1:
         raise ValueError(f"k is {k}; expected at least 1.")
-    count = len(database)
+    count = len(vectors)
     k = min(k, count)
     scores, indices = np.zeros((len(query), k), np.float32), np.zeros((len(query), k), np.int64)
     if not len(query) or not k:
         return scores, indices
-    norm = float(np.sqrt((database**2).sum(axis=1).max()))
-    tolerance = 1e-5 * norm * np.linalg.norm(query, axis=1)
-    pending, width = np.arange(len(query)), min(count, k + 16)
+    lengths = np.linalg.norm(query, axis=1)
+    pending, width = np.arange(len(query)), min(count, k + _MORE)
     while len(pending):
-        rough, candidates = _candidates(query[pending], database, width, backend, compute_device, faiss_gpu)
+        best = _backend(query[pending], backend, compute_device, faiss_gpu)
+        rough, candidates, longest = _candidates(vectors, best, len(pending), width)
+        tolerance = 1e-5 * longest * lengths[pending]
         # Rounding in the backend cuts nothing off once the last candidate is clearly below rank k.
-        done = (rough[:, -1] < rough[:, k - 1] - tolerance[pending]) | (width == count)
-        rows = pending[done]
-        step = max(1, _BLOCK_BYTES // (8 * width * query.shape[1]))
-        for start in range(0, len(rows), step):
-            part, chosen = rows[start : start + step], np.sort(candidates[done][start : start + step], axis=1)
-            exact = np.einsum("qd,qkd->qk", query[part].astype(np.float64), database[chosen].astype(np.float64))
-            exact = exact.astype(np.float32)
-            order = np.argsort(-exact, axis=1, kind="stable")[:, :k]
-            scores[part] = np.take_along_axis(exact, order, axis=1)
-            indices[part] = np.take_along_axis(chosen, order, axis=1)
+        done = (rough[:, -1] < rough[:, k - 1] - tolerance) | (width == count)
+        near = rough >= (rough[:, k - 1] - 2 * tolerance)[:, None]
+        _rescore(query, vectors, pending[done], candidates[done], near[done], scores, indices)
         pending, width = pending[~done], min(count, 4 * width)
     return scores, indices
 
@@ -74,55 +78,91 @@ def _matrix(values: ArrayLike, name: str) -> NDArray[np.float32]:
     matrix = np.ascontiguousarray(values, np.float32)
     if matrix.ndim != 2:
         raise ValueError(f"{name} has shape {matrix.shape}; expected two dimensions, one row a vector.")
-    bad = ~np.isfinite(matrix).all(axis=1)
-    if bad.any():
-        raise ValueError(f"{name} has {bad.sum()} rows with NaN or infinite values, first row {int(bad.argmax())}.")
+    _require_finite(matrix, name)
     return matrix
 
 
-def _candidates(
+def _require_finite(matrix: NDArray[np.float32], name: str, first: int = 0) -> None:
+    bad = ~np.isfinite(matrix).all(axis=1)
+    if bad.any():
+        raise ValueError(
+            f"{name} has {bad.sum()} rows with NaN or infinite values, first row {first + int(bad.argmax())}."
+        )
+
+
+def _blocks(vectors: _Vectors) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    """Yield the number of the first row and the rows (n, D) of one block after the other."""
+    step = max(1, _BLOCK_BYTES // (4 * max(1, vectors.shape[1])))
+    for start in range(0, len(vectors), step):
+        yield start, vectors[start : start + step]
+
+
+def _candidates(vectors: _Vectors, best: _Best, queries: int, width: int) -> tuple[NDArray[np.float32], Ints, float]:
+    """Return the `width` best scores and indices (Q, width), best first, up to rounding, and the longest length."""
+    scores, indices = np.zeros((queries, 0), np.float32), np.zeros((queries, 0), np.int64)
+    longest = 0.0
+    for start, block in _blocks(vectors):
+        length = float(np.sqrt(np.einsum("nd,nd->n", block, block).max()))
+        if not np.isfinite(length):
+            _require_finite(block, "database", start)
+        longest = max(longest, length)
+        of_block, inside = best(block, min(width, len(block)))
+        scores, indices = np.hstack([scores, of_block]), np.hstack([indices, inside + start])
+        order = np.argsort(-scores, axis=1, kind="stable")[:, :width]
+        scores, indices = np.take_along_axis(scores, order, 1), np.take_along_axis(indices, order, 1)
+    return scores, indices, longest
+
+
+def _rescore(
     query: NDArray[np.float32],
-    database: NDArray[np.float32],
-    width: int,
-    backend: Backend,
-    compute_device: str,
-    faiss_gpu: bool,
-) -> tuple[NDArray[np.float32], Ints]:
-    """Return the `width` best (scores, indices) (Q, width) of each query, best first, up to rounding."""
+    vectors: _Vectors,
+    rows: Ints,
+    candidates: Ints,
+    near: NDArray[np.bool_],
+    scores: NDArray[np.float32],
+    indices: Ints,
+) -> None:
+    """Fill in scores and indices of query rows: of the candidates that are near enough to be among the k best."""
+    exact = np.full(candidates.shape, -np.inf, np.float32)
+    who, rank = np.nonzero(near)
+    order = np.argsort(candidates[who, rank], kind="stable")  # as they lie on disk
+    step = max(1, _BLOCK_BYTES // (16 * query.shape[1]))
+    for start in range(0, len(order), step):
+        part = order[start : start + step]
+        numbers, where = np.unique(candidates[who[part], rank[part]], return_inverse=True)
+        found, asked = vectors[numbers].astype(np.float64)[where], query[rows[who[part]]].astype(np.float64)
+        exact[who[part], rank[part]] = np.einsum("nd,nd->n", asked, found).astype(np.float32)
+    best = np.lexsort((candidates, -exact), axis=1)[:, : scores.shape[1]]
+    scores[rows], indices[rows] = np.take_along_axis(exact, best, 1), np.take_along_axis(candidates, best, 1)
+
+
+def _backend(query: NDArray[np.float32], backend: Backend, compute_device: str, faiss_gpu: bool) -> _Best:
+    """Return what finds the best (scores, indices) (Q, n) of a block of the database for the queries."""
     if backend == "torch":
-        return _torch_candidates(query, database, width, compute_device)
+        return _torch_backend(query, compute_device)
     if backend != "faiss":
         raise ValueError(f"Unknown backend {backend!r}; expected faiss or torch.")
     import faiss
 
     if not faiss_gpu:
-        scores, indices = faiss.knn(query, database, width, metric=faiss.METRIC_INNER_PRODUCT)
-        return scores, indices
+        return lambda block, number: faiss.knn(query, block, number, metric=faiss.METRIC_INNER_PRODUCT)
     if not hasattr(faiss, "StandardGpuResources"):
         raise ToolkitError(
             "faiss_gpu is set, but the installed faiss has no GPU support (faiss-cpu). "
             "Set faiss_gpu: false, or use_faiss: false with compute_device: cuda."
         )
-    scores, indices = faiss.knn_gpu(
-        faiss.StandardGpuResources(), query, database, width, metric=faiss.METRIC_INNER_PRODUCT
-    )
-    return scores, indices
+    gpu = faiss.StandardGpuResources()
+    return lambda block, number: faiss.knn_gpu(gpu, query, block, number, metric=faiss.METRIC_INNER_PRODUCT)
 
 
-def _torch_candidates(
-    query: NDArray[np.float32], database: NDArray[np.float32], width: int, compute_device: str
-) -> tuple[NDArray[np.float32], Ints]:
-    """Search the database in blocks, so that the scores of all its rows are never in memory together."""
+def _torch_backend(query: NDArray[np.float32], compute_device: str) -> _Best:
     import torch
 
     device = resolve_device(compute_device)
     queries = torch.from_numpy(query).to(device)
-    scores = torch.zeros((len(query), 0), device=device)
-    indices = torch.zeros((len(query), 0), dtype=torch.int64, device=device)
-    step = max(1, _BLOCK_BYTES // (4 * len(query)))
-    for start in range(0, len(database), step):
-        block = queries @ torch.from_numpy(database[start : start + step]).to(device).T
-        numbers = torch.arange(start, start + block.shape[1], device=device).expand(block.shape)
-        scores, best = torch.cat([scores, block], 1).topk(min(width, scores.shape[1] + block.shape[1]))
-        indices = torch.cat([indices, numbers], 1).gather(1, best)
-    return scores.cpu().numpy(), indices.cpu().numpy()
+
+    def best(block: NDArray[np.float32], number: int) -> _Found:
+        scores, indices = (queries @ torch.from_numpy(block).to(device).T).topk(number)
+        return scores.cpu().numpy(), indices.cpu().numpy()
+
+    return best

@@ -1,0 +1,106 @@
+"""Global descriptors on disk: the matrices of a session as one, read in parts, so that a map need not fit in memory."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from toolkit.errors import ArtifactError
+from toolkit.files import require_whole
+from toolkit.geometry import Ints, unit
+
+MANIFEST_COLUMNS = ["row_index", "device_id", "sensor_id", "timestamp", "abs_path"]
+"""Columns of the `manifest.csv` that names the image of each row of embeddings."""
+
+
+@dataclass(frozen=True)
+class StoredVectors:
+    """Chosen rows of matrices in `.npy` files, one below the other; float32 when they are read."""
+
+    paths: tuple[Path, ...]
+    starts: tuple[int, ...]
+    """Number of the first row of each file, and behind them the number of all rows."""
+    dim: int
+    rows: Ints
+    """Numbers of the chosen rows, ascending."""
+    normalize: bool = False
+    """Whether vectors are brought to length 1 as they are read."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return len(self.rows), self.dim
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def choose(self, positions: Ints) -> "StoredVectors":
+        """Return only some of the rows, by their positions in ascending order."""
+        return replace(self, rows=self.rows[positions])
+
+    def __getitem__(self, positions: slice | Ints) -> NDArray[np.float32]:
+        """Read rows (n, D), by their positions in ascending order."""
+        rows = self.rows[positions]
+        vectors = np.empty((len(rows), self.dim), np.float32)
+        cuts = np.searchsorted(rows, self.starts)
+        for path, start, first, last in zip(self.paths, self.starts, cuts, cuts[1:], strict=False):
+            if first < last:
+                inside = rows[first:last] - start
+                together = inside[-1] - inside[0] == len(inside) - 1
+                # Mapped anew each time: pages of a mapping that is kept would count as this process's memory.
+                matrix = np.load(path, mmap_mode="r")
+                vectors[first:last] = matrix[inside[0] : inside[-1] + 1] if together else matrix[inside]
+        return unit(vectors) if self.normalize else vectors
+
+
+def open_embeddings(folder: str | Path) -> tuple[StoredVectors, pd.DataFrame]:
+    """Open the embeddings of a session, or of one subsession; vectors stay on disk until they are asked for.
+
+    Args:
+        folder: `<embeddings>/<session>` or `<embeddings>/<session>/<subsession>`.
+
+    Returns:
+        The vectors (N, D); a table of its rows: row_index, device_id, sensor_id, timestamp, abs_path, subsession.
+
+    Raises:
+        ArtifactError: there are none, one is damaged, or files do not fit together.
+    """
+    folder = Path(folder)
+    manifests = sorted(folder.rglob("manifest.csv"))
+    if not manifests:
+        raise ArtifactError(
+            f"No embeddings in {folder}: run the embed stage first (python -m toolkit run ... --only embed)."
+        )
+    paths, tables, starts, dim = list[Path](), [], [0], 0
+    for manifest in manifests:
+        path = manifest.parent / f"{manifest.parent.name}.npy"
+        for part in (path, manifest):
+            require_whole(part, of=path)
+        try:
+            matrix = np.load(path, mmap_mode="r")
+            table = pd.read_csv(manifest, dtype={"device_id": str, "sensor_id": str, "abs_path": str})
+        except (OSError, ValueError) as error:
+            raise ArtifactError(f"Embeddings {path} cannot be read ({error}); embed again.") from error
+        if list(table.columns) != MANIFEST_COLUMNS or matrix.ndim != 2 or len(matrix) != len(table):
+            raise ArtifactError(
+                f"{manifest} ({len(table)} rows, {', '.join(table.columns)}) does not fit {path.name} "
+                f"{matrix.shape}; expected columns {', '.join(MANIFEST_COLUMNS)} and one row a vector. Embed again."
+            )
+        if paths and matrix.shape[1] != dim:
+            raise ArtifactError(
+                f"{path} has {matrix.shape[1]} dimensions, {manifests[0].parent} {dim}; embed again."
+            )
+        dim = matrix.shape[1]
+        paths.append(path)
+        starts.append(starts[-1] + len(matrix))
+        base = folder.parent if manifest.parent == folder else folder
+        tables.append(table.assign(subsession=manifest.parent.relative_to(base).as_posix()))
+    vectors = StoredVectors(tuple(paths), tuple(starts), dim, np.arange(starts[-1]))
+    return vectors, pd.concat(tables, ignore_index=True)
+
+
+def load_embeddings(folder: str | Path) -> tuple[NDArray[np.float32], pd.DataFrame]:
+    """Read the embeddings of a session, or of one subsession, into memory: (N, D) float32; see `open_embeddings`."""
+    vectors, table = open_embeddings(folder)
+    return vectors[:], table
