@@ -228,6 +228,18 @@ def test_a_signal_ends_the_run_its_kernels_and_sockets(place: Path, number: sign
     assert set(Path(tempfile.gettempdir()).glob("kernel.*")) == before
 
 
+@pytest.mark.skipif(os.name != "posix", reason="needs signals")
+def test_a_signal_is_heard_whatever_a_command_imports() -> None:
+    # pycolmap takes SIGTERM for itself: its handler shows a stack of C++ and ends the process.
+    script = (
+        "import os, signal, sys; from toolkit import __main__;"
+        "stop = lambda: (__import__('pycolmap'), os.kill(os.getpid(), signal.SIGTERM));"
+        "__main__.app.command('stop')(stop); __main__.main()"
+    )
+    done = subprocess.run([sys.executable, "-c", script, "stop"], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (143, "Interrupted. The same command goes on from here.\n")
+
+
 def test_another_run_in_the_folder_is_named(here: Path) -> None:
     with held(here / "runs" / "run"), pytest.raises(ToolkitError, match=f"process {os.getpid()} on "):
         pipeline.run(here / "run.yaml", say=quiet)

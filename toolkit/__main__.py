@@ -306,6 +306,8 @@ def _print_json(content: dict[str, Any]) -> None:
 def main() -> None:
     """Run the command line; an error is a sentence, with a traceback only where the toolkit itself is at fault."""
 
+    import pycolmap  # noqa: F401 - when it is imported, it takes SIGTERM for itself: so before it is taken below
+
     received: list[int] = []
 
     def stop(number: int, frame: FrameType | None) -> None:
