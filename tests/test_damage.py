@@ -71,7 +71,7 @@ def content(folder: Path) -> dict[str, Any]:
             found[name] = items
         elif path.suffix == ".csv" and "poses" in name:
             found[name] = pd.read_csv(path).drop(columns="seconds").to_csv()
-        elif path.is_file() and not name.endswith(".json"):
+        elif path.is_file() and not name.endswith((".meta.json", "settings.json")):
             found[name] = path.read_bytes()
     return found
 
@@ -132,6 +132,7 @@ ARTIFACTS: dict[str, tuple[Callable[[Path, SceneFiles], pd.DataFrame], str, tupl
     "poses": (localize, "poses/*.txt", ()),
     "table of queries": (localize, "poses/*.csv", ()),
     "correspondences": (localize, "poses/*.h5", ()),
+    "what is known of a map": (localize, "poses/*_map_ios.json", ()),
     "record of poses": (localize, "poses/*.txt.meta.json", ()),
     "record of correspondences": (localize, "poses/*.h5.meta.json", ("poses/*.txt",)),
     "map": (localize, "map/ios_map.npz", ()),

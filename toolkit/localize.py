@@ -173,7 +173,7 @@ def localize_pairs(
                     _write_poses(pair, localized, settings)
                     unfinished = any(map(_is_internal, localized))
                 if update_attributes(pair.file("h5"), about) or not skipped:
-                    files = pair.file("csv"), pair.file("h5")
+                    files = pair.file("csv"), pair.file("h5"), pair.about_map
                     write_sidecar(pair.file("txt"), record, files, unfinished=unfinished)
                 rows = read_query_table(pair.file("csv"), ["status"])
                 asked.setdefault(queried, []).append(rows)
