@@ -14,7 +14,14 @@ from toolkit import pipeline
 from toolkit.capture import Capture, Session
 from toolkit.capture.check import check_capture
 from toolkit.capture.depths import DepthMaps
-from toolkit.capture.names import ALLOW_OUTSIDE, LINKED_HERE, allow_outside, outside_allowed, require_name
+from toolkit.capture.names import (
+    ALLOW_OUTSIDE,
+    LINKED_HERE,
+    allow_outside,
+    is_linked_here,
+    outside_allowed,
+    require_name,
+)
 from toolkit.embed import embed_sessions
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange.datasets import arrange
@@ -293,3 +300,21 @@ def test_links_that_import_made_are_the_user_s_own(tmp_path: Path) -> None:
     assert (folder / LINKED_HERE).is_file()
     with pytest.raises(CaptureError, match=r"images\.txt, line 2: .* is a link to .*photos/1\.png"):
         Session.open(folder).image_path(0)
+
+
+@pytest.mark.parametrize("what", ["pipe", "device", "link", "folder", "no inode"])
+def test_a_note_of_links_is_neither_waited_for_nor_read_without_end(tmp_path: Path, what: str) -> None:
+    folder = session_of(tmp_path)
+    note = folder / LINKED_HERE
+    note.parent.mkdir(exist_ok=True)
+    if what == "pipe":
+        os.mkfifo(note)
+    elif what == "folder":
+        note.mkdir()
+    elif what == "no inode":
+        note.write_text("9" * 5000)
+    else:
+        (tmp_path / "number").write_text(str(folder.stat().st_ino))
+        note.symlink_to("/dev/zero" if what == "device" else tmp_path / "number")
+    assert not is_linked_here(folder)
+    assert len(Session.open(folder)) == 1

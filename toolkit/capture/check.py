@@ -331,7 +331,7 @@ class _SessionCheck:
             return f"{self.missing[file]:,} files missing" if self.missing.get(file) else ""
 
         times = times_of(session.images)
-        span = f"over {(times.max() - times.min()) / 1e6:,.1f} s" if len(times) else ""
+        span = f"over {(int(times.max()) - int(times.min())) / 1e6:,.1f} s" if len(times) else ""
         add("images", len(times), span, missing("images.txt"))
         types = session.sensors["sensor_type"].value_counts(sort=False)
         add("sensors", len(session.sensors), *(f"{count:,} {kind}" for kind, count in types.items()))

@@ -7,6 +7,7 @@ session's folder, which may itself be a link to another disk.
 
 import os
 import re
+import stat
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -141,8 +142,11 @@ def is_linked_here(session: Path) -> bool:
 
     A copy from elsewhere has another inode, whatever it says of itself.
     """
-    try:
-        return int((session / LINKED_HERE).read_text(encoding="utf-8")) == session.stat().st_ino
+    note = session / LINKED_HERE
+    try:  # a pipe would be waited for, a device has no end
+        found = note.lstat()
+        plain = stat.S_ISREG(found.st_mode) and found.st_size < 32
+        return plain and int(note.read_text(encoding="utf-8")) == session.stat().st_ino
     except (OSError, ValueError):
         return False
 
