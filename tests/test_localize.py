@@ -689,6 +689,12 @@ def camera_of(params: list[float], width: int = 10) -> pycolmap.Camera:
         ({"image": [], "camera": []}, "0 pictures"),
         ({"image": "12345.jpg", "camera": []}, "1 pictures, 0 cameras"),
         ({"turns": [1, 2]}, "2 turns"),
+        ({"turns": 1}, "turns: found 1, expected whole numbers"),
+        ({"turns": ["a"]}, r"turns: found \['a'\], expected whole numbers"),
+        ({"rig_from_cams": "x"}, r"rig_from_cams: found 'x', expected \(C, 4, 4\) numbers"),
+        ({"rig_from_cams": np.diag([1.0, 1, -1, 1])}, "rig_from_cams: found no pose for picture 1: .* nor mirrors"),
+        ({"rig_from_cams": np.diag([2.0, 2, 2, 1])}, "rig_from_cams: found no pose for picture 1: .* neither scales"),
+        ({"rig_from_cams": np.ones((1, 4, 4))}, "rig_from_cams: found no pose for picture 1"),
     ],
 )
 def test_what_is_no_picture_is_refused(opened: Map, changed: dict, message: str) -> None:
@@ -705,7 +711,7 @@ def test_what_other_libraries_call_an_image_is_the_same_picture() -> None:
     for same in (
         color.astype(np.float32) / 255, color.astype(float), color.astype(np.int64), color.astype(np.uint16) * 257,
         np.moveaxis(color, 2, 0), np.moveaxis(color, 2, 0).astype(np.float32) / 255, torch.from_numpy(color),
-        color.tolist(), Image.fromarray(color), Image.fromarray(color).convert("RGBA"),
+        color.astype(np.uint16), color.tolist(), Image.fromarray(color), Image.fromarray(color).convert("RGBA"),
     ):  # fmt: skip
         np.testing.assert_array_equal(pixels_from(same), color)
     for same in (gray[:, :, None], gray[None], gray.tolist(), Image.fromarray(gray), gray.astype(np.uint16) << 8):

@@ -1,5 +1,6 @@
 """A single picture, or those of a rig, in the open map of a run."""
 
+import operator
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ from toolkit.features.stores import as_stored
 from toolkit.localizers.base import PoseEstimate, Query, View
 from toolkit.localizers.map import Map
 
+_NO_ROTATION = 1e-3
+"""A matrix further off, times its transpose, is no rotation; float32 and files round by less."""
 Picture = Any
 """A file (str, Path), or pixels: see `pixels_from`."""
 
@@ -44,18 +47,15 @@ def localize_image(
         The estimate: `world_from_rig` (of a single picture world_from_cam), (4, 4), or None where `status` says why.
 
     Raises:
-        ImageError: a file cannot be read, or its size is not the camera's; no picture, camera or pose.
+        ImageError: a file cannot be read, or its size is not the camera's; no picture, camera, pose or turn.
         ArtifactError: files of the run are missing.
     """
     pictures = list(image) if _are_several(image) else [image]
     cameras: list[Any] = list(camera) if isinstance(camera, list | tuple) else [camera]
     for of in cameras:
         _check_camera(of)
-    poses = np.eye(4)[None] if rig_from_cams is None else np.asarray(rig_from_cams, np.float64)
-    if poses.shape[-2:] != (4, 4) or not np.isfinite(poses).all():
-        raise ImageError(f"rig_from_cams: found {poses.shape}, expected (C, 4, 4) finite numbers, a pose a camera.")
-    poses = poses.reshape(-1, 4, 4)
-    quarter_turns = [0] * len(cameras) if turns is None else list(turns)
+    poses = np.eye(4)[None] if rig_from_cams is None else _poses(rig_from_cams)
+    quarter_turns = [0] * len(cameras) if turns is None else _turns(turns)
     if not 0 < len(pictures) == len(cameras) == len(poses) == len(quarter_turns):
         raise ImageError(
             f"Found {len(pictures)} pictures, {len(cameras)} cameras, {len(poses)} rig_from_cams and "
@@ -104,7 +104,7 @@ def pixels_from(image: Any) -> NDArray[np.uint8]:
     Args:
         image: an array or tensor (H, W), (H, W, 1), (H, W, 3), (1, H, W) or (3, H, W), a nest of lists, or a Pillow
             image. uint8 and other integers from 0 to 255; uint16 from 0 to 65535; floats from 0 to 1 or, if one is
-            larger, to 255; bool.
+            larger, to 255; bool. uint16 up to 255 counts as uint8.
 
     Raises:
         ImageError: anything else; names what was found.
@@ -130,7 +130,7 @@ def pixels_from(image: Any) -> NDArray[np.uint8]:
         return pixels
     if pixels.dtype == bool:
         return pixels.astype(np.uint8) * np.uint8(255)
-    if pixels.dtype == np.uint16:
+    if pixels.dtype == np.uint16 and pixels.max() > 255:  # else 8 bits of many libraries: a file would be black
         return (pixels >> 8).astype(np.uint8)  # as a file with 16 bits is decoded
     least, most = pixels.min(), pixels.max()
     if not (least >= 0 and most <= 255):
@@ -155,6 +155,33 @@ def _check_camera(camera: Any) -> None:
         parse_camera("camera", camera_text(camera))
     except ValueError as error:
         raise ImageError(f"camera: {error}") from None
+
+
+def _poses(rig_from_cams: Any) -> NDArray[np.float64]:
+    """Return the poses of a rig, (C, 4, 4); refuses matrices that scale or mirror what they turn."""
+    try:
+        poses = np.asarray(rig_from_cams, np.float64)
+    except (ValueError, TypeError):
+        raise ImageError(f"rig_from_cams: found {rig_from_cams!r}, expected (C, 4, 4) numbers.") from None
+    if poses.shape[-2:] != (4, 4) or not np.isfinite(poses).all():
+        raise ImageError(f"rig_from_cams: found {poses.shape}, expected (C, 4, 4) finite numbers, a pose a camera.")
+    poses = poses.reshape(-1, 4, 4)
+    turned = poses[:, :3, :3]
+    off = np.abs(turned @ np.swapaxes(turned, 1, 2) - np.eye(3)).max(axis=(1, 2))
+    off = np.maximum(off, np.abs(poses[:, 3] - [0, 0, 0, 1]).max(axis=1))
+    for number in np.flatnonzero((off > _NO_ROTATION) | (np.linalg.det(turned) < 0))[:1].tolist():
+        raise ImageError(
+            f"rig_from_cams: found no pose for picture {number + 1}: {poses[number].tolist()}. Expected a rotation, "
+            "which neither scales nor mirrors, a translation, and 0, 0, 0, 1 in the last row."
+        )
+    return poses
+
+
+def _turns(turns: Any) -> list[int]:
+    try:
+        return [operator.index(turn) for turn in turns]
+    except TypeError:
+        raise ImageError(f"turns: found {turns!r}, expected whole numbers of quarter turns, a picture each.") from None
 
 
 class _Pixels:
