@@ -247,6 +247,29 @@ def test_another_run_in_the_folder_is_named(here: Path) -> None:
     assert record_of(here)["status"] == "done"
 
 
+def test_a_notebook_that_a_full_disk_cuts_short_does_not_hide_why(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    import papermill
+
+    def cut_short(source: str, output: str, **_: object) -> None:
+        Path(output).write_text('{"cells": [')
+        raise OSError(errno.ENOSPC, "No space left on device", output)
+
+    def no_report(run_dir: Path) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(run_dir / "report.html"))
+
+    write_notebook(place / "notebooks", "retrieve", PARAMETERS, "pass")
+    monkeypatch.setattr(papermill, "execute_notebook", cut_short)
+    monkeypatch.setattr(pipeline, "_write_report", no_report)
+    with pytest.raises(OSError, match="No space left"):
+        pipeline.run(place / "run.yaml", say=quiet, only="retrieve")
+    assert record_of(place)["error"].startswith("The disk is full: ")
+    assert record_of(place)["exit_code"] == 1
+    assert "Traceback" not in capfd.readouterr().err
+    assert not list((place / "runs/run/notebooks").glob("*"))
+
+
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A file system of 64 kB."""

@@ -336,6 +336,7 @@ def execute(
     import papermill
     from jupyter_client.kernelspec import NoSuchKernel
     from nbclient.exceptions import DeadKernelError
+    from nbformat.reader import NotJSONError
     from papermill.exceptions import PapermillExecutionError
     from traitlets.config import Config
 
@@ -376,8 +377,11 @@ def execute(
         memory.stop()
         folder.cleanup()
         if partial.exists():
-            _tidy_streams(partial)
-            partial.replace(output)
+            try:
+                _tidy_streams(partial)
+                partial.replace(output)
+            except NotJSONError:  # cut short by what is being raised, as a full disk does
+                partial.unlink()
     return notebook, memory.stop()
 
 

@@ -208,8 +208,9 @@ def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: boo
         try:
             # Also of a run that stopped: the page of an earlier one would say that all is well.
             _write_report(run_dir)
-        except Exception:
-            log.exception("the report of the stopped run could not be written")
+        except Exception as other:
+            log.warning("The report of the stopped run could not be written: %s", sentence(other))
+            log.debug("the report", exc_info=other)
         raise
 
 

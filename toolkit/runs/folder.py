@@ -104,5 +104,10 @@ def log_to(path: Path) -> ExitStack:
         ending.callback(root.removeHandler, handler)
     ending.callback(own.setLevel, own.level)
     own.setLevel(logging.DEBUG)
-    ending.callback(file.close)
+    ending.callback(_close, file)
     return ending
+
+
+def _close(file: logging.FileHandler) -> None:
+    with suppress(OSError):  # a full disk; what stopped the run is the error to tell
+        file.close()
