@@ -55,3 +55,8 @@ def test_a_camera_that_does_not_fit_most_of_its_queries_is_named_once():
     assert "0.900 times those in ios_query/sensors.txt (median of 2 answers)" in messages[0]
     assert "360 px (median of 2 answers), ios_query/sensors.txt says 400 px" in messages[1]
     assert camera_messages(session, [second.drop(columns="focal_px")]) == []  # type: ignore[arg-type]
+    contradicted = "low_confidence: the poses of the map contradict its images"
+    # A doubt for another reason, such as the map's poses, names no focal length, be the column of numbers or texts.
+    for focals_px in ([np.nan] * 4, [np.nan, "450.0", "", "361.0;"], [np.nan, 450.0, 450.0, np.nan]):
+        other = pd.DataFrame({"status": [contradicted, "ok", "ok", "ok"], "focal_px": focals_px})
+        assert camera_messages(session, [other]) == []  # type: ignore[arg-type]
