@@ -20,4 +20,5 @@ def test_unusable_sessions_have_a_reason_and_the_others_are_drawn(tmp_path: Path
     assert table["reason"]["ios_map"] == ""
     assert table["images"]["hl_query"] == 0
     assert len(draw_samples(capture, 1).axes) == 3
-    draw_top_view(capture)
+    assert "[m]" in draw_top_view(capture).axes[0].get_xlabel()
+    assert "[" not in draw_top_view(capture, unit=None).axes[0].get_xlabel()

@@ -283,3 +283,7 @@ def test_what_is_known_of_a_map_is_said_and_lengths_without_a_unit_are_no_meters
     assert f"_map_ios: {said}" in text
     assert "45 % mean recall at 1°, 0.1 L" in text
     assert not re.search(r"\d\s*(cm|m)\b|\[c?m\]", text)
+
+
+def test_captions_name_no_unit_that_a_run_may_not_have():
+    assert not any("[m]" in text for texts in report.EVALUATION_FIGURES.values() for text in texts)

@@ -77,6 +77,13 @@ def test_scene_picture(scene, tmp_path):
         assert min(image.size) > 300
 
 
+def test_no_text_of_a_scene_picture_says_meters_where_the_unit_is_not_known(scene):
+    figure = draw_scene_png(*scene, unit=("L", 3.0))
+    texts = [label for axis in figure.axes for label in (axis.get_xlabel(), axis.get_ylabel()) if label]
+    assert "error of position [L]" in texts
+    assert not any("[m]" in text for text in texts)
+
+
 def test_scene_picture_without_points_truth_or_queries(scene):
     _, _, poses, estimated, _ = scene
     no_truth, no_queries = np.full_like(estimated, np.nan), np.zeros((0, 4, 4))

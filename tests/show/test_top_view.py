@@ -9,6 +9,7 @@ def test_ground_axes_are_seen_from_above():
         np.testing.assert_allclose(np.cross(*axes), up / np.linalg.norm(up), atol=1e-12)
         assert len(labels) == 2
     assert ground_axes([0, 0, -1])[1] == ["x [m]", "−y [m]"]
+    assert ground_axes([0, 0, -1], None)[1] == ["x", "−y"]
 
 
 def test_far_apart_places_are_told_apart():

@@ -134,6 +134,8 @@ class ExploreSettings(Settings):
     """Images shown of each session."""
     world_up: Direction | None = None
     """Direction that is up in the world; null: estimated from the cameras."""
+    unit: Unit = "m"
+    """Unit of the poses; null: not known, and not shown."""
 
 
 class VladSettings(Settings):

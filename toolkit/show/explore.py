@@ -70,16 +70,17 @@ def draw_samples(capture: Capture, count: int = 4) -> "Figure":
 
 
 @styled
-def draw_top_view(capture: Capture, up: ArrayLike | None = None) -> "Figure":
-    """Return a figure of all camera centers seen from above, meters; queries where the truth is known.
+def draw_top_view(capture: Capture, up: ArrayLike | None = None, unit: str | None = "m") -> "Figure":
+    """Return a figure of all camera centers seen from above; queries where the truth is known.
 
     Args:
         capture: what to draw; cameras far from all others get a panel of their own.
         up: (3,) direction that is up; None: estimated from how the cameras are held.
+        unit: that of the poses, None if it is not known.
     """
     poses = {session.id: _poses(session) for session in _usable(capture)}
     everything = np.concatenate(list(poses.values()))
-    axes, labels = ground_axes(up_of_cameras(everything) if up is None else up)
+    axes, labels = ground_axes(up_of_cameras(everything) if up is None else up, unit)
     centers = everything[:, :3, 3] @ axes.T
     sessions = np.repeat(list(poses), [len(of_session) for of_session in poses.values()])
     place = places_of(centers)

@@ -79,21 +79,21 @@ def error_colors(errors_m: ArrayLike) -> NDArray[np.uint8]:
     return rgb
 
 
-def error_bar(figure: "Figure", **where: Any) -> None:
+def error_bar(figure: "Figure", unit: str = "m", **where: Any) -> None:
     """Draw the legend of errors' colors; `where` goes to matplotlib's `Figure.colorbar`."""
     from matplotlib.cm import ScalarMappable
 
     colors, scale = error_scale()
     bar = figure.colorbar(ScalarMappable(scale, colors), extend="both", **where)
-    bar.set_label("error of position [m]")
+    bar.set_label(f"error of position [{unit}]")
     bar.set_ticks([0.01, 0.1, 1.0], labels=["0.01", "0.1", "1"])
 
 
 @styled
-def draw_error_legend() -> bytes:
-    """Return the legend of errors' colors, PNG."""
+def draw_error_legend(unit: str = "m") -> bytes:
+    """Return the legend of errors' colors, PNG; `unit` is that of the errors."""
     figure = new_figure(1.3, 2.4)
-    error_bar(figure, cax=figure.subplots())
+    error_bar(figure, unit, cax=figure.subplots())
     stream = io.BytesIO()
     figure.savefig(stream, format="png", metadata={"Software": None})
     return stream.getvalue()

@@ -144,7 +144,8 @@ def _log_overview(stream: "rr.RecordingStream", queries: Localizations) -> None:
     if len(queries.nearest_reference):
         lost = ~located & np.isfinite(queries.nearest_reference).all(1)
         dots("world/queries/failed", lost, queries.nearest_reference, rgb(ESTIMATED), 9)
-    stream.log("legend", rr.EncodedImage(contents=draw_error_legend(), media_type="image/png"), static=True)
+    legend = draw_error_legend(queries.unit[0])
+    stream.log("legend", rr.EncodedImage(contents=legend, media_type="image/png"), static=True)
 
 
 class _ChosenWriter:

@@ -41,7 +41,7 @@ EVALUATION_FIGURES = {
     ),
     "deviations": (
         "Stated and actual deviation",
-        "Error of each pose's position [m] against the standard deviation that was stated of it (position_std_m), and "
+        "Error of each pose's position against the standard deviation that was stated of it (position_std_m), and "
         "the median of each tenth of the poses. Above the dashed line, poses are off by more than five deviations.",
     ),
     "losses": (

@@ -74,8 +74,7 @@ def draw_scene_png(
     """
     map_poses = np.asarray(map_poses, np.float64)
     map_poses = map_poses[is_posed(map_poses)]
-    axes, labels = ground_axes(up_of_cameras(map_poses) if up is None else up)
-    labels = [label.replace("[m]", f"[{unit[0]}]") for label in labels]
+    axes, labels = ground_axes(up_of_cameras(map_poses) if up is None else up, unit[0])
     points, map_poses, estimated, true = points / unit[1], *(_in(unit, poses) for poses in (map_poses, estimated, true))
     map_tracks, query_tracks = ([track / unit[1] for track in tracks] for tracks in (map_tracks, query_tracks))
     step = len(points) // max_points + 1
@@ -124,7 +123,7 @@ def draw_scene_png(
     for row in range(rows):
         panels[row * columns].set_ylabel(labels[1])
     if (is_posed(estimated) & is_posed(true)).any():
-        error_bar(figure, ax=list(panels[: len(shown)]), shrink=0.8)
+        error_bar(figure, unit[0], ax=list(panels[: len(shown)]), shrink=0.8)
     handles: dict[str, Any] = {}
     for axis in panels:
         handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))

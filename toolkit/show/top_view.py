@@ -6,10 +6,14 @@ from numpy.typing import ArrayLike
 from toolkit.geometry import Floats, Ints
 
 
-def ground_axes(up: ArrayLike) -> tuple[Floats, list[str]]:
+def ground_axes(up: ArrayLike, unit: str | None = "m") -> tuple[Floats, list[str]]:
     """Return the right and the upward axis of a map seen from above, (2, 3), and their labels.
 
     They are world axes where the world stands upright, so the picture's numbers are coordinates.
+
+    Args:
+        up: direction (3,) that is up.
+        unit: that of the numbers, None if it is not known.
     """
     up = np.asarray(up, np.float64) / np.linalg.norm(up)
     axis = int(np.argmax(np.abs(up)))
@@ -17,11 +21,11 @@ def ground_axes(up: ArrayLike) -> tuple[Floats, list[str]]:
     right = first - up * (first @ up)
     right /= np.linalg.norm(right)
     axes = np.stack([right, np.cross(up, right)])
-    labels = []
+    labels, in_unit = [], f" [{unit}]" if unit else ""
     for row in axes:
         k = int(np.argmax(np.abs(row)))
         sign = "−" if row[k] < 0 else ""
-        labels.append(f"{sign}{'xyz'[k]} [m]" if abs(row[k]) > 0.99 else "along the ground [m]")
+        labels.append((f"{sign}{'xyz'[k]}" if abs(row[k]) > 0.99 else "along the ground") + in_unit)
     return axes, labels
 
 
