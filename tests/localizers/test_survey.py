@@ -150,3 +150,8 @@ def test_a_single_wrong_pose_is_listed(small_capture: Path, small_features: Path
     assert found.wrong == [session.image_name(wrong)]
     assert found.wrong[0] in found.text
     assert LocalMap.load(tmp_path / "ios_map.npz").consistency == found
+
+
+def test_what_little_a_small_map_tells_of_its_poses_is_said():
+    assert "(3 verified image pairs, 0 of which agree with them)" in Consistency(pairs=3, agreeing=0).text
+    assert "(0 verified image pairs)" in Consistency().text

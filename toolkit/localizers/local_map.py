@@ -52,7 +52,11 @@ class Consistency:
             shown = ", ".join(self.wrong[:8]) + (f" and {len(self.wrong) - 8} more" if len(self.wrong) > 8 else "")
             return f"{len(self.wrong)} map images have poses that contradict the others: {shown}"
         if self.verdict == "unknown":
-            return f"too few matches to tell whether the poses of the map are right ({self.pairs} verified image pairs)"
+            agree = f", {self.agreeing} of which agree with them" if self.pairs else ""
+            return (
+                "too few matches to tell whether the poses of the map are right "
+                f"({self.pairs} verified image pairs{agree})"
+            )
         return ""
 
 
