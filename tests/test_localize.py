@@ -827,6 +827,11 @@ def test_an_unknown_run_scene_or_device_is_told_with_the_known_ones(
     (tmp_path / "demo" / "run.json").touch()
     with pytest.raises(ArtifactError, match=r"dem: no such run.*Known: demo\."):
         Map.open(tmp_path / "dem", "SMALL", "ios")
+    for wrong in ((None, "SMALL", "ios"), (finished[0].run, None, "ios"), (finished[0].run, "SMALL", 5)):
+        with pytest.raises(ArtifactError, match=r"None|5"):
+            Map.open(*wrong)
+    with pytest.raises(ArtifactError, match="NoneType"):
+        localize_image(None, "a.jpg", None)
 
 
 def test_the_settings_of_the_last_run_count_whatever_the_clock_says(small_capture: Path, run: SceneFiles) -> None:

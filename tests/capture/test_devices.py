@@ -150,6 +150,7 @@ def test_a_run_hands_its_kinds_to_its_notebooks(tmp_path: Path, monkeypatch: pyt
     assert seen == [["ios", "hl", "spot", "drone"]]
 
 
+@pytest.mark.slow
 def test_a_fourth_kind_goes_from_images_to_recall(small_capture: Path, tmp_path: Path) -> None:
     """And a session that is called as LaMAR calls it is localized in its map."""
     root = tmp_path / "PLACE"

@@ -180,7 +180,9 @@ class _SessionCheck:
             self._add(file, line, message)
         key = key_of(file)
         shown = ", ".join(f"{name} {{{name}!r}}" for name in key)
-        self._add_rows(file, rows[rows.duplicated(key)], f"duplicate key ({shown})")
+        again, same = rows.duplicated(key), rows.duplicated()
+        self._add_rows(file, rows[again & ~same], f"duplicate key ({shown}), with other values")
+        self._add_rows(file, rows[again & same], f"duplicate key ({shown}), a line that counts once", WARNING)
         if "sensor_id" in rows:
             unknown = ~rows["sensor_id"].isin(self.sensors["sensor_id"])
             if file == "depths.txt":  # maps that were rendered for a photograph: <prefix>/<sensor id>

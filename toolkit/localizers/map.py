@@ -130,6 +130,9 @@ class Map:
             ArtifactError: no such run, scene or device (the known ones are named), or files of the run are missing.
             WeightsError: the run used a network whose weights are not there any more.
         """
+        for value, kind in ((run, str | Path), (scene, str), (device, str)):
+            if not isinstance(value, kind):
+                raise ArtifactError(f"Map.open: found {value!r}, expected a run folder, a scene's name and a device's.")
         files = SceneFiles(Path(run), scene)
         pairs = sorted(files.poses_dir.glob(f"{scene}_map_{device}_query_*.h5"))
         if not pairs:

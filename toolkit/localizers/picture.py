@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from toolkit.capture.cameras import camera_text, parse_camera
 from toolkit.capture.images import pixels_of
 from toolkit.capture.turning import turn_image
-from toolkit.errors import ImageError
+from toolkit.errors import ArtifactError, ImageError
 from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor, extract_turned
 from toolkit.features.matching import AnyMethod
 from toolkit.features.stores import as_stored
@@ -50,6 +50,8 @@ def localize_image(
         ImageError: a file cannot be read, or its size is not the camera's; no picture, camera, pose or turn.
         ArtifactError: files of the run are missing.
     """
+    if not isinstance(place, Map):
+        raise ArtifactError(f"Found {type(place).__name__} for a map, expected what `Map.open` returns.")
     pictures = list(image) if _are_several(image) else [image]
     cameras: list[Any] = list(camera) if isinstance(camera, list | tuple) else [camera]
     for of in cameras:
