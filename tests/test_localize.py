@@ -977,8 +977,8 @@ ESCALATES = {"features": {"kinds": ["sift"], "escalation": ["other"]}, "pnp": {"
         {"method": "hybrid"},
         {"map": None},
         ESCALATES,
-        {**ESCALATES, "method": "hybrid"},
-        {**ESCALATES, "map": None},
+        pytest.param({**ESCALATES, "method": "hybrid"}, marks=pytest.mark.slow),
+        pytest.param({**ESCALATES, "map": None}, marks=pytest.mark.slow),
     ],
     ids=["pnp", "nearest", "vggt", "hybrid", "no map", "escalates", "hybrid escalates", "no map escalates"],
 )
