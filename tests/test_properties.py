@@ -266,6 +266,7 @@ def test_references_come_back(content: list[dict[str, Any]], tmp_path: Path) -> 
 @given(content=st.one_of(texts, st.lists(st.lists(values, max_size=4).map(",".join), max_size=4).map(
     lambda lines: "\n".join(["timestamp,device_id,status", *lines]).encode()
 )))  # fmt: skip
+@example(content=b"timestamp\n18446744073709551616")
 @same_folder
 def test_any_text_is_a_table_of_queries_or_an_error_with_its_file(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "pair.csv"

@@ -410,7 +410,7 @@ def read_query_table(path: Path, columns: Sequence[str]) -> pd.DataFrame:
     types: dict[Any, Any] = {"timestamp": np.int64, "device_id": str, **dict.fromkeys(columns, str)}
     try:
         table = pd.read_csv(path, dtype=types)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, OverflowError) as error:
         raise ArtifactError(f"{path}: not a table of queries ({error}). Localize this pair again.") from None
     if missing := [name for name in types if name not in table]:
         raise ArtifactError(f"{path}: column {missing[0]!r} is missing. Localize this pair again.")
