@@ -288,8 +288,9 @@ def record(
 
 def _summary_of_stopped(manifest: Path, overrides: Sequence[str]) -> dict[str, Any]:
     """Return the summary of a run that this process has begun; nothing if it did not get so far."""
+    from toolkit.files import read_json
     from toolkit.manifest import load_manifest
-    from toolkit.runs.record import RECORD, read_json, summary
+    from toolkit.runs.record import RECORD, summary
 
     with suppress(ToolkitError, OSError):
         content = load_manifest(manifest, overrides)

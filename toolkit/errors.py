@@ -96,6 +96,7 @@ BUG = "Internal error: "
 OF_THE_DATA = (CaptureError, ArtifactError, ImageError)
 """Errors that one session or pair may have while the others can be done."""
 
+FREE_MEMORY = "Free some, or run fewer devices or pairs at a time (`devices:`, `pairs:` in the manifest)."
 _MEMORY = re.compile(
     r"MemoryError|OutOfMemory|out of memory|bad_alloc|(cannot|can't|unable to) allocate|insufficient memory"
     r"|can't start new thread", re.IGNORECASE
@@ -112,10 +113,8 @@ def shortage(kind: str, text: str) -> str | None:
         text: what it says; Python, HDF5, OpenCV, NumPy and torch each have their own words.
     """
     if _MEMORY.search(f"{kind}: {text}"):
-        return (
-            f"Out of memory ({kind}: {text.strip().splitlines()[0] if text.strip() else 'no more was said'}). Free "
-            "some, or run fewer devices or pairs at a time (`devices:`, `pairs:` in the manifest)."
-        )
+        said = text.strip().splitlines()[0] if text.strip() else "no more was said"
+        return f"Out of memory ({kind}: {said}). {FREE_MEMORY}"
     found = re.search(r"\berrno[ =]+(\d+)", text, re.IGNORECASE)
     number = int(found[1]) if found else 0
     if number not in _FULL | _NO_PLACE:

@@ -320,13 +320,18 @@ def map_record_path(poses_dir: str | Path, scene: str, map_device: str) -> Path:
     return Path(poses_dir) / f"{scene}_map_{map_device}.json"
 
 
+def read_json(path: str | Path) -> dict[str, Any]:
+    """Return a JSON object, an empty one where the file is missing or holds something else."""
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
 def read_map_record(path: str | Path) -> dict[str, Any]:
     """Return what the localize stage says of a map; where it says nothing: that its poses are meters."""
-    try:
-        found = dict(json.loads(Path(path).read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):
-        found = {}
-    return {"unit": "m", "depth": None, "verdict": "unknown", "text": "", "wrong": []} | found
+    return {"unit": "m", "depth": None, "verdict": "unknown", "text": "", "wrong": []} | read_json(path)
 
 
 def read_references(path: str | Path, *needed: str) -> list[dict[str, Any]]:

@@ -31,6 +31,7 @@ from toolkit.files import (
     checksum,
     files_fingerprint,
     fingerprint,
+    read_json,
     write_text,
 )  # fmt: skip
 from toolkit.manifest import (
@@ -60,7 +61,7 @@ from toolkit.notebook import (
 )
 from toolkit.runs.folder import LOG, held
 from toolkit.runs.pairs import pair_text, way_out
-from toolkit.runs.record import RunLog, failures, read_json
+from toolkit.runs.record import RunLog, failures
 
 log = logging.getLogger(__name__)
 

@@ -14,8 +14,8 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from toolkit.errors import ToolkitError
-from toolkit.files import is_left_over, sweep_partials, write_text
-from toolkit.runs.record import RECORD, read_json
+from toolkit.files import is_left_over, read_json, sweep_partials, write_text
+from toolkit.runs.record import RECORD
 
 log = logging.getLogger(__name__)
 

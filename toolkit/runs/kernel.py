@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from toolkit.errors import StageError, first_line
+from toolkit.errors import FREE_MEMORY, StageError, first_line
 
 
 def kernel_error(error: Exception, ended_by: int | None, memory_mb: float, output: Path) -> StageError:
@@ -14,7 +14,7 @@ def kernel_error(error: Exception, ended_by: int | None, memory_mb: float, outpu
     if ended_by == -9:
         text = (
             f"Out of memory, most likely: the system killed the notebook's kernel (signal 9; {memory_mb:.0f} MB were "
-            "in use). Free some, or run fewer devices or pairs at a time (`devices:`, `pairs:` in the manifest)."
+            f"in use). {FREE_MEMORY}"
         )
     elif ended_by is not None:
         by = f"signal {-ended_by}, {signal.strsignal(-ended_by)}" if ended_by < 0 else f"exit code {ended_by}"

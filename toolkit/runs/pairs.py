@@ -15,8 +15,7 @@ from typing import Any
 import pandas as pd
 
 from toolkit.errors import OF_THE_DATA, ArtifactError, DamagedError
-from toolkit.files import pair_name, write_text
-from toolkit.runs.record import read_json
+from toolkit.files import pair_name, read_json, write_text
 
 log = logging.getLogger(__name__)
 

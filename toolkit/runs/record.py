@@ -14,7 +14,7 @@ from typing import Any
 
 from toolkit import __version__
 from toolkit.errors import exit_code, sentence
-from toolkit.files import write_text
+from toolkit.files import read_json, write_text
 from toolkit.manifest import STAGES, Manifest
 
 RECORD = "run.json"
@@ -134,15 +134,6 @@ def summary(run_dir: Path) -> dict[str, Any]:
     of_stage = ("scene", "stage", "part", "status", "seconds", "counts", "left_out", "error")
     stages = [{key: row[key] for key in of_stage if key in row} for row in record.get("stages", ())]
     return {key: record.get(key) for key in kept} | {"run": str(run_dir), "stages": stages}
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Return a JSON object, an empty one where the file is missing or holds something else."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}
 
 
 def _versions() -> dict[str, str]:
