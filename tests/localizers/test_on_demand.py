@@ -231,12 +231,12 @@ SLIGHT = replace(VAGUE, misfit=True)  # a misfit that shows in the covariance al
         (OK, None, "ok", "pnp"),
         (DOUBTED, None, "low_confidence: camera?", "pnp"),
         (SLIGHT, None, "ok", "pnp"),
-        (FAILED, DOUBTED, "low_confidence: camera?", "pnp+other"),
-        (LOW, OK, "ok", "pnp+other"),
-        (FAILED, OK, "ok", "pnp+other"),
-        (LOW, LOW, "low_confidence", "pnp+other"),
+        (FAILED, DOUBTED, "low_confidence: camera?", "pnp+sift"),
+        (LOW, OK, "ok", "pnp+sift"),
+        (FAILED, OK, "ok", "pnp+sift"),
+        (LOW, LOW, "low_confidence", "pnp+sift"),
         (LOW, FAILED, "low_confidence", "pnp"),
-        (VAGUE, OK, "ok", "pnp+other"),
+        (VAGUE, OK, "ok", "pnp+sift"),
         (VAGUE, LOW, "ok", "pnp"),
         (FAILED, FAILED, "failed: no consistent pose", "pnp"),
     ],
@@ -253,8 +253,8 @@ def test_more_features_are_asked_where_a_pose_is_not_sure(
 
     extractor = SimpleNamespace(extract=extract, color=False)
     further = Scripted(*([] if second is None else [second]))
-    vars(further).update(mapped=[None], on_demand=[(SimpleNamespace(name="sift", extractor=extractor), None)])
-    localizer: Any = EscalatingLocalizer(Scripted(first), further, "other", 0.05)  # type: ignore[arg-type]
+    kind: Any = SimpleNamespace(name="sift", extractor=extractor)
+    localizer: Any = EscalatingLocalizer(Scripted(first), further, [kind], 0.05)  # type: ignore[arg-type]
     estimate = localizer.localize(scene.query, scene.references)
     assert (estimate.status, estimate.found_by) == (status, found_by)
     assert len(extracted) == len(further.asked) == (second is not None)
@@ -268,6 +268,6 @@ def test_a_query_that_nothing_can_help_is_not_asked_again(lacks: str) -> None:
     query = scene.query if lacks == "references" else replace(scene.query, features=["no image"])
     references = [References.of([])] if lacks == "references" else scene.references
     first, further = Scripted(FAILED), Scripted()
-    localizer: Any = EscalatingLocalizer(first, further, "other", 0.05)  # type: ignore[arg-type]
+    localizer: Any = EscalatingLocalizer(first, further, [], 0.05)  # type: ignore[arg-type]
     assert localizer.localize(query, references) is FAILED
     assert not further.asked

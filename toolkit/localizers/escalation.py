@@ -6,9 +6,9 @@ from typing import Any
 
 from toolkit.capture.images import pixels_of
 from toolkit.features.features import KINDS, LocalFeatures, extract_turned
+from toolkit.features.matching import AnyMethod
 from toolkit.features.stores import as_stored
 from toolkit.localizers.base import Localizer, PoseEstimate, Query, References, rank
-from toolkit.localizers.on_demand import OnDemandLocalizer
 
 
 def is_sure(status: str, position_std_m: float, limit_m: float) -> bool:
@@ -33,18 +33,16 @@ class EscalatingLocalizer:
     """Asks one localizer first, and where its pose is not sure another that has more kinds of features."""
 
     def __init__(
-        self, first: Localizer, second: OnDemandLocalizer, names: str, sure_position_std_m: float, length: float = 1.0
+        self, first: Localizer, second: Localizer, further: Sequence[AnyMethod], sure_position_std_m: float
     ) -> None:
         """
         Args:
             first: asked about every query.
-            second: its kinds of features begin with those of the first.
-            names: of the further kinds.
+            second: its kinds of features are those of the first, then the further ones.
+            further: the further kinds.
             sure_position_std_m: see `PnpSettings`.
-            length: what the lengths of the second are multiples of.
         """
-        self.first, self.second, self._names, self._limit_m = first, second, names, sure_position_std_m
-        self._length = length
+        self.first, self.second, self._further, self._limit_m = first, second, further, sure_position_std_m
 
     @property
     def image_names(self) -> list[str]:
@@ -72,8 +70,8 @@ class EscalatingLocalizer:
 
     def escalate(self, query: Query, references: Sequence[References], prediction: None = None) -> PoseEstimate:
         """Return the pose by the matches of all kinds of features, all of which the query has; see `localize`."""
-        escalated = self.second.localize(query.scaled(1 / self._length), references).scaled(self._length)
-        return replace(escalated, found_by=f"{escalated.found_by}+{self._names}")
+        escalated = self.second.localize(query, references)
+        return replace(escalated, found_by="+".join([escalated.found_by, *(kind.name for kind in self._further)]))
 
     def _with_all_features(self, query: Query) -> Query:
         """Extract the features that the query lacks."""
@@ -83,7 +81,7 @@ class EscalatingLocalizer:
                 features.append(known)
                 continue
             found = []
-            for method, _ in self.second.on_demand[len(known) - len(self.second.mapped) :]:
+            for method in self._further:
                 pixels = pixels_of(view.image, gray=not method.extractor.color)
                 turns = view.turns if KINDS[method.name].upright else 0
                 found.append(as_stored(extract_turned(method.extractor, [pixels], [turns])[0]))

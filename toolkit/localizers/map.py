@@ -197,6 +197,16 @@ class Map:
         """What localizers take as a meter, in the unit of the poses; see `Survey.length`."""
         return self.mapped[0].map.length if self.mapped else 1.0
 
+    @cached_property
+    def in_lengths(self) -> list[MappedFeatures]:
+        """The map's features with their points in multiples of its length."""
+        if self.length == 1.0:
+            return list(self.mapped)
+        return [
+            MappedFeatures(one.map.scaled(1 / self.length), one.features, one.kind, one.matcher, one.name)
+            for one in self.mapped
+        ]
+
     @property
     def sure_position_std(self) -> float:
         """The setting `sure_position_std_m` in the unit of the poses."""
@@ -453,33 +463,22 @@ def create_localizer(settings: LocalizeSettings, map: Map, predictor: Predictor 
         )
     if settings.map is None:
         return _escalating(_on_demand(settings, map, map.kinds), settings, map)
-    length = map.length
-    pnp = PnpLocalizer(_in_lengths(map), settings.pnp, settings.seed)
+    pnp = PnpLocalizer(map.in_lengths, settings.pnp, settings.seed)
     if not settings.predicts:
-        return _escalating(_scaled(pnp, length), settings, map)
+        return _escalating(_scaled(pnp, map), settings, map)
     predictor = predictor or open_predictor(settings, map.capture, map.map_dir)
     turns = map.turns if settings == map.settings else turns_for(settings, map.kinds, map.capture)
     if not settings.predictor.upright:
         turns = None
-    local_map = map.mapped[0].map.scaled(1 / length)
-    feed_forward = FeedForwardLocalizer(local_map, map.session, predictor, settings.predictor, turns, length)
+    local_map = map.in_lengths[0].map
+    feed_forward = FeedForwardLocalizer(local_map, map.session, predictor, settings.predictor, turns, map.length)
     if settings.method == "vggt":
-        return _scaled(feed_forward, length)
-    return _escalating(_scaled(HybridLocalizer(pnp, feed_forward), length), settings, map)
+        return _scaled(feed_forward, map)
+    return _escalating(_scaled(HybridLocalizer(pnp, feed_forward), map), settings, map)
 
 
-def _scaled(localizer: Localizer, length: float) -> Localizer:
-    return localizer if length == 1.0 else ScaledLocalizer(localizer, length)
-
-
-def _in_lengths(map: Map) -> list[MappedFeatures]:  # noqa: A002
-    """Return the map's features with their points in multiples of its length."""
-    if map.length == 1.0:
-        return list(map.mapped)
-    return [
-        MappedFeatures(one.map.scaled(1 / map.length), one.features, one.kind, one.matcher, one.name)
-        for one in map.mapped
-    ]
+def _scaled(localizer: Localizer, map: Map) -> Localizer:  # noqa: A002
+    return localizer if map.length == 1.0 else ScaledLocalizer(localizer, map.length)
 
 
 def _escalating(first: Localizer, settings: LocalizeSettings, map: Map) -> Localizer:  # noqa: A002
@@ -488,8 +487,8 @@ def _escalating(first: Localizer, settings: LocalizeSettings, map: Map) -> Local
     if not map.escalation or map.consistency.verdict == "inconsistent":
         return first
     kinds: list[AnyMethod] = [*(map.kinds if settings.map is None else ()), *map.escalation]
-    names = "+".join(kind.name for kind in map.escalation)
-    return EscalatingLocalizer(first, _on_demand(settings, map, kinds), names, map.sure_position_std, map.length)
+    second = _scaled(_on_demand(settings, map, kinds), map)
+    return EscalatingLocalizer(first, second, map.escalation, map.sure_position_std)
 
 
 def _on_demand(
@@ -501,7 +500,7 @@ def _on_demand(
     names = map.mapped[0].map.image_names if map.mapped else None
     return OnDemandLocalizer(
         PosedImages.of_session(map.session, names, map.length),
-        _in_lengths(map),
+        map.in_lengths,
         [(kind, partial(_features_of, map, kind)) for kind in kinds],
         settings.map,
         settings.pnp,
