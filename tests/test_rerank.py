@@ -19,7 +19,7 @@ from toolkit.evaluate import overlap_in_view, overlap_table
 from toolkit.features import verification
 from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor
 from toolkit.features.matching import LocalMethod, MutualMatcher
-from toolkit.features.verification import count_inliers, is_meaningful
+from toolkit.features.verification import is_meaningful, verified_matches
 from toolkit.files import SceneFiles, read_references, sidecar_path
 from toolkit.geometry import invert, make_pose, transform
 from toolkit.manifest import RerankSettings
@@ -50,6 +50,10 @@ def two_views(count: int, right: int, seed: int = 0, center: tuple[float, float,
 
 
 # ------------------------------------------------------------------------------------------------ inliers
+
+
+def count_inliers(*args: Any, **kwargs: Any) -> int:
+    return verified_matches(*args, **kwargs).distinct
 
 
 @pytest.mark.parametrize("right", [40, 80, 200])

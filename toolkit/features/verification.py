@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -47,7 +48,7 @@ class Verifier:
         map_features = [self._map_features(name) for name in references]
         matched = self.matcher.match([(features, other) for other in map_features])
         inliers = [
-            count_inliers(
+            verified_matches(
                 camera,
                 features.keypoints[matches.indices[:, 0]],
                 other_camera,
@@ -55,7 +56,7 @@ class Verifier:
                 matches.scores,
                 self.settings,
                 tests=len(references),
-            )
+            ).distinct
             for matches, other, other_camera in zip(matched, map_features, cameras, strict=True)
         ]
         return inliers, [len(matches) for matches in matched]
@@ -64,21 +65,15 @@ class Verifier:
         return features.take(slice(self.settings.max_features))
 
 
-def count_inliers(
-    camera_a: pycolmap.Camera,
-    pixels_a: NDArray[np.floating],
-    camera_b: pycolmap.Camera,
-    pixels_b: NDArray[np.floating],
-    scores: NDArray[np.floating],
-    settings: RerankSettings,
-    tests: int = 1,
-) -> int:
-    """Return how many matches agree with one essential matrix, or 0 where chance would give as many.
+class Verified(NamedTuple):
+    """The matches that agree with one essential matrix."""
 
-    Matches that share a keypoint with another inlier count once. Arguments as of `verified_matches`.
-    """
-    agree, _ = verified_matches(camera_a, pixels_a, camera_b, pixels_b, scores, settings, tests)
-    return min(len(np.unique(np.asarray(pixels)[agree], axis=0)) for pixels in (pixels_a, pixels_b))
+    inliers: Ints
+    """(A,) which they are."""
+    distinct: int
+    """How many there are, if those that share a keypoint count once."""
+    essential: Floats
+    """(3, 3)."""
 
 
 def verified_matches(
@@ -89,8 +84,8 @@ def verified_matches(
     scores: NDArray[np.floating],
     settings: RerankSettings,
     tests: int = 1,
-) -> tuple[Ints, Floats]:
-    """Return which matches agree with one essential matrix, (A,), and that (3, 3); none where chance gives as many.
+) -> Verified:
+    """Return which matches agree with one essential matrix; none where chance would give as many.
 
     The essential matrix is that of D. Nister, "An Efficient Solution to the Five-Point Relative Pose Problem", PAMI
     2004, drawn in the order of the matches' scores (O. Chum, J. Matas, "Matching with PROSAC", CVPR 2005).
@@ -101,7 +96,7 @@ def verified_matches(
         scores: (K,) how sure the matches are.
         tests: how many pairs are looked at together; among more, chance does more.
     """
-    nothing = np.zeros(0, np.int64), np.zeros((3, 3))
+    nothing = Verified(np.zeros(0, np.int64), 0, np.zeros((3, 3)))
     if len(scores) < 6:  # five always agree
         return nothing
     order = np.argsort(-scores, kind="stable")
@@ -123,11 +118,11 @@ def verified_matches(
     pinhole = np.eye(3), np.eye(3), np.zeros(5), np.zeros(5)  # the rays are calibrated already
     essential, mask = cv2.findEssentialMat(rays_a[finite], rays_b[finite], *pinhole, options)
     agree = np.flatnonzero(finite)[:0] if mask is None else np.flatnonzero(finite)[np.ravel(mask) > 0]
-    inliers = min(len(np.unique(pixels[agree], axis=0)) for pixels in (pixels_a, pixels_b))
+    distinct = min(len(np.unique(pixels[agree], axis=0)) for pixels in (pixels_a, pixels_b))
     chance = max(_chance(camera, options.threshold) for camera in (camera_a, camera_b))
-    if not is_meaningful(inliers, len(scores), chance, tests):
+    if not is_meaningful(distinct, len(scores), chance, tests):
         return nothing
-    return order[agree], np.asarray(essential[:3], np.float64)
+    return Verified(order[agree], distinct, np.asarray(essential[:3], np.float64))
 
 
 def is_meaningful(inliers: int, matches: int, chance: float, tests: int = 1) -> bool:

@@ -121,7 +121,7 @@ class Survey:
         (matches,) = self._matcher.match([(a, b)])
         cameras = self.images.cameras
         xy = a.keypoints[matches.indices[:, 0]], b.keypoints[matches.indices[:, 1]]
-        kept, essential = verified_matches(cameras[i], xy[0], cameras[j], xy[1], matches.scores, RerankSettings())
+        kept, _, essential = verified_matches(cameras[i], xy[0], cameras[j], xy[1], matches.scores, RerankSettings())
         if len(kept) < LEAST_MATCHES:
             return None
         rays = rays_of(cameras[i], xy[0][kept]), rays_of(cameras[j], xy[1][kept])
