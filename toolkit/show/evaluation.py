@@ -17,6 +17,7 @@ from toolkit.show.metrics import (
     Threshold,
     is_below,
     parse_threshold,
+    small_unit,
     threshold_name,
     unit_of,
 )
@@ -66,6 +67,7 @@ def draw_evaluation(evaluation: Evaluation) -> dict[str, "Figure"]:
     done = done.dropna(subset=["localized"]) if "localized" in done else done.iloc[:0]
     if len(done):
         unit = evaluation.unit
+        small, factor = small_unit(unit)
         columns = [(f"recall@{threshold_name(t, unit)}", f"recall @ {_limit(t, unit)}", 100.0, "%")
                    for t in evaluation.thresholds]  # fmt: skip
         figures["recall"] = draw_matrices(
@@ -74,7 +76,7 @@ def draw_evaluation(evaluation: Evaluation) -> dict[str, "Figure"]:
         figures["median_errors"] = draw_matrices(
             done,
             [("median_rotation_deg", "median rotation error", 1.0, "°"),
-             ("median_translation_m", "median translation error", *((100.0, "cm") if unit == "m" else (1.0, unit)))],
+             ("median_translation_m", "median translation error", factor, small)],
             "Median errors over all queries (∞: half of them have no pose)", "lower",
         )  # fmt: skip
         figures["error_curves"] = draw_error_curves(evaluation.errors, evaluation.thresholds, unit)

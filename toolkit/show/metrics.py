@@ -37,9 +37,14 @@ def length_unit(record: Mapping[str, Any]) -> tuple[str, float]:
     return ("m", 1.0) if record["unit"] or not record["depth"] else (UNKNOWN_UNIT, record["depth"] / 10)
 
 
-def unit_of(threshold: str) -> str:
-    """Return the unit of a threshold's name, or of that of a column."""
-    return UNKNOWN_UNIT if threshold.endswith(f"{UNKNOWN_UNIT})") else "m"
+def unit_of(*thresholds: str) -> str:
+    """Return the unit of thresholds, by their names or those of their columns; without any it is the meter."""
+    return UNKNOWN_UNIT if any(name.endswith(f"{UNKNOWN_UNIT})") for name in thresholds) else "m"
+
+
+def small_unit(unit: str) -> tuple[str, float]:
+    """Return the unit that errors are shown in, and how many of it make one `unit`."""
+    return ("cm", 100.0) if unit == "m" else (unit, 1.0)
 
 
 def pose_errors(

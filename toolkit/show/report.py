@@ -17,7 +17,7 @@ import pandas as pd
 from toolkit.errors import ArtifactError
 from toolkit.files import SceneFiles, read_map_record, sidecar_path, write_text
 from toolkit.show.figures import number, percent
-from toolkit.show.metrics import REASONS, THRESHOLDS, WRONG, parse_threshold, unit_of, worst_first
+from toolkit.show.metrics import REASONS, THRESHOLDS, WRONG, parse_threshold, small_unit, unit_of, worst_first
 
 # All pictures of a page together, before base64 makes them a third larger: the page stays below 10 MB.
 PICTURE_BUDGET = 7_000_000
@@ -235,8 +235,8 @@ def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> dict[str, An
     thresholds = [column for column in recall.columns if column.startswith("recall@")]
     statuses = _read_statuses(files, messages)
     messages += _messages(files.evaluation / "recall.csv") if len(recall) else []
-    unit = unit_of(thresholds[0]) if thresholds else "m"
-    small, factor = ("cm", 100.0) if unit == "m" else (unit, 1.0)
+    unit = unit_of(*thresholds)
+    small, factor = small_unit(unit)
     if unit != "m":
         messages.append(f"The unit of the poses is not known: {unit} is a tenth of the median depth that a map shows.")
     medians = ("median_rotation_deg", "Median rotation error [°]", 1.0), (
@@ -388,8 +388,7 @@ def _pairs(recall: pd.DataFrame, thresholds: list[str]) -> Table:
         columns[name] = name.replace("_", " "), lambda count: "–" if pd.isna(count) else f"{count:.0f}"
     columns |= {name: (f"recall {_threshold(name)}", _share) for name in thresholds}
     columns["median_rotation_deg"] = "median [°]", number
-    unit = unit_of(thresholds[0]) if thresholds else "m"
-    small, factor = ("cm", 100) if unit == "m" else (unit, 1)
+    small, factor = small_unit(unit_of(*thresholds))
     columns["median_translation_m"] = f"median [{small}]", lambda length: number(factor * length)
     columns["ok_wrong"] = "ok but wrong", lambda share: _share(share).text
     columns["state"] = "note", lambda state: "" if state == "evaluated" else str(state)
@@ -445,7 +444,7 @@ def _worst(queries: pd.DataFrame, thresholds: list[str]) -> Table | None:
         return None
     has_truth = "rotation_error_deg" in queries
     threshold = parse_threshold(thresholds[0]) if thresholds else THRESHOLDS[0]
-    unit = unit_of(thresholds[0]) if thresholds else "m"
+    unit = unit_of(*thresholds)
     worst = queries.iloc[worst_first(queries, threshold)[:WORST]]
     if has_truth:
         caption = f"The {len(worst)} worst, by the larger of rotation error / {threshold[0]:g}° and "
