@@ -193,13 +193,14 @@ def _subsessions(capture: Capture, device: str, subsession: str) -> tuple[list[_
     if device not in ("auto", "all", *capture.devices):
         raise ManifestError(f"device is {device!r}; {capture.name} has {', '.join(capture.devices)} (or `auto`).")
     names = _session_names(capture, device)
-    parts, left_out = list[_Subsession](), dict[str, str]()
+    parts, left_out = list[_Subsession](), dict[str, CaptureError]()
     for id_ in names:
         try:
-            session, rows = capture[id_], capture[id_].camera_rows
+            session = capture[id_]
+            rows = session.camera_rows
         except CaptureError as error:
             log.warning("%s is left out: %s", id_, error)
-            left_out[id_], first = str(error), error
+            left_out[id_] = error
             continue
         of_row = session.subsession_of(rows)
         # Images outside every listed subsession are embedded too, under the session's name.
@@ -209,11 +210,11 @@ def _subsessions(capture: Capture, device: str, subsession: str) -> tuple[list[_
             parts.append(_Subsession(session, name, members, np.zeros(len(members), np.int64)))
     chosen = [part for part in parts if subsession in ("all", part.name)]
     if not parts and left_out:
-        raise first
+        raise next(iter(left_out.values()))
     if not chosen:
         known = ", ".join(part.name for part in parts)
         raise ManifestError(f"No images of subsession {subsession!r} in {', '.join(names)}; known: {known}.")
-    return chosen, left_out
+    return chosen, {id_: str(error) for id_, error in left_out.items()}
 
 
 def _remove_former(out_dir: Path, names: list[str], parts: list[_Subsession]) -> None:

@@ -94,7 +94,7 @@ def read_depth(path: str | Path) -> NDArray[np.float32]:
     try:
         depth = decode(path, cv2.IMREAD_UNCHANGED)
     except ImageError as error:
-        fault = f"no 16-bit image of one channel ({error})" if "not found" not in str(error) else "no such file"
+        fault = f"no 16-bit image of one channel ({error})" if Path(path).exists() else "no such file"
         raise CaptureError(f"Depth map {path}: {fault}. Expected a 16-bit PNG in millimeters.") from None
     if depth.dtype != np.uint16 or depth.ndim != 2:
         raise CaptureError(f"Depth map {path}: no 16-bit image of one channel. Expected a 16-bit PNG in millimeters.")

@@ -252,7 +252,7 @@ class GroupWriter:
     def __init__(self, path: Path, made_by: Mapping[str, Any], attributes: Mapping[str, Any] | None = None):
         """Groups made by something else than `made_by`, JSON, are not kept; other readers see the `attributes`."""
         self.path = path
-        self.index = Index()
+        self.index: Index
         """What the file and the complete parts hold."""
         self._made_by = made_by
         self._attributes = attributes or {}
@@ -271,9 +271,7 @@ class GroupWriter:
                 sidecar_path(part).unlink(missing_ok=True)
             else:
                 self._parts[part] = index
-        for index in (self._whole, *self._parts.values()):
-            if index is not None:
-                self.index.update(index)
+        self._index_all()
         self._part_closed = time.monotonic()
 
     def __enter__(self) -> "GroupWriter":
@@ -385,11 +383,14 @@ class GroupWriter:
                 for name in self._whole.groups:
                     source.copy(name, file, name)
             self._write_record(self._whole)
+        self._index_all()
+        return damaged
+
+    def _index_all(self) -> None:
         self.index = Index()
         for index in (self._whole, *self._parts.values()):
             if index is not None:
                 self.index.update(index)
-        return damaged
 
     def discard(self) -> None:
         """Forget all groups, also those of the file: `finish` replaces it by what is added from now on."""
