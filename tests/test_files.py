@@ -259,3 +259,16 @@ def test_what_killed_writers_left_is_swept_and_nothing_else(tmp_path: Path) -> N
         files.sweep_partials(tmp_path)
         assert temporary.exists()
         assert {path.name for path in tmp_path.rglob("*")} == {"deep", ".mine.partial", temporary.name}
+
+
+def test_a_killed_writer_of_a_folder_leaves_what_the_next_one_removes(tmp_path: Path) -> None:
+    script = (
+        "import os, sys; from toolkit.files import write_folder\n"
+        "with write_folder(sys.argv[1]) as f:\n    (f / 'a.txt').touch(); os.kill(os.getpid(), 9)"
+    )
+    command = [sys.executable, "-c", script, str(tmp_path / "model[1]")]
+    subprocess.run(command, cwd=Path(files.__file__).parents[1], check=False)
+    assert [path.name.startswith(".model[1].") for path in tmp_path.iterdir()] == [True]
+    with files.write_folder(tmp_path / "model[1]") as folder:
+        (folder / "b.txt").touch()
+    assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")] == ["model[1]", "model[1]/b.txt"]

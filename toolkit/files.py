@@ -1,11 +1,13 @@
 """Artifacts on disk: written whole or not at all, each with a record of what it was made from."""
 
+import glob
 import hashlib
 import json
 import logging
 import os
 import platform
 import re
+import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -45,6 +47,24 @@ def write_atomic(path: str | Path) -> Iterator[Path]:
     finally:
         with suppress(FileNotFoundError):
             temporary.unlink()
+
+
+@contextmanager
+def write_folder(path: str | Path) -> Iterator[Path]:
+    """Yield a hidden folder that is moved to `path`, absent or empty, when the block ends without an error.
+
+    What a killed writer of the same folder left is removed.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for stale in path.parent.glob(f".{glob.escape(path.name)}.*-*"):
+        if is_left_over(stale.name):
+            shutil.rmtree(stale, ignore_errors=True)
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.{process_tag()}-", dir=path.parent) as folder:
+        part = Path(folder) / path.name
+        part.mkdir()
+        yield part
+        part.replace(path)
 
 
 def process_tag() -> str:

@@ -1,6 +1,5 @@
 """What other tools read: the map as a COLMAP model, retrieval as a list of pairs for hloc, poses as a table."""
 
-import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
@@ -15,7 +14,7 @@ from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import ArtifactError, ManifestError
 from toolkit.exchange.submission import Captures
 from toolkit.features.stores import FeatureStore
-from toolkit.files import SceneFiles, image_name, pair_name, read_references, write_atomic, write_text
+from toolkit.files import SceneFiles, image_name, pair_name, read_references, write_atomic, write_folder, write_text
 from toolkit.geometry import Floats, invert, qt_from_pose
 from toolkit.localizers.correspondences import LocalizedQueries
 from toolkit.localizers.local_map import LocalMap
@@ -49,14 +48,8 @@ def export_colmap(
     stores = [_features_of(files, session_id, path) for path in paths]
     local_map, keypoints = _pooled([LocalMap.load(path) for path in paths], stores)
     model = colmap_model(local_map, session, keypoints)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as folder:
-        part = Path(folder) / "model"
-        part.mkdir()
+    with write_folder(out) as part:
         model.write_binary(str(part))
-        if out.exists():
-            out.rmdir()
-        part.rename(out)
     return model
 
 

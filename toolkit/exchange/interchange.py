@@ -14,7 +14,6 @@ import re
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -31,6 +30,7 @@ from toolkit.capture.exif import ORIENTATION, exif_camera, read_header, read_num
 from toolkit.capture.names import EXPECTED_NAME, is_bad_name, note_linked_here
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import CaptureError, ImageError, ManifestError
+from toolkit.files import write_folder
 from toolkit.geometry import Floats, invert, make_pose, pose_from_qt
 from toolkit.localizers.mapping import camera_text
 from toolkit.manifest import nearest
@@ -125,10 +125,7 @@ class _Draft:
         ]  # fmt: skip
         columns = ["image", "status", "path", "timestamp", "sensor_id", "device_id", "camera"]
         table = pd.DataFrame(self.rows, columns=columns).astype({"timestamp": "Int64"})
-        self.session.parent.mkdir(parents=True, exist_ok=True)
-        # Moved into place when it is whole.
-        with tempfile.TemporaryDirectory(prefix=f".{self.session.name}.", dir=self.session.parent) as folder:
-            part = Path(folder) / self.session.name
+        with write_folder(self.session) as part:
             for image in self.images:
                 source, target = self.folder / image.name, part / RAW_DATA / image.path
                 target.parent.mkdir(parents=True, exist_ok=True)
@@ -140,7 +137,6 @@ class _Draft:
             table.to_csv(part / "proc" / "import.csv", index=False)
             if self.placing == "link":
                 note_linked_here(part)
-            part.rename(self.session)
         return ImportReport(self.session, table, self.notes)
 
     def _write_tables(self, session: Path, times: Mapping[str, int]) -> None:
