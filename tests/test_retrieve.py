@@ -71,6 +71,22 @@ def test_vectors_on_disk_are_searched_block_by_block(
         np.testing.assert_array_equal(scores, expected[0])
 
 
+def test_several_sets_of_queries_on_disk_are_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    database, parts = rng.normal(size=(50, 8)), []
+    for number, (size, chosen) in enumerate([(5, [0, 3]), (4, []), (9, [0, 1, 2, 7, 8])]):
+        np.save(tmp_path / f"{number}.npy", rng.normal(size=(size, 8)))
+        rows = np.array(chosen, np.int64)
+        parts.append(StoredVectors((tmp_path / f"{number}.npy",), (0, size), 8, rows, normalize=True))
+    stacked = StoredVectors.stack([*parts, parts[0]])
+    query = np.concatenate([part[:] for part in (*parts, parts[0])])
+    np.testing.assert_array_equal(stacked[:], query)
+    expected = search(query, database, 4)
+    monkeypatch.setattr(search_module, "_QUERY_BYTES", 3 * 4 * 8)
+    for found, wanted in zip(search(stacked, database, 4), expected, strict=True):
+        np.testing.assert_array_equal(found, wanted)
+
+
 def test_search_limits() -> None:
     scores, indices = search(np.ones((2, 3)), np.ones((4, 3), np.float16), 10)
     assert indices.tolist() == [[0, 1, 2, 3]] * 2, "k beyond the database: all of it"
@@ -236,3 +252,18 @@ def test_an_unusable_session_stops_its_own_pairs_alone(
     assert all(len(lines(path)) == count > 0 for path, count in zip(done["path"], done["queries"], strict=True))
     path.write_text(before)
     assert (retrieve_pairs(tiny / "sessions", tmp_path / "embeddings")["reason"] == "").all()
+
+
+def test_a_vector_that_is_not_finite_stops_its_own_pairs_alone(tiny: Path, tmp_path: Path) -> None:
+    expected = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", tmp_path / "before")
+    folder = tmp_path / "embeddings" / "hl_query" / "hl_a"
+    matrix, _ = load_embeddings(folder)
+    matrix[1] = np.nan
+    np.save(folder / "hl_a.npy", matrix)
+    sidecar_path(folder / "hl_a.npy").unlink()  # another tool's, from now on
+    table = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings")
+    lost = table["query_device"] == "hl"
+    assert table["reason"][lost].str.contains(r"query hl_query: query has 1 rows with NaN .* first row 1").all()
+    assert (table["queries"] > 0).tolist() == (table["reason"] == "").tolist() == (~lost).tolist()
+    for before, after in zip(expected["path"][~lost], table["path"][~lost], strict=True):
+        assert [row["topk"] for row in lines(before)] == [row["topk"] for row in lines(after)]

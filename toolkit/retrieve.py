@@ -4,9 +4,9 @@ import json
 import logging
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
 from toolkit.embedders import StoredVectors, load_embeddings, open_embeddings
-from toolkit.embedders.search import Backend, search
+from toolkit.embedders.search import Backend, Found, search
 from toolkit.errors import ArtifactError, CaptureError, ManifestError
 from toolkit.files import (
     file_fingerprint,
@@ -90,33 +90,48 @@ def retrieve_pairs(
     def load_database(device: str) -> _Images:
         return _load_database(capture[f"{device}_map"], embeddings, settings.normalize)
 
-    for device, queried in product(map_devices, query_devices):
-        with table.row(device, queried) as row:
-            query, database = load_queries(queried), load_database(device)
-            started = time.perf_counter()
-            path = out if out.suffix == ".jsonl" else out / f"{pair_name(capture.name, device, queried)}.jsonl"
-            record = {
-                "map": _inputs(database.session, embeddings),
-                "query": _inputs(query.session, embeddings),
-                "rows": fingerprint(query.rows.tolist()),
-                "topk": settings.topk,
-                "normalize": settings.normalize,
-            }
-            skipped = skip_existing and is_current(path, record)
-            if not skipped:
-                _write_pair(path, query, database, settings)
+    for device in map_devices:
+        todo: dict[str, tuple[_Images, Path, dict[str, Any]]] = {}
+        for queried in query_devices:
+            with table.row(device, queried) as row:
+                query, database = load_queries(queried), load_database(device)
+                path = out if out.suffix == ".jsonl" else out / f"{pair_name(capture.name, device, queried)}.jsonl"
+                record = {
+                    "map": _inputs(database.session, embeddings),
+                    "query": _inputs(query.session, embeddings),
+                    "rows": fingerprint(query.rows.tolist()),
+                    "topk": settings.topk,
+                    "normalize": settings.normalize,
+                }
+                skipped = skip_existing and is_current(path, record)
+                if not skipped:
+                    _require_same_dimension(query, database)
+                    todo[queried] = query, path, record
+                row |= {
+                    "keyframes": query.keyframes,
+                    "keyframes_missing": query.keyframes_missing,
+                    "queries": len(query.rows),
+                    "images_missing": query.images_missing,
+                    "database": len(database.rows),
+                    "unposed": database.unposed,
+                    "seconds": 0.0,
+                    "skipped": skipped,
+                    "path": str(path),
+                }
+        if not todo:
+            continue
+        found: dict[str, Found] = {}
+        started = time.perf_counter()
+        with suppress(ArtifactError):  # a value is not finite: the row of its pair says so
+            found = _search({queried: query for queried, (query, _, _) in todo.items()}, database, settings)
+        shared = (time.perf_counter() - started) / len(todo)
+        for queried, (query, path, record) in todo.items():
+            with table.row(device, queried) as row:
+                started = time.perf_counter()
+                found = found or _search({queried: query}, database, settings)
+                _write_pair(path, query, database, found.pop(queried))
                 write_sidecar(path, record)
-            row |= {
-                "keyframes": query.keyframes,
-                "keyframes_missing": query.keyframes_missing,
-                "queries": len(query.rows),
-                "images_missing": query.images_missing,
-                "database": len(database.rows),
-                "unposed": database.unposed,
-                "seconds": round(time.perf_counter() - started, 3),
-                "skipped": skipped,
-                "path": str(path),
-            }
+                row["seconds"] = round(shared + time.perf_counter() - started, 3)
     frame = table.frame()
     write_text(folder / "settings.json", settings.model_dump_json(indent=1) + "\n")
     return frame
@@ -184,20 +199,35 @@ def _load_queries(session: Session, embeddings: Path, queries: str, normalize: b
     )
 
 
-def _write_pair(path: Path, query: _Images, database: _Images, settings: RetrieveSettings) -> None:
-    pair = f"map {database.session.id}, query {query.session.id}"
+def _require_same_dimension(query: _Images, database: _Images) -> None:
     if query.vectors.dim != database.vectors.dim:
         raise ArtifactError(
-            f"{pair}: the map's embeddings have {database.vectors.dim} dimensions, the query's "
-            f"{query.vectors.dim}. They are of different models: embed both again with one."
+            f"map {database.session.id}, query {query.session.id}: the map's embeddings have {database.vectors.dim} "
+            f"dimensions, the query's {query.vectors.dim}. They are of different models: embed both again with one."
         )
+
+
+def _search(queries: Mapping[str, _Images], database: _Images, settings: RetrieveSettings) -> dict[str, Found]:
+    """Return scores and rows (Q, K) of the best map images for several sets of queries, by one pass over the map.
+
+    Raises:
+        ArtifactError: a value is not finite.
+    """
+    stacked = StoredVectors.stack([query.vectors for query in queries.values()])
     backend: Backend = "faiss" if settings.use_faiss else "torch"
     try:
-        scores, indices = search(
-            query.vectors[:], database.vectors, settings.topk, backend, settings.compute_device, settings.faiss_gpu
+        found = search(
+            stacked, database.vectors, settings.topk, backend, settings.compute_device, settings.faiss_gpu
         )
     except ValueError as error:
-        raise ArtifactError(f"{pair}: {error}") from error
+        of = ", ".join(query.session.id for query in queries.values())
+        raise ArtifactError(f"map {database.session.id}, query {of}: {error}") from error
+    cuts = np.cumsum([len(query.rows) for query in queries.values()])[:-1]
+    return dict(zip(queries, zip(*(np.split(part, cuts) for part in found), strict=True), strict=True))
+
+
+def _write_pair(path: Path, query: _Images, database: _Images, found: Found) -> None:
+    scores, indices = found
     world_from_sensor = database.session.world_from_cam(database.rows).tolist()
     rig_from_sensor = query.session.rig_from_cam(query.rows).tolist()
     map_images = _records(database.table, "subsession", "timestamp", "sensor_id", "path")

@@ -1,6 +1,7 @@
 """Exact nearest neighbors among global descriptors, by whatever library is quick at it."""
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -14,30 +15,31 @@ from toolkit.models.compute import resolve_device
 Backend = Literal["faiss", "torch"]
 _BLOCK_BYTES = 128 << 20
 """Of the rows of the database, in float32, that are in memory at a time."""
+_QUERY_BYTES = 512 << 20
+"""Of the queries, in float32, that one pass over the database is for."""
 _MORE = 16
 """Candidates beyond k: the backend's rounding may exchange neighbors in rank."""
 
-_Found = tuple[NDArray[np.float32], Ints]
-_Best = Callable[[NDArray[np.float32], int], _Found]
+Found = tuple[NDArray[np.float32], Ints]
+_Best = Callable[[NDArray[np.float32], int], Found]
 _Vectors = NDArray[np.float32] | StoredVectors
 
 
 def search(
-    query: ArrayLike,
+    query: ArrayLike | StoredVectors,
     database: ArrayLike | StoredVectors,
     k: int,
     backend: Backend = "faiss",
     compute_device: str = "cpu",
     faiss_gpu: bool = False,
-) -> tuple[NDArray[np.float32], Ints]:
+) -> Found:
     """Return the rows of the database with the largest dot products, best first; equal ones by index.
 
-    The database is read in blocks, once. The backend finds candidates; their scores are then computed alike for all
-    backends, so that the result does not depend on it.
+    The database is read in blocks, once for as many queries as fit in 512 MB. The backend finds candidates; their
+    scores are then computed alike for all backends, so that the result does not depend on it.
 
     Args:
-        query: (Q, D), any float type.
-        database: (N, D); `StoredVectors` stay on disk.
+        query, database: (Q, D) and (N, D), any float type; `StoredVectors` stay on disk.
         k: how many; at most N are returned.
         backend: `faiss` or `torch`.
         compute_device: where torch computes: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
@@ -49,21 +51,33 @@ def search(
     Raises:
         ValueError: shapes do not fit, k is below 1, or a value is not finite.
     """
-    query = _matrix(query, "query")
-    vectors = database if isinstance(database, StoredVectors) else _matrix(database, "database")
+    query, vectors = _matrix(query, "query"), _matrix(database, "database")
     if query.shape[1] != vectors.shape[1]:
         raise ValueError(f"query has {query.shape[1]} dimensions, the database {vectors.shape[1]}.")
     if k < 1:
         raise ValueError(f"k is {k}; expected at least 1.")
-    count = len(vectors)
-    k = min(k, count)
+    k = min(k, len(vectors))
     scores, indices = np.zeros((len(query), k), np.float32), np.zeros((len(query), k), np.int64)
-    if not len(query) or not k:
-        return scores, indices
+    for start, part in _blocks(query, _QUERY_BYTES) if k else ():
+        _require_finite(part, "query", start)
+        make = partial(_backend, backend=backend, compute_device=compute_device, faiss_gpu=faiss_gpu)
+        _search_part(part, vectors, make, scores[start : start + len(part)], indices[start : start + len(part)])
+    return scores, indices
+
+
+def _search_part(
+    query: NDArray[np.float32],
+    vectors: _Vectors,
+    make_backend: Callable[[NDArray[np.float32]], _Best],
+    scores: NDArray[np.float32],
+    indices: Ints,
+) -> None:
+    """Fill in scores and indices (Q, K) of queries that fit in memory."""
+    count, k = len(vectors), scores.shape[1]
     lengths = np.linalg.norm(query, axis=1)
     pending, width = np.arange(len(query)), min(count, k + _MORE)
     while len(pending):
-        best = _backend(query[pending], backend, compute_device, faiss_gpu)
+        best = make_backend(query if len(pending) == len(query) else query[pending])
         rough, candidates, longest = _candidates(vectors, best, len(pending), width)
         tolerance = 1e-5 * longest * lengths[pending]
         # Rounding in the backend cuts nothing off once the last candidate is clearly below rank k.
@@ -71,10 +85,11 @@ def search(
         near = rough >= (rough[:, k - 1] - 2 * tolerance)[:, None]
         _rescore(query, vectors, pending[done], candidates[done], near[done], scores, indices)
         pending, width = pending[~done], min(count, 4 * width)
-    return scores, indices
 
 
-def _matrix(values: ArrayLike, name: str) -> NDArray[np.float32]:
+def _matrix(values: ArrayLike | StoredVectors, name: str) -> _Vectors:
+    if isinstance(values, StoredVectors):
+        return values
     matrix = np.ascontiguousarray(values, np.float32)
     if matrix.ndim != 2:
         raise ValueError(f"{name} has shape {matrix.shape}; expected two dimensions, one row a vector.")
@@ -90,9 +105,9 @@ def _require_finite(matrix: NDArray[np.float32], name: str, first: int = 0) -> N
         )
 
 
-def _blocks(vectors: _Vectors) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    """Yield the number of the first row and the rows (n, D) of one block after the other."""
-    step = max(1, _BLOCK_BYTES // (4 * max(1, vectors.shape[1])))
+def _blocks(vectors: _Vectors, size: int) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    """Yield the number of the first row and the rows (n, D) of one block of so many bytes after the other."""
+    step = max(1, size // (4 * max(1, vectors.shape[1])))
     for start in range(0, len(vectors), step):
         yield start, vectors[start : start + step]
 
@@ -101,7 +116,7 @@ def _candidates(vectors: _Vectors, best: _Best, queries: int, width: int) -> tup
     """Return the `width` best scores and indices (Q, width), best first, up to rounding, and the longest length."""
     scores, indices = np.zeros((queries, 0), np.float32), np.zeros((queries, 0), np.int64)
     longest = 0.0
-    for start, block in _blocks(vectors):
+    for start, block in _blocks(vectors, _BLOCK_BYTES):
         length = float(np.sqrt(np.einsum("nd,nd->n", block, block).max()))
         if not np.isfinite(length):
             _require_finite(block, "database", start)
@@ -161,7 +176,7 @@ def _torch_backend(query: NDArray[np.float32], compute_device: str) -> _Best:
     device = resolve_device(compute_device)
     queries = torch.from_numpy(query).to(device)
 
-    def best(block: NDArray[np.float32], number: int) -> _Found:
+    def best(block: NDArray[np.float32], number: int) -> Found:
         scores, indices = (queries @ torch.from_numpy(block).to(device).T).topk(number)
         return scores.cpu().numpy(), indices.cpu().numpy()
 

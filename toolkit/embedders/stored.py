@@ -1,5 +1,6 @@
 """Global descriptors on disk: the matrices of a session as one, read in parts, so that a map need not fit in memory."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -27,6 +28,16 @@ class StoredVectors:
     """Numbers of the chosen rows, ascending."""
     normalize: bool = False
     """Whether vectors are brought to length 1 as they are read."""
+
+    @classmethod
+    def stack(cls, parts: Sequence["StoredVectors"]) -> "StoredVectors":
+        """Return several, of one dimension, one below the other."""
+        starts, rows = [0], list[Ints]()
+        for part in parts:
+            rows.append(part.rows + starts[-1])
+            starts += [starts[-1] + start for start in part.starts[1:]]
+        paths = tuple(path for part in parts for path in part.paths)
+        return replace(parts[0], paths=paths, starts=tuple(starts), rows=np.concatenate(rows))
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from toolkit.capture import Capture, Session
 from toolkit.capture.upright import Turns, upright_turns
-from toolkit.embedders import Embedder, create_embedder, load_embeddings
+from toolkit.embedders import Embedder, StoredVectors, create_embedder, open_embeddings
 from toolkit.embedders.search import search
 from toolkit.errors import ArtifactError, ToolkitError
 from toolkit.features.features import KINDS, LocalFeatures, extract_turned
@@ -57,6 +57,8 @@ SETTINGS = "settings"
 SESSIONS_ROOT = "sessions_root"
 ODD_DEPTHS_M = (0.1, 200.0)
 """A map whose median depth is beyond these may be in another unit."""
+MOST_IN_MEMORY = 1 << 30
+"""Bytes of global descriptors, in float32, that an open map holds; more are read from disk for each search."""
 RETRIEVAL = "retrieval_dir"
 """Attributes of `poses/<pair>.h5`: the settings that the pair was localized with, the capture's `sessions`, and the
 folder of the references."""
@@ -279,13 +281,17 @@ class Map:
         return self.files
 
     @cached_property
-    def _descriptors(self) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """Global descriptors (N, D) of posed map images as they are searched, and the images' rows (N,)."""
-        vectors, table = load_embeddings(self._run.embeddings / f"{self.device}_map")
+    def _descriptors(self) -> tuple[NDArray[np.float32] | StoredVectors, NDArray[np.int64]]:
+        """Global descriptors (N, D) of posed map images as they are searched, and the images' rows (N,).
+
+        Those of a large map stay on disk.
+        """
+        vectors, table = open_embeddings(self._run.embeddings / f"{self.device}_map")
         rows = np.array([self.session.row_of_name[image_name(path)] for path in table["abs_path"]], np.int64)
         posed = np.isfinite(self.session.world_from_cam(rows)).reshape(-1, 16).all(axis=1)
-        vectors = vectors[posed]
-        return unit(vectors) if self.retrieve_settings.normalize else vectors, rows[posed]
+        vectors = replace(vectors.choose(np.flatnonzero(posed)), normalize=self.retrieve_settings.normalize)
+        small = 4 * vectors.dim * len(vectors) < MOST_IN_MEMORY
+        return vectors[:] if small else vectors, rows[posed]
 
     def retrieve(
         self,

@@ -37,11 +37,15 @@ class PairRows:
 
     @contextmanager
     def row(self, map_device: str, query_device: str) -> Iterator[dict[str, Any]]:
-        """Yield the row of a pair, to be filled; an error that is of the pair's own data ends there, as its reason."""
+        """Yield the row of a pair, to be filled, or filled further; an error that is of the pair's own data ends there,
+        as its reason."""
         name = pair_name(self.scene, map_device, query_device)
         note = _note(self.out_dir, name)
-        row: dict[str, Any] = {"map_device": map_device, "query_device": query_device}
-        self.rows.append(row)
+        pair: dict[str, Any] = {"map_device": map_device, "query_device": query_device}
+        row = next((row for row in self.rows if pair.items() <= row.items()), None)
+        if row is None:
+            row = dict(pair)
+            self.rows.append(row)
         try:
             yield row
             row["reason"] = ""
@@ -50,7 +54,8 @@ class PairRows:
             raise  # what is damaged is made again, see `features.groups.heals`
         except OF_THE_DATA as error:
             log.warning("%s is left out: %s", name, error)
-            row.update({"reason": str(error)})
+            row.clear()
+            row.update(pair, reason=str(error))
             write_text(note, json.dumps({"reason": str(error)}) + "\n")
             self.errors.append(error)
 
