@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
 from toolkit.embedders import StoredVectors, load_embeddings, open_embeddings
+from toolkit.embedders.index import EXACT, make_index
 from toolkit.embedders.search import Backend, Found, search
 from toolkit.errors import ArtifactError, CaptureError, ManifestError
 from toolkit.files import (
@@ -35,6 +36,8 @@ from toolkit.runs.pairs import PairRows
 __all__ = ["load_embeddings", "retrieve_pairs", "search"]
 
 log = logging.getLogger(__name__)
+
+_OF_INDEX = {"index", "index_candidates", "nprobe"}
 
 
 
@@ -102,6 +105,7 @@ def retrieve_pairs(
                     "rows": fingerprint(query.rows.tolist()),
                     "topk": settings.topk,
                     "normalize": settings.normalize,
+                    **({} if settings.index == EXACT else settings.model_dump(include=_OF_INDEX)),
                 }
                 skipped = skip_existing and is_current(path, record)
                 if not skipped:
@@ -122,13 +126,16 @@ def retrieve_pairs(
             continue
         found: dict[str, Found] = {}
         started = time.perf_counter()
+        find = partial(
+            _search, database=database, settings=settings, embeddings=embeddings, skip_existing=skip_existing
+        )
         with suppress(ArtifactError):  # a value is not finite: the row of its pair says so
-            found = _search({queried: query for queried, (query, _, _) in todo.items()}, database, settings)
+            found = find({queried: query for queried, (query, _, _) in todo.items()})
         shared = (time.perf_counter() - started) / len(todo)
         for queried, (query, path, record) in todo.items():
             with table.row(device, queried) as row:
                 started = time.perf_counter()
-                found = found or _search({queried: query}, database, settings)
+                found = found or find({queried: query})
                 _write_pair(path, query, database, found.pop(queried))
                 write_sidecar(path, record)
                 row["seconds"] = round(shared + time.perf_counter() - started, 3)
@@ -207,7 +214,13 @@ def _require_same_dimension(query: _Images, database: _Images) -> None:
         )
 
 
-def _search(queries: Mapping[str, _Images], database: _Images, settings: RetrieveSettings) -> dict[str, Found]:
+def _search(
+    queries: Mapping[str, _Images],
+    database: _Images,
+    settings: RetrieveSettings,
+    embeddings: Path,
+    skip_existing: bool,
+) -> dict[str, Found]:
     """Return scores and rows (Q, K) of the best map images for several sets of queries, by one pass over the map.
 
     Raises:
@@ -215,9 +228,11 @@ def _search(queries: Mapping[str, _Images], database: _Images, settings: Retriev
     """
     stacked = StoredVectors.stack([query.vectors for query in queries.values()])
     backend: Backend = "faiss" if settings.use_faiss else "torch"
+    made_of = [_inputs(database.session, embeddings), fingerprint(database.rows.tolist())]
     try:
+        index = make_index(embeddings, database.session.id, database.vectors, settings, made_of, skip_existing)
         found = search(
-            stacked, database.vectors, settings.topk, backend, settings.compute_device, settings.faiss_gpu
+            stacked, database.vectors, settings.topk, backend, settings.compute_device, settings.faiss_gpu, index
         )
     except ValueError as error:
         of = ", ".join(query.session.id for query in queries.values())
@@ -238,6 +253,7 @@ def _write_pair(path: Path, query: _Images, database: _Images, found: Found) -> 
             topk = [
                 {"rank": rank, "score": score, **map_images[index], "Tws": world_from_sensor[index]}
                 for rank, (score, index) in enumerate(zip(image_scores, best, strict=True), start=1)
+                if index >= 0
             ]
             stream.write(json.dumps({**image, "Trs": pose, "topk": topk}) + "\n")
 

@@ -7,7 +7,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from toolkit.embedders.stored import StoredVectors
+from toolkit.embedders.index import VectorIndex
+from toolkit.embedders.stored import StoredVectors, require_finite
 from toolkit.errors import ToolkitError
 from toolkit.geometry import Ints
 from toolkit.models.compute import resolve_device
@@ -32,6 +33,8 @@ def search(
     backend: Backend = "faiss",
     compute_device: str = "cpu",
     faiss_gpu: bool = False,
+    index: VectorIndex | None = None,
+    allowed: NDArray[np.bool_] | None = None,
 ) -> Found:
     """Return the rows of the database with the largest dot products, best first; equal ones by index.
 
@@ -44,9 +47,12 @@ def search(
         backend: `faiss` or `torch`.
         compute_device: where torch computes: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
         faiss_gpu: let faiss compute on the GPU (needs a faiss built for it).
+        index: of the database; finds the candidates instead of the backend. What it misses is missing.
+        allowed: (N,) which rows of the database may be found; None: all.
 
     Returns:
-        Scores (Q, K) float32 and indices (Q, K) int64, K = min(k, N).
+        Scores (Q, K) float32 and indices (Q, K) int64, K = min(k, N); -inf and -1 where an index found no more, or no
+        more are allowed.
 
     Raises:
         ValueError: shapes do not fit, k is below 1, or a value is not finite.
@@ -57,9 +63,21 @@ def search(
     if k < 1:
         raise ValueError(f"k is {k}; expected at least 1.")
     k = min(k, len(vectors))
-    scores, indices = np.zeros((len(query), k), np.float32), np.zeros((len(query), k), np.int64)
+    scores, indices = np.full((len(query), k), -np.inf, np.float32), np.full((len(query), k), -1, np.int64)
+    # Among few allowed rows an index finds next to none: what it looks at is chosen by all rows.
+    if allowed is not None and (index is None or np.count_nonzero(allowed) <= index.candidates):
+        rows = np.flatnonzero(allowed)
+        chosen = vectors.choose(rows) if isinstance(vectors, StoredVectors) else vectors[rows]
+        if len(rows):
+            found = search(query, chosen, k, backend, compute_device, faiss_gpu)
+            scores[:, : len(rows)], indices[:, : len(rows)] = found[0], rows[found[1]]
+        return scores, indices
     for start, part in _blocks(query, _QUERY_BYTES) if k else ():
-        _require_finite(part, "query", start)
+        require_finite(part, "query", start)
+        if index is not None:
+            here = slice(start, start + len(part))
+            _compare(part, vectors, index.find(part, allowed), scores[here], indices[here])
+            continue
         make = partial(_backend, backend=backend, compute_device=compute_device, faiss_gpu=faiss_gpu)
         _search_part(part, vectors, make, scores[start : start + len(part)], indices[start : start + len(part)])
     return scores, indices
@@ -87,22 +105,36 @@ def _search_part(
         pending, width = pending[~done], min(count, 4 * width)
 
 
+def _compare(
+    query: NDArray[np.float32], vectors: _Vectors, candidates: Ints, scores: NDArray[np.float32], indices: Ints
+) -> None:
+    """Fill in scores and indices (Q, K) of the best among the candidates (Q, C) of each query, of which -1 is none."""
+    rough = np.full((len(query), max(candidates.shape[1], scores.shape[1])), -np.inf, np.float32)
+    near, k = np.zeros(rough.shape, bool), scores.shape[1]
+    candidates = np.hstack([candidates, np.full((len(query), rough.shape[1] - candidates.shape[1]), -1, np.int64)])
+    for number, one in enumerate(query):
+        rows = np.unique(candidates[number])  # as they lie on disk
+        rows = rows[rows >= 0]
+        block = vectors[rows]
+        count = len(rows)
+        candidates[number, :count], candidates[number, count:] = rows, -1
+        rough[number, :count] = block @ one
+        if count:
+            tolerance = 1e-5 * np.linalg.norm(block, axis=1).max() * np.linalg.norm(one)
+            kth = np.sort(rough[number, :count])[-min(k, count)]
+            near[number] = rough[number] >= kth - 2 * tolerance
+    _rescore(query, vectors, np.arange(len(query)), candidates, near, scores, indices)
+    indices[np.isneginf(scores)] = -1
+
+
 def _matrix(values: ArrayLike | StoredVectors, name: str) -> _Vectors:
     if isinstance(values, StoredVectors):
         return values
     matrix = np.ascontiguousarray(values, np.float32)
     if matrix.ndim != 2:
         raise ValueError(f"{name} has shape {matrix.shape}; expected two dimensions, one row a vector.")
-    _require_finite(matrix, name)
+    require_finite(matrix, name)
     return matrix
-
-
-def _require_finite(matrix: NDArray[np.float32], name: str, first: int = 0) -> None:
-    bad = ~np.isfinite(matrix).all(axis=1)
-    if bad.any():
-        raise ValueError(
-            f"{name} has {bad.sum()} rows with NaN or infinite values, first row {first + int(bad.argmax())}."
-        )
 
 
 def _blocks(vectors: _Vectors, size: int) -> Iterator[tuple[int, NDArray[np.float32]]]:
@@ -119,7 +151,7 @@ def _candidates(vectors: _Vectors, best: _Best, queries: int, width: int) -> tup
     for start, block in _blocks(vectors, _BLOCK_BYTES):
         length = float(np.sqrt(np.einsum("nd,nd->n", block, block).max()))
         if not np.isfinite(length):
-            _require_finite(block, "database", start)
+            require_finite(block, "database", start)
         longest = max(longest, length)
         of_block, inside = best(block, min(width, len(block)))
         scores, indices = np.hstack([scores, of_block]), np.hstack([indices, inside + start])

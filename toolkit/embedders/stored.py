@@ -65,6 +65,15 @@ class StoredVectors:
         return unit(vectors) if self.normalize else vectors
 
 
+def require_finite(matrix: NDArray[np.float32], name: str, first: int = 0) -> None:
+    """Raise ValueError if a value is not finite; `name` is what the matrix is, `first` the number of its first row."""
+    bad = ~np.isfinite(matrix).all(axis=1)
+    if bad.any():
+        raise ValueError(
+            f"{name} has {bad.sum()} rows with NaN or infinite values, first row {first + int(bad.argmax())}."
+        )
+
+
 def open_embeddings(folder: str | Path) -> tuple[StoredVectors, pd.DataFrame]:
     """Open the embeddings of a session, or of one subsession; vectors stay on disk until they are asked for.
 

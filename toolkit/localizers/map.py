@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from toolkit.capture import Capture, Session
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import Embedder, StoredVectors, create_embedder, open_embeddings
+from toolkit.embedders.index import VectorIndex, load_index
 from toolkit.embedders.search import search
 from toolkit.errors import ArtifactError, ToolkitError
 from toolkit.features.features import KINDS, LocalFeatures, extract_turned
@@ -293,6 +294,13 @@ class Map:
         small = 4 * vectors.dim * len(vectors) < MOST_IN_MEMORY
         return vectors[:] if small else vectors, rows[posed]
 
+    @cached_property
+    def _index(self) -> VectorIndex | None:
+        """What finds candidates among the descriptors, in a run with an index."""
+        return load_index(
+            self._run.embeddings, f"{self.device}_map", len(self._descriptors[0]), self.retrieve_settings
+        )
+
     def retrieve(
         self,
         vectors: NDArray[np.float32],
@@ -320,8 +328,11 @@ class Map:
                 f"{self.embedder.name} gives {vectors.shape[1]}. Embed again."
             )
         vectors = unit(vectors) if self.retrieve_settings.normalize else vectors
-        scores, nearest = search(vectors, database, self.retrieve_settings.topk, "torch", "cpu")
-        ranked = list(zip(rows[nearest], scores.astype(np.float64), strict=True))
+        scores, nearest = search(vectors, database, self.retrieve_settings.topk, "torch", "cpu", index=self._index)
+        ranked = [
+            (rows[of_query[of_query >= 0]], each[of_query >= 0].astype(np.float64))
+            for of_query, each in zip(nearest, scores, strict=True)
+        ]
         if self.reranked:
             ranked = [self._rerank(*each) for each in zip(ranked, pictures, cameras, turns, strict=True)]
         references = []

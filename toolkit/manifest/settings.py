@@ -201,6 +201,12 @@ class RetrieveSettings(Settings):
     """FAISS on the GPU; needs a FAISS built for it."""
     normalize: bool = True
     """Compare by cosine: scale descriptors to unit length before the search."""
+    index: str = "Flat"
+    """FAISS factory string, for large maps; such as PCA512,IVF4096,RaBitQ. Flat: exact search, without an index."""
+    index_candidates: Positive = 1000
+    """Of an index: found for each query, then compared exactly."""
+    nprobe: Positive | None = None
+    """Cells of an IVF index that are looked at; null: a 32nd of them, at least 16."""
     compute_device: ComputeDevice = "auto"
     """Where torch searches: auto, cpu, cuda, cuda:<number> or mps."""
 

@@ -1,0 +1,126 @@
+"""Indexes find the candidates that the exact search finds, made and kept in bounded memory."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from toolkit.embedders import StoredVectors
+from toolkit.embedders import index as index_module
+from toolkit.embedders.index import load_index, make_index
+from toolkit.embedders.search import search
+from toolkit.errors import ArtifactError, ManifestError
+from toolkit.files import sidecar_path
+from toolkit.manifest import RetrieveSettings
+
+DIM = 64
+FACTORIES = ["SQ8", "IVF16,Flat", "PCA32,IVF16,RaBitQ", "HNSW16", "OPQ16_32,IVF16,PQ16x4fs"]
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with vectors in 40 clusters, `0.npy` and `1.npy`."""
+    rng = np.random.default_rng(0)
+    folder = tmp_path_factory.mktemp("vectors")
+    for number, size in enumerate((700, 900)):
+        centers = np.random.default_rng(1).normal(size=(40, DIM))
+        vectors = centers[rng.integers(40, size=size)] + rng.normal(size=(size, DIM)) * 0.3
+        np.save(folder / f"{number}.npy", vectors.astype(np.float16))
+    return folder
+
+
+def stored(place: Path, normalize: bool = True) -> StoredVectors:
+    rows = np.delete(np.arange(1600), [3, 800])
+    return StoredVectors((place / "0.npy", place / "1.npy"), (0, 700, 1600), DIM, rows, normalize)
+
+
+def queries(place: Path) -> NDArray[np.float32]:
+    noise = np.random.default_rng(2).normal(size=(30, DIM)).astype(np.float32)
+    return stored(place)[np.arange(0, 1500, 50)] + 0.01 * noise
+
+
+@pytest.mark.parametrize("factory", FACTORIES)
+@pytest.mark.parametrize("normalize", [True, False])
+def test_an_index_finds_what_the_exact_search_finds(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factory: str, normalize: bool
+) -> None:
+    monkeypatch.setattr(index_module, "_BLOCK_BYTES", 4 * DIM * 100)
+    settings = RetrieveSettings(index=factory, index_candidates=200)
+    vectors = stored(place, normalize)
+    index = make_index(tmp_path / "embeddings", "ios_map", vectors, settings, "these")
+    exact, found = search(queries(place), vectors, 5), search(queries(place), vectors, 5, index=index)
+    assert (found[1] == exact[1]).mean() > 0.9
+    same = found[1] == exact[1]
+    np.testing.assert_array_equal(found[0][same], exact[0][same])
+    assert (np.diff(found[0], axis=1) <= 0).all()
+
+
+@pytest.mark.parametrize("factory", ["Flat", *FACTORIES])
+def test_rows_that_are_not_allowed_are_not_found(place: Path, tmp_path: Path, factory: str) -> None:
+    vectors = stored(place)
+    settings = RetrieveSettings(index=factory, index_candidates=200, nprobe=16)
+    index = make_index(tmp_path / "embeddings", "ios_map", vectors, settings, "these")
+    assert (index is None) == (factory == "Flat")
+    rows_of_all = np.arange(len(vectors))
+    for allowed in (rows_of_all % 3 == 1, np.isin(rows_of_all, [7, 1200]), rows_of_all < 0):
+        scores, rows = search(queries(place), vectors, 5, index=index, allowed=allowed)
+        there = rows >= 0
+        assert allowed[rows[there]].all()
+        assert (there.sum(axis=1) == min(5, allowed.sum())).all()
+        assert np.isneginf(scores[~there]).all()
+        expected, _ = search(queries(place), vectors, 5, allowed=allowed)
+        assert (scores == expected).mean() > 0.8
+
+
+def test_an_index_is_kept_until_its_vectors_or_settings_change(place: Path, tmp_path: Path) -> None:
+    embeddings, vectors = tmp_path / "embeddings", stored(place)
+    settings = RetrieveSettings(index="IVF16,Flat", index_candidates=10)
+    path = tmp_path / "index" / "ios_map.faiss"
+    with pytest.raises(ArtifactError, match=r"ios_map\.faiss.*Retrieve again"):
+        load_index(embeddings, "ios_map", len(vectors), settings)
+
+    def made(settings: RetrieveSettings = settings, made_of: str = "these") -> bool:
+        before = path.stat().st_ino if path.exists() else None
+        index = make_index(embeddings, "ios_map", vectors, settings, made_of)
+        assert index is not None
+        assert index.index.ntotal == len(vectors)
+        return path.stat().st_ino != before
+
+    assert [made(), made()] == [True, False]
+    assert not made(settings.model_copy(update={"nprobe": 3, "index_candidates": 20}))
+    assert made(settings.model_copy(update={"index": "IVF8,SQ8"}))
+    assert made(made_of="others")
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 255
+    path.write_bytes(content)
+    with pytest.raises(ArtifactError, match="damaged"):
+        load_index(embeddings, "ios_map", len(vectors), settings)
+    assert made(made_of="others")
+    path.write_bytes(b"no index")
+    sidecar_path(path).unlink()
+    with pytest.raises(ArtifactError, match=r"ios_map\.faiss.*cannot be read"):
+        load_index(embeddings, "ios_map", len(vectors), settings)
+
+
+def test_a_map_of_no_more_images_than_candidates_needs_no_index(place: Path, tmp_path: Path) -> None:
+    settings = RetrieveSettings(index="IVF4096,Flat", index_candidates=1598)
+    assert make_index(tmp_path / "embeddings", "ios_map", stored(place), settings, "these") is None
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("factory", ["Nope", "IVF4096,Flat", "PCA128,Flat"])
+def test_an_index_that_cannot_be_made_is_refused_by_name(place: Path, tmp_path: Path, factory: str) -> None:
+    settings = RetrieveSettings(index=factory, index_candidates=10)
+    with pytest.raises(ManifestError, match=rf"retrieve\.index: '{factory}' .* 1598 vectors of 64 dimensions"):
+        make_index(tmp_path / "embeddings", "ios_map", stored(place), settings, "these")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_vector_that_is_not_finite_is_told(place: Path, tmp_path: Path) -> None:
+    vectors = np.load(place / "0.npy")
+    vectors[5] = np.nan
+    np.save(tmp_path / "0.npy", vectors)
+    broken = StoredVectors((tmp_path / "0.npy",), (0, 700), DIM, np.arange(700))
+    with pytest.raises(ValueError, match="database has 1 rows with NaN or infinite values, first row 5"):
+        make_index(tmp_path / "embeddings", "ios_map", broken, RetrieveSettings(index="SQ8", index_candidates=10), "")

@@ -1,0 +1,204 @@
+"""Candidates among more global descriptors than are to be compared one by one, by FAISS's indexes.
+
+An index holds vectors in fewer bytes, and looks at a part of them. What it finds is compared again by the vectors on
+disk, see `search`.
+"""
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import faiss as typed_faiss
+import numpy as np
+from numpy.typing import NDArray
+
+from toolkit.embedders.stored import StoredVectors, require_finite
+from toolkit.errors import ArtifactError, ManifestError, ToolkitError, first_line
+from toolkit.files import is_current, require_whole, write_atomic, write_sidecar
+from toolkit.geometry import Ints
+from toolkit.manifest import RetrieveSettings
+
+log = logging.getLogger(__name__)
+faiss: Any = typed_faiss  # its stubs lack much of it
+
+EXACT = "Flat"
+"""Factory string of the exact search, which needs no index."""
+_BLOCK_BYTES = 128 << 20
+_TRAIN_BYTES = 1 << 30
+"""Of vectors, in float32, that are in memory: those that are added at a time, those that an index is trained with."""
+_PER_CELL = 64
+"""Vectors that each cell of an inverted file is trained with, if there are so many."""
+
+
+@dataclass(frozen=True)
+class VectorIndex:
+    """A FAISS index of N vectors."""
+
+    index: Any
+    candidates: int
+    """How many are found for each query."""
+    nprobe: int | None = None
+    """Cells of an inverted file that are looked at; None: a 32nd of them, at least 16."""
+
+    def find(self, query: NDArray[np.float32], allowed: NDArray[np.bool_] | None = None) -> Ints:
+        """Return for each query (Q, D) the rows of candidates (Q, C) int64, -1 where there are fewer.
+
+        Args:
+            allowed: (N,) the rows that may be found; None: all.
+        """
+        selector = None
+        if allowed is not None:
+            selector = faiss.IDSelectorBitmap(np.packbits(allowed, bitorder="little"))
+        number = min(self.candidates, self.index.ntotal)
+        _, rows = self.index.search(query, number, params=self._parameters(self.index, selector))
+        return np.asarray(rows, np.int64)
+
+    def _parameters(self, index: Any, selector: Any) -> Any:
+        index = faiss.downcast_index(index)
+        chosen = {} if selector is None else {"sel": selector}
+        if isinstance(index, faiss.IndexPreTransform):
+            return faiss.SearchParametersPreTransform(index_params=self._parameters(index.index, selector))
+        if isinstance(index, faiss.IndexIVF):
+            nprobe = self.nprobe or max(16, index.nlist // 32)
+            if isinstance(index, faiss.IndexIVFRaBitQ):
+                return faiss.IVFRaBitQSearchParameters(nprobe=nprobe, qb=index.qb, **chosen)
+            return faiss.SearchParametersIVF(nprobe=nprobe, **chosen)
+        if isinstance(index, faiss.IndexHNSW):
+            return faiss.SearchParametersHNSW(efSearch=max(self.candidates, index.hnsw.efSearch), **chosen)
+        return faiss.SearchParameters(**chosen) if chosen else None
+
+
+def make_index(
+    embeddings: Path,
+    map_id: str,
+    vectors: StoredVectors,
+    settings: RetrieveSettings,
+    made_of: Any,
+    skip_existing: bool = True,
+) -> VectorIndex | None:
+    """Return the index of a map, made if it is not there; None where none is needed, see `load_index`.
+
+    Memory is taken for the index and for 1 GB of vectors.
+
+    Args:
+        embeddings: folder of the embeddings; the index is a file in `index` beside it.
+        map_id: the map session.
+        vectors: (N, D) of the map.
+        made_of: what tells these vectors from others, as JSON.
+        skip_existing: take the file if it is of these vectors.
+
+    Raises:
+        ManifestError: there is no such index, or it cannot be made of so many vectors.
+        ValueError: a value is not finite.
+    """
+    path = _index_path(embeddings, map_id)
+    record = {"index": settings.index, "vectors": made_of, "normalize": vectors.normalize}
+    if _is_needed(settings, len(vectors)) and not (skip_existing and is_current(path, record)):
+        index = _build(vectors, settings.index)
+        with write_atomic(path) as temporary:
+            faiss.write_index(index, str(temporary))
+        write_sidecar(path, record)
+    return load_index(embeddings, map_id, len(vectors), settings)
+
+
+def load_index(embeddings: Path, map_id: str, count: int, settings: RetrieveSettings) -> VectorIndex | None:
+    """Return the index that the retrieve stage made of a map of `count` vectors; None if the settings ask for none.
+
+    A map of no more vectors than candidates needs none either.
+
+    Raises:
+        ArtifactError: it is missing or damaged.
+    """
+    if not _is_needed(settings, count):
+        return None
+    path = _index_path(embeddings, map_id)
+    try:
+        require_whole(path)
+        index = faiss.read_index(str(path))
+    except RuntimeError as error:
+        raise ArtifactError(f"{path}: the map's index cannot be read ({first_line(error)}). Retrieve again.") from error
+    if settings.faiss_gpu:
+        index = _on_gpu(index, settings.index)
+    return VectorIndex(index, settings.index_candidates, settings.nprobe)
+
+
+def _is_needed(settings: RetrieveSettings, count: int) -> bool:
+    return settings.index != EXACT and count > settings.index_candidates
+
+
+def _index_path(embeddings: Path, map_id: str) -> Path:
+    return embeddings.parent / "index" / f"{map_id}.faiss"
+
+
+def _build(vectors: StoredVectors, factory: str) -> Any:
+    count, dim = vectors.shape
+    # Of vectors of length 1 the nearest have the largest product, and centering by PCA does not change distances.
+    metric = faiss.METRIC_L2 if vectors.normalize else faiss.METRIC_INNER_PRODUCT
+    try:
+        index = faiss.index_factory(dim, factory, metric)
+        _train(index, vectors)
+        for rows in _parts(np.arange(count), dim):
+            block = vectors[rows]
+            require_finite(block, "database", int(rows[0]))
+            index.add(block)
+    except RuntimeError as error:
+        said = str(error).split("Error: ")[-1].strip().splitlines()[-1]
+        raise ManifestError(
+            f"retrieve.index: {factory!r} cannot be made of {count} vectors of {dim} dimensions ({said}). Expected a "
+            f"string of FAISS's index factory, such as PCA512,IVF4096,RaBitQ; {EXACT} needs no index."
+        ) from error
+    log.info("index %s of %d vectors is made", factory, count)
+    return index
+
+
+def _train(index: Any, vectors: StoredVectors) -> None:
+    """Train the parts of an index one after the other: those that see fewer dimensions see more vectors."""
+    rng = np.random.default_rng(0)
+    index = faiss.downcast_index(index)
+    applied = list[Callable[[NDArray[np.float32]], NDArray[np.float32]]]()
+
+    def sample(dim: int, most: int) -> NDArray[np.float32]:
+        number = min(len(vectors), most, _TRAIN_BYTES // (4 * dim))
+        rows = np.sort(rng.choice(len(vectors), number, replace=False))
+        parts = []
+        for part in _parts(rows, vectors.dim):
+            block = vectors[part]
+            for apply in applied:
+                block = apply(block)
+            parts.append(block)
+        return np.concatenate(parts)
+
+    if not isinstance(index, faiss.IndexPreTransform):
+        _train_last(index, sample)
+        return
+    for number in range(index.chain.size()):
+        transform = faiss.downcast_VectorTransform(index.chain.at(number))
+        if not transform.is_trained:
+            transform.train(sample(transform.d_in, len(vectors)))
+        applied.append(transform.apply)
+    _train_last(faiss.downcast_index(index.index), sample)
+    index.is_trained = True
+
+
+def _train_last(index: Any, sample: Callable[[int, int], NDArray[np.float32]]) -> None:
+    if not index.is_trained:
+        most = _PER_CELL * index.nlist if isinstance(index, faiss.IndexIVF) else 1 << 20
+        index.train(sample(index.d, most))
+
+
+def _parts(rows: Ints, dim: int) -> list[Ints]:
+    """Return rows in parts whose vectors fit in memory."""
+    step = max(1, _BLOCK_BYTES // (4 * dim))
+    return [rows[start : start + step] for start in range(0, len(rows), step)]
+
+
+def _on_gpu(index: Any, factory: str) -> Any:
+    try:
+        return faiss.index_cpu_to_all_gpus(index)
+    except (AttributeError, RuntimeError) as error:
+        raise ToolkitError(
+            f"faiss_gpu: the installed FAISS cannot have the index {factory} on a GPU ({first_line(error)}). "
+            "Set faiss_gpu: false."
+        ) from error
