@@ -278,7 +278,9 @@ def test_a_rig_goes_on_with_the_cameras_that_it_has(capture: Path, run: SceneFil
     rows = session.rows_of_keyframes(keyframe)[0]
     session.image_path(int(rows[0])).unlink()
     run_stage(capture, run, query_device="spot")
-    assert rows_of(run, "spot")["status"].iloc[0] in ("ok", "low_confidence")
+    row = rows_of(run, "spot").iloc[0]
+    assert row["status"] in ("ok", "low_confidence")
+    assert f"Image not found: {session.image_path(int(rows[0]))}" in row["reason"]
     estimated = Trajectory.read(run.poses_txt("ios", "spot"))
     true = session.ground_truth.lookup(estimated.timestamps[:1], estimated.device_ids[:1])
     assert geometry.pose_error(estimated.world_from_device[:1], true)[1] < 0.1

@@ -605,6 +605,7 @@ def test_images_without_features_are_left_out_and_the_others_keep_their_numbers(
     estimate = ask(room.localizer(), cameras, poses, ["torn", *features[1:]], references)
     check(estimate, QUERY)
     assert set(estimate.correspondences.camera) == {1, 2}
+    assert estimate.reason == "torn"
     errors = errors_deg(room.points, estimate, cameras, poses)
     assert (errors[estimate.correspondences.inlier] < 1.2 * room.localizer().settings.max_error_deg).all()
     none = ask(room.localizer(), cameras, poses, ["torn", "no features", "torn"], references)

@@ -71,13 +71,15 @@ class PnpLocalizer:
         """
         usable = [index for index, features in enumerate(query.features) if not isinstance(features, str)]
         if len(usable) < len(query.features):
+            missing = "; ".join(features for features in query.features if isinstance(features, str))
             if not usable:
-                return PoseEstimate(f"failed: no readable image ({'; '.join(map(str, query.features))})")
+                return PoseEstimate(f"failed: no readable image ({missing})")
             estimate = self.localize(query.part(usable), [references[index] for index in usable], None, priors)
             used = replace(estimate.correspondences, camera=np.array(usable, np.int64)[estimate.correspondences.camera])
             focals_px = np.full(len(query.features), np.nan)
             focals_px[usable] = estimate.focals_px or np.nan
-            return replace(estimate, correspondences=used, focals_px=tuple(focals_px.tolist()))
+            reason = "; ".join(filter(None, [estimate.reason, missing]))
+            return replace(estimate, correspondences=used, focals_px=tuple(focals_px.tolist()), reason=reason)
         if not any(len(retrieved.images) for retrieved in references):
             return PoseEstimate("failed: no references")
         rig = RigQuery(
