@@ -155,10 +155,15 @@ def test_trajectories_come_back_as_they_were_written(qt: np.ndarray, data: st.Da
         assert back.covariances is None
 
 
+awkward = st.text(st.sampled_from("ab,#/. \n\r\t") | st.characters(codec="utf-8"), max_size=6)
+
+
 @given(
-    sensors=st.lists(st.tuples(st.text(max_size=6), st.text(max_size=6)), max_size=3),
-    images=st.lists(st.tuples(times, st.text(max_size=6), st.text(max_size=6)), max_size=3),
+    sensors=st.lists(st.tuples(ids | awkward, awkward), max_size=2),
+    images=st.lists(st.tuples(times, ids | awkward, ids | awkward), max_size=2),
 )
+@example(sensors=[("#a", "b")], images=[])
+@example(sensors=[("a", "b\rc")], images=[])
 @same_folder
 def test_a_session_comes_back_or_is_refused(
     sensors: list[tuple[str, str]], images: list[tuple[int, str, str]], tmp_path: Path

@@ -74,7 +74,7 @@ def _line(values: Sequence[Any]) -> str:
     # repr of a float is the shortest text that reads back as the same number
     texts = [repr(float(value)) if isinstance(value, float) else str(value) for value in values]
     for text in texts:
-        if "," in text or "\n" in text or text != text.strip(" \t\r\v\f"):
+        if any(sign in text for sign in ",\n\r") or text != text.strip(" \t\r\v\f"):
             raise ValueError(f"The capture format cannot hold a comma, a line break or spaces at an end: {text!r}.")
     if texts[0].startswith("#"):
         raise ValueError(f"A line of the capture format that starts with # is a comment: {texts[0]!r}.")
