@@ -124,9 +124,25 @@ def session_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("file", SESSION_FILES)
 @given(content=texts)
 def test_any_text_is_a_session_or_an_error_with_its_file(file: str, content: bytes, session_folder: Path) -> None:
-    path = session_folder / file
+    use_with(session_folder, file, content)
+
+
+@pytest.mark.parametrize("file", SESSION_FILES)
+@given(data=st.data())
+def test_any_value_is_of_a_session_or_an_error_with_its_file(
+    file: str, data: st.DataObject, session_folder: Path
+) -> None:
+    rows = [line.split(", ") for line in SESSION_FILES[file].splitlines() if not line.startswith("#")]
+    row = rows[data.draw(st.integers(0, len(rows) - 1))]
+    row[data.draw(st.integers(0, len(row) - 1))] = data.draw(values)
+    use_with(session_folder, file, "\n".join(map(", ".join, rows)).encode())
+
+
+def use_with(session: Path, file: str, content: bytes) -> None:
+    """Ask a session for all that the stages ask, with another content of one of its files; errors name a file."""
+    path = session / file
     path.write_bytes(content)
-    _, error = outcome(lambda: use_session(Session.open(session_folder)), CaptureError)
+    _, error = outcome(lambda: use_session(Session.open(session)), CaptureError)
     path.write_text(SESSION_FILES[file])
     assert not error or any(name in error for name in (path.name, "images.txt", "sensors.txt"))
 

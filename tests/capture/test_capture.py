@@ -333,6 +333,7 @@ def test_every_camera_model_of_colmap_opens(tmp_path: Path) -> None:
         ("PINHOLE, 64, 48, 50, 50, 32, nan", "finite"),
         ("PINHOLE, 64.5, 48, 50, 50, 32, 24", "found image size 64.5 x 48"),
         ("PINHOLE, -64, 48, 50, 50, 32, 24", "found image size -64 x 48"),
+        ("PINHOLE, 64, 18446744073709551616, 50, 50, 32, 24", "found image size 64 x 1.84467e+19"),
         ("PINHOLE, 64, 48, -50, 50, 32, 24", "found a focal length that is not positive"),
         ("PINHOLE, 64, 48, 50, 50, 3200, 24", "found a principal point at 3200"),
         ("SIMPLE_RADIAL, 64, 48, 50, 32, -49, 0", "found a principal point at -49"),

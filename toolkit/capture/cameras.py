@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from toolkit.geometry import Floats, unit
 
 CAMERA_TYPES = ("camera", "depth")  # both have intrinsics; only the first takes photographs
+_LARGEST = 2**31 - 1  # pixels of a side; COLMAP refuses larger numbers with errors of its own
 
 
 def parse_camera(sensor_type: str, params: str) -> pycolmap.Camera:
@@ -37,8 +38,8 @@ def parse_camera(sensor_type: str, params: str) -> pycolmap.Camera:
             f"expected width, height and {count} finite numbers."
         )
     width, height = numbers[:2]
-    if width < 1 or height < 1 or width % 1 or height % 1:
-        raise ValueError(f"found image size {width:g} x {height:g}, expected positive whole numbers.")
+    if not all(1 <= size <= _LARGEST and size % 1 == 0 for size in (width, height)):
+        raise ValueError(f"found image size {width:g} x {height:g}, expected whole numbers from 1 to {_LARGEST:,}.")
     camera = pycolmap.Camera(model=model, width=int(width), height=int(height), params=numbers[2:])
     if any(camera.params[index] <= 0 for index in camera.focal_length_idxs()):
         raise ValueError(f"found a focal length that is not positive in {params!r}, expected pixels.")
