@@ -4,7 +4,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import h5py
 import numpy as np
@@ -182,6 +182,10 @@ class Failing(SimulatedPredictor):
                 if self.how == "raise":
                     raise RuntimeError("out of luck")
                 poses = found[index].model_from_cams.copy()
+                if self.how in ("too few", "no numbers"):
+                    odd: Any = poses[:-1] if self.how == "too few" else "x"
+                    found[index] = replace(found[index], model_from_cams=odd)
+                    continue
                 poses[0 if self.how == "query" else slice(None)] = np.nan
                 if self.how == "references":
                     poses[0] = np.eye(4)
@@ -195,6 +199,8 @@ class Failing(SimulatedPredictor):
         ("raise", "failed: internal: RuntimeError: out of luck"),
         ("query", "failed: the predicted camera is not finite"),
         ("references", "failed: references 0, 1, 2, 3, 4 left out: not finite; no usable reference"),
+        ("too few", "failed: AlignmentError: Found 4 model_from_cams and 5 world_from_cams: expected as many"),
+        ("no numbers", "failed: internal: ValueError: could not convert string to float: 'x'"),
     ],
 )
 def test_one_bad_query_is_a_failed_answer_and_the_others_go_on(world: World, how: str, reason: str) -> None:

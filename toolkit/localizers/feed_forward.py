@@ -10,7 +10,7 @@ from toolkit import geometry
 from toolkit.capture import Session
 from toolkit.capture.depths import DepthMaps, SeenDepth, lifted
 from toolkit.capture.upright import Turns
-from toolkit.errors import reason_of
+from toolkit.errors import first_line, reason_of
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.alignment import Alignment, align_to_map, is_trustworthy, query_pose
 from toolkit.localizers.base import PoseEstimate, Query, References, View
@@ -18,6 +18,7 @@ from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.pose_mean import robust_mean_pose
 from toolkit.localizers.prediction import Prediction, Predictor
 from toolkit.localizers.references import select_references
+from toolkit.localizers.robust import AlignmentError
 from toolkit.manifest import PredictorSettings
 
 log = logging.getLogger(__name__)
@@ -159,6 +160,8 @@ class FeedForwardLocalizer:
             return CameraAnswer(references, reason=prediction)
         try:
             return self._align(references, prediction)
+        except AlignmentError as error:  # of this prediction alone
+            return CameraAnswer(references, prediction, reason=first_line(error))
         except Exception as error:  # a prediction may be anything
             return CameraAnswer(references, prediction, reason=reason_of(error, "aligning a prediction"))
 
