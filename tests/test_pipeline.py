@@ -318,6 +318,20 @@ def test_a_killed_run_is_taken_up_again(place: Path, go: Callable[..., dict[str,
     assert go() == {"embed": "reused", "retrieve": "done"}
 
 
+def test_a_stage_that_was_stopped_is_not_taken_for_the_one_before(
+    go: Callable[..., dict[str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    assert go() == {"embed": "done", "retrieve": "done"}
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "execute", stop)
+        with pytest.raises(KeyboardInterrupt):
+            go(force=True, only="retrieve")
+    assert go() == {"embed": "reused", "retrieve": "done"}, "its notebook is not of a whole execution any more"
+
+
 def test_output_that_cannot_be_written_is_said(place: Path) -> None:
     (place / "file").write_text("in the way")
     with pytest.raises(ManifestError, match=r"output_root: .*file/runs"):

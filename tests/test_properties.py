@@ -263,6 +263,8 @@ rows = st.fixed_dictionaries(
 )
 @example(content=b"[" * 100_000)
 @example(content=b'{"timestamp": ' + b"9" * 5000 + b', "sensor_id": "", "topk": []}')
+@example(content=b'{"timestamp": 1, "sensor_id": "", "topk": {}}')
+@example(content=b'{"timestamp": [], "sensor_id": "", "topk": []}')
 @same_folder
 def test_any_text_is_a_list_of_references_or_an_error_with_its_line(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "pair.jsonl"

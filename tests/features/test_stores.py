@@ -208,13 +208,16 @@ def test_unreadable_images_are_listed_and_the_others_are_not_lost(
 
 
 @pytest.mark.parametrize("keep", [0, 100, 0.5, -1])
-def test_a_torn_file_is_made_anew(session: Session, tmp_path: Path, keep: float) -> None:
+def test_a_torn_file_is_made_anew(
+    session: Session, tmp_path: Path, keep: float, caplog: pytest.LogCaptureFixture
+) -> None:
     store = extract(session, tmp_path / "features")
     content = store.path.read_bytes()
     size = len(content) - 1 if keep == -1 else int(keep * len(content)) if 0 < keep < 1 else int(keep)
     store.path.write_bytes(content[:size])
     assert sidecar_path(store.path).exists()  # the record says that all is well
     again = extract(session, tmp_path / "features")
+    assert f"{store.path} is torn" in caplog.text
     for row in (0, 2, 3, 4, 5):
         name = session.image_name(row)
         assert_same(again[name], SiftExtractor(SETTINGS).extract([textured(row)])[0])

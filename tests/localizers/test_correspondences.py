@@ -8,7 +8,7 @@ import pytest
 
 from tests.localized import some_correspondences
 from toolkit.errors import ArtifactError
-from toolkit.features.groups import GroupWriter
+from toolkit.features.groups import CHECKSUM, GroupWriter
 from toolkit.localizers.correspondences import MAPS, Correspondences, LocalizedQueries, LocalizedQuery, query_group
 
 NAMES = ["ios_map/raw_data/1.jpg", "ios_map/raw_data/morning walk/2.jpg"]
@@ -96,3 +96,17 @@ def test_a_missing_torn_or_incomplete_file_says_what_to_do(stored: LocalizedQuer
         del file["5/phone/references"]
     with pytest.raises(ArtifactError, match=r"pair\.h5 is damaged at 5/phone.*run its stage again"):
         LocalizedQueries(stored.path)[5, "phone"]
+
+
+@pytest.mark.parametrize("pixels", [None, np.zeros((3, 3), np.float32), np.zeros(2, np.float32)])
+def test_a_file_of_another_tool_that_is_not_as_a_run_writes_it_says_what_to_do(
+    stored: LocalizedQueries, pixels: np.ndarray | None
+) -> None:
+    stored.close()
+    with h5py.File(stored.path, "a") as file:
+        group = file["17/robot%2Fbody"]
+        del group.attrs[CHECKSUM.decode()], group["pixels"]
+        if pixels is not None:
+            group["pixels"] = pixels
+    with pytest.raises(ArtifactError, match=r"pair\.h5: 17/robot%2Fbody .*Localize again"):
+        LocalizedQueries(stored.path)[17, "robot/body"]
