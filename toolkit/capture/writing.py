@@ -94,8 +94,10 @@ def read_depth(path: str | Path) -> NDArray[np.float32]:
     try:
         depth = decode(path, cv2.IMREAD_UNCHANGED)
     except ImageError as error:
-        fault = f"no 16-bit image of one channel ({error})" if Path(path).exists() else "no such file"
-        raise CaptureError(f"Depth map {path}: {fault}. Expected a 16-bit PNG in millimeters.") from None
+        raise CaptureError(
+            f"Depth map {path}: no such file, or no 16-bit image of one channel ({error}). Expected a 16-bit PNG in "
+            "millimeters."
+        ) from None
     if depth.dtype != np.uint16 or depth.ndim != 2:
         raise CaptureError(f"Depth map {path}: no 16-bit image of one channel. Expected a 16-bit PNG in millimeters.")
     return (depth / np.float32(DEPTH_SCALE)).astype(np.float32)
