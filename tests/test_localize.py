@@ -32,7 +32,7 @@ from toolkit.features import groups
 from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor, SiftSettings
 from toolkit.features.matching import MATCHERS, MutualMatcher, unit_descriptors
 from toolkit.features.stores import extract_session
-from toolkit.files import SceneFiles, map_record_path, read_map_record, sidecar_path
+from toolkit.files import SceneFiles, image_name, map_record_path, read_map_record, read_references, sidecar_path
 from toolkit.localize import COLUMNS, Map, localize_image, localize_pairs
 from toolkit.localizers import create_localizer
 from toolkit.localizers import map as maps
@@ -45,7 +45,7 @@ from toolkit.localizers.prediction import Prediction
 from toolkit.localizers.simulated import SimulatedPredictor
 from toolkit.manifest import EmbedSettings, LocalizeSettings
 from toolkit.rerank import rerank_pairs
-from toolkit.retrieve import retrieve_pairs
+from toolkit.retrieve import load_embeddings, retrieve_pairs
 
 LIST = "keyframes_original"
 DEVICES = ("ios", "hl", "spot")
@@ -1033,6 +1033,23 @@ def test_a_picture_is_reranked_as_the_run_was(small_capture: Path, run: SceneFil
         camera = session.camera(session.images["sensor_id"].iloc[rows[0]])
         pose = localize_image(place, session.image_path(int(rows[0])), camera).world_from_rig
         assert ", ".join(repr(float(number)) for number in geometry.qt_from_pose(pose)) in line
+
+
+def test_a_picture_has_the_references_of_a_run_with_an_index(small_capture: Path, run: SceneFiles) -> None:
+    sessions, asked = small_capture / "sessions", {"map_device": "ios", "query_device": "ios"}
+    settings = {"index": "IVF2,Flat", "index_candidates": 4, "nprobe": 1, "topk": 4}
+    retrieve_pairs(sessions, run.embeddings, run.retrieval_dir, settings, queries=LIST, **asked)
+    run_stage(small_capture, run, query_device="ios")
+    place = Map.open(run.run, run.scene, "ios")
+    vectors, table = load_embeddings(run.embeddings / "ios_query")
+    found = dict(zip(table["abs_path"], place.retrieve(vectors), strict=True))
+    names = place.localizer.image_names
+    rows = read_references(run.retrieval("ios", "ios"))
+    assert len(rows) >= 3
+    assert any(len(row["topk"]) < 4 for row in rows), "one cell of two does not hold enough"
+    for row in rows:
+        expected = [image_name(reference["path"]) for reference in row["topk"]]
+        assert [names[index] for index in found[row["path"]].images] == expected
 
 
 # ------------------------------------------------------------------------------------- other features, and several

@@ -159,6 +159,24 @@ def test_backends_write_the_same_and_files_are_reused(tiny: Path, tmp_path: Path
     assert not retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", settings={"topk": 3})["skipped"].any()
 
 
+def test_an_index_is_made_once_and_part_of_what_files_are_made_of(tiny: Path, tmp_path: Path) -> None:
+    exact = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", tmp_path / "exact", {"topk": 3})
+    settings = {"topk": 3, "index": "IVF2,SQ8", "index_candidates": 5, "nprobe": 2}
+    found = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", settings=settings)
+    for row, expected in zip(found["path"], exact["path"], strict=True):
+        assert Path(row).read_bytes() == Path(expected).read_bytes()
+    index = tmp_path / "index" / "ios_map.faiss"
+    made = index.stat().st_ino
+    assert retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", settings=settings)["skipped"].all()
+    again = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", settings=settings | {"nprobe": 1})
+    assert not again["skipped"].any()
+    assert index.stat().st_ino == made
+    poses = tiny / "sessions" / "ios_map" / "trajectories.txt"
+    poses.write_text("\n".join(poses.read_text().splitlines()[:-1]) + "\n")
+    retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", settings=settings | {"index_candidates": 4})
+    assert index.stat().st_ino != made, "of fewer images"
+
+
 def test_missing_images_and_poses_are_reported(
     tiny: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
