@@ -113,7 +113,7 @@ def read_image(path: str | Path, gray: bool = False) -> NDArray[np.uint8]:
         ImageError: the file is missing, or is not an image that can be decoded; see `decode`.
     """
     image = decode(path, (cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR) | cv2.IMREAD_IGNORE_ORIENTATION)
-    return np.asarray(image if gray else image[:, :, ::-1], np.uint8)
+    return np.asarray(image if gray else cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def pixels_of(image: str | Path | NDArray[np.uint8], gray: bool = False) -> NDArray[np.uint8]:
