@@ -109,22 +109,23 @@ def _compare(
     query: NDArray[np.float32], vectors: _Vectors, candidates: Ints, scores: NDArray[np.float32], indices: Ints
 ) -> None:
     """Fill in scores and indices (Q, K) of the best among the candidates (Q, C) of each query, of which -1 is none."""
-    rough = np.full((len(query), max(candidates.shape[1], scores.shape[1])), -np.inf, np.float32)
-    near, k = np.zeros(rough.shape, bool), scores.shape[1]
-    candidates = np.hstack([candidates, np.full((len(query), rough.shape[1] - candidates.shape[1]), -1, np.int64)])
     for number, one in enumerate(query):
         rows = np.unique(candidates[number])  # as they lie on disk
         rows = rows[rows >= 0]
-        block = vectors[rows]
-        count = len(rows)
-        candidates[number, :count], candidates[number, count:] = rows, -1
-        rough[number, :count] = block @ one
-        if count:
-            tolerance = 1e-5 * np.linalg.norm(block, axis=1).max() * np.linalg.norm(one)
-            kth = np.sort(rough[number, :count])[-min(k, count)]
-            near[number] = rough[number] >= kth - 2 * tolerance
-    _rescore(query, vectors, np.arange(len(query)), candidates, near, scores, indices)
-    indices[np.isneginf(scores)] = -1
+        if not len(rows):
+            continue
+        block, k = vectors[rows], min(scores.shape[1], len(rows))
+        rough = block @ one
+        tolerance = 1e-5 * np.linalg.norm(block, axis=1).max() * np.linalg.norm(one)
+        near = rough >= np.partition(rough, -k)[-k] - 2 * tolerance
+        exact = _products(np.broadcast_to(one, (int(near.sum()), len(one))), block[near])
+        best = np.lexsort((rows[near], -exact))[:k]
+        scores[number, :k], indices[number, :k] = exact[best], rows[near][best]
+
+
+def _products(query: NDArray[np.float32], vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the dot products (n,) of rows (n, D), summed in float64."""
+    return np.einsum("nd,nd->n", query.astype(np.float64), vectors.astype(np.float64)).astype(np.float32)
 
 
 def _matrix(values: ArrayLike | StoredVectors, name: str) -> _Vectors:
@@ -177,8 +178,7 @@ def _rescore(
     for start in range(0, len(order), step):
         part = order[start : start + step]
         numbers, where = np.unique(candidates[who[part], rank[part]], return_inverse=True)
-        found, asked = vectors[numbers].astype(np.float64)[where], query[rows[who[part]]].astype(np.float64)
-        exact[who[part], rank[part]] = np.einsum("nd,nd->n", asked, found).astype(np.float32)
+        exact[who[part], rank[part]] = _products(query[rows[who[part]]], vectors[numbers][where])
     best = np.lexsort((candidates, -exact), axis=1)[:, : scores.shape[1]]
     scores[rows], indices[rows] = np.take_along_axis(exact, best, 1), np.take_along_axis(candidates, best, 1)
 
