@@ -7,11 +7,13 @@ disk, see `search`.
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import faiss as typed_faiss
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from toolkit.embedders.stored import StoredVectors, require_finite
@@ -28,8 +30,8 @@ EXACT = "Flat"
 _BLOCK_BYTES = 128 << 20
 _TRAIN_BYTES = 1 << 30
 """Of vectors, in float32, that are in memory: those that are added at a time, those that an index is trained with."""
-_PER_CELL = 64
-"""Vectors that each cell of an inverted file is trained with, if there are so many."""
+_PER_PART = 64
+"""Vectors that each dimension of PCA and each cell of an inverted file is trained with, if there are so many."""
 
 
 @dataclass(frozen=True)
@@ -176,15 +178,33 @@ def _train(index: Any, vectors: StoredVectors) -> None:
     for number in range(index.chain.size()):
         transform = faiss.downcast_VectorTransform(index.chain.at(number))
         if not transform.is_trained:
-            transform.train(sample(transform.d_in, len(vectors)))
+            train = partial(_train_pca, transform) if isinstance(transform, faiss.PCAMatrix) else transform.train
+            train(sample(transform.d_in, _PER_PART * transform.d_out))
         applied.append(transform.apply)
     _train_last(faiss.downcast_index(index.index), sample)
     index.is_trained = True
 
 
+def _train_pca(pca: Any, rows: NDArray[np.float32]) -> None:
+    """Train PCA by random projections, in half a minute for 8,448 dimensions: FAISS's exact solution takes far longer.
+
+    N. Halko, P. G. Martinsson, J. A. Tropp, "Finding Structure with Randomness", SIAM Review 2011.
+    """
+    if min(rows.shape) < pca.d_out:
+        raise RuntimeError(f"PCA to {pca.d_out} dimensions needs as many, and as many vectors")
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        _, lengths, directions = torch.pca_lowrank(torch.from_numpy(rows), q=pca.d_out, niter=2)
+    faiss.copy_array_to_vector(rows.mean(axis=0), pca.mean)
+    faiss.copy_array_to_vector((lengths**2 / len(rows)).numpy(), pca.eigenvalues)
+    faiss.copy_array_to_vector(directions.T.contiguous().numpy().ravel(), pca.PCAMat)
+    pca.prepare_Ab()
+    pca.is_trained = True
+
+
 def _train_last(index: Any, sample: Callable[[int, int], NDArray[np.float32]]) -> None:
     if not index.is_trained:
-        most = _PER_CELL * index.nlist if isinstance(index, faiss.IndexIVF) else 1 << 20
+        most = _PER_PART * index.nlist if isinstance(index, faiss.IndexIVF) else 1 << 20
         index.train(sample(index.d, most))
 
 
