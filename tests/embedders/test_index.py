@@ -117,10 +117,11 @@ def test_an_index_that_cannot_be_made_is_refused_by_name(place: Path, tmp_path: 
     assert not list(tmp_path.iterdir())
 
 
-def test_a_vector_that_is_not_finite_is_told(place: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("factory", FACTORIES)
+def test_a_vector_that_is_not_finite_is_told(place: Path, tmp_path: Path, factory: str) -> None:
     vectors = np.load(place / "0.npy")
     vectors[5] = np.nan
     np.save(tmp_path / "0.npy", vectors)
     broken = StoredVectors((tmp_path / "0.npy",), (0, 700), DIM, np.arange(700))
     with pytest.raises(ValueError, match="database has 1 rows with NaN or infinite values, first row 5"):
-        make_index(tmp_path / "embeddings", "ios_map", broken, RetrieveSettings(index="SQ8", index_candidates=10), "")
+        make_index(tmp_path / "embeddings", "ios_map", broken, RetrieveSettings(index=factory, index_candidates=10), "")

@@ -143,7 +143,7 @@ def _build(vectors: StoredVectors, factory: str) -> Any:
         _train(index, vectors)
         for rows in _parts(np.arange(count), dim):
             block = vectors[rows]
-            require_finite(block, "database", int(rows[0]))
+            require_finite(block, "database", rows)
             index.add(block)
     except RuntimeError as error:
         said = str(error).split("Error: ")[-1].strip().splitlines()[-1]
@@ -167,6 +167,7 @@ def _train(index: Any, vectors: StoredVectors) -> None:
         parts = []
         for part in _parts(rows, vectors.dim):
             block = vectors[part]
+            require_finite(block, "database", part)
             for apply in applied:
                 block = apply(block)
             parts.append(block)

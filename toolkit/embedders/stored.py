@@ -65,13 +65,14 @@ class StoredVectors:
         return unit(vectors) if self.normalize else vectors
 
 
-def require_finite(matrix: NDArray[np.float32], name: str, first: int = 0) -> None:
-    """Raise ValueError if a value is not finite; `name` is what the matrix is, `first` the number of its first row."""
+def require_finite(matrix: NDArray[np.float32], name: str, first: int | Ints = 0) -> None:
+    """Raise ValueError if a value is not finite; `name` is what the matrix is, `first` the number of its first row, or
+    those of all."""
     bad = ~np.isfinite(matrix).all(axis=1)
     if bad.any():
-        raise ValueError(
-            f"{name} has {bad.sum()} rows with NaN or infinite values, first row {first + int(bad.argmax())}."
-        )
+        number = int(bad.argmax())
+        row = first + number if isinstance(first, int) else int(first[number])
+        raise ValueError(f"{name} has {bad.sum()} rows with NaN or infinite values, first row {row}.")
 
 
 def open_embeddings(folder: str | Path) -> tuple[StoredVectors, pd.DataFrame]:
