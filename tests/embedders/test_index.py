@@ -1,5 +1,6 @@
 """Indexes find the candidates that the exact search finds, made and kept in bounded memory."""
 
+import resource
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from toolkit.embedders import StoredVectors
 from toolkit.embedders import index as index_module
 from toolkit.embedders.index import load_index, make_index
 from toolkit.embedders.search import search
-from toolkit.errors import ArtifactError, ManifestError
+from toolkit.errors import ArtifactError, ManifestError, ToolkitError
 from toolkit.files import sidecar_path
 from toolkit.manifest import RetrieveSettings
 
@@ -125,3 +126,24 @@ def test_a_vector_that_is_not_finite_is_told(place: Path, tmp_path: Path, factor
     broken = StoredVectors((tmp_path / "0.npy",), (0, 700), DIM, np.arange(700))
     with pytest.raises(ValueError, match="database has 1 rows with NaN or infinite values, first row 5"):
         make_index(tmp_path / "embeddings", "ios_map", broken, RetrieveSettings(index=factory, index_candidates=10), "")
+
+
+def test_a_faiss_without_gpus_is_told(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def lacks(*_: object) -> None:
+        raise NameError("name 'GpuResourcesVector' is not defined")  # as faiss-cpu says it
+
+    monkeypatch.setattr(index_module.faiss, "index_cpu_to_all_gpus", lacks)
+    settings = RetrieveSettings(index="SQ8", index_candidates=10, faiss_gpu=True)
+    with pytest.raises(ToolkitError, match=r"faiss_gpu: .* SQ8 .*Set faiss_gpu: false"):
+        make_index(tmp_path / "embeddings", "ios_map", stored(place), settings, "these")
+
+
+def test_a_full_disk_is_told_and_leaves_nothing(place: Path, tmp_path: Path) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+    try:
+        with pytest.raises(ToolkitError, match=r"ios_map\.faiss: .* cannot be written .*File too large"):
+            make_index(tmp_path / "embeddings", "ios_map", stored(place), RetrieveSettings(index="SQ8"), "these")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not list((tmp_path / "index").iterdir())

@@ -100,7 +100,12 @@ def make_index(
     if _is_needed(settings, len(vectors)) and not (skip_existing and is_current(path, record)):
         index = _build(vectors, settings.index)
         with write_atomic(path) as temporary:
-            faiss.write_index(index, str(temporary))
+            try:
+                faiss.write_index(index, str(temporary))
+            except RuntimeError as error:
+                raise ToolkitError(
+                    f"{path}: the map's index cannot be written ({_said(error)}). Free some space on the disk."
+                ) from error
         write_sidecar(path, record)
     return load_index(embeddings, map_id, len(vectors), settings)
 
@@ -146,13 +151,17 @@ def _build(vectors: StoredVectors, factory: str) -> Any:
             require_finite(block, "database", rows)
             index.add(block)
     except RuntimeError as error:
-        said = str(error).split("Error: ")[-1].strip().splitlines()[-1]
         raise ManifestError(
-            f"retrieve.index: {factory!r} cannot be made of {count} vectors of {dim} dimensions ({said}). Expected a "
-            f"string of FAISS's index factory, such as PCA512,IVF4096,RaBitQ; {EXACT} needs no index."
+            f"retrieve.index: {factory!r} cannot be made of {count} vectors of {dim} dimensions ({_said(error)}). "
+            f"Expected a string of FAISS's index factory, such as PCA512,IVF4096,RaBitQ; {EXACT} needs no index."
         ) from error
     log.info("index %s of %d vectors is made", factory, count)
     return index
+
+
+def _said(error: RuntimeError) -> str:
+    """Return what FAISS says, without the name of its function."""
+    return str(error).split("Error: ")[-1].strip().splitlines()[-1]
 
 
 def _train(index: Any, vectors: StoredVectors) -> None:
@@ -218,7 +227,7 @@ def _parts(rows: Ints, dim: int) -> list[Ints]:
 def _on_gpu(index: Any, factory: str) -> Any:
     try:
         return faiss.index_cpu_to_all_gpus(index)
-    except (AttributeError, RuntimeError) as error:
+    except (AttributeError, NameError, RuntimeError) as error:  # faiss-cpu lacks what its own functions name
         raise ToolkitError(
             f"faiss_gpu: the installed FAISS cannot have the index {factory} on a GPU ({first_line(error)}). "
             "Set faiss_gpu: false."
