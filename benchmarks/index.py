@@ -72,7 +72,7 @@ def ask(folder: Path, images: int, factory: str, candidates: int) -> dict[str, f
     vectors = StoredVectors((folder / "map.npy",), (0, images), query.shape[1], np.arange(images), normalize=True)
     settings = RetrieveSettings(index=factory, index_candidates=candidates)
     started = time.perf_counter()
-    index = make_index(folder / "embeddings", "map", vectors, settings, "rows", skip_existing=False)
+    index = make_index(folder / "embeddings", "map", vectors, settings, skip_existing=False)
     built = time.perf_counter()
     found = 0.0
     if index is not None:

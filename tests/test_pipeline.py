@@ -157,15 +157,19 @@ def test_damage_in_what_a_stage_left_makes_it_run_again(place: Path, go: Callabl
     assert go()["embed"] == "done"
 
 
-def test_a_damaged_map_makes_the_localize_stage_run_again(place: Path) -> None:
+@pytest.mark.parametrize(("stage", "name"), [("localize", "map/{}_map.npz"), ("retrieve", "index/{}_map.faiss")])
+def test_a_damaged_map_or_index_makes_its_stage_run_again(place: Path, stage: str, name: str) -> None:
     files = SceneFiles(place / "runs", "P")
-    job = pipeline.Job("localize", files, LocalizeSettings(), {"map_device": "ios"}, "map_ios_query_hl")
-    for name in ("ios_map.npz", "hl_map.npz"):
-        write_text(files.maps / name, "points")
+    job = pipeline.Job(stage, files, LocalizeSettings(), {"map_device": "ios"}, "map_ios_query_hl")
+    ours, others = (files.root / name.format(device) for device in ("ios", "hl"))
+    for path in (ours, others):
+        write_text(path, "points")
     before = job.outputs()
-    (files.maps / "hl_map.npz").write_text("paints")
+    others.write_text("paints")
     assert job.outputs() == before, "of another job"
-    (files.maps / "ios_map.npz").write_text("paints")
+    ours.write_text("paints")
+    assert job.outputs() != before
+    ours.unlink()
     assert job.outputs() != before
 
 

@@ -171,6 +171,10 @@ def test_an_index_is_made_once_and_part_of_what_files_are_made_of(tiny: Path, tm
     again = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", settings=settings | {"nprobe": 1})
     assert not again["skipped"].any()
     assert index.stat().st_ino == made
+    index.unlink()
+    retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", settings=settings | {"nprobe": 1})
+    assert index.exists(), "the pairs do not need it, a picture that is localized does"
+    made = index.stat().st_ino
     poses = tiny / "sessions" / "ios_map" / "trajectories.txt"
     poses.write_text("\n".join(poses.read_text().splitlines()[:-1]) + "\n")
     retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", settings=settings | {"index_candidates": 4})

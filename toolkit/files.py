@@ -296,6 +296,10 @@ class SceneFiles:
         return self.root / "map"
 
     @property
+    def index(self) -> Path:
+        return self.root / "index"
+
+    @property
     def retrieval_dir(self) -> Path:
         return self.root / "retrieval"
 

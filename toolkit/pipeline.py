@@ -99,10 +99,12 @@ class Job:
         """Return what identifies the files that the job has made."""
         folder = stage_outputs(self.files, self.stage)
         found = tree_fingerprint(folder, self.label, content=True) if folder else ""
-        if self.stage != "localize":
+        beside = {"retrieve": (self.files.index, "faiss"), "localize": (self.files.maps, "npz")}
+        if self.stage not in beside:
             return found
+        place, kind = beside[self.stage]
         device = self.parameters.get("map_device", "all")
-        maps = sorted(self.files.maps.glob(f"{'*' if device == 'all' else device}_map*.npz"))
+        maps = sorted(place.glob(f"{'*' if device == 'all' else device}_map*.{kind}"))
         return fingerprint([found, [[path.name, checksum(path)] for path in maps]])
 
     def forget(self) -> None:

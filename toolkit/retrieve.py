@@ -16,15 +16,15 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
 from toolkit.embedders import StoredVectors, load_embeddings, open_embeddings
-from toolkit.embedders.index import EXACT, make_index
+from toolkit.embedders.index import EXACT, is_made, make_index
 from toolkit.embedders.search import Backend, Found, search
+from toolkit.embedders.stored import made_of
 from toolkit.errors import ArtifactError, CaptureError, ManifestError
 from toolkit.files import (
     file_fingerprint,
     fingerprint,
     is_current,
     pair_name,
-    sidecar_path,
     write_atomic,
     write_sidecar,
     write_text,
@@ -38,7 +38,6 @@ __all__ = ["load_embeddings", "retrieve_pairs", "search"]
 log = logging.getLogger(__name__)
 
 _OF_INDEX = {"index", "index_candidates", "nprobe"}
-
 
 
 def retrieve_pairs(
@@ -108,6 +107,8 @@ def retrieve_pairs(
                     **({} if settings.index == EXACT else settings.model_dump(include=_OF_INDEX)),
                 }
                 skipped = skip_existing and is_current(path, record)
+                # Pictures that are localized in the map need its index, too.
+                skipped = skipped and is_made(embeddings, database.session.id, database.vectors, settings)
                 if not skipped:
                     _require_same_dimension(query, database)
                     todo[queried] = query, path, record
@@ -228,9 +229,8 @@ def _search(
     """
     stacked = StoredVectors.stack([query.vectors for query in queries.values()])
     backend: Backend = "faiss" if settings.use_faiss else "torch"
-    made_of = [_inputs(database.session, embeddings), fingerprint(database.rows.tolist())]
     try:
-        index = make_index(embeddings, database.session.id, database.vectors, settings, made_of, skip_existing)
+        index = make_index(embeddings, database.session.id, database.vectors, settings, skip_existing)
         found = search(
             stacked, database.vectors, settings.topk, backend, settings.compute_device, settings.faiss_gpu, index
         )
@@ -267,9 +267,4 @@ def _inputs(session: Session, embeddings: Path) -> list[Any]:
     """Identify what a session contributes to a pair's file: its embeddings, poses and calibration."""
     matrices = sorted((embeddings / session.id).rglob("*.npy"))
     texts = [session.path / name for name in ("images.txt", "trajectories.txt", "rigs.txt")]
-    return [
-        # The record beside a matrix says what it was made from, and is small; a foreign matrix may have none.
-        [[path.name, file_fingerprint(record if record.exists() else path)]
-         for path, record in zip(matrices, map(sidecar_path, matrices), strict=True)],
-        [file_fingerprint(path) for path in texts if path.exists()],
-    ]
+    return [made_of(matrices), [file_fingerprint(path) for path in texts if path.exists()]]

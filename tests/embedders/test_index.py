@@ -1,6 +1,7 @@
 """Indexes find the candidates that the exact search finds, made and kept in bounded memory."""
 
 import resource
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +50,7 @@ def test_an_index_finds_what_the_exact_search_finds(
     monkeypatch.setattr(index_module, "_BLOCK_BYTES", 4 * DIM * 100)
     settings = RetrieveSettings(index=factory, index_candidates=200)
     vectors = stored(place, normalize)
-    index = make_index(tmp_path / "embeddings", "ios_map", vectors, settings, "these")
+    index = make_index(tmp_path / "embeddings", "ios_map", vectors, settings)
     exact, found = search(queries(place), vectors, 5), search(queries(place), vectors, 5, index=index)
     assert (found[1] == exact[1]).mean() > 0.9
     same = found[1] == exact[1]
@@ -61,7 +62,7 @@ def test_an_index_finds_what_the_exact_search_finds(
 def test_rows_that_are_not_allowed_are_not_found(place: Path, tmp_path: Path, factory: str) -> None:
     vectors = stored(place)
     settings = RetrieveSettings(index=factory, index_candidates=200, nprobe=16)
-    index = make_index(tmp_path / "embeddings", "ios_map", vectors, settings, "these")
+    index = make_index(tmp_path / "embeddings", "ios_map", vectors, settings)
     assert (index is None) == (factory == "Flat")
     rows_of_all = np.arange(len(vectors))
     for allowed in (rows_of_all % 3 == 1, np.isin(rows_of_all, [7, 1200]), rows_of_all < 0):
@@ -79,11 +80,11 @@ def test_an_index_is_kept_until_its_vectors_or_settings_change(place: Path, tmp_
     settings = RetrieveSettings(index="IVF16,Flat", index_candidates=10)
     path = tmp_path / "index" / "ios_map.faiss"
     with pytest.raises(ArtifactError, match=r"ios_map\.faiss.*Retrieve again"):
-        load_index(embeddings, "ios_map", len(vectors), settings)
+        load_index(embeddings, "ios_map", vectors, settings)
 
-    def made(settings: RetrieveSettings = settings, made_of: str = "these") -> bool:
+    def made(settings: RetrieveSettings = settings, vectors: StoredVectors = vectors) -> bool:
         before = path.stat().st_ino if path.exists() else None
-        index = make_index(embeddings, "ios_map", vectors, settings, made_of)
+        index = make_index(embeddings, "ios_map", vectors, settings)
         assert index is not None
         assert index.index.ntotal == len(vectors)
         return path.stat().st_ino != before
@@ -91,22 +92,38 @@ def test_an_index_is_kept_until_its_vectors_or_settings_change(place: Path, tmp_
     assert [made(), made()] == [True, False]
     assert not made(settings.model_copy(update={"nprobe": 3, "index_candidates": 20}))
     assert made(settings.model_copy(update={"index": "IVF8,SQ8"}))
-    assert made(made_of="others")
+    fewer = vectors.choose(np.arange(1, 1598))
+    assert made(vectors=fewer)
+    others = [(vectors, settings), (stored(place, False).choose(np.arange(1, 1598)), settings)]
+    for theirs, wanted in [*others, (fewer, settings.model_copy(update={"index": "SQ8"}))]:
+        with pytest.raises(ArtifactError, match=r"ios_map\.faiss: .* of other embeddings, poses or settings. Retrieve"):
+            load_index(embeddings, "ios_map", theirs, wanted)
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 255
     path.write_bytes(content)
     with pytest.raises(ArtifactError, match="damaged"):
-        load_index(embeddings, "ios_map", len(vectors), settings)
-    assert made(made_of="others")
+        load_index(embeddings, "ios_map", vectors, settings)
+    assert made()
     path.write_bytes(b"no index")
     sidecar_path(path).unlink()
     with pytest.raises(ArtifactError, match=r"ios_map\.faiss.*cannot be read"):
-        load_index(embeddings, "ios_map", len(vectors), settings)
+        load_index(embeddings, "ios_map", vectors, settings)
+
+
+def test_an_index_is_of_its_embeddings(place: Path, tmp_path: Path) -> None:
+    shutil.copytree(place, tmp_path / "embeddings")
+    vectors, settings = stored(tmp_path / "embeddings"), RetrieveSettings(index="SQ8", index_candidates=10)
+    make_index(tmp_path / "embeddings", "ios_map", vectors, settings)
+    assert load_index(tmp_path / "embeddings", "ios_map", vectors, settings) is not None
+    matrix = np.load(vectors.paths[1])
+    np.save(vectors.paths[1], matrix[::-1])
+    with pytest.raises(ArtifactError, match="of other embeddings"):
+        load_index(tmp_path / "embeddings", "ios_map", vectors, settings)
 
 
 def test_a_map_of_no_more_images_than_candidates_needs_no_index(place: Path, tmp_path: Path) -> None:
     settings = RetrieveSettings(index="IVF4096,Flat", index_candidates=1598)
-    assert make_index(tmp_path / "embeddings", "ios_map", stored(place), settings, "these") is None
+    assert make_index(tmp_path / "embeddings", "ios_map", stored(place), settings) is None
     assert not list(tmp_path.iterdir())
 
 
@@ -114,7 +131,7 @@ def test_a_map_of_no_more_images_than_candidates_needs_no_index(place: Path, tmp
 def test_an_index_that_cannot_be_made_is_refused_by_name(place: Path, tmp_path: Path, factory: str) -> None:
     settings = RetrieveSettings(index=factory, index_candidates=10)
     with pytest.raises(ManifestError, match=rf"retrieve\.index: '{factory}' .* 1598 vectors of 64 dimensions"):
-        make_index(tmp_path / "embeddings", "ios_map", stored(place), settings, "these")
+        make_index(tmp_path / "embeddings", "ios_map", stored(place), settings)
     assert not list(tmp_path.iterdir())
 
 
@@ -125,7 +142,7 @@ def test_a_vector_that_is_not_finite_is_told(place: Path, tmp_path: Path, factor
     np.save(tmp_path / "0.npy", vectors)
     broken = StoredVectors((tmp_path / "0.npy",), (0, 700), DIM, np.arange(700))
     with pytest.raises(ValueError, match="database has 1 rows with NaN or infinite values, first row 5"):
-        make_index(tmp_path / "embeddings", "ios_map", broken, RetrieveSettings(index=factory, index_candidates=10), "")
+        make_index(tmp_path / "embeddings", "ios_map", broken, RetrieveSettings(index=factory, index_candidates=10))
 
 
 def test_a_faiss_without_gpus_is_told(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -135,7 +152,7 @@ def test_a_faiss_without_gpus_is_told(place: Path, tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(index_module.faiss, "index_cpu_to_all_gpus", lacks)
     settings = RetrieveSettings(index="SQ8", index_candidates=10, faiss_gpu=True)
     with pytest.raises(ToolkitError, match=r"faiss_gpu: .* SQ8 .*Set faiss_gpu: false"):
-        make_index(tmp_path / "embeddings", "ios_map", stored(place), settings, "these")
+        make_index(tmp_path / "embeddings", "ios_map", stored(place), settings)
 
 
 def test_a_full_disk_is_told_and_leaves_nothing(place: Path, tmp_path: Path) -> None:
@@ -143,7 +160,7 @@ def test_a_full_disk_is_told_and_leaves_nothing(place: Path, tmp_path: Path) -> 
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
     try:
         with pytest.raises(ToolkitError, match=r"ios_map\.faiss: .* cannot be written .*File too large"):
-            make_index(tmp_path / "embeddings", "ios_map", stored(place), RetrieveSettings(index="SQ8"), "these")
+            make_index(tmp_path / "embeddings", "ios_map", stored(place), RetrieveSettings(index="SQ8"))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert not list((tmp_path / "index").iterdir())

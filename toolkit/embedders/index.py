@@ -16,9 +16,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from toolkit.embedders.stored import StoredVectors, require_finite
+from toolkit.embedders.stored import StoredVectors, made_of, require_finite
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError, first_line
-from toolkit.files import is_current, require_whole, write_atomic, write_sidecar
+from toolkit.files import (
+    fingerprint,
+    is_current,
+    read_json,
+    require_whole,
+    sidecar_path,
+    write_atomic,
+    write_sidecar,
+)  # fmt: skip
 from toolkit.geometry import Ints
 from toolkit.manifest import RetrieveSettings
 
@@ -77,7 +85,6 @@ def make_index(
     map_id: str,
     vectors: StoredVectors,
     settings: RetrieveSettings,
-    made_of: Any,
     skip_existing: bool = True,
 ) -> VectorIndex | None:
     """Return the index of a map, made if it is not there; None where none is needed, see `load_index`.
@@ -88,7 +95,6 @@ def make_index(
         embeddings: folder of the embeddings; the index is a file in `index` beside it.
         map_id: the map session.
         vectors: (N, D) of the map.
-        made_of: what tells these vectors from others, as JSON.
         skip_existing: take the file if it is of these vectors.
 
     Raises:
@@ -96,7 +102,7 @@ def make_index(
         ValueError: a value is not finite.
     """
     path = _index_path(embeddings, map_id)
-    record = {"index": settings.index, "vectors": made_of, "normalize": vectors.normalize}
+    record = _record(vectors, settings)
     if _is_needed(settings, len(vectors)) and not (skip_existing and is_current(path, record)):
         index = _build(vectors, settings.index)
         with write_atomic(path) as temporary:
@@ -107,18 +113,26 @@ def make_index(
                     f"{path}: the map's index cannot be written ({_said(error)}). Free some space on the disk."
                 ) from error
         write_sidecar(path, record)
-    return load_index(embeddings, map_id, len(vectors), settings)
+    return load_index(embeddings, map_id, vectors, settings)
 
 
-def load_index(embeddings: Path, map_id: str, count: int, settings: RetrieveSettings) -> VectorIndex | None:
-    """Return the index that the retrieve stage made of a map of `count` vectors; None if the settings ask for none.
+def is_made(embeddings: Path, map_id: str, vectors: StoredVectors, settings: RetrieveSettings) -> bool:
+    """Tell whether `load_index` finds what it looks for."""
+    needed = _is_needed(settings, len(vectors))
+    return not needed or is_current(_index_path(embeddings, map_id), _record(vectors, settings))
+
+
+def load_index(
+    embeddings: Path, map_id: str, vectors: StoredVectors, settings: RetrieveSettings
+) -> VectorIndex | None:
+    """Return the index that the retrieve stage made of the vectors of a map; None if the settings ask for none.
 
     A map of no more vectors than candidates needs none either.
 
     Raises:
-        ArtifactError: it is missing or damaged.
+        ArtifactError: it is missing or damaged, or of other vectors.
     """
-    if not _is_needed(settings, count):
+    if not _is_needed(settings, len(vectors)):
         return None
     path = _index_path(embeddings, map_id)
     try:
@@ -126,6 +140,10 @@ def load_index(embeddings: Path, map_id: str, count: int, settings: RetrieveSett
         index = faiss.read_index(str(path))
     except RuntimeError as error:
         raise ArtifactError(f"{path}: the map's index cannot be read ({first_line(error)}). Retrieve again.") from error
+    wanted = fingerprint(_record(vectors, settings))
+    found = read_json(sidecar_path(path)).get("fingerprint", wanted)
+    if found != wanted or (index.ntotal, index.d) != vectors.shape:
+        raise ArtifactError(f"{path}: the map's index is of other embeddings, poses or settings. Retrieve again.")
     if settings.faiss_gpu:
         index = _on_gpu(index, settings.index)
     return VectorIndex(index, settings.index_candidates, settings.nprobe)
@@ -133,6 +151,11 @@ def load_index(embeddings: Path, map_id: str, count: int, settings: RetrieveSett
 
 def _is_needed(settings: RetrieveSettings, count: int) -> bool:
     return settings.index != EXACT and count > settings.index_candidates
+
+
+def _record(vectors: StoredVectors, settings: RetrieveSettings) -> dict[str, Any]:
+    rows = fingerprint(vectors.rows.tolist())
+    return {"index": settings.index, "vectors": [made_of(vectors.paths), rows], "normalize": vectors.normalize}
 
 
 def _index_path(embeddings: Path, map_id: str) -> Path:

@@ -3,13 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
 from toolkit.errors import ArtifactError
-from toolkit.files import require_whole
+from toolkit.files import file_fingerprint, require_whole, sidecar_path
 from toolkit.geometry import Ints, unit
 
 MANIFEST_COLUMNS = ["row_index", "device_id", "sensor_id", "timestamp", "abs_path"]
@@ -63,6 +64,15 @@ class StoredVectors:
                 matrix = np.load(path, mmap_mode="r")
                 vectors[first:last] = matrix[inside[0] : inside[-1] + 1] if together else matrix[inside]
         return unit(vectors) if self.normalize else vectors
+
+
+def made_of(paths: Sequence[Path]) -> list[Any]:
+    """Identify matrices in files by what they were made from, as JSON."""
+    # The record beside a matrix says it, and is small; a foreign matrix may have none.
+    return [
+        [path.name, file_fingerprint(record if record.exists() else path)]
+        for path, record in zip(paths, map(sidecar_path, paths), strict=True)
+    ]
 
 
 def require_finite(matrix: NDArray[np.float32], name: str, first: int | Ints = 0) -> None:

@@ -282,24 +282,25 @@ class Map:
         return self.files
 
     @cached_property
-    def _descriptors(self) -> tuple[NDArray[np.float32] | StoredVectors, NDArray[np.int64]]:
-        """Global descriptors (N, D) of posed map images as they are searched, and the images' rows (N,).
-
-        Those of a large map stay on disk.
-        """
+    def _stored(self) -> tuple[StoredVectors, NDArray[np.int64]]:
+        """Global descriptors (N, D) of posed map images as they are searched, on disk, and the images' rows (N,)."""
         vectors, table = open_embeddings(self._run.embeddings / f"{self.device}_map")
         rows = np.array([self.session.row_of_name[image_name(path)] for path in table["abs_path"]], np.int64)
         posed = np.isfinite(self.session.world_from_cam(rows)).reshape(-1, 16).all(axis=1)
         vectors = replace(vectors.choose(np.flatnonzero(posed)), normalize=self.retrieve_settings.normalize)
+        return vectors, rows[posed]
+
+    @cached_property
+    def _descriptors(self) -> tuple[NDArray[np.float32] | StoredVectors, NDArray[np.int64]]:
+        """The same; those of a large map stay on disk."""
+        vectors, rows = self._stored
         small = 4 * vectors.dim * len(vectors) < MOST_IN_MEMORY
-        return vectors[:] if small else vectors, rows[posed]
+        return vectors[:] if small else vectors, rows
 
     @cached_property
     def _index(self) -> VectorIndex | None:
         """What finds candidates among the descriptors, in a run with an index."""
-        return load_index(
-            self._run.embeddings, f"{self.device}_map", len(self._descriptors[0]), self.retrieve_settings
-        )
+        return load_index(self._run.embeddings, f"{self.device}_map", self._stored[0], self.retrieve_settings)
 
     def retrieve(
         self,
