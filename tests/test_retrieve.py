@@ -45,6 +45,17 @@ def test_equal_scores_come_by_index(backend: str) -> None:
     assert not scores[3].any()
 
 
+def test_queries_of_zeros_take_no_further_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+    passes, once = [], search_module._candidates
+    monkeypatch.setattr(search_module, "_candidates", lambda *given: passes.append(given) or once(*given))
+    query = np.random.default_rng(0).normal(size=(4, 8))
+    query[[0, 2]] = 0
+    scores, indices = search(query, np.random.default_rng(1).normal(size=(500, 8)), 3)
+    assert indices[[0, 2]].tolist() == [[0, 1, 2]] * 2
+    assert (scores == 0).all(axis=1).tolist() == [True, False] * 2
+    assert len(passes) == 1
+
+
 @pytest.mark.parametrize("dtype", [np.float32, np.float16])
 @pytest.mark.parametrize("normalize", [True, False])
 def test_vectors_on_disk_are_searched_block_by_block(

@@ -93,7 +93,9 @@ def _search_part(
     """Fill in scores and indices (Q, K) of queries that fit in memory."""
     count, k = len(vectors), scores.shape[1]
     lengths = np.linalg.norm(query, axis=1)
-    pending, width = np.arange(len(query)), min(count, k + _MORE)
+    # To a query of zeros, an image without features, all rows are equal.
+    scores[lengths == 0], indices[lengths == 0] = 0, np.arange(k)
+    pending, width = np.flatnonzero(lengths), min(count, k + _MORE)
     while len(pending):
         best = make_backend(query if len(pending) == len(query) else query[pending])
         rough, candidates, longest = _candidates(vectors, best, len(pending), width)
