@@ -164,3 +164,9 @@ def test_a_full_disk_is_told_and_leaves_nothing(place: Path, tmp_path: Path) -> 
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert not list((tmp_path / "index").iterdir())
+
+
+def test_there_are_as_many_candidates_as_references(place: Path, tmp_path: Path) -> None:
+    settings = RetrieveSettings(index="SQ8", index_candidates=3, topk=5)
+    index = make_index(tmp_path / "embeddings", "ios_map", stored(place), settings)
+    assert (search(queries(place), stored(place), 5, index=index)[1] >= 0).all()

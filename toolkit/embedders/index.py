@@ -146,7 +146,7 @@ def load_index(
         raise ArtifactError(f"{path}: the map's index is of other embeddings, poses or settings. Retrieve again.")
     if settings.faiss_gpu:
         index = _on_gpu(index, settings.index)
-    return VectorIndex(index, settings.index_candidates, settings.nprobe)
+    return VectorIndex(index, max(settings.index_candidates, settings.topk), settings.nprobe)
 
 
 def _is_needed(settings: RetrieveSettings, count: int) -> bool:
