@@ -17,7 +17,7 @@ from toolkit.files import sidecar_path
 from toolkit.manifest import RetrieveSettings
 
 DIM = 64
-FACTORIES = ["SQ8", "IVF16,Flat", "PCA32,IVF16,RaBitQ", "HNSW16", "OPQ16_32,IVF16,PQ16x4fs"]
+FACTORIES = ["SQ8", "IVF16,Flat", "PCA32,IVF16,RaBitQ", "HNSW16", "OPQ16_32,IVF16,PQ16x4fs", "IVF200,SQ8,RFlat"]
 
 
 @pytest.fixture(scope="module")

@@ -70,6 +70,9 @@ class VectorIndex:
         chosen = {} if selector is None else {"sel": selector}
         if isinstance(index, faiss.IndexPreTransform):
             return faiss.SearchParametersPreTransform(index_params=self._parameters(index.index, selector))
+        if isinstance(index, faiss.IndexRefine):
+            base = self._parameters(index.base_index, selector)
+            return faiss.IndexRefineSearchParameters(k_factor=index.k_factor, base_index_params=base)
         if isinstance(index, faiss.IndexIVF):
             nprobe = self.nprobe or max(16, index.nlist // 32)
             if isinstance(index, faiss.IndexIVFRaBitQ):
