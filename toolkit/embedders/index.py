@@ -40,6 +40,8 @@ _TRAIN_BYTES = 1 << 30
 """Of vectors, in float32, that are in memory: those that are added at a time, those that an index is trained with."""
 _PER_PART = 64
 """Vectors that each dimension of PCA and each cell of an inverted file is trained with, if there are so many."""
+_OF_CODES = 1 << 16
+"""Vectors that codes are trained with at least, however few cells there are; a PQ cannot do with less than 256."""
 
 
 @dataclass(frozen=True)
@@ -240,7 +242,7 @@ def _train_pca(pca: Any, rows: NDArray[np.float32]) -> None:
 
 def _train_last(index: Any, sample: Callable[[int, int], NDArray[np.float32]]) -> None:
     if not index.is_trained:
-        most = _PER_PART * index.nlist if isinstance(index, faiss.IndexIVF) else 1 << 20
+        most = max(_PER_PART * index.nlist, _OF_CODES) if isinstance(index, faiss.IndexIVF) else 1 << 20
         index.train(sample(index.d, most))
 
 
