@@ -2,6 +2,7 @@
 
 import resource
 import shutil
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -166,6 +167,19 @@ def test_a_full_disk_is_told_and_leaves_nothing(place: Path, tmp_path: Path) -> 
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert not list((tmp_path / "index").iterdir())
+
+
+def test_vectors_that_an_index_is_trained_with_are_in_memory_once(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(index_module, "_BLOCK_BYTES", 4 * DIM * 100)
+    settings = RetrieveSettings(index="IVF16,SQ8", index_candidates=10)
+    tracemalloc.start()
+    try:
+        make_index(tmp_path / "embeddings", "ios_map", stored(place), settings)
+        assert tracemalloc.get_traced_memory()[1] < 1.7 * 4 * DIM * len(stored(place))
+    finally:
+        tracemalloc.stop()
 
 
 def test_there_are_as_many_candidates_as_references(place: Path, tmp_path: Path) -> None:

@@ -109,14 +109,7 @@ def make_index(
     path = _index_path(embeddings, map_id)
     record = _record(vectors, settings)
     if _is_needed(settings, len(vectors)) and not (skip_existing and is_current(path, record)):
-        index = _build(vectors, settings.index)
-        with write_atomic(path) as temporary:
-            try:
-                faiss.write_index(index, str(temporary))
-            except RuntimeError as error:
-                raise ToolkitError(
-                    f"{path}: the map's index cannot be written ({_said(error)}). Free some space on the disk."
-                ) from error
+        _write(path, _build(vectors, settings.index))
         write_sidecar(path, record)
     return load_index(embeddings, map_id, vectors, settings)
 
@@ -187,6 +180,16 @@ def _build(vectors: StoredVectors, factory: str) -> Any:
     return index
 
 
+def _write(path: Path, index: Any) -> None:
+    with write_atomic(path) as temporary:
+        try:
+            faiss.write_index(index, str(temporary))
+        except RuntimeError as error:
+            raise ToolkitError(
+                f"{path}: the map's index cannot be written ({_said(error)}). Free some space on the disk."
+            ) from error
+
+
 def _said(error: RuntimeError) -> str:
     """Return what FAISS says, without the name of its function."""
     return str(error).split("Error: ")[-1].strip().splitlines()[-1]
@@ -201,14 +204,15 @@ def _train(index: Any, vectors: StoredVectors) -> None:
     def sample(dim: int, most: int) -> NDArray[np.float32]:
         number = min(len(vectors), most, _TRAIN_BYTES // (4 * dim))
         rows = np.sort(rng.choice(len(vectors), number, replace=False))
-        parts = []
+        taken, done = np.empty((number, dim), np.float32), 0
         for part in _parts(rows, vectors.dim):
             block = vectors[part]
             require_finite(block, "database", part)
             for apply in applied:
                 block = apply(block)
-            parts.append(block)
-        return np.concatenate(parts)
+            taken[done : done + len(part)] = block
+            done += len(part)
+        return taken
 
     if not isinstance(index, faiss.IndexPreTransform):
         _train_last(index, sample)
