@@ -174,7 +174,8 @@ def _build(vectors: StoredVectors, factory: str) -> Any:
     except RuntimeError as error:
         raise ManifestError(
             f"retrieve.index: {factory!r} cannot be made of {count} vectors of {dim} dimensions ({_said(error)}). "
-            f"Expected a string of FAISS's index factory, such as PCA512,IVF4096,RaBitQ; {EXACT} needs no index."
+            f"Expected a string of FAISS's index factory, such as PCA512,IVF4096,RaBitQ; {EXACT} needs no index, nor "
+            f"does this map with index_candidates: {count}."
         ) from error
     log.info("index %s of %d vectors is made", factory, count)
     return index
