@@ -1040,6 +1040,8 @@ def test_a_picture_has_the_references_of_a_run_with_an_index(small_capture: Path
     settings = {"index": "IVF2,Flat", "index_candidates": 4, "nprobe": 1, "topk": 4}
     retrieve_pairs(sessions, run.embeddings, run.retrieval_dir, settings, queries=LIST, **asked)
     run_stage(small_capture, run, query_device="ios")
+    of_run = run.retrieval_dir / "settings.json"
+    of_run.write_text(json.dumps(json.loads(of_run.read_text()) | {"faiss_gpu": True}))  # where the run was
     place = Map.open(run.run, run.scene, "ios")
     vectors, table = load_embeddings(run.embeddings / "ios_query")
     found = dict(zip(table["abs_path"], place.retrieve(vectors), strict=True))

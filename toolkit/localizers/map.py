@@ -300,7 +300,8 @@ class Map:
     @cached_property
     def _index(self) -> VectorIndex | None:
         """What finds candidates among the descriptors, in a run with an index."""
-        return load_index(self._run.embeddings, f"{self.device}_map", self._stored[0], self.retrieve_settings)
+        settings = self.retrieve_settings.model_copy(update={"faiss_gpu": False})  # what is here may have none
+        return load_index(self._run.embeddings, f"{self.device}_map", self._stored[0], settings)
 
     def retrieve(
         self,
