@@ -196,7 +196,7 @@ class RetrieveSettings(Settings):
     topk: Positive = 10
     """References a query image."""
     use_faiss: bool = True
-    """Search with FAISS, else with torch; the result is the same."""
+    """Exact search with FAISS, else with torch; the result is the same. An index is always FAISS's."""
     faiss_gpu: bool = False
     """FAISS on the GPU; needs a FAISS built for it."""
     normalize: bool = True
