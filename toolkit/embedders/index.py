@@ -108,7 +108,7 @@ def make_index(
     """
     path = _index_path(embeddings, map_id)
     record = _record(vectors, settings)
-    if _is_needed(settings, len(vectors)) and not (skip_existing and is_current(path, record)):
+    if _is_needed(settings, vectors) and not (skip_existing and is_current(path, record)):
         _write(path, _build(vectors, settings.index))
         write_sidecar(path, record)
     return load_index(embeddings, map_id, vectors, settings)
@@ -116,7 +116,7 @@ def make_index(
 
 def is_made(embeddings: Path, map_id: str, vectors: StoredVectors, settings: RetrieveSettings) -> bool:
     """Tell whether `load_index` finds what it looks for."""
-    needed = _is_needed(settings, len(vectors))
+    needed = _is_needed(settings, vectors)
     return not needed or is_current(_index_path(embeddings, map_id), _record(vectors, settings))
 
 
@@ -125,12 +125,12 @@ def load_index(
 ) -> VectorIndex | None:
     """Return the index that the retrieve stage made of the vectors of a map; None if the settings ask for none.
 
-    A map of no more vectors than candidates needs none either.
+    A map of no more vectors than candidates, cells or dimensions of PCA needs none either.
 
     Raises:
         ArtifactError: it is missing or damaged, or of other vectors.
     """
-    if not _is_needed(settings, len(vectors)):
+    if not _is_needed(settings, vectors):
         return None
     path = _index_path(embeddings, map_id)
     try:
@@ -147,8 +147,29 @@ def load_index(
     return VectorIndex(index, max(settings.index_candidates, settings.topk), settings.nprobe)
 
 
-def _is_needed(settings: RetrieveSettings, count: int) -> bool:
-    return settings.index != EXACT and count > settings.index_candidates
+def _is_needed(settings: RetrieveSettings, vectors: StoredVectors) -> bool:
+    if settings.index == EXACT:
+        return False
+    index = faiss.downcast_index(_empty(vectors, settings.index))
+    trained_with = [settings.index_candidates]
+    if isinstance(index, faiss.IndexPreTransform):
+        trained_with += [index.chain.at(number).d_out for number in range(index.chain.size())]
+        index = faiss.downcast_index(index.index)
+    if isinstance(index, faiss.IndexIVF):
+        trained_with.append(index.nlist)
+    return len(vectors) > max(trained_with)
+
+
+def _empty(vectors: StoredVectors, factory: str) -> Any:
+    # Of vectors of length 1 the nearest have the largest product, and centering by PCA does not change distances.
+    metric = faiss.METRIC_L2 if vectors.normalize else faiss.METRIC_INNER_PRODUCT
+    try:
+        return faiss.index_factory(vectors.dim, factory, metric)
+    except RuntimeError as error:
+        raise ManifestError(
+            f"retrieve.index: {factory!r} cannot hold vectors of {vectors.dim} dimensions ({_said(error)}). Expected "
+            f"a string of FAISS's index factory, such as PCA512,IVF4096,RaBitQ; {EXACT} needs no index."
+        ) from error
 
 
 def _record(vectors: StoredVectors, settings: RetrieveSettings) -> dict[str, Any]:
@@ -162,10 +183,8 @@ def _index_path(embeddings: Path, map_id: str) -> Path:
 
 def _build(vectors: StoredVectors, factory: str) -> Any:
     count, dim = vectors.shape
-    # Of vectors of length 1 the nearest have the largest product, and centering by PCA does not change distances.
-    metric = faiss.METRIC_L2 if vectors.normalize else faiss.METRIC_INNER_PRODUCT
+    index = _empty(vectors, factory)
     try:
-        index = faiss.index_factory(dim, factory, metric)
         _train(index, vectors)
         for rows in _parts(np.arange(count), dim):
             block = vectors[rows]
@@ -174,8 +193,7 @@ def _build(vectors: StoredVectors, factory: str) -> Any:
     except RuntimeError as error:
         raise ManifestError(
             f"retrieve.index: {factory!r} cannot be made of {count} vectors of {dim} dimensions ({_said(error)}). "
-            f"Expected a string of FAISS's index factory, such as PCA512,IVF4096,RaBitQ; {EXACT} needs no index, nor "
-            f"does this map with index_candidates: {count}."
+            f"{EXACT} needs no index, nor does this map with index_candidates: {count}."
         ) from error
     log.info("index %s of %d vectors is made", factory, count)
     return index
