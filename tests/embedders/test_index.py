@@ -19,7 +19,7 @@ from toolkit.manifest import RetrieveSettings
 
 DIM = 64
 FACTORIES = [
-    "SQ8", "IVF16,Flat", "PCA32,IVF16,RaBitQ", "HNSW16", "OPQ16_32,IVF16,PQ16x4fs", "IVF200,SQ8,RFlat", "IVF2,PQ16np",
+    "SQ8", "IVF16,Flat", "PCA32,IVF16,RaBitQ", "HNSW16", "RR32,IVF16,PQ16x4fs", "IVF200,SQ8,RFlat", "IVF2,PQ16np",
 ]  # fmt: skip
 
 

@@ -150,7 +150,8 @@ def load_index(
 def _is_needed(settings: RetrieveSettings, vectors: StoredVectors) -> bool:
     if settings.index == EXACT:
         return False
-    index = faiss.downcast_index(_empty(vectors, settings.index))
+    empty = _empty(vectors, settings.index)  # is to live as long as what `downcast_index` returns
+    index = faiss.downcast_index(empty)
     trained_with = [settings.index_candidates]
     if isinstance(index, faiss.IndexPreTransform):
         trained_with += [index.chain.at(number).d_out for number in range(index.chain.size())]
