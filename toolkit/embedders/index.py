@@ -5,6 +5,7 @@ disk, see `search`.
 """
 
 import logging
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -212,7 +213,7 @@ def _write(path: Path, index: Any) -> None:
 
 def _said(error: RuntimeError) -> str:
     """Return what FAISS says, without the name of its function."""
-    return str(error).split("Error: ")[-1].strip().splitlines()[-1]
+    return re.sub(r"^Error in .* at \S+:\d+: (Error: )?", "", str(error).strip().splitlines()[-1])
 
 
 def _train(index: Any, vectors: StoredVectors) -> None:
