@@ -416,7 +416,7 @@ def test_a_killed_run_goes_on_where_it_was(
     assert without_times(run, device) == without_times(finished[0], device)
 
 
-@pytest.mark.parametrize(("killed_at", "calls_left"), [(2, 4), (4, 2)])
+@pytest.mark.parametrize(("killed_at", "calls_left"), [(2, 4), pytest.param(4, 2, marks=pytest.mark.slow)])
 def test_a_killed_run_goes_on_where_it_asks_for_more_features(
     small_capture: Path,
     run: SceneFiles,
