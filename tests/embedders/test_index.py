@@ -2,6 +2,8 @@
 
 import resource
 import shutil
+import subprocess
+import sys
 import tracemalloc
 from pathlib import Path
 
@@ -188,3 +190,9 @@ def test_there_are_as_many_candidates_as_references(place: Path, tmp_path: Path)
     settings = RetrieveSettings(index="SQ8", index_candidates=3, topk=5)
     index = make_index(tmp_path / "embeddings", "ios_map", stored(place), settings)
     assert (search(queries(place), stored(place), 5, index=index)[1] >= 0).all()
+
+
+def test_an_index_that_is_not_asked_for_loads_no_torch() -> None:
+    code = "import sys, toolkit.retrieve, toolkit.localizers.map; sys.exit('torch' in sys.modules)"
+    root = Path(index_module.__file__).parents[2]
+    assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0

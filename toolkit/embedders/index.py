@@ -14,7 +14,6 @@ from typing import Any
 
 import faiss as typed_faiss
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from toolkit.embedders.stored import StoredVectors, made_of, require_finite
@@ -253,6 +252,8 @@ def _train_pca(pca: Any, rows: NDArray[np.float32]) -> None:
 
     N. Halko, P. G. Martinsson, J. A. Tropp, "Finding Structure with Randomness", SIAM Review 2011.
     """
+    import torch  # a second of start-up, which localizing without networks does not need
+
     if min(rows.shape) < pca.d_out:
         raise RuntimeError(f"PCA to {pca.d_out} dimensions needs as many, and as many vectors")
     with torch.random.fork_rng(devices=[]):
