@@ -16,7 +16,7 @@ import faiss as typed_faiss
 import numpy as np
 from numpy.typing import NDArray
 
-from toolkit.embedders.stored import StoredVectors, made_of, require_finite
+from toolkit.embedders.stored import StoredVectors, blocks, made_of, require_finite
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError, first_line
 from toolkit.files import (
     fingerprint,
@@ -187,9 +187,8 @@ def _build(vectors: StoredVectors, factory: str) -> Any:
     index = _empty(vectors, factory)
     try:
         _train(index, vectors)
-        for rows in _parts(np.arange(count), dim):
-            block = vectors[rows]
-            require_finite(block, "database", rows)
+        for start, block in blocks(vectors, _BLOCK_BYTES):
+            require_finite(block, "database", start)
             index.add(block)
     except RuntimeError as error:
         raise ManifestError(
@@ -224,14 +223,12 @@ def _train(index: Any, vectors: StoredVectors) -> None:
     def sample(dim: int, most: int) -> NDArray[np.float32]:
         number = min(len(vectors), most, _TRAIN_BYTES // (4 * dim))
         rows = np.sort(rng.choice(len(vectors), number, replace=False))
-        taken, done = np.empty((number, dim), np.float32), 0
-        for part in _parts(rows, vectors.dim):
-            block = vectors[part]
-            require_finite(block, "database", part)
+        taken = np.empty((number, dim), np.float32)
+        for start, block in blocks(vectors.choose(rows), _BLOCK_BYTES):
+            require_finite(block, "database", rows[start:])
             for apply in applied:
                 block = apply(block)
-            taken[done : done + len(part)] = block
-            done += len(part)
+            taken[start : start + len(block)] = block
         return taken
 
     if not isinstance(index, faiss.IndexPreTransform):
@@ -270,12 +267,6 @@ def _train_last(index: Any, sample: Callable[[int, int], NDArray[np.float32]]) -
     if not index.is_trained:
         most = max(_PER_PART * index.nlist, _OF_CODES) if isinstance(index, faiss.IndexIVF) else 1 << 20
         index.train(sample(index.d, most))
-
-
-def _parts(rows: Ints, dim: int) -> list[Ints]:
-    """Return rows in parts whose vectors fit in memory."""
-    step = max(1, _BLOCK_BYTES // (4 * dim))
-    return [rows[start : start + step] for start in range(0, len(rows), step)]
 
 
 def _on_gpu(index: Any, factory: str) -> Any:

@@ -1,6 +1,6 @@
 """Exact nearest neighbors among global descriptors, by whatever library is quick at it."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import Literal
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.embedders.index import VectorIndex
-from toolkit.embedders.stored import StoredVectors, require_finite
+from toolkit.embedders.stored import StoredVectors, blocks, require_finite
 from toolkit.errors import ToolkitError
 from toolkit.geometry import Ints
 from toolkit.models.compute import resolve_device
@@ -72,7 +72,7 @@ def search(
             found = search(query, chosen, k, backend, compute_device, faiss_gpu)
             scores[:, : len(rows)], indices[:, : len(rows)] = found[0], rows[found[1]]
         return scores, indices
-    for start, part in _blocks(query, _QUERY_BYTES) if k else ():
+    for start, part in blocks(query, _QUERY_BYTES) if k else ():
         require_finite(part, "query", start)
         if index is not None:
             here = slice(start, start + len(part))
@@ -140,18 +140,11 @@ def _matrix(values: ArrayLike | StoredVectors, name: str) -> _Vectors:
     return matrix
 
 
-def _blocks(vectors: _Vectors, size: int) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    """Yield the number of the first row and the rows (n, D) of one block of so many bytes after the other."""
-    step = max(1, size // (4 * max(1, vectors.shape[1])))
-    for start in range(0, len(vectors), step):
-        yield start, vectors[start : start + step]
-
-
 def _candidates(vectors: _Vectors, best: _Best, queries: int, width: int) -> tuple[NDArray[np.float32], Ints, float]:
     """Return the `width` best scores and indices (Q, width), best first, up to rounding, and the longest length."""
     scores, indices = np.zeros((queries, 0), np.float32), np.zeros((queries, 0), np.int64)
     longest = 0.0
-    for start, block in _blocks(vectors, _BLOCK_BYTES):
+    for start, block in blocks(vectors, _BLOCK_BYTES):
         length = float(np.sqrt(np.einsum("nd,nd->n", block, block).max()))
         if not np.isfinite(length):
             require_finite(block, "database", start)

@@ -1,6 +1,6 @@
 """Global descriptors on disk: the matrices of a session as one, read in parts, so that a map need not fit in memory."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -73,6 +73,15 @@ def made_of(paths: Sequence[Path]) -> list[Any]:
         [path.name, file_fingerprint(record if record.exists() else path)]
         for path, record in zip(paths, map(sidecar_path, paths), strict=True)
     ]
+
+
+def blocks(
+    vectors: NDArray[np.float32] | StoredVectors, size: int
+) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    """Yield the number of the first row and the rows (n, D) of one block of so many bytes after the other."""
+    step = max(1, size // (4 * max(1, vectors.shape[1])))
+    for start in range(0, len(vectors), step):
+        yield start, vectors[start : start + step]
 
 
 def require_finite(matrix: NDArray[np.float32], name: str, first: int | Ints = 0) -> None:
