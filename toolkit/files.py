@@ -67,6 +67,15 @@ def write_folder(path: str | Path) -> Iterator[Path]:
         part.replace(path)
 
 
+@contextmanager
+def temporary_folder(path: str | Path) -> Iterator[Path]:
+    """Yield a hidden folder beside `path`, which is removed when the block ends; `sweep_partials` knows it, too."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(".partial", f".{path.name}.{process_tag()}-", path.parent) as folder:
+        yield Path(folder)
+
+
 def process_tag() -> str:
     """Return `<process>-<machine>`, for the names of what a process removes when it ends: see `is_left_over`."""
     return f"{os.getpid()}-{_machine()}"
@@ -88,7 +97,7 @@ def sweep_partials(folder: str | Path) -> None:
     for path in Path(folder).rglob(".*.partial*"):
         if is_left_over(path.name):
             with suppress(OSError):
-                path.unlink()
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 @cache

@@ -82,7 +82,7 @@ def test_points_have_their_tracks_colors_and_pixels(model: Path, run: SceneFiles
     points = [read.points3D[key] for key in sorted(read.points3D)]
     np.testing.assert_array_equal([point.xyz for point in points], local_map.points)
     np.testing.assert_array_equal([point.color for point in points], local_map.colors)
-    np.testing.assert_array_equal([point.track.length() for point in points], local_map.track_lengths)
+    np.testing.assert_array_equal([point.track.length() for point in points], np.diff(local_map.point_starts))
     for index, name in enumerate(local_map.image_names):
         image = read.find_image_with_name(name)
         np.testing.assert_array_equal([p.xy for p in image.points2D], store[name].keypoints.astype(float))

@@ -195,7 +195,7 @@ class FeedForwardLocalizer:
         """Return points (P, 3) in the world that a map image sees: triangulated, else of the capture's depth maps."""
         points = np.unique(self.map.observations(image)[1])
         if len(points) >= self.settings.least_points:
-            order = np.argsort(-self.map.track_lengths[points], kind="stable")[: self.settings.depth_points]
+            order = np.argsort(-self.map.track_lengths(points), kind="stable")[: self.settings.depth_points]
             return self.map.points[points[order]]
         seen = self.seen_depth(image)
         part = np.linspace(0, len(seen) - 1, min(len(seen), self.settings.depth_points)).astype(np.int64)

@@ -137,7 +137,7 @@ class DepthLifter:
             return None
         seen = [local_map.observations(image)[1] for image in images]
         triangulated = np.unique(np.concatenate(seen))
-        there = np.flatnonzero(np.isin(local_map.obs_point, triangulated))
+        there = np.sort(local_map.observations_of(triangulated))
         place = np.searchsorted(triangulated, local_map.obs_point[there])
         new = np.column_stack([np.concatenate(obs), len(triangulated) + np.arange(sum(map(len, points)))])
         old = np.column_stack([local_map.obs_image[there], local_map.obs_keypoint[there], place])

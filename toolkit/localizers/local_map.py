@@ -1,12 +1,15 @@
 """The triangulated map as arrays: posed images, points, and which keypoint of which image sees which point."""
 
 import json
+import struct
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
+from mmap import ACCESS_READ, mmap
+from os import SEEK_CUR
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
+from zipfile import ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 
 import numpy as np
 import pycolmap
@@ -16,8 +19,17 @@ from toolkit import geometry
 from toolkit.capture.cameras import camera_text, parse_camera, projection_jacobian
 from toolkit.errors import ArtifactError
 from toolkit.files import require_whole, write_atomic
+from toolkit.geometry import Floats, Ints
 
-Floats = NDArray[np.float64]
+_ARRAYS = ("world_from_cams", "points", "colors", "obs_image", "obs_keypoint", "obs_point", "noise_px")
+ORDERS = ("image_starts", "by_point", "point_starts")
+"""Arrays of a file: fields of `LocalMap`, and what else would have to be computed from all of it."""
+IN_MEMORY = 1 << 26
+"""Bytes of a map that is read when it is opened, so that it may be overwritten meanwhile."""
+_BLOCK = 1 << 18
+"""Points that are looked at at once."""
+_PADDING = 0xD935
+"""Of an extra field of a zip file that means nothing."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +77,7 @@ class LocalMap:
     """Posed images and the points triangulated from them, as arrays.
 
     Observations are sorted by image; observation o says that keypoint `obs_keypoint[o]` of image `obs_image[o]` sees
-    point `obs_point[o]`.
+    point `obs_point[o]`. A map that was opened has its arrays in the file: memory follows what is looked at.
     """
 
     image_names: list[str]
@@ -78,9 +90,9 @@ class LocalMap:
     """(P, 3) in the world, meters."""
     colors: NDArray[np.uint8]
     """(P, 3) RGB."""
-    obs_image: NDArray[np.int64]
-    obs_keypoint: NDArray[np.int64]
-    obs_point: NDArray[np.int64]
+    obs_image: Ints
+    obs_keypoint: Ints
+    obs_point: Ints
     noise_px: NDArray[np.float32]
     """(P,) standard deviation of the observations of each point, by axis; all of one kind of features have the same."""
     length: float = 1.0
@@ -101,34 +113,42 @@ class LocalMap:
         return np.array([camera.mean_focal_length() for camera in self.cameras])
 
     @cached_property
-    def track_lengths(self) -> NDArray[np.int64]:
-        """(P,) images that see each point."""
-        return np.bincount(self.obs_point, minlength=len(self.points))
-
-    @cached_property
-    def _image_starts(self) -> NDArray[np.int64]:
+    def image_starts(self) -> Ints:
+        """(N + 1,) the first observation of each image."""
         return np.searchsorted(self.obs_image, np.arange(len(self.image_names) + 1))
 
     @cached_property
-    def _by_point(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        order = np.argsort(self.obs_point, kind="stable")
-        return order, np.searchsorted(self.obs_point[order], np.arange(len(self.points) + 1))
+    def by_point(self) -> Ints:
+        """Observations in the order of their points."""
+        return np.argsort(self.obs_point, kind="stable")
 
-    def observations(self, image: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    @cached_property
+    def point_starts(self) -> Ints:
+        """(P + 1,) the first observation of each point in `by_point`."""
+        return np.searchsorted(self.obs_point[self.by_point], np.arange(len(self.points) + 1))
+
+    def track_lengths(self, points: Ints) -> Ints:
+        """Return how many observations each of n points has, (n,)."""
+        return self.point_starts[points + 1] - self.point_starts[points]
+
+    def observations(self, image: int) -> tuple[Ints, Ints]:
         """Return the keypoints (n,) of an image that see a point, and the points (n,)."""
-        part = slice(self._image_starts[image], self._image_starts[image + 1])
+        part = slice(self.image_starts[image], self.image_starts[image + 1])
         return self.obs_keypoint[part], self.obs_point[part]
 
-    def point_covariances(self, points: NDArray[np.int64]) -> Floats:
+    def observations_of(self, points: Ints) -> Ints:
+        """Return the observations of points, those of the first point first."""
+        counts = self.track_lengths(points)
+        within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+        return self.by_point[np.repeat(self.point_starts[points], counts) + within]
+
+    def point_covariances(self, points: Ints) -> Floats:
         """Return the covariance (n, 3, 3) of the places of n points, square meters, as least squares triangulate them.
 
         A point that fewer than two images see has NaN.
         """
-        order, starts = self._by_point
-        counts = starts[points + 1] - starts[points]
-        which = np.repeat(np.arange(len(points)), counts)  # the point of each observation
-        within = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
-        image = self.obs_image[order[np.repeat(starts[points], counts) + within]]
+        which = np.repeat(np.arange(len(points)), self.track_lengths(points))  # the point of each observation
+        image = self.obs_image[self.observations_of(points)]
         # Keypoints of one image at one place (two orientations) are one view.
         which, image = np.unique(np.column_stack([which, image]), axis=0).T
         views = np.bincount(which, minlength=len(points))
@@ -143,18 +163,20 @@ class LocalMap:
         covariances[views > 1] = noise_px2[views > 1, None, None] * np.linalg.inv(information[views > 1])
         return covariances
 
-    def images_seeing(self, points: NDArray[np.int64]) -> NDArray[np.int64]:
+    def images_seeing(self, points: Ints) -> Ints:
         """Return how many of the given points each image sees, (N,)."""
-        order, starts = self._by_point
-        seen = np.concatenate([order[starts[p] : starts[p + 1]] for p in points] or [np.zeros(0, np.int64)])
-        return np.bincount(self.obs_image[seen], minlength=len(self.image_names))
+        seeing = np.zeros(len(self.image_names), np.int64)
+        for start in range(0, len(points), _BLOCK):
+            images = self.obs_image[self.observations_of(points[start : start + _BLOCK])]
+            seeing += np.bincount(images, minlength=len(seeing))
+        return seeing
 
-    def shared_points(self, images: NDArray[np.int64]) -> NDArray[np.int64]:
+    def shared_points(self, images: Ints) -> Ints:
         """Return how many points each two of n images both see, (n, n)."""
         seen = [np.unique(self.observations(int(image))[1]) for image in images]
         return np.array([[len(np.intersect1d(a, b, assume_unique=True)) for b in seen] for a in seen], np.int64)
 
-    def around(self, images: NDArray[np.int64]) -> tuple["LocalMap", NDArray[np.int64]]:
+    def around(self, images: Ints) -> tuple["LocalMap", Ints]:
         """Return the part of the map that the images, and those that share points with them, see.
 
         Returns:
@@ -163,19 +185,20 @@ class LocalMap:
         seen = np.concatenate([np.zeros(0, np.int64), *(self.observations(int(image))[1] for image in images)])
         covisible = np.flatnonzero(self.images_seeing(np.unique(seen)))
         points = np.unique(np.concatenate([np.zeros(0, np.int64), *(self.observations(int(i))[1] for i in covisible)]))
-        place = np.full(len(self.points), -1, np.int64)
-        place[points] = np.arange(len(points))
-        there = place[self.obs_point] >= 0
-        part = replace(
+        return self.part(points)._sharing(self), points
+
+    def part(self, points: Ints) -> "LocalMap":
+        """Return a map of the same images with some of the points, ascending."""
+        there = np.sort(self.observations_of(points))
+        return replace(
             self,
             points=self.points[points],
             colors=self.colors[points],
             obs_image=self.obs_image[there],
             obs_keypoint=self.obs_keypoint[there],
-            obs_point=place[self.obs_point[there]],
+            obs_point=np.searchsorted(points, self.obs_point[there]),
             noise_px=self.noise_px[points],
         )
-        return part, points
 
     def scaled(self, factor: float) -> "LocalMap":
         """Return the map with all lengths times a factor."""
@@ -193,68 +216,108 @@ class LocalMap:
         """
         if len(maps) == 1:
             return maps[0]
-        cameras: dict[str, tuple[pycolmap.Camera, Floats]] = {}
-        same = all(one.image_names is maps[0].image_names for one in maps)
-        for one in maps[:1] if same else maps:
-            for name, camera, pose in zip(one.image_names, one.cameras, one.world_from_cams, strict=True):
-                cameras.setdefault(name, (camera, pose))
-        index_of = {name: index for index, name in enumerate(cameras)}
+        first = maps[0]
+        same = all(one.image_names is first.image_names for one in maps)
+        if same:
+            names, cameras, poses = first.image_names, first.cameras, first.world_from_cams
+            images = [one.obs_image for one in maps]
+        else:
+            posed: dict[str, tuple[pycolmap.Camera, Floats]] = {}
+            for one in maps:
+                for name, camera, pose in zip(one.image_names, one.cameras, one.world_from_cams, strict=True):
+                    posed.setdefault(name, (camera, pose))
+            names, cameras = list(posed), [camera for camera, _ in posed.values()]
+            poses = np.stack([pose for _, pose in posed.values()])
+            index_of = {name: index for index, name in enumerate(names)}
+            images = [np.array([index_of[name] for name in one.image_names], np.int64)[one.obs_image] for one in maps]
         starts = np.cumsum([0, *(len(one.points) for one in maps)])
-        image = np.concatenate(
-            [np.array([index_of[name] for name in one.image_names], np.int64)[one.obs_image] for one in maps]
-        )
+        image = np.concatenate(images)
         point = np.concatenate([one.obs_point + start for one, start in zip(maps, starts[:-1], strict=True)])
         order = np.argsort(image, kind="stable")
-        return cls(
-            image_names=list(cameras),
-            cameras=[camera for camera, _ in cameras.values()],
-            world_from_cams=np.stack([pose for _, pose in cameras.values()]),
+        together = cls(
+            image_names=names,
+            cameras=cameras,
+            world_from_cams=poses,
             points=np.concatenate([one.points for one in maps]),
             colors=np.concatenate([one.colors for one in maps]),
             obs_image=image[order],
             obs_keypoint=np.concatenate([one.obs_keypoint for one in maps])[order],
             obs_point=point[order],
             noise_px=np.concatenate([one.noise_px for one in maps]),
-            length=maps[0].length,
-            consistency=maps[0].consistency,
+            length=first.length,
+            consistency=first.consistency,
         )
+        return together._sharing(first) if same else together
+
+    def _sharing(self, other: "LocalMap") -> "LocalMap":
+        """Return this map, which takes over what another of the same images knows of them."""
+        vars(self).update({name: getattr(other, name) for name in ("index_of", "cams_from_world", "focals_px")})
+        return self
 
     def save(self, path: str | Path) -> None:
         """Write the map as one `.npz` file."""
         arrays: dict[str, Any] = {
             "image_names": np.array(self.image_names, np.str_),
             "cameras": np.array([camera_text(camera) for camera in self.cameras], np.str_),
+            "length": np.float64(self.length),
+            "consistency": np.array(json.dumps(asdict(self.consistency))),
         }
-        for name in ("world_from_cams", "points", "colors", "obs_image", "obs_keypoint", "obs_point", "noise_px"):
-            arrays[name] = getattr(self, name)
-        arrays["length"] = np.float64(self.length)
-        arrays["consistency"] = np.array(json.dumps(asdict(self.consistency)))
-        with write_atomic(path) as temporary, open(temporary, "wb") as stream:
-            np.savez(stream, **arrays)
+        arrays |= {name: getattr(self, name) for name in (*_ARRAYS, *ORDERS)}
+        with write_atomic(path) as temporary, open(temporary, "wb") as stream, ZipFile(stream, "w") as archive:
+            for name, array in arrays.items():
+                member = ZipInfo(f"{name}.npy")
+                # Arrays that are mapped should start at multiples of 64, as `zipalign` does it: by an extra field after
+                # a header of 30 bytes, the name, and 20 bytes of sizes.
+                padding = -(stream.tell() + 30 + len(member.filename) + 20 + 4) % 64
+                member.extra = struct.pack("<HH", _PADDING, padding) + bytes(padding)
+                with archive.open(member, "w", force_zip64=True) as out:
+                    np.lib.format.write_array(out, np.asanyarray(array), allow_pickle=False)
 
     @classmethod
     def load(cls, path: str | Path) -> "LocalMap":
-        """Read a map.
+        """Open a map; the arrays of one of more than `IN_MEMORY` bytes stay in the file until they are looked at.
 
         Raises:
             ArtifactError: the file is missing or damaged.
         """
         require_whole(path)
+        parse = lru_cache(maxsize=None)(lambda text: parse_camera("camera", text))  # most images share a few
         try:
-            with np.load(path) as arrays:
-                data = {name: arrays[name] for name in arrays.files}
-            names, cameras = data.pop("image_names").tolist(), data.pop("cameras").tolist()
-            return cls(
-                image_names=names,
-                cameras=[parse_camera("camera", text) for text in cameras],
-                length=float(data.pop("length")),
-                consistency=Consistency(**json.loads(str(data.pop("consistency")))),
-                **data,
+            arrays = _arrays_of(Path(path))
+            opened = cls(
+                image_names=arrays["image_names"].tolist(),
+                cameras=[parse(text) for text in arrays["cameras"].tolist()],
+                length=float(arrays["length"]),
+                consistency=Consistency(**json.loads(str(arrays["consistency"]))),
+                **{name: arrays[name] for name in _ARRAYS},
             )
-        except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile) as error:
+            vars(opened).update({name: arrays[name] for name in ORDERS})
+        except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile, struct.error) as error:
             raise ArtifactError(
                 f"The triangulated map {path} cannot be read ({error}). Build it with the localize stage."
             ) from None
+        return opened
+
+
+def _arrays_of(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an uncompressed `.npz` file, read-only; those of a large one are mapped from it."""
+    arrays: dict[str, NDArray[Any]] = {}
+    with open(path, "rb") as stream, ZipFile(stream) as archive:
+        small = path.stat().st_size <= IN_MEMORY
+        file = path.read_bytes() if small else mmap(stream.fileno(), 0, access=ACCESS_READ)
+        for member in archive.infolist():
+            if member.compress_type != ZIP_STORED:
+                raise ValueError(f"{member.filename} is compressed")
+            # A local header of 30 bytes, which ends with two lengths; the name; extra fields; then the array's own.
+            stream.seek(member.header_offset + 26)
+            stream.seek(sum(struct.unpack("<HH", stream.read(4))), SEEK_CUR)
+            version = np.lib.format.read_magic(stream)
+            read_header = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}[version[0]]
+            shape, fortran, dtype = read_header(stream)
+            arrays[member.filename.removesuffix(".npy")] = np.ndarray(
+                shape, dtype, file, stream.tell(), order="F" if fortran else "C"
+            )
+    return arrays
 
 
 def map_path(map_dir: str | Path, session_id: str, features: str = "sift") -> Path:

@@ -88,7 +88,7 @@ class MappedFeatures:
     def _image(self, index: int, max_features: int) -> MapImage:
         """Return the features of a map image that see points, those of the longest tracks."""
         keypoint, point = self.map.observations(index)
-        order = np.argsort(-self.map.track_lengths[point], kind="stable")[:max_features]
+        order = np.argsort(-self.map.track_lengths(point), kind="stable")[:max_features]
         return MapImage(self.features[self.map.image_names[index]].take(keypoint[order]), point[order])
 
     def _point_of_each_feature(self, index: int) -> Ints:
@@ -171,8 +171,11 @@ class MapMatcher:
         """The points of all kinds, one kind after the other."""
         self._first_point = np.cumsum([0, *(len(features.map.points) for features in mapped)])
         self._index_in = [
-            [features.map.index_of.get(name, -1) for name in self.map.image_names] for features in mapped
-        ]  # of each kind, the index of each image; -1: that kind has it not
+            None
+            if features.map.image_names is self.map.image_names
+            else [features.map.index_of.get(name, -1) for name in self.map.image_names]
+            for features in mapped
+        ]  # of each kind, the index of each image, None: the same; -1: that kind has it not
 
     def by_descriptors(
         self,
@@ -206,8 +209,8 @@ class MapMatcher:
     def covisible(self, points: Ints) -> Ints:
         """Return the map images that see the most of the points, in a fixed order."""
         seen = self.map.images_seeing(points)
-        order = np.argsort(-seen, kind="stable")[: self.settings.guided_images]
-        return order[seen[order] > 0]
+        some = np.flatnonzero(seen)
+        return some[np.argsort(-seen[some], kind="stable")[: self.settings.guided_images]]
 
     def kind_names(self, points: Ints) -> NDArray[np.str_]:
         """Return the name of the kind of features that each point is of."""
@@ -229,4 +232,7 @@ class MapMatcher:
 
     def _of_kind(self, kind: int, images: Ints | Sequence[int]) -> list[int]:
         """Return the indices of images in the map of one kind; those that it does not have are left out."""
-        return [index for image in images if (index := self._index_in[kind][int(image)]) >= 0]
+        index_in = self._index_in[kind]
+        if index_in is None:
+            return [int(image) for image in images]
+        return [index for image in images if (index := index_in[int(image)]) >= 0]

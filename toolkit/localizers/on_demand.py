@@ -21,9 +21,10 @@ from toolkit.features.matching import AnyMethod, PairMatches
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import NetworkMatches, PoseEstimate, Query, References
 from toolkit.localizers.local_map import LocalMap
-from toolkit.localizers.mapping import instants, match_pairs, select_pairs, triangulate
+from toolkit.localizers.mapping import instants, match_pairs, select_pairs
 from toolkit.localizers.matches import MappedFeatures
 from toolkit.localizers.pnp import PnpLocalizer
+from toolkit.localizers.triangulation import triangulate
 from toolkit.manifest import MapSettings, PnpSettings
 
 FeatureSource = Callable[[str], LocalFeatures]

@@ -109,7 +109,7 @@ class PnpLocalizer:
         misfit = find_misfit(
             query,
             geometry.invert(estimate.world_from_rig),
-            matches[self.map.track_lengths[matches.point] > 1],  # the depth of others is not known from the map alone
+            matches[self.map.track_lengths(matches.point) > 1],  # the depth of others is not known from the map alone
             self.map.points,
             self.settings.ransac_max_error_deg,
             focal_alone=estimate.rival_support > self.settings.ok_rival_support,

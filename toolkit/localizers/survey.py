@@ -160,7 +160,7 @@ class Survey:
         Args:
             local_map: what was triangulated with them; its images are those of the survey.
         """
-        lengths = local_map.track_lengths
+        lengths = np.diff(local_map.point_starts)
         three = float((lengths >= 3).mean()) if len(lengths) else 0.0
         agree = _agreeing(self.images.world_from_cams, self.sample)
         known = Consistency(pairs=len(agree), agreeing=int(agree.sum()), seen_by_three=round(three, 4))
@@ -182,8 +182,7 @@ class Survey:
     def _wrong_images(self, local_map: LocalMap) -> list[str]:
         """Return the images that have hardly a part in the map, and whose matches contradict their poses."""
         poses = self.images.world_from_cams
-        long = local_map.track_lengths[local_map.obs_point] >= 3
-        support = np.bincount(local_map.obs_image[long], minlength=len(poses))
+        support = local_map.images_seeing(np.flatnonzero(np.diff(local_map.point_starts) >= 3))
         weak = np.flatnonzero(support < WEAK * np.median(support))
         suspects = weak[np.argsort(support[weak], kind="stable")][:MOST_WEAK].tolist()
         pairs = self.verify((index, other) for index in suspects for other in self._likely(index))

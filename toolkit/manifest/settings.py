@@ -369,6 +369,8 @@ class MapSettings(Settings):
     """Observations further off, in pixels, are taken out of a point's track."""
     min_triangulation_angle_deg: PositiveNumber = 1.5
     """Points seen under a smaller angle are dropped: their depth is not known."""
+    tile_images: Positive = 400
+    """A map of more images is triangulated in tiles of about so many, and of their neighbors: some 3 MB an image."""
 
 
 class PnpSettings(Settings):

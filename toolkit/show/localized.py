@@ -60,7 +60,7 @@ def sure_points(local_map: LocalMap | None) -> tuple[Floats, NDArray[np.uint8] |
     """Return the points that at least three images see, (P, 3), and their colors (P, 3) RGB; the rest is noisy."""
     if local_map is None:
         return np.zeros((0, 3)), None
-    sure = local_map.track_lengths >= 3
+    sure = np.diff(local_map.point_starts) >= 3
     return local_map.points[sure], local_map.colors[sure]
 
 

@@ -1,0 +1,235 @@
+"""Large maps in tiles: parts of bounded size, which overlap, are triangulated one by one, and are joined without seams.
+
+Tiles share images, and so observations: keypoints of an image. What two tiles triangulated from one observation is one
+point. It then has the observations of both, and its place is found again from all of them. Memory depends on the size
+of tiles, not on the map.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from toolkit.geometry import Floats, Ints
+from toolkit.localizers.local_map import LocalMap
+from toolkit.localizers.triangulation import refine_points
+from toolkit.manifest import MapSettings
+
+OPEN_TILES = 16
+"""Tiles whose files are open at once while they are joined."""
+
+
+class Tile(NamedTuple):
+    """Images whose points are triangulated together."""
+
+    core: Ints
+    """(n,) images that are in the core of no other tile, ascending."""
+    images: Ints
+    """(m,) these and their partners, ascending."""
+
+
+def plan_tiles(places: Floats, pairs: Ints, most: int) -> list[Tile]:
+    """Part the images of a map by the places that they look at.
+
+    Args:
+        places: (N, 3) what each image looks at.
+        pairs: (Q, 2) images that are matched with each other.
+        most: images in the core of a tile.
+
+    Returns:
+        The tiles; neighbors in the list are near each other.
+    """
+    cores = _halved(places, np.arange(len(places)), -(-len(places) // most))
+    home = home_of(cores)
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    both = both[np.argsort(home[both[:, 0]], kind="stable")]
+    starts = np.searchsorted(home[both[:, 0]], np.arange(len(cores) + 1))
+    return [
+        Tile(core, np.union1d(core, both[starts[number] : starts[number + 1], 1])) for number, core in enumerate(cores)
+    ]
+
+
+def home_of(cores: Sequence[Ints]) -> Ints:
+    """Return the number of the tile whose core has each image, (N,)."""
+    home = np.zeros(sum(map(len, cores)), np.int64)
+    for number, core in enumerate(cores):
+        home[core] = number
+    return home
+
+
+def _halved(places: Floats, images: Ints, count: int) -> list[Ints]:
+    """Part images into so many groups of about the same size, across the direction in which they spread the most."""
+    if count <= 1:
+        return [np.sort(images)]
+    along = places[images, np.ptp(places[images], axis=0).argmax()]
+    order = images[np.lexsort((images, along))]
+    cut = len(images) * (count // 2) // count
+    return [*_halved(places, order[:cut], count // 2), *_halved(places, order[cut:], count - count // 2)]
+
+
+class JoinedImages(NamedTuple):
+    """All N images of a map."""
+
+    names: list[str]
+    cameras: list[pycolmap.Camera]
+    world_from_cams: Floats
+    """(N, 4, 4)."""
+    keypoints: Callable[[int], NDArray[np.float32]]
+    """Returns the keypoints (n, 2) of an image, pixels."""
+    colors: Callable[[Ints, Ints], NDArray[np.uint8]]
+    """Returns the colors (n, 3) at n keypoints, of the images and the keypoints of each."""
+
+
+def join_tiles(
+    tiles: Sequence[Tile], load: Callable[[int], LocalMap], images: JoinedImages, settings: MapSettings, folder: Path
+) -> LocalMap:
+    """Join the maps of tiles.
+
+    Args:
+        tiles: as planned.
+        load: returns the map of a tile.
+        images: of all tiles.
+        settings: how points are refined.
+        folder: empty, for temporary files; the arrays of the joined map are in it.
+    """
+    opened = lru_cache(OPEN_TILES)(load)
+    length = opened(0).length
+    near = images.world_from_cams.copy()
+    near[:, :3, 3] /= length
+    first, sharing = _assign(tiles, opened, len(images.names), folder)
+    error2, freedom, counts = 0.0, 0, np.zeros((len(tiles), 2), np.int64)
+    of_image = np.zeros(len(images.names), np.int64)
+    for number in range(len(tiles)):
+        rows = [_rows_of(number, other, tiles[other], opened(other), first, folder) for other in sharing[number]]
+        observations = np.concatenate([np.zeros((0, 3), np.int64), *rows])
+        observations = observations[np.lexsort((observations[:, 1], observations[:, 0]))]
+        seen, observations[:, 0] = np.unique(observations[:, 0], return_inverse=True)
+        refined = refine_points(
+            opened(number).points / length,
+            observations,
+            [images.cameras[image] for image in seen],
+            near[seen],
+            [images.keypoints(int(image)) for image in seen],
+            settings,
+        )
+        points, observations = refined.points, refined.observations
+        observations[:, 0] = seen[observations[:, 0]]
+        first_of = np.unique(observations[:, 2], return_index=True)[1]
+        np.savez(
+            folder / f"{number}.npz",
+            points=length * points,
+            observations=observations,
+            colors=images.colors(observations[first_of, 0], observations[first_of, 1]),
+        )
+        error2, freedom = error2 + refined.error2, freedom + refined.freedom
+        counts[number] = len(points), len(observations)
+        of_image += np.bincount(observations[:, 0], minlength=len(of_image))
+    noise_px = float(np.sqrt(error2 / max(freedom, 1)))
+    return _written(images, length, counts, of_image, noise_px, folder)
+
+
+def _assign(
+    tiles: Sequence[Tile], load: Callable[[int], LocalMap], count: int, folder: Path
+) -> tuple[Ints, list[list[int]]]:
+    """Say of which point each observation of each tile is, counting all points of all tiles; -1: an earlier tile says.
+
+    A point that shares observations with points of earlier tiles is the one with which it shares the most.
+
+    Returns:
+        The first point of each tile, (T + 1,), and of each tile, those that have observations of its points. What each
+        observation is of is in `folder`.
+    """
+    last = np.zeros(count, np.int64)
+    for number, tile in enumerate(tiles):
+        last[tile.images] = number
+    known: dict[int, tuple[Ints, Ints]] = {}  # keypoints, ascending, and points of images that later tiles have, too
+    first, sharing = [0], [list[int]() for _ in tiles]
+    for number, tile in enumerate(tiles):
+        part = load(number)
+        parts = [slice(*part.image_starts[index : index + 2]) for index in range(len(tile.images))]
+        earlier = np.full(len(part.obs_point), -1)
+        for image, seen in zip(tile.images.tolist(), parts, strict=True):
+            keypoints, points = known.get(image, (np.zeros(0, np.int64),) * 2)
+            if len(keypoints):
+                at = np.minimum(np.searchsorted(keypoints, part.obs_keypoint[seen]), len(keypoints) - 1)
+                earlier[seen] = np.where(keypoints[at] == part.obs_keypoint[seen], points[at], -1)
+        there = earlier >= 0
+        same, shared = np.unique(
+            np.column_stack([part.obs_point[there], earlier[there]]), axis=0, return_counts=True
+        )  # (point here, point there)
+        order = np.lexsort((same[:, 1], -shared, same[:, 0]))
+        same = same[order][np.unique(same[order, 0], return_index=True)[1]]
+        final = first[-1] + np.arange(len(part.points))
+        final[same[:, 0]] = same[:, 1]
+        first.append(first[-1] + len(part.points))
+        point = np.where(there, -1, final[part.obs_point])
+        np.save(folder / f"{number}.npy", point)
+        for owner in np.unique(np.searchsorted(first, point[point >= 0], "right") - 1).tolist():
+            sharing[owner].append(number)
+        for image, seen in zip(tile.images.tolist(), parts, strict=True):
+            before = known.pop(image, (np.zeros(0, np.int64),) * 2)
+            if last[image] > number:
+                new = point[seen] >= 0
+                keypoints = np.concatenate([before[0], part.obs_keypoint[seen][new]])
+                points = np.concatenate([before[1], point[seen][new]])
+                order = np.argsort(keypoints)
+                known[image] = keypoints[order], points[order]
+    return np.array(first, np.int64), sharing
+
+
+def _rows_of(owner: int, number: int, tile: Tile, part: LocalMap, first: Ints, folder: Path) -> Ints:
+    """Return the observations (n, 3) of the points of one tile in another: image, keypoint, point of the owner."""
+    point = np.load(folder / f"{number}.npy")
+    mine = np.flatnonzero((point >= first[owner]) & (point < first[owner + 1]))
+    return np.column_stack([tile.images[part.obs_image[mine]], part.obs_keypoint[mine], point[mine] - first[owner]])
+
+
+def _written(
+    images: JoinedImages, length: float, counts: Ints, of_image: Ints, noise_px: float, folder: Path
+) -> LocalMap:
+    """Return the map of points that are in files, one a tile.
+
+    Args:
+        counts: (T, 2) points and observations of each tile.
+        of_image: (N,) observations of each image.
+    """
+    (num_points, num_observations), num_images = counts.sum(axis=0).tolist(), len(of_image)
+
+    def array(name: str, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
+        # What cannot be mapped, as it has no bytes, takes none either.
+        return np.lib.format.open_memmap(folder / f"{name}.npy", "w+", dtype, shape) if shape[0] else np.zeros(shape)
+
+    points, colors = array("points", (num_points, 3), np.float64), array("colors", (num_points, 3), np.uint8)
+    noise = array("noise_px", (num_points,), np.float32)
+    point_starts = array("point_starts", (num_points + 1,), np.int64)
+    obs_image, obs_keypoint, obs_point, by_point = (
+        array(name, (num_observations,), np.int64) for name in ("obs_image", "obs_keypoint", "obs_point", "by_point")
+    )
+    image_starts = np.concatenate([[0], np.cumsum(of_image)])
+    free = image_starts[:-1].copy()  # the next observation of each image
+    point = observation = 0
+    for number in range(len(counts)):
+        with np.load(folder / f"{number}.npz") as tile:
+            rows = tile["observations"]
+            here = slice(point, point + len(tile["points"]))
+            points[here], colors[here] = tile["points"], tile["colors"]
+        starts = np.searchsorted(rows[:, 0], np.arange(num_images + 1)) if len(rows) else np.zeros(num_images + 1)
+        at = free[rows[:, 0]] + np.arange(len(rows)) - starts[rows[:, 0]].astype(np.int64)
+        np.add.at(free, rows[:, 0], 1)
+        obs_image[at], obs_keypoint[at], obs_point[at] = rows[:, 0], rows[:, 1], rows[:, 2] + point
+        order = np.lexsort((at, rows[:, 2]))
+        by_point[observation : observation + len(rows)] = at[order]
+        of_point = np.bincount(rows[:, 2], minlength=here.stop - here.start)
+        point_starts[here.start + 1 : here.stop + 1] = observation + np.cumsum(of_point)
+        noise[here] = noise_px
+        point, observation = here.stop, observation + len(rows)
+    joined = LocalMap(
+        images.names, images.cameras, images.world_from_cams, points, colors, obs_image, obs_keypoint, obs_point, noise,
+        length,
+    )  # fmt: skip
+    vars(joined).update(image_starts=image_starts, by_point=by_point, point_starts=point_starts)
+    return joined
