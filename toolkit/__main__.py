@@ -51,6 +51,14 @@ def run(
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Replace a setting, e.g. localize.method=nearest."),
     ] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            metavar="local[:N]|tcp://HOST:PORT|slurm:FILE",
+            help="Have the work done by Dask workers: N on this machine, those of a scheduler, or those that a "
+            "cluster's queue starts (see docs/scaling.md).",
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Run the notebooks of a manifest, resuming what is done, and write a report.
@@ -63,7 +71,7 @@ def run(
 
     tell = partial(print, file=sys.stderr) if as_json else print
     try:
-        run_dir = pipeline.run(manifest, only=only, force=force, overrides=overrides or (), say=tell)
+        run_dir = pipeline.run(manifest, only=only, force=force, overrides=overrides or (), say=tell, cluster=cluster)
     except BaseException as error:
         if as_json:
             status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"

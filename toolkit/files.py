@@ -5,6 +5,7 @@ import hashlib
 import json
 import logging
 import os
+import pickle
 import platform
 import re
 import shutil
@@ -408,3 +409,29 @@ def _checked(row: Any, keys: set[str]) -> dict[str, Any]:
         raise ValueError("a reference in topk has no path")
     int(row["timestamp"])
     return row
+
+
+class Remade:
+    """Pickled as the arguments that it was made with; a process that unpickles it makes it once, until it gets another.
+
+    For networks and other things that are costly to make, and of which each worker needs one.
+    """
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Any:
+        made = super().__new__(cls)
+        made.__dict__["_made_with"] = args, kwargs
+        return made
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _remade, (type(self), pickle.dumps(self.__dict__["_made_with"]))
+
+
+_last_remade: dict[type, tuple[bytes, Any]] = {}
+
+
+def _remade(kind: type, made_with: bytes) -> Any:
+    if _last_remade.get(kind, (b"", None))[0] != made_with:
+        _last_remade.pop(kind, None)  # first, as both may not fit in memory
+        args, kwargs = pickle.loads(made_with)
+        _last_remade[kind] = made_with, kind(*args, **kwargs)
+    return _last_remade[kind][1]

@@ -5,10 +5,10 @@ import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -27,12 +27,12 @@ from toolkit.features.matching import (
     DeferredMethod,
     LocalMethod,
     MutualMatcher,
-    create_local_methods,
     resolve_auto,
     weights_files,
 )
 from toolkit.features.stores import FeatureStore, MatchStore, extract_session, match_sessions
 from toolkit.files import (
+    Remade,
     file_fingerprint,
     fingerprint,
     image_name,
@@ -74,6 +74,7 @@ from toolkit.localizers.misfit import LEAST_SIZE, SIGNIFICANCE
 from toolkit.localizers.picture import localize_image
 from toolkit.localizers.prediction import Predictor
 from toolkit.manifest import LocalizeSettings
+from toolkit.runs.cluster import current_cluster
 from toolkit.runs.pairs import PairRows
 from toolkit.show.metrics import camera_messages
 
@@ -139,37 +140,27 @@ def localize_pairs(
         ArtifactError: no pair can be done; of one, the retrieval is missing.
     """
     settings = resolve_auto(LocalizeSettings.of(settings))
-    capture = Capture.from_sessions_root(sessions_root)
-    workers = workers or default_workers()
-    kinds, escalation = create_methods(settings)
-    predictor = open_predictor(settings, capture, Path(map_dir)) if settings.predicts else None
-    table = PairRows(capture.name, Path(out_dir), Path(retrieval_dir))
-
-    @lru_cache(maxsize=1)
-    def open_map(device: str) -> tuple[Map, Localizer]:
-        place = Map.build(
-            capture, device, settings, kinds, Path(features_dir), Path(map_dir), workers, skip_existing, escalation
-        )
-        return place, create_localizer(settings, place, predictor)
-
+    folders = _Folders(*map(Path, (sessions_root, retrieval_dir, out_dir, features_dir, map_dir)))
+    stage = _Stage(folders, settings, queries, skip_existing, workers or default_workers())
+    capture = stage.capture
+    table = PairRows(capture.name, folders.out, folders.retrieval)
     asked: dict[str, list[pd.DataFrame]] = {}
     devices = product(capture.devices_with("map", map_device), capture.devices_with("query", query_device))
     with threadpool_limits(1, "blas"):  # queries are the parallel dimension, and sums stay in one order
         for mapped, queried in devices:
-            pair = _Pair(capture, mapped, queried, Path(retrieval_dir), Path(out_dir), queries)
+            pair = stage.pair(mapped, queried)
             with table.row(mapped, queried) as row:
                 table.check_upstream()
                 started = time.perf_counter()
-                record = pair.record(settings, kinds, escalation, predictor)
-                about = attributes(settings, kinds, capture, mapped, pair.retrieval_dir)
-                maps = [Path(map_dir) / name for name in json.loads(about[MAPS])]
+                record = stage.record(pair)
+                about = attributes(settings, stage.kinds, capture, mapped, pair.retrieval_dir)
+                maps = [folders.map / name for name in json.loads(about[MAPS])]
                 skipped = skip_existing and pair.is_current(record, maps)
                 unfinished = False
                 if not skipped:
-                    place, localizer = open_map(mapped)
-                    run = _PairRun(pair, place, localizer, Path(features_dir), workers, skip_existing)
+                    run = stage.run(mapped, queried)
                     localized = run.localize(record, about)
-                    write_text(pair.about_map, json.dumps(place.record(), indent=1) + "\n")
+                    write_text(pair.about_map, json.dumps(run.place.record(), indent=1) + "\n")
                     _write_poses(pair, localized, settings)
                     unfinished = any(map(_is_internal, localized))
                 if update_attributes(pair.file("h5"), about) or not skipped:
@@ -282,6 +273,62 @@ class _Pair:
         return {(int(row["timestamp"]), str(row["sensor_id"])): row["topk"] for row in rows}
 
 
+class _Folders(NamedTuple):
+    """As `localize_pairs` is given them."""
+
+    sessions: Path
+    retrieval: Path
+    out: Path
+    features: Path
+    map: Path
+
+
+class _Stage(Remade):
+    """What all pairs share; a worker opens it once."""
+
+    def __init__(
+        self,
+        folders: _Folders,
+        settings: LocalizeSettings,
+        queries: str,
+        skip_existing: bool,
+        workers: int = 0,
+        time_ns: int = 0,
+    ) -> None:
+        """See `localize_pairs`; `time_ns` tells a worker which maps it opened before others were made."""
+        self.folders, self.settings, self.queries = folders, settings, queries
+        self.skip_existing, self.workers = skip_existing, workers or default_workers()
+        self.capture = Capture.from_sessions_root(folders.sessions)
+        self.kinds, self.escalation = create_methods(settings)
+        self.predictor = open_predictor(settings, self.capture, folders.map) if settings.predicts else None
+        self.open_map = lru_cache(maxsize=1)(self._open_map)
+
+    def pair(self, map_device: str, query_device: str) -> "_Pair":
+        folders = self.folders
+        return _Pair(self.capture, map_device, query_device, folders.retrieval, folders.out, self.queries)
+
+    def record(self, pair: "_Pair") -> dict[str, Any]:
+        """Return what the poses of a pair depend on."""
+        return pair.record(self.settings, self.kinds, self.escalation, self.predictor)
+
+    def _open_map(self, device: str) -> tuple[Map, Localizer]:
+        folders = self.folders
+        place = Map.build(
+            self.capture, device, self.settings, self.kinds, folders.features, folders.map, self.workers,
+            self.skip_existing, self.escalation,
+        )  # fmt: skip
+        return place, create_localizer(self.settings, place, self.predictor)
+
+    def run(self, map_device: str, query_device: str) -> "_PairRun":
+        """Return the queries of a pair on their way."""
+        return _PairRun(self.pair(map_device, query_device), *self.open_map(map_device), self)
+
+    @cached_property
+    def of_worker(self) -> "_Stage":
+        """What a worker is to open: it uses what is there, with its own number of threads."""
+        return _Stage(self.folders, self.settings, self.queries, True, 0, time.time_ns())
+
+
 _Task = tuple[int, Query, list[References], Any, float]
 """A query's number, the query, its references, what a network says of it, and the seconds that took."""
 
@@ -289,11 +336,11 @@ _Task = tuple[int, Query, list[References], Any, float]
 class _PairRun:
     """The queries of a pair on their way through a localizer."""
 
-    def __init__(
-        self, pair: _Pair, place: Map, localizer: Localizer, features_dir: Path, workers: int, skip_existing: bool
-    ) -> None:
-        self.pair, self.place, self.localizer = pair, place, localizer
-        self.features_dir, self.workers, self.skip_existing = features_dir, workers, skip_existing
+    def __init__(self, pair: _Pair, place: Map, localizer: Localizer, stage: _Stage) -> None:
+        self.pair, self.place, self.localizer, self.stage = pair, place, localizer, stage
+        self.features_dir, self.workers, self.skip_existing = stage.folders.features, stage.workers, stage.skip_existing
+        self.first = localizer.first if isinstance(localizer, EscalatingLocalizer) else localizer
+        """Of queries that are not escalated."""
         keyframes = pair.session.keyframes(pair.queries)
         self.keys = list(zip(keyframes["timestamp"].tolist(), keyframes["device_id"].tolist(), strict=True))
         self.rows = pair.session.rows_of_keyframes(keyframes)
@@ -379,20 +426,47 @@ class _PairRun:
             writer.drop_damaged()
             numbers = {group: number for number, group in enumerate(groups)}  # a list may name a query twice
             rows = writer.notes()
-            first = self.localizer.first if isinstance(self.localizer, EscalatingLocalizer) else self.localizer
             todo = [number for group, number in numbers.items() if group not in rows]
-            for number, row, localized in self._localized(first.localize, self._predicted(first, todo), len(todo)):
-                rows[groups[number]] = row
-                self._add(writer, groups[number], row, localized, again)
+            if todo and (cluster := current_cluster()):
+                shares: list[tuple[Sequence[int], tuple[Any, ...]]] = [
+                    (part, (self.stage.of_worker, *self.devices, {}, 0.0))
+                    for part in cluster.cut(todo, self.first.batch_size)
+                ]
+                writer.spread(cluster, _localize_share, shares, self._label, "query")
+                rows = writer.notes()
+                todo = [number for group, number in numbers.items() if group not in rows]  # for a fault of the toolkit
+            again |= self.localize_into(writer, todo)
             if isinstance(self.localizer, EscalatingLocalizer):
-                of_number = {number: rows[group] for group, number in numbers.items() if group not in again}
-                self._escalate(self.localizer, writer, of_number, again)
+                rows = writer.notes()
+                done = {number: rows[group] for group, number in numbers.items() if group in rows}
+                again |= self._escalate(writer, done)
             # From here until the new poses are there, a kill must not leave poses of one run with a file of another.
             for poses in (self.pair.file("txt"), sidecar_path(self.pair.file("txt"))):
                 poses.unlink(missing_ok=True)
             writer.finish()
             rows = writer.notes() | again
         return [rows[group] for group in groups]
+
+    @property
+    def devices(self) -> tuple[str, str]:
+        """Of map and queries."""
+        return self.pair.map_device, self.pair.query_device
+
+    @property
+    def _label(self) -> str:
+        return f"localize {self.pair.query_device} in {self.pair.map_device}"
+
+    def localize_into(self, writer: GroupWriter, numbers: Sequence[int]) -> dict[str, dict[str, Any]]:
+        """Localize queries and add them to a file.
+
+        Returns:
+            The rows of queries that have a fault of the toolkit in them, by group: they are not recorded as done.
+        """
+        again: dict[str, dict[str, Any]] = {}
+        tasks = self._predicted(self.first, numbers)
+        for number, row, localized in self._localized(self.first.localize, tasks, len(numbers)):
+            self._add(writer, query_group(*self.keys[number]), row, localized, again)
+        return again
 
     def _add(
         self,
@@ -407,14 +481,12 @@ class _PairRun:
             again[group] = row
         writer.add(group, arrays=localized.arrays(), note=None if group in again else row)
 
-    def _escalate(
-        self,
-        localizer: EscalatingLocalizer,
-        writer: GroupWriter,
-        rows: Mapping[int, dict[str, Any]],
-        again: dict[str, dict[str, Any]],
-    ) -> None:
-        """Ask with further features where the rows, by number of the query, tell that its pose is not sure."""
+    def _escalate(self, writer: GroupWriter, rows: Mapping[int, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+        """Ask with further features where the rows, by number of the query, tell that its pose is not sure.
+
+        Returns:
+            As `localize_into`.
+        """
         limit = self.place.sure_position_std
         todo = [
             number
@@ -423,13 +495,42 @@ class _PairRun:
             and can_gain(*self.query(number))
         ]
         if not todo:
-            return
+            return {}
         started = time.perf_counter()
-        for kind in self.place.escalation:
-            self._add_kind(kind, todo)
+        self.add_escalation(todo)
         shared = (time.perf_counter() - started) / len(todo)
-        tasks = ((number, *self.query(number), None, shared) for number in todo)
-        for number, row, localized in self._localized(localizer.escalate, tasks, len(todo)):
+        if cluster := current_cluster():
+            stage = self.stage.of_worker
+            shares = [
+                (part, (stage, *self.devices, {number: rows[number] for number in part}, shared))
+                for part in cluster.cut(todo)
+            ]
+            writer.spread(cluster, _localize_share, shares, self._label, "query")
+            after = writer.notes()
+            todo = [number for number in todo if not after[query_group(*self.keys[number])].get("first_status")]
+        return self.escalate_into(writer, {number: rows[number] for number in todo}, shared)
+
+    def add_escalation(self, numbers: Sequence[int]) -> None:
+        """Extract and match the further kinds of features of queries."""
+        for kind in self.place.escalation:
+            self._add_kind(kind, numbers)
+
+    def escalate_into(
+        self, writer: GroupWriter, rows: Mapping[int, dict[str, Any]], shared: float
+    ) -> dict[str, dict[str, Any]]:
+        """Localize queries with further features, which were extracted, and add those to a file that this helps.
+
+        Args:
+            rows: those without these features, by number of the query.
+            shared: seconds that their extraction took for each.
+
+        Returns:
+            As `localize_into`.
+        """
+        assert isinstance(self.localizer, EscalatingLocalizer)
+        again: dict[str, dict[str, Any]] = {}
+        tasks = ((number, *self.query(number), None, shared) for number in rows)
+        for number, row, localized in self._localized(self.localizer.escalate, tasks, len(rows)):
             before, group = rows[number], query_group(*self.keys[number])
             both = {
                 "first_status": before["status"],
@@ -440,14 +541,14 @@ class _PairRun:
                 self._add(writer, group, row | both, localized, again)
             else:
                 writer.annotate(group, before | both)
+        return again
 
     def _localized(
         self, localize: Callable[..., PoseEstimate], tasks: Iterator[_Task], count: int
     ) -> Iterator[tuple[int, dict[str, Any], LocalizedQuery]]:
         """Yield queries with their rows and correspondences."""
         answers = prefetch(partial(self._localize, localize), tasks, self.workers)
-        label = f"localize {self.pair.query_device} in {self.pair.map_device}"
-        return iter(tqdm(answers, total=count, desc=label, unit="query", disable=not count))
+        return iter(tqdm(answers, total=count, desc=self._label, unit="query", disable=not count))
 
     def _predicted(self, localizer: Localizer, numbers: Sequence[int]) -> Iterator[_Task]:
         """Yield queries with what a network says of them, asked for some at a time, and the seconds that took."""
@@ -483,6 +584,28 @@ class _PairRun:
         found_by = "" if estimate.world_from_rig is None else estimate.found_by
         row = _row(self.keys[number], estimate, localized, label(self.place.settings, found_by), started)
         return number, row, localized
+
+
+def _localize_share(
+    share: str,
+    numbers: Sequence[int],
+    stage: _Stage,
+    map_device: str,
+    query_device: str,
+    rows: Mapping[int, dict[str, Any]],
+    shared: float,
+) -> None:
+    """Localize a share of a pair's queries, or escalate those that have rows already."""
+    run = stage.run(map_device, query_device)
+    path, record = run.pair.file("h5"), stage.record(run.pair)
+    with threadpool_limits(1, "blas"), GroupWriter(path, record, share=share) as writer:
+        done = writer.notes()
+        rest = [number for number in numbers if query_group(*run.keys[number]) not in done]
+        if rows and rest:
+            run.add_escalation(rest)
+            run.escalate_into(writer, {number: rows[number] for number in rest}, shared)
+        elif rest:
+            run.localize_into(writer, rest)
 
 
 def _indices(rows: list[dict[str, Any]], index_of: Mapping[str, int]) -> tuple[list[int], list[float]]:
@@ -577,14 +700,10 @@ def explain_query(
     """
     if not settings.predicts:
         raise ToolkitError(f"The method {settings.method} asks no network. Use vggt or hybrid.")
-    capture = Capture.from_sessions_root(sessions_root)
     settings = resolve_auto(LocalizeSettings.of(settings, {"method": "vggt"}))
-    kinds = create_local_methods(settings)
-    place = Map.build(capture, map_device, settings, kinds, Path(features_dir), Path(map_dir))
-    localizer = create_localizer(settings, place)
-    if isinstance(localizer, ScaledLocalizer):
-        localizer = localizer.inner
+    folders = _Folders(*map(Path, (sessions_root, retrieval_dir, retrieval_dir, features_dir, map_dir)))
+    run = _Stage(folders, settings, queries, skip_existing=True, workers=1).run(map_device, query_device)
+    localizer = run.localizer.inner if isinstance(run.localizer, ScaledLocalizer) else run.localizer
     assert isinstance(localizer, FeedForwardLocalizer)
-    pair = _Pair(capture, map_device, query_device, Path(retrieval_dir), Path(retrieval_dir), queries)
-    query, references = _PairRun(pair, place, localizer, Path(features_dir), 1, True).query(index)
+    query, references = run.query(index)
     return localizer, query, localizer.predict([(query, references)])[0]

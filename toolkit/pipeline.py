@@ -59,6 +59,7 @@ from toolkit.notebook import (
     stage_outputs,
     work_seconds,
 )
+from toolkit.runs.cluster import open_cluster
 from toolkit.runs.folder import LOG, held
 from toolkit.runs.pairs import pair_text, way_out
 from toolkit.runs.record import RunLog, failures
@@ -122,6 +123,7 @@ def run(
     force: bool = False,
     overrides: Iterable[str] = (),
     say: Say = print,
+    cluster: str | None = None,
 ) -> Path:
     """Run a manifest and return its run folder, with `run.json` and `report.html` in it.
 
@@ -131,6 +133,7 @@ def run(
         force: execute stages that are up to date, and let them reuse nothing of their own.
         overrides: `key=value` or `stage.key=value`, replacing what the manifest says.
         say: takes the progress lines; called like `print`.
+        cluster: whose workers stages use, see `runs.cluster.open_cluster`.
 
     Raises:
         ManifestError: before anything runs.
@@ -143,10 +146,12 @@ def run(
         raise ManifestError(f"--only {only}: {manifest_path} has no section `{only}`, so the stage is off.")
     devices = [device.model_dump(exclude_none=True) for device in manifest.extra_devices]
     with extra_devices(devices), allow_outside(manifest.allow_outside):
-        return _run(manifest, manifest_path, only, force, say)
+        return _run(manifest, manifest_path, only, force, say, cluster)
 
 
-def _run(manifest: Manifest, manifest_path: str | Path, only: str | None, force: bool, say: Say) -> Path:
+def _run(
+    manifest: Manifest, manifest_path: str | Path, only: str | None, force: bool, say: Say, cluster: str | None
+) -> Path:
     _require_downloads(manifest, manifest_path)
     for stage in STAGES:  # a notebook that lacks a parameter stops the run before hours of work, not after
         path = notebook_path(stage)
@@ -162,7 +167,7 @@ def _run(manifest: Manifest, manifest_path: str | Path, only: str | None, force:
         run_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ManifestError(f"output_root: {run_dir} cannot be made ({error.strerror}). Choose another.") from None
-    with held(run_dir):
+    with held(run_dir), open_cluster(cluster, say):
         try:
             _run_stages(manifest, stages, run_dir, force, say)
         except BaseException as error:

@@ -21,6 +21,8 @@ from toolkit.errors import ImageError
 T = TypeVar("T")
 R = TypeVar("R")
 
+WORKERS = "TOOLKIT_WORKERS"
+"""Environment variable: the threads that this process may use."""
 MOST_BYTES = 1 << 30
 """Of a file that is read as an image."""
 MOST_PIXELS = 1 << 28
@@ -142,7 +144,9 @@ def read_for_display(path: str | Path) -> NDArray[np.uint8]:
 
 
 def default_workers() -> int:
-    """Return the default number of threads: the available cores, at most 8."""
+    """Return the default number of threads: the available cores, at most 8; what `WORKERS` says otherwise."""
+    if os.environ.get(WORKERS, "").isdigit():
+        return int(os.environ[WORKERS])
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min(cores, 8)
 

@@ -13,7 +13,7 @@ Python code loops over rows while a session is read.
 """
 
 from collections.abc import Iterator, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -64,6 +64,11 @@ Rows = ArrayLike | slice | None
 
 RAW_DATA = "raw_data"
 SUBSESSIONS = "proc/subsessions.txt"
+
+
+@lru_cache(maxsize=16)
+def _reopened(path: Path, state: str) -> "Session":
+    return Session(path)
 
 
 class Session:
@@ -118,6 +123,11 @@ class Session:
             CaptureError: the folder, sensors.txt or images.txt is missing, or a line is malformed.
         """
         return cls(path)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the folder: who unpickles it reads it once, and again when its files have changed."""
+        files = [*sorted(self.path.glob("*.txt")), *sorted((self.path / "proc").rglob("*.txt"))]
+        return _reopened, (self.path, files_fingerprint(files))
 
     def __repr__(self) -> str:
         poses = 0 if self.ground_truth is None else len(self.ground_truth)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from toolkit.capture.turning import turn_image, turn_points
 from toolkit.errors import ManifestError
+from toolkit.files import Remade
 from toolkit.geometry import Ints
 from toolkit.manifest import FeaturesSettings, SiftSettings, checkpoint_of
 
@@ -178,7 +179,7 @@ def stretch_contrast(gray: NDArray[np.uint8], max_gain: float = 8.0) -> NDArray[
     return np.asarray(cv2.LUT(gray, table), np.uint8)
 
 
-class SiftExtractor:
+class SiftExtractor(Remade):
     """Extracts RootSIFT features; one instance may be used by several threads."""
 
     color = False

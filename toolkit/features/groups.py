@@ -12,10 +12,11 @@ import logging
 import math
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, field
 from functools import wraps
+from itertools import groupby
 from pathlib import Path
 from types import TracebackType
 from typing import Any, ParamSpec, TypeVar
@@ -28,6 +29,7 @@ from numpy.typing import NDArray
 
 from toolkit.errors import DamagedError, first_line
 from toolkit.files import fingerprint, read_sidecar, sidecar_path, write_atomic, write_sidecar
+from toolkit.runs.cluster import Cluster
 
 log = logging.getLogger(__name__)
 
@@ -54,6 +56,10 @@ class Index:
     """Name of what could not be made -> the fingerprint of what it should have been made from, and the reason."""
     notes: dict[str, Any] = field(default_factory=dict)
     """Name of a group -> its note, any JSON."""
+
+    def source_of(self, name: str) -> str | None:
+        """Return what a group was made from, or should have been made from; None: it was not tried."""
+        return self.groups[name] if name in self.groups else self.failed.get(name, [None])[0]
 
     def update(self, later: "Index") -> None:
         """Take over what was made later; it replaces what was there."""
@@ -247,10 +253,21 @@ class GroupWriter:
 
     A stage whose result is another kind of file keeps its progress in groups too: it reads them back with `notes` and
     `read`, writes its file at `path` itself, and calls `discard` instead of `finish`.
+
+    Others may do shares of the work meanwhile: see `spread`.
     """
 
-    def __init__(self, path: Path, made_by: Mapping[str, Any], attributes: Mapping[str, Any] | None = None):
-        """Groups made by something else than `made_by`, JSON, are not kept; other readers see the `attributes`."""
+    def __init__(
+        self,
+        path: Path,
+        made_by: Mapping[str, Any],
+        attributes: Mapping[str, Any] | None = None,
+        share: str | None = None,
+    ):
+        """Groups made by something else than `made_by`, JSON, are not kept; other readers see the `attributes`.
+
+        A writer of a `share` writes parts of this name, and knows of no others; one that holds the file takes them.
+        """
         self.path = path
         self.index: Index
         """What the file and the complete parts hold."""
@@ -260,19 +277,56 @@ class GroupWriter:
         self._parts: dict[Path, Index] = {}
         self._open: tuple[Path, h5py.File, Index] | None = None
         self._locked, self._writing = ExitStack(), ExitStack()
+        self._share = share
+        self._whole: Index | None = None
+        if share is None:
+            self._hold()
+        self._find_parts()
+        self._part_closed = time.monotonic()
+
+    def _hold(self) -> None:
         self._wait_for_others()
-        self._whole = read_index(path, made_by)
-        if self._whole is None and path.exists() and not _is_of_another(path, made_by):
-            log.warning("%s is torn, or of another version of the toolkit: what it held is made again.", path)
-        for part in sorted(self._folder.glob("[!.]*.h5")):
-            index = read_index(part, made_by)
+        self._whole = read_index(self.path, self._made_by)
+        if self._whole is None and self.path.exists() and not _is_of_another(self.path, self._made_by):
+            log.warning("%s is torn, or of another version of the toolkit: what it held is made again.", self.path)
+
+    def _find_parts(self) -> None:
+        self._parts = {}
+        for part in sorted(self._folder.glob(f"{self._share or '[!.]'}*.h5")):
+            index = read_index(part, self._made_by)
             if index is None:
                 part.unlink(missing_ok=True)
                 sidecar_path(part).unlink(missing_ok=True)
             else:
                 self._parts[part] = index
         self._index_all()
-        self._part_closed = time.monotonic()
+
+    def spread(
+        self,
+        cluster: Cluster,
+        function: Callable[..., None],
+        shares: Sequence[tuple[Sequence[Any], tuple[Any, ...]]],
+        label: str,
+        unit: str,
+    ) -> None:
+        """Have shares of the work done by the workers of a cluster, and take what they made.
+
+        Args:
+            function: does a share; called with its name for a writer, its items, and its further arguments.
+            shares: of each the items and further arguments.
+            label, unit: of the bar.
+        """
+        self._close_part()
+        generation = self._next_number()
+        named = [(f"{generation:05d}-{number:05d}-", *share) for number, share in enumerate(shares)]
+        tasks = [(name, items, *others) for name, items, others in named]
+        cluster.run(function, tasks, [len(items) for _, items, _ in named], label, unit)
+        self._find_parts()
+
+    def _next_number(self) -> int:
+        # Parts are <number> or, of shares, <number>-<share>-<number>; what was made later comes later.
+        digits = slice(-5, None) if self._share else slice(5)
+        return max((int(path.stem[digits]) for path in self._parts), default=-1) + 1
 
     def __enter__(self) -> "GroupWriter":
         return self
@@ -331,11 +385,12 @@ class GroupWriter:
         return self.index.notes | (self._open[2].notes if self._open else {})
 
     def read(self) -> Iterator[tuple[str, dict[str, NDArray[Any]]]]:
-        """Yield name and arrays of the groups that are in parts, in the order in which they were added."""
+        """Yield name and arrays of the groups that are in parts, in the order of names."""
         self._close_part()
-        for path, index in self._parts.items():
+        part_of = {name: path for path, index in self._parts.items() for name in index.groups}
+        for path, names in groupby(sorted(part_of), part_of.__getitem__):
             with h5py.File(path, "r") as file:
-                for name in index.groups:
+                for name in names:
                     yield name, read_group(file, name)
 
     def finish(self) -> None:
@@ -451,8 +506,7 @@ class GroupWriter:
     def _part(self) -> tuple[h5py.File, Index]:
         """Return the part that is being written, a new one where there is none."""
         if self._open is None:
-            last = max((int(path.stem) for path in self._parts), default=-1)
-            path = self._folder / f"{last + 1:05d}.h5"
+            path = self._folder / f"{self._share or ''}{self._next_number():05d}.h5"
             temporary = self._writing.enter_context(write_atomic(path))
             file = self._writing.enter_context(h5py.File(temporary, "w", libver="latest"))
             file.attrs.update(self._attributes)

@@ -14,6 +14,7 @@ from torch.nn.utils.rnn import pad_sequence
 from toolkit.errors import ManifestError, ToolkitError
 from toolkit.features.features import LocalFeatures
 from toolkit.features.matching import MATCHER_WEIGHTS, PairMatches
+from toolkit.files import Remade
 from toolkit.models.compute import Fitting, in_single_threads, precision_of_matches, resolve_device
 from toolkit.models.lightglue import LightGlue, official_names
 from toolkit.models.weights import given_or_resolved, load_checkpoint, weights_digest
@@ -23,7 +24,7 @@ _BATCH = {"cpu": 8}
 _BATCH_ELSEWHERE = 32
 
 
-class LightGlueMatcher:
+class LightGlueMatcher(Remade):
     """Matches pairs of images of any sizes, with any numbers of learned features, in batches, on any device.
 
     Every pair goes through all layers with all its features. The network could stop early or drop features where it

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from toolkit.errors import ToolkitError
 from toolkit.features.features import LocalFeatures
+from toolkit.files import Remade
 from toolkit.manifest import AlikedSettings, SuperPointSettings
 from toolkit.models.compute import Fitting, precision_of_matches, resolve_device
 from toolkit.models.weights import weights_digest
@@ -21,7 +22,7 @@ _BATCH = {"cpu": 2}
 _BATCH_ELSEWHERE = 16
 
 
-class NetworkExtractor:
+class NetworkExtractor(Remade):
     """Extracts features with a network, on any device.
 
     Images of one size run together. The features of an image do not depend on the others in the batch.

@@ -13,9 +13,9 @@ first image the index of the second image's feature or -1, and `matching_scores0
 import logging
 import threading
 from collections import Counter
-from collections.abc import Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
-from itertools import islice
+from itertools import islice, tee
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +26,14 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from toolkit.capture import Session
-from toolkit.capture.images import prefetch, read_image
+from toolkit.capture.images import default_workers, prefetch, read_image
 from toolkit.errors import ArtifactError, DamagedError, ImageError, first_line
 from toolkit.features.features import DESCRIPTOR_SCALE, KINDS, Extractor, LocalFeatures, SiftExtractor, extract_turned
 from toolkit.features.groups import HDF5_ERRORS, GroupWriter, group_names_of, has_group, read_group
 from toolkit.features.matching import Matcher, PairMatches
 from toolkit.files import files_fingerprint, fingerprint, read_sidecar
 from toolkit.geometry import Ints
+from toolkit.runs.cluster import current_cluster
 
 log = logging.getLogger(__name__)
 
@@ -48,6 +49,12 @@ _HALF_PIXEL = np.float32(0.5)
 _HALVES = (np.arange(256) / DESCRIPTOR_SCALE).astype(np.float16)
 _BYTES = np.zeros(1 << 16, np.uint8)
 _BYTES[_HALVES.view(np.uint16)] = np.arange(256)
+
+
+_Todo = tuple[str, str, int]
+"""An image whose features are to be extracted: name, what they are made from, row of the session."""
+_ToMatch = tuple[str, str, str, str]
+"""A pair to match: names, group of the file, what the matches are made from."""
 
 
 def features_path(out: str | Path, session_id: str, settings: Mapping[str, Any]) -> Path:
@@ -167,6 +174,10 @@ class FeatureStore(Mapping[str, LocalFeatures]):
         """
         return cls.open(features_path(out, session_id, settings or SiftExtractor().settings))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the path: who unpickles it opens the file once, and again when it has changed."""
+        return _reopened, (self.path, files_fingerprint([self.path]))
+
     @property
     def fingerprint(self) -> str:
         """16 hex digits that identify the images and settings that the features were made from."""
@@ -209,6 +220,11 @@ class FeatureStore(Mapping[str, LocalFeatures]):
         self._file = file
 
 
+@lru_cache(maxsize=16)
+def _reopened(path: Path, state: str) -> FeatureStore:
+    return FeatureStore.open(path)
+
+
 def extract_session(
     session: Session,
     out: str | Path,
@@ -245,28 +261,54 @@ def extract_session(
     made_from = {name: _made_from(session, row, int(turns[row])) for name, row in row_of.items()}
     path, label = features_path(out, session.id, extractor.settings), f"{extractor.settings['name']} {session.id}"
     with GroupWriter(path, extractor.settings, {PIXEL_CENTER: 0.0}) as writer:
-        done = {*writer.index.groups.items(), *((name, source) for name, (source, _) in writer.index.failed.items())}
-        todo = [item for item in made_from.items() if not (skip_existing and item in done)]
-        cv2_threads = cv2.getNumThreads()
-        cv2.setNumThreads(1)  # the images are the parallel dimension
-        try:
-            results = _extract(session, [row_of[name] for name, _ in todo], extractor, turns, workers)
-            with tqdm(total=len(todo), desc=label, unit="image", disable=not progress or not todo) as bar:
-                for (name, source), features in zip(todo, results, strict=True):
-                    if isinstance(features, str):
-                        writer.fail(name, source, features)
-                    else:
-                        quantized = features.descriptors.dtype == np.uint8
-                        attributes = {"descriptors": {SCALE: DESCRIPTOR_SCALE}} if quantized else {}
-                        writer.add(name, source, _to_arrays(features), attributes)
-                    bar.update()
-        finally:
-            cv2.setNumThreads(cv2_threads)
+        todo = [
+            (name, source, row_of[name])
+            for name, source in made_from.items()
+            if not (skip_existing and writer.index.source_of(name) == source)
+        ]
+        if todo and (cluster := current_cluster()):
+            chosen_turns = {row: int(turns[row]) for _, _, row in todo if turns[row]}
+            shares = [(part, (path, session, extractor, chosen_turns)) for part in cluster.cut(todo)]
+            writer.spread(cluster, _extract_share, shares, label, "image")
+            todo = [item for item in todo if writer.index.source_of(item[0]) != item[1]]
+        bar = tqdm(todo, desc=label, unit="image", disable=not progress or not todo)
+        _extract_into(writer, bar, session, extractor, turns, workers)
         writer.finish()
         index = writer.index
     failed = {name: index.failed[name][1] for name in made_from if name in index.failed}
     readable = {name: source for name, source in made_from.items() if name in index.groups}
     return FeatureStore(path, readable, failed, extractor.settings)
+
+
+def _extract_share(
+    share: str, todo: Sequence[_Todo], path: Path, session: Session, extractor: Extractor, turned: Mapping[int, int]
+) -> None:
+    """Extract a share of a session's features; `turned` has the turns of rows with some."""
+    turns = np.zeros(len(session.images), np.int64)
+    turns[list(turned)] = list(turned.values())
+    with GroupWriter(path, extractor.settings, {PIXEL_CENTER: 0.0}, share) as writer:
+        rest = [item for item in todo if writer.index.source_of(item[0]) != item[1]]
+        _extract_into(writer, rest, session, extractor, turns, default_workers())
+
+
+def _extract_into(
+    writer: GroupWriter, todo: Iterable[_Todo], session: Session, extractor: Extractor, turns: Ints, workers: int
+) -> None:
+    """Add the features of images to a file, or why they have none."""
+    todo, rows = tee(todo)
+    cv2_threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # the images are the parallel dimension
+    try:
+        results = _extract(session, [row for _, _, row in rows], extractor, turns, workers)
+        for (name, source, _), features in zip(todo, results, strict=True):
+            if isinstance(features, str):
+                writer.fail(name, source, features)
+            else:
+                quantized = features.descriptors.dtype == np.uint8
+                attributes = {"descriptors": {SCALE: DESCRIPTOR_SCALE}} if quantized else {}
+                writer.add(name, source, _to_arrays(features), attributes)
+    finally:
+        cv2.setNumThreads(cv2_threads)
 
 
 class OnDemandFeatures:
@@ -445,19 +487,46 @@ def match_sessions(
             made_from = stores[0].made_from[name0] + stores[1].made_from[name1]
             if done.get(group) != made_from:
                 todo.append((name0, name1, group, made_from))
-        label, size = f"{matcher.settings['name']} {' '.join(sessions)}", matcher.batch_size
+        label = f"{matcher.settings['name']} {' '.join(sessions)}"
+        if todo and (cluster := current_cluster()):
+            shares = [(part, (path, made_by, stores, matcher)) for part in cluster.cut(todo, matcher.batch_size)]
+            writer.spread(cluster, _match_share, shares, label, "pair")
+            todo = [pair for pair in todo if writer.index.groups.get(pair[2]) != pair[3]]
         with tqdm(total=len(todo), desc=label, unit="pair", disable=not todo) as bar:
-            for batch in (todo[start : start + size] for start in range(0, len(todo), size)):
-                # One object for each image: the matcher computes once what depends on one image alone.
-                loaded = [
-                    {name: store[name] for name in {pair[side] for pair in batch}} for side, store in enumerate(stores)
-                ]
-                features = [(loaded[0][name0], loaded[1][name1]) for name0, name1, *_ in batch]
-                for pair, both, matches in zip(batch, features, matcher.match(features), strict=True):
-                    write_matches(writer, *pair[2:], (len(both[0]), len(both[1])), matches)
-                bar.update(len(batch))
+            _match_into(writer, todo, stores, matcher, bar.update)
         writer.finish()
     return MatchStore(path)
+
+
+def _match_share(
+    share: str,
+    todo: Sequence[_ToMatch],
+    path: Path,
+    made_by: Mapping[str, Any],
+    stores: tuple[FeatureStore, FeatureStore],
+    matcher: Matcher,
+) -> None:
+    with GroupWriter(path, made_by, share=share) as writer:
+        rest = [pair for pair in todo if pair[2] not in writer.index.groups]
+        _match_into(writer, rest, stores, matcher, lambda _: None)
+
+
+def _match_into(
+    writer: GroupWriter,
+    todo: Sequence[_ToMatch],
+    stores: tuple[FeatureStore, FeatureStore],
+    matcher: Matcher,
+    done: Callable[[int], object],
+) -> None:
+    """Add the matches of pairs to a file; `done` is told of how many."""
+    for start in range(0, len(todo), matcher.batch_size):
+        batch = todo[start : start + matcher.batch_size]
+        # One object for each image: the matcher computes once what depends on one image alone.
+        loaded = [{name: store[name] for name in {pair[side] for pair in batch}} for side, store in enumerate(stores)]
+        features = [(loaded[0][name0], loaded[1][name1]) for name0, name1, *_ in batch]
+        for pair, both, matches in zip(batch, features, matcher.match(features), strict=True):
+            write_matches(writer, *pair[2:], (len(both[0]), len(both[1])), matches)
+        done(len(batch))
 
 
 def group_names(pairs: Iterable[tuple[str, str]], existing: Container[str] = ()) -> dict[tuple[str, str], str]:

@@ -17,20 +17,23 @@ from tqdm.auto import tqdm
 from toolkit import geometry
 from toolkit.capture import Session
 from toolkit.capture.cameras import camera_text, in_view, rays_of, view_bounds
-from toolkit.capture.images import prefetch, read_image
+from toolkit.capture.images import default_workers, prefetch, read_image
 from toolkit.errors import ArtifactError, ImageError
 from toolkit.features.features import LocalFeatures, feature_kind
 from toolkit.features.groups import GroupWriter
 from toolkit.features.matching import PairMatches, match_along_epipolar_lines, unit_descriptors
 from toolkit.features.stores import FeatureStore, MatchStore, group_names, matches_path, write_matches
-from toolkit.files import fingerprint, is_current, temporary_folder, write_sidecar
+from toolkit.files import Remade, fingerprint, is_current, temporary_folder, write_sidecar
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.local_map import ORDERS, LocalMap
 from toolkit.localizers.survey import Survey, SurveyedImages
 from toolkit.localizers.tiles import JoinedImages, home_of, join_tiles, plan_tiles
 from toolkit.localizers.triangulation import triangulate
 from toolkit.manifest import MapSettings
+from toolkit.runs.cluster import current_cluster
 
+_ToMatch = tuple[int, int, str, str]
+"""A pair to match: images, group of the file, what the matches are made from."""
 DEPTHS = (2.0, 4.0, 8.0, 16.0)
 """Depths at which views are compared, "meters"."""
 _MAP_FORMAT = 4
@@ -194,7 +197,13 @@ def build_map(
     return LocalMap.load(path)
 
 
-class MapPlan:
+def _match_share(share: str, todo: Sequence[_ToMatch], plan: "MapPlan", number: int) -> None:
+    with plan._matches(number, share) as writer:
+        rest = [pair for pair in todo if pair[2] not in writer.index.groups]
+        plan.match_into(writer, rest, default_workers(), label="")
+
+
+class MapPlan(Remade):
     """What there is to do for a map: images, pairs of them to match, tiles to triangulate."""
 
     def __init__(
@@ -266,37 +275,45 @@ class MapPlan:
 
     def match(self, number: int, skip_existing: bool = True, workers: int = 1) -> None:
         """Match the pairs of a tile along epipolar lines, but for those whose matches are there."""
-        made_by, pairs = self._matches_made_by(number), self.pairs_of[number].tolist()
-        names, made_from, features = self.names, self._made_from, self.features
-        with GroupWriter(self._matches_path(number), made_by) as writer:
+        pairs, names, made_from = self.pairs_of[number].tolist(), self.names, self._made_from
+        with self._matches(number) as writer:
             known = writer.index.groups if skip_existing else {}
             groups = group_names([(names[i], names[j]) for i, j in pairs], writer.index.groups)
-            wanted = {(i, j): (groups[names[i], names[j]], made_from[i] + made_from[j]) for i, j in pairs}
-            todo = [pair for pair, (group, source) in wanted.items() if known.get(group) != source]
-            counts: dict[int, int] = {}
-
-            def load(index: int) -> LocalFeatures:
-                found = features[names[index]]
-                counts[index] = len(found)
-                return found
-
-            found = match_pairs(
-                np.array(todo, np.int64).reshape(-1, 2),
-                load,
-                self.cameras,
-                self.world_from_cams,
-                self.matcher["max_error_px"],
-                self.matcher["ratio"],
-                self.matcher["min_score"],
-                workers,
-            )
-            label = self._label("match", number)
-            for (i, j), matches in zip(todo, tqdm(found, total=len(todo), desc=label, unit="pair"), strict=True):
-                write_matches(writer, *wanted[i, j], (counts[i], counts[j]), matches)
+            wanted = [(i, j, groups[names[i], names[j]], made_from[i] + made_from[j]) for i, j in pairs]
+            todo = [pair for pair in wanted if known.get(pair[2]) != pair[3]]
+            label = f"match {self.session.id}" + (f" {number + 1}/{len(self.tiles)}" if len(self.tiles) > 1 else "")
+            if todo and (cluster := current_cluster()):
+                shares = [(part, (self, number)) for part in cluster.cut(todo)]
+                writer.spread(cluster, _match_share, shares, label, "pair")
+                todo = [pair for pair in todo if writer.index.groups.get(pair[2]) != pair[3]]
+            self.match_into(writer, todo, workers, label if todo else "")
             writer.finish()
 
-    def _label(self, what: str, number: int) -> str:
-        return f"{what} {self.session.id}" + (f" {number + 1}/{len(self.tiles)}" if len(self.tiles) > 1 else "")
+    def _matches(self, number: int, share: str | None = None) -> GroupWriter:
+        return GroupWriter(self._matches_path(number), self._matches_made_by(number), share=share)
+
+    def match_into(self, writer: GroupWriter, todo: Sequence[_ToMatch], workers: int, label: str) -> None:
+        """Add the matches of pairs to a file."""
+        counts: dict[int, int] = {}
+
+        def load(index: int) -> LocalFeatures:
+            found = self.features[self.names[index]]
+            counts[index] = len(found)
+            return found
+
+        found = match_pairs(
+            np.array([pair[:2] for pair in todo], np.int64).reshape(-1, 2),
+            load,
+            self.cameras,
+            self.world_from_cams,
+            self.matcher["max_error_px"],
+            self.matcher["ratio"],
+            self.matcher["min_score"],
+            workers,
+        )
+        bar = tqdm(found, total=len(todo), desc=label, unit="pair", disable=not label)
+        for (i, j, group, source), matches in zip(todo, bar, strict=True):
+            write_matches(writer, group, source, (counts[i], counts[j]), matches)
 
     def tile_path(self, number: int) -> Path:
         """Return the file of a tile, a map of its own."""
@@ -354,9 +371,13 @@ class MapPlan:
             colors = self._colors(local_map.obs_image[first], local_map.obs_keypoint[first])
             self._save(replace(local_map, colors=colors))
             return
-        numbers = range(len(self.tiles))
-        for number in tqdm(numbers, desc=f"triangulate {self.session.id}", unit="tile"):
-            self.triangulate(number, skip_existing)
+        numbers, label = range(len(self.tiles)), f"triangulate {self.session.id}"
+        if cluster := current_cluster():
+            shares = [(self, number, skip_existing) for number in numbers]
+            cluster.run(MapPlan.triangulate, shares, [1] * len(shares), label, "tile")
+        else:
+            for number in tqdm(numbers, desc=label, unit="tile"):
+                self.triangulate(number, skip_existing)
         images = JoinedImages(self.names, self.cameras, self.world_from_cams, self._keypoints, self._colors)
         with temporary_folder(self.path) as folder:
             self._save(
