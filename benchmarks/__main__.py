@@ -5,7 +5,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-NAMES = ("capture", "embed", "search", "index", "matching", "vggt", "alignment", "localize", "latency", "confidence")
+NAMES = (
+    "capture", "embed", "search", "index", "cluster", "matching", "vggt", "alignment", "localize", "latency",
+    "confidence",
+)  # fmt: skip
 SCRIPTS = {name: Path(__file__).with_name(f"{name}.py") for name in NAMES}
 
 

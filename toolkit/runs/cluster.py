@@ -37,8 +37,9 @@ SHARES_A_WORKER = 4
 """Work is cut into about so many shares a worker: all end at about the same time, and little is lost with one."""
 QUEUES = ("HTCondor", "LSF", "Moab", "OAR", "PBS", "SGE", "SLURM")
 """The schedulers of clusters that `dask-jobqueue` knows, as its classes spell them."""
-_WAIT_S = 300
-"""Longest time that the first worker may take to start."""
+_CONNECT_S = 30
+_WAIT_S = 600
+"""Longest time that a scheduler takes to answer, and a worker to start."""
 
 
 class Cluster:
@@ -119,7 +120,7 @@ def _client(address: str) -> "Client":
     from distributed import Client
 
     try:
-        client = Client(address, set_as_default=False, timeout=30)
+        client = Client(address, set_as_default=False, timeout=_CONNECT_S)
         client.wait_for_workers(1, timeout=_WAIT_S)
     except (OSError, TimeoutError) as error:
         raise ToolkitError(
@@ -171,11 +172,12 @@ def open_cluster(asked: str | None, say: Callable[[str], object] = print) -> Ite
             say(f"{cluster.size} workers at {address}; what they do: {link or _client(address).dashboard_link}")
             yield
         finally:
-            _client(address).close()
-            _client.cache_clear()
             del os.environ[ADDRESS]
             if before is not None:
                 os.environ[ADDRESS] = before
+            elif _client.cache_info().currsize:
+                _client(address).close()
+                _client.cache_clear()
 
 
 def _start(asked: str, stack: ExitStack) -> tuple[str, str]:
@@ -231,7 +233,7 @@ def _queued_cluster(queue: str, path: Path) -> Any:
         jobs = options.pop("jobs")
     except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
         raise ManifestError(f"--cluster: {path} cannot be read ({first_line(error)}).") from None
-    except (AttributeError, KeyError):
+    except (AttributeError, KeyError, TypeError):
         raise ManifestError(f"--cluster: {path} has no `jobs: <number>`, the workers to start.") from None
     try:
         cluster = getattr(dask_jobqueue, f"{queue}Cluster")(**options)

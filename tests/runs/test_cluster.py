@@ -1,0 +1,370 @@
+"""Work done by the workers of a cluster: the same results as of one process, whatever becomes of a worker."""
+
+import os
+import pickle
+import shutil
+import signal
+import stat
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from toolkit.capture import Capture
+from toolkit.capture.names import ALLOW_OUTSIDE
+from toolkit.embed import embed_sessions
+from toolkit.errors import DamagedError, ImageError, ManifestError, ToolkitError
+from toolkit.features import stores
+from toolkit.features.features import SiftExtractor
+from toolkit.features.groups import GroupWriter
+from toolkit.features.stores import FeatureStore, extract_session
+from toolkit.files import SceneFiles
+from toolkit.localize import localize_pairs
+from toolkit.localizers import mapping
+from toolkit.localizers.mapping import build_map
+from toolkit.manifest import MapSettings
+from toolkit.retrieve import retrieve_pairs
+from toolkit.runs import cluster as clusters
+from toolkit.runs.cluster import ADDRESS, Cluster, current_cluster, open_cluster
+
+LIST = "keyframes_pruned_subsampled"
+
+
+class Here(Cluster):
+    """Does the shares in this process, in another order, the first one twice, from what a worker would be sent."""
+
+    size = 2
+
+    def __init__(self) -> None:
+        self.labels: list[str] = []
+
+    def run(self, function: Callable[..., None], shares: Sequence[tuple[Any, ...]], sizes: Sequence[int], label: str,
+            unit: str) -> None:  # fmt: skip
+        self.labels.append(label.split()[0])
+        for share in [*shares[::-1], shares[0]]:
+            function(*pickle.loads(pickle.dumps(share)))
+
+
+@pytest.fixture
+def here(monkeypatch: pytest.MonkeyPatch) -> Here:
+    """A cluster for all that asks for one, but for what is done for it."""
+    cluster = Here()
+
+    def current() -> Cluster | None:
+        frame = sys._getframe(1)
+        while frame is not None:
+            if frame.f_code.co_name.endswith("_share"):
+                return None
+            frame = frame.f_back  # type: ignore[assignment]
+        return cluster
+
+    for module in ("toolkit.features.stores", "toolkit.localizers.mapping", "toolkit.localize"):
+        monkeypatch.setattr(f"{module}.current_cluster", current)
+    return cluster
+
+
+# -------------------------------------------------------------------------------------------------------- shares
+
+
+def write_share(share: str, items: Sequence[int], path: Path, fail_at: int | None = None) -> None:
+    with GroupWriter(path, {"by": 1}, share=share) as writer:
+        for item in items:
+            if f"{item}" in writer.index.groups:
+                continue
+            if item == fail_at:
+                raise ImageError("no more")
+            writer.add(f"{item}", f"from {item}", {"value": np.array([item])}, note=item)
+
+
+def test_a_writer_takes_what_others_made(tmp_path: Path) -> None:
+    path, cluster = tmp_path / "file.h5", Here()
+    with GroupWriter(path, {"by": 1}) as writer:
+        writer.add("0", "old", {"value": np.array([-1])}, note=-1)
+        writer.spread(cluster, write_share, [(part, (path,)) for part in cluster.cut(range(20))], "write", "group")
+        assert writer.notes() == {str(item): item for item in range(20)}
+        assert {name: int(arrays["value"][0]) for name, arrays in writer.read()} == writer.notes()
+        writer.annotate("3", "annotated")
+    with GroupWriter(path, {"by": 1}) as writer:  # what comes last counts, in the next run too
+        assert writer.notes()["3"] == "annotated"
+        writer.spread(cluster, write_share, [([3], (path,))], "write", "group")
+        assert writer.notes()["3"] == 3
+        writer.finish()
+    assert [path.name for path in sorted(tmp_path.iterdir())] == ["file.h5", "file.h5.meta.json"]
+
+
+def test_a_share_goes_on_where_it_was_and_leaves_others_alone(tmp_path: Path) -> None:
+    path = tmp_path / "file.h5"
+    write_share("00000-00001-", range(5), path)
+    with pytest.raises(ImageError):
+        write_share("00000-00000-", range(5, 10), path, fail_at=8)
+    parts = {part.name: part.stat().st_mtime_ns for part in (tmp_path / ".file.h5.parts").iterdir()}
+    write_share("00000-00000-", range(5, 10), path, fail_at=7)  # which is there
+    now = {part.name: part.stat().st_mtime_ns for part in (tmp_path / ".file.h5.parts").iterdir()}
+    assert now.items() > parts.items()
+    with GroupWriter(path, {"by": 1}) as writer:
+        assert sorted(writer.notes().values()) == list(range(10))
+
+
+@pytest.mark.parametrize(("items", "multiple", "lengths"), [(0, 1, []), (3, 1, [1] * 3), (20, 1, [3] * 6 + [2]),
+                                                            (20, 8, [8, 8, 4]), (100, 8, [16] * 6 + [4])])  # fmt: skip
+def test_work_is_cut_into_successive_shares(items: int, multiple: int, lengths: list[int]) -> None:
+    parts = Here().cut(range(items), multiple)
+    assert [len(part) for part in parts] == lengths
+    assert [item for part in parts for item in part] == list(range(items))
+
+
+def test_what_is_costly_is_made_once_in_a_process(monkeypatch: pytest.MonkeyPatch, small_capture: Path) -> None:
+    extractor, session = SiftExtractor(), Capture.open(small_capture)["ios_map"]
+    first, again = (pickle.loads(pickle.dumps(extractor)) for _ in range(2))
+    assert first is again
+    assert first.settings == extractor.settings
+    assert pickle.loads(pickle.dumps(session)) is pickle.loads(pickle.dumps(session))
+    assert len(pickle.dumps(session)) < 500
+    error = pickle.loads(pickle.dumps(DamagedError(Path("a.h5"), "torn")))
+    assert (error.path, str(error)) == (Path("a.h5"), "torn")
+
+
+# -------------------------------------------------------------------------------------------------------- stages
+
+
+def test_features_and_maps_are_those_of_one_process(small_capture: Path, tmp_path: Path, here: Here) -> None:
+    session, settings = Capture.open(small_capture)["ios_map"], MapSettings(tile_images=3)
+    made = {}
+    for name in ("cluster", "alone"):
+        if name == "alone":
+            here.labels, labels = [], here.labels
+            clusters_off = pytest.MonkeyPatch()
+            for module in (stores, mapping):
+                clusters_off.setattr(module, "current_cluster", lambda: None)
+        features = extract_session(session, tmp_path / name)
+        build_map(session, features, tmp_path / name / "ios_map.npz", settings)
+        made[name] = features
+    clusters_off.undo()
+    assert labels == ["sift", "match", "match", "triangulate"]
+    assert here.labels == []
+    assert made["cluster"].fingerprint == made["alone"].fingerprint
+    for image in made["alone"]:
+        np.testing.assert_array_equal(made["cluster"][image].descriptors, made["alone"][image].descriptors)
+    maps = [(tmp_path / name / "ios_map.npz").read_bytes() for name in ("cluster", "alone")]
+    assert maps[0] == maps[1]
+    assert not list(tmp_path.rglob("*.parts"))
+
+
+def test_poses_are_those_of_one_process(small_capture: Path, small_features: Path, tmp_path: Path, here: Here) -> None:
+    files = SceneFiles(tmp_path / "run", small_capture.name)
+    shutil.copytree(small_features, files.features)
+    sessions = small_capture / "sessions"
+    embed_sessions(sessions, files.embeddings, features_dir=files.features)
+    retrieve_pairs(sessions, files.embeddings, map_device="ios", out_jsonl=files.retrieval_dir, queries=LIST)
+    found = {}
+    for name in ("cluster", "alone"):
+        place = SceneFiles(tmp_path / name, small_capture.name)
+        with pytest.MonkeyPatch.context() as patch:
+            if name == "alone":
+                for module in ("toolkit.features.stores", "toolkit.localizers.mapping", "toolkit.localize"):
+                    patch.setattr(f"{module}.current_cluster", lambda: None)
+            localize_pairs(sessions, files.retrieval_dir, place.poses_dir, files.features, place.maps, map_device="ios")
+        found[name] = {path.name: path.read_bytes() for path in sorted(place.poses_dir.glob("*.txt"))}
+    assert "localize" in here.labels
+    assert len(found["alone"]) == 3
+    assert found["cluster"] == found["alone"]
+
+
+def test_what_no_worker_did_is_done_here(small_capture: Path, tmp_path: Path, here: Here) -> None:
+    here.run = lambda *args: None  # type: ignore[method-assign]
+    session = Capture.open(small_capture)["ios_map"]
+    features = extract_session(session, tmp_path)
+    assert len(features) == len(session.images)
+    assert isinstance(features, FeatureStore)
+
+
+# ------------------------------------------------------------------------------------------------------- clusters
+
+
+@pytest.mark.parametrize(
+    "asked", ["loca", "local:0", "local:two", "slurm", "slurm:", "dask:file", "", "localhost:8786"]
+)
+def test_an_unknown_cluster_names_the_known_ones(asked: str) -> None:
+    with pytest.raises(ManifestError, match=r"tcp://HOST:PORT"), open_cluster(asked):
+        pass
+
+
+def test_without_dask_one_sentence_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ManifestError, match=r"pip install -e '.\[cluster\]'"), open_cluster("local"):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [(None, "cannot be read"), ("queue: x", "jobs: <number>"), ("- 1", "jobs: <number>"), ("a: [", "cannot be read"),
+     ("{jobs: 1, coresss: 2}", "cores")],
+)  # fmt: skip
+def test_a_faulty_file_of_a_queue_is_named(tmp_path: Path, content: str | None, said: str) -> None:
+    path = tmp_path / "slurm.yaml"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(ManifestError, match=rf"slurm\.yaml.*{said}"), open_cluster(f"slurm:{path}"):
+        pass
+
+
+def test_a_scheduler_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clusters, "_CONNECT_S", 1)
+    with pytest.raises(ToolkitError, match="tcp://127.0.0.1:9"), open_cluster("tcp://127.0.0.1:9"):
+        pass
+    assert ADDRESS not in os.environ
+
+
+def note_share(folder: Path, name: str, environment: str) -> None:
+    (folder / name).write_text(f"{os.getpid()} {os.environ.get(environment)} {Path.cwd()} {current_cluster()}")
+
+
+def failing_share(path: Path) -> None:
+    raise DamagedError(path, "torn")
+
+
+def test_local_workers_have_the_settings_and_the_folder_of_who_asks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    said: list[str] = []
+    monkeypatch.setenv(ALLOW_OUTSIDE, "1")
+    monkeypatch.chdir(tmp_path)
+    with open_cluster("local:2", said.append):
+        cluster = current_cluster()
+        assert cluster is not None
+        assert cluster.size == 2
+        assert "http://" in said[0]
+        shares = [(tmp_path, str(number), ALLOW_OUTSIDE) for number in range(8)]
+        cluster.run(note_share, shares, [1] * 8, "note", "file")
+        notes = {tuple((tmp_path / str(number)).read_text().split()) for number in range(8)}
+        assert {note[1:] for note in notes} == {("1", str(tmp_path), "None")}
+        assert str(os.getpid()) not in {note[0] for note in notes}
+        with pytest.raises(DamagedError) as caught:  # a stage heals what it names
+            cluster.run(failing_share, [(tmp_path / "a.h5",)], [1], "fail", "file")
+        assert caught.value.path == tmp_path / "a.h5"
+    assert current_cluster() is None
+
+
+def deadly_share() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.mark.slow
+def test_a_share_that_kills_its_workers_is_named(capfd: pytest.CaptureFixture[str]) -> None:
+    with open_cluster("local:1", lambda _: None), pytest.raises(ToolkitError, match="workers died.*memory"):
+        cluster = current_cluster()
+        assert cluster is not None
+        cluster.run(deadly_share, [()], [1], "die", "file")
+
+
+@pytest.fixture(scope="module")
+def long_queries(small_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SceneFiles]:
+    """A capture whose phone session has 200 queries, and a run of it that has retrieved their references."""
+    folder = tmp_path_factory.mktemp("long")
+    capture = Path(shutil.copytree(small_capture, folder / small_capture.name))
+    for other in ("hl_map", "hl_query", "spot_map", "spot_query"):
+        shutil.rmtree(capture / "sessions" / other)
+    query = capture / "sessions" / "ios_query"
+    header, *lines = (query / "images.txt").read_text().splitlines()
+    rows = [line.split(", ") for line in lines]
+    keyframes, *_ = (query / "proc" / f"{LIST}.txt").read_text().splitlines()
+    copies, asked = [], []
+    for number in range(200):
+        stamp, sensor, path = rows[number % len(rows)]
+        name = path.replace(stamp, f"{int(stamp) + number}")
+        if number >= len(rows):
+            shutil.copyfile(query / "raw_data" / path, query / "raw_data" / name)
+        else:
+            (query / "raw_data" / path).rename(query / "raw_data" / name)
+        copies.append(f"{int(stamp) + number}, {sensor}, {name}")
+        asked.append(f"{int(stamp) + number}, {sensor}")
+    (query / "images.txt").write_text("\n".join([header, *copies]) + "\n")
+    (query / "proc" / f"{LIST}.txt").write_text("\n".join([keyframes, *asked]) + "\n")
+    for unneeded in ("proc/alignment_trajectories.txt", "depths.txt"):
+        (query / unneeded).unlink(missing_ok=True)
+    files = SceneFiles(folder / "run", capture.name)
+    embed_sessions(capture / "sessions", files.embeddings, features_dir=files.features)
+    retrieve_pairs(capture / "sessions", files.embeddings, out_jsonl=files.retrieval_dir)
+    return capture, files
+
+
+def localized(capture: Path, files: SceneFiles, out: Path) -> bytes:
+    """Return the poses of all queries, localized in a folder of its own."""
+    table = localize_pairs(capture / "sessions", files.retrieval_dir, out, files.features, out / "map", workers=1)
+    assert table["queries"].tolist() == [200]
+    assert table["ok"].tolist() == [200]
+    return (out / f"{capture.name}_map_ios_query_ios.txt").read_bytes()
+
+
+@pytest.mark.slow
+def test_a_killed_worker_changes_no_pose(
+    long_queries: tuple[Path, SceneFiles], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    alone = localized(*long_queries, tmp_path / "alone")
+    killed: list[int] = []
+
+    def kill_one() -> None:
+        parts = tmp_path / "cluster" / f".{long_queries[0].name}_map_ios_query_ios.h5.parts"
+        while len(list(parts.glob("*.meta.json"))) < 4:
+            time.sleep(0.05)
+        address = os.environ[ADDRESS]
+        pids = clusters._client(address).run(os.getpid)
+        killed.append(min(pids.values()))
+        os.kill(killed[0], signal.SIGKILL)
+
+    with open_cluster("local:2", lambda _: None):
+        killer = threading.Thread(target=kill_one, daemon=True)
+        killer.start()
+        assert localized(*long_queries, tmp_path / "cluster") == alone
+    assert killed
+    assert not list((tmp_path / "cluster").glob(".*.parts"))
+
+
+@contextmanager
+def on_path(folder: Path, **programs: str) -> Iterator[None]:
+    for name, content in programs.items():
+        (folder / name).write_text(f"#!/bin/sh\n{content}\n")
+        (folder / name).chmod((folder / name).stat().st_mode | stat.S_IXUSR)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PATH", f"{folder}:{os.environ['PATH']}")
+        yield
+
+
+@pytest.mark.slow
+def test_a_queue_starts_the_workers(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """By programs that take jobs as those of Slurm do, and run them at once."""
+    (tmp_path / "slurm.yaml").write_text(
+        f"{{jobs: 2, cores: 1, memory: 1GB, python: {sys.executable}, interface: lo, walltime: '00:05:00',"
+        f" log_directory: {tmp_path / 'logs'}}}"
+    )
+    run = (
+        f'cp "$1" {tmp_path}/job-$$.sh; setsid sh {tmp_path}/job-$$.sh >/dev/null 2>&1 & echo "Submitted batch job $!"'
+    )
+    with on_path(tmp_path, sbatch=run, scancel="kill -TERM -- -$1"):
+        with open_cluster(f"slurm:{tmp_path / 'slurm.yaml'}", lambda _: None):
+            cluster = current_cluster()
+            assert cluster is not None
+            shares = [(tmp_path, f"{number}.txt", ALLOW_OUTSIDE) for number in range(8)]
+            cluster.run(note_share, shares, [1] * 8, "note", "file")
+        assert len(list(tmp_path.glob("?.txt"))) == 8
+        script = next(tmp_path.glob("job-*.sh")).read_text()
+    assert "#SBATCH --mem=1" in script
+    assert "-t 00:05:00" in script
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_runs_is_used(
+    long_queries: tuple[Path, SceneFiles], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with open_cluster("local:2", lambda _: None):
+        address = os.environ[ADDRESS]
+        with open_cluster(address, lambda _: None):
+            assert os.environ[ADDRESS] == address
+            session = Capture.open(long_queries[0])["ios_map"]
+            assert len(extract_session(session, tmp_path)) == len(session.images)
