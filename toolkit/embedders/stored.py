@@ -26,7 +26,7 @@ class StoredVectors:
     """Number of the first row of each file, and behind them the number of all rows."""
     dim: int
     rows: Ints
-    """Numbers of the chosen rows, ascending."""
+    """Numbers of the chosen rows, in any order."""
     normalize: bool = False
     """Whether vectors are brought to length 1 as they are read."""
 
@@ -48,12 +48,18 @@ class StoredVectors:
         return len(self.rows)
 
     def choose(self, positions: Ints) -> "StoredVectors":
-        """Return only some of the rows, by their positions in ascending order."""
+        """Return only some of the rows, by their positions."""
         return replace(self, rows=self.rows[positions])
 
     def __getitem__(self, positions: slice | Ints) -> NDArray[np.float32]:
-        """Read rows (n, D), by their positions in ascending order."""
+        """Read rows (n, D), by their positions."""
         rows = self.rows[positions]
+        if (np.diff(rows) < 0).any():  # files are read from their start to their end
+            order = np.argsort(rows)
+            read = replace(self, rows=rows[order])[:]
+            vectors = np.empty_like(read)
+            vectors[order] = read
+            return vectors
         vectors = np.empty((len(rows), self.dim), np.float32)
         cuts = np.searchsorted(rows, self.starts)
         for path, start, first, last in zip(self.paths, self.starts, cuts, cuts[1:], strict=False):
