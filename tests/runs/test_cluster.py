@@ -263,6 +263,22 @@ def test_a_share_that_kills_its_workers_is_named(capfd: pytest.CaptureFixture[st
         cluster.run(deadly_share, [()], [1], "die", "file")
 
 
+@pytest.mark.slow
+def test_a_cluster_that_loses_all_workers_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    from distributed import LocalCluster
+
+    monkeypatch.setattr(clusters, "_CHECK_S", 1)
+    monkeypatch.setattr(clusters, "_WAIT_S", 2)
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as local:
+        with open_cluster(local.scheduler_address, lambda _: None), pytest.raises(ToolkitError, match="no worker"):
+            cluster = current_cluster()
+            assert cluster is not None
+            threading.Timer(1, local.scale, [0]).start()
+            cluster.run(time.sleep, [(3600,)] * 2, [1] * 2, "wait", "file")
+
+
 @pytest.fixture(scope="module")
 def long_queries(small_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SceneFiles]:
     """A capture whose phone session has 200 queries, and a run of it that has retrieved their references."""
@@ -330,6 +346,7 @@ def on_path(folder: Path, **programs: str) -> Iterator[None]:
         (folder / name).chmod((folder / name).stat().st_mode | stat.S_IXUSR)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PATH", f"{folder}:{os.environ['PATH']}")
+        patch.setenv("PYTHONPATH", str(Path(__file__).resolve().parent))  # the workers import this module
         yield
 
 
@@ -351,7 +368,7 @@ def test_a_queue_starts_the_workers(tmp_path: Path, capfd: pytest.CaptureFixture
             cluster.run(note_share, shares, [1] * 8, "note", "file")
         assert len(list(tmp_path.glob("?.txt"))) == 8
         script = next(tmp_path.glob("job-*.sh")).read_text()
-    assert "#SBATCH --mem=1" in script
+    assert "#SBATCH --mem=" in script
     assert "-t 00:05:00" in script
 
 

@@ -40,6 +40,8 @@ QUEUES = ("HTCondor", "LSF", "Moab", "OAR", "PBS", "SGE", "SLURM")
 _CONNECT_S = 30
 _WAIT_S = 600
 """Longest time that a scheduler takes to answer, and a worker to start."""
+_CHECK_S = 60
+"""How long nothing may happen before it is asked whether there are workers."""
 
 
 class Cluster:
@@ -71,7 +73,7 @@ class Cluster:
         Raises:
             ToolkitError: a share killed several workers; else what the function raised.
         """
-        from distributed import KilledWorker, as_completed
+        from distributed import KilledWorker, wait
 
         environment = {name: os.environ[name] for name in (EXTRA_DEVICES, ALLOW_OUTSIDE) if name in os.environ}
         here = os.getcwd()  # noqa: PTH109 - as text
@@ -80,10 +82,24 @@ class Cluster:
             for share, size in zip(shares, sizes, strict=True)
         }
         try:
-            with self._client.as_current(), tqdm(total=sum(sizes), desc=f"{label}, {self.size} workers", unit=unit) as bar:
-                for future in as_completed(futures):
-                    future.result()
-                    bar.update(futures[future])
+            with (
+                self._client.as_current(),
+                tqdm(total=sum(sizes), desc=f"{label}, {self.size} workers", unit=unit) as bar,
+            ):
+                running = set(futures)
+                while running:
+                    try:
+                        done, running = wait(running, timeout=_CHECK_S, return_when="FIRST_COMPLETED")
+                    except TimeoutError:
+                        self._client.wait_for_workers(1, timeout=_WAIT_S)
+                        continue
+                    for future in done:
+                        future.result()
+                        bar.update(futures[future])
+        except TimeoutError:
+            raise ToolkitError(
+                f"{label}: no worker is left, and none came for {_WAIT_S} s. What was done is kept."
+            ) from None
         except KilledWorker as error:
             raise ToolkitError(
                 f"{label}: several workers died of one share ({first_line(error)}). Most likely it needs more memory "
