@@ -500,7 +500,7 @@ def test_a_network_is_asked_once_about_a_query_that_escalates(
     add_other_kind(monkeypatch)
     predictor, asked = ByContent(Capture.open(small_capture), run.maps), list[int]()
 
-    def predict(groups: Sequence[Sequence[View]]) -> list[Prediction]:
+    def predict(groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]]) -> list[Prediction]:
         asked.append(len(groups))
         return ByContent.predict(predictor, groups)
 
@@ -919,7 +919,7 @@ class AsManyAsFeatures:
     def __init__(self, image_names: list[str]) -> None:
         self.image_names = image_names
 
-    def predict(self, queries: Sequence[object]) -> list[None]:
+    def predict(self, queries: Sequence[object], following: Sequence[object] = ()) -> list[None]:
         return [None] * len(queries)
 
     def localize(self, query: Query, _: object, prediction: None = None) -> PoseEstimate:
@@ -957,7 +957,7 @@ class ByContent:
             for row in session.camera_rows.tolist()
         }
 
-    def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
+    def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
         def named(view: View) -> View:
             pixels = read_image(view.image) if isinstance(view.image, Path) else view.image
             return replace(view, name=self.names[pixels.tobytes()])
