@@ -126,7 +126,7 @@ def localize_pairs(
         map_device, query_device: `ios`, `hl`, `spot`, or `all` that the capture has.
         queries: the keyframe list that says which devices are asked for, or `all`.
         skip_existing: reuse what was made from the same inputs and settings, and go on where a run was killed.
-        workers: threads; 0 takes the number of cores, at most 8.
+        workers: threads; 0 takes the number of cores.
 
     Returns:
         One row a pair: map_device, query_device, queries = ok + low_confidence + failed, escalated (those that further

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from toolkit.capture import read_depth
-from toolkit.capture.images import default_workers, prefetch, read_for_display, read_image, stored_size
+from toolkit.capture.images import WORKERS, default_workers, prefetch, read_for_display, read_image, stored_size
 from toolkit.errors import CaptureError, ImageError
 
 
@@ -94,8 +94,28 @@ def test_half_an_image_is_refused(tmp_path: Path, suffix: str) -> None:
         read_image(path)
 
 
-def test_default_workers() -> None:
-    assert 1 <= default_workers() <= 8
+@pytest.mark.parametrize(
+    ("files", "cores"),
+    [
+        ({}, 64),
+        ({"cpu.max": "max 100000"}, 64),
+        ({"cpu.max": "250000 100000"}, 2),
+        ({"cpu.max": "50000 100000"}, 1),
+        ({"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"}, 64),
+        ({"cpu/cpu.cfs_quota_us": "400000", "cpu/cpu.cfs_period_us": "100000"}, 4),
+        ({"cpu.max": "nonsense"}, 64),
+    ],
+)
+def test_workers_are_the_cores_that_a_container_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, files: dict[str, str], cores: int
+) -> None:
+    monkeypatch.delenv(WORKERS, raising=False)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(64), raising=False)
+    monkeypatch.setattr("toolkit.capture.images._CGROUPS", tmp_path)
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text + "\n")
+    assert default_workers() == cores
 
 
 @pytest.mark.parametrize(("workers", "ahead"), [(1, 0), (2, 4), (4, 1)])

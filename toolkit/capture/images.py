@@ -1,11 +1,12 @@
 """Decode images, with errors that say whether a file is missing or unreadable."""
 
+import math
 import os
 import stat
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
@@ -33,6 +34,8 @@ _HEADER_READERS: dict[bytes, Callable[[Any], PIL.Image.Image]] = {
     b"\x89PNG\r\n\x1a\n": PngImagePlugin.PngImageFile,
     b"": PIL.Image.open,
 }
+_CGROUPS = Path("/sys/fs/cgroup")
+_QUOTA_FILES = (("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us"))  # version 2, version 1
 _HEADER_ERRORS = (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError)
 
 
@@ -144,11 +147,23 @@ def read_for_display(path: str | Path) -> NDArray[np.uint8]:
 
 
 def default_workers() -> int:
-    """Return the default number of threads: the available cores, at most 8; what `WORKERS` says otherwise."""
+    """Return the default number of threads: what `WORKERS` says, else the cores that this process may use.
+
+    These are limited by its affinity and by the quota of its container.
+    """
     if os.environ.get(WORKERS, "").isdigit():
         return int(os.environ[WORKERS])
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(cores, 8)
+    return max(1, int(min(cores, _quota())))
+
+
+def _quota() -> float:
+    """Return the cores whose time the control group of this process may use, as containers limit them; or infinity."""
+    for files in _QUOTA_FILES:
+        with suppress(OSError, ValueError):  # of another version of control groups; or `max`, for no limit
+            quota, period = (int(text) for file in files for text in (_CGROUPS / file).read_text().split())
+            return quota / period if quota > 0 else math.inf
+    return math.inf
 
 
 def prefetch(function: Callable[[T], R], items: Iterable[T], workers: int = 2, ahead: int = 4) -> Iterator[R]:
