@@ -323,7 +323,7 @@ def _inputs(
     def read(item: tuple[int, int]) -> tuple[int, NDArray[np.uint8] | str]:
         row, turns = item
         try:
-            image = read_image(session.image_path(row))
+            image = read_image(session.image_path(row), least_side=embedder.least_side)
         except ImageError as error:
             return row, str(error)
         return row, embedder.prepare(turn_image(image, turns))

@@ -21,6 +21,9 @@ class Embedder(Protocol):
     """What `embed` takes: images (H, W, 3) uint8 RGB, or `toolkit.features.features.LocalFeatures`."""
     upright: bool
     """Whether it was trained with upright photographs, so that images should be turned upright for it."""
+    least_side: int | None
+    """Pixels that the shorter side of an image must have: larger ones may be decoded smaller, see `read_image`. None:
+    images are wanted as they are stored."""
 
     @property
     def dim(self) -> int:

@@ -49,6 +49,9 @@ class MegaLocEmbedder:
                 f"image_size is {image_size}; expected a multiple of {PATCH}, at least {9 * PATCH} (322 is usual)."
             )
         self._size = image_size
+        # Twice the size, as where Pillow makes thumbnails: cosines with the descriptors of images that were decoded
+        # whole are above 1 - 1e-4, what bfloat16 changes; once the size, 1 - 1e-3.
+        self.least_side = 2 * image_size
         self._device = resolve_device(device)
         self._dtype = resolve_precision(dtype_compute, self._device)
         weights: Path | Mapping[str, Tensor] | MegaLoc = given_or_resolved(MEGALOC, checkpoint)
@@ -65,8 +68,12 @@ class MegaLocEmbedder:
     def settings(self) -> dict[str, Any]:
         precision = str(self._dtype).removeprefix("torch.")
         return {
-            "name": self.name, "weights": self._weights, "image_size": self._size, "dtype_compute": precision
-        }  # fmt: skip
+            "name": self.name,
+            "weights": self._weights,
+            "image_size": self._size,
+            "least_side": self.least_side,
+            "dtype_compute": precision,
+        }
 
     def prepare(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return an image (H, W, 3) or (H, W), uint8 RGB or gray, as the network takes it, (S, S, 3).

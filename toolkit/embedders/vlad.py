@@ -33,6 +33,7 @@ class Vlad:
     name = "vlad"
     inputs: Literal["features"] = "features"
     upright = False
+    least_side = None
 
     def __init__(self, settings: VladSettings, arrays: dict[str, Floats], fingerprint: str = ""):
         self._settings = settings
