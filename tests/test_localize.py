@@ -891,6 +891,9 @@ class Learned:
     def prepare(self, image: np.ndarray) -> np.ndarray:
         return image
 
+    def stack(self, inputs: Sequence[np.ndarray]) -> Sequence[np.ndarray]:
+        return inputs
+
     def embed(self, inputs: Sequence[np.ndarray]) -> np.ndarray:
         self.seen += [image.shape for image in inputs]
         return np.repeat(self.vector[None], len(inputs), axis=0)

@@ -53,6 +53,10 @@ class Vlad:
         """Return the features as they are."""
         return item
 
+    def stack(self, inputs: Sequence[LocalFeatures]) -> Sequence[LocalFeatures]:
+        """Return the features as they are."""
+        return inputs
+
     @threadpool_limits.wrap(limits=1, user_api="blas")  # small products: two threads take three times as long
     def embed(self, inputs: Sequence[LocalFeatures]) -> Floats:
         """Return the global descriptors (B, dim) of images; rows of zeros where an image has no features.
