@@ -19,7 +19,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +33,8 @@ from numpy.typing import NDArray
 
 OFFICIAL_WORKER = Path(__file__).with_name("megaloc_worker.py")
 GPU_BATCHES = (1, 32, 128)
+DECODE_SIZES = ((1920, 1440), (4000, 3000))
+DECODE_IMAGES = 8
 MEMORY_IMAGES = (200, 2000)
 # The smallest size that the embedder takes: memory beside the images is what counts here.
 MEMORY_IMAGE_SIZE = 126
@@ -227,7 +232,7 @@ def run_toolkit(job: Job, out: Path, precision: str) -> dict[str, Any]:
     session = Capture.from_sessions_root(job.sessions_root)["ios_map"]
     decode = time.perf_counter()
     for row in session.camera_rows.tolist():
-        embedder.prepare(read_image(session.image_path(row)))
+        embedder.prepare(read_image(session.image_path(row), least_side=embedder.least_side))
     return {
         "precision": embedder.settings["dtype_compute"],
         "images": int(table["embedded"].sum()),
@@ -326,6 +331,59 @@ def embed_shallow(folder: Path, count: int, threads: int) -> dict[str, float]:
     return {"peak_mb": peak_mb(), "seconds": time.perf_counter() - started}
 
 
+def decode_rows(job: Job, folder: Path) -> list[dict[str, Any]]:
+    """Return images/s from JPEG files to what the network takes, decoded whole and as small as it allows.
+
+    The photographs of the capture are enlarged for that, to sizes that cameras have.
+    """
+    import torch
+    from PIL import Image
+
+    from toolkit.capture.images import read_image
+    from toolkit.embedders.megaloc import MegaLocEmbedder
+
+    torch.set_num_threads(job.threads)
+    files = sorted(job.sessions_root.glob("ios_map/raw_data/images/*"))[:DECODE_IMAGES]
+    embedder = MegaLocEmbedder(job.weights, job.device, "float32", job.image_size)
+    rows = []
+    for size in DECODE_SIZES:
+        paths = [folder / f"{size[0]}-{file.name}" for file in files]
+        for file, path in zip(files, paths, strict=True):
+            with Image.open(file) as image:
+                image.convert("RGB").resize(size, Image.Resampling.BICUBIC).save(path, quality=92)
+        whole = None
+        for least_side in (None, embedder.least_side):
+            row: dict[str, Any] = {"size": f"{size[0]} x {size[1]}"}
+            row["decoded"] = "{1} x {0}".format(*read_image(paths[0], least_side=least_side).shape)
+            prepare = partial(_decoded, image_size=job.image_size, least_side=least_side)
+            many = (paths * DECODE_IMAGES)[: 4 * DECODE_IMAGES]
+            for name, pool in (
+                ("one", ThreadPoolExecutor(1)),
+                ("threads", ThreadPoolExecutor(job.threads)),
+                ("processes", ProcessPoolExecutor(job.threads, mp_context=get_context("spawn"))),
+            ):
+                with pool:
+                    list(pool.map(prepare, many))
+                    started = time.perf_counter()
+                    list(pool.map(prepare, many, chunksize=4))
+                    row[name] = len(many) / (time.perf_counter() - started)
+            descriptors = embedder.embed([prepare(path) for path in paths])
+            whole = descriptors if whole is None else whole
+            row["cosines"] = _cosines(descriptors, whole).tolist()
+            rows.append(row)
+    return rows
+
+
+def _decoded(path: Path, image_size: int, least_side: int | None) -> NDArray[np.uint8]:
+    """Return what `MegaLocEmbedder.prepare` makes of a file, without a network: for processes of their own."""
+    from PIL import Image
+
+    from toolkit.capture.images import read_image
+
+    image = Image.fromarray(read_image(path, least_side=least_side))
+    return np.asarray(image.resize((image_size, image_size), Image.Resampling.BILINEAR))
+
+
 def gpu_rows(checkout: str, job: Job, precisions: tuple[str, ...], batches: tuple[int, ...]) -> list[dict[str, Any]]:
     """Return images/s of the network on a GPU by batch and precision, beside the official forward under autocast."""
     import torch
@@ -337,7 +395,7 @@ def gpu_rows(checkout: str, job: Job, precisions: tuple[str, ...], batches: tupl
     files = sorted(job.sessions_root.glob("ios_map/raw_data/images/*"))
     embedder = MegaLocEmbedder(job.weights, job.device, precisions[0], job.image_size)
     started = time.perf_counter()
-    images = [embedder.prepare(read_image(path)) for path in files]
+    images = [embedder.prepare(read_image(path, least_side=embedder.least_side)) for path in files]
     decode = (time.perf_counter() - started) / len(files)
     official: dict[int, float] = {}
     if checkout:
@@ -427,6 +485,25 @@ def markdown(document: dict[str, Any], ours: list[Measurement], official: Measur
             f"official sizes but depth 1, random weights, images of 160 x 120 at {MEMORY_IMAGE_SIZE} x "
             f"{MEMORY_IMAGE_SIZE}."
         )
+    rows = [
+        [
+            row["size"],
+            row["decoded"],
+            f"{1000 / row['one']:.1f}",
+            *(f"{row[name]:.1f}" for name in ("one", "threads", "processes")),
+            f"{1 - np.mean(row['cosines']):.1e}, {1 - min(row['cosines']):.1e}",
+        ]
+        for row in document["decode"]
+    ]
+    count = document["threads"]
+    header = ["JPEG", "decoded at", "ms an image", "images/s, 1 thread", f"{count} threads", f"{count} processes"]
+    text += [
+        "",
+        f"From JPEG files to what the network takes, of {DECODE_IMAGES} of these photographs, enlarged:",
+        "",
+        markdown_table([*header, "1 - cosine to the whole: mean, largest"], rows),
+        "",
+    ]
     if document["gpu"]:
         rows = [
             [
@@ -517,6 +594,7 @@ def benchmark(options: argparse.Namespace, checkout: str) -> tuple[str, dict[str
                 ours[precision].append(measured)
                 print(f"toolkit, {precision} {measured.rate:.2f} images/s", file=sys.stderr)
         memory = in_own_process(aggregation_memory, checkout, job)
+        decode = in_own_process(decode_rows, job, folder)
         gpu = []
         if machine["gpu"] and job.device.startswith("cuda"):
             gpu = in_own_process(gpu_rows, checkout, job, ("bfloat16", "float32"), GPU_BATCHES)
@@ -543,6 +621,7 @@ def benchmark(options: argparse.Namespace, checkout: str) -> tuple[str, dict[str
         "aggregation_mb": memory,
         "growth": growth,
         "growth_of_descriptors_mb": (MEMORY_IMAGES[1] - MEMORY_IMAGES[0]) * 8448 * 4 / 2**20,
+        "decode": decode,
         "gpu": gpu,
     }
     text = markdown(document, best, official)

@@ -2,12 +2,15 @@
 
 import json
 import shutil
+import threading
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pandas as pd
 import pytest
+import torch
+from PIL import Image
 
 from tests.calls import call
 from tests.models.test_megaloc import tiny_megaloc
@@ -194,6 +197,56 @@ def test_a_learned_embedder(tiny: Path, tmp_path: Path, megaloc: dict[str, objec
     assert call(embed_sessions, tiny / "sessions", out, **megaloc)["skipped"].all()  # type: ignore[arg-type]
     other = megaloc | {"image_size": 140}
     assert not call(embed_sessions, tiny / "sessions", out, **other)["skipped"].any()  # type: ignore[arg-type]
+
+
+def test_photographs_are_decoded_as_small_as_the_network_allows(
+    tiny: Path, tmp_path: Path, megaloc: dict[str, object]
+) -> None:
+    """Then the descriptors change by less than those of two types of numbers do, and the record tells them apart."""
+    for path in (tiny / "sessions/ios_query/raw_data").rglob("*.*"):
+        if path.is_file():
+            coarse = np.random.default_rng(0).integers(0, 256, (40, 56, 3), np.uint8)
+            Image.fromarray(coarse).resize((784, 560), Image.Resampling.BICUBIC).save(path, format="JPEG", quality=95)
+    out = tmp_path / "e"
+    call(embed_sessions, tiny / "sessions", out, device="ios", upright=False, **megaloc)  # type: ignore[arg-type]
+    matrix, manifest = load_embeddings(out / "ios_query")
+    embedder = MegaLocEmbedder(tiny_megaloc(), device="cpu", dtype_compute="float32", image_size=126)
+    path = tiny.parent / manifest["abs_path"][0]
+    reduced, whole = read_image(path, least_side=embedder.least_side), read_image(path)
+    assert (reduced.shape, whole.shape) == ((280, 392, 3), (560, 784, 3))
+    np.testing.assert_allclose(matrix[0], embedder.embed([reduced])[0], atol=1e-6)
+    assert 1e-9 < 1 - matrix[0] @ embedder.embed([whole])[0] < 1e-4
+    record = json.loads((out / "ios_query/ios_a/ios_a.npy.meta.json").read_text())
+    assert record["settings"]["embedder"]["least_side"] == 252
+
+
+def test_the_next_batch_is_made_while_one_is_embedded(
+    tiny: Path, tmp_path: Path, megaloc: dict[str, object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In whatever order threads get to it: embedding a batch waits here until the next one is there."""
+    shutil.rmtree(tiny / "sessions" / "ios_query")
+    stack, embed = MegaLocEmbedder.stack, MegaLocEmbedder.embed
+    stacked, embedded, made = list[int](), list[int](), threading.Condition()
+
+    def stacks(self: MegaLocEmbedder, inputs: list[np.ndarray]) -> torch.Tensor:
+        batch = stack(self, inputs)
+        with made:
+            stacked.append(len(batch))
+            made.notify()
+        return batch
+
+    def embeds(self: MegaLocEmbedder, batch: torch.Tensor) -> np.ndarray:
+        embedded.append(len(batch))
+        with made:
+            assert len(embedded) == 3 or made.wait_for(lambda: len(stacked) > len(embedded), timeout=20)
+        return embed(self, batch)
+
+    monkeypatch.setattr(MegaLocEmbedder, "stack", stacks)
+    monkeypatch.setattr(MegaLocEmbedder, "embed", embeds)
+    settings = megaloc | {"batch_size": 2}
+    table = call(embed_sessions, tiny / "sessions", tmp_path / "e", device="ios", **settings)  # type: ignore[arg-type]
+    assert table["embedded"].tolist() == [6]
+    assert stacked == embedded == [2, 2, 2]
 
 
 def test_half_precision_on_disk(tiny: Path, tmp_path: Path, megaloc: dict[str, object]) -> None:

@@ -500,7 +500,7 @@ def test_a_network_is_asked_once_about_a_query_that_escalates(
     add_other_kind(monkeypatch)
     predictor, asked = ByContent(Capture.open(small_capture), run.maps), list[int]()
 
-    def predict(groups: Sequence[Sequence[View]]) -> list[Prediction]:
+    def predict(groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]]) -> list[Prediction]:
         asked.append(len(groups))
         return ByContent.predict(predictor, groups)
 
@@ -881,6 +881,7 @@ class Learned:
 
     name, upright = "learned", True
     inputs: Literal["images"] = "images"
+    least_side: int | None = None
 
     def __init__(self, vector: np.ndarray) -> None:
         self.vector = vector
@@ -889,6 +890,9 @@ class Learned:
 
     def prepare(self, image: np.ndarray) -> np.ndarray:
         return image
+
+    def stack(self, inputs: Sequence[np.ndarray]) -> Sequence[np.ndarray]:
+        return inputs
 
     def embed(self, inputs: Sequence[np.ndarray]) -> np.ndarray:
         self.seen += [image.shape for image in inputs]
@@ -906,6 +910,9 @@ def test_a_learned_embedder_is_given_colors(small_capture: Path, finished: tuple
     place.embedder = learned  # type: ignore[misc]
     np.testing.assert_array_equal(localize_image(place, path, camera).world_from_rig, expected.world_from_rig)
     assert learned.seen == [(camera.height, camera.width, 3)]
+    learned.least_side = camera.height // 4
+    np.testing.assert_array_equal(localize_image(place, path, camera).world_from_rig, expected.world_from_rig)
+    assert learned.seen[1] == (camera.height // 4, camera.width // 4, 3), "as the stage decodes it"
     place.embedder = Learned(np.zeros(7, np.float32))  # type: ignore[misc]
     with pytest.raises(ArtifactError, match="learned gives 7"):
         localize_image(place, path, camera)
@@ -919,7 +926,7 @@ class AsManyAsFeatures:
     def __init__(self, image_names: list[str]) -> None:
         self.image_names = image_names
 
-    def predict(self, queries: Sequence[object]) -> list[None]:
+    def predict(self, queries: Sequence[object], following: Sequence[object] = ()) -> list[None]:
         return [None] * len(queries)
 
     def localize(self, query: Query, _: object, prediction: None = None) -> PoseEstimate:
@@ -957,7 +964,7 @@ class ByContent:
             for row in session.camera_rows.tolist()
         }
 
-    def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
+    def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
         def named(view: View) -> View:
             pixels = read_image(view.image) if isinstance(view.image, Path) else view.image
             return replace(view, name=self.names[pixels.tobytes()])

@@ -283,9 +283,16 @@ def _embed(
         done = note["done"]
         failed |= dict(note["failed"])
     inputs = _inputs(embedder, part, done, settings.batch_size, store_of)
+
+    def stack(item: tuple[list[Any], dict[int, str]]) -> tuple[Any, dict[int, str]]:
+        readable, unreadable = item
+        return embedder.stack(readable) if readable else readable, unreadable
+
+    # The next batch is copied to the device while one is embedded.
+    stacked = prefetch(stack, _batches(inputs, settings.batch_size), workers=1, ahead=0)
     label = f"embed {part.session.id}/{part.name}"
     with tqdm(total=len(part.rows), initial=done, desc=label, unit="image") as bar:
-        for number, (batch, unreadable) in enumerate(_batches(inputs, settings.batch_size), start=len(finished)):
+        for number, (batch, unreadable) in enumerate(stacked, start=len(finished)):
             vectors = embedder.embed(batch)
             if vectors.shape != (len(batch), embedder.dim):
                 raise ValueError(f"{embedder.name} gave {vectors.shape}; expected {(len(batch), embedder.dim)}.")
@@ -323,7 +330,7 @@ def _inputs(
     def read(item: tuple[int, int]) -> tuple[int, NDArray[np.uint8] | str]:
         row, turns = item
         try:
-            image = read_image(session.image_path(row))
+            image = read_image(session.image_path(row), least_side=embedder.least_side)
         except ImageError as error:
             return row, str(error)
         return row, embedder.prepare(turn_image(image, turns))

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
-from itertools import product
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -126,7 +126,7 @@ def localize_pairs(
         map_device, query_device: `ios`, `hl`, `spot`, or `all` that the capture has.
         queries: the keyframe list that says which devices are asked for, or `all`.
         skip_existing: reuse what was made from the same inputs and settings, and go on where a run was killed.
-        workers: threads; 0 takes the number of cores, at most 8.
+        workers: threads; 0 takes the number of cores.
 
     Returns:
         One row a pair: map_device, query_device, queries = ok + low_confidence + failed, escalated (those that further
@@ -553,11 +553,11 @@ class _PairRun:
     def _predicted(self, localizer: Localizer, numbers: Sequence[int]) -> Iterator[_Task]:
         """Yield queries with what a network says of them, asked for some at a time, and the seconds that took."""
         size = localizer.batch_size
-        for start in range(0, len(numbers), size):
-            part = numbers[start : start + size]
-            queries = [self.query(number) for number in part]
+        parts = [numbers[start : start + size] for start in range(0, len(numbers), size)]
+        asked = ([self.query(number) for number in part] for part in [*parts, []])
+        for part, (queries, following) in zip(parts, pairwise(asked), strict=True):
             started = time.perf_counter()
-            predictions = localizer.predict(queries)
+            predictions = localizer.predict(queries, following)
             seconds = (time.perf_counter() - started) / len(part)
             for number, query, prediction in zip(part, queries, predictions, strict=True):
                 yield number, *query, prediction, seconds

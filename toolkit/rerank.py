@@ -73,7 +73,7 @@ def rerank_pairs(
         settings: see `RerankSettings`; a dict holds what differs from the defaults.
         map_device, query_device: `ios`, `hl`, `spot`, or `all` that the capture has.
         skip_existing: reuse what was made from the same inputs and settings, and go on where a run was killed.
-        workers: threads; 0 takes the number of cores, at most 8.
+        workers: threads; 0 takes the number of cores.
 
     Returns:
         One row a pair: map_device, query_device, queries (images) = confirmed + kept, changed (confirmed ones that have

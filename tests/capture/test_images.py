@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from toolkit.capture import read_depth
-from toolkit.capture.images import default_workers, prefetch, read_for_display, read_image, stored_size
+from toolkit.capture.images import WORKERS, default_workers, prefetch, read_for_display, read_image, stored_size
 from toolkit.errors import CaptureError, ImageError
 
 
@@ -94,8 +94,62 @@ def test_half_an_image_is_refused(tmp_path: Path, suffix: str) -> None:
         read_image(path)
 
 
-def test_default_workers() -> None:
-    assert 1 <= default_workers() <= 8
+@pytest.mark.parametrize(
+    ("least_side", "size"),
+    [(None, (896, 672)), (337, (896, 672)), (336, (448, 336)), (168, (224, 168)), (84, (112, 84)), (1, (112, 84))],
+)
+def test_photographs_are_decoded_smaller(tmp_path: Path, least_side: int | None, size: tuple[int, int]) -> None:
+    """JPEG by 2, 4 and 8, as long as the shorter side has `least_side` pixels; nothing moves."""
+    x, y = np.meshgrid(np.linspace(0, 1, 896), np.linspace(0, 1, 672))
+    smooth = np.stack([255 * x, 255 * y, 127 * (1 + np.sin(6 * x + 9 * y))], axis=-1).astype(np.uint8)
+    path = tmp_path / "a.jpg"
+    Image.fromarray(smooth).save(path, quality=98)
+    image = read_image(path, least_side=least_side)
+    assert image.shape == (size[1], size[0], 3)
+    shown, whole = (np.asarray(Image.fromarray(one).resize((42, 42)), int) for one in (image, smooth))
+    assert np.abs(shown - whole).max() <= 3
+    if least_side:
+        assert read_image(path, gray=True, least_side=least_side).shape == (672, 896)
+        Image.fromarray(smooth).save(tmp_path / "a.png")
+        np.testing.assert_array_equal(read_image(tmp_path / "a.png", least_side=least_side), smooth)
+
+
+@pytest.mark.parametrize(("size", "by"), [((900, 700), 4), ((900, 702), 2), ((899, 700), 1), ((896, 701), 1)])
+def test_only_a_whole_number_of_pixels_is_left_out(tmp_path: Path, size: tuple[int, int], by: int) -> None:
+    """Else the last column would stand for fewer, and all be moved: MegaLoc then loses up to 0.0025 of the cosine."""
+    Image.new("RGB", size).save(tmp_path / "a.jpg")
+    assert read_image(tmp_path / "a.jpg", least_side=80).shape == (size[1] // by, size[0] // by, 3)
+
+
+def test_half_a_photograph_is_refused_at_any_size(tmp_path: Path) -> None:
+    path = tmp_path / "a.jpg"
+    path.write_bytes(noise_file(path)[: path.stat().st_size // 2])
+    with pytest.raises(ImageError, match="cannot be decoded"):
+        read_image(path, least_side=50)
+
+
+@pytest.mark.parametrize(
+    ("files", "cores"),
+    [
+        ({}, 64),
+        ({"cpu.max": "max 100000"}, 64),
+        ({"cpu.max": "250000 100000"}, 2),
+        ({"cpu.max": "50000 100000"}, 1),
+        ({"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"}, 64),
+        ({"cpu/cpu.cfs_quota_us": "400000", "cpu/cpu.cfs_period_us": "100000"}, 4),
+        ({"cpu.max": "nonsense"}, 64),
+    ],
+)
+def test_workers_are_the_cores_that_a_container_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, files: dict[str, str], cores: int
+) -> None:
+    monkeypatch.delenv(WORKERS, raising=False)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(64), raising=False)
+    monkeypatch.setattr("toolkit.capture.images._CGROUPS", tmp_path)
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text + "\n")
+    assert default_workers() == cores
 
 
 @pytest.mark.parametrize(("workers", "ahead"), [(1, 0), (2, 4), (4, 1)])

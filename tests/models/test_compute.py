@@ -1,12 +1,14 @@
 """Devices, precisions, and batches that do not fit."""
 
 import logging
+from unittest.mock import MagicMock, call
 
 import pytest
 import torch
 
 from toolkit.errors import ManifestError, ToolkitError
-from toolkit.models.compute import Fitting, resolve_device, resolve_precision
+from toolkit.models import compute
+from toolkit.models.compute import Fitting, resolve_device, resolve_precision, upload
 
 
 @pytest.mark.parametrize("name", ["gpu", "cuda:", "cuda:x", "cuda0", "", "CPU", "xpu"])
@@ -43,6 +45,35 @@ def test_precisions(monkeypatch: pytest.MonkeyPatch) -> None:
         assert resolve_precision("auto", gpu) == expected
     with pytest.raises(ManifestError, match="dtype_compute is 'half'"):
         resolve_precision("half", cpu)
+
+
+def test_on_the_cpu_nothing_is_copied() -> None:
+    batch = torch.arange(6).reshape(2, 3)
+    assert upload(batch, torch.device("cpu")) is batch
+
+
+def test_a_gpu_is_sent_page_locked_memory_beside_what_it_computes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No GPU is asked: what is called, in which order, and that the copies have one stream of their own."""
+    gpu, device = MagicMock(), torch.device("cuda:1")
+    for name in ("Stream", "stream", "current_stream"):
+        monkeypatch.setattr(torch.cuda, name, getattr(gpu, name))
+    compute._copy_stream.cache_clear()
+    sent = gpu.batch.pin_memory().to()
+    gpu.reset_mock()
+    assert upload(gpu.batch, device) is upload(gpu.batch, device) is sent
+    compute._copy_stream.cache_clear()
+    once = [
+        call.stream(gpu.Stream()),
+        call.stream().__enter__(),
+        call.batch.pin_memory(),
+        call.batch.pin_memory().to(device, non_blocking=True),
+        call.stream().__exit__(None, None, None),
+        call.Stream().synchronize(),
+        call.current_stream(device),
+        call.batch.pin_memory().to().record_stream(gpu.current_stream()),
+    ]
+    assert gpu.mock_calls[: len(once) + 1] == [call.Stream(device), *once]
+    assert gpu.mock_calls.count(call.Stream(device)) == 1
 
 
 class Memory:

@@ -1,11 +1,12 @@
 """Decode images, with errors that say whether a file is missing or unreadable."""
 
+import math
 import os
 import stat
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
@@ -33,6 +34,9 @@ _HEADER_READERS: dict[bytes, Callable[[Any], PIL.Image.Image]] = {
     b"\x89PNG\r\n\x1a\n": PngImagePlugin.PngImageFile,
     b"": PIL.Image.open,
 }
+_REDUCED = {8: cv2.IMREAD_REDUCED_COLOR_8, 4: cv2.IMREAD_REDUCED_COLOR_4, 2: cv2.IMREAD_REDUCED_COLOR_2}
+_CGROUPS = Path("/sys/fs/cgroup")
+_QUOTA_FILES = (("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us"))  # version 2, version 1
 _HEADER_ERRORS = (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError)
 
 
@@ -82,8 +86,11 @@ def _header_size(stream: BinaryIO) -> tuple[int, int]:
     return next(read for start, read in _HEADER_READERS.items() if first.startswith(start))(stream).size
 
 
-def decode(path: str | Path, flags: int) -> NDArray[Any]:
+def decode(path: str | Path, flags: int, least_side: int | None = None) -> NDArray[Any]:
     """Return the pixels of an image file as OpenCV decodes it with `flags`.
+
+    Args:
+        least_side: see `read_image`; adds to `flags`.
 
     Raises:
         ImageError: see `read_file`; or it is no image, is cut short, or has more than `MOST_PIXELS`.
@@ -97,6 +104,8 @@ def decode(path: str | Path, flags: int) -> NDArray[Any]:
         width = height = 0  # OpenCV says whether it is an image
     if width * height > MOST_PIXELS:
         raise ImageError(f"Image cannot be decoded ({width} x {height} pixels, more than {MOST_PIXELS:,}): {path}")
+    if least_side is not None and data.startswith(b"\xff\xd8"):  # of other files OpenCV decodes all, then subsamples
+        flags |= _reduced(width, height, least_side)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     except cv2.error as error:
@@ -106,26 +115,42 @@ def decode(path: str | Path, flags: int) -> NDArray[Any]:
     return np.asarray(image)
 
 
-def read_image(path: str | Path, gray: bool = False) -> NDArray[np.uint8]:
+def _reduced(width: int, height: int, least_side: int) -> int:
+    """Return the flag to decode a JPEG file of a size with, see `read_image`; 0 for as it is stored."""
+    for by, flag in _REDUCED.items():
+        # Of other sizes the last row and column would stand for fewer pixels than the others, and all be moved.
+        if width % by == height % by == 0 and min(width, height) >= by * least_side:
+            return flag
+    return 0
+
+
+def read_image(path: str | Path, gray: bool = False, least_side: int | None = None) -> NDArray[np.uint8]:
     """Return an image as stored, (H, W, 3) RGB uint8, or (H, W) where `gray`.
 
     EXIF orientation is not applied: a capture's intrinsics belong to the pixels as they are in the file.
 
+    Args:
+        least_side: a JPEG file in color comes at 1/8, 1/4 or 1/2 of its size where that is a whole number of pixels
+            and leaves the shorter side so many: for who makes it smaller still. None: as stored.
+
     Raises:
         ImageError: the file is missing, or is not an image that can be decoded; see `decode`.
     """
-    image = decode(path, (cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR) | cv2.IMREAD_IGNORE_ORIENTATION)
+    flags = cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR
+    image = decode(path, flags | cv2.IMREAD_IGNORE_ORIENTATION, None if gray else least_side)
     return np.asarray(image if gray else cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 
-def pixels_of(image: str | Path | NDArray[np.uint8], gray: bool = False) -> NDArray[np.uint8]:
+def pixels_of(
+    image: str | Path | NDArray[np.uint8], gray: bool = False, least_side: int | None = None
+) -> NDArray[np.uint8]:
     """Return the pixels of a file, see `read_image`, or those given, (H, W) or (H, W, 3) RGB, in gray or in color.
 
     Raises:
         ImageError: the file is missing or cannot be decoded, or pixels of another shape or type.
     """
     if isinstance(image, str | Path):
-        return read_image(image, gray)
+        return read_image(image, gray, least_side)
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)):
         raise ImageError(f"Found pixels {image.shape} {image.dtype}: expected (H, W) or (H, W, 3) uint8.")
     if gray == (image.ndim == 2):
@@ -144,11 +169,23 @@ def read_for_display(path: str | Path) -> NDArray[np.uint8]:
 
 
 def default_workers() -> int:
-    """Return the default number of threads: the available cores, at most 8; what `WORKERS` says otherwise."""
+    """Return the default number of threads: what `WORKERS` says, else the cores that this process may use.
+
+    These are limited by its affinity and by the quota of its container.
+    """
     if os.environ.get(WORKERS, "").isdigit():
         return int(os.environ[WORKERS])
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(cores, 8)
+    return max(1, int(min(cores, _quota())))
+
+
+def _quota() -> float:
+    """Return the cores whose time the control group of this process may use, as containers limit them; or infinity."""
+    for files in _QUOTA_FILES:
+        with suppress(OSError, ValueError):  # of another version of control groups; or `max`, for no limit
+            quota, period = (int(text) for file in files for text in (_CGROUPS / file).read_text().split())
+            return quota / period if quota > 0 else math.inf
+    return math.inf
 
 
 def prefetch(function: Callable[[T], R], items: Iterable[T], workers: int = 2, ahead: int = 4) -> Iterator[R]:

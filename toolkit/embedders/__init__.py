@@ -21,6 +21,9 @@ class Embedder(Protocol):
     """What `embed` takes: images (H, W, 3) uint8 RGB, or `toolkit.features.features.LocalFeatures`."""
     upright: bool
     """Whether it was trained with upright photographs, so that images should be turned upright for it."""
+    least_side: int | None
+    """Pixels that the shorter side of an image must have: larger ones may be decoded smaller, see `read_image`. None:
+    images are wanted as they are stored."""
 
     @property
     def dim(self) -> int:
@@ -33,8 +36,14 @@ class Embedder(Protocol):
     def prepare(self, item: Any) -> Any:
         """Return an input as the embedder needs it; threads call this while other inputs are embedded."""
 
-    def embed(self, inputs: Sequence[Any]) -> NDArray[np.float32]:
-        """Return the vectors (B, D) float32; an image without structure may have a zero vector."""
+    def stack(self, inputs: Sequence[Any]) -> Any:
+        """Return inputs, at least one, as a batch on the device; a thread calls this while another is embedded."""
+
+    def embed(self, inputs: Any) -> NDArray[np.float32]:
+        """Return the vectors (B, D) float32 of inputs, or of what `stack` made of them.
+
+        An image without structure may have a zero vector.
+        """
 
 
 EMBEDDERS: dict[str, str] = {

@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from toolkit.errors import ManifestError, ToolkitError
-from toolkit.models.compute import Fitting, resolve_device, resolve_precision
+from toolkit.models.compute import Fitting, resolve_device, resolve_precision, upload
 from toolkit.models.megaloc import PATCH, MegaLoc
 from toolkit.models.vit import IMAGENET_MEAN, IMAGENET_STD
 from toolkit.models.weights import MEGALOC, given_or_resolved, weights_digest
@@ -49,6 +49,9 @@ class MegaLocEmbedder:
                 f"image_size is {image_size}; expected a multiple of {PATCH}, at least {9 * PATCH} (322 is usual)."
             )
         self._size = image_size
+        # Twice the size, as where Pillow makes thumbnails: cosines with the descriptors of images that were decoded
+        # whole are above 1 - 1e-4, what bfloat16 changes; once the size, 1 - 1e-3.
+        self.least_side = 2 * image_size
         self._device = resolve_device(device)
         self._dtype = resolve_precision(dtype_compute, self._device)
         weights: Path | Mapping[str, Tensor] | MegaLoc = given_or_resolved(MEGALOC, checkpoint)
@@ -65,8 +68,12 @@ class MegaLocEmbedder:
     def settings(self) -> dict[str, Any]:
         precision = str(self._dtype).removeprefix("torch.")
         return {
-            "name": self.name, "weights": self._weights, "image_size": self._size, "dtype_compute": precision
-        }  # fmt: skip
+            "name": self.name,
+            "weights": self._weights,
+            "image_size": self._size,
+            "least_side": self.least_side,
+            "dtype_compute": precision,
+        }
 
     def prepare(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return an image (H, W, 3) or (H, W), uint8 RGB or gray, as the network takes it, (S, S, 3).
@@ -85,17 +92,21 @@ class MegaLocEmbedder:
         square = (self._size, self._size)
         return np.asarray(Image.fromarray(np.ascontiguousarray(image)).resize(square, Image.Resampling.BILINEAR))
 
-    def embed(self, inputs: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
-        """Return unit vectors (B, 8448) of images (H, W, 3), uint8 RGB, of any sizes.
+    def stack(self, inputs: Sequence[NDArray[np.uint8]]) -> Tensor:
+        """Return images (H, W, 3), uint8 RGB, of any sizes as a batch (B, S, S, 3) on the device."""
+        return upload(torch.from_numpy(np.stack([self.prepare(image) for image in inputs])), self._device)
+
+    def embed(self, inputs: Sequence[NDArray[np.uint8]] | Tensor) -> NDArray[np.float32]:
+        """Return unit vectors (B, 8448) of images (H, W, 3), uint8 RGB, of any sizes, or of what `stack` made of them.
 
         Raises:
             ToolkitError: a vector is not finite.
         """
         if not len(inputs):
             return np.zeros((0, self.dim), np.float32)
-        batch = torch.from_numpy(np.stack([self.prepare(image) for image in inputs]))
+        batch = inputs if isinstance(inputs, Tensor) else self.stack(inputs)
         with torch.inference_mode():
-            vectors = self._fitting(batch.to(self._device)).float().cpu().numpy()
+            vectors = self._fitting(batch).float().cpu().numpy()
         if not np.isfinite(vectors).all():
             raise ToolkitError(
                 "MegaLoc gave a descriptor that is not finite. Its weights may hold NaN: compare the file with the "

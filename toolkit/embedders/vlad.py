@@ -33,6 +33,7 @@ class Vlad:
     name = "vlad"
     inputs: Literal["features"] = "features"
     upright = False
+    least_side = None
 
     def __init__(self, settings: VladSettings, arrays: dict[str, Floats], fingerprint: str = ""):
         self._settings = settings
@@ -51,6 +52,10 @@ class Vlad:
     def prepare(self, item: LocalFeatures) -> LocalFeatures:
         """Return the features as they are."""
         return item
+
+    def stack(self, inputs: Sequence[LocalFeatures]) -> Sequence[LocalFeatures]:
+        """Return the features as they are."""
+        return inputs
 
     @threadpool_limits.wrap(limits=1, user_api="blas")  # small products: two threads take three times as long
     def embed(self, inputs: Sequence[LocalFeatures]) -> Floats:

@@ -85,6 +85,10 @@ class References:
         return cls(np.array(images, np.int64), np.array(scores if scores is not None else [1.0] * len(images)))
 
 
+Asked = tuple[Query, Sequence[References]]
+"""A query with the references of each of its images."""
+
+
 @dataclass(frozen=True)
 class PoseEstimate:
     """The answer for one query device: a pose, or why there is none."""
@@ -180,8 +184,12 @@ class Localizer(Protocol):
     def batch_size(self) -> int:
         """How many queries `predict` is best given at once."""
 
-    def predict(self, queries: Sequence[tuple[Query, Sequence[References]]]) -> list[Any]:
+    def predict(self, queries: Sequence[Asked], following: Sequence[Asked] = ()) -> list[Any]:
         """Return what a network says of each query, or None of each where the method asks none. Not for threads.
+
+        Args:
+            queries: each with the references of its images.
+            following: those of the next call, whose images are decoded meanwhile.
 
         Raises:
             ToolkitError: what no other query would do better with: no such device, other weights, too little memory.
@@ -216,9 +224,12 @@ class ScaledLocalizer:
     def batch_size(self) -> int:
         return self.inner.batch_size
 
-    def predict(self, queries: Sequence[tuple[Query, Sequence[References]]]) -> list[Any]:
+    def predict(self, queries: Sequence[Asked], following: Sequence[Asked] = ()) -> list[Any]:
         """Return what a network says of each query, in lengths of the inner localizer; see `Localizer`."""
-        return self.inner.predict([(query.scaled(1 / self._length), references) for query, references in queries])
+        return self.inner.predict(self._scaled(queries), self._scaled(following))
+
+    def _scaled(self, queries: Sequence[Asked]) -> list[Asked]:
+        return [(query.scaled(1 / self._length), references) for query, references in queries]
 
     def localize(self, query: Query, references: Sequence[References], prediction: Any = None) -> PoseEstimate:
         """Return one pose for the cameras of a rig, or for a single camera; see `Localizer`."""

@@ -8,7 +8,7 @@ from toolkit.capture.images import pixels_of
 from toolkit.features.features import KINDS, LocalFeatures, extract_turned
 from toolkit.features.matching import AnyMethod
 from toolkit.features.stores import as_stored
-from toolkit.localizers.base import Localizer, PoseEstimate, Query, References, rank
+from toolkit.localizers.base import Asked, Localizer, PoseEstimate, Query, References, rank
 
 
 def is_sure(status: str, position_std_m: float, limit_m: float) -> bool:
@@ -52,9 +52,9 @@ class EscalatingLocalizer:
     def batch_size(self) -> int:
         return self.first.batch_size
 
-    def predict(self, queries: Sequence[tuple[Query, Sequence[References]]]) -> list[Any]:
+    def predict(self, queries: Sequence[Asked], following: Sequence[Asked] = ()) -> list[Any]:
         """Return what the first's network says of each query; see `Localizer`."""
-        return self.first.predict(queries)
+        return self.first.predict(queries, following)
 
     def localize(self, query: Query, references: Sequence[References], prediction: Any = None) -> PoseEstimate:
         """Return one pose for the cameras of a rig, or for a single camera; see `Localizer`.

@@ -13,7 +13,7 @@ from toolkit.capture.upright import Turns
 from toolkit.errors import first_line, reason_of
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.alignment import Alignment, align_to_map, is_trustworthy, query_pose
-from toolkit.localizers.base import PoseEstimate, Query, References, View
+from toolkit.localizers.base import Asked, PoseEstimate, Query, References, View
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.pose_mean import robust_mean_pose
 from toolkit.localizers.prediction import Prediction, Predictor
@@ -52,6 +52,10 @@ class FeedForwardAnswer:
     cameras: tuple[CameraAnswer, ...] = ()
 
 
+_Groups = tuple[list[list[Ints]], dict[tuple[int, int], list[View]]]
+"""The references chosen for each image of each query, and the groups of views by query and image."""
+
+
 class FeedForwardLocalizer:
     """Localizes queries in one map by a predictor's cameras."""
 
@@ -74,6 +78,8 @@ class FeedForwardLocalizer:
         self._length = length
         self._upright = turns is not None
         self._turns = np.zeros(len(session.images), np.int64) if turns is None else turns.of(session)
+        self._next: tuple[Sequence[Asked], _Groups] = (), ([], {})
+        """The queries of the next call."""
 
     @property
     def image_names(self) -> list[str]:
@@ -90,8 +96,8 @@ class FeedForwardLocalizer:
         answer = self.predict([(query, references)])[0] if prediction is None else prediction
         return answer.estimate
 
-    def predict(self, queries: Sequence[tuple[Query, Sequence[References]]]) -> list[FeedForwardAnswer]:
-        """Return an answer for each query; all go to the predictor in one call.
+    def predict(self, queries: Sequence[Asked], following: Sequence[Asked] = ()) -> list[FeedForwardAnswer]:
+        """Return an answer for each query; all go to the predictor in one call; see `Localizer`.
 
         Nothing that goes wrong with one query is raised or touches another: its answer says `failed: <reason>`.
 
@@ -99,14 +105,12 @@ class FeedForwardLocalizer:
             Exception: what no other query would do better with: no such device, other weights, too little memory; see
                 `errors.reason_of`.
         """
-        chosen = [[self._choose(retrieved) for retrieved in references] for _, references in queries]
-        groups = {
-            (number, camera): [self._as_shown(query.views[camera]), *(self.view(int(index)) for index in references)]
-            for number, (query, _) in enumerate(queries)
-            for camera, references in enumerate(chosen[number])
-            if len(references)
-        }
-        predictions = dict(zip(groups, self._predict(list(groups.values())), strict=True))
+        expected, known = self._next
+        chosen, groups = known if queries is expected else self._groups(queries)
+        next_groups = self._groups(following)
+        self._next = following, next_groups
+        found = self._predict(list(groups.values()), list(next_groups[1].values()))
+        predictions = dict(zip(groups, found, strict=True))
         answers = []
         for number, (query, _) in enumerate(queries):
             cameras = tuple(
@@ -115,6 +119,16 @@ class FeedForwardLocalizer:
             )
             answers.append(FeedForwardAnswer(_combine(query, cameras), cameras))
         return answers
+
+    def _groups(self, queries: Sequence[Asked]) -> _Groups:
+        chosen = [[self._choose(retrieved) for retrieved in references] for _, references in queries]
+        groups = {
+            (number, camera): [self._as_shown(query.views[camera]), *(self.view(int(index)) for index in references)]
+            for number, (query, _) in enumerate(queries)
+            for camera, references in enumerate(chosen[number])
+            if len(references)
+        }
+        return chosen, groups
 
     def _as_shown(self, view: View) -> View:
         return view if self._upright else replace(view, turns=0)
@@ -146,10 +160,10 @@ class FeedForwardLocalizer:
         )
         return near[chosen]
 
-    def _predict(self, groups: list[list[View]]) -> list[Prediction | str]:
+    def _predict(self, groups: list[list[View]], following: Sequence[list[View]] = ()) -> list[Prediction | str]:
         """Return predictions, or why there is none."""
         try:
-            return [*self.predictor.predict(groups)] if groups else []
+            return [*self.predictor.predict(groups, following)] if groups else []
         except Exception as error:  # one bad query never ends a run
             if len(groups) == 1:
                 return [reason_of(error, f"predicting {groups[0][0].name}")]

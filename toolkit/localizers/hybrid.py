@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from toolkit.localizers.base import PoseEstimate, Prior, Query, References, agree, rank
+from toolkit.localizers.base import Asked, PoseEstimate, Prior, Query, References, agree, rank
 from toolkit.localizers.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
 from toolkit.localizers.lifting import DepthLifter
 from toolkit.localizers.pnp import PnpLocalizer
@@ -31,9 +31,9 @@ class HybridLocalizer:
     def batch_size(self) -> int:
         return self.feed_forward.batch_size
 
-    def predict(self, queries: Sequence[tuple[Query, Sequence[References]]]) -> list[FeedForwardAnswer]:
+    def predict(self, queries: Sequence[Asked], following: Sequence[Asked] = ()) -> list[FeedForwardAnswer]:
         """Return what the network says of each query; see `Localizer`."""
-        return self.feed_forward.predict(queries)
+        return self.feed_forward.predict(queries, following)
 
     def localize(
         self, query: Query, references: Sequence[References], prediction: FeedForwardAnswer | None = None

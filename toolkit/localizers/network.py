@@ -3,6 +3,7 @@
 import logging
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -25,6 +26,8 @@ from toolkit.models.weights import resolve_weights
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
+
+    _Begun = dict[tuple[Path | int, tuple[int, int], int], Future[Tensor | ImageError | None]]
 
 log = logging.getLogger(__name__)
 
@@ -229,6 +232,7 @@ class NetworkPredictor:
         self._cache = TokenCache(cache_bytes)
         self._fitting: dict[tuple[int, tuple[int, int]], Fitting] = {}
         self._most_views: dict[tuple[int, int], int] = {}
+        self._begun: _Begun = {}
 
     @cached_property
     def settings(self) -> dict[str, Any]:
@@ -256,7 +260,7 @@ class NetworkPredictor:
     def _model(self) -> Any:
         return _load_network(self.checkpoint, self._heads, self._dtype, self._device)
 
-    def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
+    def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
         """Return a prediction for each group of views, in order: the query first, then its references.
 
         Each has as many views as its group. Those that the network was not shown have NaN in `model_from_cams` and
@@ -269,11 +273,16 @@ class NetworkPredictor:
         Nothing else is raised for a group, and what one group holds does not change the others. Groups of equally many
         views and equal image size run together, as many as fit the memory.
 
+        Args:
+            groups: views of photographs.
+            following: groups of the next call, whose first photographs are decoded while the network runs.
+
         Raises:
             WeightsError: at the first call, the file is not of VGGT.
             ToolkitError: there is no such device; or the memory does not hold a query and one reference.
         """
         placed = [_place(group) for group in groups]
+        begun = self._read_ahead(placed, [_place(group) for group in following])
         results = [_nothing(len(group)) for group in groups]
         alike: dict[tuple[int, tuple[int, int]], list[int]] = {}
         for number, group in enumerate(placed):
@@ -283,7 +292,8 @@ class NetworkPredictor:
             batch, views = self._plan(len(numbers), views, size)
             batches = [numbers[start : start + batch] for start in range(0, len(numbers), batch)]
             shown = {number: placed[number][:views] for number in numbers}
-            for part, found in zip(batches, self._encoded([[shown[n] for n in b] for b in batches]), strict=True):
+            encoded = self._encoded([[shown[n] for n in b] for b in batches], begun)
+            for part, found in zip(batches, encoded, strict=True):
                 for number, prediction in self._run(part, [placed[n] for n in part], found).items():
                     results[number] = prediction
         return results
@@ -306,12 +316,34 @@ class NetworkPredictor:
                         views, *size[::-1], estimate(1, views) / 1e9, self._device, free / 1e9, fitting)  # fmt: skip
         return batch, fitting
 
-    def _encoded(self, batches: Sequence[Sequence[Sequence[_Placed]]]) -> "Iterator[list[list[Tensor | str]]]":
+    def _read_ahead(self, groups: Sequence[list[_Placed]], following: Sequence[list[_Placed]]) -> "_Begun":
+        """Return what the call before began to decode, and begin with the first photographs of the following groups.
+
+        Those whose encoding is kept, or will be after these groups, are not decoded.
+        """
+        begun = self._begun
+        encoded = {placed.key for group in groups for placed in group if placed.view.in_map}
+        files = {placed.key: placed for group in following for placed in group if isinstance(placed.view.image, Path)}
+        new = [key for key in files if key not in encoded and key not in self._cache]
+        workers = default_workers()
+        pool = ThreadPoolExecutor(workers)
+        self._begun = {key: pool.submit(_read, files[key]) for key in new[: workers + _IMAGES_AT_A_TIME]}
+        pool.shutdown(wait=False)
+        return begun
+
+    def _encoded(
+        self, batches: Sequence[Sequence[Sequence[_Placed]]], begun: "_Begun"
+    ) -> "Iterator[list[list[Tensor | str]]]":
         """Yield the tokens (P, C) of each view of each group of each batch, or why it cannot be read.
 
         Photographs are decoded in other threads meanwhile, those whose encoding is kept not at all.
         """
-        decoded = prefetch(_read, self._to_read(batches), workers=default_workers(), ahead=_IMAGES_AT_A_TIME)
+
+        def read(placed: _Placed | None) -> "Tensor | ImageError | None":
+            future = begun.pop(placed.key, None) if placed else None
+            return future.result() if future else _read(placed)
+
+        decoded = prefetch(read, self._to_read(batches), workers=default_workers(), ahead=_IMAGES_AT_A_TIME)
         for batch in batches:
             found: dict[Any, Tensor | str] = {}
             waiting: dict[Any, tuple[_Placed, Tensor]] = {}

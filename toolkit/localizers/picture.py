@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from toolkit.capture.cameras import camera_text, parse_camera
-from toolkit.capture.images import pixels_of
+from toolkit.capture.images import pixels_of, stored_size
 from toolkit.capture.turning import turn_image
 from toolkit.errors import ArtifactError, ImageError
 from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor, extract_turned
@@ -94,7 +94,8 @@ def localize_image(
     else:
         turned = embedder.upright if place.embed_settings.upright is None else place.embed_settings.upright
         shown = zip(pixels, quarter_turns if turned else none, strict=True)
-        inputs = [embedder.prepare(turn_image(picture.read(color=True), turn)) for picture, turn in shown]
+        side = embedder.least_side
+        inputs = [embedder.prepare(turn_image(picture.read(True, side), turn)) for picture, turn in shown]
     references = place.retrieve(embedder.embed(inputs), [picture.read for picture in pixels], cameras, quarter_turns)
     with threadpool_limits(1, "blas"):  # sums stay in one order, as in a run
         return place.judged(place.localizer.localize(Query(views, poses, features), references))
@@ -192,16 +193,17 @@ class _Pixels:
     def __init__(self, image: Picture, camera: pycolmap.Camera) -> None:
         self.image = Path(image) if isinstance(image, str | Path) else pixels_from(image)
         self._camera = camera
-        self._decoded: dict[bool, NDArray[np.uint8]] = {}
+        self._decoded: dict[tuple[bool, int | None], NDArray[np.uint8]] = {}
 
-    def read(self, color: bool) -> NDArray[np.uint8]:
-        """Return the pixels in color, (H, W, 3), or in gray, (H, W), as a run reads them."""
-        if color not in self._decoded:
-            pixels = pixels_of(self.image, gray=not color)
-            if (self._camera.width, self._camera.height) != pixels.shape[1::-1]:
+    def read(self, color: bool, least_side: int | None = None) -> NDArray[np.uint8]:
+        """Return the pixels in color, (H, W, 3), or in gray, (H, W), as a run reads them; see `read_image`."""
+        if (color, least_side) not in self._decoded:
+            pixels = pixels_of(self.image, not color, least_side)
+            width, height = stored_size(self.image) if isinstance(self.image, Path) else pixels.shape[1::-1]
+            if (self._camera.width, self._camera.height) != (width, height):
                 raise ImageError(
-                    f"The image is {pixels.shape[1]} x {pixels.shape[0]} pixels, its camera {self._camera.width} x "
+                    f"The image is {width} x {height} pixels, its camera {self._camera.width} x "
                     f"{self._camera.height}. Give the intrinsics of the image as it is stored."
                 )
-            self._decoded[color] = pixels
-        return self._decoded[color]
+            self._decoded[color, least_side] = pixels
+        return self._decoded[color, least_side]

@@ -69,5 +69,9 @@ class Predictor(Protocol):
     def settings(self) -> dict[str, Any]:
         """What the predictions depend on besides the views; part of the poses' fingerprint."""
 
-    def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
-        """Return a prediction for each group of views; groups do not influence each other."""
+    def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
+        """Return a prediction for each group of views; groups do not influence each other.
+
+        Args:
+            following: groups that the next call is likely to have; their images may be read meanwhile.
+        """

@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -148,6 +149,33 @@ def in_single_threads(run: "Callable[[Item], Result]", items: "Iterable[Item]") 
         results = list(pool.map(run_one, items))
     torch.set_num_threads(threads)  # also of threads that are not started yet
     return results
+
+
+def upload(batch: "torch.Tensor", device: "torch.device") -> "torch.Tensor":
+    """Return a tensor of the CPU on a device.
+
+    To a GPU it is copied from page-locked memory, on a stream of its own: a thread can do this while the network runs
+    on another batch. The copy is complete when this returns.
+    """
+    import torch
+
+    if device.type != "cuda":
+        return batch.to(device)
+    stream = _copy_stream(device)
+    with torch.cuda.stream(stream):
+        copied = batch.pin_memory().to(device, non_blocking=True)
+    stream.synchronize()
+    # Its memory is of the stream of copies, which shall not have it back before the network is done with it.
+    copied.record_stream(torch.cuda.current_stream(device))
+    return copied
+
+
+@cache
+def _copy_stream(device: "torch.device") -> "torch.cuda.Stream":
+    """Return the stream for copies to a GPU: one, as torch keeps memory apart for each stream that had some."""
+    import torch
+
+    return torch.cuda.Stream(device)
 
 
 class Fitting:
