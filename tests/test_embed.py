@@ -284,7 +284,7 @@ def test_a_killed_run_goes_on_within_a_subsession(
 
     monkeypatch.setattr(MegaLocEmbedder, "embed", counts)
     table = call(embed_sessions, tiny / "sessions", tmp_path / "e", **go)  # type: ignore[arg-type]
-    assert seen == [4, 4, 3, 4, 2], "11 images of the map, of which 8 were done, and 6 of the query"
+    assert seen == [3, 4, 4, 4, 2], "12 images of the map, one unreadable, of which 8 were done, and 6 of the query"
     assert table["unreadable"].tolist() == [1, 0]
     for path in (tmp_path / "whole").rglob("*.*"):
         twin = tmp_path / "e" / path.relative_to(tmp_path / "whole")

@@ -2,9 +2,10 @@
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ from toolkit.files import (
 )
 from toolkit.geometry import Ints, unit
 from toolkit.manifest import EmbedSettings
+from toolkit.runs.cluster import current_cluster
 
 log = logging.getLogger(__name__)
 
@@ -114,10 +116,11 @@ def embed_sessions(
             embedded = len(np.load(matrix_path, mmap_mode="r"))
         else:
             # The same images in batches of another size are the same up to rounding.
-            with GroupWriter(matrix_path, {**record, "batch_size": settings.batch_size}) as batches:
+            made_by = {**record, "rows_a_batch": settings.batch_size}
+            with GroupWriter(matrix_path, made_by) as batches:
                 if not skip_existing:
                     batches.discard()
-                failed = _embed(embedder, part, batches, settings, store_of)
+                failed = _embed(embedder, part, batches, made_by, settings, store_of)
                 embedded = len(part.rows) - len(failed)
                 tables = _write_tables(folder, capture.name, part, failed)
                 write_matrix(matrix_path, batches, embedded, embedder.dim, settings.dtype)
@@ -273,37 +276,69 @@ def _embed(
     embedder: Embedder,
     part: _Subsession,
     batches: GroupWriter,
+    made_by: Mapping[str, Any],
     settings: EmbedSettings,
     store_of: Callable[[str], FeatureStore],
 ) -> dict[int, str]:
     """Add the vectors of the readable images, in order; return why the others (by row) have none."""
-    failed: dict[int, str] = {}
-    done, finished = 0, batches.notes()
-    for note in finished.values():  # what a stopped run had done
-        done = note["done"]
-        failed |= dict(note["failed"])
-    inputs = _inputs(embedder, part, done, settings.batch_size, store_of)
+    size, store = settings.batch_size, store_of(part.session.id) if embedder.inputs == "features" else None
+    label, done = f"embed {part.session.id}/{part.name}", batches.notes()
+    todo = [number for number in range(-(-len(part.rows) // size)) if f"{number:08d}" not in done]
+    if todo and (cluster := current_cluster()):
+        shares = [(numbers, (batches.path, made_by, embedder, part, settings, store)) for numbers in cluster.cut(todo)]
+        batches.spread(cluster, _embed_share, shares, label, "batch")
+        todo = [number for number in todo if f"{number:08d}" not in batches.notes()]
+    rest = sum(len(part.rows[number * size : (number + 1) * size]) for number in todo)
+    with tqdm(total=len(part.rows), initial=len(part.rows) - rest, desc=label, unit="image") as bar:
+        _embed_into(batches, todo, embedder, part, settings, store, bar.update)
+    return {row: reason for note in batches.notes().values() for row, reason in note["failed"]}
 
-    def stack(item: tuple[list[Any], dict[int, str]]) -> tuple[Any, dict[int, str]]:
-        readable, unreadable = item
+
+def _embed_share(
+    share: str,
+    numbers: Sequence[int],
+    path: Path,
+    made_by: Mapping[str, Any],
+    embedder: Embedder,
+    part: _Subsession,
+    settings: EmbedSettings,
+    store: FeatureStore | None,
+) -> None:
+    with GroupWriter(path, made_by, share=share) as batches:
+        rest = [number for number in numbers if f"{number:08d}" not in batches.notes()]
+        _embed_into(batches, rest, embedder, part, settings, store, lambda _: None)
+
+
+def _embed_into(
+    batches: GroupWriter,
+    numbers: Sequence[int],
+    embedder: Embedder,
+    part: _Subsession,
+    settings: EmbedSettings,
+    store: FeatureStore | None,
+    done: Callable[[int], object],
+) -> None:
+    """Add the vectors of batches, by number, and why images in them have none; `done` is told of how many images."""
+    size = settings.batch_size
+    slices = [slice(number * size, (number + 1) * size) for number in numbers]
+    chosen = np.concatenate([np.zeros(0, np.int64), *(np.arange(len(part.rows))[rows] for rows in slices)])
+    inputs = _inputs(embedder, replace(part, rows=part.rows[chosen], turns=part.turns[chosen]), size, store)
+
+    def stack(items: list[tuple[int, Any | str]]) -> tuple[Any, dict[int, str]]:
+        readable = [item for _, item in items if not isinstance(item, str)]
+        unreadable = {row: item for row, item in items if isinstance(item, str)}
         return embedder.stack(readable) if readable else readable, unreadable
 
     # The next batch is copied to the device while one is embedded.
-    stacked = prefetch(stack, _batches(inputs, settings.batch_size), workers=1, ahead=0)
-    label = f"embed {part.session.id}/{part.name}"
-    with tqdm(total=len(part.rows), initial=done, desc=label, unit="image") as bar:
-        for number, (batch, unreadable) in enumerate(stacked, start=len(finished)):
-            vectors = embedder.embed(batch)
-            if vectors.shape != (len(batch), embedder.dim):
-                raise ValueError(f"{embedder.name} gave {vectors.shape}; expected {(len(batch), embedder.dim)}.")
-            if settings.normalize:
-                vectors = unit(vectors)
-            failed |= unreadable
-            done += len(batch) + len(unreadable)
-            note = {"done": done, "failed": list(unreadable.items())}
-            batches.add(f"{number:08d}", arrays={VECTORS: vectors}, note=note)
-            bar.update(len(batch) + len(unreadable))
-    return failed
+    of_batches = (list(islice(inputs, len(part.rows[rows]))) for rows in slices)
+    for number, (batch, unreadable) in zip(numbers, prefetch(stack, of_batches, workers=1, ahead=0), strict=True):
+        vectors = embedder.embed(batch)
+        if vectors.shape != (len(batch), embedder.dim):
+            raise ValueError(f"{embedder.name} gave {vectors.shape}; expected {(len(batch), embedder.dim)}.")
+        if settings.normalize:
+            vectors = unit(vectors)
+        batches.add(f"{number:08d}", arrays={VECTORS: vectors}, note={"failed": list(unreadable.items())})
+        done(len(batch) + len(unreadable))
 
 
 def write_matrix(path: Path, batches: GroupWriter, rows: int, dim: int, dtype: str) -> None:
@@ -316,13 +351,12 @@ def write_matrix(path: Path, batches: GroupWriter, rows: int, dim: int, dtype: s
 
 
 def _inputs(
-    embedder: Embedder, part: _Subsession, done: int, batch_size: int, store_of: Callable[[str], FeatureStore]
+    embedder: Embedder, part: _Subsession, batch_size: int, store: FeatureStore | None
 ) -> Iterator[tuple[int, Any | str]]:
-    """Yield row and input (features or a prepared image) of the images after the first `done`, or why it has none."""
+    """Yield row and input (features or a prepared image) of the images, or why it has none."""
     session = part.session
-    if embedder.inputs == "features":
-        store = store_of(session.id)
-        for row in part.rows[done:].tolist():
+    if store is not None:
+        for row in part.rows.tolist():
             name = session.image_name(row)
             yield row, store[name] if name in store else store.failed.get(name, "no local features were extracted")
         return
@@ -335,24 +369,8 @@ def _inputs(
             return row, str(error)
         return row, embedder.prepare(turn_image(image, turns))
 
-    items = zip(part.rows[done:].tolist(), part.turns[done:].tolist(), strict=True)
+    items = zip(part.rows.tolist(), part.turns.tolist(), strict=True)
     yield from prefetch(read, items, workers=default_workers(), ahead=2 * batch_size)
-
-
-def _batches(items: Iterable[tuple[int, Any | str]], size: int) -> Iterator[tuple[list[Any], dict[int, str]]]:
-    """Yield up to `size` inputs, and the reasons (by row) of those that are none, in order."""
-    batch: list[Any] = []
-    unreadable: dict[int, str] = {}
-    for row, item in items:
-        if isinstance(item, str):
-            unreadable[row] = item
-        else:
-            batch.append(item)
-        if len(batch) == size:
-            yield batch, unreadable
-            batch, unreadable = [], {}
-    if batch or unreadable:
-        yield batch, unreadable
 
 
 def _images_fingerprint(session: Session, rows: NDArray[np.intp]) -> str:

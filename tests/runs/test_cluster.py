@@ -64,7 +64,7 @@ def here(monkeypatch: pytest.MonkeyPatch) -> Here:
             frame = frame.f_back  # type: ignore[assignment]
         return cluster
 
-    for module in ("toolkit.features.stores", "toolkit.localizers.mapping", "toolkit.localize"):
+    for module in ("toolkit.embed", "toolkit.features.stores", "toolkit.localizers.mapping", "toolkit.localize"):
         monkeypatch.setattr(f"{module}.current_cluster", current)
     return cluster
 
@@ -167,7 +167,12 @@ def test_poses_are_those_of_one_process(small_capture: Path, small_features: Pat
         place = SceneFiles(tmp_path / name, small_capture.name)
         with pytest.MonkeyPatch.context() as patch:
             if name == "alone":
-                for module in ("toolkit.features.stores", "toolkit.localizers.mapping", "toolkit.localize"):
+                for module in (
+                    "toolkit.embed",
+                    "toolkit.features.stores",
+                    "toolkit.localizers.mapping",
+                    "toolkit.localize",
+                ):
                     patch.setattr(f"{module}.current_cluster", lambda: None)
             localize_pairs(sessions, files.retrieval_dir, place.poses_dir, files.features, place.maps, map_device="ios")
         found[name] = {path.name: path.read_bytes() for path in sorted(place.poses_dir.glob("*.txt"))}

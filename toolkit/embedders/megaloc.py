@@ -12,13 +12,14 @@ from PIL import Image
 from torch import Tensor
 
 from toolkit.errors import ManifestError, ToolkitError
+from toolkit.files import Remade
 from toolkit.models.compute import Fitting, resolve_device, resolve_precision, upload
 from toolkit.models.megaloc import PATCH, MegaLoc
 from toolkit.models.vit import IMAGENET_MEAN, IMAGENET_STD
 from toolkit.models.weights import MEGALOC, given_or_resolved, weights_digest
 
 
-class MegaLocEmbedder:
+class MegaLocEmbedder(Remade):
     """Global descriptors by MegaLoc, (8448,) unit vectors."""
 
     name = "megaloc"
