@@ -183,7 +183,7 @@ def walk_street(scene: Scene, seed: int, counts: dict[str, int], name: str) -> d
             x = scene.origin[0] + length * ((np.arange(count) + 0.5) / max(1, count) - 0.5)
             waves = rng.uniform(0, 2 * np.pi, (5, 2))
             y, z, yaw, pitch, roll = (0.6 * np.sin(0.7 * x + a) + 0.4 * np.sin(1.9 * x + b) for a, b in waves)
-            y = (0.3 * y - side * (1.6 if split == "map" else 0.8)) * np.ones(count)
+            y = scene.origin[1] + (0.3 * y - side * (1.6 if split == "map" else 0.8)) * np.ones(count)
             z = device.height_m + 0.05 * z
             yaw = side * 90 + (25 if split == "map" else 15) * yaw
             turns = zip(yaw, device.sway_deg * pitch, device.sway_deg * roll, strict=True)
