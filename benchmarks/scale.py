@@ -291,7 +291,7 @@ class Books:
         from toolkit.embedders.stored import MANIFEST_COLUMNS
 
         rng = np.random.default_rng(0)
-        for session in self.capture.values():
+        for session in (self.capture[name] for name in self.capture):
             folder = self.run / "embeddings" / session.id / "walk"
             folder.mkdir(parents=True)
             np.save(folder / "walk.npy", rng.standard_normal((len(session.images), 512), np.float32).astype(np.float16))

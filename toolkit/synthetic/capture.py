@@ -245,7 +245,7 @@ def render_street(
     """Render a street seen by a phone with small pictures, for maps of many images; return the capture's folder.
 
     The street has no end: blocks of 12 m follow each other, each sees the next, and none is like another. What an image
-    shares with others depends on `frames` alone, so a longer street is more of the same. 30 images/s on two cores.
+    shares with others depends on `frames` alone, so a longer street is more of the same. 15 images/s a core.
 
     Args:
         out: as `render_capture` has it.
