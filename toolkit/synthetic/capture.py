@@ -12,7 +12,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,16 +23,52 @@ import numpy as np
 from toolkit.errors import CaptureError
 from toolkit.files import is_left_over, process_tag
 from toolkit.geometry import Floats, invert, pose_from_qt, qt_from_pose
-from toolkit.synthetic.devices import DEVICES, Device, walks
+from toolkit.synthetic.devices import DEVICES, Device, halved, walk_street, walks
 from toolkit.synthetic.light import paint
 from toolkit.synthetic.render import Rays, render
-from toolkit.synthetic.scene import Scene, build_room, named_rng
+from toolkit.synthetic.scene import Quad, Scene, build_block, build_room, named_rng
 from toolkit.synthetic.textures import Image
 
 if TYPE_CHECKING:
     import pycolmap
 
 FORMAT = 1  # raise it when the same settings give other bytes
+
+
+@dataclass(frozen=True)
+class World:
+    """What is rendered: places along a way, and how often they are photographed."""
+
+    places: int  # rooms, or blocks of a street
+    frames: int  # a place and map session
+    queries: int  # a place and query session
+    seed: int
+    look_alikes: bool = False
+    street: bool = False  # else rooms
+
+    @property
+    def devices(self) -> dict[str, Device]:
+        """Who walks there. In a street a phone with small pictures, for many images in little time."""
+        return {"ios": halved(DEVICES["ios"])} if self.street else DEVICES
+
+    @property
+    def hours(self) -> int:
+        """Whole hours that are enough for one subsession."""
+        return 1 + int(1.4 * self.places * (self.frames + 8) / 3600)
+
+    def build(self, index: int) -> Scene:
+        """Return a place without its textures."""
+        if not self.street:
+            return build_room(self.seed, index)
+        block = build_block(self.seed, index)
+        block.quads = [replace(quad, ppm=quad.ppm / 2) for quad in block.quads]
+        return block
+
+    def walk(self, scene: Scene, index: int, name: str) -> dict[tuple[str, int], Floats]:
+        """Return the poses world_from_body of one device in one place, by split and subsession."""
+        if self.street:
+            return walk_street(scene, self.seed, {"map": self.frames, "query": self.queries}, name)
+        return walks(scene, self.seed, index, self.frames, name)
 
 
 @dataclass
@@ -74,21 +110,19 @@ def _subsession(name: str, split: str, part: int, hours: int) -> tuple[str, int]
     return time.strftime("spot_%Y-%m-%d-%H-%M", stamp), day
 
 
-def _plan_room(
-    scene: Scene, seed: int, index: int, frames: int, hours: int, tables: dict[str, Tables]
-) -> Iterator[Shot]:
-    """Add one room's frames to the tables of all sessions, and yield its pictures."""
+def _plan_place(world: World, scene: Scene, index: int, tables: dict[str, Tables]) -> Iterator[Shot]:
+    """Add one place's frames to the tables of all sessions, and yield its pictures."""
     import pycolmap
 
-    for name, device in DEVICES.items():
-        for (split, part), bodies in walks(scene, seed, index, frames, name).items():
+    for name, device in world.devices.items():
+        for (split, part), bodies in world.walk(scene, index, name).items():
             session, table = f"{name}_{split}", tables[f"{name}_{split}"]
-            subsession, start = _subsession(name, split, part, hours)
+            subsession, start = _subsession(name, split, part, world.hours)
             if subsession not in table.subsessions:
                 table.subsessions.append(subsession)
-            rng = named_rng(seed, index, "frames", name, split, part)
+            rng = named_rng(world.seed, index, "frames", name, split, part)
             for i, world_from_body in enumerate(bodies):
-                timestamp = start + int(1e6 * (5 + 1.4 * (index * (frames + 8) + i)) + rng.integers(0, 700_000))
+                timestamp = start + int(1e6 * (5 + 1.4 * (index * (world.frames + 8) + i)) + rng.integers(0, 700_000))
                 zoom = float(np.round(rng.normal(1, 0.004), 5))
                 rig_id = f"{subsession}/" + (f"hetrig_{timestamp}" if name == "hl" else f"{timestamp}-body")
                 if device.rig_from_body is not None:
@@ -116,16 +150,16 @@ def _plan_room(
                         table.rigs.append((timestamp, rig_id, sensor_id, rig_from_body @ sensor.body_from_cam))
                     table.images.append((timestamp, sensor_id, path))
                     depth_path = None
-                    if split == "map":
+                    if split == "map" and not world.street:
                         depth_path = f"{subsession}/depths/{folder.removeprefix('images/')}{stem}.png"
                         table.depths.append((timestamp, sensor_id, depth_path))
                     yield Shot(session, timestamp, sensor_id, path, depth_path, camera, world_from_cam, device)
 
 
-def _take(shot: Shot, scene: Scene, rays: Rays | None, sessions: Path, seed: int) -> None:
+def _take(shot: Shot, quads: list[Quad], rays: Rays | None, sessions: Path, seed: int) -> None:
     """Render one picture as its device sees it, and its depth, into the session's raw_data."""
     device = shot.device
-    picture, depth = render(scene.quads, shot.world_from_cam, rays or Rays.of(shot.camera), device.gray)
+    picture, depth = render(quads, shot.world_from_cam, rays or Rays.of(shot.camera), device.gray)
     h, w = depth.shape
     y, x = np.ogrid[0:h, 0:w]
     radius2 = ((x - w / 2) ** 2 + (y - h / 2) ** 2).astype(np.float32) / ((w / 2) ** 2 + (h / 2) ** 2)
@@ -198,11 +232,41 @@ def render_capture(
     Raises:
         CaptureError: a setting is out of range, or `out` holds something else than a rendered capture.
     """
-    out = Path(out)
     if rooms < 1 or frames < 2 or seed < 0:
         raise CaptureError(f"Expected rooms >= 1, frames >= 2, seed >= 0; found {rooms=}, {frames=}, {seed=}.")
     settings = {"format": FORMAT, "rooms": rooms, "frames": frames, "seed": seed}
     settings |= {"look_alikes": 1} if look_alikes else {}
+    return _render(Path(out), World(rooms, frames, max(2, frames // 2), seed, look_alikes), settings, progress)
+
+
+def render_street(
+    out: str | Path, blocks: int = 2, frames: int = 50, queries: int = 4, seed: int = 0, progress: bool = True
+) -> Path:
+    """Render a street seen by a phone with small pictures, for maps of many images; return the capture's folder.
+
+    The street has no end: blocks of 12 m follow each other, each sees the next, and none is like another. What an image
+    shares with others depends on `frames` alone, so a longer street is more of the same. 15 images/s a core.
+
+    Args:
+        out: as `render_capture` has it.
+        blocks: how many, at least 1.
+        frames: map images a block, at least 2; half look at one front, half at the other.
+        queries: query images a block.
+        seed: of everything; the same seed gives the same bytes.
+
+    Raises:
+        CaptureError: a setting is out of range, or `out` holds something else than a rendered capture.
+    """
+    if blocks < 1 or frames < 2 or queries < 1 or seed < 0:
+        raise CaptureError(
+            f"Expected blocks, queries >= 1, frames >= 2, seed >= 0; found {blocks=}, {queries=}, {frames=}, {seed=}."
+        )
+    settings = {"format": FORMAT, "blocks": blocks, "frames": frames, "queries": queries, "seed": seed}
+    return _render(Path(out), World(blocks, frames, queries, seed, street=True), settings, progress)
+
+
+def _render(out: Path, world: World, settings: dict[str, int], progress: bool) -> Path:
+    """Render a capture into a hidden folder and move it to `out`, unless it is there already."""
     if _is_complete(out, settings):
         return out
     if out.exists() and any(out.iterdir()) and not (out / "demo.json").exists():
@@ -218,7 +282,7 @@ def render_capture(
     threads = cv2.getNumThreads()
     try:
         cv2.setNumThreads(1)  # the renderer's pool has a thread a core
-        _render_sessions(partial_out, rooms, frames, seed, progress, look_alikes)
+        _render_sessions(partial_out, world, progress)
         count = sum(1 for path in partial_out.rglob("*") if path.is_file())
         (partial_out / "demo.json").write_text(json.dumps({**settings, "files": count}, indent=1) + "\n")
         partial_out.chmod(0o755)
@@ -233,33 +297,41 @@ def render_capture(
     return out
 
 
-def _render_sessions(out: Path, rooms: int, frames: int, seed: int, progress: bool, look_alikes: bool) -> None:
-    """Render the pictures of all sessions, room by room, and write the sessions' files."""
+def _render_sessions(out: Path, world: World, progress: bool) -> None:
+    """Render the pictures of all sessions, place by place, and write the sessions' files."""
     from tqdm.auto import tqdm
 
     from toolkit.capture.images import default_workers
 
     sessions = out / "sessions"
-    tables = {f"{name}_{split}": Tables() for name in DEVICES for split in ("map", "query")}
-    hours = 1 + int(1.4 * rooms * (frames + 8) / 3600)
-    pictures = rooms * sum(len(d.sensors) for d in DEVICES.values()) * (frames + max(2, frames // 2))
+    tables = {f"{name}_{split}": Tables() for name in world.devices for split in ("map", "query")}
+    pictures = world.places * sum(len(d.sensors) for d in world.devices.values()) * (world.frames + world.queries)
     rays: dict[tuple[float, ...], Rays] = {}
+    scenes: dict[int, Scene] = {}
     with (
         tqdm(total=pictures, desc="render", unit="image", disable=not progress) as bar,
         ThreadPoolExecutor(default_workers()) as pool,  # a thread may hold 150 MB
     ):
         try:
-            for index in range(rooms):
-                scene = build_room(seed, index)
-                paint_quad = partial(paint, scene, seed, index, look_alikes=look_alikes)
-                for _ in pool.map(paint_quad, range(len(scene.quads))):
-                    pass
+            for index in range(world.places):
+                seen = (index, index - 1, index + 1) if world.street else (index,)
+                around = [i for i in seen if 0 <= i < world.places]
+                for i in around:
+                    if i not in scenes:
+                        scenes[i] = world.build(i)
+                        paint_quad = partial(paint, scenes[i], world.seed, i, look_alikes=world.look_alikes)
+                        for _ in pool.map(paint_quad, range(len(scenes[i].quads))):
+                            pass
+                scenes = {i: scenes[i] for i in around}
+                scene = scenes[index]
+                # The sky of one place is enough.
+                quads = scene.quads + [quad for i in around[1:] for quad in scenes[i].quads if quad.lit]
                 waiting = []
-                for shot in _plan_room(scene, seed, index, frames, hours, tables):
+                for shot in _plan_place(world, scene, index, tables):
                     key = tuple(shot.camera.params)
                     if shot.device.rig_from_body is not None and key not in rays:
                         rays[key] = Rays.of(shot.camera)
-                    waiting.append(pool.submit(_take, shot, scene, rays.get(key), sessions, seed))
+                    waiting.append(pool.submit(_take, shot, quads, rays.get(key), sessions, world.seed))
                 for work in waiting:
                     work.result()
                     bar.update()

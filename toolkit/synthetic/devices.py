@@ -1,6 +1,6 @@
 """Who sees the rendered rooms: a phone, a headset and a robot, their cameras and their walks."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -76,6 +76,15 @@ DEVICES = {
         (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     ),
 }  # fmt: skip
+
+
+def halved(device: Device) -> Device:
+    """Return a device whose pinhole cameras take pictures of half the width and height."""
+    sensors = (
+        replace(sensor, size=(sensor.size[0] // 2, sensor.size[1] // 2), params=tuple(p / 2 for p in sensor.params))
+        for sensor in device.sensors
+    )
+    return replace(device, sensors=tuple(sensors))
 
 
 def looking(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Floats:
@@ -154,4 +163,30 @@ def walks(scene: Scene, seed: int, index: int, frames: int, name: str) -> dict[t
             price = abs(turn) + 100 * ((angle < 11) | (angle > 24)) + 8 * ((turn > 0) == bool(part))
             best, cost = np.where(price < cost, turn, best), np.minimum(price, cost)
         poses["query", part] = _turn(query, best)
+    return poses
+
+
+def walk_street(scene: Scene, seed: int, counts: dict[str, int], name: str) -> dict[tuple[str, int], Floats]:
+    """Return the poses world_from_body of one device along one block of a street, by split and subsession.
+
+    There on one side of the middle, looking at the front across, and back on the other. Queries walk closer to the
+    middle and look elsewhere. The wobble is that of the whole street: a walk goes on from block to block.
+
+    Args:
+        counts: frames of a split, `map` and `query`, both subsessions together.
+    """
+    device, length = DEVICES[name], scene.size[0]
+    poses: dict[tuple[str, int], Floats] = {}
+    for split, total in counts.items():
+        for part, (count, side) in enumerate(((total - total // 2, 1), (total // 2, -1))):
+            rng = named_rng(seed, "street", name, split, part)
+            x = scene.origin[0] + length * ((np.arange(count) + 0.5) / max(1, count) - 0.5)
+            waves = rng.uniform(0, 2 * np.pi, (5, 2))
+            y, z, yaw, pitch, roll = (0.6 * np.sin(0.7 * x + a) + 0.4 * np.sin(1.9 * x + b) for a, b in waves)
+            y = scene.origin[1] + (0.3 * y - side * (1.6 if split == "map" else 0.8)) * np.ones(count)
+            z = device.height_m + 0.05 * z
+            yaw = side * 90 + (25 if split == "map" else 15) * yaw
+            turns = zip(yaw, device.sway_deg * pitch, device.sway_deg * roll, strict=True)
+            rotations = np.array([looking(*turn) for turn in turns]).reshape(-1, 3, 3)
+            poses[split, part] = make_pose(rotations, np.stack([x, y, z], -1)) @ invert(BODY_FROM_LEVEL_CAM)
     return poses

@@ -222,6 +222,39 @@ KINDS: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
+BLOCK_M = (12.0, 9.0, 5.4)
+STREET_WALLS = (0, 2)  # those along x
+STREET_THINGS = [
+    "planter", "bench", "crates", "posters", "door", "painting", "board", "window", "shelf", "cabinet", "posters",
+]  # fmt: skip
+
+
+def _build_wall(scene: Scene, wall: int, material: Material) -> None:
+    (x, y, yaw), (w, d, h) = scene.at_wall(wall, 0.0, -0.008), scene.size
+    length = w if wall % 2 == 0 else d
+    right = np.cross(UP, [-np.sin(yaw), np.cos(yaw), 0.0])
+    scene.plate(np.array([x, y, h]) - right * length / 2, right, -UP, length, h, material, 256)
+
+
+def _furnish_wall(scene: Scene, rng: Rng, wall: int, things: list[str]) -> None:
+    """Set things side by side against a wall, and outdoors windows above them."""
+    length = scene.size[wall % 2]
+    along = -length / 2 + 0.5
+    for thing in list(rng.permutation(things)) * 3:
+        width = _furnish(scene, rng, wall, along, length / 2 - 0.45 - along, thing)
+        along += width and width + rng.uniform(0.08, 0.3)
+    if scene.outdoor:  # the upper story
+        sill = partial(tex.plaster, color=(150, 165, 175))
+        for at in np.arange(-length / 2 + 0.9, length / 2 - 0.6, 1.7):
+            scene.hang(wall, at, 3.1, 1.05, 1.5, tex.window, 300)
+            scene.box(scene.at_wall(wall, at, 0.18), 2.98, (1.25, 0.18, 0.1), sill)
+
+
+def _build_sky(scene: Scene) -> None:
+    scene.plate((-150, -150, 40), (1, 0, 0), (0, 1, 0), 300, 300, tex.clouds, 4, lit=False)
+    scene.lamps = [scene.origin + np.array([9.0 + 2 * i, -14.0, 22.0]) for i in (-0.5, 0.5)]
+
+
 def build_room(seed: int, index: int) -> Scene:
     """Return room `index` of the world of `seed`: geometry and materials; `light.paint` makes its textures."""
     rng = named_rng(seed, index, "room")
@@ -239,16 +272,12 @@ def build_room(seed: int, index: int) -> Scene:
         ch, cw, colors, stagger = kind["wall"]
         wall = partial(tex.cells, size=(ch, cw), colors=colors, stagger=stagger)
     for k in range(4):
-        x, y, yaw = scene.at_wall(k, 0.0, -0.008)
-        length = w if k % 2 == 0 else d
-        right = np.cross(UP, [-np.sin(yaw), np.cos(yaw), 0.0])
-        scene.plate(np.array([x, y, h]) - right * length / 2, right, -UP, length, h, wall, 256)
+        _build_wall(scene, k, wall)
     ch, cw, colors, stagger = kind["floor"]
     floor = partial(tex.cells, size=(ch, cw), colors=colors, stagger=stagger, jitter=0.15, motifs=stagger == "none")
     scene.plate((-w / 2, d / 2, 0), (1, 0, 0), (0, -1, 0), w, d, floor, 256)
     if outdoor:
-        scene.plate((-150, -150, 40), (1, 0, 0), (0, 1, 0), 300, 300, tex.clouds, 4, lit=False)
-        scene.lamps = [origin + np.array([9.0 + 2 * i, -14.0, 22.0]) for i in (-0.5, 0.5)]
+        _build_sky(scene)
     else:
         ceiling = partial(tex.cells, size=(0.6, 0.6), colors=[(215, 222, 225)], stagger="none", jitter=0.03)
         scene.plate((-w / 2, -d / 2, h), (1, 0, 0), (0, 1, 0), w, d, ceiling, 160)
@@ -260,17 +289,25 @@ def build_room(seed: int, index: int) -> Scene:
                 scene.box((x, y, 0), h - 0.04, (0.9, 0.25, 0.04), tex.lamp, lit=False, ppm=120)
                 scene.lamps.append(origin + np.array([x, y, h - 0.08]))
     for k in range(4):
-        length = w if k % 2 == 0 else d
-        along = -length / 2 + 0.5
-        for thing in list(rng.permutation(kind["things"])) * 3:
-            width = _furnish(scene, rng, k, along, length / 2 - 0.45 - along, thing)
-            along += width and width + rng.uniform(0.08, 0.3)
-        if outdoor:  # the upper story
-            sill = partial(tex.plaster, color=(150, 165, 175))
-            for at in np.arange(-length / 2 + 0.9, length / 2 - 0.6, 1.7):
-                scene.hang(k, at, 3.1, 1.05, 1.5, tex.window, 300)
-                scene.box(scene.at_wall(k, at, 0.18), 2.98, (1.25, 0.18, 0.1), sill)
+        _furnish_wall(scene, rng, k, kind["things"])
     _furnish_middle(scene, rng)
+    return scene
+
+
+def build_block(seed: int, index: int) -> Scene:
+    """Return block `index` of the street of `seed`, which goes on along x: two fronts and the ground between them."""
+    rng = named_rng(seed, index, "block")
+    w, d, _ = BLOCK_M
+    scene = Scene(np.array([w * index, 0.0, 0.0]), BLOCK_M, outdoor=True)
+    for k in STREET_WALLS:
+        bricks = [BRICK, SANDSTONE, MOSAIC, SLATE][int(rng.integers(4))]
+        size = tuple(rng.uniform([0.07, 0.2], [0.22, 0.45]))
+        _build_wall(scene, k, partial(tex.cells, size=size, colors=np.asarray(bricks) * rng.uniform(0.8, 1.2)))
+    slabs = partial(tex.cells, size=(0.5, 0.5), colors=SLATE, stagger="none", jitter=0.15, motifs=True)
+    scene.plate((-w / 2, d / 2, 0), (1, 0, 0), (0, -1, 0), w, d, slabs, 160)
+    _build_sky(scene)
+    for k in STREET_WALLS:
+        _furnish_wall(scene, rng, k, STREET_THINGS)
     return scene
 
 

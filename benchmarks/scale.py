@@ -1,0 +1,431 @@
+"""A street of N rendered map images from capture to report: seconds, memory and files of each stage, and how they grow.
+
+    python benchmarks/scale.py [--images 60 240] [--folder runs/scale] [--threads 2] [--resume] [--set KEY=VALUE]
+    python benchmarks/scale.py --bookkeeping 10000 100000 [--folder runs/scale]
+
+The street goes on and on, so a longer one is more of the same: 12 m have 50 map images of 480 x 360 and 3 query
+images, of which every sixth is left out of the keyframe list, which makes 500 queries at 10,000. Captures are kept in
+FOLDER/N/STREET and used again. The run is headless, in a process of its own, with VLAD and SIFT alone: learned
+features on a CPU take the same seconds for each image whatever the size, and hide what grows. Seconds are those of
+run.json, without starting a kernel; of `localize`, those until the map stands are a row of their own. Memory is that of
+all processes of the run, sampled twice a second: the sum of their proportional sets (PSS: a page that several have
+mapped counts once in all), and of their resident sets (RSS: it counts in each). The exponent is the slope of a line
+through log seconds over log images: 1 is linear. FOLDER/growth.png draws it, FOLDER/scale.md and scale.json hold the
+figures.
+
+With --bookkeeping, what needs no pixels, for maps of poses and random descriptors along such streets, each size in a
+process of its own: peak memory is the process's largest resident set while a step runs, less what it had before.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from common import add_out, check_out, in_own_process, limit_cores, markdown_table, write_out
+
+from toolkit.files import SceneFiles
+
+FRAMES, QUERIES = 50, 3
+"""Map and query images of a block of the street."""
+SCENE = "STREET"
+STAGES = ("explore", "embed", "retrieve", "map", "localize", "evaluate", "visualize", "report")
+"""Rows of the table; the map is the first part of the stage `localize`, and the report what follows the last stage."""
+MANIFEST: dict[str, Any] = {
+    "description": "A rendered street.",
+    "queries": "keyframes_pruned",
+    "embed": {"model": "vlad"},
+    "localize": {"method": "pnp", "features": {"kinds": ["sift"], "escalation": []}},
+}
+MIB = 2**20
+
+
+class Watch(threading.Thread):
+    """Samples the memory of a run's processes, and which stage they are at."""
+
+    def __init__(self, process: subprocess.Popen[bytes], run: Path) -> None:
+        super().__init__(daemon=True)
+        self.process, self.run_dir = process, run
+        self.peaks: dict[str, dict[str, float]] = {}
+        """Highest sums by stage, in MB: `pss`, `rss`."""
+        self.began: dict[str, float] = {}
+        """When a stage was first seen, seconds."""
+        self.start()
+
+    def run(self) -> None:
+        import psutil
+
+        me = psutil.Process(self.process.pid)
+        while self.process.poll() is None:
+            with suppress(psutil.Error):
+                stage = self._stage()
+                self.began.setdefault(stage, time.perf_counter())
+                sums = {"pss": 0.0, "rss": 0.0}
+                for process in [me, *me.children(recursive=True)]:
+                    with suppress(psutil.Error, OSError):
+                        sums["rss"] += process.memory_info().rss / MIB
+                        sums["pss"] += _proportional_mb(process.pid)
+                peak = self.peaks.setdefault(stage, dict.fromkeys(sums, 0.0))
+                for name, total in sums.items():
+                    peak[name] = max(peak[name], total)
+            time.sleep(0.5)
+        self.ended = time.perf_counter()
+
+    def _stage(self) -> str:
+        try:
+            done = len(json.loads((self.run_dir / "run.json").read_text())["stages"])
+        except (OSError, ValueError):
+            return STAGES[0]
+        stage = [name for name in STAGES if name != "map"][min(done, len(STAGES) - 2)]
+        maps = SceneFiles(self.run_dir, SCENE).maps
+        return "map" if stage == "localize" and not any(maps.glob("*.npz")) else stage
+
+
+def _proportional_mb(pid: int) -> float:
+    """Return a process's proportional set size; 0 where the system does not tell."""
+    with suppress(OSError):
+        for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines():
+            if line.startswith("Pss:"):
+                return int(line.split()[1]) / 1024
+    return 0.0
+
+
+def render(folder: Path, images: int) -> Path:
+    """Render the street of about so many map images, if it is not there; whole blocks."""
+    from toolkit.synthetic import render_street
+
+    blocks = max(1, round(images / FRAMES))
+    return render_street(folder / SCENE, blocks, round(images / blocks), QUERIES, progress=sys.stderr.isatty())
+
+
+def measure(folder: Path, images: int, settings: list[str], resume: bool) -> dict[str, Any]:
+    """Run the chain on the street of so many images; return what it took."""
+    capture = in_own_process(render, folder, images)
+    record, run = folder / "measured.json", folder / "runs" / "scale"
+    if resume and record.exists():
+        return dict(json.loads(record.read_text()))
+    record.unlink(missing_ok=True)
+    if not resume:
+        shutil.rmtree(run.parent, ignore_errors=True)
+    manifest = folder / "scale.yaml"
+    # JSON is YAML.
+    manifest.write_text(json.dumps(MANIFEST | {"captures": [str(capture)], "output_root": str(run.parent)}, indent=1))
+    started, load = time.perf_counter(), os.getloadavg()[0]
+    command = [sys.executable, "-m", "toolkit", "run", manifest, *(f"--set={one}" for one in settings)]
+    with open(folder / "run.log", "ab") as log:
+        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
+        watch = Watch(process, run)
+        status = process.wait()
+    watch.join()
+    if status:
+        raise SystemExit(f"The run of {images} images ended with {status}: see {folder / 'run.log'}.")
+    measured = {"load": [load, os.getloadavg()[0]], "total": time.perf_counter() - started}
+    measured |= read_run(run, capture) | {"peaks": watch.peaks, "seconds": seconds_of(run, watch)}
+    record.write_text(json.dumps(measured, indent=1) + "\n")
+    return measured
+
+
+def seconds_of(run: Path, watch: Watch) -> dict[str, float]:
+    """Return the seconds of each row of the table."""
+    rows = {row["stage"]: row for row in json.loads((run / "run.json").read_text())["stages"]}
+    seconds = {stage: float(row["work_seconds"]) for stage, row in rows.items()}
+    if {"map", "localize"} <= watch.began.keys():  # else the stage was reused
+        localizing = watch.began["evaluate"] - watch.began["localize"]
+        seconds["map"] = max(0.0, seconds["localize"] - localizing)
+        seconds["localize"] = min(seconds["localize"], localizing)
+    if "report" in watch.began:
+        seconds["report"] = watch.ended - watch.began["report"]
+    return seconds
+
+
+def read_run(run: Path, capture: Path) -> dict[str, Any]:
+    """Return sizes, counts and accuracy of a finished run."""
+    import pandas as pd
+
+    files = [path.stat().st_size for path in run.rglob("*") if path.is_file()]
+    rows = {row["stage"]: row["counts"] for row in json.loads((run / "run.json").read_text())["stages"]}
+    recall = pd.read_csv(run / SCENE / "evaluation" / "recall.csv").iloc[0]
+    names = [name for name in recall.index if name.startswith("recall@")]
+    return {
+        "images": sum(1 for _ in open(capture / "sessions" / "ios_map" / "images.txt")) - 1,
+        "queries": int(recall["queries"]),
+        "counts": rows,
+        "ok": float((pd.read_csv(next((run / SCENE / "poses").glob("*.csv")))["status"] == "ok").mean()),
+        "recall": {name: float(recall[name]) for name in names},
+        "files": len(files),
+        "bytes": sum(files),
+    }
+
+
+def exponent(sizes: list[float], values: list[float]) -> float:
+    """Return the slope of log values over log sizes by least squares; NaN for fewer than two sizes."""
+    known = [(size, value) for size, value in zip(sizes, values, strict=True) if value > 0]
+    if len(known) < 2:
+        return float("nan")
+    return float(np.polyfit(*np.log(known).T, 1)[0])
+
+
+def growth_table(sizes: list[float], rows: dict[str, list[float]], form: str) -> str:
+    """Return a table: a row a stage, a column a size, the fitted exponent and that of the two largest sizes."""
+    header = ["", *(f"{size:,.0f}" for size in sizes), "exponent", "of the last two"]
+    lines = [
+        [name, *(format(value, form) for value in values), f"{exponent(sizes, values):.2f}",
+         f"{exponent(sizes[-2:], values[-2:]):.2f}"]
+        for name, values in rows.items()
+    ]  # fmt: skip
+    return markdown_table(header, lines)
+
+
+def draw_growth(path: Path, sizes: list[float], seconds: dict[str, list[float]], mb: dict[str, list[float]]) -> None:
+    """Draw seconds and memory over images, a line a row, with the slope in the legend."""
+    import matplotlib as mpl
+
+    mpl.use("agg")
+    from matplotlib import pyplot as plt
+    from matplotlib import ticker
+
+    figure, axes = plt.subplots(1, 2, figsize=(15, 5.5), layout="constrained")
+    for panel, rows, label in zip(axes, (seconds, mb), ("seconds", "peak memory, MB"), strict=True):
+        for (name, values), marker in zip(rows.items(), "osD^v<>PXh*" * 3, strict=False):
+            panel.plot(sizes, values, marker=marker, label=f"{name}: {exponent(sizes, values):.2f}")
+        panel.set(xscale="log", yscale="log", xlabel="map images", ylabel=label, xticks=sizes)
+        panel.set_xticks(sizes, [f"{size:,.0f}" for size in sizes])
+        panel.xaxis.set_minor_locator(ticker.NullLocator())
+        for axis in (panel.yaxis.set_major_formatter, panel.yaxis.set_minor_formatter):
+            axis(ticker.LogFormatter(minor_thresholds=(2, 0.5)))
+        panel.grid(alpha=0.3)
+        low, high = panel.get_ylim()
+        panel.plot(sizes, [low * 1.3 * size / sizes[0] for size in sizes], "k:", lw=1, label="linear: 1.00")
+        panel.set_ylim(low, high)
+        panel.legend(title="slope", loc="upper left", bbox_to_anchor=(1, 1))
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+class Books:
+    """A map of poses and random descriptors, and what is done with it without pixels; `steps` are timed in order."""
+
+    def __init__(self, folder: Path, images: int) -> None:
+        self.capture_dir, self.images = folder / SCENE, images
+        self.run = folder / "run"
+
+    @property
+    def steps(self) -> list[tuple[str, Callable[[], object]]]:
+        return [
+            ("write the sessions", self.write),
+            ("open the sessions", self.open),
+            ("select pairs", self.select_pairs),
+            ("plan tiles", self.plan_tiles),
+            ("write descriptors", self.write_descriptors),
+            ("retrieve", self.retrieve),
+            ("write poses", self.write_poses),
+            ("evaluate", self.evaluate),
+        ]
+
+    def write(self) -> None:
+        """Write both sessions, a phone's: a camera an image. 100 blocks stand in a row, the rows 40 m apart."""
+        import pandas as pd
+
+        from toolkit.capture import Trajectory, write_session
+        from toolkit.geometry import qt_from_pose
+        from toolkit.synthetic.devices import DEVICES, walk_street
+        from toolkit.synthetic.scene import BLOCK_M, Scene
+
+        (sensor,) = DEVICES["ios"].sensors
+        poses: dict[str, list[np.ndarray]] = {"map": [], "query": []}
+        for index in range(max(1, round(self.images / FRAMES))):
+            origin = np.array([BLOCK_M[0] * (index % 100), 40.0 * (index // 100), 0.0])
+            walks = walk_street(Scene(origin, BLOCK_M, True), 0, {"map": FRAMES, "query": QUERIES}, "ios")
+            for (split, _), bodies in walks.items():
+                poses[split].append(bodies @ sensor.body_from_cam)
+        for split, of_blocks in poses.items():
+            qt = qt_from_pose(np.concatenate(of_blocks))
+            times = [10**9 * (1 + (split == "query")) + 10**6 * i for i in range(len(qt))]
+            ids = [f"walk/cam_phone_{stamp}" for stamp in times]
+            trajectory = Trajectory(times, ids, qt)
+            keyframes = pd.DataFrame({"timestamp": times, "device_id": ids})
+            asked = {"keyframes": {"pruned": keyframes}, "ground_truth": trajectory}
+            write_session(
+                self.capture_dir / "sessions" / f"ios_{split}",
+                sensors=[(name, "phone", "camera", "PINHOLE", *sensor.size, *sensor.params) for name in ids],
+                rigs=None,
+                trajectory=trajectory if split == "map" else None,
+                images=[(*key, f"walk/images/{key[0]}.jpg") for key in zip(times, ids, strict=True)],
+                subsessions=["walk"],
+                **(asked if split == "query" else {}),
+            )
+
+    def open(self) -> None:
+        """Open the sessions; poses and cameras of the map."""
+        from toolkit.capture import Capture
+
+        self.capture = Capture.open(self.capture_dir)
+        session = self.capture["ios_map"]
+        self.poses = session.world_from_cam()
+        self.cameras = [session.camera(sensor) for sensor in session.images["sensor_id"]]
+
+    def select_pairs(self) -> None:
+        from toolkit.localizers.mapping import instants, select_pairs
+
+        session = self.capture["ios_map"]
+        groups = instants(session, np.arange(len(self.poses)))
+        self.pairs = select_pairs(self.poses, self.cameras, groups)
+
+    def plan_tiles(self) -> None:
+        from toolkit.localizers.tiles import plan_tiles
+        from toolkit.manifest import MapSettings
+
+        self.tiles = plan_tiles(self.poses[:, :3, 3] + 4 * self.poses[:, :3, 2], self.pairs, MapSettings().tile_images)
+
+    def write_descriptors(self) -> None:
+        """Write as many random numbers as VLAD has dimensions, as float16."""
+        from toolkit.embedders.stored import MANIFEST_COLUMNS
+
+        rng = np.random.default_rng(0)
+        for session in (self.capture[name] for name in self.capture):
+            folder = self.run / "embeddings" / session.id / "walk"
+            folder.mkdir(parents=True)
+            np.save(folder / "walk.npy", rng.standard_normal((len(session.images), 512), np.float32).astype(np.float16))
+            table = session.images.assign(row_index=range(len(session.images)), device_id=session.device_ids)
+            table["abs_path"] = [f"{SCENE}/sessions/{session.id}/raw_data/{path}" for path in table["path"]]
+            table[MANIFEST_COLUMNS].to_csv(folder / "manifest.csv", index=False)
+
+    def retrieve(self) -> None:
+        from toolkit.retrieve import retrieve_pairs
+
+        folders = self.capture_dir / "sessions", self.run / "embeddings", self.run / "retrieval"
+        retrieve_pairs(*folders, queries="keyframes_pruned")
+
+    def write_poses(self) -> None:
+        """Write the true poses as the localized ones."""
+        truth = self.capture["ios_query"].ground_truth
+        assert truth is not None
+        (self.run / "poses").mkdir()
+        truth.write(self.run / "poses" / f"{SCENE}_map_ios_query_ios.txt")
+
+    def evaluate(self) -> None:
+        from toolkit.evaluate import evaluate_scene
+
+        folders = (self.run / name for name in ("poses", "retrieval", "evaluation"))
+        evaluation = evaluate_scene(self.capture_dir / "sessions", *folders, queries="keyframes_pruned")
+        assert evaluation.recall["localized"].sum() == len(self.capture["ios_query"].images)
+
+
+def keep_books(folder: Path, images: int) -> dict[str, dict[str, float]]:
+    """Time every step for so many images; should be a fresh process. Returns seconds and MB by step."""
+    from threadpoolctl import threadpool_limits
+
+    import toolkit.evaluate
+    import toolkit.localizers.mapping  # noqa: F401  # that imports take time is no matter of size
+
+    shutil.rmtree(folder, ignore_errors=True)
+    books, found = Books(folder, images), dict[str, dict[str, float]]()
+    with threadpool_limits(1):
+        for name, step in books.steps:
+            _forget_peak()
+            before, started = _status_mb("VmRSS"), time.perf_counter()
+            step()
+            seconds = time.perf_counter() - started
+            found[name] = {"seconds": seconds, "mb": max(0.1, _status_mb("VmHWM") - before)}
+            print(f"{images} {name}: {found[name]}", flush=True)
+    shutil.rmtree(folder)
+    return found
+
+
+def _forget_peak() -> None:
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+def _status_mb(name: str) -> float:
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(f"{name}:"):
+            return int(line.split()[1]) / 1024
+    return 0.0
+
+
+def report_run(measured: list[dict[str, Any]], threads: int, plot: Path) -> str:
+    """Return the tables of rendered streets, and draw their growth."""
+    sizes = [float(one["images"]) for one in measured]
+    nan = float("nan")
+    stages = [stage for stage in STAGES if any(stage in one["seconds"] for one in measured)]
+    seconds = {stage: [one["seconds"].get(stage, nan) for one in measured] for stage in stages}
+    mb = {stage: [one["peaks"].get(stage, {}).get("pss", nan) for one in measured] for stage in stages}
+    resident = {"sum of RSS, all stages": [max(peak["rss"] for peak in one["peaks"].values()) for one in measured]}
+    disk = {"files": [one["files"] for one in measured], "MB": [one["bytes"] / MIB for one in measured]}
+    seconds["from capture to report"] = [one["total"] for one in measured]
+    draw_growth(plot, sizes, seconds, mb)
+    names = list(measured[0]["recall"])
+    accuracy = [
+        [f"{one['images']:,}", str(one["queries"]), f"{100 * one['ok']:.1f} %",
+         *(f"{100 * one['recall'][name]:.1f} %" for name in names), "{:.1f} / {:.1f}".format(*one["load"])]
+        for one in measured
+    ]  # fmt: skip
+    return "\n\n".join((
+        f"Seconds by map images, {threads} threads:", growth_table(sizes, seconds, ".1f"),
+        "Peak memory of all processes, MB (sum of PSS):", growth_table(sizes, mb | resident, ".0f"),
+        "The run's folder:", growth_table(sizes, disk, ".0f"),
+        markdown_table(["map images", "queries", "ok", *names, "load before / after"], accuracy),
+    )) + "\n"  # fmt: skip
+
+
+def report_books(sizes: list[int], found: list[dict[str, dict[str, float]]]) -> str:
+    """Return the tables of poses without pixels."""
+    exact = [float(size) for size in sizes]
+    rows = {name: {key: [one[name][key] for one in found] for key in ("seconds", "mb")} for name in found[0]}
+    return "\n\n".join((
+        "Bookkeeping alone, seconds by map images, 1 thread:",
+        growth_table(exact, {name: row["seconds"] for name, row in rows.items()}, ".2f"),
+        "Memory that a step adds at most, MB:",
+        growth_table(exact, {name: row["mb"] for name, row in rows.items()}, ".0f"),
+    )) + "\n"  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--images", type=int, nargs="+", default=[60, 240], help="map images of each street")
+    parser.add_argument("--bookkeeping", type=int, nargs="+", metavar="IMAGES", help="instead: no pixels")
+    parser.add_argument("--folder", type=Path, default=Path("runs/scale"), help="of captures, runs and results; kept")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--set", dest="settings", action="append", default=[], metavar="KEY=VALUE", help="of the run")
+    parser.add_argument("--render-only", action="store_true", help="render the captures, and measure nothing")
+    parser.add_argument(
+        "--resume", action="store_true", help="keep figures of before, and go on with a run that was stopped"
+    )
+    add_out(parser)
+    options = parser.parse_args()
+    check_out(parser, options.out)
+    limit_cores(options.threads)
+    root = options.folder.resolve()
+    root.mkdir(parents=True, exist_ok=True)
+    if options.render_only:
+        for images in options.images:
+            print(in_own_process(render, root / str(images), images))
+        return
+    if options.bookkeeping:
+        sizes = sorted(options.bookkeeping)
+        found = [in_own_process(keep_books, root / "bookkeeping", images) for images in sizes]
+        text, name = report_books(sizes, found), "bookkeeping"
+        document: dict[str, Any] = {"sizes": sizes, "steps": found}
+    else:
+        measured = [
+            measure(root / str(images), images, options.settings, options.resume) for images in sorted(options.images)
+        ]
+        text, name = report_run(measured, options.threads, root / "growth.png"), "scale"
+        document = {"threads": options.threads, "settings": options.settings, "sizes": measured}
+    print(text)
+    write_out([*options.out, root / f"{name}.md", root / f"{name}.json"], text, document)
+    print(f"Results: {root}")
+
+
+if __name__ == "__main__":
+    main()
