@@ -335,7 +335,7 @@ class MapPlan(Remade):
             write_sidecar(path, record)
 
     def _pairs_in(self, number: int) -> Ints:
-        """Return the pairs of the images of a tile, with those that are in none of two cores."""
+        """Return the pairs that the images of a tile are among themselves."""
         images = self.tiles[number].images
         pairs = np.concatenate([self.pairs_of[tile] for tile in np.unique(self._home[images])])
         return pairs[np.isin(pairs, images).all(axis=1)]

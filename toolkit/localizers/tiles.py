@@ -127,7 +127,7 @@ def join_tiles(
         )
         error2, freedom = error2 + refined.error2, freedom + refined.freedom
         counts[number] = len(points), len(observations)
-        of_image += np.bincount(observations[:, 0], minlength=len(of_image))
+        np.add.at(of_image, observations[:, 0], 1)
     noise_px = float(np.sqrt(error2 / max(freedom, 1)))
     return _written(images, length, counts, of_image, noise_px, folder)
 
@@ -197,7 +197,7 @@ def _written(
         counts: (T, 2) points and observations of each tile.
         of_image: (N,) observations of each image.
     """
-    (num_points, num_observations), num_images = counts.sum(axis=0).tolist(), len(of_image)
+    num_points, num_observations = counts.sum(axis=0).tolist()
 
     def array(name: str, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
         # What cannot be mapped, as it has no bytes, takes none either.
@@ -217,9 +217,9 @@ def _written(
             rows = tile["observations"]
             here = slice(point, point + len(tile["points"]))
             points[here], colors[here] = tile["points"], tile["colors"]
-        starts = np.searchsorted(rows[:, 0], np.arange(num_images + 1)) if len(rows) else np.zeros(num_images + 1)
-        at = free[rows[:, 0]] + np.arange(len(rows)) - starts[rows[:, 0]].astype(np.int64)
-        np.add.at(free, rows[:, 0], 1)
+        seeing, begin, each = np.unique(rows[:, 0], return_index=True, return_counts=True)
+        at = np.repeat(free[seeing] - begin, each) + np.arange(len(rows))
+        free[seeing] += each
         obs_image[at], obs_keypoint[at], obs_point[at] = rows[:, 0], rows[:, 1], rows[:, 2] + point
         order = np.lexsort((at, rows[:, 2]))
         by_point[observation : observation + len(rows)] = at[order]
