@@ -7,6 +7,7 @@ import time
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -138,6 +139,9 @@ def test_half_a_photograph_is_refused_at_any_size(tmp_path: Path) -> None:
         ({"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"}, 64),
         ({"cpu/cpu.cfs_quota_us": "400000", "cpu/cpu.cfs_period_us": "100000"}, 4),
         ({"cpu.max": "nonsense"}, 64),
+        ({"memory.max": "max"}, 64),
+        ({"cpu.max": "800000 100000", "memory.max": str(2 << 30)}, 4),
+        ({"memory/memory.limit_in_bytes": str(1 << 63)}, 64),
     ],
 )
 def test_workers_are_the_cores_that_a_container_has(
@@ -145,6 +149,7 @@ def test_workers_are_the_cores_that_a_container_has(
 ) -> None:
     monkeypatch.delenv(WORKERS, raising=False)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(64), raising=False)
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(total=128 << 30))
     monkeypatch.setattr("toolkit.capture.images._CGROUPS", tmp_path)
     for name, text in files.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)

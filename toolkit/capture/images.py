@@ -1,6 +1,5 @@
 """Decode images, with errors that say whether a file is missing or unreadable."""
 
-import math
 import os
 import stat
 from collections import deque
@@ -24,6 +23,8 @@ R = TypeVar("R")
 
 WORKERS = "TOOLKIT_WORKERS"
 """Environment variable: the threads that this process may use."""
+THREAD_BYTES = 1 << 29
+"""Memory for each thread: SIFT of a photograph of 4000 x 3000 pixels takes 460 MB."""
 MOST_BYTES = 1 << 30
 """Of a file that is read as an image."""
 MOST_PIXELS = 1 << 28
@@ -35,8 +36,7 @@ _HEADER_READERS: dict[bytes, Callable[[Any], PIL.Image.Image]] = {
     b"": PIL.Image.open,
 }
 _REDUCED = {8: cv2.IMREAD_REDUCED_COLOR_8, 4: cv2.IMREAD_REDUCED_COLOR_4, 2: cv2.IMREAD_REDUCED_COLOR_2}
-_CGROUPS = Path("/sys/fs/cgroup")
-_QUOTA_FILES = (("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us"))  # version 2, version 1
+_CGROUPS = Path("/sys/fs/cgroup")  # its files are named differently in versions 2 and 1
 _HEADER_ERRORS = (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError)
 
 
@@ -171,21 +171,27 @@ def read_for_display(path: str | Path) -> NDArray[np.uint8]:
 def default_workers() -> int:
     """Return the default number of threads: what `WORKERS` says, else the cores that this process may use.
 
-    These are limited by its affinity and by the quota of its container.
+    These are limited by its affinity, by the quota of its container, and by the memory of the machine or the container,
+    of which each thread should have `THREAD_BYTES`.
     """
+    import psutil
+
     if os.environ.get(WORKERS, "").isdigit():
         return int(os.environ[WORKERS])
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, int(min(cores, _quota())))
+    limits = [cores, psutil.virtual_memory().total / THREAD_BYTES]
+    for files in (("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us")):
+        limits += [quota / period for quota, period in _of_control_group(*files) if quota > 0]
+    for file in ("memory.max", "memory/memory.limit_in_bytes"):
+        limits += [limit / THREAD_BYTES for (limit,) in _of_control_group(file)]
+    return max(1, int(min(limits)))
 
 
-def _quota() -> float:
-    """Return the cores whose time the control group of this process may use, as containers limit them; or infinity."""
-    for files in _QUOTA_FILES:
-        with suppress(OSError, ValueError):  # of another version of control groups; or `max`, for no limit
-            quota, period = (int(text) for file in files for text in (_CGROUPS / file).read_text().split())
-            return quota / period if quota > 0 else math.inf
-    return math.inf
+def _of_control_group(*files: str) -> list[list[int]]:
+    """Return the numbers in files of this process's control group; nothing where it has none or they say `max`."""
+    with suppress(OSError, ValueError):
+        return [[int(text) for file in files for text in (_CGROUPS / file).read_text().split()]]
+    return []
 
 
 def prefetch(function: Callable[[T], R], items: Iterable[T], workers: int = 2, ahead: int = 4) -> Iterator[R]:
