@@ -39,6 +39,34 @@ def triangulate(
         The map, its points not yet colored.
     """
     settings = settings or MapSettings()
+    tracks = _tracks(names, cameras, world_from_cams, keypoints, pairs, matches, settings, seed)
+    # What COLMAP took, some 2 MB an image, is free now.
+    refined = refine_points(*tracks, cameras, world_from_cams, keypoints, settings)
+    points, observations = refined.points, refined.observations
+    return LocalMap(
+        image_names=list(names),
+        cameras=list(cameras),
+        world_from_cams=np.asarray(world_from_cams, np.float64),
+        points=points,
+        colors=np.full((len(points), 3), 128, np.uint8),
+        obs_image=observations[:, 0],
+        obs_keypoint=observations[:, 1],
+        obs_point=observations[:, 2],
+        noise_px=np.full(len(points), refined.noise_px, np.float32),
+    )
+
+
+def _tracks(
+    names: Sequence[str],
+    cameras: Sequence[pycolmap.Camera],
+    world_from_cams: Floats,
+    keypoints: Sequence[NDArray[np.float32]],
+    pairs: Ints,
+    matches: Sequence[Ints],
+    settings: MapSettings,
+    seed: int,
+) -> tuple[Floats, Ints]:
+    """Return points (P, 3) as COLMAP triangulates them, and their sorted observations (n, 3): image, keypoint, point."""
     graph = pycolmap.CorrespondenceGraph()
     reconstruction = pycolmap.Reconstruction()
     for index, (name, camera, cam_from_world, xy) in enumerate(
@@ -69,27 +97,14 @@ def triangulate(
     triangulator.complete_all_tracks(options)
     triangulator.merge_all_tracks(options)
     observed.filter_all_points3D(settings.max_reprojection_error_px, settings.min_triangulation_angle_deg)
-    triangulated = sorted(reconstruction.points3D.items())
-    ids = np.array([number for number, _ in triangulated], np.uint64)
-    points = np.array([point.xyz for _, point in triangulated]).reshape(-1, 3)
+    places = {number: point.xyz for number, point in reconstruction.points3D.items()}
+    ids = np.array(sorted(places), np.uint64)
     rows = [np.zeros((0, 3), np.int64)]
     for index in range(len(names)):
         of_keypoint = np.array([point.point3D_id for point in reconstruction.image(index + 1).points2D], np.uint64)
         seen = np.flatnonzero(np.isin(of_keypoint, ids))
         rows.append(np.column_stack([np.full(len(seen), index), seen, np.searchsorted(ids, of_keypoint[seen])]))
-    refined = refine_points(points, np.concatenate(rows), cameras, world_from_cams, keypoints, settings)
-    points, observations = refined.points, refined.observations
-    return LocalMap(
-        image_names=list(names),
-        cameras=list(cameras),
-        world_from_cams=np.asarray(world_from_cams, np.float64),
-        points=points,
-        colors=np.full((len(points), 3), 128, np.uint8),
-        obs_image=observations[:, 0],
-        obs_keypoint=observations[:, 1],
-        obs_point=observations[:, 2],
-        noise_px=np.full(len(points), refined.noise_px, np.float32),
-    )
+    return np.array([places[number] for number in sorted(places)]).reshape(-1, 3), np.concatenate(rows)
 
 
 class RefinedPoints(NamedTuple):
