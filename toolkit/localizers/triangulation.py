@@ -66,7 +66,7 @@ def _tracks(
     settings: MapSettings,
     seed: int,
 ) -> tuple[Floats, Ints]:
-    """Return points (P, 3) as COLMAP triangulates them, and their sorted observations (n, 3): image, keypoint, point."""
+    """Return points (P, 3) as COLMAP triangulates them, and sorted observations (n, 3): image, keypoint, point."""
     graph = pycolmap.CorrespondenceGraph()
     reconstruction = pycolmap.Reconstruction()
     for index, (name, camera, cam_from_world, xy) in enumerate(
