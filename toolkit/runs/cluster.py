@@ -71,7 +71,7 @@ class Cluster:
             label, unit: of the bar.
 
         Raises:
-            ToolkitError: a share killed several workers; else what the function raised.
+            ToolkitError: a share killed several workers, or none is left; else what the function raised.
         """
         from distributed import KilledWorker, wait
 
@@ -91,15 +91,11 @@ class Cluster:
                     try:
                         done, running = wait(running, timeout=_CHECK_S, return_when="FIRST_COMPLETED")
                     except TimeoutError:
-                        self._client.wait_for_workers(1, timeout=_WAIT_S)
+                        self._await_worker(label)
                         continue
                     for future in done:
                         future.result()
                         bar.update(futures[future])
-        except TimeoutError:
-            raise ToolkitError(
-                f"{label}: no worker is left, and none came for {_WAIT_S} s. What was done is kept."
-            ) from None
         except KilledWorker as error:
             raise ToolkitError(
                 f"{label}: several workers died of one share ({first_line(error)}). Most likely it needs more memory "
@@ -107,6 +103,14 @@ class Cluster:
             ) from None
         finally:
             self._client.cancel(list(futures))
+
+    def _await_worker(self, label: str) -> None:
+        try:
+            self._client.wait_for_workers(1, timeout=_WAIT_S)
+        except TimeoutError:
+            raise ToolkitError(
+                f"{label}: no worker is left, and none came for {_WAIT_S} s. What was done is kept."
+            ) from None
 
 
 def _run_share(here: str, environment: Mapping[str, str], function: Callable[..., None], *share: Any) -> None:
