@@ -11,7 +11,7 @@ run.json, without starting a kernel; of `localize`, those until the map stands a
 all processes of the run, sampled twice a second: the sum of their proportional sets (PSS: a page that several have
 mapped counts once in all), and of their resident sets (RSS: it counts in each). The exponent is the slope of a line
 through log seconds over log images: 1 is linear. FOLDER/growth.png draws it, FOLDER/scale.md and scale.json hold the
-figures.
+figures. With --resume, sizes that were measured before are taken as they were, and a stopped run goes on.
 
 With --bookkeeping, what needs no pixels, for maps of poses and random descriptors along such streets, each size in a
 process of its own: peak memory is the process's largest resident set while a step runs, less what it had before.
@@ -20,6 +20,7 @@ process of its own: peak memory is the process's largest resident set while a st
 import argparse
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -52,9 +53,9 @@ MIB = 2**20
 class Watch(threading.Thread):
     """Samples the memory of a run's processes, and which stage they are at."""
 
-    def __init__(self, process: subprocess.Popen[bytes], run: Path) -> None:
+    def __init__(self, process: subprocess.Popen[bytes], run: Path, log: Path) -> None:
         super().__init__(daemon=True)
-        self.process, self.run_dir = process, run
+        self.process, self.run_dir, self.log = process, run, log
         self.peaks: dict[str, dict[str, float]] = {}
         """Highest sums by stage, in MB: `pss`, `rss`."""
         self.began: dict[str, float] = {}
@@ -81,11 +82,13 @@ class Watch(threading.Thread):
         self.ended = time.perf_counter()
 
     def _stage(self) -> str:
-        try:
-            done = len(json.loads((self.run_dir / "run.json").read_text())["stages"])
-        except (OSError, ValueError):
+        """Return the stage that the log names last: each begins a line with its name, and ends it when it is done."""
+        begun = list(re.finditer(r"^\[(\d+)/(\d+)\] +(\w+)(.*\n)?", self.log.read_text(), re.MULTILINE))
+        if not begun:
             return STAGES[0]
-        stage = [name for name in STAGES if name != "map"][min(done, len(STAGES) - 2)]
+        number, of, stage, ended = begun[-1].groups()
+        if number == of and ended:
+            return "report"
         maps = SceneFiles(self.run_dir, SCENE).maps
         return "map" if stage == "localize" and not any(maps.glob("*.npz")) else stage
 
@@ -121,15 +124,22 @@ def measure(folder: Path, images: int, settings: list[str], resume: bool) -> dic
     manifest.write_text(json.dumps(MANIFEST | {"captures": [str(capture)], "output_root": str(run.parent)}, indent=1))
     started, load = time.perf_counter(), os.getloadavg()[0]
     command = [sys.executable, "-m", "toolkit", "run", manifest, *(f"--set={one}" for one in settings)]
-    with open(folder / "run.log", "ab") as log:
+    path = folder / "run.log"
+    with open(path, "wb") as log:
         process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
-        watch = Watch(process, run)
+        watch = Watch(process, run, path)
         status = process.wait()
     watch.join()
     if status:
-        raise SystemExit(f"The run of {images} images ended with {status}: see {folder / 'run.log'}.")
+        raise SystemExit(f"The run of {images} images ended with {status}: see {path}.")
     measured = {"load": [load, os.getloadavg()[0]], "total": time.perf_counter() - started}
     measured |= read_run(run, capture) | {"peaks": watch.peaks, "seconds": seconds_of(run, watch)}
+    # Of stages that a run before this one did, their records have to do.
+    for stage, (mb, _) in measured["stages"].items():
+        peak = measured["peaks"].setdefault(stage, {"pss": 0.0, "rss": 0.0})
+        peak["pss"] = max(peak["pss"], 0.0 if stage == "localize" and "map" in measured["peaks"] else mb)
+    stages = sum(seconds for _, seconds in measured.pop("stages").values())
+    measured["total"] = max(measured["total"], stages + measured["seconds"].get("report", 0.0))
     record.write_text(json.dumps(measured, indent=1) + "\n")
     return measured
 
@@ -152,13 +162,14 @@ def read_run(run: Path, capture: Path) -> dict[str, Any]:
     import pandas as pd
 
     files = [path.stat().st_size for path in run.rglob("*") if path.is_file()]
-    rows = {row["stage"]: row["counts"] for row in json.loads((run / "run.json").read_text())["stages"]}
+    record = json.loads((run / "run.json").read_text())["stages"]
     recall = pd.read_csv(run / SCENE / "evaluation" / "recall.csv").iloc[0]
     names = [name for name in recall.index if name.startswith("recall@")]
     return {
+        "stages": {row["stage"]: (row["peak_memory_mb"], row["seconds"]) for row in record},
         "images": sum(1 for _ in open(capture / "sessions" / "ios_map" / "images.txt")) - 1,
         "queries": int(recall["queries"]),
-        "counts": rows,
+        "counts": {row["stage"]: row["counts"] for row in record},
         "ok": float((pd.read_csv(next((run / SCENE / "poses").glob("*.csv")))["status"] == "ok").mean()),
         "recall": {name: float(recall[name]) for name in names},
         "files": len(files),
@@ -200,8 +211,9 @@ def draw_growth(path: Path, sizes: list[float], seconds: dict[str, list[float]],
         panel.set(xscale="log", yscale="log", xlabel="map images", ylabel=label, xticks=sizes)
         panel.set_xticks(sizes, [f"{size:,.0f}" for size in sizes])
         panel.xaxis.set_minor_locator(ticker.NullLocator())
-        for axis in (panel.yaxis.set_major_formatter, panel.yaxis.set_minor_formatter):
-            axis(ticker.LogFormatter(minor_thresholds=(2, 0.5)))
+        panel.yaxis.set_major_formatter("{x:g}")
+        if np.ptp(np.log10(panel.get_ylim())) < 1.5:
+            panel.yaxis.set_minor_formatter("{x:g}")
         panel.grid(alpha=0.3)
         low, high = panel.get_ylim()
         panel.plot(sizes, [low * 1.3 * size / sizes[0] for size in sizes], "k:", lw=1, label="linear: 1.00")
@@ -415,6 +427,8 @@ def main() -> None:
         sizes = sorted(options.bookkeeping)
         found = [in_own_process(keep_books, root / "bookkeeping", images) for images in sizes]
         text, name = report_books(sizes, found), "bookkeeping"
+        rows = [{step: [one[step][key] for one in found] for step in found[0]} for key in ("seconds", "mb")]
+        draw_growth(root / "bookkeeping.png", [float(size) for size in sizes], *rows)
         document: dict[str, Any] = {"sizes": sizes, "steps": found}
     else:
         measured = [

@@ -10,7 +10,8 @@ from toolkit.capture import Capture
 from toolkit.errors import ArtifactError
 from toolkit.localizers.correspondences import LocalizedQuery
 from toolkit.localizers.local_map import LocalMap
-from toolkit.show.localized import LocalizedPair, load_maps, map_files
+from toolkit.show import localized
+from toolkit.show.localized import LocalizedPair, load_maps, map_files, sure_points
 from toolkit.show.stills import draw_localization
 
 INLIERS = [True, False, True, True, False, True]
@@ -155,3 +156,17 @@ def test_maps_are_those_that_the_poses_were_found_with(tmp_path):
     write_queries(tmp_path / f"{poses.name}.h5", {}, ["ios_map-superpoint.npz", "ios_map-gone.npz"])
     assert [path.name for path in map_files(tmp_path, "ios_map", poses)] == ["ios_map-superpoint.npz"]
     assert load_maps([tmp_path / "ios_map-other.npz"]) is None
+
+
+def test_of_a_large_map_a_regular_choice_of_points_is_shown(monkeypatch):
+    seen_by = np.array([3, 2, 3, 4, 3, 3, 1, 3, 3])  # images, of each point
+    obs_point = np.repeat(np.arange(9), seen_by)
+    obs_image = np.concatenate([np.arange(count) for count in seen_by])
+    points, colors = np.arange(27.0).reshape(9, 3), np.arange(27, dtype=np.uint8).reshape(9, 3)
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    local_map = LocalMap(list("abcd"), [], poses, points, colors, obs_image, obs_point, obs_point, np.ones(9))
+    for most, shown in ((7, [0, 2, 3, 4, 5, 7, 8]), (6, [0, 3, 5, 8]), (3, [0, 4, 8])):
+        monkeypatch.setattr(localized, "MAX_POINTS", most)
+        chosen, their_colors = sure_points(local_map)
+        np.testing.assert_array_equal(chosen, points[shown])
+        np.testing.assert_array_equal(their_colors, colors[shown])

@@ -56,11 +56,19 @@ def load_maps(paths: Sequence[Path]) -> LocalMap | None:
     return LocalMap.pooled(maps) if maps else None
 
 
+MAX_POINTS = 1_000_000
+"""Points of a map that are shown at most: a viewer takes some 30 bytes for each."""
+
+
 def sure_points(local_map: LocalMap | None) -> tuple[Floats, NDArray[np.uint8] | None]:
-    """Return the points that at least three images see, (P, 3), and their colors (P, 3) RGB; the rest is noisy."""
+    """Return the points that at least three images see, (P, 3), and their colors (P, 3) RGB; the rest is noisy.
+
+    Of a large map a regular choice of `MAX_POINTS` at most.
+    """
     if local_map is None:
         return np.zeros((0, 3)), None
-    sure = np.diff(local_map.point_starts) >= 3
+    sure = np.flatnonzero(np.diff(local_map.point_starts) >= 3)
+    sure = sure[:: -(-len(sure) // MAX_POINTS) or 1]
     return local_map.points[sure], local_map.colors[sure]
 
 
