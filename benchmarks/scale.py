@@ -18,6 +18,7 @@ process of its own: peak memory is the process's largest resident set while a st
 """
 
 import argparse
+import itertools
 import json
 import os
 import re
@@ -237,6 +238,9 @@ class Books:
             ("open the sessions", self.open),
             ("select pairs", self.select_pairs),
             ("plan tiles", self.plan_tiles),
+            ("write tiles", self.write_tiles),
+            ("join tiles", self.join_tiles),
+            ("open the joined map, look at 100 images", self.open_map),
             ("write descriptors", self.write_descriptors),
             ("retrieve", self.retrieve),
             ("write poses", self.write_poses),
@@ -297,6 +301,77 @@ class Books:
         from toolkit.manifest import MapSettings
 
         self.tiles = plan_tiles(self.poses[:, :3, 3] + 4 * self.poses[:, :3, 2], self.pairs, MapSettings().tile_images)
+
+    def write_tiles(self) -> None:
+        """Write tiles of random points: 50 before each image, which up to three of its partners see, too."""
+        from toolkit.geometry import transform
+        from toolkit.localizers.local_map import LocalMap
+
+        count, each = len(self.poses), 50
+        starts = np.searchsorted(self.pairs[:, 0], np.arange(count + 1))
+        partners = [self.pairs[start:end, 1][:3] for start, end in itertools.pairwise(starts)]
+        lengths = np.array([1 + len(of_image) for of_image in partners])
+        seeing = np.concatenate([np.append(image, of_image) for image, of_image in enumerate(partners)])
+        image = np.repeat(seeing, each)
+        point = np.repeat(np.repeat(np.arange(count), lengths) * each, each) + np.tile(np.arange(each), len(seeing))
+        order = np.lexsort((point, image))
+        self.obs_image, self.obs_point = image[order], point[order]
+        self.starts = np.searchsorted(self.obs_image, np.arange(count + 1))
+        rays = np.random.default_rng(0).uniform([-0.5, -0.4, 1], [0.5, 0.4, 1], (count, each, 3)) * 4
+        self.points = transform(self.poses, rays).reshape(-1, 3)
+        for number, (core, images) in enumerate(self.tiles):
+            rows = np.concatenate([np.arange(*self.starts[image : image + 2]) for image in images])
+            image, points = self.obs_image[rows], self.obs_point[rows]
+            known = np.unique(points[np.isin(image, core)])
+            rows = rows[np.isin(points, known)]
+            observed, place = np.unique(self.obs_point[rows], return_inverse=True)
+            LocalMap(
+                [f"{image}" for image in images],
+                [self.cameras[image] for image in images],
+                self.poses[images],
+                self.points[observed],
+                np.zeros((len(observed), 3), np.uint8),
+                np.searchsorted(images, self.obs_image[rows]),
+                rows - self.starts[self.obs_image[rows]],
+                place,
+                np.ones(len(observed), np.float32),
+            ).save(self.run / "tiles" / f"{number}.npz")
+
+    def join_tiles(self) -> None:
+        from toolkit.geometry import invert, transform
+        from toolkit.localizers.local_map import LocalMap
+        from toolkit.localizers.tiles import JoinedImages, join_tiles
+        from toolkit.manifest import MapSettings
+
+        def keypoints(image: int) -> np.ndarray:
+            seen = self.points[self.obs_point[slice(*self.starts[image : image + 2])]]
+            in_cam = transform(invert(self.poses[image]), seen)
+            return np.asarray(self.cameras[image].img_from_cam(in_cam), np.float32)
+
+        def gray(images: np.ndarray, _: np.ndarray) -> np.ndarray:
+            return np.full((len(images), 3), 128, np.uint8)
+
+        names = [f"ios_map/raw_data/walk/images/{image}.jpg" for image in range(len(self.poses))]
+        images = JoinedImages(names, self.cameras, self.poses, keypoints, gray)
+        (self.run / "joined").mkdir()
+        tiles = self.run / "tiles"
+        joined = join_tiles(
+            self.tiles,
+            lambda number: LocalMap.load(tiles / f"{number}.npz"),
+            images,
+            MapSettings(),
+            self.run / "joined",
+        )
+        assert len(joined.points) > 0.99 * len(self.points)
+        joined.save(self.run / "map.npz")
+        del self.obs_image, self.obs_point, self.points
+
+    def open_map(self) -> None:
+        from toolkit.localizers.local_map import LocalMap
+
+        opened = LocalMap.load(self.run / "map.npz")
+        for image in np.linspace(0, len(self.poses) - 1, 100).astype(int):
+            opened.around(np.array([image]))
 
     def write_descriptors(self) -> None:
         """Write as many random numbers as VLAD has dimensions, as float16."""
