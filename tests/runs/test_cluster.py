@@ -234,6 +234,7 @@ def failing_share(path: Path) -> None:
     raise DamagedError(path, "torn")
 
 
+@pytest.mark.slow
 def test_local_workers_have_the_settings_and_the_folder_of_who_asks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
