@@ -18,7 +18,7 @@ from typing import Any
 
 from common import add_out, check_out, in_own_process, limit_cores, markdown_table, part_of_capture, write_out
 
-STAGES = ("embed", "retrieve", "localize")
+STAGES = ("embed", "retrieve", "map and queries", "queries alone")
 
 
 def measure(sessions_root: Path, run: Path, workers: int) -> dict[str, Any]:
@@ -39,6 +39,8 @@ def measure(sessions_root: Path, run: Path, workers: int) -> dict[str, Any]:
         retrieve_pairs(sessions_root, files.embeddings, files.retrieval_dir)
         times.append(time.perf_counter())
         table = localize_pairs(sessions_root, *folders, {"features": ["sift"]})
+        times.append(time.perf_counter())
+        localize_pairs(sessions_root, folders[0], run / "again", *folders[2:], {"features": ["sift"]})
         times.append(time.perf_counter())
     seconds = dict(zip(STAGES, (after - before for before, after in pairwise(times)), strict=True))
     poses = {path.name: path.read_text() for path in sorted(files.poses_dir.glob("*.txt"))}
