@@ -4,6 +4,7 @@ import json
 import shutil
 import threading
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -404,6 +405,20 @@ def test_a_torn_matrix_is_made_anew(tiny: Path, tmp_path: Path) -> None:
     path.write_bytes(whole[:100])
     embed_sessions(tiny / "sessions", tmp_path / "e", device="ios")
     assert path.read_bytes() == whole
+
+
+def test_a_run_killed_after_the_matrix_was_written_leaves_no_progress_beside_it(
+    tiny: Path, tmp_path: Path, megaloc: dict[str, object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go = {"device": "hl", **megaloc}
+    with monkeypatch.context() as patch:
+        patch.setattr(GroupWriter, "discard", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            call(embed_sessions, tiny / "sessions", tmp_path / "e", **go)  # type: ignore[arg-type]
+    assert list((tmp_path / "e/hl_map/hl_a").glob(".*"))
+    table = call(embed_sessions, tiny / "sessions", tmp_path / "e", **go)  # type: ignore[arg-type]
+    assert table["skipped"].tolist() == [True, False]
+    assert not list((tmp_path / "e/hl_map/hl_a").glob(".*"))
 
 
 def test_an_unusable_session_stops_no_other(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
+from unittest.mock import Mock
 
 import numpy as np
 import pycolmap
@@ -18,6 +19,7 @@ from toolkit.errors import ArtifactError, ManifestError, ToolkitError
 from toolkit.evaluate import overlap_in_view, overlap_table
 from toolkit.features import verification
 from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor
+from toolkit.features.groups import GroupWriter
 from toolkit.features.matching import LocalMethod, MutualMatcher
 from toolkit.features.verification import is_meaningful, verified_matches
 from toolkit.files import SceneFiles, read_references, sidecar_path
@@ -235,6 +237,19 @@ def test_what_is_current_is_reused_and_a_killed_run_goes_on(
     assert not list(files.reranked_dir.glob(".*"))
     assert run(small_capture, files, topk=2)["skipped"].tolist() == [False]
     assert all(len(row["topk"]) == 2 for row in read_references(reranked(files)))
+
+
+def test_a_run_killed_after_the_file_was_written_leaves_no_progress_beside_it(
+    small_capture: Path, files: SceneFiles, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sidecar_path(reranked(files)).unlink()
+    with monkeypatch.context() as patch:
+        patch.setattr(GroupWriter, "discard", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            run(small_capture, files)
+    assert list(files.reranked_dir.glob(".*"))
+    assert run(small_capture, files)["skipped"].tolist() == [True]
+    assert not list(files.reranked_dir.glob(".*"))
 
 
 def test_a_query_that_fails_keeps_the_order_of_retrieval(

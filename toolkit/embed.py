@@ -21,7 +21,7 @@ from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import Embedder, create_embedder, resolve_name
 from toolkit.errors import CaptureError, ImageError, ManifestError, ToolkitError
 from toolkit.features.features import LocalFeatures, SiftExtractor
-from toolkit.features.groups import GroupWriter, heals
+from toolkit.features.groups import GroupWriter, heals, sweep
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import (
     file_fingerprint,
@@ -113,6 +113,7 @@ def embed_sessions(
         }
         skipped = skip_existing and is_current(matrix_path, record)
         if skipped:
+            sweep(matrix_path)
             embedded = len(np.load(matrix_path, mmap_mode="r"))
         else:
             # The same images in batches of another size are the same up to rounding.

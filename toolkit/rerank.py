@@ -25,7 +25,7 @@ from toolkit.capture.images import default_workers, prefetch
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.errors import INTERNAL, ArtifactError, reason_of
 from toolkit.features.features import KINDS
-from toolkit.features.groups import GroupWriter, heals
+from toolkit.features.groups import GroupWriter, heals, sweep
 from toolkit.features.matching import LocalMethod, create_local_methods, resolve_auto
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.features.verification import Verifier
@@ -106,7 +106,9 @@ def rerank_pairs(
                     name = f"{pair_name(capture.name, *devices)}.jsonl"
                     pair = _Pair(*sessions, Path(retrieval_dir) / name, Path(out_dir) / name, method, settings)
                     skipped = skip_existing and is_current(pair.path, pair.record)
-                    if not skipped:
+                    if skipped:
+                        sweep(pair.path)
+                    else:
                         pair.rerank(Path(features_dir), workers, skip_existing, turns)
                     row |= _counts(read_references(pair.path))
                     row |= {"seconds": round(time.perf_counter() - started, 2), "skipped": skipped}

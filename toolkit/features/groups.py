@@ -227,6 +227,17 @@ def forget_damaged(path: Path) -> bool:
     return True
 
 
+def sweep(path: Path) -> None:
+    """Remove what progress a stage left beside a file that it had written: it was killed before its `discard` ended."""
+    if _parts_folder(path).exists():
+        with GroupWriter(path, {}) as writer:  # waits for another process that makes the file again
+            writer.discard()
+
+
+def _parts_folder(path: Path) -> Path:
+    return path.with_name(f".{path.name}.parts")
+
+
 def read_index(path: Path, made_by: Mapping[str, Any]) -> Index | None:
     """Return what a file holds; None if it is absent, torn, or was made by other settings."""
     record = read_sidecar(path)
@@ -273,7 +284,7 @@ class GroupWriter:
         """What the file and the complete parts hold."""
         self._made_by = made_by
         self._attributes = attributes or {}
-        self._folder = path.with_name(f".{path.name}.parts")
+        self._folder = _parts_folder(path)
         self._parts: dict[Path, Index] = {}
         self._open: tuple[Path, h5py.File, Index] | None = None
         self._locked, self._writing = ExitStack(), ExitStack()
