@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from toolkit.embedders import StoredVectors
 from toolkit.embedders import index as index_module
-from toolkit.embedders.index import load_index, make_index
+from toolkit.embedders.index import VectorIndex, load_index, make_index
 from toolkit.embedders.search import search
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError
 from toolkit.files import sidecar_path
@@ -78,6 +78,23 @@ def test_rows_that_are_not_allowed_are_not_found(place: Path, tmp_path: Path, fa
         assert np.isneginf(scores[~there]).all()
         expected, _ = search(queries(place), vectors, 5, allowed=allowed)
         assert (scores == expected).mean() > 0.8
+
+
+@pytest.mark.parametrize("factory", ["LSH", "PQ16", "NSG16", "IVF16,PQ16+8", "PQ16,RFlat"])
+def test_rows_are_selected_from_what_an_index_finds_that_knows_no_selection(
+    place: Path, tmp_path: Path, factory: str
+) -> None:
+    vectors = stored(place)
+    settings = RetrieveSettings(index=factory, index_candidates=50, nprobe=16)
+    index = make_index(tmp_path / "embeddings", "ios_map", vectors, settings)
+    assert index is not None
+    allowed = np.arange(len(vectors)) % 9 == 1  # more than candidates, and fewer of these than are asked for
+    found = index.find(queries(place), allowed)
+    assert found.shape == (len(queries(place)), 50)
+    assert allowed[found].all()
+    assert all(len(set(row)) == 50 for row in found.tolist())
+    whole = VectorIndex(index.index, len(vectors), nprobe=16).find(queries(place))
+    np.testing.assert_array_equal(found, np.stack([row[(row >= 0) & allowed[row]][:50] for row in whole]))
 
 
 def test_an_index_is_kept_until_its_vectors_or_settings_change(place: Path, tmp_path: Path) -> None:

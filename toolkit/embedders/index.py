@@ -60,12 +60,31 @@ class VectorIndex:
         Args:
             allowed: (N,) the rows that may be found; None: all.
         """
-        selector = None
-        if allowed is not None:
-            selector = faiss.IDSelectorBitmap(np.packbits(allowed, bitorder="little"))
         number = min(self.candidates, self.index.ntotal)
+        if allowed is None:
+            return self._search(query, number)
+        try:
+            return self._search(query, number, faiss.IDSelectorBitmap(np.packbits(allowed, bitorder="little")))
+        except RuntimeError:  # LSH, PQ, NSG, and others know no selection
+            return self._selected(query, number, allowed)
+
+    def _search(self, query: NDArray[np.float32], number: int, selector: Any = None) -> Ints:
         _, rows = self.index.search(query, number, params=self._parameters(self.index, selector))
         return np.asarray(rows, np.int64)
+
+    def _selected(self, query: NDArray[np.float32], number: int, allowed: NDArray[np.bool_]) -> Ints:
+        """Return what `find` does, of an index that finds allowed rows only among all."""
+        found = np.full((len(query), number), -1, np.int64)
+        for row, one in zip(found, query[:, None], strict=True):
+            wanted = number
+            while True:
+                rows = self._search(one, wanted)[0]
+                rows = rows[(rows >= 0) & allowed[rows]][:number]
+                if len(rows) == number or wanted == self.index.ntotal:
+                    break
+                wanted = min(4 * wanted, self.index.ntotal)
+            row[: len(rows)] = rows
+        return found
 
     def _parameters(self, index: Any, selector: Any) -> Any:
         index = faiss.downcast_index(index)
@@ -106,12 +125,13 @@ def make_index(
         ManifestError: there is no such index, or it cannot be made of so many vectors.
         ValueError: a value is not finite.
     """
-    path = _index_path(embeddings, map_id)
-    record = _record(vectors, settings)
-    if _is_needed(settings, vectors) and not (skip_existing and is_current(path, record)):
+    if not _is_needed(settings, vectors):
+        return None
+    path, record = _index_path(embeddings, map_id), _record(vectors, settings)
+    if not (skip_existing and is_current(path, record)):
         _write(path, _build(vectors, settings.index))
         write_sidecar(path, record)
-    return load_index(embeddings, map_id, vectors, settings)
+    return _open(path, record, vectors, settings)
 
 
 def is_made(embeddings: Path, map_id: str, vectors: StoredVectors, settings: RetrieveSettings) -> bool:
@@ -132,13 +152,16 @@ def load_index(
     """
     if not _is_needed(settings, vectors):
         return None
-    path = _index_path(embeddings, map_id)
+    return _open(_index_path(embeddings, map_id), _record(vectors, settings), vectors, settings)
+
+
+def _open(path: Path, record: dict[str, Any], vectors: StoredVectors, settings: RetrieveSettings) -> VectorIndex:
     try:
         require_whole(path)
         index = faiss.read_index(str(path))
     except RuntimeError as error:
         raise ArtifactError(f"{path}: the map's index cannot be read ({first_line(error)}). Retrieve again.") from error
-    wanted = fingerprint(_record(vectors, settings))
+    wanted = fingerprint(record)
     found = read_json(sidecar_path(path)).get("fingerprint", wanted)
     if found != wanted or (index.ntotal, index.d) != vectors.shape:
         raise ArtifactError(f"{path}: the map's index is of other embeddings, poses or settings. Retrieve again.")
