@@ -14,6 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
 from toolkit import __version__
@@ -121,8 +122,9 @@ def _run_share(here: str, environment: Mapping[str, str], function: Callable[...
     # No worker asks other workers: they could all wait for each other.
     os.environ.pop(ADDRESS, None)
     os.environ.update(environment)
-    with open(os.devnull, "w") as nowhere, redirect_stderr(nowhere):  # the one bar is that of who asks
-        function(*share)
+    # A worker's own threads are the parallel dimension, whatever the environment says: BLAS's would wait for each other.
+    with threadpool_limits(1, "blas"), open(os.devnull, "w") as nowhere, redirect_stderr(nowhere):
+        function(*share)  # the one bar is that of who asks
 
 
 def current_cluster() -> Cluster | None:
@@ -230,7 +232,7 @@ def _local_cluster(count: int) -> Any:
             "cls": Nanny,
             "options": options
             | {
-                "env": {WORKERS: str(max(1, default_workers() // count))}
+                "env": dict.fromkeys((WORKERS, "OMP_NUM_THREADS"), str(max(1, default_workers() // count)))
                 | ({"CUDA_VISIBLE_DEVICES": gpus[number % len(gpus)]} if gpus else {})
             },
         }
