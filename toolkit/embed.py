@@ -35,7 +35,6 @@ from toolkit.files import (
 )
 from toolkit.geometry import Ints, unit
 from toolkit.manifest import EmbedSettings
-from toolkit.runs.cluster import current_cluster
 
 log = logging.getLogger(__name__)
 
@@ -283,12 +282,9 @@ def _embed(
 ) -> dict[int, str]:
     """Add the vectors of the readable images, in order; return why the others (by row) have none."""
     size, store = settings.batch_size, store_of(part.session.id) if embedder.inputs == "features" else None
-    label, done = f"embed {part.session.id}/{part.name}", batches.notes()
-    todo = [number for number in range(-(-len(part.rows) // size)) if f"{number:08d}" not in done]
-    if todo and (cluster := current_cluster()):
-        shares = [(numbers, (batches.path, made_by, embedder, part, settings, store)) for numbers in cluster.cut(todo)]
-        batches.spread(cluster, _embed_share, shares, label, "batch")
-        todo = [number for number in todo if f"{number:08d}" not in batches.notes()]
+    label, todo = f"embed {part.session.id}/{part.name}", _left(batches, range(-(-len(part.rows) // size)))
+    others = batches.path, made_by, embedder, part, settings, store
+    todo = batches.spread(_embed_share, todo, others, _left, label, "batch")
     rest = sum(len(part.rows[number * size : (number + 1) * size]) for number in todo)
     with tqdm(total=len(part.rows), initial=len(part.rows) - rest, desc=label, unit="image") as bar:
         _embed_into(batches, todo, embedder, part, settings, store, bar.update)
@@ -306,8 +302,13 @@ def _embed_share(
     store: FeatureStore | None,
 ) -> None:
     with GroupWriter(path, made_by, share=share) as batches:
-        rest = [number for number in numbers if f"{number:08d}" not in batches.notes()]
-        _embed_into(batches, rest, embedder, part, settings, store, lambda _: None)
+        _embed_into(batches, _left(batches, numbers), embedder, part, settings, store, lambda _: None)
+
+
+def _left(batches: GroupWriter, numbers: Sequence[int]) -> list[int]:
+    """Return the numbers of batches that are still to do."""
+    done = batches.notes()
+    return [number for number in numbers if f"{number:08d}" not in done]
 
 
 def _embed_into(

@@ -74,7 +74,6 @@ from toolkit.localizers.misfit import LEAST_SIZE, SIGNIFICANCE
 from toolkit.localizers.picture import localize_image
 from toolkit.localizers.prediction import Predictor
 from toolkit.manifest import LocalizeSettings
-from toolkit.runs.cluster import current_cluster
 from toolkit.runs.pairs import PairRows
 from toolkit.show.metrics import camera_messages
 
@@ -324,13 +323,15 @@ class _Stage(Remade):
         return _PairRun(self.pair(map_device, query_device), *self.open_map(map_device), self)
 
     @cached_property
-    def of_worker(self) -> "_Stage":
+    def of_worker(self) -> Any:
         """What a worker is to open: it uses what is there, with its own number of threads."""
-        return _Stage(self.folders, self.settings, self.queries, True, 0, time.time_ns())
+        return _Stage.elsewhere(self.folders, self.settings, self.queries, True, 0, time.time_ns())
 
 
 _Task = tuple[int, Query, list[References], Any, float]
 """A query's number, the query, its references, what a network says of it, and the seconds that took."""
+_Row = tuple[int, dict[str, Any]]
+"""A query's number and its line of the table."""
 
 
 class _PairRun:
@@ -338,7 +339,6 @@ class _PairRun:
 
     def __init__(self, pair: _Pair, place: Map, localizer: Localizer, stage: _Stage) -> None:
         self.pair, self.place, self.localizer, self.stage = pair, place, localizer, stage
-        self.features_dir, self.workers, self.skip_existing = stage.folders.features, stage.workers, stage.skip_existing
         self.first = localizer.first if isinstance(localizer, EscalatingLocalizer) else localizer
         """Of queries that are not escalated."""
         keyframes = pair.session.keyframes(pair.queries)
@@ -359,10 +359,10 @@ class _PairRun:
 
         Where the map has no points of the kind, the features of the references are extracted, too.
         """
-        session, place = self.pair.session, self.place
+        session, place, stage = self.pair.session, self.place, self.stage
         rows = np.unique(np.concatenate([*(self.rows[number] for number in numbers), np.zeros(0, np.int64)]))
         turns = place.turns_of(kind, session)
-        store = extract_session(session, self.features_dir, kind.extractor, rows, self.workers, turns=turns)
+        store = extract_session(session, stage.folders.features, kind.extractor, rows, stage.workers, turns=turns)
         images = session.images.iloc[rows]
         keys = zip(images["timestamp"].tolist(), images["sensor_id"].tolist(), strict=True)
         names = [
@@ -374,11 +374,12 @@ class _PairRun:
         of_map = next((mapped.features for mapped in place.mapped if mapped.name == kind.name), None)
         if of_map is None:
             references = dict.fromkeys(name for _, name in names)
-            of_map = place.on_demand(kind).prepare(references, self.workers, self.skip_existing)
+            of_map = place.on_demand(kind).prepare(references, stage.workers, stage.skip_existing)
         matches = None
         if isinstance(of_map, FeatureStore) and not isinstance(kind.matcher, MutualMatcher):
             sessions = session.id, f"{place.device}_map"
-            matches = match_sessions((store, of_map), names, kind.matcher, place.map_dir, sessions, self.skip_existing)
+            stores = store, of_map
+            matches = match_sessions(stores, names, kind.matcher, place.map_dir, sessions, stage.skip_existing)
         self.stores.append(store)
         self.matches.append(matches)
 
@@ -421,20 +422,15 @@ class _PairRun:
         groups = [query_group(*key) for key in self.keys]
         again: dict[str, dict[str, Any]] = {}  # rows of queries that are not recorded as done
         with GroupWriter(path, record, about) as writer:
-            if not self.skip_existing:
+            if not self.stage.skip_existing:
                 writer.discard()
             writer.drop_damaged()
             numbers = {group: number for number, group in enumerate(groups)}  # a list may name a query twice
-            rows = writer.notes()
-            todo = [number for group, number in numbers.items() if group not in rows]
-            if todo and (cluster := current_cluster()):
-                shares: list[tuple[Sequence[int], tuple[Any, ...]]] = [
-                    (part, (self.stage.of_worker, *self.devices, {}, 0.0))
-                    for part in cluster.cut(todo, self.first.batch_size)
-                ]
-                writer.spread(cluster, _localize_share, shares, self._label, "query")
-                rows = writer.notes()
-                todo = [number for group, number in numbers.items() if group not in rows]  # for a fault of the toolkit
+            # Queries with a fault of the toolkit in them are left to do, and done again.
+            todo = writer.spread(
+                _localize_share, self.not_localized(writer, list(numbers.values())),
+                (self.stage.of_worker, *self.devices), self.not_localized, self._label, "query", self.first.batch_size,
+            )  # fmt: skip
             again |= self.localize_into(writer, todo)
             if isinstance(self.localizer, EscalatingLocalizer):
                 rows = writer.notes()
@@ -446,6 +442,24 @@ class _PairRun:
             writer.finish()
             rows = writer.notes() | again
         return [rows[group] for group in groups]
+
+    def share(self, name: str) -> GroupWriter:
+        """Return a file that takes a share of the queries."""
+        return GroupWriter(self.pair.file("h5"), self.stage.record(self.pair), share=name)
+
+    def not_localized(self, writer: GroupWriter, numbers: Sequence[int]) -> list[int]:
+        """Return those of some queries that a file has no row of."""
+        rows = writer.notes()
+        return [number for number in numbers if query_group(*self.keys[number]) not in rows]
+
+    def not_escalated(self, writer: GroupWriter, rows: Sequence[_Row]) -> list[_Row]:
+        """Return those of some queries that a file has no row of that tells of an escalation."""
+        after = writer.notes()
+        return [
+            (number, row)
+            for number, row in rows
+            if not after.get(query_group(*self.keys[number]), {}).get("first_status")
+        ]
 
     @property
     def devices(self) -> tuple[str, str]:
@@ -489,7 +503,7 @@ class _PairRun:
         """
         limit = self.place.sure_position_std
         todo = [
-            number
+            (number, row)
             for number, row in rows.items()
             if not (row.get("first_status") or row["misfit"] or is_sure(row["status"], row["position_std_m"], limit))
             and can_gain(*self.query(number))
@@ -499,29 +513,20 @@ class _PairRun:
         started = time.perf_counter()
         self.add_escalation(todo)
         shared = (time.perf_counter() - started) / len(todo)
-        if cluster := current_cluster():
-            stage = self.stage.of_worker
-            shares = [
-                (part, (stage, *self.devices, {number: rows[number] for number in part}, shared))
-                for part in cluster.cut(todo)
-            ]
-            writer.spread(cluster, _localize_share, shares, self._label, "query")
-            after = writer.notes()
-            todo = [number for number in todo if not after[query_group(*self.keys[number])].get("first_status")]
-        return self.escalate_into(writer, {number: rows[number] for number in todo}, shared)
+        others = self.stage.of_worker, *self.devices, shared
+        todo = writer.spread(_escalate_share, todo, others, self.not_escalated, self._label, "query")
+        return self.escalate_into(writer, todo, shared)
 
-    def add_escalation(self, numbers: Sequence[int]) -> None:
+    def add_escalation(self, rows: Sequence[_Row]) -> None:
         """Extract and match the further kinds of features of queries."""
         for kind in self.place.escalation:
-            self._add_kind(kind, numbers)
+            self._add_kind(kind, [number for number, _ in rows])
 
-    def escalate_into(
-        self, writer: GroupWriter, rows: Mapping[int, dict[str, Any]], shared: float
-    ) -> dict[str, dict[str, Any]]:
+    def escalate_into(self, writer: GroupWriter, rows: Sequence[_Row], shared: float) -> dict[str, dict[str, Any]]:
         """Localize queries with further features, which were extracted, and add those to a file that this helps.
 
         Args:
-            rows: those without these features, by number of the query.
+            rows: those without these features.
             shared: seconds that their extraction took for each.
 
         Returns:
@@ -529,9 +534,10 @@ class _PairRun:
         """
         assert isinstance(self.localizer, EscalatingLocalizer)
         again: dict[str, dict[str, Any]] = {}
-        tasks = ((number, *self.query(number), None, shared) for number in rows)
+        first = dict(rows)
+        tasks = ((number, *self.query(number), None, shared) for number in first)
         for number, row, localized in self._localized(self.localizer.escalate, tasks, len(rows)):
-            before, group = rows[number], query_group(*self.keys[number])
+            before, group = first[number], query_group(*self.keys[number])
             both = {
                 "first_status": before["status"],
                 "first_seconds": before["seconds"],
@@ -547,7 +553,7 @@ class _PairRun:
         self, localize: Callable[..., PoseEstimate], tasks: Iterator[_Task], count: int
     ) -> Iterator[tuple[int, dict[str, Any], LocalizedQuery]]:
         """Yield queries with their rows and correspondences."""
-        answers = prefetch(partial(self._localize, localize), tasks, self.workers)
+        answers = prefetch(partial(self._localize, localize), tasks, self.stage.workers)
         return iter(tqdm(answers, total=count, desc=self._label, unit="query", disable=not count))
 
     def _predicted(self, localizer: Localizer, numbers: Sequence[int]) -> Iterator[_Task]:
@@ -586,26 +592,20 @@ class _PairRun:
         return number, row, localized
 
 
-def _localize_share(
-    share: str,
-    numbers: Sequence[int],
-    stage: _Stage,
-    map_device: str,
-    query_device: str,
-    rows: Mapping[int, dict[str, Any]],
-    shared: float,
-) -> None:
-    """Localize a share of a pair's queries, or escalate those that have rows already."""
+def _localize_share(share: str, numbers: Sequence[int], stage: _Stage, map_device: str, query_device: str) -> None:
     run = stage.run(map_device, query_device)
-    path, record = run.pair.file("h5"), stage.record(run.pair)
-    with threadpool_limits(1, "blas"), GroupWriter(path, record, share=share) as writer:
-        done = writer.notes()
-        rest = [number for number in numbers if query_group(*run.keys[number]) not in done]
-        if rows and rest:
-            run.add_escalation(rest)
-            run.escalate_into(writer, {number: rows[number] for number in rest}, shared)
-        elif rest:
-            run.localize_into(writer, rest)
+    with run.share(share) as writer:
+        run.localize_into(writer, run.not_localized(writer, numbers))
+
+
+def _escalate_share(
+    share: str, rows: Sequence[_Row], stage: _Stage, map_device: str, query_device: str, shared: float
+) -> None:
+    run = stage.run(map_device, query_device)
+    with run.share(share) as writer:
+        rest = run.not_escalated(writer, rows)
+        run.add_escalation(rest)
+        run.escalate_into(writer, rest, shared)
 
 
 def _indices(rows: list[dict[str, Any]], index_of: Mapping[str, int]) -> tuple[list[int], list[float]]:

@@ -15,12 +15,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from toolkit.capture import Capture
 from toolkit.capture.names import ALLOW_OUTSIDE
 from toolkit.embed import embed_sessions
 from toolkit.errors import DamagedError, ImageError, ManifestError, ToolkitError
-from toolkit.features import stores
+from toolkit.features import groups
 from toolkit.features.features import SiftExtractor
 from toolkit.features.groups import GroupWriter
 from toolkit.features.stores import FeatureStore, extract_session
@@ -64,7 +65,7 @@ def here(monkeypatch: pytest.MonkeyPatch) -> Here:
             frame = frame.f_back  # type: ignore[assignment]
         return cluster
 
-    for module in ("toolkit.embed", "toolkit.features.stores", "toolkit.localizers.mapping", "toolkit.localize"):
+    for module in ("toolkit.features.groups", "toolkit.localizers.mapping"):
         monkeypatch.setattr(f"{module}.current_cluster", current)
     return cluster
 
@@ -82,17 +83,21 @@ def write_share(share: str, items: Sequence[int], path: Path, fail_at: int | Non
             writer.add(f"{item}", f"from {item}", {"value": np.array([item])}, note=item)
 
 
-def test_a_writer_takes_what_others_made(tmp_path: Path) -> None:
-    path, cluster = tmp_path / "file.h5", Here()
+def unwritten(writer: GroupWriter, items: Sequence[int]) -> list[int]:
+    return [item for item in items if writer.index.source_of(f"{item}") != f"from {item}"]
+
+
+def test_a_writer_takes_what_others_made(tmp_path: Path, here: Here) -> None:
+    path = tmp_path / "file.h5"
     with GroupWriter(path, {"by": 1}) as writer:
         writer.add("0", "old", {"value": np.array([-1])}, note=-1)
-        writer.spread(cluster, write_share, [(part, (path,)) for part in cluster.cut(range(20))], "write", "group")
+        assert writer.spread(write_share, range(20), (path,), unwritten, "write", "group") == []
         assert writer.notes() == {str(item): item for item in range(20)}
         assert {name: int(arrays["value"][0]) for name, arrays in writer.read()} == writer.notes()
         writer.annotate("3", "annotated")
     with GroupWriter(path, {"by": 1}) as writer:  # what comes last counts, in the next run too
         assert writer.notes()["3"] == "annotated"
-        writer.spread(cluster, write_share, [([3], (path,))], "write", "group")
+        writer.spread(write_share, [3], (path,), unwritten, "write", "group")
         assert writer.notes()["3"] == 3
         writer.finish()
     assert [path.name for path in sorted(tmp_path.iterdir())] == ["file.h5", "file.h5.meta.json"]
@@ -140,7 +145,7 @@ def test_features_and_maps_are_those_of_one_process(small_capture: Path, tmp_pat
         if name == "alone":
             here.labels, labels = [], here.labels
             clusters_off = pytest.MonkeyPatch()
-            for module in (stores, mapping):
+            for module in (groups, mapping):
                 clusters_off.setattr(module, "current_cluster", lambda: None)
         features = extract_session(session, tmp_path / name)
         build_map(session, features, tmp_path / name / "ios_map.npz", settings)
@@ -167,12 +172,7 @@ def test_poses_are_those_of_one_process(small_capture: Path, small_features: Pat
         place = SceneFiles(tmp_path / name, small_capture.name)
         with pytest.MonkeyPatch.context() as patch:
             if name == "alone":
-                for module in (
-                    "toolkit.embed",
-                    "toolkit.features.stores",
-                    "toolkit.localizers.mapping",
-                    "toolkit.localize",
-                ):
+                for module in ("toolkit.features.groups", "toolkit.localizers.mapping"):
                     patch.setattr(f"{module}.current_cluster", lambda: None)
             localize_pairs(sessions, files.retrieval_dir, place.poses_dir, files.features, place.maps, map_device="ios")
         found[name] = {path.name: path.read_bytes() for path in sorted(place.poses_dir.glob("*.txt"))}
@@ -224,6 +224,17 @@ def test_a_scheduler_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPat
     with pytest.raises(ToolkitError, match="tcp://127.0.0.1:9"), open_cluster("tcp://127.0.0.1:9"):
         pass
     assert ADDRESS not in os.environ
+
+
+def test_a_share_computes_products_by_one_thread_whatever_the_environment_says() -> None:
+    found: list[int] = []
+
+    def count_share() -> None:
+        found.extend(one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas")
+
+    with threadpool_limits(2, "blas"):
+        clusters._run_share(str(Path.cwd()), {}, count_share)
+    assert set(found) == {1}
 
 
 def note_share(folder: Path, name: str, environment: str) -> None:

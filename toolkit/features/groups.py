@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from toolkit.errors import DamagedError, first_line
 from toolkit.files import fingerprint, read_sidecar, sidecar_path, write_atomic, write_sidecar
-from toolkit.runs.cluster import Cluster
+from toolkit.runs.cluster import current_cluster
 
 log = logging.getLogger(__name__)
 
@@ -195,6 +195,7 @@ def group_checksum(name: str, arrays: Mapping[str, Any]) -> int:
 
 P = ParamSpec("P")
 Result = TypeVar("Result")
+Item = TypeVar("Item")
 
 
 def heals(stage: Callable[P, Result]) -> Callable[P, Result]:
@@ -314,25 +315,34 @@ class GroupWriter:
 
     def spread(
         self,
-        cluster: Cluster,
         function: Callable[..., None],
-        shares: Sequence[tuple[Sequence[Any], tuple[Any, ...]]],
+        items: Sequence[Item],
+        others: tuple[Any, ...],
+        left: Callable[["GroupWriter", Sequence[Item]], list[Item]],
         label: str,
         unit: str,
-    ) -> None:
-        """Have shares of the work done by the workers of a cluster, and take what they made.
+        multiple: int = 1,
+    ) -> list[Item]:
+        """Have work done by the workers of the cluster, if there is one, and take what they made.
 
         Args:
-            function: does a share; called with its name for a writer, its items, and its further arguments.
-            shares: of each the items and further arguments.
+            function: does a share; called with its name for a writer, its items, and the `others`.
+            items: the work; a share has a `multiple` of them.
+            left: returns those of some items that the groups of a writer do not hold.
             label, unit: of the bar.
+
+        Returns:
+            The items that are left to do here.
         """
+        cluster = current_cluster() if items else None
+        if cluster is None:
+            return list(items)
         self._close_part()
-        generation = self._next_number()
-        named = [(f"{generation:05d}-{number:05d}-", *share) for number, share in enumerate(shares)]
-        tasks = [(name, items, *others) for name, items, others in named]
-        cluster.run(function, tasks, [len(items) for _, items, _ in named], label, unit)
+        generation, shares = self._next_number(), cluster.cut(items, multiple)
+        tasks = [(f"{generation:05d}-{number:05d}-", share, *others) for number, share in enumerate(shares)]
+        cluster.run(function, tasks, [len(share) for share in shares], label, unit)
         self._find_parts()
+        return left(self, items)
 
     def _next_number(self) -> int:
         # Parts are <number> or, of shares, <number>-<share>-<number>; what was made later comes later.

@@ -17,7 +17,7 @@ from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Se
 from functools import lru_cache
 from itertools import islice, tee
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import h5py
@@ -33,7 +33,6 @@ from toolkit.features.groups import HDF5_ERRORS, GroupWriter, group_names_of, ha
 from toolkit.features.matching import Matcher, PairMatches
 from toolkit.files import files_fingerprint, fingerprint, read_sidecar
 from toolkit.geometry import Ints
-from toolkit.runs.cluster import current_cluster
 
 log = logging.getLogger(__name__)
 
@@ -55,6 +54,7 @@ _Todo = tuple[str, str, int]
 """An image whose features are to be extracted: name, what they are made from, row of the session."""
 _ToMatch = tuple[str, str, str, str]
 """A pair to match: names, group of the file, what the matches are made from."""
+_Pair = TypeVar("_Pair", bound=tuple[Any, Any, str, str])
 
 
 def features_path(out: str | Path, session_id: str, settings: Mapping[str, Any]) -> Path:
@@ -261,16 +261,10 @@ def extract_session(
     made_from = {name: _made_from(session, row, int(turns[row])) for name, row in row_of.items()}
     path, label = features_path(out, session.id, extractor.settings), f"{extractor.settings['name']} {session.id}"
     with GroupWriter(path, extractor.settings, {PIXEL_CENTER: 0.0}) as writer:
-        todo = [
-            (name, source, row_of[name])
-            for name, source in made_from.items()
-            if not (skip_existing and writer.index.source_of(name) == source)
-        ]
-        if todo and (cluster := current_cluster()):
-            chosen_turns = {row: int(turns[row]) for _, _, row in todo if turns[row]}
-            shares = [(part, (path, session, extractor, chosen_turns)) for part in cluster.cut(todo)]
-            writer.spread(cluster, _extract_share, shares, label, "image")
-            todo = [item for item in todo if writer.index.source_of(item[0]) != item[1]]
+        todo = [(name, source, row_of[name]) for name, source in made_from.items()]
+        todo = _left(writer, todo) if skip_existing else todo
+        others = path, session, extractor, {row: int(turns[row]) for _, _, row in todo if turns[row]}
+        todo = writer.spread(_extract_share, todo, others, _left, label, "image")
         bar = tqdm(todo, desc=label, unit="image", disable=not progress or not todo)
         _extract_into(writer, bar, session, extractor, turns, workers)
         writer.finish()
@@ -287,8 +281,11 @@ def _extract_share(
     turns = np.zeros(len(session.images), np.int64)
     turns[list(turned)] = list(turned.values())
     with GroupWriter(path, extractor.settings, {PIXEL_CENTER: 0.0}, share) as writer:
-        rest = [item for item in todo if writer.index.source_of(item[0]) != item[1]]
-        _extract_into(writer, rest, session, extractor, turns, default_workers())
+        _extract_into(writer, _left(writer, todo), session, extractor, turns, default_workers())
+
+
+def _left(writer: GroupWriter, todo: Sequence[_Todo]) -> list[_Todo]:
+    return [item for item in todo if writer.index.source_of(item[0]) != item[1]]
 
 
 def _extract_into(
@@ -480,18 +477,15 @@ def match_sessions(
     made_by = {"features": [store.settings for store in stores], "matcher": matcher.settings}
     path = matches_path(out, *sessions, made_by)
     with GroupWriter(path, made_by) as writer:
-        done = writer.index.groups if skip_existing else {}
         readable = [(name0, name1) for name0, name1 in pairs if name0 in stores[0] and name1 in stores[1]]
-        todo = []
-        for (name0, name1), group in group_names(readable, writer.index.groups).items():
-            made_from = stores[0].made_from[name0] + stores[1].made_from[name1]
-            if done.get(group) != made_from:
-                todo.append((name0, name1, group, made_from))
+        todo = [
+            (name0, name1, group, stores[0].made_from[name0] + stores[1].made_from[name1])
+            for (name0, name1), group in group_names(readable, writer.index.groups).items()
+        ]
+        todo = unmatched(writer, todo) if skip_existing else todo
         label = f"{matcher.settings['name']} {' '.join(sessions)}"
-        if todo and (cluster := current_cluster()):
-            shares = [(part, (path, made_by, stores, matcher)) for part in cluster.cut(todo, matcher.batch_size)]
-            writer.spread(cluster, _match_share, shares, label, "pair")
-            todo = [pair for pair in todo if writer.index.groups.get(pair[2]) != pair[3]]
+        others = path, made_by, stores, matcher
+        todo = writer.spread(_match_share, todo, others, unmatched, label, "pair", matcher.batch_size)
         with tqdm(total=len(todo), desc=label, unit="pair", disable=not todo) as bar:
             _match_into(writer, todo, stores, matcher, bar.update)
         writer.finish()
@@ -507,8 +501,16 @@ def _match_share(
     matcher: Matcher,
 ) -> None:
     with GroupWriter(path, made_by, share=share) as writer:
-        rest = [pair for pair in todo if pair[2] not in writer.index.groups]
-        _match_into(writer, rest, stores, matcher, lambda _: None)
+        _match_into(writer, unmatched(writer, todo), stores, matcher, lambda _: None)
+
+
+def unmatched(writer: GroupWriter, todo: Sequence[_Pair]) -> list[_Pair]:
+    """Return the pairs whose matches, made from the same, a file does not have.
+
+    Args:
+        todo: pairs of images, by name or index, each with its group and what its matches are made from.
+    """
+    return [pair for pair in todo if writer.index.groups.get(pair[2]) != pair[3]]
 
 
 def _match_into(

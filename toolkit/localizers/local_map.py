@@ -249,10 +249,20 @@ class LocalMap:
         )
         return together._sharing(first) if same else together
 
+    def judged(self, consistency: Consistency) -> "LocalMap":
+        """Return the map with another consistency."""
+        return replace(self, consistency=consistency).knowing(
+            **{name: known for name, known in vars(self).items() if name in ORDERS}
+        )
+
+    def knowing(self, **known: Any) -> "LocalMap":
+        """Return this map, told of the properties that it would compute when they are asked for."""
+        vars(self).update(known)
+        return self
+
     def _sharing(self, other: "LocalMap") -> "LocalMap":
         """Return this map, which takes over what another of the same images knows of them."""
-        vars(self).update({name: getattr(other, name) for name in ("index_of", "cams_from_world", "focals_px")})
-        return self
+        return self.knowing(**{name: getattr(other, name) for name in ("index_of", "cams_from_world", "focals_px")})
 
     def save(self, path: str | Path) -> None:
         """Write the map as one `.npz` file."""
@@ -290,8 +300,7 @@ class LocalMap:
                 length=float(arrays["length"]),
                 consistency=Consistency(**json.loads(str(arrays["consistency"]))),
                 **{name: arrays[name] for name in _ARRAYS},
-            )
-            vars(opened).update({name: arrays[name] for name in ORDERS})
+            ).knowing(**{name: arrays[name] for name in ORDERS})
         except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile, struct.error) as error:
             raise ArtifactError(
                 f"The triangulated map {path} cannot be read ({error}). Build it with the localize stage."

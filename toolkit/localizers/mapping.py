@@ -22,10 +22,10 @@ from toolkit.errors import ArtifactError, ImageError
 from toolkit.features.features import LocalFeatures, feature_kind
 from toolkit.features.groups import GroupWriter
 from toolkit.features.matching import PairMatches, match_along_epipolar_lines, unit_descriptors
-from toolkit.features.stores import FeatureStore, MatchStore, group_names, matches_path, write_matches
+from toolkit.features.stores import FeatureStore, MatchStore, group_names, matches_path, unmatched, write_matches
 from toolkit.files import Remade, fingerprint, is_current, temporary_folder, write_sidecar
 from toolkit.geometry import Floats, Ints
-from toolkit.localizers.local_map import ORDERS, LocalMap
+from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.survey import Survey, SurveyedImages
 from toolkit.localizers.tiles import JoinedImages, home_of, join_tiles, plan_tiles
 from toolkit.localizers.triangulation import triangulate
@@ -199,8 +199,7 @@ def build_map(
 
 def _match_share(share: str, todo: Sequence[_ToMatch], plan: "MapPlan", number: int) -> None:
     with plan._matches(number, share) as writer:
-        rest = [pair for pair in todo if pair[2] not in writer.index.groups]
-        plan.match_into(writer, rest, default_workers(), label="")
+        plan.match_into(writer, unmatched(writer, todo), default_workers(), label="")
 
 
 class MapPlan(Remade):
@@ -277,15 +276,11 @@ class MapPlan(Remade):
         """Match the pairs of a tile along epipolar lines, but for those whose matches are there."""
         pairs, names, made_from = self.pairs_of[number].tolist(), self.names, self._made_from
         with self._matches(number) as writer:
-            known = writer.index.groups if skip_existing else {}
             groups = group_names([(names[i], names[j]) for i, j in pairs], writer.index.groups)
-            wanted = [(i, j, groups[names[i], names[j]], made_from[i] + made_from[j]) for i, j in pairs]
-            todo = [pair for pair in wanted if known.get(pair[2]) != pair[3]]
+            todo = [(i, j, groups[names[i], names[j]], made_from[i] + made_from[j]) for i, j in pairs]
+            todo = unmatched(writer, todo) if skip_existing else todo
             label = f"match {self.session.id}" + (f" {number + 1}/{len(self.tiles)}" if len(self.tiles) > 1 else "")
-            if todo and (cluster := current_cluster()):
-                shares = [(part, (self, number)) for part in cluster.cut(todo)]
-                writer.spread(cluster, _match_share, shares, label, "pair")
-                todo = [pair for pair in todo if writer.index.groups.get(pair[2]) != pair[3]]
+            todo = writer.spread(_match_share, todo, (self, number), unmatched, label, "pair")
             self.match_into(writer, todo, workers, label if todo else "")
             writer.finish()
 
@@ -387,10 +382,7 @@ class MapPlan(Remade):
             )
 
     def _save(self, local_map: LocalMap) -> None:
-        orders = {name: vars(local_map)[name] for name in ORDERS if name in vars(local_map)}
-        judged = replace(local_map, consistency=self.survey.consistency(local_map))
-        vars(judged).update(orders)
-        judged.save(self.path)
+        local_map.judged(self.survey.consistency(local_map)).save(self.path)
 
     def _keypoints(self, image: int) -> NDArray[np.float32]:
         return self.features[self.names[image]].keypoints

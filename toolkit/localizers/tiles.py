@@ -227,9 +227,7 @@ def _written(
         point_starts[here.start + 1 : here.stop + 1] = observation + np.cumsum(of_point)
         noise[here] = noise_px
         point, observation = here.stop, observation + len(rows)
-    joined = LocalMap(
+    return LocalMap(
         images.names, images.cameras, images.world_from_cams, points, colors, obs_image, obs_keypoint, obs_point, noise,
         length,
-    )  # fmt: skip
-    vars(joined).update(image_starts=image_starts, by_point=by_point, point_starts=point_starts)
-    return joined
+    ).knowing(image_starts=image_starts, by_point=by_point, point_starts=point_starts)  # fmt: skip
