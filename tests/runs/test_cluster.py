@@ -226,19 +226,36 @@ def test_a_scheduler_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPat
     assert ADDRESS not in os.environ
 
 
+COUNTED = set[int]()
+
+
+def count_share() -> None:
+    COUNTED.update(one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas")
+
+
 def test_a_share_computes_products_by_one_thread_whatever_the_environment_says() -> None:
-    found: list[int] = []
-
-    def count_share() -> None:
-        found.extend(one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas")
-
     with threadpool_limits(2, "blas"):
-        clusters._run_share(str(Path.cwd()), {}, count_share)
-    assert set(found) == {1}
+        clusters._run_share(str(Path.cwd()), {}, pickle.dumps((count_share, ())))
+    assert COUNTED == {1}
 
 
 def note_share(folder: Path, name: str, environment: str) -> None:
     (folder / name).write_text(f"{os.getpid()} {os.environ.get(environment)} {Path.cwd()} {current_cluster()}")
+
+
+def not_in(process: int, path: Path) -> Path:
+    assert os.getpid() != process
+    return path
+
+
+class MadeByWorkers:
+    """A path, which only another process can unpickle."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return not_in, (os.getpid(), self.path)
 
 
 def failing_share(path: Path) -> None:
@@ -257,7 +274,7 @@ def test_local_workers_have_the_settings_and_the_folder_of_who_asks(
         assert cluster is not None
         assert cluster.size == 2
         assert "http://" in said[0]
-        shares = [(tmp_path, str(number), ALLOW_OUTSIDE) for number in range(8)]
+        shares = [(MadeByWorkers(tmp_path), str(number), ALLOW_OUTSIDE) for number in range(8)]  # not by the scheduler
         cluster.run(note_share, shares, [1] * 8, "note", "file")
         notes = {tuple((tmp_path / str(number)).read_text().split()) for number in range(8)}
         assert {note[1:] for note in notes} == {("1", str(tmp_path), "None")}

@@ -213,8 +213,9 @@ class MapPlan(Remade):
         settings: MapSettings,
         seed: int = 0,
         metric: bool = True,
+        length: float | None = None,
     ):
-        """See `build_map`."""
+        """See `build_map`; `length` is that of the survey, where it is known."""
         self.session, self.features, self.path, self.settings, self.seed = session, features, path, settings, seed
         names, poses = session.image_names, session.world_from_cam()
         self.rows = np.array(
@@ -229,20 +230,10 @@ class MapPlan(Remade):
         self.names = [names[row] for row in self.rows]
         sensor_ids = session.images["sensor_id"].to_numpy()[self.rows]
         self.cameras = [session.camera(sensor) for sensor in sensor_ids]
-        rig_from_cams, groups = session.rig_from_cam(self.rows), instants(session, self.rows)
-        surveyed = SurveyedImages(
-            self.names,
-            self.cameras,
-            self.world_from_cams @ geometry.invert(rig_from_cams),
-            rig_from_cams,
-            groups,
-            sensor_ids.tolist(),
-        )
-        kind = feature_kind(features.settings.get("name", "sift"))
-        with threadpool_limits(1, "blas"):
-            self.survey = Survey(surveyed, lambda index: features[self.names[index]], kind.min_score, kind.ratio)
-        self.length = self.survey.length(metric)
-        self.pairs = select_pairs(self.world_from_cams, self.cameras, groups, settings.pairs_per_image, self.length)
+        self.kind, self.groups = feature_kind(features.settings.get("name", "sift")), instants(session, self.rows)
+        self.length = self.survey.length(metric) if length is None else length
+        pairs_per_image = settings.pairs_per_image
+        self.pairs = select_pairs(self.world_from_cams, self.cameras, self.groups, pairs_per_image, self.length)
         centers, axes = self.world_from_cams[:, :3, 3], self.world_from_cams[:, :3, 2]
         self.tiles = plan_tiles(centers + DEPTHS[1] * self.length * axes, self.pairs, settings.tile_images)
         self._home = home_of([tile.core for tile in self.tiles])
@@ -254,8 +245,30 @@ class MapPlan(Remade):
             "name": "epipolar",
             "max_error_px": settings.max_epipolar_error_px,
             "ratio": settings.ratio,
-            "min_score": kind.epipolar_min_score,
+            "min_score": self.kind.epipolar_min_score,
         }
+
+    @cached_property
+    def survey(self) -> Survey:
+        """What some pairs of images tell of the poses."""
+        rig_from_cams = self.session.rig_from_cam(self.rows)
+        surveyed = SurveyedImages(
+            self.names,
+            self.cameras,
+            self.world_from_cams @ geometry.invert(rig_from_cams),
+            rig_from_cams,
+            self.groups,
+            self.session.images["sensor_id"].to_numpy()[self.rows].tolist(),
+        )
+        kind = self.kind
+        with threadpool_limits(1, "blas"):
+            return Survey(surveyed, lambda index: self.features[self.names[index]], kind.min_score, kind.ratio)
+
+    @cached_property
+    def of_worker(self) -> Any:
+        """This plan for a worker, which need not survey."""
+        given = self.session, self.features, self.path, self.settings, self.seed
+        return MapPlan.elsewhere(*given, length=self.length)
 
     @cached_property
     def _made_from(self) -> list[str]:
@@ -280,7 +293,7 @@ class MapPlan(Remade):
             todo = [(i, j, groups[names[i], names[j]], made_from[i] + made_from[j]) for i, j in pairs]
             todo = unmatched(writer, todo) if skip_existing else todo
             label = f"match {self.session.id}" + (f" {number + 1}/{len(self.tiles)}" if len(self.tiles) > 1 else "")
-            todo = writer.spread(_match_share, todo, (self, number), unmatched, label, "pair")
+            todo = writer.spread(_match_share, todo, (self.of_worker, number), unmatched, label, "pair")
             self.match_into(writer, todo, workers, label if todo else "")
             writer.finish()
 
@@ -368,7 +381,7 @@ class MapPlan(Remade):
             return
         numbers, label = range(len(self.tiles)), f"triangulate {self.session.id}"
         if cluster := current_cluster():
-            shares = [(self, number, skip_existing) for number in numbers]
+            shares = [(self.of_worker, number, skip_existing) for number in numbers]
             cluster.run(MapPlan.triangulate, shares, [1] * len(shares), label, "tile")
         else:
             for number in tqdm(numbers, desc=label, unit="tile"):

@@ -8,6 +8,7 @@ under the same paths.
 
 import logging
 import os
+import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stderr
 from functools import cache
@@ -78,8 +79,9 @@ class Cluster:
 
         environment = {name: os.environ[name] for name in (EXTRA_DEVICES, ALLOW_OUTSIDE) if name in os.environ}
         here = os.getcwd()  # noqa: PTH109 - as text
+        # As bytes: a scheduler that reads a share would make what only workers need, such as networks.
         futures = {
-            self._client.submit(_run_share, here, environment, function, *share, pure=False): size
+            self._client.submit(_run_share, here, environment, pickle.dumps((function, share)), pure=False): size
             for share, size in zip(shares, sizes, strict=True)
         }
         try:
@@ -114,8 +116,8 @@ class Cluster:
             ) from None
 
 
-def _run_share(here: str, environment: Mapping[str, str], function: Callable[..., None], *share: Any) -> None:
-    """Do a share on a worker, with the folder and the settings of the process that asks for it."""
+def _run_share(here: str, environment: Mapping[str, str], pickled: bytes) -> None:
+    """Do a share, a pickled function and its arguments, with the folder and the settings of who asks for it."""
     os.chdir(here)
     for name in (EXTRA_DEVICES, ALLOW_OUTSIDE):
         os.environ.pop(name, None)
@@ -124,6 +126,7 @@ def _run_share(here: str, environment: Mapping[str, str], function: Callable[...
     os.environ.update(environment)
     # A worker's own threads are the parallel dimension, whatever the environment says: BLAS's would wait for each other.
     with threadpool_limits(1, "blas"), open(os.devnull, "w") as nowhere, redirect_stderr(nowhere):
+        function, share = pickle.loads(pickled)
         function(*share)  # the one bar is that of who asks
 
 
