@@ -166,6 +166,12 @@ class Session:
     def _trajectory(self, file: str) -> Trajectory | None:
         return Trajectory.from_table(self._read(file)) if (self.path / file).exists() else None
 
+    @property
+    def odometry(self) -> Trajectory | None:
+        """Of a query session its trajectories.txt, if it has one: world_from_device in a frame that is the device's own
+        and begins anew where tracking was lost. A map session has none: its poses are in the world."""
+        return self.trajectory if self.split == "query" else None
+
     @cached_property
     def _roots(self) -> list[Path]:
         return roots_of(self.path)

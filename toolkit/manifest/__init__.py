@@ -19,6 +19,7 @@ from toolkit.manifest.settings import (
     PredictorSettings,
     RerankSettings,
     RetrieveSettings,
+    SequenceSettings,
     Settings,
     SiftSettings,
     SuperPointSettings,

@@ -356,6 +356,21 @@ class RerankSettings(Settings):
         return self
 
 
+class SequenceSettings(Settings):
+    """How odometry and the poses of single queries are joined to poses of a whole recording."""
+
+    position_drift: PositiveNumber = 0.03
+    """Standard deviation, by axis, that a meter of odometry adds to a position, meters; grows with the way's root."""
+    rotation_drift_deg: PositiveNumber = 0.15
+    """Standard deviation, by axis, that a second of odometry adds to a rotation; grows with the time's root."""
+    scale_std: PositiveNumber = 0.02
+    """Relative standard deviation of the lengths of a recording's odometry."""
+    max_gap_s: PositiveNumber = 10.0
+    """A longer time without a pose is a loss of tracking: a new piece, with a frame of its own, begins."""
+    max_speed_m_s: PositiveNumber = 15.0
+    """So is a step that is faster."""
+
+
 class MapSettings(Settings):
     """How a map is triangulated."""
 

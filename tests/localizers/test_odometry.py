@@ -1,0 +1,83 @@
+"""Odometry: its pieces, and the placements in the map that single queries vote for."""
+
+import numpy as np
+import pytest
+
+from tests.localizers.drifting import PLACE, Drive, drive
+from toolkit import geometry
+from toolkit.localizers.odometry import Odometry, PosedQueries, first_guess, fitted_scale, place
+from toolkit.manifest import SequenceSettings
+
+SETTINGS = SequenceSettings()
+
+
+def test_losses_of_tracking_end_a_piece() -> None:
+    times = np.array([0, 1, 2, 20, 21, 22, 23], np.int64) * 1_000_000  # a gap of 18 s
+    poses = np.tile(np.eye(4), (7, 1, 1))
+    poses[:, 0, 3] = [0, 1, 2, 3, 4, 64, 65]  # a step of 60 m in a second
+    assert Odometry(times, poses).split(SETTINGS) == [slice(0, 3), slice(3, 5), slice(5, 7)]
+    assert Odometry(times[:1], poses[:1]).split(SETTINGS) == [slice(0, 1)]
+    assert Odometry(times[:0], poses[:0]).split(SETTINGS) == []
+
+
+def test_drift_does_not_depend_on_the_number_of_steps() -> None:
+    coarse = drive(np.random.default_rng(0), frames=11).odometry
+    times = np.linspace(coarse.timestamps[0], coarse.timestamps[-1], 101).astype(np.int64)
+    poses = np.tile(np.eye(4), (101, 1, 1))
+    for axis in range(3):
+        poses[:, axis, 3] = np.interp(times, coarse.timestamps, coarse.odom_from_rig[:, axis, 3])
+    fine = Odometry(times, poses)
+    first, last = np.array([0]), np.array([-1])
+    np.testing.assert_allclose(fine.drift(SETTINGS, first, last), coarse.drift(SETTINGS, first, last), rtol=1e-6)
+    steps = np.arange(100)
+    of_steps = np.linalg.norm(fine.drift(SETTINGS, steps, steps + 1), axis=1)
+    np.testing.assert_allclose(of_steps, np.ravel(fine.drift(SETTINGS, first, last)), rtol=1e-6)
+
+
+def test_the_placement_with_the_most_support_comes_first() -> None:
+    rng = np.random.default_rng(1)
+    way = drive(rng, wrong=0.4)
+    found = place(way.odometry, way.queries, SETTINGS)
+    assert set(found[0].members.tolist()) == set(np.flatnonzero(~way.is_wrong).tolist())
+    assert found[0].trusted
+    assert found[0].support > 2 * found[0].rival_support
+    members = np.concatenate([placement.members for placement in found])
+    assert sorted(members.tolist()) == list(range(len(way.queries)))
+
+
+def test_a_rival_as_likely_is_not_trusted() -> None:
+    way = drive(np.random.default_rng(2), wrong=0.0)
+    elsewhere = geometry.make_pose(np.eye(3), [30.0, 0.0, 0.0])  # a room that looks alike
+    poses = way.queries.world_from_rig.copy()
+    poses[::2] = elsewhere @ poses[::2]
+    queries = PosedQueries(way.queries.frames, poses, *list(vars(way.queries).values())[2:])
+    found = place(way.odometry, queries, SETTINGS)
+    assert not found[0].trusted
+    assert found[0].rival_support == pytest.approx(found[1].support)
+
+
+@pytest.mark.parametrize(
+    ("trusted", "count", "sure"), [(True, 1, True), (False, 1, False), (False, 2, False), (False, 3, True)]
+)
+def test_one_sure_query_or_three_that_agree_are_trusted(trusted: bool, count: int, sure: bool) -> None:
+    way = drive(np.random.default_rng(3), wrong=0.0)
+    some = way.queries.choose(np.arange(count))
+    queries = PosedQueries(*list(vars(some).values())[:4], np.full(count, trusted))
+    assert place(way.odometry, queries, SETTINGS)[0].trusted == sure
+
+
+def test_scale_is_fitted_as_far_as_queries_know_it() -> None:
+    way = drive(np.random.default_rng(4), wrong=0.0)
+    assert fitted_scale(way.odometry.scaled(1 / 1.03), way.queries, SETTINGS) == pytest.approx(1.03, abs=0.005)
+    near = way.queries.choose(np.arange(2))
+    vague = PosedQueries(near.frames, near.world_from_rig, 1e4 * near.covariances, near.weights, near.trusted)
+    assert fitted_scale(way.odometry.scaled(1 / 1.03), vague, SETTINGS) == pytest.approx(1.0, abs=0.002)
+    assert fitted_scale(way.odometry, near.choose(np.arange(1)), SETTINGS) == 1.0
+
+
+def test_the_first_guess_follows_odometry_from_the_next_query() -> None:
+    way: Drive = drive(np.random.default_rng(5), wrong=0.0, noise=0.0, drift=0.0)
+    guess = first_guess(way.odometry, way.queries.choose(np.array([0, 3])))
+    np.testing.assert_allclose(guess, way.world_from_rig, atol=1e-9)
+    places = guess @ geometry.invert(way.odometry.odom_from_rig)
+    np.testing.assert_allclose(places, np.tile(PLACE, (len(guess), 1, 1)), atol=1e-9)

@@ -1,0 +1,88 @@
+"""The pose graph of odometry and single queries."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from tests.localizers.drifting import drive
+from toolkit import geometry
+from toolkit.errors import ManifestError
+from toolkit.localizers.odometry import Odometry, PosedQueries
+from toolkit.localizers.pose_graph import _logarithm, place_piece
+from toolkit.manifest import SequenceSettings
+
+pytest.importorskip("gtsam")
+SETTINGS = SequenceSettings()
+
+
+def test_exact_measurements_give_the_exact_poses() -> None:
+    way = drive(np.random.default_rng(0), noise=0.0, drift=0.0)
+    placed = place_piece(way.odometry, way.queries, SETTINGS)
+    np.testing.assert_allclose(placed.world_from_rig, way.world_from_rig, atol=1e-6)
+    assert placed.status == "ok"
+    assert placed.used.all()
+    assert placed.scale == pytest.approx(1.0, abs=1e-6)
+    assert (np.linalg.eigvalsh(placed.covariances) > 0).all()
+
+
+def test_wrong_queries_are_not_used_and_harm_nothing() -> None:
+    way = drive(np.random.default_rng(1), wrong=0.5)
+    placed = place_piece(way.odometry, way.queries, SETTINGS)
+    assert placed.used.tolist() == (~way.is_wrong).tolist()
+    rotation_deg, position_m = geometry.pose_error(placed.world_from_rig, way.world_from_rig)
+    assert rotation_deg.max() < 1.0
+    assert position_m.max() < 0.3
+    assert placed.status == "ok"
+
+
+def test_the_stated_covariance_is_as_large_as_the_errors() -> None:
+    chi2 = []
+    for seed in range(12):
+        way = drive(np.random.default_rng(seed), every=5)
+        placed = place_piece(way.odometry, way.queries, SETTINGS)
+        error = _logarithm(geometry.invert(placed.world_from_rig) @ way.world_from_rig)
+        chi2.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(placed.covariances), error))
+    assert 4.0 < np.mean(chi2) < 8.0  # 6 degrees of freedom
+
+
+def test_a_pose_is_less_sure_the_farther_it_is_from_a_query() -> None:
+    way = drive(np.random.default_rng(2))
+    placed = place_piece(way.odometry, way.queries.choose(np.array([0])), SETTINGS)
+    stds = np.sqrt(np.trace(placed.covariances[:, 3:, 3:], axis1=1, axis2=2))
+    assert (np.diff(stds) > 0).all()
+
+
+def test_a_piece_without_a_sure_query_says_so() -> None:
+    way = drive(np.random.default_rng(3))
+    nothing = place_piece(way.odometry, way.queries.choose(np.zeros(0, np.int64)), SETTINGS)
+    assert nothing.status.startswith("failed")
+    assert np.isnan(nothing.world_from_rig).all()
+    one = way.queries.choose(np.array([4]))
+    doubtful = PosedQueries(one.frames, one.world_from_rig, one.covariances, one.weights, np.array([False]))
+    placed = place_piece(way.odometry, doubtful, SETTINGS)
+    assert placed.status.startswith("low_confidence")
+    assert np.isfinite(placed.world_from_rig).all()
+
+
+@pytest.mark.parametrize("frames", [1, 2, 5])
+def test_a_device_that_stands_still_is_placed(frames: int) -> None:
+    way = drive(np.random.default_rng(4))
+    still = Odometry(np.arange(frames) * 33_333, np.tile(np.eye(4), (frames, 1, 1)))
+    one = way.queries.choose(np.array([0]))
+    placed = place_piece(still, one, SETTINGS)
+    np.testing.assert_allclose(placed.world_from_rig, np.tile(one.world_from_rig[0], (frames, 1, 1)), atol=1e-6)
+
+
+def test_a_wrong_scale_of_odometry_is_found() -> None:
+    way = drive(np.random.default_rng(5), frames=80)
+    placed = place_piece(way.odometry.scaled(1 / 1.04), way.queries, SETTINGS)
+    assert placed.scale == pytest.approx(1.04, abs=0.01)
+    assert geometry.pose_error(placed.world_from_rig, way.world_from_rig)[1].max() < 0.3
+
+
+def test_without_gtsam_one_sentence_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gtsam", None)
+    way = drive(np.random.default_rng(6))
+    with pytest.raises(ManifestError, match="pip install"):
+        place_piece(way.odometry, way.queries, SETTINGS)

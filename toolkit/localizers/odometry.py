@@ -1,0 +1,184 @@
+"""Odometry: motion that a device measures itself, in a frame of its own, and which place of that frame in the map the
+poses of single queries agree with.
+
+Of a recording whose tracking was lost, each piece has a frame of its own. Odometry drifts: what two poses of a piece
+say of each other becomes less sure with the way and the time between them.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from toolkit import geometry
+from toolkit.geometry import Floats, Ints
+from toolkit.manifest import SequenceSettings
+
+LEAST_STD_M, LEAST_STD_DEG = 0.02, 0.1
+"""A single query's pose is not surer than this: its covariance does not know of errors of the map."""
+_CHI2_99 = 16.81
+"""99 % quantile of the chi-squared distribution with 6 degrees of freedom."""
+
+
+@dataclass(frozen=True)
+class Odometry:
+    """N poses of one device in a frame of its own, in the order of time, without a loss of tracking."""
+
+    timestamps: Ints
+    """(N,) microseconds."""
+    odom_from_rig: Floats
+    """(N, 4, 4), meters."""
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    @property
+    def way_m(self) -> Floats:
+        """(N,) meters from the first pose, along the way."""
+        steps = np.diff(self.odom_from_rig[:, :3, 3], axis=0)
+        return np.concatenate([[0.0], np.cumsum(np.linalg.norm(steps, axis=1))])
+
+    def scaled(self, factor: float) -> "Odometry":
+        """Return it with all lengths times a factor."""
+        poses = self.odom_from_rig.copy()
+        poses[:, :3, 3] *= factor
+        return replace(self, odom_from_rig=poses)
+
+    def drift(self, settings: SequenceSettings, first: Ints, second: Ints) -> tuple[Floats, Floats]:
+        """Return standard deviations (n,) by axis of what pairs of poses say of each other: radians, meters."""
+        way, seconds = self.way_m, self.timestamps / 1e6
+        rotation = np.deg2rad(settings.rotation_drift_deg) * np.sqrt(np.abs(seconds[first] - seconds[second]))
+        # A random walk: the same for many short steps as for one long one.
+        return rotation, settings.position_drift * np.sqrt(np.abs(way[first] - way[second]))
+
+    def split(self, settings: SequenceSettings) -> list[slice]:
+        """Return the pieces between losses of tracking: gaps in time, and steps that no device makes."""
+        seconds = np.diff(self.timestamps) / 1e6
+        lost = (seconds > settings.max_gap_s) | (np.diff(self.way_m) > settings.max_speed_m_s * seconds)
+        ends = [0, *(np.flatnonzero(lost) + 1).tolist(), len(self)]
+        return [slice(start, end) for start, end in pairwise(ends) if end > start]
+
+
+@dataclass(frozen=True)
+class PosedQueries:
+    """Q poses of single queries of one piece of odometry."""
+
+    frames: Ints
+    """(Q,) their indices in the odometry."""
+    world_from_rig: Floats
+    """(Q, 4, 4)."""
+    covariances: Floats
+    """(Q, 6, 6) of a small motion in the rig's frame: rotation, radians, then translation, meters."""
+    weights: Floats
+    """(Q,) probability that each is right."""
+    trusted: NDArray[np.bool_]
+    """(Q,) whether localization said `ok`."""
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def choose(self, rows: Ints | NDArray[np.bool_]) -> "PosedQueries":
+        return PosedQueries(*(values[rows] for values in vars(self).values()))
+
+
+def floored(covariances: Floats) -> Floats:
+    """Return covariances (n, 6, 6) of poses that are not surer than a map is right."""
+    least = np.repeat([np.deg2rad(LEAST_STD_DEG), LEAST_STD_M], 3) ** 2
+    return covariances + np.diag(least)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Which single poses agree with each other, given the odometry between them."""
+
+    members: Ints
+    """Queries that agree, ascending."""
+    support: float
+    """Sum of their weights."""
+    trusted: bool
+    """Whether one of them is `ok`, or three agree, and no rival is half as well supported."""
+    rival_support: float
+    """That of the best placement that contradicts this one."""
+
+
+def place(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> list[Placement]:
+    """Return the rival placements of odometry in the map, the best supported first.
+
+    Each query votes: its pose gives one placement, which is supported by all queries whose poses it predicts, within
+    the drift between the two and the covariances of both.
+    """
+    agree = _agreement(odometry, queries, settings)
+    left = np.ones(len(queries), bool)
+    found: list[tuple[Ints, float]] = []
+    while left.any():
+        seed = int(np.argmax(np.where(left, (agree & left) @ queries.weights, -1.0)))
+        members = agree[seed] & left
+        # Who contradicts most of the others was predicted by the seed by chance.
+        with_others = agree[:, members] @ queries.weights[members]
+        members &= with_others >= 0.5 * queries.weights[members].sum()
+        members[seed] = True
+        found.append((np.flatnonzero(members), float(queries.weights[members].sum())))
+        left &= ~members
+    found.sort(key=lambda one: -one[1])
+    placements = []
+    for number, (rows, support) in enumerate(found):
+        others = [other for index, (_, other) in enumerate(found) if index != number]
+        rival = max(others, default=0.0)
+        sure = bool(queries.trusted[rows].any() or len(rows) >= 3) and rival < 0.5 * support
+        placements.append(Placement(rows, support, sure, rival))
+    return placements
+
+
+def _agreement(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> NDArray[np.bool_]:
+    """Return (Q, Q) whether two poses fit the motion between them."""
+    count = len(queries)
+    first, second = (each.ravel() for each in np.indices((count, count)))
+    frames = queries.frames
+    moved = odometry.odom_from_rig[frames]
+    expected = (geometry.invert(moved)[:, None] @ moved[None]).reshape(-1, 4, 4)
+    poses = queries.world_from_rig
+    found = (geometry.invert(poses)[:, None] @ poses[None]).reshape(-1, 4, 4)
+    difference = geometry.invert(expected) @ found
+    rotation_std, position_std = odometry.drift(settings, frames[first], frames[second])
+    distance = np.linalg.norm(expected[:, :3, 3], axis=1)
+    variances = np.trace(floored(queries.covariances)[:, :3, :3], axis1=1, axis2=2) / 3
+    rotation_var = rotation_std**2 + variances[first] + variances[second]
+    variances = np.trace(floored(queries.covariances)[:, 3:, 3:], axis1=1, axis2=2) / 3
+    # A wrong heading at the first puts the second aside, a wrong scale before or behind.
+    position_var = position_std**2 + variances[first] + variances[second]
+    position_var += distance**2 * (rotation_var / 2 + settings.scale_std**2)
+    angle = np.deg2rad(geometry.rotation_angle_deg(difference[:, :3, :3]))
+    chi2 = angle**2 / rotation_var + (difference[:, :3, 3] ** 2).sum(axis=1) / position_var
+    agree = (chi2 < _CHI2_99).reshape(count, count)
+    return agree | agree.T
+
+
+def fitted_scale(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> float:
+    """Return the factor of the odometry's lengths that single poses of one placement ask for; 1 says the prior."""
+    if len(queries) < 2:
+        return 1.0
+    moved, placed = (poses[:, :3, 3] for poses in (odometry.odom_from_rig[queries.frames], queries.world_from_rig))
+    moved, placed = moved - moved.mean(axis=0), placed - placed.mean(axis=0)
+    rotation = _rotation(placed, moved)
+    _, drift = odometry.drift(settings, queries.frames, np.full(len(queries), queries.frames[len(queries) // 2]))
+    variance = drift**2 + np.trace(floored(queries.covariances)[:, 3:, 3:], axis1=1, axis2=2) / 3
+    information = ((moved**2).sum(axis=1) / variance).sum()
+    product = ((placed * (moved @ rotation.T)).sum(axis=1) / variance).sum()
+    prior = 1 / settings.scale_std**2
+    return float((product + prior) / (information + prior))
+
+
+def _rotation(a: Floats, b: Floats) -> Floats:
+    """Return the rotation a_from_b of centered points (n, 3): W. Kabsch, Acta Crystallographica A32, 1976."""
+    u, _, vt = np.linalg.svd(a.T @ b)
+    return np.asarray(u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt)
+
+
+def first_guess(odometry: Odometry, queries: PosedQueries) -> Floats:
+    """Return world_from_rig (N, 4, 4): each pose as odometry leads to it from the next query along the way."""
+    way = odometry.way_m
+    nearest = np.argmin(np.abs(way[:, None] - way[queries.frames]), axis=1)
+    moved = odometry.odom_from_rig
+    return queries.world_from_rig[nearest] @ geometry.invert(moved[queries.frames[nearest]]) @ moved
+

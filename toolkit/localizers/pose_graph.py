@@ -1,0 +1,129 @@
+"""The poses of a recording that its odometry and the poses of single queries make most probable.
+
+A graph of all poses of a piece of odometry: each step between two is as odometry measured it, up to its drift; the
+pose of a single query is as it was localized, up to its covariance. Solved by GTSAM (F. Dellaert and GTSAM
+Contributors, https://gtsam.org).
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from toolkit import geometry
+from toolkit.errors import ManifestError
+from toolkit.geometry import Floats, Ints
+from toolkit.localizers.odometry import Odometry, PosedQueries, first_guess, fitted_scale, floored, place
+from toolkit.manifest import SequenceSettings
+
+MISSING = (
+    "The stage `sequence` needs GTSAM, which is not installed here. To add it, where the toolkit was installed from: "
+    "pip install -e '.[sequence]'"
+)
+_CHI2_999 = 22.46
+"""99.9 % quantile of the chi-squared distribution with 6 degrees of freedom."""
+_ROUNDS = 8
+
+
+@dataclass(frozen=True)
+class PlacedPiece:
+    """The poses of one piece of odometry in the map."""
+
+    world_from_rig: Floats
+    """(N, 4, 4), NaN where no query has a pose."""
+    covariances: Floats
+    """(N, 6, 6) of a small motion in the rig's frame: rotation, radians, then translation, meters."""
+    used: NDArray[np.bool_]
+    """(Q,) whether the poses rest on each query."""
+    status: str
+    """`ok`, `low_confidence: <reason>` or `failed: <reason>`."""
+    scale: float = 1.0
+    """Factor of the odometry's lengths."""
+
+
+def place_piece(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> PlacedPiece:
+    """Return the poses of a piece of odometry, from the poses of single queries in it.
+
+    Raises:
+        ManifestError: GTSAM is not installed.
+    """
+    count = len(odometry)
+    if not len(queries):
+        nothing = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan), np.zeros(0, bool)
+        return PlacedPiece(*nothing, "failed: no query of this piece has a pose")
+    best = place(odometry, queries, settings)[0]
+    used, seen = best.members, set[bytes]()
+    for _ in range(_ROUNDS):
+        chosen = queries.choose(used)
+        scale = fitted_scale(odometry, chosen, settings)
+        moved = odometry.scaled(scale)
+        poses, covariances = _optimized(moved, chosen, settings)
+        seen.add(used.tobytes())
+        # Who fits is used, whether it voted for this place or not; who does not fit is not.
+        fit = np.flatnonzero(_chi2(poses, covariances, queries) < _CHI2_999)
+        if not len(fit) or fit.tobytes() in seen:
+            break
+        used = fit
+    mask = np.isin(np.arange(len(queries)), used)
+    status = "ok"
+    if not best.trusted:
+        rivaled = best.rival_support >= 0.5 * best.support
+        status = f"low_confidence: {'another place is as likely' if rivaled else 'no query of this piece is sure'}"
+    return PlacedPiece(poses, covariances, mask, status, scale)
+
+
+def _chi2(poses: Floats, covariances: Floats, queries: PosedQueries) -> Floats:
+    """Return how far (Q,) the poses of single queries are off, in their own and the graph's covariance together."""
+    frames = queries.frames
+    difference = _logarithm(geometry.invert(poses[frames]) @ queries.world_from_rig)
+    both = floored(queries.covariances) + covariances[frames]
+    return np.asarray(np.einsum("qi,qi->q", difference, np.linalg.solve(both, difference[..., None])[..., 0]))
+
+
+def _logarithm(poses: Floats) -> Floats:
+    """Return small motions (n, 6): rotation vector, radians, then translation."""
+    angle = np.deg2rad(geometry.rotation_angle_deg(poses[:, :3, :3]))
+    axis = np.stack([poses[:, i, j] - poses[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=1)
+    return np.concatenate([geometry.unit(axis) * angle[:, None], poses[:, :3, 3]], axis=1)
+
+
+def _optimized(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> tuple[Floats, Floats]:
+    """Return poses (N, 4, 4) and covariances (N, 6, 6)."""
+    gtsam = _gtsam()
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for number, pose in enumerate(first_guess(odometry, queries)):
+        values.insert(number, gtsam.Pose3(_rigid(pose)))
+    steps = geometry.invert(odometry.odom_from_rig[:-1]) @ odometry.odom_from_rig[1:]
+    first: Ints = np.arange(len(steps))
+    rotation_std, position_std = odometry.drift(settings, first, first + 1)
+    # The scale is not the same all along the way, either.
+    position_std = np.hypot(position_std, settings.scale_std * np.linalg.norm(steps[:, :3, 3], axis=1))
+    # A device that stands still moves by nothing, but is not known to a billionth.
+    rotation_std, position_std = np.maximum(rotation_std, 1e-4), np.maximum(position_std, 1e-3)
+    for number, step in enumerate(steps):
+        noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([rotation_std[number], position_std[number]], 3))
+        graph.add(gtsam.BetweenFactorPose3(number, number + 1, gtsam.Pose3(_rigid(step)), noise))
+    kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(3.0)
+    for frame, pose, covariance in zip(queries.frames.tolist(), queries.world_from_rig, floored(queries.covariances),
+                                       strict=True):  # fmt: skip
+        noise = gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Gaussian.Covariance(covariance))
+        graph.add(gtsam.PriorFactorPose3(frame, gtsam.Pose3(_rigid(pose)), noise))
+    result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    marginals = gtsam.Marginals(graph, result)
+    numbers = range(len(odometry))
+    poses = np.stack([result.atPose3(number).matrix() for number in numbers])
+    return poses, np.stack([marginals.marginalCovariance(number) for number in numbers])
+
+
+def _rigid(pose: Floats) -> Floats:
+    """Return a pose (4, 4) whose rotation is one up to the last digit; files have some of them."""
+    return geometry.pose_from_qt(geometry.qt_from_pose(pose))
+
+
+def _gtsam() -> Any:
+    try:
+        import gtsam
+    except ImportError:
+        raise ManifestError(MISSING) from None
+    return gtsam
