@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 TOOLKIT = Path(__file__).resolve().parents[1] / "toolkit"
-STAGES = ("embed", "retrieve", "rerank", "localize", "evaluate", "visualize")
+STAGES = ("embed", "retrieve", "rerank", "localize", "sequence", "evaluate", "visualize")
 # From the ground up. A row may import from the rows above it, and within a name; not from its neighbors in the row.
 LEVELS: list[tuple[str, ...]] = [
     ("__init__",),

@@ -1,0 +1,228 @@
+"""The sequence stage: the poses of single queries and the odometry between them in, a pose of every frame out."""
+
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from toolkit.capture import Capture, Session, Trajectory
+from toolkit.capture.tables import KeyIndex, as_strings, read_query_table
+from toolkit.errors import OF_THE_DATA, ArtifactError
+from toolkit.files import file_fingerprint, is_current, pair_name, require_whole, write_atomic, write_sidecar
+from toolkit.geometry import Floats, Ints, pose_error
+from toolkit.localizers.odometry import Odometry, PosedQueries
+from toolkit.localizers.pose_graph import place_piece
+from toolkit.manifest import SequenceSettings
+
+SUFFIX = "_sequence"
+"""Ends the name of what the stage makes of a pair, beside what localization has made of it."""
+COLUMNS = (
+    "timestamp", "device_id", "recording", "piece", "status", "position_std_m", "rotation_std_deg", "single_status",
+    "used", "moved_m", "turned_deg",
+)  # fmt: skip
+"""Of the table: `moved_m` and `turned_deg` tell how far a query's pose is from that of localization, which was `used`
+where it agrees with the others of its piece."""
+
+
+def sequence_pairs(
+    sessions_root: str | Path,
+    poses_dir: str | Path,
+    settings: SequenceSettings | Mapping[str, Any] | None = None,
+    *,
+    map_device: str = "all",
+    query_device: str = "all",
+    skip_existing: bool = True,
+) -> pd.DataFrame:
+    """Write for each pair of devices the poses of all frames of the queries' recordings, and a table of them.
+
+    `<poses_dir>/<pair>_sequence.txt` has every frame of the odometry, and every query without odometry that was
+    localized; `<pair>_sequence.csv` has a row for each of them, with `COLUMNS`, also for those without a pose.
+
+    Args:
+        sessions_root: `<capture>/sessions`; the odometry is trajectories.txt of a query session.
+        poses_dir: folder of the localize stage's poses; the results go there, too.
+        settings: see `SequenceSettings`; a dict holds what differs from the defaults.
+        map_device, query_device: `ios`, `hl`, `spot`, or `all` that the capture has.
+        skip_existing: reuse what was made from the same inputs and settings.
+
+    Returns:
+        One row a pair: map_device, query_device, frames = ok + low_confidence + failed, pieces, queries that were
+        localized, used (those that agree), seconds, skipped, path, reason. A pair that cannot be done, for want of
+        odometry or of poses, has zeros and the `reason`.
+
+    Raises:
+        ManifestError: a setting is not valid, or GTSAM is not installed.
+        CaptureError: unknown device.
+    """
+    settings = SequenceSettings.of(settings)
+    capture = Capture.from_sessions_root(sessions_root)
+    rows = []
+    for devices in product(capture.devices_with("map", map_device), capture.devices_with("query", query_device)):
+        row = {"map_device": devices[0], "query_device": devices[1], **dict.fromkeys(_COUNTS, 0)}
+        row |= {"seconds": 0.0, "skipped": False, "path": "", "reason": ""}
+        try:
+            row |= _place_pair(capture, *devices, Path(poses_dir), settings, skip_existing)
+        except OF_THE_DATA as error:
+            row["reason"] = str(error)
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+_COUNTS = ("frames", "ok", "low_confidence", "failed", "pieces", "queries", "used")
+
+
+def _place_pair(
+    capture: Capture, map_device: str, query_device: str, poses_dir: Path, settings: SequenceSettings,
+    skip_existing: bool,
+) -> dict[str, Any]:  # fmt: skip
+    started = time.perf_counter()
+    session = capture[f"{query_device}_query"]
+    stem = poses_dir / pair_name(capture.name, map_device, query_device)
+    poses, table, out = (stem.with_name(f"{stem.name}{end}") for end in (".txt", ".csv", f"{SUFFIX}.txt"))
+    if session.odometry is None:
+        raise ArtifactError(f"{session.path} has no trajectories.txt: there is no odometry of {session.id}.")
+    if not poses.exists():
+        raise ArtifactError(f"{poses}: no poses of this pair. Localize first.")
+    require_whole(poses)
+    record = {
+        "sequence": settings.model_dump(),
+        "poses": [file_fingerprint(path) for path in (poses, table)],
+        "odometry": file_fingerprint(session.path / "trajectories.txt"),
+    }
+    skipped = skip_existing and is_current(out, record)
+    if not skipped:
+        frames, trajectory = _frames(session, _Answers.read(poses, table), settings)
+        with write_atomic(out.with_suffix(".csv")) as temporary:
+            frames.to_csv(temporary, index=False)
+        trajectory.write(out)
+        write_sidecar(out, record, [out.with_suffix(".csv")])
+    frames = pd.read_csv(out.with_suffix(".csv"), keep_default_na=False)
+    status = frames["status"].str.split(":").str[0].value_counts()
+    return {
+        "frames": len(frames),
+        **{name: int(status.get(name, 0)) for name in ("ok", "low_confidence", "failed")},
+        "pieces": len(frames[["recording", "piece"]].drop_duplicates()),
+        "queries": int((frames["moved_m"] != "").sum()),
+        "used": int((frames["used"].astype(str) == "True").sum()),
+        "seconds": round(time.perf_counter() - started, 2),
+        "skipped": skipped,
+        "path": str(out),
+    }
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """A piece of a recording's odometry."""
+
+    recording: str
+    number: int
+    rows: Ints
+    """(N,) of the session's odometry."""
+
+
+@dataclass(frozen=True)
+class _Answers:
+    """What localization says of Q queries."""
+
+    keys: pd.DataFrame
+    """Table [timestamp, device_id]."""
+    status: NDArray[np.object_]
+    weights: Floats
+    """(Q,) probability that each pose is right."""
+    poses: Floats
+    """(Q, 4, 4), NaN where there is none."""
+    covariances: Floats
+    """(Q, 6, 6)."""
+
+    @classmethod
+    def read(cls, poses: Path, table: Path) -> "_Answers":
+        rows, trajectory = read_query_table(table, ["status"]), Trajectory.read(poses)
+        rows = rows.drop_duplicates(["timestamp", "device_id"], ignore_index=True)
+        status = rows["status"].to_numpy(object)
+        # Where localization gives no probability, its word counts.
+        weights = rows.get("p_correct", pd.Series(np.nan, rows.index)).fillna(rows["status"].eq("ok") * 0.9 + 0.05)
+        at = trajectory.index.find(rows["timestamp"].to_numpy(), as_strings(rows["device_id"]))
+        # Nor is a pose without a covariance, such as that of `nearest`, known better than to some meters.
+        covariances = np.tile(np.diag(np.repeat([0.1, 4.0], 3)), (len(rows), 1, 1))
+        if (given := trajectory.covariances) is not None:
+            known = (at >= 0) & np.isfinite(given[at]).all(axis=(1, 2))
+            covariances[known] = given[at[known]]
+        found = trajectory.lookup(rows["timestamp"], rows["device_id"])
+        return cls(rows[["timestamp", "device_id"]], status, weights.to_numpy(float), found, covariances)
+
+    def posed(self, rows: Ints, frames: Ints) -> PosedQueries:
+        """Return some queries, which are frames of a piece of odometry."""
+        trusted = np.asarray(self.status[rows] == "ok")
+        return PosedQueries(frames, self.poses[rows], self.covariances[rows], self.weights[rows], trusted)
+
+    def of(self, timestamps: Ints, device_ids: Any) -> Ints:
+        """Return which query each frame (N,) is, -1 where it is none."""
+        index = KeyIndex(self.keys["timestamp"].to_numpy(), as_strings(self.keys["device_id"]))
+        return index.find(timestamps, as_strings(device_ids))
+
+
+def _frames(session: Session, answers: _Answers, settings: SequenceSettings) -> tuple[pd.DataFrame, Trajectory]:
+    """Return the table of all frames and queries, and the poses of those that have one."""
+    assert session.odometry is not None
+    odometry = session.odometry
+    query_of = answers.of(odometry.timestamps, odometry.arrow_ids)
+    tables, poses, covariances = list[pd.DataFrame](), list[Floats](), list[Floats]()
+    for piece in _pieces(session, odometry, settings):
+        asked = query_of[piece.rows]
+        frames = np.flatnonzero((asked >= 0) & np.isfinite(answers.poses[asked]).all(axis=(1, 2)))
+        queries = answers.posed(asked[frames], frames)
+        motion = Odometry(odometry.timestamps[piece.rows], odometry.world_from_device[piece.rows])
+        placed = place_piece(motion, queries, settings)
+        table = pd.DataFrame(dict.fromkeys(COLUMNS), index=range(len(piece.rows)))
+        table["timestamp"], table["device_id"] = motion.timestamps, odometry.device_ids[piece.rows]
+        table["recording"], table["piece"], table["status"] = piece.recording, piece.number, placed.status
+        table["single_status"] = np.where(asked >= 0, answers.status[asked], "")
+        turned, moved = pose_error(placed.world_from_rig[frames], queries.world_from_rig)
+        for name, values in (("used", placed.used), ("moved_m", moved.round(6)), ("turned_deg", turned.round(6))):
+            table.loc[frames, name] = values
+        tables.append(table)
+        poses.append(placed.world_from_rig)
+        covariances.append(placed.covariances)
+    alone = np.setdiff1d(np.arange(len(answers.keys)), query_of)
+    table = answers.keys.iloc[alone].assign(status=answers.status[alone], single_status=answers.status[alone])
+    tables.append(table.reindex(columns=list(COLUMNS)))
+    every = np.concatenate([*poses, answers.poses[alone]])
+    known = np.concatenate([*covariances, answers.covariances[alone]])
+    frames_table = pd.concat([part.astype(object) for part in tables], ignore_index=True)
+    posed = np.isfinite(every).all(axis=(1, 2))
+    stds = np.sqrt(np.trace(known[:, 3:, 3:], axis1=1, axis2=2)), np.sqrt(np.trace(known[:, :3, :3], axis1=1, axis2=2))
+    frames_table["position_std_m"] = np.where(posed, stds[0], np.nan).round(6)
+    frames_table["rotation_std_deg"] = np.where(posed, np.degrees(stds[1]), np.nan).round(6)
+    kept = frames_table[posed]
+    times = kept["timestamp"].to_numpy(np.int64)
+    return frames_table, Trajectory.from_poses(times, kept["device_id"].to_list(), every[posed], known[posed])
+
+
+def _pieces(session: Session, odometry: Trajectory, settings: SequenceSettings) -> Iterator[_Piece]:
+    """Yield the pieces of each recording, in the order of time."""
+    recordings = _recordings(session, odometry)
+    for recording in dict.fromkeys(recordings.tolist()):
+        rows = np.flatnonzero(recordings == recording)
+        rows = rows[np.argsort(odometry.timestamps[rows], kind="stable")]
+        whole = Odometry(odometry.timestamps[rows], odometry.world_from_device[rows])
+        for number, part in enumerate(whole.split(settings)):
+            yield _Piece(recording, number, rows[part])
+
+
+def _recordings(session: Session, odometry: Trajectory) -> NDArray[np.object_]:
+    """Return the recording (N,) of each pose: its subsession; of devices that moved at the same time, each its own."""
+    devices = odometry.device_ids
+    recordings = np.full(len(odometry), "", object)
+    for name in sorted(session.subsessions, key=len):
+        recordings[[device.startswith(f"{name}/") for device in devices]] = name
+    for name in dict.fromkeys(recordings.tolist()):
+        rows = np.flatnonzero(recordings == name)
+        if len(np.unique(odometry.timestamps[rows])) < len(rows):
+            recordings[rows] = [f"{name} {device}".strip() for device in devices[rows]]
+    return recordings
