@@ -26,6 +26,7 @@ def place(small_capture: Path, tmp_path: Path) -> Path:
     truth = session.ground_truth
     assert truth is not None
     odometry = geometry.invert(PLACE) @ truth.world_from_device
+    (capture / "sessions/hl_query/trajectories.txt").unlink()
     Trajectory.from_poses(truth.timestamps, truth.device_ids, odometry).write(session.path / "trajectories.txt")
     localized(tmp_path, capture, truth, np.arange(0, len(truth), 2))
     return capture

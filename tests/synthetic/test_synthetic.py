@@ -18,7 +18,7 @@ from toolkit.errors import CaptureError
 from toolkit.geometry import invert, make_pose, rotation_angle_deg, transform
 from toolkit.synthetic import capture as capture_writing
 from toolkit.synthetic import render_capture, render_street, textures
-from toolkit.synthetic.devices import DEVICES, Sensor, looking, walk_street, walks
+from toolkit.synthetic.devices import DEVICES, Sensor, looking, odometry_of, walk_street, walks
 from toolkit.synthetic.light import paint
 from toolkit.synthetic.render import Rays, render
 from toolkit.synthetic.scene import BLOCK_M, Quad, Scene, build_block, build_room
@@ -151,7 +151,7 @@ def test_the_format_is_whole(small_capture: Path) -> None:
         frames = 6 if split == "map" else 3
         assert len(session.images) == frames * len(DEVICES[device].sensors)
         assert len(session.subsessions) == 2
-        assert (session.trajectory is None) == (split == "query")
+        assert (session.odometry is None) == (split == "map")
         assert (session.rigs is None) == (device == "ios")
         assert session.ground_truth is not None
         assert len(session.ground_truth) == frames
@@ -341,3 +341,32 @@ def test_refusals(tmp_path: Path) -> None:
 def test_a_quad_faces_the_side_it_is_seen_from() -> None:
     quad = Quad(np.zeros(3), np.array([1.0, 0, 0]), np.array([0, 0, -1.0]), 1, 1, textures.plain, 10)
     np.testing.assert_array_equal(quad.normal, [0, -1, 0])  # right and down as seen from -y
+
+
+def test_odometry_drifts_from_the_truth_in_an_upright_frame_of_its_own(small_capture: Path) -> None:
+    session = Capture.open(small_capture)["spot_query"]
+    truth, odometry = session.ground_truth, session.odometry
+    assert truth is not None
+    assert odometry is not None
+    assert odometry.device_ids.tolist() == truth.device_ids.tolist()
+    recording = [device.startswith(f"{session.subsessions[0]}/") for device in truth.device_ids]
+    poses, measured = truth.world_from_device[recording], odometry.world_from_device[recording]
+    odom_from_world = measured @ invert(poses)
+    assert rotation_angle_deg(odom_from_world[0, :3, :3]) > 1.0
+    tilt = np.degrees(np.arccos(odom_from_world[:, 2, 2]))
+    assert tilt.max() < 2.0
+    steps, taken = invert(poses[:-1]) @ poses[1:], invert(measured[:-1]) @ measured[1:]
+    lengths, found = (np.linalg.norm(step[:, :3, 3], axis=1) for step in (steps, taken))
+    assert (found != lengths).all()
+    np.testing.assert_allclose(found, lengths, rtol=0.15)
+    assert 0 < rotation_angle_deg((invert(steps) @ taken)[:, :3, :3]).max() < 1.0
+
+
+def test_drift_of_odometry_is_as_large_as_stated() -> None:
+    straight = np.tile(np.eye(4), (4001, 1, 1))
+    straight[:, 0, 3] = 0.5 * np.arange(4001)
+    measured = odometry_of(np.random.default_rng(0), straight, 2.0)
+    steps = invert(measured[:-1]) @ measured[1:]
+    assert np.degrees(steps[:, 2, 1].std()) == pytest.approx(0.2, rel=0.1)
+    np.testing.assert_allclose(steps[:, :3, 3].std(axis=0), 0.02 * 0.5, rtol=0.1)
+    assert steps[:, 0, 3].mean() == pytest.approx(0.5, rel=0.06)

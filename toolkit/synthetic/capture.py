@@ -22,8 +22,8 @@ import numpy as np
 
 from toolkit.errors import CaptureError
 from toolkit.files import is_left_over, process_tag
-from toolkit.geometry import Floats, invert, pose_from_qt, qt_from_pose
-from toolkit.synthetic.devices import DEVICES, Device, halved, walk_street, walks
+from toolkit.geometry import Floats, invert, pose_from_qt
+from toolkit.synthetic.devices import DEVICES, Device, halved, odometry_of, walk_street, walks
 from toolkit.synthetic.light import paint
 from toolkit.synthetic.render import Rays, render
 from toolkit.synthetic.scene import Quad, Scene, build_block, build_room, named_rng
@@ -32,7 +32,7 @@ from toolkit.synthetic.textures import Image
 if TYPE_CHECKING:
     import pycolmap
 
-FORMAT = 1  # raise it when the same settings give other bytes
+FORMAT = 2  # raise it when the same settings give other bytes
 
 
 @dataclass(frozen=True)
@@ -187,15 +187,21 @@ def _save(path: Path, image: Image, options: list[int]) -> None:
     path.write_bytes(encoded.tobytes())
 
 
-def _write_session(path: Path, split: str, table: Tables) -> None:
-    """Write the text files of a session, rows in order of time."""
+def _write_session(path: Path, split: str, table: Tables, drift: float, seed: int) -> None:
+    """Write the text files of a session, rows in order of time; the odometry of queries has a `drift`."""
     import pandas as pd
 
     from toolkit.capture import Trajectory, write_session
 
     poses = sorted(table.poses, key=lambda row: row[:2])
     times, ids = [row[0] for row in poses], [row[1] for row in poses]
-    trajectory = Trajectory(times, ids, qt_from_pose(np.stack([row[2] for row in poses])))
+    trajectory = Trajectory.from_poses(times, ids, np.stack([row[2] for row in poses]))
+    measured = trajectory.world_from_device
+    for recording in table.subsessions:
+        rows = [row for row, id_ in enumerate(ids) if id_.startswith(f"{recording}/")]
+        if rows:
+            measured[rows] = odometry_of(named_rng(seed, "odometry", recording), measured[rows], drift)
+    odometry = Trajectory.from_poses(times, ids, measured)
     frames = pd.DataFrame({"timestamp": times, "device_id": ids})
     pruned = frames[np.arange(len(frames)) % 6 != 5]
     subsampled = pruned[np.arange(len(pruned)) % 3 != 1]
@@ -204,7 +210,7 @@ def _write_session(path: Path, split: str, table: Tables) -> None:
         path,
         sensors=table.sensors.values(),
         rigs=[row[1:] for row in sorted(table.rigs, key=lambda row: row[:3])] or None,
-        trajectory=trajectory if split == "map" else None,
+        trajectory=trajectory if split == "map" else odometry,
         images=sorted(table.images),
         depths=sorted(table.depths) or None,
         subsessions=table.subsessions,
@@ -340,7 +346,8 @@ def _render_sessions(out: Path, world: World, progress: bool) -> None:
             pool.shutdown(cancel_futures=True)
             raise
     for session, table in tables.items():
-        _write_session(sessions / session, session.rpartition("_")[2], table)
+        device, _, split = session.rpartition("_")
+        _write_session(sessions / session, split, table, world.devices[device].drift, world.seed)
 
 
 def _is_complete(out: Path, settings: dict[str, int]) -> bool:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from toolkit.geometry import Floats, invert, make_pose, rotation_angle_deg
+from toolkit.geometry import Floats, invert, make_pose, quaternion_to_rotation, rotation_angle_deg
 from toolkit.synthetic.scene import Scene, named_rng
 from toolkit.synthetic.textures import Rng
 
@@ -43,6 +43,7 @@ class Device:
     noise: float
     quality: int  # JPEG
     rig_from_body: tuple[float, ...] | None = None  # qw qx qy qz tx ty tz
+    drift: float = 1.0  # of its odometry, in units of what `odometry_of` says
 
 
 DEVICES = {
@@ -58,7 +59,7 @@ DEVICES = {
                    (0.02, -0.05, 0.004), -12.0, 0.0, 90.0),
         ),
         1.65, 5.0, True, 98.0, 1.12, (1.0, 1.0, 1.0), 0.25, 3.5, 91,
-        (0.36, 0.55, -0.42, 0.63, 0.08, -0.22, 0.31),
+        (0.36, 0.55, -0.42, 0.63, 0.08, -0.22, 0.31), 0.7,
     ),
     "spot": Device(
         (
@@ -73,7 +74,7 @@ DEVICES = {
                    (0.16, 0.15, 0.02), 78.0, 4.0),
         ),
         0.7, 1.5, True, 126.0, 0.86, (1.0, 1.0, 1.0), 0.2, 3.0, 90,
-        (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), 1.5,
     ),
 }  # fmt: skip
 
@@ -95,6 +96,29 @@ def looking(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Floats:
     down = np.cross(forward, right)
     c, s = np.cos(roll), np.sin(roll)
     return np.stack([c * right + s * down, c * down - s * right, forward], axis=-1)
+
+
+def odometry_of(rng: Rng, world_from_rig: Floats, drift: float) -> Floats:
+    """Return odom_from_rig (N, 4, 4): the motion of a recording as its device measures it, in a frame of its own.
+
+    The frame is upright up to 0.3 degrees. At `drift` 1 all lengths are wrong by 1 %, each step by another 1 %, and by
+    0.1 degrees (standard deviations; those of the step and the rotation by axis).
+    """
+
+    def turned(degrees: Floats) -> Floats:
+        angle = max(float(np.linalg.norm(degrees)), 1e-12)
+        half = np.radians(angle) / 2
+        return quaternion_to_rotation([np.cos(half), *(np.sin(half) * degrees / angle)])
+
+    heading = np.array([0.0, 0.0, rng.uniform(-180, 180)])
+    odom_from_world = make_pose(turned(rng.normal(0, 0.3, 3) * [1, 1, 0]) @ turned(heading), rng.uniform(-5, 5, 3))
+    scale = 1 + 0.01 * drift * rng.normal()
+    poses = [odom_from_world @ make_pose(np.eye(3), -world_from_rig[0, :3, 3]) @ world_from_rig[0]]
+    for step in invert(world_from_rig[:-1]) @ world_from_rig[1:]:
+        length = float(np.linalg.norm(step[:3, 3]))
+        moved = scale * step[:3, 3] + 0.01 * drift * length * rng.normal(size=3)
+        poses.append(poses[-1] @ make_pose(step[:3, :3] @ turned(0.1 * drift * rng.normal(size=3)), moved))
+    return np.stack(poses)
 
 
 BODY_FROM_LEVEL_CAM = make_pose(looking(0, 0, 0), (0, 0, 0))
