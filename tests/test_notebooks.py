@@ -100,9 +100,9 @@ def test_a_capture_goes_from_files_to_a_report(small_run: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_run_with_reranking_is_reused_and_repeated(small_capture: Path, small_run: Path, tmp_path: Path) -> None:
+def test_a_run_with_all_stages_is_reused_and_repeated(small_capture: Path, small_run: Path, tmp_path: Path) -> None:
     manifest = tmp_path / "small.yaml"
-    sections = "rerank: {}\nvisualize: {samples: 1}\n"
+    sections = "rerank: {}\nsequence: {}\nvisualize: {samples: 1}\n"
     manifest.write_text(f"captures: ['{small_capture}']\noutput_root: runs\n{sections}")
     run = tmp_path / "runs" / "small"
     # What the stages have made is taken over, but for what reranking changes.
@@ -117,9 +117,10 @@ def test_a_run_with_reranking_is_reused_and_repeated(small_capture: Path, small_
     assert rows["rerank"]["counts"]["pairs"] == 9
     table = (run / "SMALL" / "evaluation" / "overlap.csv").read_text()
     assert "reranked_mean" in table
+    assert rows["sequence"]["counts"]["frames"] == rows["sequence"]["counts"]["ok"] == 3 * 3 * 3
     poses = sorted((run / "SMALL" / "poses").glob("*.txt"))
     before = {path.name: path.read_bytes() for path in poses}
-    assert len(before) == 9
+    assert len(before) == 18
 
     again = subprocess.run(command, capture_output=True, text=True)
     assert again.stdout.count("reused") == len(STAGES), again.stdout + again.stderr

@@ -47,7 +47,7 @@ out.mkdir(parents=True, exist_ok=True)
 def write_notebook(folder: Path, stage: str, parameters: str, code: str) -> None:
     first, work = new_code_cell(parameters), new_code_cell(code)
     first.metadata["tags"] = ["parameters"]
-    number = {"rerank": "03b"}.get(stage) or f"{DEFAULT.index(stage) + 1:02d}"
+    number = {"rerank": "03b", "sequence": "04b"}.get(stage) or f"{DEFAULT.index(stage) + 1:02d}"
     nbformat.write(new_notebook(cells=[first, work], metadata=KERNEL), folder / f"{number}_{stage}.ipynb")
 
 
@@ -214,7 +214,7 @@ def test_reranking_is_switched_on_by_its_section(place: Path, monkeypatch: pytes
     assert "reranked_dir" not in off["evaluate"]
     for switch in ("rerank=true", "rerank=null", "rerank={}"):
         on = asked(switch)
-        assert list(on) == list(STAGES)
+        assert list(on) == [stage for stage in STAGES if stage != "sequence"]
         assert on["retrieve"]["topk"] == 30  # what is verified has to be retrieved
         assert on["rerank"]["retrieval_dir"].endswith("/retrieval")
         assert on["localize"]["retrieval_dir"].endswith("/reranked")

@@ -89,13 +89,12 @@ def run(
 @app.command()
 def settings(stage: Annotated[str, typer.Argument(help="Only this stage, e.g. localize.")] = "") -> None:
     """Show all settings of a manifest, with meanings and defaults, as YAML that a manifest can hold."""
-    from toolkit.manifest import STAGES, Manifest, RerankSettings, describe, nearest
+    from toolkit.manifest import STAGES, Manifest, describe, nearest
 
     if stage and stage not in STAGES:
         raise ManifestError(f"settings {stage}: no such stage. {nearest(stage, STAGES)}")
-    sections = {name: field.default for name, field in Manifest.model_fields.items()} | {"rerank": RerankSettings()}
     if stage:
-        print("\n".join([f"{stage}:", *describe(type(sections[stage]), "  ")]))
+        print("\n".join([f"{stage}:", *describe(type(Manifest.defaults(stage)), "  ")]))
     else:
         print("\n".join(describe(Manifest)))
 

@@ -4,6 +4,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -184,6 +185,45 @@ def evaluate_scene(
         record = {"poses": str(poses_dir), "queries": queries, "at": at, **settings.model_dump()}
         write_evaluation(evaluation, out_dir, record | {"messages": evaluation.messages})
     return evaluation
+
+
+def sequence_table(
+    sessions_root: str | Path,
+    poses_dir: str | Path,
+    settings: EvaluateSettings | Mapping[str, Any] | None = None,
+    *,
+    map_device: str = "all",
+    query_device: str = "all",
+    queries: str = "keyframes_pruned_subsampled",
+) -> pd.DataFrame:
+    """Compare the poses of single queries with those that the sequence stage makes of them.
+
+    Args:
+        sessions_root, poses_dir, settings, map_device, query_device, queries: as `evaluate_scene` has them.
+
+    Returns:
+        One row a pair that has poses of sequences and queries with ground truth: map_device, query_device, queries; for
+        each threshold the recall of single poses and of sequences; how many queries are within the last threshold by
+        their sequence alone (`rescued`), and how many by their single pose alone (`broken`).
+    """
+    limits = [(float(degrees), float(meters)) for degrees, meters in EvaluateSettings.of(settings).thresholds]
+    capture = Capture.from_sessions_root(sessions_root)
+    rows: list[dict[str, Any]] = []
+    for map_, query in product(capture.devices_with("map", map_device), capture.devices_with("query", query_device)):
+        stem = Path(poses_dir) / pair_name(capture.name, map_, query)
+        paths = {"single": stem.with_name(f"{stem.name}.txt"), "sequence": stem.with_name(f"{stem.name}_sequence.txt")}
+        if not all(path.is_file() for path in paths.values()):
+            continue
+        keys, truth = _queries_with_truth(capture[f"{query}_query"], queries, [])
+        if truth is None or not len(keys):
+            continue
+        row: dict[str, Any] = {"map_device": map_, "query_device": query, "queries": len(keys)}
+        errors = {name: pose_errors(Trajectory.read(path), truth, keys) for name, path in paths.items()}
+        for limit in limits:
+            row |= {f"{name} {threshold_name(limit)}": recall(*errors[name], [limit])[0] for name in paths}
+        single, sequence = (is_below(*errors[name], limits[-1]) for name in paths)
+        rows.append(row | {"rescued": int((sequence & ~single).sum()), "broken": int((single & ~sequence).sum())})
+    return pd.DataFrame(rows)
 
 
 def _unreadable(capture: Capture, session_id: str) -> str:

@@ -44,6 +44,7 @@ UPSTREAM: dict[str, tuple[str, ...]] = {
     "retrieve": ("embed",),
     "rerank": ("retrieve",),
     "localize": ("retrieve", "rerank"),
+    "sequence": ("localize",),
     "evaluate": ("retrieve", "rerank", "localize"),
     "visualize": ("retrieve", "localize"),
 }
@@ -205,6 +206,7 @@ def stage_outputs(files: SceneFiles, stage: str) -> Path | None:
         "retrieve": files.retrieval_dir,
         "rerank": files.reranked_dir,
         "localize": files.poses_dir,
+        "sequence": files.poses_dir,
         "evaluate": files.evaluation,
         "visualize": files.visualization,
     }.get(stage)

@@ -10,7 +10,7 @@ import json
 import logging
 import os
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -34,6 +34,7 @@ from toolkit.files import (
     read_json,
     write_text,
 )  # fmt: skip
+from toolkit.localizers.pose_graph import require_gtsam
 from toolkit.manifest import (
     STAGES,
     EmbedSettings,
@@ -96,10 +97,14 @@ class Job:
         """Map and query device of a job of one pair; empty for any other job."""
         return {name: self.parameters[name] for name in ("map_device", "query_device") if self.label.startswith("map_")}
 
+    def makes(self, name: str) -> bool:
+        """Tell whether a file of the stage's folder of results, by its path there, is one of the job's."""
+        return self.label in name and (self.stage == "sequence") == ("_sequence." in name)
+
     def outputs(self) -> str:
         """Return what identifies the files that the job has made."""
         folder = stage_outputs(self.files, self.stage)
-        found = tree_fingerprint(folder, self.label, content=True) if folder else ""
+        found = tree_fingerprint(folder, self.makes, content=True) if folder else ""
         beside = {"retrieve": (self.files.index, "faiss"), "localize": (self.files.maps, "npz")}
         if self.stage not in beside:
             return found
@@ -113,7 +118,7 @@ class Job:
         folder = stage_outputs(self.files, self.stage)
         if folder:
             for path in folder.rglob("*.meta.json"):
-                if self.label in path.relative_to(folder).as_posix():
+                if self.makes(path.relative_to(folder).as_posix()):
                     path.unlink()
 
 
@@ -160,6 +165,8 @@ def _run(
     manifest = _name_embedder(manifest, say)
     run_dir = Path(manifest.output_root) / manifest.name
     stages = [only] if only else [stage for stage in STAGES if stage in manifest.stages]
+    if "sequence" in stages:
+        require_gtsam()
     for stage in stages:
         if not any(run_dir.glob(f"*/.stages/{stage}*.json")):
             _require_weights(stage, manifest.stage(stage))
@@ -280,10 +287,10 @@ def _not_tolerated(
     return "\n".join([*lines, *reasons, *ways])
 
 
-def tree_fingerprint(folder: Path, part: str = "", content: bool = False) -> str:
+def tree_fingerprint(folder: Path, of: Callable[[str], bool] | None = None, content: bool = False) -> str:
     """Return 16 hex digits for the files below a folder: their paths, sizes, and times of change or their content.
 
-    With `part`, of those that have it in their path. Damage leaves size and time as they are; to read the content takes
+    With `of`, for those whose paths it is true of. Damage leaves size and time as they are; to read the content takes
     a second for some gigabytes that the system has in memory.
     """
     rows = []
@@ -291,7 +298,7 @@ def tree_fingerprint(folder: Path, part: str = "", content: bool = False) -> str
         folders.sort()
         place = os.path.relpath(root, folder)
         for name in sorted(names):
-            if part in f"{place}/{name}":
+            if of is None or of(f"{place}/{name}"):
                 with suppress(FileNotFoundError):
                     stat = os.stat(file := f"{root}/{name}")  # noqa: PTH116 - a Path for each is 5 times slower
                     rows.append([place, name, stat.st_size, checksum(file) if content else stat.st_mtime_ns])
@@ -419,7 +426,7 @@ def _parts(manifest: Manifest, stage: str, capture: Path) -> list[tuple[str, dic
         return [("", {"device": "auto", "map_device": "all", "query_device": "all"})]
     if stage == "embed":
         return [(f"{d}_", {"device": d}) for d in present if any(d in pair for pair in pairs)]
-    if stage in ("retrieve", "rerank", "localize"):
+    if stage in ("retrieve", "rerank", "localize", "sequence"):
         return [(f"map_{m}_query_{q}", {"map_device": m, "query_device": q}) for m, q in pairs]
     return [("", {"map_device": "all", "query_device": "all", "pairs": [list(pair) for pair in pairs]})]
 

@@ -90,7 +90,7 @@ def _logarithm(poses: Floats) -> Floats:
 
 def _optimized(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> tuple[Floats, Floats]:
     """Return poses (N, 4, 4) and covariances (N, 6, 6)."""
-    gtsam = _gtsam()
+    gtsam = require_gtsam()
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for number, pose in enumerate(first_guess(odometry, queries)):
         values.insert(number, gtsam.Pose3(_rigid(pose)))
@@ -121,7 +121,12 @@ def _rigid(pose: Floats) -> Floats:
     return geometry.pose_from_qt(geometry.qt_from_pose(pose))
 
 
-def _gtsam() -> Any:
+def require_gtsam() -> Any:
+    """Return the package.
+
+    Raises:
+        ManifestError: it is not installed.
+    """
     try:
         import gtsam
     except ImportError:

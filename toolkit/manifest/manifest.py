@@ -17,14 +17,15 @@ from toolkit.manifest.settings import (
     Positive,
     RerankSettings,
     RetrieveSettings,
+    SequenceSettings,
     Settings,
     Share,
     Unit,
     VisualizeSettings,
 )
 
-STAGES = ("explore", "embed", "retrieve", "rerank", "localize", "evaluate", "visualize")
-OPTIONAL = ("rerank",)
+STAGES = ("explore", "embed", "retrieve", "rerank", "localize", "sequence", "evaluate", "visualize")
+OPTIONAL = ("rerank", "sequence")
 """Stages that run only where the manifest has their section."""
 
 DevicePair = Annotated[list[str], Field(min_length=2, max_length=2)]
@@ -163,16 +164,18 @@ class Manifest(Settings):
     """Optional: the stage runs if the section is there, also without a key in it, or is `true`."""
     localize: LocalizeSettings = LocalizeSettings()
     """How poses are found."""
+    sequence: SequenceSettings | None = None
+    """Optional, as `rerank`: poses of whole recordings, for queries with odometry."""
     evaluate: EvaluateSettings = EvaluateSettings()
     """What is counted."""
     visualize: VisualizeSettings = VisualizeSettings()
     """What is drawn and recorded."""
 
-    @field_validator("rerank", mode="before")
+    @field_validator(*OPTIONAL, mode="before")
     @classmethod
-    def _a_switch(cls, rerank: Any) -> Any:
+    def _a_switch(cls, section: Any) -> Any:
         """Take `rerank:` and `rerank: true` as a section without keys, and `false` as none."""
-        return {} if rerank is None or rerank is True else None if rerank is False else rerank
+        return {} if section is None or section is True else None if section is False else section
 
     @model_validator(mode="after")
     def _enough_references(self) -> Self:
@@ -203,13 +206,20 @@ class Manifest(Settings):
 
     def stage(self, stage: str) -> Settings:
         """Return the settings of one stage, also of one that is off, with what the manifest says for all stages."""
-        section: Settings = getattr(self, stage) or RerankSettings()
+        section: Settings = getattr(self, stage) or self.defaults(stage)
         known, update = type(section).model_fields, dict[str, Any]()
         for key in {"seed", "world_up", "unit"} & known.keys() & self.model_fields_set - section.model_fields_set:
             update[key] = getattr(self, key)
         if stage == "retrieve" and self.rerank is not None and "topk" not in section.model_fields_set:
             update["topk"] = self.rerank.topn
         return section.model_copy(update=update)
+
+    @classmethod
+    def defaults(cls, stage: str) -> Settings:
+        """Return the settings of a stage of which nothing is said."""
+        off: dict[str, Settings] = {"rerank": RerankSettings(), "sequence": SequenceSettings()}
+        given: Settings = off.get(stage) or cls.model_fields[stage].default
+        return given
 
     @property
     def stages(self) -> tuple[str, ...]:

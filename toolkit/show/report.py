@@ -309,7 +309,7 @@ def _pairs_of(files: SceneFiles) -> dict[tuple[str, str], Path]:
     """Return the path, without suffix, of the results of each pair that has any."""
     pairs = {}
     for path in sorted([*files.poses_dir.glob("*.csv"), *files.poses_dir.glob("*.txt")]):
-        if devices := re.fullmatch(f"{re.escape(files.scene)}_map_(.+)_query_(.+)", path.stem):
+        if devices := re.fullmatch(f"{re.escape(files.scene)}_map_(.+)_query_(.+)(?<!_sequence)", path.stem):
             pairs[devices[1], devices[2]] = path.with_suffix("")
     return pairs
 
