@@ -106,6 +106,17 @@ def test_pieces_end_where_tracking_was_lost(place: Path, tmp_path: Path) -> None
     assert geometry.pose_error(found.world_from_device, there)[1].max() < 0.1
 
 
+def test_online_there_are_poses_of_queries_alone(place: Path, tmp_path: Path) -> None:
+    done = sequence_pairs(place / "sessions", tmp_path / "poses", {"online": True, "length_s": 10.0},
+                          map_device="ios", query_device="ios").iloc[0]  # fmt: skip
+    single = Trajectory.read(tmp_path / "poses" / f"{pair_name(place.name, 'ios', 'ios')}.txt")
+    found = Trajectory.read(done["path"])
+    assert found.timestamps.tolist() == single.timestamps.tolist()
+    assert done["frames"] == done["ok"] == len(single)
+    with pytest.raises(ManifestError, match="online"):
+        sequence_pairs(place / "sessions", tmp_path / "poses", {"length_s": 10.0})
+
+
 def test_what_cannot_be_done_has_a_reason(place: Path, tmp_path: Path) -> None:
     table = sequence_pairs(place / "sessions", tmp_path / "poses").set_index(["map_device", "query_device"])
     assert table.loc[("ios", "ios"), "reason"] == ""

@@ -17,7 +17,7 @@ from toolkit.errors import OF_THE_DATA, ArtifactError
 from toolkit.files import file_fingerprint, is_current, pair_name, require_whole, write_atomic, write_sidecar
 from toolkit.geometry import Floats, Ints, pose_error
 from toolkit.localizers.odometry import Odometry, PosedQueries
-from toolkit.localizers.pose_graph import place_piece
+from toolkit.localizers.pose_graph import place_online, place_piece
 from toolkit.manifest import SequenceSettings
 
 SUFFIX = "_sequence"
@@ -178,7 +178,10 @@ def _frames(session: Session, answers: _Answers, settings: SequenceSettings) -> 
         frames = np.flatnonzero((asked >= 0) & np.isfinite(answers.poses[asked]).all(axis=(1, 2)))
         queries = answers.posed(asked[frames], frames)
         motion = Odometry(odometry.timestamps[piece.rows], odometry.world_from_device[piece.rows])
-        placed = place_piece(motion, queries, settings)
+        if settings.online:
+            placed = place_online(motion, queries, np.flatnonzero(asked >= 0), settings)
+        else:
+            placed = place_piece(motion, queries, settings)
         table = pd.DataFrame(dict.fromkeys(COLUMNS), index=range(len(piece.rows)))
         table["timestamp"], table["device_id"] = motion.timestamps, odometry.device_ids[piece.rows]
         table["recording"], table["piece"], table["status"] = piece.recording, piece.number, placed.status
@@ -195,6 +198,8 @@ def _frames(session: Session, answers: _Answers, settings: SequenceSettings) -> 
     every = np.concatenate([*poses, answers.poses[alone]])
     known = np.concatenate([*covariances, answers.covariances[alone]])
     frames_table = pd.concat([part.astype(object) for part in tables], ignore_index=True)
+    asked_for = (frames_table["status"] != "").to_numpy()
+    frames_table, every, known = frames_table[asked_for], every[asked_for], known[asked_for]
     posed = np.isfinite(every).all(axis=(1, 2))
     stds = np.sqrt(np.trace(known[:, 3:, 3:], axis1=1, axis2=2)), np.sqrt(np.trace(known[:, :3, :3], axis1=1, axis2=2))
     frames_table["position_std_m"] = np.where(posed, stds[0], np.nan).round(6)

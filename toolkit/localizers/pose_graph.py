@@ -5,7 +5,7 @@ pose of a single query is as it was localized, up to its covariance. Solved by G
 Contributors, https://gtsam.org).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -35,11 +35,40 @@ class PlacedPiece:
     covariances: Floats
     """(N, 6, 6) of a small motion in the rig's frame: rotation, radians, then translation, meters."""
     used: NDArray[np.bool_]
-    """(Q,) whether the poses rest on each query."""
-    status: str
-    """`ok`, `low_confidence: <reason>` or `failed: <reason>`."""
+    """(Q,) whether the poses, or online its own, rest on each query."""
+    status: NDArray[np.object_]
+    """(N,) `ok`, `low_confidence: <reason>` or `failed: <reason>`; empty where no pose was asked for."""
     scale: float = 1.0
-    """Factor of the odometry's lengths."""
+    """Factor of the odometry's lengths; online that of the last pose."""
+
+
+def place_online(odometry: Odometry, queries: PosedQueries, asked: Ints, settings: SequenceSettings) -> PlacedPiece:
+    """Return the poses of some frames of a piece, each from what was before it alone, at most `settings.length_s`.
+
+    Args:
+        asked: indices of the frames.
+
+    Raises:
+        ManifestError: GTSAM is not installed.
+    """
+    length_us = np.inf if settings.length_s is None else settings.length_s * 1e6
+    count = len(odometry)
+    every = PlacedPiece(
+        np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan), np.zeros(len(queries), bool),
+        np.full(count, "", object),
+    )  # fmt: skip
+    for frame in asked.tolist():
+        start = int(np.searchsorted(odometry.timestamps, odometry.timestamps[frame] - length_us))
+        within = (queries.frames >= start) & (queries.frames <= frame)
+        past = Odometry(odometry.timestamps[start : frame + 1], odometry.odom_from_rig[start : frame + 1])
+        chosen = queries.choose(within)
+        placed = place_piece(past, replace(chosen, frames=chosen.frames - start), settings)
+        every.world_from_rig[frame], every.covariances[frame] = placed.world_from_rig[-1], placed.covariances[-1]
+        every.status[frame] = placed.status[-1]
+        own = queries.frames[within] == frame
+        every.used[np.flatnonzero(within)[own]] = placed.used[own]
+        every = replace(every, scale=placed.scale)
+    return every
 
 
 def place_piece(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> PlacedPiece:
@@ -51,7 +80,7 @@ def place_piece(odometry: Odometry, queries: PosedQueries, settings: SequenceSet
     count = len(odometry)
     if not len(queries):
         nothing = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan), np.zeros(0, bool)
-        return PlacedPiece(*nothing, "failed: no query of this piece has a pose")
+        return PlacedPiece(*nothing, np.full(count, "failed: no query of this piece has a pose", object))
     best = place(odometry, queries, settings)[0]
     used, seen = best.members, set[bytes]()
     for _ in range(_ROUNDS):
@@ -70,7 +99,7 @@ def place_piece(odometry: Odometry, queries: PosedQueries, settings: SequenceSet
     if not best.trusted:
         rivaled = best.rival_support >= 0.5 * best.support
         status = f"low_confidence: {'another place is as likely' if rivaled else 'no query of this piece is sure'}"
-    return PlacedPiece(poses, covariances, mask, status, scale)
+    return PlacedPiece(poses, covariances, mask, np.full(count, status, object), scale)
 
 
 def _chi2(poses: Floats, covariances: Floats, queries: PosedQueries) -> Floats:

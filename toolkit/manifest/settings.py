@@ -369,6 +369,16 @@ class SequenceSettings(Settings):
     """A longer time without a pose is a loss of tracking: a new piece, with a frame of its own, begins."""
     max_speed_m_s: PositiveNumber = 15.0
     """So is a step that is faster."""
+    online: bool = False
+    """Whether the pose of a query rests on what was before it alone; other frames then have none."""
+    length_s: PositiveNumber | None = None
+    """Seconds before a query that its pose rests on, if `online`; null: all that was before it in its piece."""
+
+    @model_validator(mode="after")
+    def _of_the_past(self) -> Self:
+        if self.length_s is not None and not self.online:
+            raise ValueError(f"length_s is {self.length_s:g}, which counts before a query: set online: true")
+        return self
 
 
 class MapSettings(Settings):
