@@ -68,7 +68,7 @@ def test_one_sure_query_or_three_that_agree_are_trusted(trusted: bool, count: in
 
 def test_scale_is_fitted_as_far_as_queries_know_it() -> None:
     way = drive(np.random.default_rng(4), wrong=0.0)
-    assert fitted_scale(way.odometry.scaled(1 / 1.03), way.queries, SETTINGS) == pytest.approx(1.03, abs=0.005)
+    assert fitted_scale(way.odometry.scaled(1 / 1.03), way.queries, SETTINGS) == pytest.approx(1.03, abs=0.01)
     near = way.queries.choose(np.arange(2))
     vague = PosedQueries(near.frames, near.world_from_rig, 1e4 * near.covariances, near.weights, near.trusted)
     assert fitted_scale(way.odometry.scaled(1 / 1.03), vague, SETTINGS) == pytest.approx(1.0, abs=0.002)
@@ -81,3 +81,10 @@ def test_the_first_guess_follows_odometry_from_the_next_query() -> None:
     np.testing.assert_allclose(guess, way.world_from_rig, atol=1e-9)
     places = guess @ geometry.invert(way.odometry.odom_from_rig)
     np.testing.assert_allclose(places, np.tile(PLACE, (len(guess), 1, 1)), atol=1e-9)
+
+
+def test_scale_is_fitted_where_drift_has_bent_the_way() -> None:
+    way = drive(np.random.default_rng(6), frames=2000, every=10, drift=3.0)
+    turned = geometry.pose_error(way.odometry.odom_from_rig[-1:], geometry.invert(PLACE) @ way.world_from_rig[-1:])[0]
+    assert turned.item() > 5.0
+    assert fitted_scale(way.odometry, way.queries, SETTINGS) == pytest.approx(1.0, abs=0.01)

@@ -155,24 +155,32 @@ def _agreement(odometry: Odometry, queries: PosedQueries, settings: SequenceSett
 
 
 def fitted_scale(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> float:
-    """Return the factor of the odometry's lengths that single poses of one placement ask for; 1 says the prior."""
+    """Return the factor of the odometry's lengths that single poses of one placement ask for; 1 says the prior.
+
+    Compared are motions between queries, in the frame of the first, which no drift before it has turned.
+    """
     if len(queries) < 2:
         return 1.0
-    moved, placed = (poses[:, :3, 3] for poses in (odometry.odom_from_rig[queries.frames], queries.world_from_rig))
-    moved, placed = moved - moved.mean(axis=0), placed - placed.mean(axis=0)
-    rotation = _rotation(placed, moved)
-    _, drift = odometry.drift(settings, queries.frames, np.full(len(queries), queries.frames[len(queries) // 2]))
-    variance = drift**2 + np.trace(floored(queries.covariances)[:, 3:, 3:], axis1=1, axis2=2) / 3
-    information = ((moved**2).sum(axis=1) / variance).sum()
-    product = ((placed * (moved @ rotation.T)).sum(axis=1) / variance).sum()
+    moved, placed = odometry.odom_from_rig[queries.frames], queries.world_from_rig
+    rotation = np.trace(floored(queries.covariances)[:, :3, :3], axis1=1, axis2=2) / 3
+    position = np.trace(floored(queries.covariances)[:, 3:, 3:], axis1=1, axis2=2) / 3
+    best = 0.0, 0.0
+    lag = 1
+    while lag < len(queries):
+        first, second = np.arange(len(queries) - lag), np.arange(lag, len(queries))
+        by_odometry, by_poses = (
+            (geometry.invert(poses[first]) @ poses[second])[:, :3, 3] for poses in (moved, placed)
+        )
+        turn, shift = odometry.drift(settings, queries.frames[first], queries.frames[second])
+        length2 = (by_odometry**2).sum(axis=1)
+        variance = shift**2 + position[first] + position[second] + length2 * (turn**2 + rotation[first])
+        # So many motions of this lag overlap.
+        information = float((length2 / variance).sum() / lag)
+        product = float(((by_odometry * by_poses).sum(axis=1) / variance).sum() / lag)
+        best = max(best, (information, product))
+        lag *= 2
     prior = 1 / settings.scale_std**2
-    return float((product + prior) / (information + prior))
-
-
-def _rotation(a: Floats, b: Floats) -> Floats:
-    """Return the rotation a_from_b of centered points (n, 3): W. Kabsch, Acta Crystallographica A32, 1976."""
-    u, _, vt = np.linalg.svd(a.T @ b)
-    return np.asarray(u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt)
+    return (best[1] + prior) / (best[0] + prior)
 
 
 def first_guess(odometry: Odometry, queries: PosedQueries) -> Floats:
