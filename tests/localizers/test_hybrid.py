@@ -132,7 +132,7 @@ def test_a_prior_is_found_again_in_whatever_order(world: World, pnp: PnpLocalize
     asked = asked_of(world, "spot", 1)
     true = world.queries("spot")[1][1]
     images = np.unique(np.concatenate([retrieved.images for retrieved in asked[1]]))
-    priors = [Prior(prediction_near(true, [], seed).world_from_rig, images, 2.0) for seed in range(2)]
+    priors = [Prior(prediction_near(true, [], seed).world_from_rig, images, 2.0, "vggt") for seed in range(2)]
     found = [pnp.localize(*asked, priors=priors) for _ in range(2)]
     assert same(*found)
     assert same(found[0], pnp.localize(*asked, priors=priors[::-1]))

@@ -14,7 +14,7 @@ from tests.queries import query_of
 from toolkit import geometry
 from toolkit.features.features import LocalFeatures
 from toolkit.features.matching import LocalMethod, PairMatches
-from toolkit.localizers.base import PoseEstimate, Query, References
+from toolkit.localizers.base import PoseEstimate, Prior, Query, References
 from toolkit.localizers.escalation import EscalatingLocalizer
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.matches import MappedFeatures
@@ -213,7 +213,9 @@ class Scripted:
     def __init__(self, *answers: PoseEstimate) -> None:
         self.answers, self.asked = list(answers), list[Query]()
 
-    def localize(self, query: Query, references: Sequence[References], prediction: Any = None) -> PoseEstimate:
+    def localize(
+        self, query: Query, references: Sequence[References], prediction: Any = None, priors: Sequence[Prior] = ()
+    ) -> PoseEstimate:
         self.asked.append(query)
         return self.answers.pop(0)
 

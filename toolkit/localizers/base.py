@@ -15,6 +15,10 @@ from toolkit.features.matching import PairMatches
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.correspondences import Correspondences
 
+SEARCH_DEG = (1.0, 6.0)
+"""Limits of the radius in which features are sought about a prior."""
+NEARBY_M = 3.0
+"""Depth at which the uncertainty of a place is seen as an angle."""
 CONFIRMED = (5.0, 0.5)  # degrees, meters: further apart, two answers contradict each other
 
 CAMERA = "low_confidence: camera?"
@@ -119,7 +123,7 @@ class PoseEstimate:
     correspondences: Correspondences = field(default_factory=Correspondences)
     """What the pose rests on, and what disagrees with it."""
     found_by: str = "pnp"
-    """How the pose was found: `pnp`, `pnp+vggt` (from a prior), `lifted` (map features lifted by a capture's depth
+    """How the pose was found: `pnp`, `pnp+vggt` or `pnp+near` (from a prior), `lifted` (map features lifted by a capture's depth
     maps), `lifted+vggt` (by predicted depth, too), `vggt` (a prediction), `nearest`."""
     scale_std: float = float("nan")
     """Relative standard deviation of a prediction's scale; inf if unknown, NaN without a prediction."""
@@ -171,6 +175,21 @@ class Prior:
     """Map images that see what the query sees."""
     radius_deg: float
     """How far from where the pose puts a map point its feature may be."""
+    source: str
+    """What gave it: `vggt`, `near`."""
+
+    @classmethod
+    def about(
+        cls, world_from_rig: Floats, images: Ints, rotation_std_deg: float, position_std_m: float, source: str
+    ) -> "Prior":
+        """Return a prior that is searched as far about as its standard deviations ask for."""
+        spread_deg = rotation_std_deg + np.degrees(np.arctan(position_std_m / NEARBY_M))
+        return cls(world_from_rig, images, float(np.clip(2 * spread_deg, *SEARCH_DEG)), source)
+
+    def scaled(self, factor: float) -> "Prior":
+        """Return the prior with all lengths times a factor."""
+        pose = self.world_from_rig
+        return replace(self, world_from_rig=geometry.make_pose(pose[:3, :3], factor * pose[:3, 3]))
 
 
 class Localizer(Protocol):
@@ -195,13 +214,16 @@ class Localizer(Protocol):
             ToolkitError: what no other query would do better with: no such device, other weights, too little memory.
         """
 
-    def localize(self, query: Query, references: Sequence[References], prediction: Any = None) -> PoseEstimate:
+    def localize(
+        self, query: Query, references: Sequence[References], prediction: Any = None, priors: Sequence[Prior] = ()
+    ) -> PoseEstimate:
         """Return one pose for the cameras of a rig, or for a single camera.
 
         Args:
             query: the images of one device at one instant.
             references: of each image.
             prediction: what `predict` returned for the query; None: it is asked here where it is needed.
+            priors: poses to look for; methods that match nothing do not use them.
         """
 
 
@@ -231,9 +253,12 @@ class ScaledLocalizer:
     def _scaled(self, queries: Sequence[Asked]) -> list[Asked]:
         return [(query.scaled(1 / self._length), references) for query, references in queries]
 
-    def localize(self, query: Query, references: Sequence[References], prediction: Any = None) -> PoseEstimate:
+    def localize(
+        self, query: Query, references: Sequence[References], prediction: Any = None, priors: Sequence[Prior] = ()
+    ) -> PoseEstimate:
         """Return one pose for the cameras of a rig, or for a single camera; see `Localizer`."""
-        return self.inner.localize(query.scaled(1 / self._length), references, prediction).scaled(self._length)
+        near = [prior.scaled(1 / self._length) for prior in priors]
+        return self.inner.localize(query.scaled(1 / self._length), references, prediction, near).scaled(self._length)
 
 
 def rank(status: str) -> int:

@@ -8,7 +8,7 @@ from toolkit.capture.images import pixels_of
 from toolkit.features.features import KINDS, LocalFeatures, extract_turned
 from toolkit.features.matching import AnyMethod
 from toolkit.features.stores import as_stored
-from toolkit.localizers.base import Asked, Localizer, PoseEstimate, Query, References, rank
+from toolkit.localizers.base import Asked, Localizer, PoseEstimate, Prior, Query, References, rank
 
 
 def is_sure(status: str, position_std_m: float, limit_m: float) -> bool:
@@ -56,21 +56,25 @@ class EscalatingLocalizer:
         """Return what the first's network says of each query; see `Localizer`."""
         return self.first.predict(queries, following)
 
-    def localize(self, query: Query, references: Sequence[References], prediction: Any = None) -> PoseEstimate:
+    def localize(
+        self, query: Query, references: Sequence[References], prediction: Any = None, priors: Sequence[Prior] = ()
+    ) -> PoseEstimate:
         """Return one pose for the cameras of a rig, or for a single camera; see `Localizer`.
 
         `found_by` names the further kinds if the pose rests on the matches of all kinds.
         """
-        estimate = self.first.localize(query, references, prediction)
+        estimate = self.first.localize(query, references, prediction, priors)
         sure = is_sure(estimate.status, estimate.position_std_m, self._limit_m)
         if sure or estimate.misfit or not can_gain(query, references):  # further features do not mend a camera
             return estimate
-        escalated = self.escalate(self._with_all_features(query), references)
+        escalated = self.escalate(self._with_all_features(query), references, None, priors)
         return escalated if is_better(escalated.status, estimate.status) else estimate
 
-    def escalate(self, query: Query, references: Sequence[References], prediction: None = None) -> PoseEstimate:
+    def escalate(
+        self, query: Query, references: Sequence[References], prediction: None = None, priors: Sequence[Prior] = ()
+    ) -> PoseEstimate:
         """Return the pose by the matches of all kinds of features, all of which the query has; see `localize`."""
-        escalated = self.second.localize(query, references)
+        escalated = self.second.localize(query, references, None, priors)
         return replace(escalated, found_by="+".join([escalated.found_by, *(kind.name for kind in self._further)]))
 
     def _with_all_features(self, query: Query) -> Query:

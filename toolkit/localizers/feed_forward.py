@@ -13,7 +13,7 @@ from toolkit.capture.upright import Turns
 from toolkit.errors import first_line, reason_of
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.alignment import Alignment, align_to_map, is_trustworthy, query_pose
-from toolkit.localizers.base import Asked, PoseEstimate, Query, References, View
+from toolkit.localizers.base import Asked, PoseEstimate, Prior, Query, References, View
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.pose_mean import robust_mean_pose
 from toolkit.localizers.prediction import Prediction, Predictor
@@ -90,7 +90,11 @@ class FeedForwardLocalizer:
         return self.settings.batch_size
 
     def localize(
-        self, query: Query, references: Sequence[References], prediction: FeedForwardAnswer | None = None
+        self,
+        query: Query,
+        references: Sequence[References],
+        prediction: FeedForwardAnswer | None = None,
+        priors: Sequence[Prior] = (),
     ) -> PoseEstimate:
         """Return the predicted pose of a query; see `Localizer`."""
         answer = self.predict([(query, references)])[0] if prediction is None else prediction

@@ -10,9 +10,7 @@ from toolkit.localizers.feed_forward import FeedForwardAnswer, FeedForwardLocali
 from toolkit.localizers.lifting import DepthLifter
 from toolkit.localizers.pnp import PnpLocalizer
 
-SEARCH_DEG = (1.0, 6.0)  # limits of the radius in which features are sought about a predicted pose
 TIE = 0.8  # of the other's matches: with more, there is no reason to change
-NEARBY_M = 3.0  # depth at which the uncertainty of a place is seen as an angle
 
 
 class HybridLocalizer:
@@ -36,7 +34,11 @@ class HybridLocalizer:
         return self.feed_forward.predict(queries, following)
 
     def localize(
-        self, query: Query, references: Sequence[References], prediction: FeedForwardAnswer | None = None
+        self,
+        query: Query,
+        references: Sequence[References],
+        prediction: FeedForwardAnswer | None = None,
+        priors: Sequence[Prior] = (),
     ) -> PoseEstimate:
         """Return one pose for the cameras of a rig, or for a single camera; `found_by` says from what.
 
@@ -49,7 +51,7 @@ class HybridLocalizer:
         answer = self.predict([(query, references)])[0] if prediction is None else prediction
         predicted = answer.estimate
         prior = _prior(predicted)
-        priors = () if prior is None else (prior,)
+        priors = (*priors, *(() if prior is None else (prior,)))
         estimate = self.pnp.localize(query, references, None, priors)
         if estimate.status != "ok" and not estimate.misfit:
             lifted = self.lifter.localize(query, references, answer, priors)
@@ -76,6 +78,6 @@ def _prior(predicted: PoseEstimate) -> Prior | None:
     """Return where to look for features; None where the place is not known."""
     if predicted.world_from_rig is None or not np.isfinite(predicted.position_std_m):
         return None
-    spread_deg = predicted.rotation_std_deg + np.degrees(np.arctan(predicted.position_std_m / NEARBY_M))
-    radius_deg = float(np.clip(2 * spread_deg, *SEARCH_DEG))
-    return Prior(predicted.world_from_rig, np.array(predicted.references, np.int64), radius_deg)
+    images = np.array(predicted.references, np.int64)
+    stds = predicted.rotation_std_deg, predicted.position_std_m
+    return Prior.about(predicted.world_from_rig, images, *stds, "vggt")

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from toolkit import geometry
 from toolkit.geometry import Floats
-from toolkit.localizers.base import Asked, PoseEstimate, Query, References
+from toolkit.localizers.base import Asked, PoseEstimate, Prior, Query, References
 
 
 class NearestLocalizer:
@@ -21,7 +21,9 @@ class NearestLocalizer:
         """Return nothing for each query: no network is asked."""
         return [None] * len(queries)
 
-    def localize(self, query: Query, references: Sequence[References], prediction: None = None) -> PoseEstimate:
+    def localize(
+        self, query: Query, references: Sequence[References], prediction: None = None, priors: Sequence[Prior] = ()
+    ) -> PoseEstimate:
         """Return the pose of the best reference, never `ok`; see `Localizer`."""
         best = [(float(part.scores[0]), camera) for camera, part in enumerate(references) if len(part.images)]
         if not best:

@@ -19,7 +19,7 @@ from toolkit.capture.cameras import rays_of
 from toolkit.features.features import KINDS, LocalFeatures
 from toolkit.features.matching import AnyMethod, PairMatches
 from toolkit.geometry import Floats, Ints
-from toolkit.localizers.base import Asked, NetworkMatches, PoseEstimate, Query, References
+from toolkit.localizers.base import Asked, NetworkMatches, PoseEstimate, Prior, Query, References
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.mapping import instants, match_pairs, select_pairs
 from toolkit.localizers.matches import MappedFeatures
@@ -95,7 +95,9 @@ class OnDemandLocalizer:
         """Return nothing for each query: no network is asked for cameras."""
         return [None] * len(queries)
 
-    def localize(self, query: Query, references: Sequence[References], prediction: None = None) -> PoseEstimate:
+    def localize(
+        self, query: Query, references: Sequence[References], prediction: None = None, priors: Sequence[Prior] = ()
+    ) -> PoseEstimate:
         """Return one pose for the cameras of a rig, or for a single camera; see `Localizer`."""
         images = np.unique(np.concatenate([np.zeros(0, np.int64), *(part.images for part in references)]))
         mapped, point_index, before = [], [], 0
@@ -115,7 +117,7 @@ class OnDemandLocalizer:
             for of_camera, of_kind in zip(matches, found, strict=True):
                 of_camera.append(of_kind.__getitem__)
         estimate = PnpLocalizer(mapped, self._settings, self._seed).localize(
-            replace(query, network_matches=matches), references
+            replace(query, network_matches=matches), references, None, priors
         )
         used = estimate.correspondences
         index = np.concatenate([np.zeros(0, np.int64), *point_index])[used.point_index]

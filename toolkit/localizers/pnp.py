@@ -155,7 +155,7 @@ class PnpLocalizer:
             with_prior = self._estimate(query, near, [hypothesis, *hypotheses], seen)
             lost = estimate.world_from_rig is None
             if with_prior.world_from_rig is not None and (not same or lost or with_prior.status == "ok"):
-                return replace(with_prior, found_by="pnp+vggt")
+                return replace(with_prior, found_by=f"pnp+{prior.source}")
             return estimate
         if same or estimate.world_from_rig is None:
             return estimate
