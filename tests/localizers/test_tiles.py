@@ -212,6 +212,15 @@ def test_a_stopped_map_goes_on_at_the_tile_where_it_was(
     assert done == [len(LocalMap.load(tiles[1]).image_names)]
 
 
+def test_tiles_of_other_features_are_made_anew(phone: tuple[Session, FeatureStore], tmp_path: Path) -> None:
+    session, store = phone
+    settings = MapSettings(pairs_per_image=2, tile_images=2)
+    build_map(session, store, tmp_path / "ios_map.npz", settings)
+    fewer = extract_session(session, tmp_path, SiftExtractor(SiftSettings(max_keypoints=300)), progress=False)
+    again = build_map(session, fewer, tmp_path / "ios_map.npz", settings, inputs="fewer")
+    assert_equal(again, build_map(session, fewer, tmp_path / "alone" / "ios_map.npz", settings))
+
+
 def test_a_query_gets_the_same_pose_from_either_tile(phone: tuple[Session, FeatureStore], tmp_path: Path) -> None:
     session, store = phone
     settings = MapSettings(tile_images=3)

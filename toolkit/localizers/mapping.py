@@ -332,6 +332,7 @@ class MapPlan(Remade):
         images, path = self.tiles[number].images.tolist(), self.tile_path(number)
         record = {
             "map": map_settings(self.settings, self.seed),
+            "features": self.features.settings,
             "matcher": self.matcher,
             "length": self.length,
             "images": fingerprint([[self.names[image], self._made_from[image]] for image in images]),
