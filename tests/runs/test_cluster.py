@@ -5,10 +5,12 @@ import pickle
 import shutil
 import signal
 import stat
+import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -193,10 +195,16 @@ def test_what_no_worker_did_is_done_here(small_capture: Path, tmp_path: Path, he
 
 
 @pytest.mark.parametrize(
-    "asked", ["loca", "local:0", "local:two", "slurm", "slurm:", "dask:file", "", "localhost:8786"]
+    "asked", ["loca", "local:0", "local:two", "local:²", "slurm", "slurm:", "dask:file", "", "localhost:8786"]
 )
 def test_an_unknown_cluster_names_the_known_ones(asked: str) -> None:
     with pytest.raises(ManifestError, match=r"tcp://HOST:PORT"), open_cluster(asked):
+        pass
+
+
+@pytest.mark.parametrize("asked", ["tcp://", "tcp://node", "tcp://node:port", "tls://:8786"])
+def test_an_address_without_host_or_port_is_refused(asked: str) -> None:
+    with pytest.raises(ManifestError, match=rf"{asked}: expected {asked[:3]}://HOST:PORT"), open_cluster(asked):
         pass
 
 
@@ -209,7 +217,7 @@ def test_without_dask_one_sentence_says_what_to_install(monkeypatch: pytest.Monk
 @pytest.mark.parametrize(
     ("content", "said"),
     [(None, "cannot be read"), ("queue: x", "jobs: <number>"), ("- 1", "jobs: <number>"), ("a: [", "cannot be read"),
-     ("{jobs: 1, coresss: 2}", "cores")],
+     ("{jobs: 1, coresss: 2}", "cores"), ("jobs: two", "jobs: <number>"), ("jobs: 0", "jobs: <number>")],
 )  # fmt: skip
 def test_a_faulty_file_of_a_queue_is_named(tmp_path: Path, content: str | None, said: str) -> None:
     path = tmp_path / "slurm.yaml"
@@ -237,6 +245,27 @@ def test_a_share_computes_products_by_one_thread_whatever_the_environment_says()
     with threadpool_limits(2, "blas"):
         clusters._run_share(str(Path.cwd()), {}, pickle.dumps((count_share, ())))
     assert COUNTED == {1}
+
+
+AT_ONCE = [0, 0]
+
+
+def slow_share() -> None:
+    AT_ONCE[0] += 1
+    AT_ONCE[1] = max(AT_ONCE)
+    time.sleep(0.05)
+    print("said", file=sys.stderr)
+    AT_ONCE[0] -= 1
+
+
+def test_a_worker_of_several_threads_does_one_share_at_a_time(capfd: pytest.CaptureFixture[str]) -> None:
+    before = sys.stderr
+    given = str(Path.cwd()), {}, pickle.dumps((slow_share, ()))
+    with ThreadPoolExecutor(3) as threads:
+        for future in [threads.submit(clusters._run_share, *given) for _ in range(3)]:
+            future.result()
+    assert AT_ONCE == [0, 1]
+    assert sys.stderr is before
 
 
 def note_share(folder: Path, name: str, environment: str) -> None:
@@ -311,6 +340,25 @@ def test_a_cluster_that_loses_all_workers_is_named(
             assert cluster is not None
             threading.Timer(1, local.scale, [0]).start()
             cluster.run(time.sleep, [(3600,)] * 2, [1] * 2, "wait", "file")
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_dies_is_named(capfd: pytest.CaptureFixture[str]) -> None:
+    command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard"]
+    with subprocess.Popen([*command, "--host", "127.0.0.1"], stderr=subprocess.PIPE, text=True) as scheduler:
+        assert scheduler.stderr is not None
+        address = next(line for line in scheduler.stderr if "Scheduler at:" in line).split()[-1]
+        worker = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny"]
+        with subprocess.Popen([*worker, "--no-dashboard"], stderr=subprocess.DEVNULL) as working:
+            try:
+                with open_cluster(address, lambda _: None), pytest.raises(ToolkitError, match="scheduler is gone"):
+                    cluster = current_cluster()
+                    assert cluster is not None
+                    threading.Timer(1, scheduler.kill).start()
+                    cluster.run(time.sleep, [(3600,)], [1], "wait", "file")
+            finally:
+                scheduler.kill()
+                working.kill()
 
 
 @pytest.fixture(scope="module")

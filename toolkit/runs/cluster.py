@@ -9,6 +9,8 @@ under the same paths.
 import logging
 import os
 import pickle
+import re
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stderr
 from functools import cache
@@ -44,6 +46,8 @@ _WAIT_S = 600
 """Longest time that a scheduler takes to answer, and a worker to start."""
 _CHECK_S = 60
 """How long nothing may happen before it is asked whether there are workers."""
+_ONE_SHARE = threading.Lock()
+"""Held while a share is done: folder, environment, BLAS's threads, streams and what is made once are a process's."""
 
 
 class Cluster:
@@ -75,7 +79,7 @@ class Cluster:
         Raises:
             ToolkitError: a share killed several workers, or none is left; else what the function raised.
         """
-        from distributed import KilledWorker, wait
+        from distributed import CancelledError, KilledWorker, wait
 
         environment = {name: os.environ[name] for name in (EXTRA_DEVICES, ALLOW_OUTSIDE) if name in os.environ}
         here = os.getcwd()  # noqa: PTH109 - as text
@@ -104,6 +108,11 @@ class Cluster:
                 f"{label}: several workers died of one share ({first_line(error)}). Most likely it needs more memory "
                 "than a worker has."
             ) from None
+        except CancelledError as error:  # the client gives up its shares when it loses the scheduler
+            raise ToolkitError(
+                f"{label}: the cluster's scheduler is gone ({first_line(error)}). What was done is kept: the same "
+                "command goes on from here, with or without a cluster."
+            ) from None
         finally:
             self._client.cancel(list(futures))
 
@@ -118,16 +127,18 @@ class Cluster:
 
 def _run_share(here: str, environment: Mapping[str, str], pickled: bytes) -> None:
     """Do a share, a pickled function and its arguments, with the folder and the settings of who asks for it."""
-    os.chdir(here)
-    for name in (EXTRA_DEVICES, ALLOW_OUTSIDE):
-        os.environ.pop(name, None)
-    # No worker asks other workers: they could all wait for each other.
-    os.environ.pop(ADDRESS, None)
-    os.environ.update(environment)
-    # A worker's own threads are the parallel dimension, whatever the environment says: BLAS's would wait for each other.
-    with threadpool_limits(1, "blas"), open(os.devnull, "w") as nowhere, redirect_stderr(nowhere):
-        function, share = pickle.loads(pickled)
-        function(*share)  # the one bar is that of who asks
+    with _ONE_SHARE:  # a worker may have several threads: `dask worker` starts one a core
+        os.chdir(here)
+        for name in (EXTRA_DEVICES, ALLOW_OUTSIDE):
+            os.environ.pop(name, None)
+        # No worker asks other workers: they could all wait for each other.
+        os.environ.pop(ADDRESS, None)
+        os.environ.update(environment)
+        # A worker's own threads are the parallel dimension, whatever the environment says: BLAS's would wait for each
+        # other.
+        with threadpool_limits(1, "blas"), open(os.devnull, "w") as nowhere, redirect_stderr(nowhere):
+            function, share = pickle.loads(pickled)
+            function(*share)  # the one bar is that of who asks
 
 
 def current_cluster() -> Cluster | None:
@@ -152,7 +163,12 @@ def _client(address: str) -> "Client":
             f"The cluster at {address} has no worker that answers ({first_line(error)}). Is its scheduler running, "
             "and does it have workers?"
         ) from None
-    found = set(client.run(_version).values())
+    try:
+        found = set(client.run(_version).values())
+    except ImportError as error:
+        raise ToolkitError(
+            f"The workers at {address} cannot import the toolkit ({first_line(error)}). Install it where they run."
+        ) from None
     if found != {__version__}:
         raise ToolkitError(
             f"The workers at {address} have the toolkit's version {', '.join(sorted(found))}, this is {__version__}. "
@@ -209,9 +225,13 @@ def _start(asked: str, stack: ExitStack) -> tuple[str, str]:
     """Return the address of a cluster's scheduler, started if need be, and of its dashboard if that is known."""
     kind, _, rest = asked.partition(":")
     if kind in ("tcp", "tls"):
+        if not re.fullmatch(r"//(\[[\da-fA-F:.%]+\]|[^\[\]:/\s]+):\d{1,5}", rest):
+            raise ManifestError(
+                f"--cluster {asked}: expected {kind}://HOST:PORT; the port of Dask's scheduler is 8786 if not told."
+            )
         return asked, ""
     queue = next((name for name in QUEUES if name.lower() == kind), None)
-    if kind == "local" and (not rest or rest.isdigit() and int(rest)):
+    if kind == "local" and (not rest or (rest.isdecimal() and int(rest))):
         cluster = stack.enter_context(_local_cluster(int(rest or 0)))
     elif queue and rest:
         cluster = stack.enter_context(_queued_cluster(queue, Path(rest)))
@@ -256,6 +276,8 @@ def _queued_cluster(queue: str, path: Path) -> Any:
     try:
         options = yaml.safe_load(path.read_text(encoding="utf-8"))
         jobs = options.pop("jobs")
+        if type(jobs) is not int or jobs < 1:
+            raise TypeError
     except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
         raise ManifestError(f"--cluster: {path} cannot be read ({first_line(error)}).") from None
     except (AttributeError, KeyError, TypeError):
