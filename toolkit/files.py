@@ -10,7 +10,7 @@ import platform
 import re
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -20,7 +20,7 @@ from typing import Any
 import xxhash
 
 from toolkit import __version__
-from toolkit.errors import ArtifactError
+from toolkit.errors import ArtifactError, ToolkitError
 
 log = logging.getLogger(__name__)
 
@@ -414,7 +414,8 @@ def _checked(row: Any, keys: set[str]) -> dict[str, Any]:
 class Remade:
     """Pickled as the arguments that it was made with; a process that unpickles it makes it once, until it gets another.
 
-    For networks and other things that are costly to make, and of which each worker needs one.
+    For networks and other things that are costly to make, and of which each worker needs one. What is made again must
+    have the same `settings`, where they are JSON: `auto` may be another precision on another machine.
     """
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Any:
@@ -423,7 +424,9 @@ class Remade:
         return made
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _remade, (type(self), pickle.dumps(self.__dict__["_made_with"]))
+        settings = getattr(self, "settings", None)
+        expected = settings if isinstance(settings, dict) else None
+        return _remade, (type(self), pickle.dumps(self.__dict__["_made_with"]), expected)
 
     @classmethod
     def elsewhere(cls, *args: Any, **kwargs: Any) -> Any:
@@ -443,9 +446,27 @@ class _Elsewhere:
 _last_remade: dict[type, tuple[bytes, Any]] = {}
 
 
-def _remade(kind: type, made_with: bytes) -> Any:
+def _remade(kind: type, made_with: bytes, expected: dict[str, Any] | None = None) -> Any:
     if _last_remade.get(kind, (b"", None))[0] != made_with:
         _last_remade.pop(kind, None)  # first, as both may not fit in memory
         args, kwargs = pickle.loads(made_with)
         _last_remade[kind] = made_with, kind(*args, **kwargs)
-    return _last_remade[kind][1]
+    made = _last_remade[kind][1]
+    if expected is not None:
+        require_same(expected, made.settings)
+    return made
+
+
+def require_same(asked: Mapping[str, Any], here: Mapping[str, Any]) -> None:
+    """Refuse to compute with other settings than those that results are recorded under.
+
+    Raises:
+        ToolkitError: names those that differ.
+    """
+    differing = [name for name in {**asked, **here} if asked.get(name) != here.get(name)]
+    if differing:
+        found = "; ".join(f"{name}: {here.get(name)} here, {asked.get(name)} there" for name in differing)
+        raise ToolkitError(
+            f"The worker on {platform.node()} would compute otherwise than the process that asks ({found}). "
+            "Set it in the manifest, or use machines of one kind."
+        )

@@ -42,6 +42,7 @@ from toolkit.files import (
     read_map_record,
     read_references,
     read_sidecar,
+    require_same,
     sidecar_path,
     write_atomic,
     write_sidecar,
@@ -293,13 +294,17 @@ class _Stage(Remade):
         skip_existing: bool,
         workers: int = 0,
         time_ns: int = 0,
+        made_by: Mapping[str, Any] | None = None,
     ) -> None:
-        """See `localize_pairs`; `time_ns` tells a worker which maps it opened before others were made."""
+        """See `localize_pairs`; `time_ns` tells a worker which maps it opened before others were made, and `made_by`
+        the `networks` of who asks."""
         self.folders, self.settings, self.queries = folders, settings, queries
         self.skip_existing, self.workers = skip_existing, workers or default_workers()
         self.capture = Capture.from_sessions_root(folders.sessions)
         self.kinds, self.escalation = create_methods(settings)
         self.predictor = open_predictor(settings, self.capture, folders.map) if settings.predicts else None
+        if made_by is not None:
+            require_same(made_by, self.networks)
         self.open_map = lru_cache(maxsize=1)(self._open_map)
 
     def pair(self, map_device: str, query_device: str) -> "_Pair":
@@ -322,10 +327,16 @@ class _Stage(Remade):
         """Return the queries of a pair on their way."""
         return _PairRun(self.pair(map_device, query_device), *self.open_map(map_device), self)
 
+    @property
+    def networks(self) -> dict[str, Any]:
+        """What poses depend on that the machine has a part in."""
+        made_by = {kind.name: [kind.extractor.settings, kind.matcher.settings] for kind in self.kinds}
+        return made_by if self.predictor is None else made_by | {self.predictor.name: self.predictor.settings}
+
     @cached_property
     def of_worker(self) -> Any:
         """What a worker is to open: it uses what is there, with its own number of threads."""
-        return _Stage.elsewhere(self.folders, self.settings, self.queries, True, 0, time.time_ns())
+        return _Stage.elsewhere(self.folders, self.settings, self.queries, True, 0, time.time_ns(), self.networks)
 
 
 _Task = tuple[int, Query, list[References], Any, float]

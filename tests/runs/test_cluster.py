@@ -27,7 +27,7 @@ from toolkit.features import groups
 from toolkit.features.features import SiftExtractor
 from toolkit.features.groups import GroupWriter
 from toolkit.features.stores import FeatureStore, extract_session
-from toolkit.files import SceneFiles
+from toolkit.files import Remade, SceneFiles
 from toolkit.localize import localize_pairs
 from toolkit.localizers import mapping
 from toolkit.localizers.mapping import build_map
@@ -135,6 +135,24 @@ def test_what_is_costly_is_made_once_in_a_process(monkeypatch: pytest.MonkeyPatc
     assert len(pickle.dumps(session)) < 500
     error = pickle.loads(pickle.dumps(DamagedError(Path("a.h5"), "torn")))
     assert (error.path, str(error)) == (Path("a.h5"), "torn")
+
+
+class AutoPrecision(Remade):
+    """Stands for a network whose precision is that of the machine."""
+
+    precision = "float32"
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return {"name": "network", "dtype_compute": self.precision}
+
+
+def test_a_worker_that_would_compute_in_another_precision_refuses(monkeypatch: pytest.MonkeyPatch) -> None:
+    pickled = pickle.dumps(AutoPrecision())
+    assert pickle.loads(pickled).settings["dtype_compute"] == "float32"
+    monkeypatch.setattr(AutoPrecision, "precision", "bfloat16")
+    with pytest.raises(ToolkitError, match="dtype_compute: bfloat16 here, float32 there"):
+        pickle.loads(pickled)
 
 
 # -------------------------------------------------------------------------------------------------------- stages
