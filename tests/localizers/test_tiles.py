@@ -212,6 +212,17 @@ def test_a_stopped_map_goes_on_at_the_tile_where_it_was(
     assert done == [len(LocalMap.load(tiles[1]).image_names)]
 
 
+def test_a_tile_may_have_no_point_that_earlier_ones_have_not(
+    phone: tuple[Session, FeatureStore], tmp_path: Path
+) -> None:
+    session, store = phone
+    two = FeatureStore(store.path, dict(list(store.made_from.items())[:2]), {}, store.settings)
+    joined, whole = (
+        build_map(session, two, tmp_path / str(size) / "ios_map.npz", MapSettings(tile_images=size)) for size in (1, 9)
+    )
+    assert len(joined.points) == len(whole.points) > 0
+
+
 def test_tiles_of_other_features_are_made_anew(phone: tuple[Session, FeatureStore], tmp_path: Path) -> None:
     session, store = phone
     settings = MapSettings(pairs_per_image=2, tile_images=2)

@@ -144,8 +144,8 @@ def refine_points(
         observations: (n, 3) image, keypoint and point, sorted by image.
         cameras, world_from_cams, keypoints: of the images.
     """
-    if not len(points):
-        return RefinedPoints(points, observations, 0.0, 0)
+    if not len(observations):  # of a tile, earlier ones may have taken all
+        return RefinedPoints(points[:0], observations, 0.0, 0)
     cams_from_world = geometry.invert(world_from_cams)
     image, keypoint, _ = observations.T
     plane = np.zeros((len(observations), 2))
