@@ -123,8 +123,8 @@ class PoseEstimate:
     correspondences: Correspondences = field(default_factory=Correspondences)
     """What the pose rests on, and what disagrees with it."""
     found_by: str = "pnp"
-    """How the pose was found: `pnp`, `pnp+vggt` or `pnp+near` (from a prior), `lifted` (map features lifted by a capture's depth
-    maps), `lifted+vggt` (by predicted depth, too), `vggt` (a prediction), `nearest`."""
+    """How the pose was found: `pnp`, `pnp+vggt` or `pnp+near` (from a prior), `lifted` (map features lifted by a
+    capture's depth maps), `lifted+vggt` (by predicted depth, too), `vggt` (a prediction), `nearest`."""
     scale_std: float = float("nan")
     """Relative standard deviation of a prediction's scale; inf if unknown, NaN without a prediction."""
     rejected: tuple[int, ...] = ()
@@ -163,6 +163,16 @@ class PoseEstimate:
     @property
     def inlier_ratio(self) -> float:
         return self.num_inliers / self.num_matches if self.num_matches else 0.0
+
+
+@dataclass(frozen=True)
+class RoughPose:
+    """About where a query is."""
+
+    world_from_rig: Floats
+    """(4, 4); of a single camera world_from_cam."""
+    rotation_std_deg: float
+    position_std_m: float
 
 
 @dataclass(frozen=True)

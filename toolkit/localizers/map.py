@@ -15,7 +15,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from toolkit.capture import Capture, Session
+from toolkit.capture import Capture, Session, masks
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import Embedder, StoredVectors, create_embedder, open_embeddings
 from toolkit.embedders.index import VectorIndex, load_index
@@ -36,7 +36,7 @@ from toolkit.files import (
     write_sidecar,
 )  # fmt: skip
 from toolkit.geometry import unit
-from toolkit.localizers.base import Localizer, PoseEstimate, References, ScaledLocalizer
+from toolkit.localizers.base import Localizer, PoseEstimate, References, RoughPose, ScaledLocalizer
 from toolkit.localizers.correspondences import MAPS
 from toolkit.localizers.escalation import EscalatingLocalizer
 from toolkit.localizers.feed_forward import FeedForwardLocalizer
@@ -60,6 +60,8 @@ ODD_DEPTHS_M = (0.1, 200.0)
 """A map whose median depth is beyond these may be in another unit."""
 MOST_IN_MEMORY = 1 << 30
 """Bytes of global descriptors, in float32, that an open map holds; more are read from disk for each search."""
+NEAR, NEAR_DEG = 10.0, 60.0
+"""Images of the map may show what a camera sees that is at most so many lengths away, and turned by so much."""
 RETRIEVAL = "retrieval_dir"
 """Attributes of `poses/<pair>.h5`: the settings that the pair was localized with, the capture's `sessions`, and the
 folder of the references."""
@@ -309,6 +311,7 @@ class Map:
         pictures: Sequence[Callable[[bool], NDArray[np.uint8]]] = (),
         cameras: Sequence[pycolmap.Camera] = (),
         turns: Sequence[int] = (),
+        near: Sequence[RoughPose] = (),
     ) -> list[References]:
         """Return the references of query images as the run would find them.
 
@@ -316,6 +319,7 @@ class Map:
             vectors: (Q, D) what the embedder gave for them.
             pictures: what returns their pixels, in color if it is given True; of use to a run that reranks.
             cameras, turns: their intrinsics, and the quarter turns that make them upright; likewise.
+            near: about where they are, of their cameras; empty: anywhere.
 
         Raises:
             ArtifactError: the map was embedded by another embedder.
@@ -330,7 +334,13 @@ class Map:
                 f"{self.embedder.name} gives {vectors.shape[1]}. Embed again."
             )
         vectors = unit(vectors) if self.retrieve_settings.normalize else vectors
-        scores, nearest = search(vectors, database, self.retrieve_settings.topk, "torch", "cpu", index=self._index)
+        allowed = [self._may_show(rows, pose) for pose in near] or [None]
+        parts = np.split(vectors, len(allowed))
+        found = [
+            search(part, database, self.retrieve_settings.topk, "torch", "cpu", index=self._index, allowed=mask)
+            for part, mask in zip(parts, allowed, strict=True)
+        ]
+        scores, nearest = (np.concatenate(each) for each in zip(*found, strict=True))
         ranked = [
             (rows[of_query[of_query >= 0]], each[of_query >= 0].astype(np.float64))
             for of_query, each in zip(nearest, scores, strict=True)
@@ -342,6 +352,16 @@ class Map:
             indices = np.array([self.index_of.get(self.session.image_name(int(row)), -1) for row in images], np.int64)
             references.append(References(indices[indices >= 0], similarities[indices >= 0]))
         return references
+
+    def _may_show(self, rows: NDArray[np.int64], about: RoughPose) -> NDArray[np.bool_] | None:
+        """Return which images (N,) of the map, by their rows, may show what a camera sees; None if that is unknown."""
+        mask = masks.near(
+            self.session.world_from_cam(rows),
+            about.world_from_rig,
+            NEAR * self.length + 3 * about.position_std_m,
+            NEAR_DEG + 3 * about.rotation_std_deg,
+        )
+        return mask if mask.any() else None
 
     @cached_property
     def _verification(self) -> tuple[LocalMethod, Verifier]:

@@ -2,6 +2,7 @@
 
 import operator
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from toolkit.errors import ArtifactError, ImageError
 from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor, extract_turned
 from toolkit.features.matching import AnyMethod
 from toolkit.features.stores import as_stored
-from toolkit.localizers.base import PoseEstimate, Query, View
+from toolkit.localizers.base import PoseEstimate, Prior, Query, RoughPose, View
 from toolkit.localizers.map import Map
 
 _NO_ROTATION = 1e-3
@@ -32,6 +33,7 @@ def localize_image(
     camera: pycolmap.Camera | Sequence[pycolmap.Camera],
     rig_from_cams: NDArray[np.float64] | None = None,
     turns: Sequence[int] | None = None,
+    near: RoughPose | None = None,
 ) -> PoseEstimate:
     """Localize one picture, or those that the cameras of a rig took at one instant, as the run of the map would.
 
@@ -42,6 +44,8 @@ def localize_image(
         rig_from_cams: (C, 4, 4) of a rig.
         turns: for each picture, the counter-clockwise quarter turns that bring gravity down; None: it is upright. Of
             use to learned embedders and networks only.
+        near: about where it is, if that is known: references are then images of the map that look the same way from
+            there, and features are also sought where this pose puts the map's points.
 
     Returns:
         The estimate: `world_from_rig` (of a single picture world_from_cam), (4, 4), or None where `status` says why.
@@ -96,9 +100,16 @@ def localize_image(
         shown = zip(pixels, quarter_turns if turned else none, strict=True)
         side = embedder.least_side
         inputs = [embedder.prepare(turn_image(picture.read(True, side), turn)) for picture, turn in shown]
-    references = place.retrieve(embedder.embed(inputs), [picture.read for picture in pixels], cameras, quarter_turns)
+    about = [] if near is None else [replace(near, world_from_rig=pose) for pose in near.world_from_rig @ poses]
+    readers = [picture.read for picture in pixels]
+    references = place.retrieve(embedder.embed(inputs), readers, cameras, quarter_turns, about)
+    query = Query(views, poses, features)
     with threadpool_limits(1, "blas"):  # sums stay in one order, as in a run
-        return place.judged(place.localizer.localize(Query(views, poses, features), references))
+        if near is None:
+            return place.judged(place.localizer.localize(query, references))
+        images = np.unique(np.concatenate([part.images for part in references]))
+        prior = Prior.about(near.world_from_rig, images, near.rotation_std_deg, near.position_std_m, "near")
+        return place.judged(place.localizer.localize(query, references, None, [prior]))
 
 
 def pixels_from(image: Any) -> NDArray[np.uint8]:
