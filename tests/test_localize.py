@@ -23,8 +23,9 @@ from numpy.testing import assert_allclose
 from tests.calls import call
 from tests.other_kind import add_other_kind
 from toolkit import geometry, localize
-from toolkit.capture import Capture, Trajectory
+from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import read_image
+from toolkit.capture.tables import POSE_NAMES
 from toolkit.embed import embed_sessions
 from toolkit.errors import ArtifactError, CaptureError, ImageError, ManifestError, ToolkitError
 from toolkit.evaluate import evaluate_scene
@@ -36,7 +37,7 @@ from toolkit.files import SceneFiles, image_name, map_record_path, read_map_reco
 from toolkit.localize import COLUMNS, Map, localize_image, localize_pairs
 from toolkit.localizers import create_localizer
 from toolkit.localizers import map as maps
-from toolkit.localizers.base import PoseEstimate, Query, View
+from toolkit.localizers.base import PoseEstimate, Query, RoughPose, View
 from toolkit.localizers.correspondences import LocalizedQueries
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.picture import pixels_from
@@ -46,6 +47,7 @@ from toolkit.localizers.simulated import SimulatedPredictor
 from toolkit.manifest import EmbedSettings, LocalizeSettings
 from toolkit.rerank import rerank_pairs
 from toolkit.retrieve import load_embeddings, retrieve_pairs
+from toolkit.sequence import sequence_pairs
 
 LIST = "keyframes_original"
 DEVICES = ("ios", "hl", "spot")
@@ -1227,3 +1229,83 @@ def test_errors_without_a_unit_are_relative_to_the_depth(capture: Path, run: Sce
 
 def _times(poses: np.ndarray, factor: float) -> np.ndarray:
     return geometry.make_pose(poses[:, :3, :3], factor * poses[:, :3, 3])
+
+
+def test_a_picture_is_localized_near_a_rough_pose(
+    small_capture: Path, finished: tuple[SceneFiles, pd.DataFrame]
+) -> None:
+    files, _ = finished
+    place = Map.open(files.run, files.scene, "ios")
+    session = Capture.open(small_capture)["ios_query"]
+    path, camera = session.image_path(0), session.camera(session.images["sensor_id"][0])
+    found = localize_image(place, path, camera).world_from_rig
+    assert found is not None
+    estimate = localize_image(place, path, camera, near=RoughPose(found, 1.0, 0.05))
+    assert estimate.status == "ok"
+    assert geometry.pose_error(np.asarray(estimate.world_from_rig), found)[1] < 0.01
+    rows = [place.session.row_of_name[name] for name in place.localizer.image_names]
+    mapped = place.session.world_from_cam(np.array(rows))
+    vectors, _ = load_embeddings(files.embeddings / "ios_map")
+    for about in mapped:  # whatever the picture looks like
+        (references,) = place.retrieve(vectors[:1], near=[RoughPose(about, 1.0, 0.05)])
+        angles = np.degrees(np.arccos(np.clip(mapped[:, :3, 2] @ about[:3, 2], -1, 1)))
+        assert sorted(references.images) == np.flatnonzero(angles < 63.0).tolist()
+    away = geometry.make_pose(found[:3, :3], [1e6, 0.0, 0.0])
+    nowhere = localize_image(place, path, camera, near=RoughPose(away, 1.0, 0.05))
+    assert nowhere.status == "ok"  # no image of the map is there: all are searched
+
+
+def test_a_query_that_failed_is_localized_again_where_odometry_leads(
+    capture: Path, finished: tuple[SceneFiles, pd.DataFrame], tmp_path: Path
+) -> None:
+    pytest.importorskip("gtsam")
+    files = SceneFiles(tmp_path / "run", finished[0].scene)
+    shutil.copytree(finished[0].root, files.root)
+    session = Session(capture / "sessions/ios_query")
+    truth = session.ground_truth
+    assert truth is not None
+    Trajectory.from_poses(truth.timestamps, truth.device_ids, truth.world_from_device).write(
+        session.path / "trajectories.txt"
+    )
+    table, poses = rows_of(files, "ios"), Trajectory.read(files.poses_txt("ios", "ios"))
+    key = table["timestamp"][1], table["device_id"][1]
+    table.loc[1, "status"] = "failed: too few matches"
+    table.to_csv(files.poses_csv("ios", "ios"), index=False)
+    kept = poses.timestamps != key[0]
+    assert poses.covariances is not None
+    Trajectory(poses.timestamps[kept], poses.device_ids[kept], poses.qt[kept], poses.covariances[kept]).write(
+        files.poses_txt("ios", "ios")
+    )
+    sidecar_path(files.poses_txt("ios", "ios")).unlink()
+    only = {"map_device": "ios", "query_device": "ios"}
+    without = sequence_pairs(capture / "sessions", files.poses_dir, {"relocalize": False}, **only).iloc[0]
+    assert (without["again"], without["used"]) == (0, kept.sum())
+    done = sequence_pairs(capture / "sessions", files.poses_dir, **only).iloc[0]
+    assert (done["again"], done["used"], done["ok"]) == (1, kept.sum() + 1, len(truth))
+    rows = pd.read_csv(str(done["path"]).replace(".txt", ".csv"), keep_default_na=False)
+    row = rows[rows["timestamp"] == key[0]].iloc[0]
+    assert (row["single_status"], row["again_status"]) == ("failed: too few matches", "ok")
+    steps = pd.read_csv(str(done["path"]).replace(".txt", "_steps.csv"))
+    again = steps[(steps["step"] == "again") & (steps["timestamp"] == key[0])].iloc[0]
+    found = geometry.pose_from_qt(again[list(POSE_NAMES)].to_numpy(float))
+    assert geometry.pose_error(found, truth.lookup([key[0]], [key[1]])[0])[1] < 0.02
+
+
+def test_poses_of_no_run_cannot_be_localized_again(
+    capture: Path, finished: tuple[SceneFiles, pd.DataFrame], tmp_path: Path
+) -> None:
+    pytest.importorskip("gtsam")
+    session = Session(capture / "sessions/ios_query")
+    truth = session.ground_truth
+    assert truth is not None
+    Trajectory.from_poses(truth.timestamps, truth.device_ids, truth.world_from_device).write(
+        session.path / "trajectories.txt"
+    )
+    shutil.copytree(finished[0].poses_dir, tmp_path / "elsewhere")
+    table = pd.read_csv(tmp_path / "elsewhere" / finished[0].poses_csv("ios", "ios").name)
+    table.assign(status="low_confidence").to_csv(tmp_path / "elsewhere" / finished[0].poses_csv("ios", "ios").name)
+    sidecar_path(tmp_path / "elsewhere" / finished[0].poses_txt("ios", "ios").name).unlink()
+    only = {"map_device": "ios", "query_device": "ios"}
+    row = sequence_pairs(capture / "sessions", tmp_path / "elsewhere", **only).iloc[0]
+    assert "relocalize: false" in row["reason"]
+    assert str(tmp_path / "elsewhere") in row["reason"]

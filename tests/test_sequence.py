@@ -10,6 +10,7 @@ import pytest
 from tests.localizers.drifting import PLACE, small_motion
 from toolkit import geometry
 from toolkit.capture import Session, Trajectory
+from toolkit.capture.tables import as_strings
 from toolkit.errors import ManifestError
 from toolkit.files import pair_name
 from toolkit.sequence import COLUMNS, sequence_pairs
@@ -133,3 +134,24 @@ def test_a_map_session_has_no_odometry(place: Path) -> None:
     odometry = Session(place / "sessions/ios_query").odometry
     assert odometry is not None
     assert len(odometry)
+
+
+def test_a_query_between_two_poses_of_the_odometry_has_one_in_between(place: Path, tmp_path: Path) -> None:
+    path = place / "sessions/ios_query/trajectories.txt"
+    truth = Session(place / "sessions/ios_query").ground_truth
+    assert truth is not None
+    odometry = Trajectory.read(path)
+    asked = odometry.index.find(truth.timestamps[::2], as_strings(truth.device_ids[::2]))
+    # A pose before and behind each query, which has none itself; the names of phones tell the time.
+    times = np.concatenate([odometry.timestamps[asked] + shift for shift in (-1000, 1000)])
+    rows = np.tile(asked, 2)
+    early = Trajectory(times, [f"{odometry.device_ids[row]}_" for row in rows], odometry.qt[rows])
+    early.write(path)
+    done = sequence_pairs(place / "sessions", tmp_path / "poses", map_device="ios", query_device="ios").iloc[0]
+    found = Trajectory.read(done["path"])
+    single = Trajectory.read(tmp_path / "poses" / f"{pair_name(place.name, 'ios', 'ios')}.txt")
+    there = truth.lookup(single.timestamps, single.device_ids)
+    poses = found.lookup(single.timestamps, single.device_ids)
+    assert np.isfinite(poses).all()
+    assert geometry.pose_error(poses, there)[1].max() < 0.1
+    assert len(found) == len(early) + len(single)

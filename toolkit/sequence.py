@@ -1,8 +1,9 @@
 """The sequence stage: the poses of single queries and the odometry between them in, a pose of every frame out."""
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -10,24 +11,42 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
+from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
-from toolkit.capture.tables import KeyIndex, as_strings, read_query_table
-from toolkit.errors import OF_THE_DATA, ArtifactError
-from toolkit.files import file_fingerprint, is_current, pair_name, require_whole, write_atomic, write_sidecar
+from toolkit.capture.images import default_workers, prefetch
+from toolkit.capture.tables import POSE_NAMES, KeyIndex, as_strings, read_query_table
+from toolkit.errors import OF_THE_DATA, ArtifactError, reason_of
+from toolkit.files import (
+    SceneFiles,
+    file_fingerprint,
+    is_current,
+    pair_name,
+    read_sidecar,
+    require_whole,
+    write_atomic,
+    write_sidecar,
+)
 from toolkit.geometry import Floats, Ints, pose_error
+from toolkit.localizers.base import PoseEstimate, RoughPose
+from toolkit.localizers.map import Map
 from toolkit.localizers.odometry import Odometry, PosedQueries
-from toolkit.localizers.pose_graph import place_online, place_piece
+from toolkit.localizers.picture import localize_image
+from toolkit.localizers.recording import localize_piece
 from toolkit.manifest import SequenceSettings
 
 SUFFIX = "_sequence"
 """Ends the name of what the stage makes of a pair, beside what localization has made of it."""
 COLUMNS = (
     "timestamp", "device_id", "recording", "piece", "status", "position_std_m", "rotation_std_deg", "single_status",
-    "used", "moved_m", "turned_deg",
+    "again_status", "used", "moved_m", "turned_deg",
 )  # fmt: skip
-"""Of the table: `moved_m` and `turned_deg` tell how far a query's pose is from that of localization, which was `used`
-where it agrees with the others of its piece."""
+"""Of the table: `again_status` is that of a query that was localized again near its predicted pose, empty for others.
+A query's own pose, the first or that found again, was `used` if it agrees with the others of its piece; `moved_m` and
+`turned_deg` tell how far its pose is from the first."""
+STEP_COLUMNS = ("step", "timestamp", "device_id", *POSE_NAMES)
+"""Of `<pair>_sequence_steps.csv`: the poses of queries after each of `STEPS`."""
 
 
 def sequence_pairs(
@@ -42,19 +61,21 @@ def sequence_pairs(
     """Write for each pair of devices the poses of all frames of the queries' recordings, and a table of them.
 
     `<poses_dir>/<pair>_sequence.txt` has every frame of the odometry, and every query without odometry that was
-    localized; `<pair>_sequence.csv` has a row for each of them, with `COLUMNS`, also for those without a pose.
+    localized; `<pair>_sequence.csv` has a row for each of them, with `COLUMNS`, also for those without a pose;
+    `<pair>_sequence_steps.csv` has the queries' poses in between.
 
     Args:
-        sessions_root: `<capture>/sessions`; the odometry is trajectories.txt of a query session.
-        poses_dir: folder of the localize stage's poses; the results go there, too.
+        sessions_root: `<capture>/sessions`; the odometry is trajectories.txt of a query session. A query between two of
+            its poses gets one by interpolation.
+        poses_dir: RUN/SCENE/poses, the folder of the localize stage's poses; the results go there, too.
         settings: see `SequenceSettings`; a dict holds what differs from the defaults.
         map_device, query_device: `ios`, `hl`, `spot`, or `all` that the capture has.
         skip_existing: reuse what was made from the same inputs and settings.
 
     Returns:
         One row a pair: map_device, query_device, frames = ok + low_confidence + failed, pieces, queries that were
-        localized, used (those that agree), seconds, skipped, path, reason. A pair that cannot be done, for want of
-        odometry or of poses, has zeros and the `reason`.
+        localized at first, again (those that were localized again), used (those that agree), seconds, skipped, path,
+        reason. A pair that cannot be done, for want of odometry or of poses, has zeros and the `reason`.
 
     Raises:
         ManifestError: a setting is not valid, or GTSAM is not installed.
@@ -74,7 +95,7 @@ def sequence_pairs(
     return pd.DataFrame(rows)
 
 
-_COUNTS = ("frames", "ok", "low_confidence", "failed", "pieces", "queries", "used")
+_COUNTS = ("frames", "ok", "low_confidence", "failed", "pieces", "queries", "again", "used")
 
 
 def _place_pair(
@@ -90,18 +111,23 @@ def _place_pair(
     if not poses.exists():
         raise ArtifactError(f"{poses}: no poses of this pair. Localize first.")
     require_whole(poses)
-    record = {
+    record: dict[str, Any] = {
         "sequence": settings.model_dump(),
         "poses": [file_fingerprint(path) for path in (poses, table)],
         "odometry": file_fingerprint(session.path / "trajectories.txt"),
     }
+    if settings.relocalize:
+        record["localize"] = read_sidecar(poses)
     skipped = skip_existing and is_current(out, record)
     if not skipped:
-        frames, trajectory = _frames(session, _Answers.read(poses, table), settings)
-        with write_atomic(out.with_suffix(".csv")) as temporary:
-            frames.to_csv(temporary, index=False)
+        again = _Relocalizer(poses_dir, capture.name, map_device, session) if settings.relocalize else None
+        frames, steps, trajectory = _frames(session, _Answers.read(poses, table), settings, again)
+        csvs = {out.with_suffix(".csv"): frames, out.with_name(f"{out.stem}_steps.csv"): steps}
+        for path, rows in csvs.items():
+            with write_atomic(path) as temporary:
+                rows.to_csv(temporary, index=False)
         trajectory.write(out)
-        write_sidecar(out, record, [out.with_suffix(".csv")])
+        write_sidecar(out, record, list(csvs))
     frames = pd.read_csv(out.with_suffix(".csv"), keep_default_na=False)
     status = frames["status"].str.split(":").str[0].value_counts()
     return {
@@ -109,6 +135,7 @@ def _place_pair(
         **{name: int(status.get(name, 0)) for name in ("ok", "low_confidence", "failed")},
         "pieces": len(frames[["recording", "piece"]].drop_duplicates()),
         "queries": int((frames["moved_m"] != "").sum()),
+        "again": int((frames["again_status"] != "").sum()),
         "used": int((frames["used"].astype(str) == "True").sum()),
         "seconds": round(time.perf_counter() - started, 2),
         "skipped": skipped,
@@ -167,28 +194,83 @@ class _Answers:
         return index.find(timestamps, as_strings(device_ids))
 
 
-def _frames(session: Session, answers: _Answers, settings: SequenceSettings) -> tuple[pd.DataFrame, Trajectory]:
-    """Return the table of all frames and queries, and the poses of those that have one."""
+class _Relocalizer:
+    """Localizes queries again near predicted poses, in the map of the run that the first poses are of."""
+
+    def __init__(self, poses_dir: Path, scene: str, map_device: str, session: Session) -> None:
+        self._run, self._scene, self._device, self._session = poses_dir.parent.parent, scene, map_device, session
+        self._expected = poses_dir
+
+    @cached_property
+    def _place(self) -> Map:
+        if SceneFiles(self._run, self._scene).poses_dir != self._expected:
+            raise ArtifactError(
+                f"{self._expected}: found no folder of a run, RUN/{self._scene}/poses, whose map could be opened to "
+                "localize again. Write the poses there, or set relocalize: false."
+            )
+        return Map.open(self._run, self._scene, self._device)
+
+    def __call__(self, queries: pd.DataFrame, near: Sequence[RoughPose]) -> list[PoseEstimate]:
+        """Return an estimate of each query, given by `timestamp` and `device_id`."""
+        session, place = self._session, self._place
+        _ = place.localizer, place.embedder  # opened before threads ask for them
+        rows_of_each = session.rows_of_keyframes(queries)
+
+        def localize(number: int) -> PoseEstimate:
+            rows = rows_of_each[number]
+            turns = None if place.turns is None else place.turns.of(session, rows).tolist()
+            cameras = [session.camera(sensor) for sensor in session.images["sensor_id"].iloc[rows]]
+            paths = [session.image_path(int(row)) for row in rows]
+            try:
+                poses = session.rig_from_cam(rows)
+                return localize_image(place, paths, cameras, poses, turns, near[number])
+            except Exception as error:  # one bad query never ends a run
+                return PoseEstimate(f"failed: {reason_of(error, f'localizing {paths[0]} again')}")
+
+        with threadpool_limits(1, "blas"):
+            return list(prefetch(localize, range(len(queries)), default_workers()))
+
+
+def _frames(
+    session: Session, answers: _Answers, settings: SequenceSettings, relocalizer: _Relocalizer | None
+) -> tuple[pd.DataFrame, pd.DataFrame, Trajectory]:
+    """Return the table of all frames and queries, that of steps, and the poses of those frames that have one."""
     assert session.odometry is not None
-    odometry = session.odometry
+    odometry = _with_queries(session, answers.keys, settings)
     query_of = answers.of(odometry.timestamps, odometry.arrow_ids)
     tables, poses, covariances = list[pd.DataFrame](), list[Floats](), list[Floats]()
+    steps = [pd.DataFrame(columns=list(STEP_COLUMNS))]
     for piece in _pieces(session, odometry, settings):
         asked = query_of[piece.rows]
         frames = np.flatnonzero((asked >= 0) & np.isfinite(answers.poses[asked]).all(axis=(1, 2)))
         queries = answers.posed(asked[frames], frames)
         motion = Odometry(odometry.timestamps[piece.rows], odometry.world_from_device[piece.rows])
-        if settings.online:
-            placed = place_online(motion, queries, np.flatnonzero(asked >= 0), settings)
-        else:
-            placed = place_piece(motion, queries, settings)
+        keys = pd.DataFrame({"timestamp": motion.timestamps, "device_id": odometry.device_ids[piece.rows]})
+        again = None
+        if relocalizer is not None:
+
+            def again(
+                todo: Sequence[tuple[int, RoughPose]], keys: pd.DataFrame = keys, ask: _Relocalizer = relocalizer
+            ) -> list[PoseEstimate]:
+                return ask(keys.iloc[[frame for frame, _ in todo]], [pose for _, pose in todo])
+
+        done = localize_piece(motion, queries, np.flatnonzero(asked >= 0), settings, again)
+        placed = done.placed
+        for name, of_queries in done.steps.items():
+            posed = np.isfinite(of_queries).all(axis=(1, 2))
+            table = keys[asked >= 0][posed].assign(step=name)
+            table[list(POSE_NAMES)] = geometry.qt_from_pose(of_queries[posed]).round(9)
+            steps.append(table[list(STEP_COLUMNS)])
         table = pd.DataFrame(dict.fromkeys(COLUMNS), index=range(len(piece.rows)))
-        table["timestamp"], table["device_id"] = motion.timestamps, odometry.device_ids[piece.rows]
+        table[list(keys)] = keys
         table["recording"], table["piece"], table["status"] = piece.recording, piece.number, placed.status
         table["single_status"] = np.where(asked >= 0, answers.status[asked], "")
+        table.loc[list(done.again), "again_status"] = [estimate.status for estimate in done.again.values()]
         turned, moved = pose_error(placed.world_from_rig[frames], queries.world_from_rig)
-        for name, values in (("used", placed.used), ("moved_m", moved.round(6)), ("turned_deg", turned.round(6))):
+        for name, values in (("moved_m", moved.round(6)), ("turned_deg", turned.round(6))):
             table.loc[frames, name] = values
+        table.loc[done.queries.frames, "used"] = False
+        table.loc[done.queries.frames[placed.used], "used"] = True
         tables.append(table)
         poses.append(placed.world_from_rig)
         covariances.append(placed.covariances)
@@ -206,7 +288,34 @@ def _frames(session: Session, answers: _Answers, settings: SequenceSettings) -> 
     frames_table["rotation_std_deg"] = np.where(posed, np.degrees(stds[1]), np.nan).round(6)
     kept = frames_table[posed]
     times = kept["timestamp"].to_numpy(np.int64)
-    return frames_table, Trajectory.from_poses(times, kept["device_id"].to_list(), every[posed], known[posed])
+    trajectory = Trajectory.from_poses(times, kept["device_id"].to_list(), every[posed], known[posed])
+    return frames_table, pd.concat([part.astype(object) for part in steps], ignore_index=True), trajectory
+
+
+def _with_queries(session: Session, queries: pd.DataFrame, settings: SequenceSettings) -> Trajectory:
+    """Return a session's odometry with poses of queries between two of it, where tracking was not lost."""
+    odometry = session.odometry
+    assert odometry is not None
+    known = odometry.index.find(queries["timestamp"].to_numpy(), as_strings(queries["device_id"])) >= 0
+    if known.all():
+        return odometry
+    recordings, poses = _recordings(session, odometry), odometry.world_from_device
+    missing = queries[~known].reset_index(drop=True)
+    devices = missing["device_id"].to_numpy(object)
+    of_each = _subsessions(session, devices)
+    alone = ~np.isin(of_each, recordings)  # devices that moved at the same time have a recording each
+    of_each[alone] = [f"{name} {device}".strip() for name, device in zip(of_each[alone], devices[alone], strict=True)]
+    added = [(odometry.timestamps, odometry.device_ids, poses)]
+    for recording in dict.fromkeys(of_each.tolist()):
+        rows = np.flatnonzero(recordings == recording)
+        rows = rows[np.argsort(odometry.timestamps[rows], kind="stable")]
+        asked = np.flatnonzero(of_each == recording)
+        between, found = Odometry(odometry.timestamps[rows], poses[rows]).at(
+            missing["timestamp"].to_numpy(np.int64)[asked], settings
+        )
+        added.append((missing["timestamp"].to_numpy(np.int64)[asked[between]], devices[asked[between]], found))
+    times, names, every = (np.concatenate(part) for part in zip(*added, strict=True))
+    return Trajectory.from_poses(times, names, every)
 
 
 def _pieces(session: Session, odometry: Trajectory, settings: SequenceSettings) -> Iterator[_Piece]:
@@ -223,11 +332,17 @@ def _pieces(session: Session, odometry: Trajectory, settings: SequenceSettings) 
 def _recordings(session: Session, odometry: Trajectory) -> NDArray[np.object_]:
     """Return the recording (N,) of each pose: its subsession; of devices that moved at the same time, each its own."""
     devices = odometry.device_ids
-    recordings = np.full(len(odometry), "", object)
-    for name in sorted(session.subsessions, key=len):
-        recordings[[device.startswith(f"{name}/") for device in devices]] = name
+    recordings = _subsessions(session, devices)
     for name in dict.fromkeys(recordings.tolist()):
         rows = np.flatnonzero(recordings == name)
         if len(np.unique(odometry.timestamps[rows])) < len(rows):
             recordings[rows] = [f"{name} {device}".strip() for device in devices[rows]]
     return recordings
+
+
+def _subsessions(session: Session, device_ids: NDArray[np.object_]) -> NDArray[np.object_]:
+    """Return the subsession (N,) of each device, empty where it is of none."""
+    found = np.full(len(device_ids), "", object)
+    for name in sorted(session.subsessions, key=len):
+        found[[device.startswith(f"{name}/") for device in device_ids]] = name
+    return found

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.localizers.drifting import PLACE, Drive, drive
 from toolkit import geometry
@@ -88,3 +89,13 @@ def test_scale_is_fitted_where_drift_has_bent_the_way() -> None:
     turned = geometry.pose_error(way.odometry.odom_from_rig[-1:], geometry.invert(PLACE) @ way.world_from_rig[-1:])[0]
     assert turned.item() > 5.0
     assert fitted_scale(way.odometry, way.queries, SETTINGS) == pytest.approx(1.0, abs=0.01)
+
+
+def test_between_two_poses_motion_is_steady() -> None:
+    turn = Rotation.from_rotvec([0.0, 0.0, 0.4]).as_matrix()
+    poses = np.stack([np.eye(4), *(geometry.make_pose(turn, at) for at in ([1.0, 2.0, 0.0], [900.0, 0.0, 0.0]))])
+    odometry = Odometry(np.array([0, 1_000_000, 2_000_000]), poses)
+    which, found = odometry.at(np.array([-1, 250_000, 1_500_000, 2_000_001]), SequenceSettings())
+    assert which.tolist() == [1]  # outside, and where tracking was lost, nothing is known
+    expected = geometry.make_pose(Rotation.from_rotvec([0.0, 0.0, 0.1]).as_matrix(), [0.25, 0.5, 0.0])
+    np.testing.assert_allclose(found[0], expected, atol=1e-12)

@@ -10,13 +10,14 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
 
 from toolkit import geometry
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import SequenceSettings
 
-LEAST_STD_M, LEAST_STD_DEG = 0.02, 0.1
-"""A single query's pose is not surer than this: its covariance does not know of errors of the map."""
+LEAST_STD_M, LEAST_STD_DEG = 0.01, 0.05
+"""A single query's pose is not surer than this: its covariance does not know of errors that a part of the map has."""
 _CHI2_99 = 16.81
 """99 % quantile of the chi-squared distribution with 6 degrees of freedom."""
 
@@ -51,6 +52,25 @@ class Odometry:
         rotation = np.deg2rad(settings.rotation_drift_deg) * np.sqrt(np.abs(seconds[first] - seconds[second]))
         # A random walk: the same for many short steps as for one long one.
         return rotation, settings.position_drift * np.sqrt(np.abs(way[first] - way[second]))
+
+    def at(self, timestamps: Ints, settings: SequenceSettings) -> tuple[Ints, Floats]:
+        """Return which of some times are between two poses, (n,) their numbers, and poses (n, 4, 4) of these.
+
+        Between two, it turns and moves at a constant rate. Times outside, or where tracking was lost, are left out.
+        """
+        after = np.searchsorted(self.timestamps, timestamps)
+        inside = (after > 0) & (after < len(self))
+        piece = np.zeros(len(self), int)
+        for number, part in enumerate(self.split(settings)):
+            piece[part] = number
+        inside[inside] = piece[after[inside]] == piece[after[inside] - 1]
+        if not inside.any():
+            return np.flatnonzero(inside), np.zeros((0, 4, 4))
+        seconds = (self.timestamps - self.timestamps[0]) / 1e6
+        asked = (timestamps[inside] - self.timestamps[0]) / 1e6
+        turned = Slerp(seconds, Rotation.from_matrix(self.odom_from_rig[:, :3, :3]))(asked)
+        moved = [np.interp(asked, seconds, self.odom_from_rig[:, axis, 3]) for axis in range(3)]
+        return np.flatnonzero(inside), geometry.make_pose(turned.as_matrix(), np.stack(moved, axis=1))
 
     def split(self, settings: SequenceSettings) -> list[slice]:
         """Return the pieces between losses of tracking: gaps in time, and steps that no device makes."""
@@ -92,6 +112,8 @@ def floored(covariances: Floats) -> Floats:
 class Placement:
     """Which single poses agree with each other, given the odometry between them."""
 
+    seed: int
+    """The query that the others agree with."""
     members: Ints
     """Queries that agree, ascending."""
     support: float
@@ -110,7 +132,7 @@ def place(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings)
     """
     agree = _agreement(odometry, queries, settings)
     left = np.ones(len(queries), bool)
-    found: list[tuple[Ints, float]] = []
+    found: list[tuple[int, Ints, float]] = []
     while left.any():
         seed = int(np.argmax(np.where(left, (agree & left) @ queries.weights, -1.0)))
         members = agree[seed] & left
@@ -118,15 +140,15 @@ def place(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings)
         with_others = agree[:, members] @ queries.weights[members]
         members &= with_others >= 0.5 * queries.weights[members].sum()
         members[seed] = True
-        found.append((np.flatnonzero(members), float(queries.weights[members].sum())))
+        found.append((seed, np.flatnonzero(members), float(queries.weights[members].sum())))
         left &= ~members
-    found.sort(key=lambda one: -one[1])
+    found.sort(key=lambda one: -one[2])
     placements = []
-    for number, (rows, support) in enumerate(found):
-        others = [other for index, (_, other) in enumerate(found) if index != number]
+    for number, (seed, rows, support) in enumerate(found):
+        others = [other for index, (_, _, other) in enumerate(found) if index != number]
         rival = max(others, default=0.0)
         sure = bool(queries.trusted[rows].any() or len(rows) >= 3) and rival < 0.5 * support
-        placements.append(Placement(rows, support, sure, rival))
+        placements.append(Placement(seed, rows, support, sure, rival))
     return placements
 
 

@@ -97,7 +97,7 @@ def place_piece(odometry: Odometry, queries: PosedQueries, settings: SequenceSet
     mask = np.isin(np.arange(len(queries)), used)
     status = "ok"
     if not best.trusted:
-        rivaled = best.rival_support >= 0.5 * best.support
+        rivaled = best.rival_support >= 0.5 * best.support > 0
         status = f"low_confidence: {'another place is as likely' if rivaled else 'no query of this piece is sure'}"
     return PlacedPiece(poses, covariances, mask, np.full(count, status, object), scale)
 

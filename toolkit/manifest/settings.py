@@ -369,6 +369,8 @@ class SequenceSettings(Settings):
     """A longer time without a pose is a loss of tracking: a new piece, with a frame of its own, begins."""
     max_speed_m_s: PositiveNumber = 15.0
     """So is a step that is faster."""
+    relocalize: bool = True
+    """Whether queries that are not `ok`, or contradict the others, are localized again near their predicted pose."""
     online: bool = False
     """Whether the pose of a query rests on what was before it alone; other frames then have none."""
     length_s: PositiveNumber | None = None

@@ -1,0 +1,121 @@
+"""A piece of a recording in the map: single poses joined by odometry, and what they leave in doubt localized again.
+
+The steps are those of the LaMAR benchmark (Sarlin et al., ECCV 2022): the odometry is laid where most single poses
+agree, a pose graph follows, then localization again with the predicted poses as priors, and the graph once more.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from toolkit import geometry
+from toolkit.geometry import Floats, Ints
+from toolkit.localizers.base import PoseEstimate, RoughPose, agree
+from toolkit.localizers.odometry import Odometry, PosedQueries, place
+from toolkit.localizers.pose_graph import PlacedPiece, place_online, place_piece
+from toolkit.manifest import SequenceSettings
+
+Again = Callable[[Sequence[tuple[int, RoughPose]]], Sequence[PoseEstimate]]
+"""Localizes some frames of a piece, given by their indices, again, each near a pose."""
+
+
+@dataclass(frozen=True)
+class LocalizedPiece:
+    """The poses of a piece of odometry, and how they came about."""
+
+    placed: PlacedPiece
+    queries: PosedQueries
+    """What the poses rest on: the first single poses, and those found again."""
+    again: Mapping[int, PoseEstimate]
+    """What localization near the predicted pose has found, by the frame."""
+    steps: Mapping[str, Floats]
+    """world_from_rig (A, 4, 4) of the frames that were asked for, NaN where there is none, after each of `STEPS`."""
+
+
+STEPS = ("voted", "graph", "again")
+"""Odometry laid as a whole where most single poses agree; the first pose graph; single poses, the doubtful ones found
+again. What the second graph makes of these is the result."""
+
+
+def localize_piece(
+    odometry: Odometry,
+    queries: PosedQueries,
+    asked: Ints,
+    settings: SequenceSettings,
+    again: Again | None = None,
+) -> LocalizedPiece:
+    """Return the poses of a piece of odometry: of all frames, or of those that are asked for if `settings.online`.
+
+    Args:
+        queries: those with a pose.
+        asked: (A,) frames of all queries, ascending.
+        again: asked about queries that are not `ok`, or that contradict the others; None: they stay as they are.
+
+    Raises:
+        ManifestError: GTSAM is not installed.
+    """
+    first = _placed(odometry, queries, asked, settings)
+    sure = queries.frames[first.used & queries.trusted]
+    doubted = [int(frame) for frame in np.setdiff1d(asked, sure) if np.isfinite(first.world_from_rig[frame]).all()]
+    answers: dict[int, PoseEstimate] = {}
+    if again is not None and doubted:
+        found = again([(frame, _rough(first, frame)) for frame in doubted])
+        answers = dict(zip(doubted, found, strict=True))
+    every = with_answers(queries, answers)
+    second = first if every is queries else _placed(odometry, every, asked, settings)
+    singles = np.full((len(odometry), 4, 4), np.nan)
+    singles[queries.frames] = queries.world_from_rig
+    voted = np.full((len(asked), 4, 4), np.nan)
+    if len(queries) and not settings.online:
+        seed = place(odometry, queries, settings)[0].seed
+        laid = queries.world_from_rig[seed] @ geometry.invert(odometry.odom_from_rig[queries.frames[seed]])
+        voted = laid @ odometry.odom_from_rig[asked]
+    graph = first.world_from_rig[asked]
+    for frame, estimate in answers.items():
+        if estimate.world_from_rig is not None:
+            singles[frame] = estimate.world_from_rig
+    return LocalizedPiece(second, every, answers, dict(zip(STEPS, (voted, graph, singles[asked]), strict=True)))
+
+
+def _placed(odometry: Odometry, queries: PosedQueries, asked: Ints, settings: SequenceSettings) -> PlacedPiece:
+    if settings.online:
+        return place_online(odometry, queries, asked, settings)
+    return place_piece(odometry, queries, settings)
+
+
+def _rough(placed: PlacedPiece, frame: int) -> RoughPose:
+    covariance = placed.covariances[frame]
+    return RoughPose(
+        placed.world_from_rig[frame],
+        float(np.degrees(np.sqrt(np.trace(covariance[:3, :3])))),
+        float(np.sqrt(np.trace(covariance[3:, 3:]))),
+    )
+
+
+def with_answers(queries: PosedQueries, answers: Mapping[int, PoseEstimate]) -> PosedQueries:
+    """Return single poses with those that were found near a predicted pose.
+
+    One that agrees with the first of its frame replaces it. Another stands beside it, and has no vote on where the
+    odometry is: it was sought where the others had put it.
+    """
+    poses, covariances = queries.world_from_rig.copy(), queries.covariances.copy()
+    added: list[tuple[int, PoseEstimate]] = []
+    for frame, estimate in answers.items():
+        if estimate.world_from_rig is None or estimate.covariance is None:
+            continue
+        same = [row for row in np.flatnonzero(queries.frames == frame) if agree(poses[row], estimate.world_from_rig)]
+        if same:
+            poses[same[0]], covariances[same[0]] = estimate.world_from_rig, estimate.covariance
+        else:
+            added.append((frame, estimate))
+    if not answers:
+        return queries
+    every = PosedQueries(
+        np.concatenate([queries.frames, np.array([frame for frame, _ in added], np.int64)]),
+        np.concatenate([poses, *(np.asarray(estimate.world_from_rig)[None] for _, estimate in added)]),
+        np.concatenate([covariances, *(np.asarray(estimate.covariance)[None] for _, estimate in added)]),
+        np.concatenate([queries.weights, np.zeros(len(added))]),
+        np.concatenate([queries.trusted, np.zeros(len(added), bool)]),
+    )
+    return every.choose(np.argsort(every.frames, kind="stable"))
