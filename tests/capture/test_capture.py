@@ -239,6 +239,47 @@ def test_a_malformed_line_is_named(tmp_path: Path, file: str, line: str | bytes,
     assert "python -m toolkit check" in text or " again, " in text
 
 
+def test_scans_and_fixes_are_tables(tmp_path: Path) -> None:
+    header = "# timestamp, sensor_id, mac_addr, frequency_khz, rssi_dbm, name, scan_time_start_us, scan_time_end_us\n"
+    path = write(
+        tmp_path / "ios_query",
+        {
+            # The name of a network may have a comma; a scan may receive an emitter twice.
+            "wifi.txt": f"{header}5, s/wifi, AA:BB:CC:DD:EE:FF, 2412000, -61.5, Tom, Dick, 4, 5\n" * 2,
+            "bt.txt": "6, s/bt, 8f14e45f-ceea-467f-a8f4-6f2d2e1a9c01:0:0, -80\n7, s/bt, b:1:2, -90, beacon\n",
+            "gps.txt": "8, s/gps, 47.3763, -8.5477, 408.5, 4.7\n9, s/gps, 47.4, -8.5, 0, -1\n",
+        },
+    )
+    session = Session.open(path)
+    assert session.wifi.to_numpy().tolist() == [[5, "s/wifi", "AA:BB:CC:DD:EE:FF", 2412000.0, -61.5]] * 2
+    assert list(session.wifi) == ["timestamp", "sensor_id", "mac_addr", "frequency_khz", "rssi_dbm"]
+    assert session.bluetooth["rssi_dbm"].tolist() == [-80, -90]
+    assert session.bluetooth["id"].tolist()[1] == "b:1:2"
+    assert session.gps.iloc[0].tolist() == [8, "s/gps", 47.3763, -8.5477, 408.5, 4.7]
+    other = Session.open(write(tmp_path / "hl_query", {}))
+    assert other.wifi is other.bluetooth is other.gps is None
+
+
+@pytest.mark.parametrize(
+    ("file", "line", "message"),
+    [
+        ("wifi.txt", "2, w, aa:bb, 2412000", "found 4 values in '2, w, aa:bb, 2412000', expected 5: timestamp,"),
+        ("wifi.txt", "2, w, aa:bb, 2412000, loud", "found rssi_dbm = 'loud'"),
+        ("wifi.txt", "2, w, , 2412000, -50", "found mac_addr = ''"),
+        ("bt.txt", "now, w, a:1:2, -50", "found timestamp = 'now'"),
+        ("gps.txt", "2, g, 90.1, 8, 400, 5", "found latitude_deg = '90.1', expected degrees from -90 to 90"),
+        ("gps.txt", "2, g, 47, 181, 400, 5", "found longitude_deg = '181', expected degrees from -180 to 180"),
+        ("gps.txt", "1, g, 47, 8, 400, 6", "timestamp 1, sensor_id 'g' again, with other values than in line 1"),
+    ],
+)
+def test_a_malformed_scan_or_fix_is_named(tmp_path: Path, file: str, line: str, message: str) -> None:
+    good = {"wifi.txt": "1, w, aa:bb, 2412000, -50", "bt.txt": "1, b, a:1:2, -50", "gps.txt": "1, g, 47, 8, 400, 5"}
+    session = Session.open(write(tmp_path / "ios_map", {file: f"{good[file]}\n{line}\n"}))
+    with pytest.raises(CaptureError) as caught:
+        getattr(session, {"wifi.txt": "wifi", "bt.txt": "bluetooth", "gps.txt": "gps"}[file])
+    assert f"{session.path / file}, line 2: {message}" in str(caught.value)
+
+
 def test_a_file_whose_lines_end_in_carriage_returns_is_not_empty(tmp_path: Path) -> None:
     """It is one line, which begins with `#`."""
     path = write(tmp_path / "ios_map", {"images.txt": "# timestamp, sensor_id, image_path\r1, cam, a/1.jpg\r"})

@@ -75,6 +75,23 @@ def test_a_good_capture_has_no_problems(capture: Path) -> None:
     assert table.loc["subsessions", "details"] == "s (4 images)"
 
 
+def test_scans_and_fixes_are_counted_and_a_sensor_that_is_not_known_is_told_once(capture: Path) -> None:
+    append(capture, "hl_map/sensors.txt", "s/wifi, , wifi\n")
+    append(capture, "hl_map/wifi.txt", "1, s/wifi, aa:bb, 2412000, -50\n" * 2 + "2, s/wifi, aa:cc, 2412000, -50\n")
+    append(capture, "hl_map/bt.txt", "1, s/bt, a:1:2, -50\n1, s/bt, a:1:3, -50\n2, s/bt, a:1:3\n")
+    append(capture, "hl_map/gps.txt", "1, s/gps, 47, 8, 400, 5\n2, s/gps, 47, 8, 400, -1\n")
+    report = check_capture(capture)
+    table = report.tables["hl_map"].set_index("what")
+    assert table.loc["WiFi"].tolist() == ["3", "2 scans, 2 emitters"]
+    assert table.loc["Bluetooth"].tolist() == ["2", "1 scans, 2 emitters"]
+    assert table.loc["GPS"].tolist() == ["2", "1 with an accuracy"]
+    assert [str(problem).split(",")[0] for problem in report.problems] == [
+        "hl_map/bt.txt:1: warning: unknown sensor 's/bt': not in sensors.txt",
+        "hl_map/bt.txt:3: error: found 3 values in '2",
+        "hl_map/gps.txt:1: warning: unknown sensor 's/gps': not in sensors.txt",
+    ]
+
+
 @pytest.mark.parametrize(
     ("file", "text", "expected"),
     [

@@ -99,10 +99,10 @@ def test_the_query_list_of_lamar_is_a_keyframe_list(tmp_path: Path) -> None:
 
 def test_check_says_what_is_not_used_and_what_has_no_row(tmp_path: Path) -> None:
     path = write(tmp_path / "CAB", "ios_map")
-    (path / "wifi.txt").write_text("1, s/wifi, aa:bb:cc:dd:ee:ff, 2400000, -50\n")
+    (path / "pointclouds.txt").write_text("1, s/lidar, cloud.ply\n")
     write(tmp_path / "CAB", "drone_map")
     report = check_capture(tmp_path / "CAB")
-    assert "wifi.txt is there and is not used" in report.text()
+    assert "pointclouds.txt is there and is not used" in report.text()
     messages = [str(problem) for problem in report.problems if not problem.file]
     assert messages == [
         "drone_map/: warning: device 'drone' is none of ios, hl, spot; it takes part. Meant? Else rename it"

@@ -13,7 +13,7 @@ from toolkit.capture.folder import Capture
 from toolkit.capture.images import default_workers, prefetch, read_image, stored_size
 from toolkit.capture.names import HOW_TO_ALLOW, has_long_part
 from toolkit.capture.session import RAW_DATA, SUBSESSIONS, Session
-from toolkit.capture.tables import ALIGNED, COLUMNS, POSE_NAMES, KeyIndex, key_of, read_table, times_of
+from toolkit.capture.tables import ALIGNED, COLUMNS, POSE_NAMES, SIGNALS, KeyIndex, key_of, read_table, times_of
 from toolkit.capture.trajectory import Trajectory
 from toolkit.capture.world_up import estimate_world_up, posed_photographs
 from toolkit.capture.writing import read_depth
@@ -21,7 +21,7 @@ from toolkit.errors import CaptureError, ImageError
 from toolkit.geometry import unit
 
 ERROR, WARNING = "error", "warning"
-UNUSED = {"wifi": "wifi.txt", "bluetooth": "bt.txt", "point clouds": "pointclouds.txt"}
+UNUSED = {"point clouds": "pointclouds.txt"}
 """Files of the format that the toolkit does not read; it ignores sensors of these kinds."""
 ASKED = "pruned_subsampled"
 """The list of keyframes that manifests ask for, unless they say otherwise."""
@@ -150,6 +150,7 @@ class _SessionCheck:
         if not len(session.images) and not session.tables["images.txt"].problems:
             self._add("images.txt", 0, "lists no image", WARNING)
         _ = session.subsessions, session.depths, [session.keyframes(name) for name in session.keyframe_files]
+        _ = session.wifi, session.bluetooth, session.gps
         for file in session.tables:
             self._check_rows(file, self._rows(file))
         self._check_cameras()
@@ -178,16 +179,19 @@ class _SessionCheck:
         """Check what does not depend on the kind of file: malformed lines, keys, ids and quaternions."""
         for line, message in self.session.tables[file].problems:
             self._add(file, line, message)
-        key = key_of(file)
-        shown = ", ".join(f"{name} {{{name}!r}}" for name in key)
-        again, same = rows.duplicated(key), rows.duplicated()
-        self._add_rows(file, rows[again & ~same], f"duplicate key ({shown}), with other values")
-        self._add_rows(file, rows[again & same], f"duplicate key ({shown}), a line that counts once", WARNING)
+        if file not in SIGNALS:
+            key = key_of(file)
+            shown = ", ".join(f"{name} {{{name}!r}}" for name in key)
+            again, same = rows.duplicated(key), rows.duplicated()
+            self._add_rows(file, rows[again & ~same], f"duplicate key ({shown}), with other values")
+            self._add_rows(file, rows[again & same], f"duplicate key ({shown}), a line that counts once", WARNING)
         if "sensor_id" in rows:
-            unknown = ~rows["sensor_id"].isin(self.sensors["sensor_id"])
+            unknown, severity = ~rows["sensor_id"].isin(self.sensors["sensor_id"]), ERROR
             if file == "depths.txt":  # maps that were rendered for a photograph: <prefix>/<sensor id>
                 unknown &= ~rows["sensor_id"].str.replace("^[^/]*/", "", regex=True).isin(self.sensors["sensor_id"])
-            self._add_rows(file, rows[unknown], "unknown sensor {sensor_id!r}: not in sensors.txt")
+            elif file in (*SIGNALS, "gps.txt"):  # which need nothing else of their sensors
+                unknown, severity = unknown & ~rows.duplicated("sensor_id"), WARNING
+            self._add_rows(file, rows[unknown], "unknown sensor {sensor_id!r}: not in sensors.txt", severity)
         if "device_id" in rows:
             message = "unknown device {device_id!r}: neither in rigs.txt nor in sensors.txt"
             self._add_rows(file, rows[~self._is_device(rows)], message)
@@ -357,6 +361,12 @@ class _SessionCheck:
         if session.split == "map" and not self._has_errors and len(posed_photographs(session)[1]):
             add("up in the world", None, estimate_world_up([session]).reason)
         add("depth maps", None if session.depths is None else len(session.depths), missing("depths.txt"))
+        for what, signals in (("WiFi", session.wifi), ("Bluetooth", session.bluetooth)):
+            if signals is not None:
+                scans = len(signals[["timestamp", "sensor_id"]].drop_duplicates())
+                add(what, len(signals), f"{scans:,} scans", f"{signals.iloc[:, 2].nunique():,} emitters")
+        if session.gps is not None:
+            add("GPS", len(session.gps), f"{np.sum(session.gps['horizontal_accuracy_m'] >= 0):,} with an accuracy")
         images = pd.Series(session.subsession_of()).value_counts()
         shown = [f"{name} ({images.get(name, 0):,} images)" for name in session.subsessions[:6]]
         add("subsessions", len(session.subsessions), *shown, "..." if len(session.subsessions) > 6 else "")

@@ -1,7 +1,7 @@
 """One session of a capture in the CroCoDL/LaMAR format. `toolkit.capture.check` looks for inconsistencies.
 
     CAPTURE/sessions/<device>_<map|query>/          (LaMAR: map, query_phone, query_hololens; see capture.devices)
-        sensors.txt  rigs.txt  images.txt  depths.txt  trajectories.txt  raw_data/
+        sensors.txt  rigs.txt  images.txt  depths.txt  trajectories.txt  wifi.txt  bt.txt  gps.txt  raw_data/
         proc/subsessions.txt  proc/keyframes_*.txt  proc/alignment_trajectories.txt      (LaMAR: queries.txt)
 
 `trajectories.txt` and `alignment_trajectories.txt` hold world_from_device, `rigs.txt` holds rig_from_sensor. Lengths
@@ -40,6 +40,7 @@ from toolkit.capture.tables import (
     ALIGNED,
     COLUMNS,
     POSE_NAMES,
+    SIGNALS,
     Floats,
     Ints,
     KeyIndex,
@@ -150,7 +151,9 @@ class Session:
         if file in ("trajectories.txt", ALIGNED):
             table.repeated(key_of(file))  # a pose that is there twice is found once; its covariance stays in the file
             return table
-        return table if file == "sensors.txt" else table.without_repeated(key_of(file))  # sensors: see `_sensor_rows`
+        if file in ("sensors.txt", *SIGNALS):  # sensors: see `_sensor_rows`
+            return table
+        return table.without_repeated(key_of(file))
 
     def _require_different(self, images: TextTable) -> None:
         """Refuse images of one path: whatever is made of an image goes by its path."""
@@ -171,6 +174,26 @@ class Session:
         """Of a query session its trajectories.txt, if it has one: world_from_device in a frame that is the device's own
         and begins anew where tracking was lost. A map session has none: its poses are in the world."""
         return self.trajectory if self.split == "query" else None
+
+    @cached_property
+    def wifi(self) -> pd.DataFrame | None:
+        """Signals of access points, table [timestamp, sensor_id, mac_addr, frequency_khz, rssi_dbm]; None without a
+        wifi.txt. A scan is what a sensor received at one time."""
+        return self._optional("wifi.txt")
+
+    @cached_property
+    def bluetooth(self) -> pd.DataFrame | None:
+        """Signals of beacons, table [timestamp, sensor_id, id, rssi_dbm]; None without a bt.txt."""
+        return self._optional("bt.txt")
+
+    @cached_property
+    def gps(self) -> pd.DataFrame | None:
+        """Fixes, table [timestamp, sensor_id, latitude_deg, longitude_deg, altitude_m, horizontal_accuracy_m], WGS 84;
+        None without a gps.txt. A negative accuracy says that there is no fix."""
+        return self._optional("gps.txt")
+
+    def _optional(self, file: str) -> pd.DataFrame | None:
+        return self._read(file).frame(*dict(COLUMNS[file])) if (self.path / file).exists() else None
 
     @cached_property
     def _roots(self) -> list[Path]:

@@ -31,25 +31,36 @@ log = logging.getLogger(__name__)
 
 Columns = Sequence[tuple[str, str]]
 
-# Column types: an integer, a finite number, a length of a position, a name, the path of an image, any text.
-INTEGER, NUMBER, METERS, ID, PATH, TEXT = "integer", "finite number", "meters", "id", "path", "text"
+# Column types: an integer, a finite number, a length of a position, angles, a name, the path of an image, any text.
+INTEGER, NUMBER, METERS, LATITUDE, LONGITUDE = "integer", "finite number", "meters", "latitude", "longitude"
+ID, PATH, TEXT = "id", "path", "text"
 FARTHEST_M = 1e12
 """Farther than any place; the squares of numbers near the largest one would not be finite."""
 POSE_NAMES = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
 POSE = tuple((name, NUMBER if name.startswith("q") else METERS) for name in POSE_NAMES)
 ALIGNED = "proc/alignment_trajectories.txt"
 _TRAJECTORY: Columns = (("timestamp", INTEGER), ("device_id", ID), *POSE)
+_DBM = ("rssi_dbm", NUMBER)
 COLUMNS: dict[str, Columns] = {
     "sensors.txt": (("sensor_id", ID), ("name", TEXT), ("sensor_type", ID)),
     "rigs.txt": (("rig_id", ID), ("sensor_id", ID), *POSE),
     "images.txt": (("timestamp", INTEGER), ("sensor_id", ID), ("image_path", PATH)),
     "depths.txt": (("timestamp", INTEGER), ("sensor_id", ID), ("depth_path", PATH)),
+    "wifi.txt": (("timestamp", INTEGER), ("sensor_id", ID), ("mac_addr", ID), ("frequency_khz", NUMBER), _DBM),
+    "bt.txt": (("timestamp", INTEGER), ("sensor_id", ID), ("id", ID), _DBM),
+    "gps.txt": (
+        *(("timestamp", INTEGER), ("sensor_id", ID), ("latitude_deg", LATITUDE), ("longitude_deg", LONGITUDE)),
+        *(("altitude_m", METERS), ("horizontal_accuracy_m", METERS)),
+    ),
     "trajectories.txt": _TRAJECTORY,
     ALIGNED: _TRAJECTORY,
     "proc/subsessions.txt": (("subsession", ID),),
     "keyframes": (("timestamp", INTEGER), ("device_id", ID)),
 }
-"""The columns of each file of a session: names and types."""
+"""The columns of each file of a session: names and types. wifi.txt and bt.txt have more, a name and the times of a
+scan, which are not needed."""
+SIGNALS = ("wifi.txt", "bt.txt")
+"""Files in which a key may be there again: a scan may receive an emitter several times."""
 
 
 def key_of(file: str) -> list[str]:
@@ -189,9 +200,13 @@ class _Block:
     has_extra: bool
 
 
-_ARROW_TYPES = {INTEGER: pa.int64(), NUMBER: pa.float64(), METERS: pa.float64()} | dict.fromkeys(
-    (ID, PATH, TEXT), pa.large_string()
-)
+_MOST = {METERS: FARTHEST_M, LATITUDE: 90.0, LONGITUDE: 180.0}
+"""Largest size of what is limited."""
+_ARROW_TYPES = {
+    INTEGER: pa.int64(),
+    **dict.fromkeys((NUMBER, *_MOST), pa.float64()),
+    **dict.fromkeys((ID, PATH, TEXT), pa.large_string()),
+}
 # Small enough that two in flight cost little memory, large enough to hide the overhead.
 _BLOCK_BYTES = 1 << 20
 
@@ -280,6 +295,8 @@ _EXPECTED = {
     INTEGER: "an integer (microseconds)",
     NUMBER: "a finite number",
     METERS: f"a finite number of meters, at most {FARTHEST_M:.0e}",
+    LATITUDE: "degrees from -90 to 90",
+    LONGITUDE: "degrees from -180 to 180",
     ID: EXPECTED_NAME,
     PATH: f"{EXPECTED_NAME}, below raw_data/ (if you list files that lie elsewhere yourself, {HOW_TO_ALLOW})",
 }
@@ -306,8 +323,8 @@ def convert(column: pa.Array, kind: str) -> tuple[pa.Array, NDArray[np.bool_]]:
     if kind == INTEGER:  # Arrow takes 0x10 for 16
         for prefix in ("0x", "0X"):
             wrong |= pc.starts_with(column, prefix).to_numpy(zero_copy_only=False)
-    elif kind == METERS:
-        wrong |= ~(np.abs(converted.to_numpy()) <= FARTHEST_M)
+    elif kind in _MOST:
+        wrong |= ~(np.abs(converted.to_numpy()) <= _MOST[kind])
     else:
         wrong |= ~np.isfinite(converted.to_numpy())
     return converted, wrong
