@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from tests.test_embed import HL_RIG, write_tiny_capture
+from toolkit.capture.masks import Masks
 from toolkit.embed import embed_sessions
 from toolkit.embedders import StoredVectors
 from toolkit.embedders import search as search_module
@@ -100,6 +101,40 @@ def test_several_sets_of_queries_on_disk_are_one(tmp_path: Path, monkeypatch: py
         np.testing.assert_array_equal(found, wanted)
 
 
+def brute_force(query: np.ndarray, database: np.ndarray, k: int, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What a search among the allowed rows (Q, N) is to find."""
+    full = (query.astype(np.float64) @ database.astype(np.float64).T).astype(np.float32)
+    full[~allowed] = -np.inf
+    indices = np.argsort(-full, axis=1, kind="stable")[:, :k]
+    scores = np.take_along_axis(full, indices, 1)
+    return scores, np.where(np.isneginf(scores), -1, indices)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.4])
+def test_a_masked_search_is_that_among_the_allowed_rows(
+    monkeypatch: pytest.MonkeyPatch, backend: str, share: float
+) -> None:
+    rng = np.random.default_rng(0)
+    # Whole numbers, so that many scores are equal, and rounding makes no difference.
+    database = rng.integers(-2, 3, (203, 8)).astype(np.float32)
+    query = rng.integers(-2, 3, (37, 8)).astype(np.float32)
+    query[[4, 36]] = 0
+    distinct, which = rng.random((9, 203)) < share, rng.integers(-1, 9, 37)
+    masks = Masks(203, np.packbits(distinct, axis=1, bitorder="little"), which)
+    allowed = np.where((which < 0)[:, None], True, distinct[which])
+    expected = brute_force(query, database, 5, allowed)
+    for products, block, queries in ((1 << 23, 1 << 20, 1 << 20), (50, 4 * 8 * 21, 4 * 8 * 10)):
+        monkeypatch.setattr(search_module, "_PRODUCTS", products)
+        monkeypatch.setattr(search_module, "_BLOCK_BYTES", block)
+        monkeypatch.setattr(search_module, "_QUERY_BYTES", queries)
+        for found, wanted in zip(search(query, database, 5, backend, allowed=masks), expected, strict=True):
+            np.testing.assert_array_equal(found, wanted)
+    found = search(query, database, 5, backend, allowed=distinct[0])
+    wanted = brute_force(query, database, 5, np.tile(distinct[0], (37, 1)))
+    np.testing.assert_array_equal(found[1], wanted[1])
+
+
 def test_search_limits() -> None:
     scores, indices = search(np.ones((2, 3)), np.ones((4, 3), np.float16), 10)
     assert indices.tolist() == [[0, 1, 2, 3]] * 2, "k beyond the database: all of it"
@@ -112,6 +147,8 @@ def test_search_limits() -> None:
         search(np.ones((2, 3)), np.ones((4, 3)), 0)
     with pytest.raises(ValueError, match="shape"):
         search(np.ones(3), np.ones((4, 3)), 1)
+    with pytest.raises(ValueError, match="1 masks of 9 rows for 2 queries and 4 rows"):
+        search(np.ones((2, 3)), np.ones((4, 3)), 1, allowed=Masks.of([], np.array([-1]), 9))
     assert scores.dtype == np.float32
 
 

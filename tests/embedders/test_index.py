@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from toolkit.capture.masks import Masks
 from toolkit.embedders import StoredVectors
 from toolkit.embedders import index as index_module
 from toolkit.embedders.index import VectorIndex, load_index, make_index
@@ -78,6 +79,26 @@ def test_rows_that_are_not_allowed_are_not_found(place: Path, tmp_path: Path, fa
         assert np.isneginf(scores[~there]).all()
         expected, _ = search(queries(place), vectors, 5, allowed=allowed)
         assert (scores == expected).mean() > 0.8
+
+
+@pytest.mark.parametrize("factory", ["IVF16,Flat", "PQ16"])
+def test_each_query_finds_what_it_may(place: Path, tmp_path: Path, factory: str) -> None:
+    vectors = stored(place)
+    settings = RetrieveSettings(index=factory, index_candidates=200, nprobe=16)
+    index = make_index(tmp_path / "embeddings", "ios_map", vectors, settings)
+    rng = np.random.default_rng(0)
+    # More than candidates, of which the index finds some; fewer, which are compared one by one; none.
+    distinct = np.stack([rng.random(len(vectors)) < share for share in (0.5, 0.2, 0.05, 0.001, 0)])
+    which = rng.integers(-1, 5, len(queries(place)))
+    masks = Masks(len(vectors), np.packbits(distinct, axis=1, bitorder="little"), which)
+    found = search(queries(place), vectors, 5, index=index, allowed=masks)
+    exact = search(queries(place), vectors, 5, allowed=masks)
+    approximate = (which < 0) | (distinct.sum(axis=1)[which] > index.candidates)
+    for one, other in zip(found, exact, strict=True):
+        np.testing.assert_array_equal(one[~approximate], other[~approximate])
+    assert (found[1][approximate] == exact[1][approximate]).mean() > 0.8
+    assert ((found[1] >= 0) == (exact[1] >= 0)).all()
+    assert all(distinct[mask][row[row >= 0]].all() for mask, row in zip(which, found[1], strict=True) if mask >= 0)
 
 
 @pytest.mark.parametrize("factory", ["LSH", "PQ16", "NSG16", "IVF16,PQ16+8", "PQ16,RFlat"])

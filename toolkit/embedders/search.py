@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from toolkit.capture.masks import Masks
 from toolkit.embedders.index import VectorIndex
 from toolkit.embedders.stored import StoredVectors, blocks, require_finite
 from toolkit.errors import ToolkitError
@@ -18,11 +19,14 @@ _BLOCK_BYTES = 128 << 20
 """Of the rows of the database, in float32, that are in memory at a time."""
 _QUERY_BYTES = 512 << 20
 """Of the queries, in float32, that one pass over the database is for."""
+_PRODUCTS = 1 << 23
+"""Of queries that have masks and rows of the database, that are in memory at a time."""
 _MORE = 16
 """Candidates beyond k: the backend's rounding may exchange neighbors in rank."""
 
 Found = tuple[NDArray[np.float32], Ints]
-_Best = Callable[[NDArray[np.float32], int], Found]
+_Best = Callable[[NDArray[np.float32], int, int], Found]
+"""Finds in a block of the database, which begins at a row, for each query so many of the best."""
 _Vectors = NDArray[np.float32] | StoredVectors
 
 
@@ -34,7 +38,7 @@ def search(
     compute_device: str = "cpu",
     faiss_gpu: bool = False,
     index: VectorIndex | None = None,
-    allowed: NDArray[np.bool_] | None = None,
+    allowed: NDArray[np.bool_] | Masks | None = None,
 ) -> Found:
     """Return the rows of the database with the largest dot products, best first; equal ones by index.
 
@@ -48,7 +52,8 @@ def search(
         compute_device: where torch computes: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
         faiss_gpu: let faiss compute on the GPU (needs a faiss built for it).
         index: of the database; finds the candidates instead of the backend. What it misses is missing.
-        allowed: (N,) which rows of the database may be found; None: all.
+        allowed: (N,) which rows of the database may be found, or masks of each query; None: all. With masks of each,
+            faiss without an index leaves the products to NumPy, on the CPU.
 
     Returns:
         Scores (Q, K) float32 and indices (Q, K) int64, K = min(k, N); -inf and -1 where an index found no more, or no
@@ -64,8 +69,18 @@ def search(
         raise ValueError(f"k is {k}; expected at least 1.")
     k = min(k, len(vectors))
     scores, indices = np.full((len(query), k), -np.inf, np.float32), np.full((len(query), k), -1, np.int64)
+    if isinstance(allowed, Masks) and (len(allowed), allowed.count) != (len(query), len(vectors)):
+        raise ValueError(
+            f"{len(allowed)} masks of {allowed.count} rows for {len(query)} queries and {len(vectors)} rows."
+        )
+    if isinstance(allowed, Masks) and index is not None and k:
+        for queries, mask in allowed.distinct():
+            those = query.choose(queries) if isinstance(query, StoredVectors) else query[queries]
+            found = search(those, vectors, k, backend, compute_device, faiss_gpu, index, mask)
+            scores[queries], indices[queries] = found
+        return scores, indices
     # Among few allowed rows an index finds next to none: what it looks at is chosen by all rows.
-    if allowed is not None and (index is None or np.count_nonzero(allowed) <= index.candidates):
+    if isinstance(allowed, np.ndarray) and (index is None or np.count_nonzero(allowed) <= index.candidates):
         rows = np.flatnonzero(allowed)
         chosen = vectors.choose(rows) if isinstance(vectors, StoredVectors) else vectors[rows]
         if len(rows):
@@ -74,19 +89,22 @@ def search(
         return scores, indices
     for start, part in blocks(query, _QUERY_BYTES) if k else ():
         require_finite(part, "query", start)
+        here = slice(start, start + len(part))
         if index is not None:
-            here = slice(start, start + len(part))
-            _compare(part, vectors, index.find(part, allowed), scores[here], indices[here])
+            mask = allowed if isinstance(allowed, np.ndarray) else None
+            _compare(part, vectors, index.find(part, mask), scores[here], indices[here])
             continue
         make = partial(_backend, backend=backend, compute_device=compute_device, faiss_gpu=faiss_gpu)
-        _search_part(part, vectors, make, scores[start : start + len(part)], indices[start : start + len(part)])
+        masks = allowed.choose(here) if isinstance(allowed, Masks) else None
+        _search_part(part, vectors, make, masks, scores[here], indices[here])
     return scores, indices
 
 
 def _search_part(
     query: NDArray[np.float32],
     vectors: _Vectors,
-    make_backend: Callable[[NDArray[np.float32]], _Best],
+    make_backend: Callable[[NDArray[np.float32], Masks | None], _Best],
+    masks: Masks | None,
     scores: NDArray[np.float32],
     indices: Ints,
 ) -> None:
@@ -94,15 +112,19 @@ def _search_part(
     count, k = len(vectors), scores.shape[1]
     lengths = np.linalg.norm(query, axis=1)
     # To a query of zeros, an image without features, all rows are equal.
-    scores[lengths == 0], indices[lengths == 0] = 0, np.arange(k)
+    for number in np.flatnonzero(lengths == 0):
+        rows = np.arange(k) if masks is None else np.flatnonzero(masks.choose(slice(number, number + 1)).rows(0, count))
+        scores[number, : len(rows)], indices[number, : len(rows)] = 0, rows[:k]
     pending, width = np.flatnonzero(lengths), min(count, k + _MORE)
     while len(pending):
-        best = make_backend(query if len(pending) == len(query) else query[pending])
+        best = make_backend(
+            query if len(pending) == len(query) else query[pending], None if masks is None else masks.choose(pending)
+        )
         rough, candidates, longest = _candidates(vectors, best, len(pending), width)
         tolerance = 1e-5 * longest * lengths[pending]
         # Rounding in the backend cuts nothing off once the last candidate is clearly below rank k.
-        done = (rough[:, -1] < rough[:, k - 1] - tolerance) | (width == count)
-        near = rough >= (rough[:, k - 1] - 2 * tolerance)[:, None]
+        done = (rough[:, -1] < rough[:, k - 1] - tolerance) | (width == count) | np.isneginf(rough[:, -1])
+        near = (rough >= (rough[:, k - 1] - 2 * tolerance)[:, None]) & (rough > -np.inf)
         _rescore(query, vectors, pending[done], candidates[done], near[done], scores, indices)
         pending, width = pending[~done], min(count, 4 * width)
 
@@ -149,7 +171,7 @@ def _candidates(vectors: _Vectors, best: _Best, queries: int, width: int) -> tup
         if not np.isfinite(length):
             require_finite(block, "database", start)
         longest = max(longest, length)
-        of_block, inside = best(block, min(width, len(block)))
+        of_block, inside = best(block, start, min(width, len(block)))
         scores, indices = np.hstack([scores, of_block]), np.hstack([indices, inside + start])
         order = np.argsort(-scores, axis=1, kind="stable")[:, :width]
         scores, indices = np.take_along_axis(scores, order, 1), np.take_along_axis(indices, order, 1)
@@ -176,25 +198,31 @@ def _rescore(
         exact[who[part], rank[part]] = _products(query[rows[who[part]]], vectors[numbers][where])
     best = np.lexsort((candidates, -exact), axis=1)[:, : scores.shape[1]]
     scores[rows], indices[rows] = np.take_along_axis(exact, best, 1), np.take_along_axis(candidates, best, 1)
+    indices[np.isneginf(scores)] = -1
 
 
-def _backend(query: NDArray[np.float32], backend: Backend, compute_device: str, faiss_gpu: bool) -> _Best:
+def _backend(
+    query: NDArray[np.float32], masks: Masks | None, backend: Backend, compute_device: str, faiss_gpu: bool
+) -> _Best:
     """Return what finds the best (scores, indices) (Q, n) of a block of the database for the queries."""
+    if backend not in ("faiss", "torch"):
+        raise ValueError(f"Unknown backend {backend!r}; expected faiss or torch.")
+    if masks is not None:
+        masked = partial(_torch_best, device=compute_device) if backend == "torch" else _numpy_best
+        return lambda block, start, number: _masked(query, masks, masked, block, start, number)
     if backend == "torch":
         return _torch_backend(query, compute_device)
-    if backend != "faiss":
-        raise ValueError(f"Unknown backend {backend!r}; expected faiss or torch.")
     import faiss
 
     if not faiss_gpu:
-        return lambda block, number: faiss.knn(query, block, number, metric=faiss.METRIC_INNER_PRODUCT)
+        return lambda block, _, number: faiss.knn(query, block, number, metric=faiss.METRIC_INNER_PRODUCT)
     if not hasattr(faiss, "StandardGpuResources"):
         raise ToolkitError(
             "faiss_gpu is set, but the installed faiss has no GPU support (faiss-cpu). "
             "Set faiss_gpu: false, or use_faiss: false with compute_device: cuda."
         )
     gpu = faiss.StandardGpuResources()
-    return lambda block, number: faiss.knn_gpu(gpu, query, block, number, metric=faiss.METRIC_INNER_PRODUCT)
+    return lambda block, _, number: faiss.knn_gpu(gpu, query, block, number, metric=faiss.METRIC_INNER_PRODUCT)
 
 
 def _torch_backend(query: NDArray[np.float32], compute_device: str) -> _Best:
@@ -203,8 +231,51 @@ def _torch_backend(query: NDArray[np.float32], compute_device: str) -> _Best:
     device = resolve_device(compute_device)
     queries = torch.from_numpy(query).to(device)
 
-    def best(block: NDArray[np.float32], number: int) -> Found:
+    def best(block: NDArray[np.float32], _: int, number: int) -> Found:
         scores, indices = (queries @ torch.from_numpy(block).to(device).T).topk(number)
         return scores.cpu().numpy(), indices.cpu().numpy()
 
     return best
+
+
+def _masked(
+    query: NDArray[np.float32],
+    masks: Masks,
+    best: Callable[[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], int], Found],
+    block: NDArray[np.float32],
+    start: int,
+    number: int,
+) -> Found:
+    """Return what `_Best` does, of queries that may find some rows alone; -inf where there are fewer.
+
+    Args:
+        best: of queries (n, D) the best rows (m, D) that they may find (n, m), so many.
+    """
+    scores, indices = np.full((len(query), number), -np.inf, np.float32), np.zeros((len(query), number), np.int64)
+    step = max(1, _PRODUCTS // len(block))
+    for first in range(0, len(query), step):
+        allowed = masks.choose(slice(first, first + step)).rows(start, start + len(block))
+        finds = np.flatnonzero(allowed.any(axis=1))  # many priors leave neighbors in a recording: few blocks
+        if len(finds):
+            found = best(query[first + finds], block, allowed[finds], number)
+            scores[first + finds], indices[first + finds] = found
+    return scores, indices
+
+
+def _numpy_best(
+    query: NDArray[np.float32], block: NDArray[np.float32], allowed: NDArray[np.bool_], number: int
+) -> Found:
+    scores = query @ block.T
+    scores[~allowed] = -np.inf
+    indices = np.argpartition(scores, -number, axis=1)[:, -number:]
+    return np.take_along_axis(scores, indices, 1), indices
+
+
+def _torch_best(
+    query: NDArray[np.float32], block: NDArray[np.float32], allowed: NDArray[np.bool_], number: int, device: str
+) -> Found:
+    import torch
+
+    queries, rows, refused = (torch.from_numpy(part).to(resolve_device(device)) for part in (query, block, ~allowed))
+    scores, indices = (queries @ rows.T).masked_fill_(refused, -torch.inf).topk(number)
+    return scores.cpu().numpy(), indices.cpu().numpy()
