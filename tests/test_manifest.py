@@ -93,7 +93,7 @@ def test_inherited_paths_count_from_the_file_that_has_them(tmp_path: Path, monke
         mine="inherits: bases/base.yaml\nembed: {checkpoint: mine.pt}",
         bases__base="captures: [here, $DATA/a, ~/b, $HERE/c]\noutput_root: out\nlocalize: {"
         "predictor: {checkpoint: its.pt}, features: {checkpoint: features.pt}, matcher: {checkpoint: ~/matcher.pt}}\n"
-        "rerank: {features: {checkpoint: {aliked: aliked.pth}}}",
+        "rerank: {features: {checkpoint: {aliked: aliked.pth}}}\nretrieve: {mask: {poses: rough.txt}}",
     )
     manifest = load_manifest(path)
     bases = tmp_path / "bases"
@@ -104,6 +104,7 @@ def test_inherited_paths_count_from_the_file_that_has_them(tmp_path: Path, monke
     assert manifest.localize.matcher.checkpoint == "/home/me/matcher.pt"
     assert manifest.rerank is not None
     assert manifest.rerank.features.checkpoint == {"aliked": str(bases / "aliked.pth")}
+    assert manifest.retrieve.mask.poses == str(bases / "rough.txt")
     assert manifest.embed.checkpoint == str(tmp_path / "mine.pt")
     path = write_files(tmp_path, mine="inherits: bases/base.yaml\ncaptures: [a]", bases__base="captures: [$UNSET/a]")
     assert load_manifest(path).captures == [str(tmp_path / "a")], "what is replaced need not be known"

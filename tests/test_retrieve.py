@@ -339,3 +339,97 @@ def test_a_vector_that_is_not_finite_stops_its_own_pairs_alone(tiny: Path, tmp_p
     assert (table["queries"] > 0).tolist() == (table["reason"] == "").tolist() == (~lost).tolist()
     for before, after in zip(expected["path"][~lost], table["path"][~lost], strict=True):
         assert [row["topk"] for row in lines(before)] == [row["topk"] for row in lines(after)]
+
+
+WINDOW = {"window_s": 4e-6}
+"""The tiny capture has an image each microsecond or ten."""
+
+
+def write_wifi(capture: Path, session: str, walls: dict[int, int]) -> None:
+    """Write a scan at each wall, which receives the emitters of a wall, or of another one."""
+    device = session.partition("_")[0]
+    scans = (f"{1000 + 10 * wall}, {device}_a/wifi, 02:00:0{heard}, 2412000, -50\n" for wall, heard in walls.items())
+    (capture / "sessions" / session / "wifi.txt").write_text("".join(scans))
+
+
+def first_walls(path: str | Path) -> list[int]:
+    """The walls of the first references, in order of the queries."""
+    return [(int(record["topk"][0]["timestamp"]) - 1000) // 10 for record in lines(path)]
+
+
+def test_references_come_from_where_radio_says(
+    tiny: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    asked = {"map_device": "hl", "query_device": "hl"}
+
+    def retrieve(**mask: object) -> pd.Series:
+        settings = {"topk": 9, "mask": mask}
+        return retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", settings=settings, **asked).iloc[0]
+
+    without = retrieve()
+    assert first_walls(without["path"]) == [0, 0, 1, 1, 2, 2]
+    before = Path(without["path"]).read_bytes()
+    write_wifi(tiny, "hl_map", {0: 0, 1: 1, 2: 2})
+    write_wifi(tiny, "hl_query", {0: 2, 1: 1})
+    assert retrieve()["skipped"], "radio that is not asked for makes no difference"
+    assert "without_radio" not in without
+    row = retrieve(radio=True, **WINDOW)
+    assert not row["skipped"]
+    assert first_walls(row["path"]) == [2, 2, 1, 1, 2, 2]
+    assert [len(record["topk"]) for record in lines(row["path"])] == [4, 4, 4, 4, 9, 9], "images of one scan are equal"
+    assert row["without_radio"] == 2
+    assert "radio leaves the whole map to 2 of 6 query images" in caplog.text
+    again = retrieve(radio=True, **WINDOW)
+    assert (again["skipped"], again["without_radio"]) == (True, 2)
+    write_wifi(tiny, "hl_map", {0: 2, 1: 1, 2: 0})
+    row = retrieve(radio=True, **WINDOW)
+    assert not row["skipped"], "other signals"
+    assert first_walls(row["path"]) == [0, 0, 1, 1, 2, 2]
+    row = retrieve()
+    assert Path(row["path"]).read_bytes() == before
+    for session, bad in (("hl_query", "now, w, a, 1, 1\n"), ("hl_map", "1, x\n")):
+        (tiny / "sessions" / session / "wifi.txt").write_text(bad)
+        with pytest.raises(CaptureError, match=rf"{session}/wifi\.txt, line 1"):
+            retrieve(radio=True)
+
+
+def test_masks_of_several_query_sessions_backends_and_an_index_are_joined(tiny: Path, tmp_path: Path) -> None:
+    for session in ("ios_map", "ios_query", "hl_query"):
+        write_wifi(tiny, session, {0: 0, 1: 1, 2: 2} if session.endswith("map") else {0: 2, 1: 1, 2: 0})
+    other = {"use_faiss": False}, {"index": "IVF2,SQ8", "index_candidates": 5, "nprobe": 2}
+    paths = []
+    for number, settings in enumerate(({}, *other)):
+        settings = {"topk": 2, "mask": {"radio": True, **WINDOW}, **settings}
+        out = tmp_path / str(number)
+        table = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", out, settings, map_device="ios")
+        paths.append(table["path"])
+    for same in zip(*paths, strict=True):
+        assert first_walls(same[0]) in ([2, 1, 0], [2, 2, 1, 1, 0, 0])
+        assert len({Path(path).read_bytes() for path in same}) == 1
+
+
+def test_references_come_from_near_rough_poses_and_fixes(tiny: Path, tmp_path: Path) -> None:
+    rough = tmp_path / "rough.txt"
+    rough.write_text("1000, ios_a/cam, 1, 0, 0, 0, 20, 0, 0\n1010, ios_a/cam, 1, 0, 0, 0, 900, 0, 0\n")
+    for session, east in (("ios_map", (0.0, 0.001, 0.002)), ("ios_query", (0.0, 0.002, 0.002))):
+        fixes = (f"{1000 + 10 * wall}, ios_a/gps, 0, {degrees}, 0, 5\n" for wall, degrees in enumerate(east))
+        (tiny / "sessions" / session / "gps.txt").write_text("".join(fixes))
+
+    def retrieve(**mask: object) -> pd.Series:
+        asked = {"map_device": "ios", "query_device": "ios", "settings": {"topk": 1, "mask": mask}}
+        return retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", **asked).iloc[0]
+
+    row = retrieve(poses=str(rough), poses_distance_m=2)
+    assert first_walls(row["path"]) == [2, 1, 2]
+    assert row["without_poses"] == 2
+    row = retrieve(gps=True, **WINDOW)
+    assert first_walls(row["path"]) == [0, 2, 2]
+    assert row["without_gps"] == 0
+    row = retrieve(gps=True, poses=str(rough), poses_distance_m=2, **WINDOW)
+    assert first_walls(row["path"]) == [2, 2, 2], "a rough pose outdoes the fix that contradicts it"
+    assert (row["without_poses"], row["without_gps"]) == (2, 1)
+    rough.write_text(rough.read_text().replace(" 900", " 10"))
+    again = retrieve(gps=True, poses=str(rough), poses_distance_m=2, **WINDOW)
+    assert (again["skipped"], again["without_poses"]) == (False, 1)
+    with pytest.raises(ManifestError, match=r"retrieve\.mask\.poses: no such file: .*nowhere\.txt.*trajectories\.txt"):
+        retrieve(poses=str(tmp_path / "nowhere.txt"))

@@ -41,6 +41,7 @@ from toolkit.manifest import (
     LocalizeSettings,
     Manifest,
     RerankSettings,
+    RetrieveSettings,
     Settings,
     load_manifest,
     nearest,
@@ -441,13 +442,15 @@ def _inputs_of(job: Job, capture: str) -> str:
         for stage in UPSTREAM[job.stage]
         for record in sorted(job.record.parent.glob(f"{stage}*.json"))
     ]
-    return fingerprint([parameters, table_record(), _weights_of(job), capture, _code_fingerprint(), source, upstream])
+    return fingerprint([parameters, table_record(), _files_of(job), capture, _code_fingerprint(), source, upstream])
 
 
-def _weights_of(job: Job) -> str | None:
-    """Return what identifies the file with the weights that a job uses, None if it uses none or has none yet."""
+def _files_of(job: Job) -> str | None:
+    """Return what identifies the files of weights and of rough poses that a job reads, None if there are none yet."""
     needed = _weights_needed(job.stage, job.settings)
     paths = [path for source, checkpoint in needed if (path := find_weights(source, checkpoint))]
+    if isinstance(job.settings, RetrieveSettings) and job.settings.mask.poses:
+        paths.append(Path(job.settings.mask.poses))
     return files_fingerprint([path.resolve() for path in paths]) if paths else None
 
 

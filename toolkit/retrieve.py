@@ -14,7 +14,10 @@ import numpy as np
 import pandas as pd
 from tqdm.auto import tqdm
 
-from toolkit.capture import Capture, Session
+from toolkit.capture import Capture, Session, Trajectory
+from toolkit.capture.masks import Masks, combine, gps_masks, pose_masks, radio_masks
+from toolkit.capture.session import SUBSESSIONS
+from toolkit.capture.tables import SIGNALS
 from toolkit.embedders import StoredVectors, load_embeddings, open_embeddings
 from toolkit.embedders.index import EXACT, is_made, make_index
 from toolkit.embedders.search import Backend, Found, search
@@ -30,7 +33,7 @@ from toolkit.files import (
     write_text,
 )  # fmt: skip
 from toolkit.geometry import Ints
-from toolkit.manifest import RetrieveSettings
+from toolkit.manifest import MaskSettings, RetrieveSettings
 from toolkit.runs.pairs import PairRows
 
 __all__ = ["load_embeddings", "retrieve_pairs", "search"]
@@ -66,7 +69,8 @@ def retrieve_pairs(
         One row a pair: map_device, query_device, keyframes, keyframes_missing (no image of theirs has an
         embedding), queries and images_missing (images of the keyframes, with and without an embedding),
         database, unposed (map images left out for want of a pose), seconds, skipped, path, reason. A pair that
-        cannot be done has zeros and the `reason`.
+        cannot be done has zeros and the `reason`. For what is in `settings.mask`, such as `radio`, also
+        without_radio: the queries to which the whole map was left by it.
 
     Raises:
         ToolkitError: see the message: unknown device; or no pair can be done: no such list, embeddings missing or of
@@ -83,6 +87,7 @@ def retrieve_pairs(
         raise ManifestError(f"out_jsonl is one file ({out}) for {pairs} pairs; give a folder.")
     folder = out.parent if out.suffix == ".jsonl" else out
     table = PairRows(capture.name, folder)
+    poses = _rough_poses(settings.mask)
 
     @cache
     def load_queries(device: str) -> _Images:
@@ -105,13 +110,15 @@ def retrieve_pairs(
                     "topk": settings.topk,
                     "normalize": settings.normalize,
                     **({} if settings.index == EXACT else settings.model_dump(include=_OF_INDEX)),
+                    **_mask_record(settings.mask, database.session, query.session),
                 }
+                masks, without = _masks(settings.mask, poses, database, query)
                 skipped = skip_existing and is_current(path, record)
                 # Pictures that are localized in the map need its index, too.
                 skipped = skipped and is_made(embeddings, database.session.id, database.vectors, settings)
                 if not skipped:
                     _require_same_dimension(query, database)
-                    todo[queried] = query, path, record
+                    todo[queried] = replace(query, masks=masks), path, record
                 row |= {
                     "keyframes": query.keyframes,
                     "keyframes_missing": query.keyframes_missing,
@@ -119,6 +126,7 @@ def retrieve_pairs(
                     "images_missing": query.images_missing,
                     "database": len(database.rows),
                     "unposed": database.unposed,
+                    **without,
                     "seconds": 0.0,
                     "skipped": skipped,
                     "path": str(path),
@@ -157,6 +165,7 @@ class _Images:
     keyframes_missing: int = 0
     images_missing: int = 0
     unposed: int = 0
+    masks: Masks | None = None
 
     def take(self, chosen: Ints) -> "_Images":
         table = self.table.iloc[chosen].reset_index(drop=True)
@@ -229,11 +238,13 @@ def _search(
     """
     stacked = StoredVectors.stack([query.vectors for query in queries.values()])
     backend: Backend = "faiss" if settings.use_faiss else "torch"
+    masks = [query.masks for query in queries.values() if query.masks is not None]
     try:
         index = make_index(embeddings, database.session.id, database.vectors, settings, skip_existing)
         found = search(
-            stacked, database.vectors, settings.topk, backend, settings.compute_device, settings.faiss_gpu, index
-        )
+            stacked, database.vectors, settings.topk, backend, settings.compute_device, settings.faiss_gpu, index,
+            Masks.stack(masks) if masks else None,
+        )  # fmt: skip
     except ValueError as error:
         of = ", ".join(query.session.id for query in queries.values())
         raise ArtifactError(f"map {database.session.id}, query {of}: {error}") from error
@@ -268,3 +279,53 @@ def _inputs(session: Session, embeddings: Path) -> list[Any]:
     matrices = sorted((embeddings / session.id).rglob("*.npy"))
     texts = [session.path / name for name in ("images.txt", "trajectories.txt", "rigs.txt")]
     return [made_of(matrices), [file_fingerprint(path) for path in texts if path.exists()]]
+
+
+def _rough_poses(settings: MaskSettings) -> Trajectory | None:
+    if settings.poses is None:
+        return None
+    if not Path(settings.poses).is_file():
+        raise ManifestError(
+            f"retrieve.mask.poses: no such file: {settings.poses}. Expected poses of query devices in the map's frame, "
+            "in the format of trajectories.txt."
+        )
+    return Trajectory.read(settings.poses)
+
+
+def _masks(
+    settings: MaskSettings, poses: Trajectory | None, database: _Images, query: _Images
+) -> tuple[Masks | None, dict[str, int]]:
+    """Return which map images each query image may find, None: all; and columns of the pair's row."""
+    both = database.session, database.rows, query.session, query.rows
+    priors = dict[str, Masks]()
+    if poses is not None:
+        priors["poses"] = pose_masks(poses, *both, settings.poses_distance_m, settings.poses_angle_deg)
+    if settings.gps:
+        priors["gps"] = gps_masks(*both, settings.gps_margin_m, settings.window_s)
+    if settings.radio:
+        priors["radio"] = radio_masks(*both, settings.radio_share, settings.window_s)
+    if not priors:
+        return None, {}
+    masks, without = combine(list(priors.values()))
+    for prior, number in zip(priors, without, strict=True):
+        if number:
+            message = "map %s, query %s: %s leaves the whole map to %d of %d query images"
+            log.warning(message, database.session.id, query.session.id, prior, number, len(masks))
+    return masks, {f"without_{prior}": number for prior, number in zip(priors, without, strict=True)}
+
+
+def _mask_record(settings: MaskSettings, *sessions: Session) -> dict[str, Any]:
+    """Identify what masks are made of; nothing without any."""
+    record: dict[str, Any] = {}
+    names: list[str] = []
+    if settings.poses:
+        limits = [settings.poses_distance_m, settings.poses_angle_deg]
+        record["poses"] = [file_fingerprint(settings.poses), *limits]
+    if settings.gps:
+        record["gps"], names = [settings.gps_margin_m, settings.window_s], ["gps.txt"]
+    if settings.radio:
+        record["radio"], names = [settings.radio_share, settings.window_s], [*names, *SIGNALS]
+    if names:
+        paths = [session.path / name for session in sessions for name in (*names, SUBSESSIONS)]
+        record["files"] = [file_fingerprint(path) if path.exists() else None for path in paths]
+    return {"mask": record} if record else {}

@@ -14,6 +14,7 @@ from toolkit.manifest.settings import (
     FeaturesSettings,
     LocalizeSettings,
     MapSettings,
+    MaskSettings,
     MatcherSettings,
     PnpSettings,
     PredictorSettings,

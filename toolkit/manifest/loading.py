@@ -16,6 +16,8 @@ from toolkit.manifest.manifest import Manifest
 from toolkit.manifest.messages import explain
 from toolkit.manifest.settings import expand, merge
 
+PATHS = ("captures", "output_root", "retrieve.mask.poses")
+"""Keys of paths, beside those of checkpoints."""
 MOST_VALUES = 100_000
 """A manifest of more values is no manifest, but aliases of aliases that fill the memory."""
 
@@ -100,7 +102,7 @@ def _map_paths(raw: dict[str, Any], change: Callable[[str, str], str], where: st
         key = f"{where}{name}"
         if isinstance(value, dict):
             value = _map_paths(value, change, f"{key}.")
-        elif re.search(r"checkpoint(\.\w+)?$", key) or key in ("captures", "output_root"):
+        elif re.search(r"checkpoint(\.\w+)?$", key) or key in PATHS:
             if isinstance(value, list):
                 value = [change(text, key) if isinstance(text, str) else text for text in value]
             elif isinstance(value, str):

@@ -190,6 +190,30 @@ class EmbedSettings(Settings):
     """Direction that is up in the map's world; null: estimated from its cameras."""
 
 
+class MaskSettings(Settings):
+    """What is known of the place of a query image before the search, and leaves only a part of the map to it.
+
+    All that is known is joined; what says nothing about a query, or contradicts what stands before it, does not count.
+    """
+
+    poses: str | None = None
+    """File of rough poses of query devices in the map's frame, in the format of trajectories.txt: search only ..."""
+    poses_distance_m: PositiveNumber = 10.0
+    """... map cameras so near, in the unit of the poses ..."""
+    poses_angle_deg: PositiveNumber = 90.0
+    """... that look in a direction at most so different. The roll about the viewing direction does not count."""
+    gps: bool = False
+    """Search only map images whose fix in gps.txt is as near the query's as ..."""
+    gps_margin_m: PositiveNumber = 25.0
+    """... this and twice both accuracies, and those without a fix."""
+    radio: bool = False
+    """Search only the map images at which WiFi and Bluetooth were received most nearly as at the query, ..."""
+    radio_share: Share = 0.025
+    """... this share of the map."""
+    window_s: PositiveNumber = 2.0
+    """Scans and fixes count for images so long before and after them."""
+
+
 class RetrieveSettings(Settings):
     """How references are found."""
 
@@ -207,6 +231,8 @@ class RetrieveSettings(Settings):
     """Of an index: found for each query, then compared exactly."""
     nprobe: Positive | None = None
     """Cells of an IVF index that are looked at; null: a 32nd of them, at least 16."""
+    mask: MaskSettings = MaskSettings()
+    """What leaves a query only a part of the map."""
     compute_device: ComputeDevice = "auto"
     """Where torch searches: auto, cpu, cuda, cuda:<number> or mps."""
 
