@@ -112,7 +112,7 @@ def retrieve_pairs(
                     **({} if settings.index == EXACT else settings.model_dump(include=_OF_INDEX)),
                     **_mask_record(settings.mask, database.session, query.session),
                 }
-                masks, without = _masks(settings.mask, poses, database, query)
+                masks, without = _masks(settings, poses, database, query)
                 skipped = skip_existing and is_current(path, record)
                 # Pictures that are localized in the map need its index, too.
                 skipped = skipped and is_made(embeddings, database.session.id, database.vectors, settings)
@@ -293,17 +293,19 @@ def _rough_poses(settings: MaskSettings) -> Trajectory | None:
 
 
 def _masks(
-    settings: MaskSettings, poses: Trajectory | None, database: _Images, query: _Images
+    settings: RetrieveSettings, poses: Trajectory | None, database: _Images, query: _Images
 ) -> tuple[Masks | None, dict[str, int]]:
     """Return which map images each query image may find, None: all; and columns of the pair's row."""
+    mask = settings.mask
     both = database.session, database.rows, query.session, query.rows
     priors = dict[str, Masks]()
     if poses is not None:
-        priors["poses"] = pose_masks(poses, *both, settings.poses_distance_m, settings.poses_angle_deg)
-    if settings.gps:
-        priors["gps"] = gps_masks(*both, settings.gps_margin_m, settings.window_s)
-    if settings.radio:
-        priors["radio"] = radio_masks(*both, settings.radio_share, settings.window_s)
+        priors["poses"] = pose_masks(poses, *both, mask.poses_distance_m, mask.poses_angle_deg)
+    if mask.gps:
+        priors["gps"] = gps_masks(*both, mask.gps_margin_m, mask.window_s)
+    if mask.radio:
+        least = max(settings.topk, int(np.ceil(mask.radio_share * len(database.rows))))
+        priors["radio"] = radio_masks(*both, least, mask.window_s)
     if not priors:
         return None, {}
     masks, without = combine(list(priors.values()))

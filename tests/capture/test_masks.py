@@ -64,10 +64,10 @@ def shown(masks: Masks) -> list[list[int]]:
     return [np.flatnonzero(row).tolist() for row in masks.rows(0, masks.count)]
 
 
-def radio(tmp_path: Path, of_map: str, of_query: str, share: float = 0.25, **files: str) -> list[list[int]]:
-    mapped = session_of(tmp_path / "ios_map", {"wifi.txt": of_map, **files}, [(0, 0), (1, 0), (20, 0), (21, 0)])
+def radio(tmp_path: Path, of_map: str, of_query: str, least: int = 1) -> list[list[int]]:
+    mapped = session_of(tmp_path / "ios_map", {"wifi.txt": of_map}, [(0, 0), (1, 0), (20, 0), (21, 0)])
     asked = session_of(tmp_path / "hl_query", {"wifi.txt": of_query})
-    return shown(radio_masks(mapped, np.arange(4), asked, np.arange(4), share, 2))
+    return shown(radio_masks(mapped, np.arange(4), asked, np.arange(4), least, 2))
 
 
 def test_radio_finds_the_place_that_received_the_same(tmp_path: Path) -> None:
@@ -78,7 +78,7 @@ def test_radio_finds_the_place_that_received_the_same(tmp_path: Path) -> None:
     of_query = wifi((1, {"A": -45, "B": -85}), (9, near_b), (20, {"b": -45, "new": -30}), (30, {"new": -30}))
     everything = [0, 1, 2, 3]
     assert radio(tmp_path, of_map, of_query) == [[0], [2], [3], everything]
-    assert radio(tmp_path / "half", of_map, of_query, 0.5) == [[0, 1], [2, 3], [2, 3], everything]
+    assert radio(tmp_path / "half", of_map, of_query, 2) == [[0, 1], [2, 3], [2, 3], everything]
 
 
 def test_a_place_with_more_emitters_than_the_query_is_another(tmp_path: Path) -> None:
@@ -89,7 +89,7 @@ def test_a_place_with_more_emitters_than_the_query_is_another(tmp_path: Path) ->
 def test_places_that_are_equal_by_radio_stay_together_and_others_than_received_go(tmp_path: Path) -> None:
     of_map = wifi((0, {"a": -50}), (10, {"a": -50}), (20, {"a": -50}), (30, {"b": -50}))
     assert radio(tmp_path, of_map, wifi((0, {"a": -90})))[0] == [0, 1, 2]
-    assert radio(tmp_path / "all", of_map, wifi((0, {"a": -90})), 1.0)[0] == [0, 1, 2], "b was not received"
+    assert radio(tmp_path / "all", of_map, wifi((0, {"a": -90})), 4)[0] == [0, 1, 2], "b was not received"
 
 
 def test_scans_count_for_their_recording_and_time_alone(tmp_path: Path) -> None:
@@ -100,7 +100,7 @@ def test_scans_count_for_their_recording_and_time_alone(tmp_path: Path) -> None:
     places = [(0.0, 0.0), (1.0, 0.0), (20.0, 0.0), (21.0, 0.0)]
     mapped = session_of(tmp_path / "ios_map", {"wifi.txt": of_map, "proc/subsessions.txt": "s\nt\n"}, places)
     asked = session_of(tmp_path / "hl_query", {"wifi.txt": wifi((0, a), (10, b)) + wifi((20, b), sensor="wifi")})
-    found = shown(radio_masks(mapped, np.arange(4), asked, np.arange(4), 0.25, 2))
+    found = shown(radio_masks(mapped, np.arange(4), asked, np.arange(4), 1, 2))
     assert found == [[0, 1], [2, 3], [2, 3], [0, 1, 2, 3]]
 
 
@@ -113,7 +113,7 @@ def test_strengths_of_several_scans_and_of_bluetooth_are_joined(tmp_path: Path) 
     )
     places = [(0.0, 0.0), (1.0, 0.0), (20.0, 0.0), (21.0, 0.0)]
     mapped = session_of(tmp_path / "ios_map", {"wifi.txt": of_map, "bt.txt": beacon}, places)
-    assert shown(radio_masks(mapped, np.arange(4), asked, np.arange(1), 0.25, 2)) == [[1]]
+    assert shown(radio_masks(mapped, np.arange(4), asked, np.arange(1), 1, 2)) == [[1]]
 
 
 def test_radio_of_one_side_limits_nothing(tmp_path: Path) -> None:
@@ -123,7 +123,7 @@ def test_radio_of_one_side_limits_nothing(tmp_path: Path) -> None:
     ):
         mapped = session_of(tmp_path / name / "ios_map", files[0], [(0, 0)])
         asked = session_of(tmp_path / name / "hl_query", files[1])
-        masks = radio_masks(mapped, np.arange(1), asked, np.arange(4), 0.025, 2)
+        masks = radio_masks(mapped, np.arange(1), asked, np.arange(4), 1, 2)
         assert (masks.which == -1).all()
         assert shown(masks) == [[0]] * 4
 
@@ -137,12 +137,12 @@ def test_radio_in_blocks_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyP
     places = [tuple(place) for place in rng.uniform(0, 50, (20, 2))]
     mapped = session_of(tmp_path / "ios_map", {"wifi.txt": texts[0]}, places)
     asked = session_of(tmp_path / "hl_query", {"wifi.txt": texts[1]}, places)
-    whole = radio_masks(mapped, np.arange(20), asked, np.arange(20), 0.1, 2)
+    whole = radio_masks(mapped, np.arange(20), asked, np.arange(20), 2, 2)
     assert set(whole.rows(0, 20).sum(axis=1)) == {2}
     monkeypatch.setattr(masks_module, "_BLOCK", 50)
-    assert shown(radio_masks(mapped, np.arange(20), asked, np.arange(20), 0.1, 2)) == shown(whole)
+    assert shown(radio_masks(mapped, np.arange(20), asked, np.arange(20), 2, 2)) == shown(whole)
     some = np.array([3, 19, 4])
-    assert shown(radio_masks(mapped, np.arange(20), asked, some, 0.1, 2)) == shown(whole.choose(some))
+    assert shown(radio_masks(mapped, np.arange(20), asked, some, 2, 2)) == shown(whole.choose(some))
 
 
 # A degree of latitude near 47.4 is 111,177 m, one of longitude 75,457 m (WGS 84).

@@ -2,7 +2,8 @@
 
 Radio: what a device receives within some seconds is compared with what was received at the map's images, as the LaMAR
 benchmark does (P.-E. Sarlin et al., "LaMAR: Benchmarking Localization and Mapping for Augmented Reality", ECCV 2022).
-There a place is like the query if it has the query's emitters as strong; here it must also have few others.
+There levels are compared in dB, where the query received any; here all strengths by the angle between them, as the
+receivers of different devices differ by several dB.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -196,7 +197,7 @@ def _mean_fix(
     return within @ fixes / np.maximum(within.sum(axis=1), 1)[:, None], which
 
 
-def radio_masks(mapped: Session, map_rows: Ints, asked: Session, rows: Ints, share: float, window_s: float) -> Masks:
+def radio_masks(mapped: Session, map_rows: Ints, asked: Session, rows: Ints, least: int, window_s: float) -> Masks:
     """Return the masks of the map images that received most nearly what a device received at query images.
 
     The likeness is the cosine between the strengths of all emitters, in dB above -100 dBm and 0 where they were not
@@ -204,7 +205,8 @@ def radio_masks(mapped: Session, map_rows: Ints, asked: Session, rows: Ints, sha
 
     Args:
         map_rows, rows: of the images of the two sessions, (N,) and (Q,); those of the map have poses.
-        share: of the map's images that are allowed; more where they are equal.
+        least: so many of the map's images are allowed, if so many received any of the query's emitters; more where
+            they are equal.
         window_s: a scan counts for images so long before and after it.
     """
     count = len(map_rows)
@@ -217,13 +219,13 @@ def radio_masks(mapped: Session, map_rows: Ints, asked: Session, rows: Ints, sha
         return Masks.of([], np.full(len(rows), -1), count)
     centers = mapped.world_from_cam(map_rows)[:, :3, 3]
     where[~known] = where[known][cKDTree(centers[known]).query(centers[~known])[1]]
-    images, least = np.bincount(where, minlength=strengths.shape[0]), int(np.ceil(share * count))
+    images = np.bincount(where, minlength=strengths.shape[0])
 
     def blocks() -> Iterator[Bools]:
         for part in _blocks(strengths_asked, max(count, len(images))):
             likeness = (part @ strengths.T).toarray()
             order = np.argsort(-likeness, axis=1)
-            enough = np.argmax(np.cumsum(images[order], axis=1) >= least, axis=1)[:, None]
+            enough = np.argmax(np.cumsum(images[order], axis=1) >= min(least, count), axis=1)[:, None]
             lowest = np.take_along_axis(likeness, np.take_along_axis(order, enough, axis=1), axis=1)
             yield ((likeness >= lowest) & (likeness > 0))[:, where]
 
