@@ -20,7 +20,7 @@ from safetensors.torch import save_file
 from toolkit import notebook, pipeline
 from toolkit.errors import ManifestError, ToolkitError, WeightsError
 from toolkit.files import SceneFiles, write_sidecar, write_text
-from toolkit.manifest import STAGES, LocalizeSettings, RerankSettings, load_manifest
+from toolkit.manifest import STAGES, LocalizeSettings, RerankSettings, RetrieveSettings, load_manifest
 from toolkit.pipeline import StageError
 
 DEFAULT = ("explore", "embed", "retrieve", "localize", "evaluate", "visualize")
@@ -398,6 +398,17 @@ def test_the_weights_of_every_network_of_a_stage_are_asked_for() -> None:
     settings = [source.setting for source, _ in reranking]
     assert settings == ["rerank.features.checkpoint", "rerank.matcher.checkpoint"]
     assert pipeline._weights_needed("rerank", RerankSettings()) == []
+
+
+def test_rough_poses_are_an_input_of_retrieval(tmp_path: Path) -> None:
+    rough = tmp_path / "rough.txt"
+    rough.write_text("1, cam, 1, 0, 0, 0, 0, 0, 0\n")
+    settings = RetrieveSettings.of({"mask": {"poses": rough}})
+    job = pipeline.Job("retrieve", SceneFiles(tmp_path / "run", "HERE"), settings, {})
+    before = pipeline._inputs_of(job, "")
+    assert before == pipeline._inputs_of(job, "")
+    rough.write_text("1, cam, 1, 0, 0, 0, 0, 0, 10\n")
+    assert before != pipeline._inputs_of(job, "")
 
 
 @pytest.mark.parametrize("content", ["another model", "torn"])

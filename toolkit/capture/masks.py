@@ -61,9 +61,9 @@ class Masks:
 
     def rows(self, start: int, stop: int) -> Bools:
         """Return what each query may find of some of the rows, (Q, stop - start)."""
-        first = start // 8
-        part = self.bits[:, first : -(-stop // 8)]
-        packed = np.concatenate([part, np.full((1, part.shape[1]), 255, np.uint8)])[self.which]
+        first, last, limited = start // 8, -(-stop // 8), self.which >= 0
+        packed = np.full((len(self), last - first), 255, np.uint8)
+        packed[limited] = self.bits[self.which[limited], first:last]
         unpacked = np.unpackbits(packed, axis=1, bitorder="little").view(bool)
         return unpacked[:, start - 8 * first : stop - 8 * first]
 
