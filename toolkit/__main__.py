@@ -185,11 +185,19 @@ def demo_data(
     rooms: Annotated[int, typer.Option(min=1, help="Rooms to render.")] = 2,
     frames: Annotated[int, typer.Option(min=2, help="Frames a room and map session.")] = 12,
     seed: Annotated[int, typer.Option(min=0, help="Another seed, another place.")] = 0,
+    alike: Annotated[bool, typer.Option("--alike", help="The last room looks exactly as the first.")] = False,
+    seconds: Annotated[int, typer.Option(min=0, help="Of a query recording, with odometry between pictures.")] = 0,
+    losses: Annotated[int, typer.Option(min=0, help="Losses of tracking a query recording.")] = 0,
+    gaps: Annotated[int, typer.Option(min=0, help="Times of 4 s without odometry a query recording.")] = 0,
+    radio: Annotated[bool, typer.Option("--radio", help="Scans of WiFi and Bluetooth.")] = False,
 ) -> None:
     """Render a capture with exact ground truth, for demos, tests and benchmarks."""
     from toolkit.synthetic import render_capture
 
-    print(f"Capture: {render_capture(out, rooms=rooms, frames=frames, seed=seed)}")
+    capture = render_capture(
+        out, rooms, frames, seed, alike=alike, seconds=seconds, losses=losses, gaps=gaps, radio=radio
+    )
+    print(f"Capture: {capture}")
 
 
 @import_app.command("colmap")

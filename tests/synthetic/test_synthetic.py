@@ -9,24 +9,28 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pandas as pd
 import pycolmap
 import pytest
 
 from toolkit.capture import Capture, read_depth
 from toolkit.capture import images as capture_images
+from toolkit.capture.check import check_capture
 from toolkit.errors import CaptureError
 from toolkit.geometry import invert, make_pose, rotation_angle_deg, transform
 from toolkit.synthetic import capture as capture_writing
 from toolkit.synthetic import render_capture, render_street, textures
-from toolkit.synthetic.devices import DEVICES, Sensor, looking, odometry_of, walk_street, walks
+from toolkit.synthetic.capture import World
+from toolkit.synthetic.devices import DEVICES, Sensor, halved, looking, walk_street, walks
 from toolkit.synthetic.light import paint
+from toolkit.synthetic.recording import Emitter, emitters_of, odometry_of, received, scans
 from toolkit.synthetic.render import Rays, render
 from toolkit.synthetic.scene import BLOCK_M, Quad, Scene, build_block, build_room
 
 
-def coarse_room(seed: int, index: int) -> Scene:
+def coarse_room(seed: int, index: int, look: int | None = None) -> Scene:
     """A room whose textures have few texels, so that a capture is rendered in seconds."""
-    scene = build_room(seed, index)
+    scene = build_room(seed, index, look)
     for quad in scene.quads:
         quad.ppm /= 4
     return scene
@@ -329,9 +333,126 @@ def test_a_rendering_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pyte
     assert not list(tmp_path.iterdir())
 
 
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A capture of two bare rooms that look alike, by a phone: recordings of 60 s, a loss, a gap, and radio."""
+
+    def bare_room(seed: int, index: int, look: int | None = None) -> Scene:
+        scene = build_room(seed, index, look)
+        del scene.quads[1:], scene.blockers[:]
+        scene.quads[0].ppm = 20
+        return scene
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(capture_writing, "build_room", bare_room)
+        patch.setattr(capture_writing, "DEVICES", {"ios": halved(DEVICES["ios"])})
+        return render_capture(
+            tmp_path_factory.mktemp("recorded") / "LONG", 2, 8, seed=1, progress=False,
+            alike=True, seconds=60, losses=1, gaps=1, radio=True,
+        )  # fmt: skip
+
+
+def test_a_recording_has_odometry_between_its_pictures_with_a_loss_and_a_gap(recorded: Path) -> None:
+    session = Capture.open(recorded)["ios_query"]
+    truth, odometry = session.ground_truth, session.odometry
+    assert truth is not None
+    assert odometry is not None
+    assert np.isfinite(session.world_from_cam(ground_truth=True)).all()
+    assert len(session.images) == len(session.keyframes("original")) == 8
+    assert not check_capture(recorded).problems
+    for recording in session.subsessions:
+        rows, true_rows = ([id_.startswith(f"{recording}/") for id_ in one.device_ids] for one in (odometry, truth))
+        times, true_times = odometry.timestamps[rows], truth.timestamps[true_rows]
+        assert len(true_times) == 300
+        assert 59 < np.ptp(true_times) / 1e6 < 60
+        gap = np.flatnonzero(np.diff(times) > 1e6)
+        assert len(gap) == 1
+        assert 3.8 < (times[gap + 1] - times[gap]) / 1e6 < 4.5
+        true_poses = truth.lookup(times, odometry.device_ids[rows])
+        by_odometry, by_truth = (
+            invert(poses[:-1]) @ poses[1:] for poses in (odometry.world_from_device[rows], true_poses)
+        )
+        off = np.linalg.norm((by_odometry - by_truth)[:, :3, 3], axis=1)
+        off = off / np.maximum(np.linalg.norm(by_truth[:, :3, 3], axis=1), 0.1)
+        (lost,) = np.flatnonzero(off > 0.5)
+        assert np.delete(off, lost).max() < 0.3
+        # All drift of a minute is of the size that it has at a pose a picture.
+        last = invert(odometry.world_from_device[rows][lost + 1]) @ odometry.world_from_device[rows][-1]
+        expected = invert(true_poses[lost + 1]) @ true_poses[-1]
+        assert rotation_angle_deg((invert(expected) @ last)[None, :3, :3])[0] < 5
+        assert np.linalg.norm((invert(expected) @ last)[:3, 3]) < 2
+
+
+def test_the_last_room_can_look_as_the_first(recorded: Path) -> None:
+    def texture(look: int | None) -> np.ndarray:
+        scene = build_room(0, 2, look)
+        paint(scene, 0, 2 if look is None else look, 0)
+        return scene.quads[0].gray[2]
+
+    assert World(3, 8, 4, 0, alike=True).look(2) == 0
+    assert [World(3, 8, 4, 0, alike=True).look(index) for index in range(2)] == [0, 1]
+    first, copy = build_room(0, 0), build_room(0, 2, 0)
+    away = copy.origin - first.origin
+    assert np.linalg.norm(away) > 50
+    for one, other in zip(first.quads, copy.quads, strict=True):
+        np.testing.assert_allclose(one.corners + away, other.corners, atol=1e-9)
+    assert texture(0).shape != texture(None).shape or np.any(texture(0) != texture(None))
+
+
+def test_radio_fades_with_distance_and_walls_and_tells_rooms(recorded: Path) -> None:
+    rng, room = np.random.default_rng(0), build_room(0, 0)
+    beacon = Emitter("b", room.origin + np.array([0.0, 0.0, 1.5]), -59.0)
+    away = np.array([0.5, 1.0, 2.0, 5.0])
+    places = beacon.place + np.stack([away, 0 * away, 0 * away], axis=1)
+    levels = np.nanmean([received(rng, [beacon], places, [room])[:, 0] for _ in range(400)], axis=0)
+    expected = -59 - 25 * np.log10(away) - [0, 0, 0, 6.9]  # the last is outside
+    np.testing.assert_allclose(levels, expected, atol=0.6)
+    assert np.isnan(received(rng, [beacon], places + 300.0, [room])).all()
+    capture = Capture.open(recorded)
+    for session in (capture["ios_map"], capture["ios_query"]):
+        assert not (session.path / "wifi.txt").exists()
+        table = pd.read_csv(session.path / "bt.txt", sep=", ", engine="python")
+        assert list(table) == ["# timestamp", "sensor_id", "id", "rssi_dbm", "name"]
+        assert set(table["sensor_id"]) == {f"{name}/bt_sensor" for name in session.subsessions}
+        assert table["id"].str.fullmatch(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}:[01]:[0-3]").all()
+        loudest = table.loc[table.groupby("# timestamp")["rssi_dbm"].idxmax()]
+        truth = session.ground_truth
+        assert truth is not None
+        nearest = np.abs(truth.timestamps - loudest["# timestamp"].to_numpy()[:, None]).argmin(axis=1)
+        x = truth.world_from_device[nearest, 0, 3]
+        in_room = np.abs(x - 28 * (x > 14)) < 4
+        right = (loudest["id"].str.split(":").str[1].astype(int) == (x > 14)).to_numpy()
+        assert in_room.sum() > 20
+        assert right[in_room].mean() > 0.9
+
+
+def test_scans_of_wifi_have_what_the_format_asks_for() -> None:
+    rooms = [build_room(0, 0)]
+    poses = make_pose(np.eye(3), np.tile(rooms[0].origin + 1.5, (2, 1)))
+    times = np.array([10_000_000, 30_000_000])
+    emitters = emitters_of(0, rooms, "wifi")
+    rows = list(scans(np.random.default_rng(0), times, poses, emitters, rooms, "r/wifi_sensor"))
+    assert {row[2] for row in rows} == {emitter.id for emitter in emitters}
+    stamps = np.unique([row[0] for row in rows])
+    assert set(np.diff(stamps)) == {4_000_000}
+    for time, sensor, address, frequency_khz, dbm, _, start, end in rows:
+        assert times[0] <= time <= times[1]
+        assert (sensor, end) == ("r/wifi_sensor", time)
+        assert start < end
+        assert len(address) == 17
+        assert frequency_khz in (2_412_000, 2_437_000, 5_180_000, 5_260_000)
+        assert -92 < dbm < -20
+
+
 def test_refusals(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match="frames"):
         render_capture(tmp_path / "C", 1, 1)
+    with pytest.raises(CaptureError, match="seconds >= 40"):
+        render_capture(tmp_path / "C", 2, 8, seconds=39)
+    with pytest.raises(CaptureError, match="frames >= 4"):
+        render_capture(tmp_path / "C", 1, 7, seconds=60)
+    with pytest.raises(CaptureError, match="set seconds"):
+        render_capture(tmp_path / "C", losses=1)
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(CaptureError, match=r"demo\.json"):
         render_capture(tmp_path, 1, 2)

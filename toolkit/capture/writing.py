@@ -15,6 +15,8 @@ from toolkit.files import write_atomic
 from toolkit.geometry import qt_from_pose
 
 DEPTH_SCALE = 1000.0  # depth maps are 16-bit PNGs in millimeters
+_WIFI = "mac_addr, frequency_khz, rssi_dbm, name, scan_time_start_us, scan_time_end_us"
+_BLUETOOTH = "id, rssi_dbm, name"
 Records: TypeAlias = pd.DataFrame | Iterable[tuple[int, str, str]]
 
 
@@ -28,6 +30,8 @@ def write_session(
     subsessions: Sequence[str] | None = None,
     keyframes: Mapping[str, pd.DataFrame] | None = None,
     ground_truth: Trajectory | None = None,
+    wifi: Iterable[Sequence[Any]] | None = None,
+    bt: Iterable[Sequence[Any]] | None = None,
 ) -> Path:
     """Write the text files of a session (not the images); what is None is not written. Return the folder.
 
@@ -39,6 +43,8 @@ def write_session(
         images, depths: rows (timestamp, sensor_id, path relative to raw_data/).
         keyframes: tables [timestamp, device_id] by name, e.g. `pruned_subsampled`.
         ground_truth: goes to proc/alignment_trajectories.txt.
+        wifi: rows (timestamp, sensor_id, MAC address, kHz, dBm, name, start and end of the scan, microseconds).
+        bt: rows (timestamp, sensor_id, id, dBm, name), the id as `<guid>:<major>:<minor>`.
 
     Raises:
         ValueError: a value that the format cannot hold: with a comma, a line break or spaces at an end, or # at the
@@ -61,6 +67,9 @@ def write_session(
         trajectory.write(path / "trajectories.txt")
     if ground_truth is not None:
         ground_truth.write(path / ALIGNED)
+    for file, columns, signals in (("wifi.txt", _WIFI, wifi), ("bt.txt", _BLUETOOTH, bt)):
+        if signals is not None:
+            write_table(path / file, f"timestamp, sensor_id, {columns}", map(_line, signals))
     # The benchmark writes the files in proc/ without a header, and its evaluation reads them so.
     if subsessions is not None:
         write_table(path / "proc" / "subsessions.txt", None, (_line([name]) for name in subsessions))

@@ -40,6 +40,16 @@ class DemoData(Settings):
     """Frames a room and map session; queries have half."""
     seed: Natural = 0
     """Another seed, another place."""
+    alike: bool = False
+    """Whether the last room looks exactly as the first."""
+    seconds: Natural = 0
+    """Length of a query recording, with odometry also between pictures; 0: as long as its pictures take."""
+    losses: Natural = 0
+    """Losses of tracking in each query recording; need `seconds`."""
+    gaps: Natural = 0
+    """Times of 4 s without odometry in each query recording; need `seconds`."""
+    radio: bool = False
+    """Whether sessions have scans of WiFi and Bluetooth."""
 
 
 class Tolerance(Settings):

@@ -23,8 +23,9 @@ import numpy as np
 from toolkit.errors import CaptureError
 from toolkit.files import is_left_over, process_tag
 from toolkit.geometry import Floats, invert, pose_from_qt
-from toolkit.synthetic.devices import DEVICES, Device, halved, odometry_of, walk_street, walks
+from toolkit.synthetic.devices import DEVICES, Device, Sensor, halved, walk_street, walks
 from toolkit.synthetic.light import paint
+from toolkit.synthetic.recording import PICTURE_S, RADIOS, RATE_HZ, emitters_of, every_frame, scans, tracked
 from toolkit.synthetic.render import Rays, render
 from toolkit.synthetic.scene import Quad, Scene, build_block, build_room, named_rng
 from toolkit.synthetic.textures import Image
@@ -45,6 +46,11 @@ class World:
     seed: int
     look_alikes: bool = False
     street: bool = False  # else rooms
+    alike: bool = False
+    seconds: int = 0  # of a query recording; 0: as long as its pictures take
+    losses: int = 0  # of tracking, a query recording
+    gaps: int = 0  # in its odometry
+    radio: bool = False
 
     @property
     def devices(self) -> dict[str, Device]:
@@ -54,12 +60,21 @@ class World:
     @property
     def hours(self) -> int:
         """Whole hours that are enough for one subsession."""
-        return 1 + int(1.4 * self.places * (self.frames + 8) / 3600)
+        return 1 + int(max(PICTURE_S * self.places * (self.frames + 8), self.seconds) / 3600)
+
+    @property
+    def stay_s(self) -> float:
+        """Seconds in a room of a recording that is `seconds` long; half as many are the way to the next."""
+        return self.seconds / (1.5 * self.places - 0.5)
+
+    def look(self, index: int) -> int:
+        """Return which place a place looks like."""
+        return 0 if self.alike and index == self.places - 1 else index
 
     def build(self, index: int) -> Scene:
         """Return a place without its textures."""
         if not self.street:
-            return build_room(self.seed, index)
+            return build_room(self.seed, index, self.look(index))
         block = build_block(self.seed, index)
         block.quads = [replace(quad, ppm=quad.ppm / 2) for quad in block.quads]
         return block
@@ -94,7 +109,28 @@ class Tables:
     poses: list[tuple[int, str, Floats]] = field(default_factory=list)
     images: list[tuple[int, str, str]] = field(default_factory=list)
     depths: list[tuple[int, str, str]] = field(default_factory=list)
-    subsessions: list[str] = field(default_factory=list)
+    subsessions: dict[str, int] = field(default_factory=dict)  # the start of each, microseconds
+
+    def add_frame(
+        self, name: str, device: Device, subsession: str, timestamp: int, zoom: float = 1.0
+    ) -> tuple[str, Floats]:
+        """Add the sensors of a frame; return the id of the device that is posed, and body_from_device (4, 4)."""
+        if name == "ios":  # a phone focuses anew for every picture
+            (sensor,) = device.sensors
+            sensor_id, *_ = _names(name, sensor, subsession, timestamp)
+            params = [round(f * zoom, 3) for f in sensor.params[:2]] + list(sensor.params[2:])
+            label = f"phone camera for timestamp {timestamp}"
+            self.sensors[sensor_id] = (sensor_id, label, "camera", sensor.model, *sensor.size, *params)
+            return sensor_id, sensor.body_from_cam
+        rig_id = f"{subsession}/" + (f"hetrig_{timestamp}" if name == "hl" else f"{timestamp}-body")
+        assert device.rig_from_body is not None
+        rig_from_body = pose_from_qt(device.rig_from_body)
+        for sensor in device.sensors:
+            sensor_id, *_ = _names(name, sensor, subsession, timestamp)
+            label = sensor_id.removeprefix(f"{subsession}/")
+            self.sensors[sensor_id] = (sensor_id, label, "camera", sensor.model, *sensor.size, *sensor.params)
+            self.rigs.append((timestamp, rig_id, sensor_id, rig_from_body @ sensor.body_from_cam))
+        return rig_id, invert(rig_from_body)
 
 
 def _subsession(name: str, split: str, part: int, hours: int) -> tuple[str, int]:
@@ -110,6 +146,16 @@ def _subsession(name: str, split: str, part: int, hours: int) -> tuple[str, int]
     return time.strftime("spot_%Y-%m-%d-%H-%M", stamp), day
 
 
+def _names(name: str, sensor: Sensor, subsession: str, timestamp: int) -> tuple[str, str, str]:
+    """Return the id of a device's sensor, the folder of its pictures and the stem of one's file name."""
+    if name == "ios":
+        return f"{subsession}/cam_phone_{timestamp}", "images/", str(timestamp)
+    if name == "hl":
+        return f"{subsession}/{sensor.name}", f"images/{sensor.name}/", str(timestamp)
+    label = f"spot-camera-{sensor.name}-image"
+    return f"{subsession}/{label}", f"{label}/", f"{timestamp}-{label}"
+
+
 def _plan_place(world: World, scene: Scene, index: int, tables: dict[str, Tables]) -> Iterator[Shot]:
     """Add one place's frames to the tables of all sessions, and yield its pictures."""
     import pycolmap
@@ -118,41 +164,29 @@ def _plan_place(world: World, scene: Scene, index: int, tables: dict[str, Tables
         for (split, part), bodies in world.walk(scene, index, name).items():
             session, table = f"{name}_{split}", tables[f"{name}_{split}"]
             subsession, start = _subsession(name, split, part, world.hours)
-            if subsession not in table.subsessions:
-                table.subsessions.append(subsession)
+            table.subsessions[subsession] = start
             rng = named_rng(world.seed, index, "frames", name, split, part)
             for i, world_from_body in enumerate(bodies):
-                timestamp = start + int(1e6 * (5 + 1.4 * (index * (world.frames + 8) + i)) + rng.integers(0, 700_000))
+                if world.seconds and split == "query":
+                    after_s = world.stay_s * (1.5 * index + (i + rng.uniform(0.2, 0.8)) / len(bodies))
+                    timestamp = start + int(1e6 * after_s)
+                else:
+                    after_s = 5 + PICTURE_S * (index * (world.frames + 8) + i)
+                    timestamp = start + int(1e6 * after_s + rng.integers(0, 700_000))
                 zoom = float(np.round(rng.normal(1, 0.004), 5))
-                rig_id = f"{subsession}/" + (f"hetrig_{timestamp}" if name == "hl" else f"{timestamp}-body")
-                if device.rig_from_body is not None:
-                    rig_from_body = pose_from_qt(device.rig_from_body)
-                    table.poses.append((timestamp, rig_id, world_from_body @ invert(rig_from_body)))
+                device_id, body_from_device = table.add_frame(name, device, subsession, timestamp, zoom)
+                table.poses.append((timestamp, device_id, world_from_body @ body_from_device))
                 for sensor in device.sensors:
-                    params, label = list(sensor.params), sensor.name
-                    if name == "ios":  # a phone focuses anew for every picture
-                        params[:2] = [round(f * zoom, 3) for f in params[:2]]
-                        label, short = f"phone camera for timestamp {timestamp}", f"cam_phone_{timestamp}"
-                        folder, stem = "images/", str(timestamp)
-                    elif name == "hl":
-                        short, folder, stem = label, f"images/{label}/", str(timestamp)
-                    else:
-                        short = label = f"spot-camera-{label}-image"
-                        folder, stem = f"{label}/", f"{timestamp}-{label}"
-                    sensor_id, path = f"{subsession}/{short}", f"{subsession}/{folder}{stem}.jpg"
-                    table.sensors[sensor_id] = (sensor_id, label, "camera", sensor.model, *sensor.size, *params)
-                    width, height = sensor.size
-                    camera = pycolmap.Camera(model=sensor.model, width=width, height=height, params=params)
-                    world_from_cam = world_from_body @ sensor.body_from_cam
-                    if device.rig_from_body is None:
-                        table.poses.append((timestamp, sensor_id, world_from_cam))
-                    else:
-                        table.rigs.append((timestamp, rig_id, sensor_id, rig_from_body @ sensor.body_from_cam))
+                    sensor_id, folder, stem = _names(name, sensor, subsession, timestamp)
+                    _, _, _, model, width, height, *params = table.sensors[sensor_id]
+                    camera = pycolmap.Camera(model=model, width=width, height=height, params=params)
+                    path = f"{subsession}/{folder}{stem}.jpg"
                     table.images.append((timestamp, sensor_id, path))
                     depth_path = None
                     if split == "map" and not world.street:
                         depth_path = f"{subsession}/depths/{folder.removeprefix('images/')}{stem}.png"
                         table.depths.append((timestamp, sensor_id, depth_path))
+                    world_from_cam = world_from_body @ sensor.body_from_cam
                     yield Shot(session, timestamp, sensor_id, path, depth_path, camera, world_from_cam, device)
 
 
@@ -187,22 +221,54 @@ def _save(path: Path, image: Image, options: list[int]) -> None:
     path.write_bytes(encoded.tobytes())
 
 
-def _write_session(path: Path, split: str, table: Tables, drift: float, seed: int) -> None:
-    """Write the text files of a session, rows in order of time; the odometry of queries has a `drift`."""
+def _poses_between(table: Tables, world: World, name: str) -> list[tuple[int, str, Floats]]:
+    """Return the poses of all frames of `world.seconds` long recordings, which have pictures now and then."""
+    poses = []
+    for recording, start in table.subsessions.items():
+        own = sorted((row for row in table.poses if row[1].startswith(f"{recording}/")), key=lambda row: row[:2])
+        device_ids = {time: device_id for time, device_id, _ in own}
+        pictures = np.array([row[0] for row in own]), np.stack([row[2] for row in own])
+        for time_us, pose in zip(*every_frame(*pictures, start, world.seconds), strict=True):
+            if int(time_us) not in device_ids:
+                device_ids[int(time_us)] = table.add_frame(name, world.devices[name], recording, int(time_us))[0]
+            poses.append((int(time_us), device_ids[int(time_us)], pose))
+    return poses
+
+
+def _write_session(path: Path, world: World, table: Tables, rooms: list[Scene]) -> None:
+    """Write the text files of a session, rows in order of time; queries have odometry.
+
+    Args:
+        rooms: where radio signals are scanned; none: no scans.
+    """
     import pandas as pd
 
     from toolkit.capture import Trajectory, write_session
 
-    poses = sorted(table.poses, key=lambda row: row[:2])
-    times, ids = [row[0] for row in poses], [row[1] for row in poses]
+    name, _, split = path.name.rpartition("_")
+    pictured = sorted(row[:2] for row in table.poses)
+    long = world.seconds > 0 and split == "query"
+    poses = sorted(_poses_between(table, world, name) if long else table.poses, key=lambda row: row[:2])
+    times, ids = np.array([row[0] for row in poses], np.int64), [row[1] for row in poses]
     trajectory = Trajectory.from_poses(times, ids, np.stack([row[2] for row in poses]))
     measured = trajectory.world_from_device
+    kept, scanned = np.ones(len(ids), bool), dict[str, list[tuple[Any, ...]]]()
     for recording in table.subsessions:
-        rows = [row for row, id_ in enumerate(ids) if id_.startswith(f"{recording}/")]
-        if rows:
-            measured[rows] = odometry_of(named_rng(seed, "odometry", recording), measured[rows], drift)
-    odometry = Trajectory.from_poses(times, ids, measured)
-    frames = pd.DataFrame({"timestamp": times, "device_id": ids})
+        rows = np.array([row for row, id_ in enumerate(ids) if id_.startswith(f"{recording}/")], int)
+        if not len(rows):
+            continue
+        for kind in RADIOS[name] if rooms else ():
+            sensor_id = f"{recording}/{kind}_sensor"
+            table.sensors[sensor_id] = (sensor_id, f"{kind} sensor", {"bt": "bluetooth"}.get(kind, kind))
+            rng, emitters = named_rng(world.seed, kind, recording), emitters_of(world.seed, rooms, kind)
+            scanned.setdefault(kind, []).extend(scans(rng, times[rows], measured[rows], emitters, rooms, sensor_id))
+        rng, device = named_rng(world.seed, "odometry", recording), world.devices[name]
+        parts = PICTURE_S * RATE_HZ if long else 1.0
+        kept[rows], measured[rows] = tracked(
+            rng, times[rows], measured[rows], device.drift, parts, world.losses, world.gaps
+        )
+    odometry = Trajectory.from_poses(times[kept], np.array(ids, object)[kept].tolist(), measured[kept])
+    frames = pd.DataFrame(pictured, columns=["timestamp", "device_id"])
     pruned = frames[np.arange(len(frames)) % 6 != 5]
     subsampled = pruned[np.arange(len(pruned)) % 3 != 1]
     keyframes = {"original": frames, "pruned": pruned, "pruned_subsampled": subsampled}
@@ -213,14 +279,26 @@ def _write_session(path: Path, split: str, table: Tables, drift: float, seed: in
         trajectory=trajectory if split == "map" else odometry,
         images=sorted(table.images),
         depths=sorted(table.depths) or None,
-        subsessions=table.subsessions,
+        subsessions=list(table.subsessions),
         keyframes=keyframes if split == "query" else None,
         ground_truth=trajectory if split == "query" else None,
+        wifi=sorted(scanned.get("wifi", [])) or None,
+        bt=sorted(scanned.get("bt", [])) or None,
     )
 
 
 def render_capture(
-    out: str | Path, rooms: int = 2, frames: int = 12, seed: int = 0, progress: bool = True, look_alikes: bool = False
+    out: str | Path,
+    rooms: int = 2,
+    frames: int = 12,
+    seed: int = 0,
+    progress: bool = True,
+    look_alikes: bool = False,
+    alike: bool = False,
+    seconds: int = 0,
+    losses: int = 0,
+    gaps: int = 0,
+    radio: bool = False,
 ) -> Path:
     """Render a capture of `rooms` rooms by a phone, a headset and a robot; return its folder.
 
@@ -234,15 +312,31 @@ def render_capture(
         seed: of everything; the same seed gives the same bytes.
         look_alikes: whether doors, windows, shelves, cabinets and crates come in few models, the same in all rooms,
             which are easily taken for one another.
+        alike: whether the last room looks exactly as the first.
+        seconds: length of a query recording, at least 20 a room; it then has odometry also between its pictures, five
+            poses a second. 0: as long as the pictures take, one in 1.4 s, and poses of these alone.
+        losses: how often tracking is lost in a query recording: from there on its odometry is in another frame.
+        gaps: how often such odometry has no poses for 4 s. Both need `seconds`.
+        radio: whether sessions have scans of WiFi (the phone has none) and Bluetooth, of emitters in and about rooms.
 
     Raises:
         CaptureError: a setting is out of range, or `out` holds something else than a rendered capture.
     """
     if rooms < 1 or frames < 2 or seed < 0:
         raise CaptureError(f"Expected rooms >= 1, frames >= 2, seed >= 0; found {rooms=}, {frames=}, {seed=}.")
+    if seconds and (seconds < 20 * rooms or rooms * (frames // 4) < 2):
+        raise CaptureError(
+            f"A recording that lasts {seconds=} in {rooms=} of {frames=}: expected seconds >= {20 * rooms}, 20 a room, "
+            "and frames >= 4, or 8 in a single room, for two pictures or more."
+        )
+    if (losses or gaps) and not seconds:
+        raise CaptureError(f"{losses=} and {gaps=} are of the odometry between pictures: set seconds, too.")
     settings = {"format": FORMAT, "rooms": rooms, "frames": frames, "seed": seed}
-    settings |= {"look_alikes": 1} if look_alikes else {}
-    return _render(Path(out), World(rooms, frames, max(2, frames // 2), seed, look_alikes), settings, progress)
+    asked = {"look_alikes": look_alikes, "alike": alike, "seconds": seconds, "losses": losses, "gaps": gaps}
+    settings |= {name: int(value) for name, value in {**asked, "radio": radio}.items() if value}
+    queries = max(2, frames // 2)
+    world = World(rooms, frames, queries, seed, look_alikes, False, alike, seconds, losses, gaps, radio)
+    return _render(Path(out), world, settings, progress)
 
 
 def render_street(
@@ -325,7 +419,8 @@ def _render_sessions(out: Path, world: World, progress: bool) -> None:
                 for i in around:
                     if i not in scenes:
                         scenes[i] = world.build(i)
-                        paint_quad = partial(paint, scenes[i], world.seed, i, look_alikes=world.look_alikes)
+                        look = world.look(i)
+                        paint_quad = partial(paint, scenes[i], world.seed, look, look_alikes=world.look_alikes)
                         for _ in pool.map(paint_quad, range(len(scenes[i].quads))):
                             pass
                 scenes = {i: scenes[i] for i in around}
@@ -345,9 +440,9 @@ def _render_sessions(out: Path, world: World, progress: bool) -> None:
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
+    rooms = [world.build(index) for index in range(world.places)] if world.radio else []
     for session, table in tables.items():
-        device, _, split = session.rpartition("_")
-        _write_session(sessions / session, split, table, world.devices[device].drift, world.seed)
+        _write_session(sessions / session, world, table, rooms)
 
 
 def _is_complete(out: Path, settings: dict[str, int]) -> bool:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from toolkit.geometry import Floats, invert, make_pose, quaternion_to_rotation, rotation_angle_deg
+from toolkit.geometry import Floats, invert, make_pose, rotation_angle_deg
 from toolkit.synthetic.scene import Scene, named_rng
 from toolkit.synthetic.textures import Rng
 
@@ -96,29 +96,6 @@ def looking(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Floats:
     down = np.cross(forward, right)
     c, s = np.cos(roll), np.sin(roll)
     return np.stack([c * right + s * down, c * down - s * right, forward], axis=-1)
-
-
-def odometry_of(rng: Rng, world_from_rig: Floats, drift: float) -> Floats:
-    """Return odom_from_rig (N, 4, 4): the motion of a recording as its device measures it, in a frame of its own.
-
-    The frame is upright up to 0.3 degrees. At `drift` 1 all lengths are wrong by 1 %, each step by another 1 %, and by
-    0.1 degrees (standard deviations; those of the step and the rotation by axis).
-    """
-
-    def turned(degrees: Floats) -> Floats:
-        angle = max(float(np.linalg.norm(degrees)), 1e-12)
-        half = np.radians(angle) / 2
-        return quaternion_to_rotation([np.cos(half), *(np.sin(half) * degrees / angle)])
-
-    heading = np.array([0.0, 0.0, rng.uniform(-180, 180)])
-    odom_from_world = make_pose(turned(rng.normal(0, 0.3, 3) * [1, 1, 0]) @ turned(heading), rng.uniform(-5, 5, 3))
-    scale = 1 + 0.01 * drift * rng.normal()
-    poses = [odom_from_world @ make_pose(np.eye(3), -world_from_rig[0, :3, 3]) @ world_from_rig[0]]
-    for step in invert(world_from_rig[:-1]) @ world_from_rig[1:]:
-        length = float(np.linalg.norm(step[:3, 3]))
-        moved = scale * step[:3, 3] + 0.01 * drift * length * rng.normal(size=3)
-        poses.append(poses[-1] @ make_pose(step[:3, :3] @ turned(0.1 * drift * rng.normal(size=3)), moved))
-    return np.stack(poses)
 
 
 BODY_FROM_LEVEL_CAM = make_pose(looking(0, 0, 0), (0, 0, 0))

@@ -255,10 +255,14 @@ def _build_sky(scene: Scene) -> None:
     scene.lamps = [scene.origin + np.array([9.0 + 2 * i, -14.0, 22.0]) for i in (-0.5, 0.5)]
 
 
-def build_room(seed: int, index: int) -> Scene:
-    """Return room `index` of the world of `seed`: geometry and materials; `light.paint` makes its textures."""
-    rng = named_rng(seed, index, "room")
-    kind = list(KINDS.values())[(index + seed) % len(KINDS)]
+def build_room(seed: int, index: int, look: int | None = None) -> Scene:
+    """Return room `index` of the world of `seed`: geometry and materials; `light.paint` makes its textures.
+
+    It is where room `index` is, and looks like room `look`, if that is given.
+    """
+    look = index if look is None else look
+    rng = named_rng(seed, look, "room")
+    kind = list(KINDS.values())[(look + seed) % len(KINDS)]
     outdoor = bool(kind.get("outdoor"))
     w, d, h = rng.uniform([7.4, 6.0, 3.0], [8.8, 7.0, 3.4])
     if outdoor:
