@@ -21,6 +21,43 @@ def test_losses_of_tracking_end_a_piece() -> None:
     assert Odometry(times[:0], poses[:0]).split(SETTINGS) == []
 
 
+def walk(rate_hz: float, seconds: float = 40.0) -> Odometry:
+    """Someone who walks, stops, walks faster and looks to both sides, as often as `rate_hz` says."""
+    time = np.arange(0, seconds, 1 / rate_hz)
+    speed = np.where((time > 10) & (time < 15), 0.0, np.where(time > 25, 2.5, 1.2))
+    heading = 0.1 * time + 1.0 * np.sin(1.5 * time)
+    places = np.cumsum(speed[:, None] / rate_hz * np.stack([np.cos(0.1 * time), np.sin(0.1 * time)], axis=1), axis=0)
+    turns = Rotation.from_rotvec(np.stack([0 * time, 0 * time, heading], axis=1)).as_matrix()
+    return Odometry((time * 1e6).astype(np.int64), geometry.make_pose(turns, np.pad(places, ((0, 0), (0, 1)))))
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 5.0, 30.0])
+def test_a_walk_is_one_piece(rate_hz: float) -> None:
+    odometry = walk(rate_hz)
+    assert odometry.split(SETTINGS) == [slice(0, len(odometry))]
+    missing = np.delete(np.arange(len(odometry)), np.arange(int(20 * rate_hz), int(24 * rate_hz)))
+    silent = Odometry(odometry.timestamps[missing], odometry.odom_from_rig[missing])
+    assert silent.split(SETTINGS) == [slice(0, len(silent))]
+    fast = Odometry(odometry.timestamps[:2], odometry.scaled(10.0).odom_from_rig[:2])
+    assert fast.split(SETTINGS) == [slice(0, 2)]
+
+
+@pytest.mark.parametrize("rate_hz", [5.0, 30.0])
+@pytest.mark.parametrize("at_s", [5.0, 12.0, 30.0])
+def test_tracking_that_begins_again_where_the_device_is_is_a_loss(rate_hz: float, at_s: float) -> None:
+    odometry, lost = walk(rate_hz), int(at_s * rate_hz)
+    poses = odometry.odom_from_rig.copy()
+    poses[lost:] = geometry.invert(poses[lost]) @ poses[lost:]
+    assert np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).max() < 75
+    assert Odometry(odometry.timestamps, poses).split(SETTINGS) == [slice(0, lost), slice(lost, len(poses))]
+    # A few decimeters are enough, or a turn on the spot.
+    about = Rotation.from_rotvec([0.0, 0.0, 1.6]).as_matrix()
+    for off in (geometry.make_pose(np.eye(3), [0.0, 1.0, 0.0]), geometry.make_pose(about, np.zeros(3))):
+        poses = odometry.odom_from_rig.copy()
+        poses[lost:] = poses[lost - 1] @ off @ geometry.invert(poses[lost]) @ poses[lost:]
+        assert Odometry(odometry.timestamps, poses).split(SETTINGS) == [slice(0, lost), slice(lost, len(poses))]
+
+
 def test_drift_does_not_depend_on_the_number_of_steps() -> None:
     coarse = drive(np.random.default_rng(0), frames=11).odometry
     times = np.linspace(coarse.timestamps[0], coarse.timestamps[-1], 101).astype(np.int64)

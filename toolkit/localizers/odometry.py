@@ -18,6 +18,10 @@ from toolkit.manifest import SequenceSettings
 
 LEAST_STD_M, LEAST_STD_DEG = 0.01, 0.05
 """A single query's pose is not surer than this: its covariance does not know of errors that a part of the map has."""
+JUMP_M, JUMP_DEG = 0.2, 20.0
+"""A step is off by no more, beyond what `ACCELERATION` makes of those beside it."""
+ACCELERATION_M_S2, ACCELERATION_DEG_S2 = 10.0, 500.0
+"""Of a hand, a head or a wheel at most."""
 _CHI2_99 = 16.81
 """99 % quantile of the chi-squared distribution with 6 degrees of freedom."""
 
@@ -73,11 +77,33 @@ class Odometry:
         return np.flatnonzero(inside), geometry.make_pose(turned.as_matrix(), np.stack(moved, axis=1))
 
     def split(self, settings: SequenceSettings) -> list[slice]:
-        """Return the pieces between losses of tracking: gaps in time, and steps that no device makes."""
+        """Return the pieces between losses of tracking: gaps in time, and steps that no device makes.
+
+        A step is one if it is too fast, or if no acceleration leads to its speed from that of the steps beside it.
+        """
         seconds = np.diff(self.timestamps) / 1e6
         lost = (seconds > settings.max_gap_s) | (np.diff(self.way_m) > settings.max_speed_m_s * seconds)
-        ends = [0, *(np.flatnonzero(lost) + 1).tolist(), len(self)]
+        ends = [0, *(np.flatnonzero(lost | self._jumps(seconds)) + 1).tolist(), len(self)]
         return [slice(start, end) for start, end in pairwise(ends) if end > start]
+
+    def _jumps(self, seconds: Floats) -> NDArray[np.bool_]:
+        """Return which steps (N - 1,) differ from those beside them, and from none, by more than an acceleration."""
+        jumps = np.zeros(len(seconds), bool)
+        if len(seconds) < 2:
+            return jumps
+        steps = geometry.invert(self.odom_from_rig[:-1]) @ self.odom_from_rig[1:]
+        turns = np.degrees(Rotation.from_matrix(steps[:, :3, :3]).as_rotvec())
+        seconds = np.maximum(seconds, 1e-6)
+        for moved, least, acceleration in (
+            (steps[:, :3, 3], JUMP_M, ACCELERATION_M_S2), (turns, JUMP_DEG, ACCELERATION_DEG_S2),
+        ):  # fmt: skip
+            speeds = moved / seconds[:, None]
+            # A velocity in the device's own frame is the same whichever frame its odometry is in.
+            off = np.linalg.norm(np.diff(speeds, axis=0), axis=1) - acceleration * (seconds[1:] + seconds[:-1]) / 2
+            still = np.linalg.norm(speeds, axis=1) - acceleration * seconds  # a step beside a jump is none
+            nearest = np.minimum(np.minimum(np.append(off, np.inf), np.insert(off, 0, np.inf)), still)
+            jumps |= nearest * seconds > least
+        return jumps
 
 
 @dataclass(frozen=True)
