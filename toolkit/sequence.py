@@ -174,6 +174,9 @@ class _Answers:
         status = rows["status"].to_numpy(object)
         # Where localization gives no probability, its word counts.
         weights = rows.get("p_correct", pd.Series(np.nan, rows.index)).fillna(rows["status"].eq("ok") * 0.9 + 0.05)
+        # Of two poses with as much support, such as in rooms that look alike, either may be right.
+        rivals = rows.get("rival_support", pd.Series(0.0, rows.index)).fillna(0.0)
+        weights = weights.where(rows["status"] == "ok", weights / (1 + rivals))
         at = trajectory.index.find(rows["timestamp"].to_numpy(), as_strings(rows["device_id"]))
         # Nor is a pose without a covariance, such as that of `nearest`, known better than to some meters.
         covariances = np.tile(np.diag(np.repeat([0.1, 4.0], 3)), (len(rows), 1, 1))

@@ -1,5 +1,7 @@
 """Odometry: its pieces, and the placements in the map that single queries vote for."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -102,6 +104,22 @@ def test_one_sure_query_or_three_that_agree_are_trusted(trusted: bool, count: in
     some = way.queries.choose(np.arange(count))
     queries = PosedQueries(*list(vars(some).values())[:4], np.full(count, trusted))
     assert place(way.odometry, queries, SETTINGS)[0].trusted == sure
+
+
+def test_look_alikes_are_not_trusted_however_many_agree() -> None:
+    way = drive(np.random.default_rng(2), wrong=0.0)
+    count = len(way.queries)
+    weights, trusted = np.full(count, 0.51), np.zeros(count, bool)
+    either = replace(way.queries, weights=weights, trusted=trusted)
+    (alone,) = place(way.odometry, either, SETTINGS)
+    assert len(alone.members) == count
+    assert not alone.trusted
+    poses = way.queries.world_from_rig.copy()
+    poses[1:4] = geometry.make_pose(np.eye(3), [30.0, 0.0, 0.0]) @ poses[1:4]
+    weights[0], trusted[0] = 0.99, True  # one that knows, against three that were led astray
+    best = place(way.odometry, replace(either, world_from_rig=poses).choose(np.arange(4)), SETTINGS)[0]
+    assert best.members.tolist() == [0]
+    assert not best.trusted
 
 
 def test_scale_is_fitted_as_far_as_queries_know_it() -> None:

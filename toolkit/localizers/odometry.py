@@ -22,6 +22,8 @@ JUMP_M, JUMP_DEG = 0.2, 20.0
 """A step is off by no more, beyond what `ACCELERATION` makes of those beside it."""
 ACCELERATION_M_S2, ACCELERATION_DEG_S2 = 10.0, 500.0
 """Of a hand, a head or a wheel at most."""
+_TELLING = 2 / 3
+"""Probability of a pose that says where it is without the others: more than half as likely is no other pose."""
 _CHI2_99 = 16.81
 """99 % quantile of the chi-squared distribution with 6 degrees of freedom."""
 
@@ -145,13 +147,13 @@ class Placement:
     support: float
     """Sum of their weights."""
     trusted: bool
-    """Whether one of them is `ok`, or three agree, and no rival is half as well supported."""
+    """Whether one of them is `ok`, or three agree that are likely right, and no rival is half as well supported."""
     rival_support: float
     """That of the best placement that contradicts this one."""
 
 
 def place(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> list[Placement]:
-    """Return the rival placements of odometry in the map, the best supported first.
+    """Return the rival placements of odometry in the map, the best supported first: by `ok` queries, then by all.
 
     Each query votes: its pose gives one placement, which is supported by all queries whose poses it predicts, within
     the drift between the two and the covariances of both.
@@ -168,12 +170,14 @@ def place(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings)
         members[seed] = True
         found.append((seed, np.flatnonzero(members), float(queries.weights[members].sum())))
         left &= ~members
-    found.sort(key=lambda one: -one[2])
+    found.sort(key=lambda one: (-queries.weights[one[1]] @ queries.trusted[one[1]], -one[2]))
     placements = []
     for number, (seed, rows, support) in enumerate(found):
         others = [other for index, (_, _, other) in enumerate(found) if index != number]
         rival = max(others, default=0.0)
-        sure = bool(queries.trusted[rows].any() or len(rows) >= 3) and rival < 0.5 * support
+        # Those that are led astray by a look-alike are led to the same place, however many there are.
+        independent = np.count_nonzero(queries.weights[rows] > _TELLING)
+        sure = bool(queries.trusted[rows].any() or independent >= 3) and rival < 0.5 * support
         placements.append(Placement(seed, rows, support, sure, rival))
     return placements
 
