@@ -1,6 +1,8 @@
 """The sequence stage on files: a rendered capture's query session with odometry, and poses of some of its queries."""
 
 import shutil
+import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +13,17 @@ from tests.localizers.drifting import PLACE, small_motion
 from toolkit import geometry
 from toolkit.capture import Session, Trajectory
 from toolkit.capture.tables import as_strings
+from toolkit.embed import embed_sessions
 from toolkit.errors import ManifestError
-from toolkit.files import pair_name
+from toolkit.files import SceneFiles, pair_name
+from toolkit.localize import localize_pairs
+from toolkit.retrieve import retrieve_pairs
 from toolkit.sequence import COLUMNS, sequence_pairs
+from toolkit.synthetic import capture as rendering
+from toolkit.synthetic import render_capture
+from toolkit.synthetic.devices import DEVICES, halved
+from toolkit.synthetic.recording import PICTURE_S, RATE_HZ, tracked
+from toolkit.synthetic.scene import Scene, build_room
 
 pytest.importorskip("gtsam")
 
@@ -126,6 +136,120 @@ def test_what_cannot_be_done_has_a_reason(place: Path, tmp_path: Path) -> None:
     assert (table.drop(("ios", "ios"))["frames"] == 0).all()
     with pytest.raises(ManifestError):
         sequence_pairs(place / "sessions", tmp_path / "poses", {"scale": 1.0})
+
+
+@dataclass(frozen=True)
+class Alike:
+    """Three rooms, the last looks exactly as the first, walked through twice in 120 s; each picture is localized."""
+
+    capture: Path
+    poses: Path
+    folder: Path
+
+    @property
+    def session(self) -> Session:
+        return Session(self.capture / "sessions/ios_query")
+
+    def pieces(self, rng: np.random.Generator, losses: int, gaps: int = 0, useless: float = 0.0) -> pd.DataFrame:
+        """Return what becomes of each piece of odometry, of which a share of the queries is useless.
+
+        Table: status, frames, queries with a pose, share of frames in a wrong room, median errors.
+        """
+        folder = Path(tempfile.mkdtemp(dir=self.folder))
+        sessions, truth = folder / self.capture.name / "sessions", self.session.ground_truth
+        assert truth is not None
+        for name in ("ios_map", "ios_query"):
+            shutil.copytree(
+                self.capture / "sessions" / name, sessions / name, ignore=shutil.ignore_patterns("raw_data")
+            )
+        rows, measured = [], []
+        for recording in self.session.subsessions:
+            own = np.flatnonzero([id_.startswith(f"{recording}/") for id_ in truth.device_ids])
+            kept, poses = tracked(
+                rng, truth.timestamps[own], truth.world_from_device[own], 1.0, PICTURE_S * RATE_HZ, losses, gaps
+            )
+            rows.append(own[kept])
+            measured.append(poses[kept])
+        kept = np.concatenate(rows)
+        odometry = Trajectory.from_poses(truth.timestamps[kept], truth.device_ids[kept], np.concatenate(measured))
+        odometry.write(sessions / "ios_query/trajectories.txt")
+        stem = folder / "poses" / pair_name(self.capture.name, "ios", "ios")
+        single, table = Trajectory.read(self.poses), pd.read_csv(self.poses.with_suffix(".csv"))
+        lost = np.isin(np.arange(len(table)), rng.permutation(len(table))[: round(useless * len(table))])
+        table.loc[lost, "status"] = "failed: black"
+        found = single.index.find(table["timestamp"][~lost], table["device_id"][~lost])
+        assert single.covariances is not None
+        Trajectory.from_poses(
+            single.timestamps[found], single.device_ids[found], single.world_from_device[found],
+            single.covariances[found],
+        ).write(stem.with_name(f"{stem.name}.txt"))  # fmt: skip
+        table.to_csv(stem.with_name(f"{stem.name}.csv"), index=False)
+        done = sequence_pairs(sessions, folder / "poses").iloc[0]
+        frames = pd.read_csv(str(done["path"]).replace(".txt", ".csv"), keep_default_na=False)
+        frames = frames[frames["recording"] != ""]
+        poses = Trajectory.read(done["path"]).lookup(frames["timestamp"], frames["device_id"])
+        known = truth.lookup(frames["timestamp"], frames["device_id"])
+        frames["deg"], frames["m"] = geometry.pose_error(poses, known)
+        pieces = frames.groupby(["recording", "piece"])
+        assert pieces["status"].nunique().eq(1).all()
+        assert len(pieces) == len(self.session.subsessions) * (losses + 1)
+        return pd.DataFrame(
+            {
+                "status": pieces["status"].first(), "frames": pieces.size(),
+                "queries": pieces["used"].apply(lambda used: (used != "").sum()),
+                "wrong": pieces["m"].apply(lambda m: (m > 5).mean()),
+                "median_m": pieces["m"].median(), "median_deg": pieces["deg"].median(),
+            }
+        )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def alike(tmp_path_factory: pytest.TempPathFactory) -> Alike:
+    def coarse_room(seed: int, index: int, look: int | None = None) -> Scene:
+        scene = build_room(seed, index, look)
+        for quad in scene.quads:
+            quad.ppm /= 2
+        return scene
+
+    folder = tmp_path_factory.mktemp("alike")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rendering, "build_room", coarse_room)
+        patch.setattr(rendering, "DEVICES", {"ios": halved(DEVICES["ios"])})
+        capture = render_capture(
+            folder / "ALIKE", 3, 16, seed=3, progress=False, alike=True, seconds=120, losses=1, radio=True
+        )
+    files, sessions, queries = SceneFiles(folder / "run", "ALIKE"), capture / "sessions", "keyframes_original"
+    embed_sessions(sessions, files.embeddings, features_dir=files.features)
+    retrieve_pairs(sessions, files.embeddings, out_jsonl=files.retrieval_dir, queries=queries)
+    folders = files.retrieval_dir, files.poses_dir, files.features, files.maps
+    localize_pairs(sessions, *folders, {"features": ["sift"]}, queries=queries)
+    return Alike(capture, files.poses_txt("ios", "ios"), folder)
+
+
+@pytest.mark.slow
+def test_no_piece_ends_in_a_wrong_room_that_looks_alike(alike: Alike) -> None:
+    table, truth = pd.read_csv(alike.poses.with_suffix(".csv")), alike.session.ground_truth
+    assert truth is not None
+    keys = table["timestamp"], table["device_id"]
+    single_m = geometry.pose_error(Trajectory.read(alike.poses).lookup(*keys), truth.lookup(*keys))[1]
+    wrong_room = single_m > 5
+    print(f"single: {wrong_room.sum()} of {len(table)} in the wrong room, {table['status'].value_counts().to_dict()}")
+    assert 4 <= wrong_room.sum() <= 12  # of 16 in rooms that look alike
+    assert not wrong_room[table["status"] == "ok"].any()
+    for useless in (0.0, 0.5):
+        rng = np.random.default_rng(0)
+        pieces = pd.concat([alike.pieces(rng, losses, 1, useless) for losses in (0, 1, 1, 2, 2, 3, 3, 4)])
+        ok, posed = pieces[pieces["status"] == "ok"], pieces[~pieces["status"].str.startswith("failed")]
+        print(f"{useless:.0%} of the queries useless")
+        print(pieces.assign(wrong=pieces["wrong"] > 0).groupby(["status", "wrong"])["frames"].agg(["size", "sum"]))
+        assert ok["wrong"].max() == 0
+        assert ok["median_m"].max() < 0.3
+        assert ok["median_deg"].max() < 1.0
+        assert ok["frames"].sum() > (0.6, 0.4)[useless > 0] * pieces["frames"].sum()
+        assert 0 < (posed["wrong"] > 0).sum() < 0.25 * len(pieces)
+        assert ((pieces["queries"] == 0) == pieces["status"].str.startswith("failed")).all()
+        # A recording that is one piece has been where the rooms are told apart.
+        assert (pieces["status"][pieces["frames"] > 550] == "ok").all()
 
 
 def test_a_map_session_has_no_odometry(place: Path) -> None:
