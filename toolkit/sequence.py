@@ -31,7 +31,7 @@ from toolkit.files import (
 from toolkit.geometry import Floats, Ints, pose_error
 from toolkit.localizers.base import PoseEstimate, RoughPose
 from toolkit.localizers.map import Map
-from toolkit.localizers.odometry import Odometry, PosedQueries
+from toolkit.localizers.odometry import Odometry, PosedQueries, recordings_of, subsessions_of
 from toolkit.localizers.picture import localize_image
 from toolkit.localizers.recording import localize_piece
 from toolkit.manifest import SequenceSettings
@@ -302,50 +302,22 @@ def _with_queries(session: Session, queries: pd.DataFrame, settings: SequenceSet
     known = odometry.index.find(queries["timestamp"].to_numpy(), as_strings(queries["device_id"])) >= 0
     if known.all():
         return odometry
-    recordings, poses = _recordings(session, odometry), odometry.world_from_device
-    missing = queries[~known].reset_index(drop=True)
-    devices = missing["device_id"].to_numpy(object)
-    of_each = _subsessions(session, devices)
-    alone = ~np.isin(of_each, recordings)  # devices that moved at the same time have a recording each
-    of_each[alone] = [f"{name} {device}".strip() for name, device in zip(of_each[alone], devices[alone], strict=True)]
+    poses, missing = odometry.world_from_device, queries[~known]
+    times, devices = missing["timestamp"].to_numpy(np.int64), missing["device_id"].to_numpy(object)
+    of_each = subsessions_of(session, devices)
+    of_device = np.array([f"{name} {device}".strip() for name, device in zip(of_each, devices, strict=True)], object)
     added = [(odometry.timestamps, odometry.device_ids, poses)]
-    for recording in dict.fromkeys(of_each.tolist()):
-        rows = np.flatnonzero(recordings == recording)
-        rows = rows[np.argsort(odometry.timestamps[rows], kind="stable")]
-        asked = np.flatnonzero(of_each == recording)
-        between, found = Odometry(odometry.timestamps[rows], poses[rows]).at(
-            missing["timestamp"].to_numpy(np.int64)[asked], settings
-        )
-        added.append((missing["timestamp"].to_numpy(np.int64)[asked[between]], devices[asked[between]], found))
+    for recording, rows in recordings_of(session, odometry).items():
+        asked = np.flatnonzero((of_each == recording) | (of_device == recording))
+        between, found = Odometry(odometry.timestamps[rows], poses[rows]).at(times[asked], settings)
+        added.append((times[asked[between]], devices[asked[between]], found))
     times, names, every = (np.concatenate(part) for part in zip(*added, strict=True))
     return Trajectory.from_poses(times, names, every)
 
 
 def _pieces(session: Session, odometry: Trajectory, settings: SequenceSettings) -> Iterator[_Piece]:
     """Yield the pieces of each recording, in the order of time."""
-    recordings = _recordings(session, odometry)
-    for recording in dict.fromkeys(recordings.tolist()):
-        rows = np.flatnonzero(recordings == recording)
-        rows = rows[np.argsort(odometry.timestamps[rows], kind="stable")]
+    for recording, rows in recordings_of(session, odometry).items():
         whole = Odometry(odometry.timestamps[rows], odometry.world_from_device[rows])
         for number, part in enumerate(whole.split(settings)):
             yield _Piece(recording, number, rows[part])
-
-
-def _recordings(session: Session, odometry: Trajectory) -> NDArray[np.object_]:
-    """Return the recording (N,) of each pose: its subsession; of devices that moved at the same time, each its own."""
-    devices = odometry.device_ids
-    recordings = _subsessions(session, devices)
-    for name in dict.fromkeys(recordings.tolist()):
-        rows = np.flatnonzero(recordings == name)
-        if len(np.unique(odometry.timestamps[rows])) < len(rows):
-            recordings[rows] = [f"{name} {device}".strip() for device in devices[rows]]
-    return recordings
-
-
-def _subsessions(session: Session, device_ids: NDArray[np.object_]) -> NDArray[np.object_]:
-    """Return the subsession (N,) of each device, empty where it is of none."""
-    found = np.full(len(device_ids), "", object)
-    for name in sorted(session.subsessions, key=len):
-        found[[device.startswith(f"{name}/") for device in device_ids]] = name
-    return found

@@ -1,5 +1,6 @@
 """What notebook 01 says of a capture with sessions that cannot be used."""
 
+import shutil
 from pathlib import Path
 
 from tests.test_embed import write_tiny_capture
@@ -22,3 +23,15 @@ def test_unusable_sessions_have_a_reason_and_the_others_are_drawn(tmp_path: Path
     assert len(draw_samples(capture, 1).axes) == 3
     assert "[m]" in draw_top_view(capture).axes[0].get_xlabel()
     assert "[" not in draw_top_view(capture, unit=None).axes[0].get_xlabel()
+
+
+def test_odometry_and_radio_are_told(small_capture: Path, tmp_path: Path) -> None:
+    table = describe(Capture.open(small_capture))
+    assert table["odometry"]["ios_map"] == table["radio"]["ios_query"] == ""
+    assert table["odometry"]["ios_query"] == "3 poses, 2 s, 2 pieces"
+    shutil.copytree(small_capture, tmp_path / "C")
+    session = tmp_path / "C/sessions/ios_query"
+    (session / "bt.txt").touch()
+    (session / "trajectories.txt").unlink()
+    table = describe(Capture.open(tmp_path / "C"))
+    assert (table["odometry"]["ios_query"], table["radio"]["ios_query"]) == ("", "bt")

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from toolkit import geometry
+from toolkit.capture import Session, Trajectory
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import SequenceSettings
 
@@ -106,6 +107,28 @@ class Odometry:
             nearest = np.minimum(np.minimum(np.append(off, np.inf), np.insert(off, 0, np.inf)), still)
             jumps |= nearest * seconds > least
         return jumps
+
+
+def recordings_of(session: Session, odometry: Trajectory) -> dict[str, Ints]:
+    """Return the rows of each recording, in the order of time: a subsession, or one device of those that move in it."""
+    subsessions, recordings = subsessions_of(session, odometry.device_ids), dict[str, Ints]()
+    for name in dict.fromkeys(subsessions.tolist()):
+        rows = np.flatnonzero(subsessions == name)
+        rows = rows[np.argsort(odometry.timestamps[rows], kind="stable")]
+        if len(np.unique(odometry.timestamps[rows])) == len(rows):
+            recordings[name] = rows
+            continue
+        devices = odometry.device_ids[rows]
+        recordings |= {f"{name} {device}".strip(): rows[devices == device] for device in dict.fromkeys(devices)}
+    return recordings
+
+
+def subsessions_of(session: Session, device_ids: NDArray[np.object_]) -> NDArray[np.object_]:
+    """Return the subsession (N,) of each device, empty where it is of none."""
+    found = np.full(len(device_ids), "", object)
+    for name in sorted(session.subsessions, key=len):
+        found[[device.startswith(f"{name}/") for device in device_ids]] = name
+    return found
 
 
 @dataclass(frozen=True)

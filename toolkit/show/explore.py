@@ -16,6 +16,8 @@ from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import CaptureError
 from toolkit.files import image_name, read_references
 from toolkit.geometry import Floats, unit
+from toolkit.localizers.odometry import Odometry, recordings_of
+from toolkit.manifest import SequenceSettings
 from toolkit.show.figures import GREEN, ORANGE, VERMILLION, new_figure, styled
 from toolkit.show.metrics import is_posed
 from toolkit.show.top_view import ground_axes, places_of
@@ -29,14 +31,16 @@ MAX_PLACES = 4
 def describe(capture: Capture, queries: str = "keyframes_pruned_subsampled") -> pd.DataFrame:
     """Return one row a session: counts of images, posed images, rigs, subsessions and queries asked.
 
-    What makes a session unusable for later stages is its `reason`.
+    `odometry` tells how many poses that of queries has, over how long, and in how many pieces between losses of
+    tracking (by the defaults of the stage `sequence`); `radio` which scans there are. What makes a session unusable
+    for later stages is its `reason`.
     """
     rows = []
     for name in capture:
         device, _, split = name.rpartition("_")
         row: dict[str, Any] = {"session": name, "device": device, "split": split}
         row |= dict.fromkeys(("images", "subsessions", "cameras", "rigs", "with pose", "queries"), 0)
-        row["reason"] = ""
+        row |= dict.fromkeys(("odometry", "radio", "reason"), "")
         rows.append(row)
         try:
             session = capture[name]
@@ -44,7 +48,8 @@ def describe(capture: Capture, queries: str = "keyframes_pruned_subsampled") -> 
                 "images": len(session.images), "subsessions": len(session.subsessions),
                 "cameras": int(session.sensors["sensor_type"].eq("camera").sum()),
                 "rigs": 0 if session.rigs is None else session.rigs["rig_id"].nunique(),
-                "with pose": len(_poses(session)),
+                "with pose": len(_poses(session)), "odometry": _odometry(session),
+                "radio": ", ".join(kind for kind in ("wifi", "bt") if (session.path / f"{kind}.txt").exists()),
             }  # fmt: skip
             if split == "query":
                 row["queries"] = len(session.keyframes(queries))
@@ -53,6 +58,17 @@ def describe(capture: Capture, queries: str = "keyframes_pruned_subsampled") -> 
         except CaptureError as error:
             row["reason"] = str(error)
     return pd.DataFrame(rows).set_index("session")
+
+
+def _odometry(session: Session) -> str:
+    if session.odometry is None:
+        return ""
+    times, poses = session.odometry.timestamps, session.odometry.world_from_device
+    pieces, seconds = 0, 0.0
+    for rows in recordings_of(session, session.odometry).values():
+        pieces += len(Odometry(times[rows], poses[rows]).split(SequenceSettings()))
+        seconds += np.ptp(times[rows]) / 1e6
+    return f"{len(times):,} poses, {seconds:,.0f} s, {pieces:,} piece{'s' if pieces > 1 else ''}"
 
 
 @styled
