@@ -184,15 +184,21 @@ class Alike:
             single.covariances[found],
         ).write(stem.with_name(f"{stem.name}.txt"))  # fmt: skip
         table.to_csv(stem.with_name(f"{stem.name}.csv"), index=False)
-        done = sequence_pairs(sessions, folder / "poses").iloc[0]
+        pieces = self.judged(sessions, folder / "poses", relocalize=False)
+        assert len(pieces) == len(self.session.subsessions) * (losses + 1)
+        return pieces
+
+    def judged(self, sessions: Path, poses_dir: Path, **settings: bool) -> pd.DataFrame:
+        """Return what becomes of each piece of odometry in the sequence stage, see `pieces`."""
+        done, truth = sequence_pairs(sessions, poses_dir, settings).iloc[0], self.session.ground_truth
+        assert truth is not None
         frames = pd.read_csv(str(done["path"]).replace(".txt", ".csv"), keep_default_na=False)
         frames = frames[frames["recording"] != ""]
-        poses = Trajectory.read(done["path"]).lookup(frames["timestamp"], frames["device_id"])
-        known = truth.lookup(frames["timestamp"], frames["device_id"])
-        frames["deg"], frames["m"] = geometry.pose_error(poses, known)
+        keys = frames["timestamp"], frames["device_id"]
+        poses = Trajectory.read(done["path"]).lookup(*keys)
+        frames["deg"], frames["m"] = geometry.pose_error(poses, truth.lookup(*keys))
         pieces = frames.groupby(["recording", "piece"])
         assert pieces["status"].nunique().eq(1).all()
-        assert len(pieces) == len(self.session.subsessions) * (losses + 1)
         return pd.DataFrame(
             {
                 "status": pieces["status"].first(), "frames": pieces.size(),
@@ -236,6 +242,10 @@ def test_no_piece_ends_in_a_wrong_room_that_looks_alike(alike: Alike) -> None:
     print(f"single: {wrong_room.sum()} of {len(table)} in the wrong room, {table['status'].value_counts().to_dict()}")
     assert 4 <= wrong_room.sum() <= 12  # of 16 in rooms that look alike
     assert not wrong_room[table["status"] == "ok"].any()
+    as_rendered = alike.judged(alike.capture / "sessions", alike.poses.parent)
+    print(f"as rendered, localized again with the predicted poses:\n{as_rendered}")
+    assert len(as_rendered) == 4
+    assert as_rendered["wrong"][as_rendered["status"] == "ok"].max() == 0
     for useless in (0.0, 0.5):
         rng = np.random.default_rng(0)
         pieces = pd.concat([alike.pieces(rng, losses, 1, useless) for losses in (0, 1, 1, 2, 2, 3, 3, 4)])
