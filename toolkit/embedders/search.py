@@ -21,6 +21,9 @@ _QUERY_BYTES = 512 << 20
 """Of the queries, in float32, that one pass over the database is for."""
 _PRODUCTS = 1 << 23
 """Of queries that have masks and rows of the database, that are in memory at a time."""
+_MASKED_ROWS = 1 << 12
+"""Of the database, in memory at a time where queries have masks: of so few, most queries find none, if masks leave
+parts of recordings."""
 _MORE = 16
 """Candidates beyond k: the backend's rounding may exchange neighbors in rank."""
 
@@ -116,11 +119,12 @@ def _search_part(
         rows = np.arange(k) if masks is None else np.flatnonzero(masks.choose(slice(number, number + 1)).rows(0, count))
         scores[number, : len(rows)], indices[number, : len(rows)] = 0, rows[:k]
     pending, width = np.flatnonzero(lengths), min(count, k + _MORE)
+    size = _BLOCK_BYTES if masks is None else min(_BLOCK_BYTES, 4 * query.shape[1] * _MASKED_ROWS)
     while len(pending):
         best = make_backend(
             query if len(pending) == len(query) else query[pending], None if masks is None else masks.choose(pending)
         )
-        rough, candidates, longest = _candidates(vectors, best, len(pending), width)
+        rough, candidates, longest = _candidates(vectors, best, len(pending), width, size)
         tolerance = 1e-5 * longest * lengths[pending]
         # Rounding in the backend cuts nothing off once the last candidate is clearly below rank k.
         done = (rough[:, -1] < rough[:, k - 1] - tolerance) | (width == count) | np.isneginf(rough[:, -1])
@@ -162,11 +166,17 @@ def _matrix(values: ArrayLike | StoredVectors, name: str) -> _Vectors:
     return matrix
 
 
-def _candidates(vectors: _Vectors, best: _Best, queries: int, width: int) -> tuple[NDArray[np.float32], Ints, float]:
-    """Return the `width` best scores and indices (Q, width), best first, up to rounding, and the longest length."""
+def _candidates(
+    vectors: _Vectors, best: _Best, queries: int, width: int, size: int
+) -> tuple[NDArray[np.float32], Ints, float]:
+    """Return the `width` best scores and indices (Q, width), best first, up to rounding, and the longest length.
+
+    Args:
+        size: bytes of a block of the database.
+    """
     scores, indices = np.zeros((queries, 0), np.float32), np.zeros((queries, 0), np.int64)
     longest = 0.0
-    for start, block in blocks(vectors, _BLOCK_BYTES):
+    for start, block in blocks(vectors, size):
         length = float(np.sqrt(np.einsum("nd,nd->n", block, block).max()))
         if not np.isfinite(length):
             require_finite(block, "database", start)
@@ -255,7 +265,7 @@ def _masked(
     step = max(1, _PRODUCTS // len(block))
     for first in range(0, len(query), step):
         allowed = masks.choose(slice(first, first + step)).rows(start, start + len(block))
-        finds = np.flatnonzero(allowed.any(axis=1))  # many priors leave neighbors in a recording: few blocks
+        finds = np.flatnonzero(allowed.any(axis=1))
         if len(finds):
             found = best(query[first + finds], block, allowed[finds], number)
             scores[first + finds], indices[first + finds] = found
