@@ -9,7 +9,8 @@ import pandas as pd
 import pytest
 
 from tests.test_embed import HL_RIG, write_tiny_capture
-from toolkit.capture.masks import Masks
+from toolkit.capture import Capture
+from toolkit.capture.masks import Masks, near
 from toolkit.embed import embed_sessions
 from toolkit.embedders import StoredVectors
 from toolkit.embedders import search as search_module
@@ -17,6 +18,7 @@ from toolkit.errors import ArtifactError, CaptureError, ManifestError
 from toolkit.files import sidecar_path
 from toolkit.geometry import unit
 from toolkit.retrieve import load_embeddings, retrieve_pairs, search
+from toolkit.synthetic import render_capture
 
 BACKENDS = ["faiss", "torch"]
 
@@ -433,3 +435,28 @@ def test_references_come_from_near_rough_poses_and_fixes(tiny: Path, tmp_path: P
     assert (again["skipped"], again["without_poses"]) == (False, 1)
     with pytest.raises(ManifestError, match=r"retrieve\.mask\.poses: no such file: .*nowhere\.txt.*trajectories\.txt"):
         retrieve(poses=str(tmp_path / "nowhere.txt"))
+
+
+@pytest.mark.slow
+def test_radio_finds_the_right_one_of_two_rooms_that_look_alike(tmp_path: Path) -> None:
+    capture = render_capture(tmp_path / "ALIKE", 2, 12, progress=False, alike=True, radio=True)
+    embed_sessions(capture / "sessions", tmp_path / "embeddings")
+    truth = {
+        session.path.name: dict(zip(session.images["path"], session.world_from_cam(ground_truth=True), strict=True))
+        for session in (Capture.open(capture)[f"{device}_query"] for device in ("ios", "hl", "spot"))
+    }
+    for radio in (False, True):
+        settings = {"mask": {"radio": radio}}
+        table = retrieve_pairs(
+            capture / "sessions", tmp_path / "embeddings", settings=settings, queries="keyframes_original"
+        )
+        right, good = [], []
+        for record in (record for path in table["path"] for record in lines(path)):
+            name, _, path = record["path"].removeprefix("ALIKE/sessions/").partition("/raw_data/")
+            pose, reference = truth[name][path], np.array(record["topk"][0]["Tws"])
+            right.append((pose[0, 3] > 13) == (reference[0, 3] > 13))  # the second room is 27 m away along x
+            good.append(near(reference[None], pose, 8, 45)[0])
+        print(f"{radio=}: {np.mean(right):.1%} of {len(right)} in the right room, {np.mean(good):.1%} good references")
+        assert len(right) == 216
+        assert np.mean(right) > 0.95 if radio else np.mean(right) < 0.8
+        assert np.mean(good) > 0.9 if radio else np.mean(good) < 0.8
