@@ -742,7 +742,8 @@ def test_a_picture_is_turned_for_what_the_run_turned_images_for(
     place = Map.open(files.run, files.scene, "ios")
     place.settings = LocalizeSettings.of({"method": "vggt", "predictor": {"upright": upright is None}})
     place.embed_settings = EmbedSettings.of({"upright": upright})  # type: ignore[misc]
-    place.embedder = learned = Learned(np.ones(place._descriptors[0].shape[1], np.float32))  # type: ignore[misc]
+    learned = Learned(np.ones(place._descriptors[0].shape[1], np.float32))
+    place.embedders = [learned]  # type: ignore[misc]
     asked: list[Query] = []
     answer = SimpleNamespace(localize=lambda query, _: asked.append(query), image_names=[])
     place.localizer = answer  # type: ignore[misc, assignment]
@@ -908,14 +909,14 @@ def test_a_learned_embedder_is_given_colors(small_capture: Path, finished: tuple
     place = Map.open(files.run, files.scene, "ios")
     expected = localize_image(place, path, camera)
     store = extract_session(session, files.features)
-    learned = Learned(place.embedder.embed([store[session.image_name(0)]])[0])
-    place.embedder = learned  # type: ignore[misc]
+    learned = Learned(place.embedders[0].embed([store[session.image_name(0)]])[0])
+    place.embedders = [learned]  # type: ignore[misc]
     np.testing.assert_array_equal(localize_image(place, path, camera).world_from_rig, expected.world_from_rig)
     assert learned.seen == [(camera.height, camera.width, 3)]
     learned.least_side = camera.height // 4
     np.testing.assert_array_equal(localize_image(place, path, camera).world_from_rig, expected.world_from_rig)
     assert learned.seen[1] == (camera.height // 4, camera.width // 4, 3), "as the stage decodes it"
-    place.embedder = Learned(np.zeros(7, np.float32))  # type: ignore[misc]
+    place.embedders = [Learned(np.zeros(7, np.float32))]  # type: ignore[misc]
     with pytest.raises(ArtifactError, match="learned gives 7"):
         localize_image(place, path, camera)
 
@@ -1053,7 +1054,7 @@ def test_a_picture_has_the_references_of_a_run_with_an_index(small_capture: Path
     of_run.write_text(json.dumps(json.loads(of_run.read_text()) | {"faiss_gpu": True}))  # where the run was
     place = Map.open(run.run, run.scene, "ios")
     vectors, table = load_embeddings(run.embeddings / "ios_query")
-    found = dict(zip(table["abs_path"], place.retrieve(vectors), strict=True))
+    found = dict(zip(table["abs_path"], place.retrieve([vectors]), strict=True))
     names = place.localizer.image_names
     rows = read_references(run.retrieval("ios", "ios"))
     assert len(rows) >= 3

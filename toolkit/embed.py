@@ -1,6 +1,8 @@
 """Global descriptors of all images of a capture: one matrix and one table a subsession."""
 
 import logging
+import os
+import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +20,7 @@ from toolkit.capture import Capture, Session
 from toolkit.capture.images import default_workers, prefetch, read_image
 from toolkit.capture.turning import turn_image
 from toolkit.capture.upright import Turns, upright_turns
-from toolkit.embedders import Embedder, create_embedder, resolve_name
+from toolkit.embedders import WEIGHTS, Embedder, create_embedder, resolve_model
 from toolkit.errors import CaptureError, ImageError, ManifestError, ToolkitError
 from toolkit.features.features import LocalFeatures, SiftExtractor
 from toolkit.features.groups import GroupWriter, heals, sweep
@@ -28,6 +30,7 @@ from toolkit.files import (
     files_fingerprint,
     fingerprint,
     is_current,
+    read_json,
     sidecar_path,
     write_atomic,
     write_sidecar,
@@ -35,6 +38,7 @@ from toolkit.files import (
 )
 from toolkit.geometry import Ints, unit
 from toolkit.manifest import EmbedSettings
+from toolkit.models.weights import resolve_weights
 
 log = logging.getLogger(__name__)
 
@@ -57,6 +61,8 @@ def embed_sessions(
 ) -> pd.DataFrame:
     """Write `<out_dir>/<session>/<subsession>/<subsession>.npy` (N, D) and its `manifest.csv`.
 
+    Of several models, each writes the same below `<out_dir>/<model>`.
+
     Images that cannot be read are left out of both, and listed with the reason in `failed.csv` beside them.
     Memory does not grow with the number of images, and a killed run goes on within a subsession.
 
@@ -70,8 +76,8 @@ def embed_sessions(
         skip_existing: reuse subsessions made from the same images and settings.
 
     Returns:
-        One row a subsession: session, subsession, images, embedded, unreadable, turned, seconds, skipped, model,
-        dim, reason; and one for each session that cannot be read, with the `reason`.
+        One row a subsession and model: session, subsession, images, embedded, unreadable, turned, seconds, skipped,
+        model, dim, reason; and one for each session that cannot be read, with the `reason`.
 
     Raises:
         CaptureError: no session can be read.
@@ -82,8 +88,63 @@ def embed_sessions(
     out_dir = Path(out_dir)
     features_dir = Path(features_dir) if features_dir is not None else out_dir.parent / "features"
     capture = Capture.from_sessions_root(sessions_root)
+    named = resolve_model(settings.model, settings.checkpoint)
+    if settings.model == "auto":
+        log.warning("model auto: %s", named)
+    settings = settings.model_copy(update={"model": named})
+    several = len(settings.models) > 1
+    if several:
+        for name in settings.models:
+            if name in WEIGHTS:  # before the work of another one
+                resolve_weights(WEIGHTS[name], settings.checkpoint)
+    tables = []
+    for name in settings.models:
+        # What a run with this model alone left is taken over into the model's own folder, and the other way round.
+        own, other = (out_dir / name, out_dir) if several else (out_dir, out_dir / name)
+        chosen = settings.model_copy(update={"model": name})
+        folders = _Folders(own, other if skip_existing else None, features_dir)
+        tables.append(_embed_with_one(capture, folders, chosen, device, subsession, skip_existing))
+    write_text(out_dir / "settings.json", settings.model_dump_json(indent=1) + "\n")
+    return pd.concat(tables, ignore_index=True) if several else tables[0]
+
+
+@dataclass(frozen=True)
+class _Folders:
+    """Where the embeddings of one model go, and what they are made of."""
+
+    out: Path
+    other: Path | None
+    """Where the same may lie; None: nothing is taken over."""
+    features: Path
+
+    def take_over(self, path: Path, record: Mapping[str, Any]) -> None:
+        """Take an artifact and the files of its record from the other folder, if it is current there and not here."""
+        wanted = dict(record)
+        found = self.other / path.relative_to(self.out) if self.other is not None else path
+        if found == path or is_current(path, wanted) or not is_current(found, wanted):
+            return
+        (path.parent / "failed.csv").unlink(missing_ok=True)
+        # Files are replaced and never changed, so that both places can share them.
+        for name in [*read_json(sidecar_path(found))["files"], sidecar_path(found).name]:
+            with write_atomic(path.with_name(name)) as temporary:
+                try:
+                    temporary.unlink()
+                    os.link(found.with_name(name), temporary)
+                except OSError:  # a file system without links
+                    shutil.copyfile(found.with_name(name), temporary)
+
+
+def _embed_with_one(
+    capture: Capture,
+    folders: _Folders,
+    settings: EmbedSettings,
+    device: str,
+    subsession: str,
+    skip_existing: bool,
+) -> pd.DataFrame:
+    out_dir, features_dir = folders.out, folders.features
     parts, left_out = _subsessions(capture, device, subsession)
-    embedder = _open_embedder(capture, settings, out_dir, features_dir, skip_existing)
+    embedder = _open_embedder(capture, settings, folders, skip_existing)
     if (turns := _turns(capture, embedder, settings)) is not None:
         parts = [replace(part, turns=turns.of(part.session, part.rows)) for part in parts]
     if subsession == "all":
@@ -110,6 +171,7 @@ def embed_sessions(
             "normalize": settings.normalize,
             "dtype": settings.dtype,
         }
+        folders.take_over(matrix_path, record)
         skipped = skip_existing and is_current(matrix_path, record)
         if skipped:
             sweep(matrix_path)
@@ -143,8 +205,6 @@ def embed_sessions(
         )
     nothing = {name: type(value)() for name, value in table[0].items()}
     table += [{**nothing, "session": name, "reason": reason} for name, reason in left_out.items()]
-    made_with = settings.model_copy(update={"model": embedder.name})
-    write_text(out_dir / "settings.json", made_with.model_dump_json(indent=1) + "\n")
     return pd.DataFrame(table)
 
 
@@ -160,14 +220,10 @@ class _Subsession:
     """(N,) counter-clockwise quarter turns that make each image upright for the embedder."""
 
 
-def _open_embedder(
-    capture: Capture, settings: EmbedSettings, out_dir: Path, features_dir: Path, skip_existing: bool
-) -> Embedder:
-    name = resolve_name(settings.model, settings.checkpoint)
-    if settings.model == "auto":
-        log.warning("model auto: %s", name)
+def _open_embedder(capture: Capture, settings: EmbedSettings, folders: _Folders, skip_existing: bool) -> Embedder:
+    (name,) = settings.models
     if name == "vlad":
-        return create_embedder(name, vocabulary=_vocabulary(capture, out_dir, features_dir, settings, skip_existing))
+        return create_embedder(name, vocabulary=_vocabulary(capture, folders, settings, skip_existing))
     return create_embedder(
         name,
         checkpoint=settings.checkpoint,
@@ -232,9 +288,7 @@ def _remove_former(out_dir: Path, names: list[str], parts: list[_Subsession]) ->
                     path.unlink(missing_ok=True)
 
 
-def _vocabulary(
-    capture: Capture, out_dir: Path, features_dir: Path, settings: EmbedSettings, skip_existing: bool
-) -> Path:
+def _vocabulary(capture: Capture, folders: _Folders, settings: EmbedSettings, skip_existing: bool) -> Path:
     """Learn the VLAD vocabulary from the map images of all devices, unless a current one is there."""
     from toolkit.embedders.vlad import Vlad
 
@@ -255,7 +309,8 @@ def _vocabulary(
         "images": {name: _images_fingerprint(capture[name], np.array(rows)) for name, rows in chosen.items()},
         "seed": settings.seed,
     }
-    path = out_dir / "vlad.npz"
+    path, features_dir = folders.out / "vlad.npz", folders.features
+    folders.take_over(path, record)
     if skip_existing and is_current(path, record):
         return path
     stores = {name: extract_session(capture[name], features_dir, rows=np.array(rows)) for name, rows in chosen.items()}

@@ -21,7 +21,7 @@ from typing import Any
 from toolkit.capture.devices import extra_devices, table_record
 from toolkit.capture.names import allow_outside
 from toolkit.embedders import WEIGHTS as EMBEDDER_WEIGHTS
-from toolkit.embedders import resolve_name
+from toolkit.embedders import resolve_model
 from toolkit.errors import ManifestError, StageError, exit_code, sentence
 from toolkit.exchange.download import is_unfinished
 from toolkit.features.matching import local_weights, resolve_auto
@@ -309,7 +309,7 @@ def tree_fingerprint(folder: Path, of: Callable[[str], bool] | None = None, cont
 def _name_embedder(manifest: Manifest, say: Say) -> Manifest:
     """Return the manifest with the embedder that `auto` stands for; refuses an unknown one."""
     settings = manifest.embed
-    name = resolve_name(settings.model, settings.checkpoint)
+    name = resolve_model(settings.model, settings.checkpoint)
     if name != settings.model:
         say(f"embed.model {settings.model}: {name}")
     return manifest.model_copy(update={"embed": settings.model_copy(update={"model": name})})
@@ -324,8 +324,7 @@ def _require_weights(stage: str, settings: Settings) -> None:
 def _weights_needed(stage: str, settings: Settings) -> list[tuple[WeightsSource, str | None]]:
     """Return the weights of each network that a stage runs with these settings, and the file given for them."""
     if isinstance(settings, EmbedSettings):
-        weights = EMBEDDER_WEIGHTS.get(settings.model)
-        return [] if weights is None else [(weights, settings.checkpoint)]
+        return [(EMBEDDER_WEIGHTS[name], settings.checkpoint) for name in settings.models if name in EMBEDDER_WEIGHTS]
     needed: list[tuple[WeightsSource, str | None]] = []
     if isinstance(settings, LocalizeSettings):
         if settings.method == "nearest":

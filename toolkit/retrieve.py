@@ -18,7 +18,7 @@ from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.masks import Masks, combine, gps_masks, pose_masks, radio_masks
 from toolkit.capture.session import SUBSESSIONS
 from toolkit.capture.tables import SIGNALS
-from toolkit.embedders import StoredVectors, load_embeddings, open_embeddings
+from toolkit.embedders import Vectors, embedding_folders, load_embeddings, open_descriptors
 from toolkit.embedders.index import EXACT, is_made, make_index
 from toolkit.embedders.search import Backend, Found, search
 from toolkit.embedders.stored import made_of
@@ -159,7 +159,7 @@ class _Images:
 
     session: Session
     rows: Ints
-    vectors: StoredVectors
+    vectors: Vectors
     table: pd.DataFrame
     keyframes: int = 0
     keyframes_missing: int = 0
@@ -173,16 +173,16 @@ class _Images:
 
 
 def _load(session: Session, embeddings: Path, normalize: bool) -> _Images:
-    folder = embeddings / session.id
-    vectors, table = open_embeddings(folder)
+    vectors, table = open_descriptors(embeddings, session.id, normalize)
     names = table["abs_path"].str.split(f"/sessions/{session.path.name}/raw_data/", n=1, regex=False).str[-1]
     rows = pd.Index(session.images["path"]).get_indexer(names)
     if (rows < 0).any():
         raise ArtifactError(
-            f"{folder}: {(rows < 0).sum()} embedded images are not in {session.path / 'images.txt'}, first "
-            f"{table['abs_path'][int(np.argmax(rows < 0))]}. They are of another capture: embed again."
+            f"{embeddings / session.id}: {(rows < 0).sum()} embedded images are not in "
+            f"{session.path / 'images.txt'}, first {table['abs_path'][int(np.argmax(rows < 0))]}. They are of another "
+            "capture: embed again."
         )
-    return _Images(session, rows, replace(vectors, normalize=normalize), table)
+    return _Images(session, rows, vectors, table)
 
 
 def _load_database(session: Session, embeddings: Path, normalize: bool) -> _Images:
@@ -217,10 +217,11 @@ def _load_queries(session: Session, embeddings: Path, queries: str, normalize: b
 
 
 def _require_same_dimension(query: _Images, database: _Images) -> None:
-    if query.vectors.dim != database.vectors.dim:
+    if query.vectors.dims != database.vectors.dims:
+        ours, theirs = (" + ".join(map(str, images.vectors.dims)) for images in (database, query))
         raise ArtifactError(
-            f"map {database.session.id}, query {query.session.id}: the map's embeddings have {database.vectors.dim} "
-            f"dimensions, the query's {query.vectors.dim}. They are of different models: embed both again with one."
+            f"map {database.session.id}, query {query.session.id}: the map's embeddings have {ours} "
+            f"dimensions, the query's {theirs}. They are of different models: embed both again with one."
         )
 
 
@@ -236,14 +237,14 @@ def _search(
     Raises:
         ArtifactError: a value is not finite.
     """
-    stacked = StoredVectors.stack([query.vectors for query in queries.values()])
+    stacked = type(database.vectors).stack([query.vectors for query in queries.values()])  # type: ignore[misc]
     backend: Backend = "faiss" if settings.use_faiss else "torch"
     masks = [query.masks for query in queries.values() if query.masks is not None]
     try:
         index = make_index(embeddings, database.session.id, database.vectors, settings, skip_existing)
         found = search(
             stacked, database.vectors, settings.topk, backend, settings.compute_device, settings.faiss_gpu, index,
-            Masks.stack(masks) if masks else None,
+            Masks.stack(masks) if masks else None, database.vectors.dims,
         )  # fmt: skip
     except ValueError as error:
         of = ", ".join(query.session.id for query in queries.values())
@@ -276,7 +277,8 @@ def _records(table: pd.DataFrame, *columns: str) -> list[dict[str, Any]]:
 
 def _inputs(session: Session, embeddings: Path) -> list[Any]:
     """Identify what a session contributes to a pair's file: its embeddings, poses and calibration."""
-    matrices = sorted((embeddings / session.id).rglob("*.npy"))
+    folders = [folder / session.id for folder in embedding_folders(embeddings).values()]
+    matrices = [path for folder in folders for path in sorted(folder.rglob("*.npy"))]
     texts = [session.path / name for name in ("images.txt", "trajectories.txt", "rigs.txt")]
     return [made_of(matrices), [file_fingerprint(path) for path in texts if path.exists()]]
 

@@ -216,7 +216,7 @@ class _Relocalizer:
     def __call__(self, queries: pd.DataFrame, near: Sequence[RoughPose]) -> list[PoseEstimate]:
         """Return an estimate of each query, given by `timestamp` and `device_id`."""
         session, place = self._session, self._place
-        _ = place.localizer, place.embedder  # opened before threads ask for them
+        _ = place.localizer, place.embedders  # opened before threads ask for them
         rows_of_each = session.rows_of_keyframes(queries)
 
         def localize(number: int) -> PoseEstimate:

@@ -8,7 +8,15 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from toolkit.embedders.stored import MANIFEST_COLUMNS, StoredVectors, load_embeddings, open_embeddings
+from toolkit.embedders.stored import (
+    MANIFEST_COLUMNS,
+    StoredVectors,
+    Vectors,
+    embedding_folders,
+    load_embeddings,
+    open_descriptors,
+    open_embeddings,
+)
 from toolkit.errors import ManifestError
 from toolkit.models.weights import MEGALOC, find_weights
 
@@ -67,6 +75,13 @@ def resolve_name(name: str, checkpoint: str | Path | None = None) -> str:
     if name not in EMBEDDERS:
         raise ManifestError(f"Unknown embedder {name!r}. Known: {', '.join([*sorted(EMBEDDERS), 'auto'])}.")
     return name
+
+
+def resolve_model(model: str | list[str], checkpoint: str | Path | None = None) -> str | list[str]:
+    """Return the embedder that a name stands for, or those of several names; see `resolve_name`."""
+    if isinstance(model, str):
+        return resolve_name(model, checkpoint)
+    return [resolve_name(name, checkpoint) for name in model]
 
 
 def create_embedder(name: str, **options: Any) -> Embedder:

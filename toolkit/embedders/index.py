@@ -16,7 +16,7 @@ import faiss as typed_faiss
 import numpy as np
 from numpy.typing import NDArray
 
-from toolkit.embedders.stored import StoredVectors, blocks, made_of, require_finite
+from toolkit.embedders.stored import JoinedVectors, StoredVectors, Vectors, blocks, made_of, require_finite
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError, first_line
 from toolkit.files import (
     fingerprint,
@@ -104,19 +104,38 @@ class VectorIndex:
         return faiss.SearchParameters(**chosen) if chosen else None
 
 
+@dataclass(frozen=True)
+class JoinedIndex:
+    """The indexes of several descriptors of the same images, side by side: each finds candidates."""
+
+    parts: tuple[VectorIndex, ...]
+    dims: tuple[int, ...]
+
+    @property
+    def candidates(self) -> int:
+        return sum(part.candidates for part in self.parts)
+
+    def find(self, query: NDArray[np.float32], allowed: NDArray[np.bool_] | None = None) -> Ints:
+        """Return for each query (Q, sum of D) what any of the indexes finds, (Q, C); rows may come twice."""
+        queries = np.split(query, np.cumsum(self.dims)[:-1], axis=1)
+        found = [part.find(np.ascontiguousarray(of), allowed) for part, of in zip(self.parts, queries, strict=True)]
+        return np.hstack(found)
+
+
 def make_index(
     embeddings: Path,
     map_id: str,
-    vectors: StoredVectors,
+    vectors: Vectors,
     settings: RetrieveSettings,
     skip_existing: bool = True,
-) -> VectorIndex | None:
+) -> VectorIndex | JoinedIndex | None:
     """Return the index of a map, made if it is not there; None where none is needed, see `load_index`.
 
     Memory is taken for the index and for 1 GB of vectors.
 
     Args:
-        embeddings: folder of the embeddings; the index is a file in `index` beside it.
+        embeddings: folder of the embeddings; the index is a file in `index` beside it, of each of several descriptors
+            one in a folder of its name.
         map_id: the map session.
         vectors: (N, D) of the map.
         skip_existing: take the file if it is of these vectors.
@@ -125,6 +144,8 @@ def make_index(
         ManifestError: there is no such index, or it cannot be made of so many vectors.
         ValueError: a value is not finite.
     """
+    if isinstance(vectors, JoinedVectors):
+        return _join(vectors, lambda name, part: make_index(embeddings, name, part, settings, skip_existing), map_id)
     if not _is_needed(settings, vectors):
         return None
     path, record = _index_path(embeddings, map_id), _record(vectors, settings)
@@ -134,15 +155,27 @@ def make_index(
     return _open(path, record, vectors, settings)
 
 
-def is_made(embeddings: Path, map_id: str, vectors: StoredVectors, settings: RetrieveSettings) -> bool:
+def _join(
+    vectors: JoinedVectors, of_one: Callable[[str, StoredVectors], VectorIndex | JoinedIndex | None], map_id: str
+) -> JoinedIndex | None:
+    """Return the indexes of all descriptors, or None if one of them needs none."""
+    parts = [of_one(f"{name}/{map_id}", part) for name, part in vectors.parts.items()]
+    single = tuple(part for part in parts if isinstance(part, VectorIndex))
+    return JoinedIndex(single, vectors.dims) if len(single) == len(parts) else None
+
+
+def is_made(embeddings: Path, map_id: str, vectors: Vectors, settings: RetrieveSettings) -> bool:
     """Tell whether `load_index` finds what it looks for."""
+    if isinstance(vectors, JoinedVectors):
+        parts = vectors.parts.items()
+        return all(is_made(embeddings, f"{name}/{map_id}", part, settings) for name, part in parts)
     needed = _is_needed(settings, vectors)
     return not needed or is_current(_index_path(embeddings, map_id), _record(vectors, settings))
 
 
 def load_index(
-    embeddings: Path, map_id: str, vectors: StoredVectors, settings: RetrieveSettings
-) -> VectorIndex | None:
+    embeddings: Path, map_id: str, vectors: Vectors, settings: RetrieveSettings
+) -> VectorIndex | JoinedIndex | None:
     """Return the index that the retrieve stage made of the vectors of a map; None if the settings ask for none.
 
     A map of no more vectors than candidates, cells or dimensions of PCA needs none either.
@@ -150,6 +183,8 @@ def load_index(
     Raises:
         ArtifactError: it is missing or damaged, or of other vectors.
     """
+    if isinstance(vectors, JoinedVectors):
+        return _join(vectors, lambda name, part: load_index(embeddings, name, part, settings), map_id)
     if not _is_needed(settings, vectors):
         return None
     return _open(_index_path(embeddings, map_id), _record(vectors, settings), vectors, settings)

@@ -1,15 +1,15 @@
 """Exact nearest neighbors among global descriptors, by whatever library is quick at it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.masks import Masks
-from toolkit.embedders.index import VectorIndex
-from toolkit.embedders.stored import StoredVectors, blocks, require_finite
+from toolkit.embedders.index import JoinedIndex, VectorIndex
+from toolkit.embedders.stored import Vectors, blocks, require_finite
 from toolkit.errors import ToolkitError
 from toolkit.geometry import Ints
 from toolkit.models.compute import resolve_device
@@ -26,22 +26,25 @@ _MASKED_ROWS = 1 << 12
 parts of recordings."""
 _MORE = 16
 """Candidates beyond k: the backend's rounding may exchange neighbors in rank."""
+_GAMMA = 0.5
+"""Of the generalized harmonic mean. With it no similarity of n >= 2 unit vectors is below its pole, -n/2."""
 
 Found = tuple[NDArray[np.float32], Ints]
 _Best = Callable[[NDArray[np.float32], int, int], Found]
 """Finds in a block of the database, which begins at a row, for each query so many of the best."""
-_Vectors = NDArray[np.float32] | StoredVectors
+_Vectors = NDArray[np.float32] | Vectors
 
 
 def search(
-    query: ArrayLike | StoredVectors,
-    database: ArrayLike | StoredVectors,
+    query: ArrayLike | Vectors,
+    database: ArrayLike | Vectors,
     k: int,
     backend: Backend = "faiss",
     compute_device: str = "cpu",
     faiss_gpu: bool = False,
-    index: VectorIndex | None = None,
+    index: VectorIndex | JoinedIndex | None = None,
     allowed: NDArray[np.bool_] | Masks | None = None,
+    dims: Sequence[int] = (),
 ) -> Found:
     """Return the rows of the database with the largest dot products, best first; equal ones by index.
 
@@ -49,7 +52,7 @@ def search(
     scores are then computed alike for all backends, so that the result does not depend on it.
 
     Args:
-        query, database: (Q, D) and (N, D), any float type; `StoredVectors` stay on disk.
+        query, database: (Q, D) and (N, D), any float type; `StoredVectors` and `JoinedVectors` stay on disk.
         k: how many; at most N are returned.
         backend: `faiss` or `torch`.
         compute_device: where torch computes: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
@@ -57,6 +60,8 @@ def search(
         index: of the database; finds the candidates instead of the backend. What it misses is missing.
         allowed: (N,) which rows of the database may be found, or masks of each query; None: all. With masks of each,
             faiss without an index leaves the products to NumPy, on the CPU.
+        dims: of several descriptors side by side in each row, how many of the D columns each has, in order: their
+            products are fused, see `fuse`, by torch whatever the backend. Empty: one.
 
     Returns:
         Scores (Q, K) float32 and indices (Q, K) int64, K = min(k, N); -inf and -1 where an index found no more, or no
@@ -68,6 +73,8 @@ def search(
     query, vectors = _matrix(query, "query"), _matrix(database, "database")
     if query.shape[1] != vectors.shape[1]:
         raise ValueError(f"query has {query.shape[1]} dimensions, the database {vectors.shape[1]}.")
+    if dims and sum(dims) != query.shape[1]:
+        raise ValueError(f"dims is {list(dims)}; expected a sum of {query.shape[1]}.")
     if k < 1:
         raise ValueError(f"k is {k}; expected at least 1.")
     k = min(k, len(vectors))
@@ -78,16 +85,16 @@ def search(
         )
     if isinstance(allowed, Masks) and index is not None and k:
         for queries, mask in allowed.distinct():
-            those = query.choose(queries) if isinstance(query, StoredVectors) else query[queries]
-            found = search(those, vectors, k, backend, compute_device, faiss_gpu, index, mask)
+            those = query.choose(queries) if isinstance(query, Vectors) else query[queries]
+            found = search(those, vectors, k, backend, compute_device, faiss_gpu, index, mask, dims)
             scores[queries], indices[queries] = found
         return scores, indices
     # Among few allowed rows an index finds next to none: what it looks at is chosen by all rows.
     if isinstance(allowed, np.ndarray) and (index is None or np.count_nonzero(allowed) <= index.candidates):
         rows = np.flatnonzero(allowed)
-        chosen = vectors.choose(rows) if isinstance(vectors, StoredVectors) else vectors[rows]
+        chosen = vectors.choose(rows) if isinstance(vectors, Vectors) else vectors[rows]
         if len(rows):
-            found = search(query, chosen, k, backend, compute_device, faiss_gpu)
+            found = search(query, chosen, k, backend, compute_device, faiss_gpu, dims=dims)
             scores[:, : len(rows)], indices[:, : len(rows)] = found[0], rows[found[1]]
         return scores, indices
     for start, part in blocks(query, _QUERY_BYTES) if k else ():
@@ -95,12 +102,35 @@ def search(
         here = slice(start, start + len(part))
         if index is not None:
             mask = allowed if isinstance(allowed, np.ndarray) else None
-            _compare(part, vectors, index.find(part, mask), scores[here], indices[here])
+            _compare(part, vectors, index.find(part, mask), scores[here], indices[here], dims)
             continue
-        make = partial(_backend, backend=backend, compute_device=compute_device, faiss_gpu=faiss_gpu)
+        make = partial(_backend, backend=backend, compute_device=compute_device, faiss_gpu=faiss_gpu, dims=dims)
         masks = allowed.choose(here) if isinstance(allowed, Masks) else None
-        _search_part(part, vectors, make, masks, scores[here], indices[here])
+        _search_part(part, vectors, make, masks, scores[here], indices[here], dims)
     return scores, indices
+
+
+def fuse(similarities: Sequence[Any]) -> Any:
+    """Return the generalized harmonic mean of n similarities (arrays or tensors of one shape), in the same shape.
+
+    1 / mean(1 / (gamma + s / n)) - gamma with gamma = 0.5, as kapture-localization and the LaMAR benchmark fuse: M.
+    Humenberger et al., "Investigating the Role of Image Retrieval for Visual Localization", IJCV 2022, after G. Csurka
+    and S. Clinchant, "An Empirical Study of Fusion Operators for Multimodal Image Retrieval", CBMI 2012. It grows with
+    each similarity, and is 1 / n where all are 1. A similarity of 0, such as that of an image without structure, leaves
+    the order to the others; at the pole, -n / 2, and below, which only vectors longer than 1 have, it is -gamma.
+    """
+    count = len(similarities)
+    with np.errstate(divide="ignore"):
+        return count / sum(1 / (_GAMMA + each / count).clip(min=0) for each in similarities) - _GAMMA
+
+
+def _fused(query: Any, vectors: Any, dims: Sequence[int], product: Callable[[Any, Any], Any]) -> Any:
+    """Return the product of queries (..., D) and vectors (..., D); of several descriptors, their fused products."""
+    if len(dims) < 2:
+        return product(query, vectors)
+    ends = np.cumsum(dims).tolist()
+    cuts = [slice(end - dim, end) for dim, end in zip(dims, ends, strict=True)]
+    return fuse([product(query[..., cut], vectors[..., cut]) for cut in cuts])
 
 
 def _search_part(
@@ -110,6 +140,7 @@ def _search_part(
     masks: Masks | None,
     scores: NDArray[np.float32],
     indices: Ints,
+    dims: Sequence[int],
 ) -> None:
     """Fill in scores and indices (Q, K) of queries that fit in memory."""
     count, k = len(vectors), scores.shape[1]
@@ -125,16 +156,26 @@ def _search_part(
             query if len(pending) == len(query) else query[pending], None if masks is None else masks.choose(pending)
         )
         rough, candidates, longest = _candidates(vectors, best, len(pending), width, size)
-        tolerance = 1e-5 * longest * lengths[pending]
+        tolerance = _tolerance(longest * lengths[pending], dims)
         # Rounding in the backend cuts nothing off once the last candidate is clearly below rank k.
         done = (rough[:, -1] < rough[:, k - 1] - tolerance) | (width == count) | np.isneginf(rough[:, -1])
         near = (rough >= (rough[:, k - 1] - 2 * tolerance)[:, None]) & (rough > -np.inf)
-        _rescore(query, vectors, pending[done], candidates[done], near[done], scores, indices)
+        _rescore(query, vectors, pending[done], candidates[done], near[done], scores, indices, dims)
         pending, width = pending[~done], min(count, 4 * width)
 
 
+def _tolerance(product_of_lengths: Any, dims: Sequence[int]) -> Any:
+    """Return how far rounding may move a score: fused ones no further than any product, but for their own rounding."""
+    return 1e-5 * (product_of_lengths + (len(dims) > 1))
+
+
 def _compare(
-    query: NDArray[np.float32], vectors: _Vectors, candidates: Ints, scores: NDArray[np.float32], indices: Ints
+    query: NDArray[np.float32],
+    vectors: _Vectors,
+    candidates: Ints,
+    scores: NDArray[np.float32],
+    indices: Ints,
+    dims: Sequence[int],
 ) -> None:
     """Fill in scores and indices (Q, K) of the best among the candidates (Q, C) of each query, of which -1 is none."""
     for number, one in enumerate(query):
@@ -143,21 +184,23 @@ def _compare(
         if not len(rows):
             continue
         block, k = vectors[rows], min(scores.shape[1], len(rows))
-        rough = block @ one
-        tolerance = 1e-5 * np.linalg.norm(block, axis=1).max() * np.linalg.norm(one)
+        rough = _fused(one, block, dims, lambda a, b: b @ a)
+        tolerance = _tolerance(np.linalg.norm(block, axis=1).max() * np.linalg.norm(one), dims)
         near = rough >= np.partition(rough, -k)[-k] - 2 * tolerance
-        exact = _products(np.broadcast_to(one, (int(near.sum()), len(one))), block[near])
+        exact = _products(np.broadcast_to(one, (int(near.sum()), len(one))), block[near], dims)
         best = np.lexsort((rows[near], -exact))[:k]
         scores[number, :k], indices[number, :k] = exact[best], rows[near][best]
 
 
-def _products(query: NDArray[np.float32], vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the dot products (n,) of rows (n, D), summed in float64."""
-    return np.einsum("nd,nd->n", query.astype(np.float64), vectors.astype(np.float64)).astype(np.float32)
+def _products(query: NDArray[np.float32], vectors: NDArray[np.float32], dims: Sequence[int]) -> NDArray[np.float32]:
+    """Return the dot products (n,) of rows (n, D), summed and fused in float64."""
+    wide = query.astype(np.float64), vectors.astype(np.float64)
+    fused: NDArray[np.float64] = _fused(*wide, dims, partial(np.einsum, "nd,nd->n"))
+    return fused.astype(np.float32)
 
 
-def _matrix(values: ArrayLike | StoredVectors, name: str) -> _Vectors:
-    if isinstance(values, StoredVectors):
+def _matrix(values: ArrayLike | Vectors, name: str) -> _Vectors:
+    if isinstance(values, Vectors):
         return values
     matrix = np.ascontiguousarray(values, np.float32)
     if matrix.ndim != 2:
@@ -196,6 +239,7 @@ def _rescore(
     near: NDArray[np.bool_],
     scores: NDArray[np.float32],
     indices: Ints,
+    dims: Sequence[int],
 ) -> None:
     """Fill in scores and indices of query rows: of the candidates that are near enough to be among the k best."""
     exact = np.full(candidates.shape, -np.inf, np.float32)
@@ -205,23 +249,29 @@ def _rescore(
     for start in range(0, len(order), step):
         part = order[start : start + step]
         numbers, where = np.unique(candidates[who[part], rank[part]], return_inverse=True)
-        exact[who[part], rank[part]] = _products(query[rows[who[part]]], vectors[numbers][where])
+        exact[who[part], rank[part]] = _products(query[rows[who[part]]], vectors[numbers][where], dims)
     best = np.lexsort((candidates, -exact), axis=1)[:, : scores.shape[1]]
     scores[rows], indices[rows] = np.take_along_axis(exact, best, 1), np.take_along_axis(candidates, best, 1)
     indices[np.isneginf(scores)] = -1
 
 
 def _backend(
-    query: NDArray[np.float32], masks: Masks | None, backend: Backend, compute_device: str, faiss_gpu: bool
+    query: NDArray[np.float32],
+    masks: Masks | None,
+    backend: Backend,
+    compute_device: str,
+    faiss_gpu: bool,
+    dims: Sequence[int],
 ) -> _Best:
     """Return what finds the best (scores, indices) (Q, n) of a block of the database for the queries."""
     if backend not in ("faiss", "torch"):
         raise ValueError(f"Unknown backend {backend!r}; expected faiss or torch.")
+    by_torch = backend == "torch" or len(dims) > 1
     if masks is not None:
-        masked = partial(_torch_best, device=compute_device) if backend == "torch" else _numpy_best
+        masked = partial(_torch_best, device=compute_device, dims=dims) if by_torch else _numpy_best
         return lambda block, start, number: _masked(query, masks, masked, block, start, number)
-    if backend == "torch":
-        return _torch_backend(query, compute_device)
+    if by_torch:
+        return _torch_backend(query, compute_device, dims)
     import faiss
 
     if not faiss_gpu:
@@ -235,15 +285,18 @@ def _backend(
     return lambda block, _, number: faiss.knn_gpu(gpu, query, block, number, metric=faiss.METRIC_INNER_PRODUCT)
 
 
-def _torch_backend(query: NDArray[np.float32], compute_device: str) -> _Best:
+def _torch_backend(query: NDArray[np.float32], compute_device: str, dims: Sequence[int]) -> _Best:
     import torch
 
     device = resolve_device(compute_device)
     queries = torch.from_numpy(query).to(device)
 
     def best(block: NDArray[np.float32], _: int, number: int) -> Found:
-        scores, indices = (queries @ torch.from_numpy(block).to(device).T).topk(number)
-        return scores.cpu().numpy(), indices.cpu().numpy()
+        rows = torch.from_numpy(block).to(device)
+        most = max(1, _QUERY_BYTES // (4 * len(block) * (len(dims) + 2)))
+        found = [_fused(some, rows, dims, lambda a, b: a @ b.T).topk(number) for some in queries.split(most)]
+        scores, indices = (torch.cat(parts).cpu().numpy() for parts in zip(*found, strict=True))
+        return scores, indices
 
     return best
 
@@ -282,10 +335,16 @@ def _numpy_best(
 
 
 def _torch_best(
-    query: NDArray[np.float32], block: NDArray[np.float32], allowed: NDArray[np.bool_], number: int, device: str
+    query: NDArray[np.float32],
+    block: NDArray[np.float32],
+    allowed: NDArray[np.bool_],
+    number: int,
+    device: str,
+    dims: Sequence[int],
 ) -> Found:
     import torch
 
     queries, rows, refused = (torch.from_numpy(part).to(resolve_device(device)) for part in (query, block, ~allowed))
-    scores, indices = (queries @ rows.T).masked_fill_(refused, -torch.inf).topk(number)
+    products = _fused(queries, rows, dims, lambda a, b: a @ b.T)
+    scores, indices = products.masked_fill_(refused, -torch.inf).topk(number)
     return scores.cpu().numpy(), indices.cpu().numpy()

@@ -1,6 +1,7 @@
 """Global descriptors on disk: the matrices of a session as one, read in parts, so that a map need not fit in memory."""
 
-from collections.abc import Iterator, Sequence
+import logging
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,10 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from toolkit.errors import ArtifactError
-from toolkit.files import file_fingerprint, require_whole, sidecar_path
+from toolkit.files import file_fingerprint, read_json, require_whole, sidecar_path
 from toolkit.geometry import Ints, unit
+
+log = logging.getLogger(__name__)
 
 MANIFEST_COLUMNS = ["row_index", "device_id", "sensor_id", "timestamp", "abs_path"]
 """Columns of the `manifest.csv` that names the image of each row of embeddings."""
@@ -39,6 +42,10 @@ class StoredVectors:
             starts += [starts[-1] + start for start in part.starts[1:]]
         paths = tuple(path for part in parts for path in part.paths)
         return replace(parts[0], paths=paths, starts=tuple(starts), rows=np.concatenate(rows))
+
+    @property
+    def dims(self) -> tuple[int, ...]:
+        return (self.dim,)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -72,6 +79,42 @@ class StoredVectors:
         return unit(vectors) if self.normalize else vectors
 
 
+@dataclass(frozen=True)
+class JoinedVectors:
+    """The vectors of several descriptors of the same images, side by side in a row."""
+
+    parts: Mapping[str, StoredVectors]
+    """Of each descriptor, by its name."""
+
+    @classmethod
+    def stack(cls, several: Sequence["JoinedVectors"]) -> "JoinedVectors":
+        """Return several, of the same descriptors, one below the other."""
+        names = several[0].parts
+        return cls({name: StoredVectors.stack([joined.parts[name] for joined in several]) for name in names})
+
+    @property
+    def dims(self) -> tuple[int, ...]:
+        return tuple(part.dim for part in self.parts.values())
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return len(self), sum(self.dims)
+
+    def __len__(self) -> int:
+        return len(next(iter(self.parts.values())))
+
+    def choose(self, positions: Ints) -> "JoinedVectors":
+        """Return only some of the rows, by their positions."""
+        return JoinedVectors({name: part.choose(positions) for name, part in self.parts.items()})
+
+    def __getitem__(self, positions: slice | Ints) -> NDArray[np.float32]:
+        """Read rows (n, sum of D), by their positions."""
+        return np.hstack([part[positions] for part in self.parts.values()])
+
+
+Vectors = StoredVectors | JoinedVectors
+
+
 def made_of(paths: Sequence[Path]) -> list[Any]:
     """Identify matrices in files by what they were made from, as JSON."""
     # The record beside a matrix says it, and is small; a foreign matrix may have none.
@@ -82,7 +125,7 @@ def made_of(paths: Sequence[Path]) -> list[Any]:
 
 
 def blocks(
-    vectors: NDArray[np.float32] | StoredVectors, size: int
+    vectors: NDArray[np.float32] | Vectors, size: int
 ) -> Iterator[tuple[int, NDArray[np.float32]]]:
     """Yield the number of the first row and the rows (n, D) of one block of so many bytes after the other."""
     step = max(1, size // (4 * max(1, vectors.shape[1])))
@@ -144,6 +187,38 @@ def open_embeddings(folder: str | Path) -> tuple[StoredVectors, pd.DataFrame]:
         tables.append(table.assign(subsession=manifest.parent.relative_to(base).as_posix()))
     vectors = StoredVectors(tuple(paths), tuple(starts), dim, np.arange(starts[-1]))
     return vectors, pd.concat(tables, ignore_index=True)
+
+
+def embedding_folders(embeddings: str | Path) -> dict[str, Path]:
+    """Return the folders of the descriptors in an embeddings folder, by name: of one, which has no name, it itself."""
+    model = read_json(Path(embeddings) / "settings.json").get("model")
+    return {name: Path(embeddings) / name for name in model} if isinstance(model, list) else {"": Path(embeddings)}
+
+
+def open_descriptors(embeddings: str | Path, session: str, normalize: bool) -> tuple[Vectors, pd.DataFrame]:
+    """Open what an embeddings folder has of a session: of several descriptors, the images that all of them describe.
+
+    Args:
+        normalize: bring the vectors of each descriptor to length 1 as they are read.
+
+    Raises:
+        ArtifactError: see `open_embeddings`; or no image has all descriptors.
+    """
+    opened = {name: open_embeddings(folder / session) for name, folder in embedding_folders(embeddings).items()}
+    parts = {name: replace(vectors, normalize=normalize) for name, (vectors, _) in opened.items()}
+    tables = [table for _, table in opened.values()]
+    if len(parts) == 1:
+        return next(iter(parts.values())), tables[0]
+    in_all = pd.concat([table["abs_path"] for table in tables]).value_counts() == len(tables)
+    table = tables[0][tables[0]["abs_path"].map(in_all)].reset_index(drop=True)
+    if not len(table):
+        raise ArtifactError(f"{embeddings}: no image of {session} has all of {', '.join(parts)}. Embed again.")
+    if lost := len(in_all) - len(table):
+        log.warning("%s: %d of %d images lack a descriptor of %s and are left out, see failed.csv",
+                    session, lost, len(in_all), ", ".join(parts))  # fmt: skip
+    rows = [pd.Index(each["abs_path"]).get_indexer(table["abs_path"]) for each in tables]
+    chosen = {name: part.choose(of) for (name, part), of in zip(parts.items(), rows, strict=True)}
+    return JoinedVectors(chosen), table
 
 
 def load_embeddings(folder: str | Path) -> tuple[NDArray[np.float32], pd.DataFrame]:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from toolkit.capture import Capture, Session, masks
 from toolkit.capture.upright import Turns, upright_turns
-from toolkit.embedders import Embedder, StoredVectors, create_embedder, open_embeddings
-from toolkit.embedders.index import VectorIndex, load_index
+from toolkit.embedders import Embedder, Vectors, create_embedder, embedding_folders, open_descriptors
+from toolkit.embedders.index import JoinedIndex, VectorIndex, load_index
 from toolkit.embedders.search import search
 from toolkit.errors import ArtifactError, ToolkitError
 from toolkit.features.features import KINDS, LocalFeatures, extract_turned
@@ -264,18 +264,20 @@ class Map:
         return RetrieveSettings.of(_read_settings(self._run.retrieval_dir / "settings.json"))
 
     @cached_property
-    def embedder(self) -> Embedder:
-        """The embedder that the run was made with."""
+    def embedders(self) -> list[Embedder]:
+        """The embedders that the run was made with."""
         settings = self.embed_settings
-        if settings.model == "vlad":
-            return create_embedder("vlad", vocabulary=self._run.embeddings / "vlad.npz")
-        return create_embedder(
-            settings.model,
-            checkpoint=settings.checkpoint,
-            device=settings.compute_device,
-            dtype_compute=settings.dtype_compute,
-            image_size=settings.image_size,
-        )
+        folders = embedding_folders(self._run.embeddings).values()
+        learned = {
+            "checkpoint": settings.checkpoint,
+            "device": settings.compute_device,
+            "dtype_compute": settings.dtype_compute,
+            "image_size": settings.image_size,
+        }
+        return [
+            create_embedder(name, **({"vocabulary": folder / "vlad.npz"} if name == "vlad" else learned))
+            for name, folder in zip(settings.models, folders, strict=True)
+        ]
 
     @property
     def _run(self) -> SceneFiles:
@@ -284,30 +286,30 @@ class Map:
         return self.files
 
     @cached_property
-    def _stored(self) -> tuple[StoredVectors, NDArray[np.int64]]:
+    def _stored(self) -> tuple[Vectors, NDArray[np.int64]]:
         """Global descriptors (N, D) of posed map images as they are searched, on disk, and the images' rows (N,)."""
-        vectors, table = open_embeddings(self._run.embeddings / f"{self.device}_map")
+        normalize = self.retrieve_settings.normalize
+        vectors, table = open_descriptors(self._run.embeddings, f"{self.device}_map", normalize)
         rows = np.array([self.session.row_of_name[image_name(path)] for path in table["abs_path"]], np.int64)
         posed = np.isfinite(self.session.world_from_cam(rows)).reshape(-1, 16).all(axis=1)
-        vectors = replace(vectors.choose(np.flatnonzero(posed)), normalize=self.retrieve_settings.normalize)
-        return vectors, rows[posed]
+        return vectors.choose(np.flatnonzero(posed)), rows[posed]
 
     @cached_property
-    def _descriptors(self) -> tuple[NDArray[np.float32] | StoredVectors, NDArray[np.int64]]:
+    def _descriptors(self) -> tuple[NDArray[np.float32] | Vectors, NDArray[np.int64]]:
         """The same; those of a large map stay on disk."""
         vectors, rows = self._stored
-        small = 4 * vectors.dim * len(vectors) < MOST_IN_MEMORY
+        small = 4 * vectors.shape[1] * len(vectors) < MOST_IN_MEMORY
         return vectors[:] if small else vectors, rows
 
     @cached_property
-    def _index(self) -> VectorIndex | None:
+    def _index(self) -> VectorIndex | JoinedIndex | None:
         """What finds candidates among the descriptors, in a run with an index."""
         settings = self.retrieve_settings.model_copy(update={"faiss_gpu": False})  # what is here may have none
         return load_index(self._run.embeddings, f"{self.device}_map", self._stored[0], settings)
 
     def retrieve(
         self,
-        vectors: NDArray[np.float32],
+        described: Sequence[NDArray[np.float32]],
         pictures: Sequence[Callable[[bool], NDArray[np.uint8]]] = (),
         cameras: Sequence[pycolmap.Camera] = (),
         turns: Sequence[int] = (),
@@ -316,7 +318,7 @@ class Map:
         """Return the references of query images as the run would find them.
 
         Args:
-            vectors: (Q, D) what the embedder gave for them.
+            described: (Q, D) what each of the `embedders` gave for them.
             pictures: what returns their pixels, in color if it is given True; of use to a run that reranks.
             cameras, turns: their intrinsics, and the quarter turns that make them upright; likewise.
             near: about where they are, of their cameras; empty: anywhere.
@@ -325,19 +327,19 @@ class Map:
             ArtifactError: the map was embedded by another embedder.
         """
         database, rows = self._descriptors
-        if self.embed_settings.normalize:
-            vectors = unit(vectors)
-        vectors = vectors.astype(self.embed_settings.dtype).astype(np.float32)
-        if vectors.shape[1] != database.shape[1]:
-            raise ArtifactError(
-                f"{self._run.embeddings}: the map's descriptors have {database.shape[1]} dimensions, "
-                f"{self.embedder.name} gives {vectors.shape[1]}. Embed again."
-            )
-        vectors = unit(vectors) if self.retrieve_settings.normalize else vectors
+        dims = self._stored[0].dims
+        for embedder, vectors, dim in zip(self.embedders, described, dims, strict=True):
+            if vectors.shape[1] != dim:
+                raise ArtifactError(
+                    f"{self._run.embeddings}: the map's descriptors have {dim} dimensions, "
+                    f"{embedder.name} gives {vectors.shape[1]}. Embed again."
+                )
+        query = np.hstack([self._as_searched(vectors) for vectors in described])
+        topk = self.retrieve_settings.topk
         allowed = [self._may_show(rows, pose) for pose in near] or [None]
-        parts = np.split(vectors, len(allowed))
+        parts = np.split(query, len(allowed))
         found = [
-            search(part, database, self.retrieve_settings.topk, "torch", "cpu", index=self._index, allowed=mask)
+            search(part, database, topk, "torch", "cpu", index=self._index, allowed=mask, dims=dims)
             for part, mask in zip(parts, allowed, strict=True)
         ]
         scores, nearest = (np.concatenate(each) for each in zip(*found, strict=True))
@@ -362,6 +364,13 @@ class Map:
             NEAR_DEG + 3 * about.rotation_std_deg,
         )
         return mask if mask.any() else None
+
+    def _as_searched(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return vectors of an embedder as those of the map are when they have been written and read."""
+        if self.embed_settings.normalize:
+            vectors = unit(vectors)
+        vectors = vectors.astype(self.embed_settings.dtype).astype(np.float32)
+        return unit(vectors) if self.retrieve_settings.normalize else vectors
 
     @cached_property
     def _verification(self) -> tuple[LocalMethod, Verifier]:

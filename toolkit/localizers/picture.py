@@ -87,22 +87,25 @@ def localize_image(
             for kind in place.kinds
         ]
         features = [list(kinds) for kinds in zip(*extracted, strict=True)]
-    embedder = place.embedder
-    if embedder.inputs == "features":
-        sift = SiftExtractor()
-        settings = [kind.extractor.settings for kind in place.kinds]
-        if features and sift.settings in settings:  # the features that are matched serve the embedder, too
-            inputs = [kinds[settings.index(sift.settings)] for kinds in features]
+    described = []
+    for embedder in place.embedders:
+        if embedder.inputs == "features":
+            sift = SiftExtractor()
+            settings = [kind.extractor.settings for kind in place.kinds]
+            if features and sift.settings in settings:  # the features that are matched serve the embedder, too
+                inputs = [kinds[settings.index(sift.settings)] for kinds in features]
+            else:
+                found = sift.extract([picture.read(color=False) for picture in pixels])
+                inputs = [as_stored(of_picture) for of_picture in found]
         else:
-            inputs = [as_stored(found) for found in sift.extract([picture.read(color=False) for picture in pixels])]
-    else:
-        turned = embedder.upright if place.embed_settings.upright is None else place.embed_settings.upright
-        shown = zip(pixels, quarter_turns if turned else none, strict=True)
-        side = embedder.least_side
-        inputs = [embedder.prepare(turn_image(picture.read(True, side), turn)) for picture, turn in shown]
+            turned = embedder.upright if place.embed_settings.upright is None else place.embed_settings.upright
+            shown = zip(pixels, quarter_turns if turned else none, strict=True)
+            side = embedder.least_side
+            inputs = [embedder.prepare(turn_image(picture.read(True, side), turn)) for picture, turn in shown]
+        described.append(embedder.embed(inputs))
     about = [] if near is None else [replace(near, world_from_rig=pose) for pose in near.world_from_rig @ poses]
     readers = [picture.read for picture in pixels]
-    references = place.retrieve(embedder.embed(inputs), readers, cameras, quarter_turns, about)
+    references = place.retrieve(described, readers, cameras, quarter_turns, about)
     query = Query(views, poses, features)
     with threadpool_limits(1, "blas"):  # sums stay in one order, as in a run
         if near is None:

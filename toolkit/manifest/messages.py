@@ -7,7 +7,7 @@ from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
-_BRANCH = r"literal|list\[|dict\[|constrained"
+_BRANCH = r"literal|str$|list\[|dict\[|constrained"
 """What pydantic adds to the keys of a value that may be of several types."""
 
 
@@ -44,8 +44,8 @@ def explain(
             line = f"unknown key {where!r}. {nearest(keys[-1], _model_at(model, keys[:-1]).model_fields)}"
         elif problem["type"] == "value_error":
             line = f"{where}: {problem['ctx']['error']}." if keys else f"{problem['ctx']['error']}."
-        elif of_branch and problem["type"] == "literal_error" and isinstance(problem["input"], list):
-            continue  # the other branch of `"all" | list`, which says what is wrong in the list
+        elif of_branch and problem["type"] in ("literal_error", "string_type") and isinstance(problem["input"], list):
+            continue  # the other branch of `"all" | list` or `str | list`, which says what is wrong in the list
         elif of_branch and problem["type"] in ("list_type", "dict_type") and isinstance(problem["input"], list | dict):
             continue  # likewise, of `list | dict`
         elif problem["type"] == "missing":

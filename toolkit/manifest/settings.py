@@ -30,6 +30,17 @@ def _check_direction(direction: list[float]) -> list[float]:
     return direction
 
 
+def _check_models(model: str | list[str]) -> str | list[str]:
+    """Return a list of one name as the name."""
+    if isinstance(model, str):
+        return model
+    twice = [name for name in dict.fromkeys(model) if model.count(name) > 1]
+    if not model or twice or "auto" in model:
+        found = f"{twice[0]!r} twice" if twice else "'auto' in a list" if model else "an empty list"
+        raise ValueError(f"found {found}, expected a name, or a list of different names such as [megaloc, vlad]")
+    return model if len(model) > 1 else model[0]
+
+
 Unit = Literal["m"] | None
 Direction = Annotated[list[float], Field(min_length=3, max_length=3), AfterValidator(_check_direction)]
 
@@ -164,8 +175,9 @@ class VladSettings(Settings):
 class EmbedSettings(Settings):
     """How images become global descriptors."""
 
-    model: str = "vlad"
-    """Global descriptor: vlad, megaloc, or auto: megaloc if its weights are there. `vlad` needs no weights."""
+    model: Annotated[str | list[str], AfterValidator(_check_models)] = "vlad"
+    """Global descriptor: vlad, megaloc, or auto: megaloc if its weights are there. `vlad` needs no weights.
+    Of a list, such as [megaloc, vlad], the similarities are fused by their generalized harmonic mean."""
     checkpoint: str | None = None
     """File with the weights of a learned model; null: the hub's cache, else a download."""
     batch_size: Positive = 8
@@ -188,6 +200,10 @@ class EmbedSettings(Settings):
     """Of the vocabulary."""
     world_up: Direction | None = None
     """Direction that is up in the map's world; null: estimated from its cameras."""
+
+    @property
+    def models(self) -> list[str]:
+        return [self.model] if isinstance(self.model, str) else self.model
 
 
 class MaskSettings(Settings):
@@ -220,7 +236,8 @@ class RetrieveSettings(Settings):
     topk: Positive = 10
     """References a query image."""
     use_faiss: bool = True
-    """Exact search with FAISS, else with torch; the result is the same. An index is always FAISS's."""
+    """Exact search with FAISS, else with torch; the result is the same. An index is always FAISS's.
+    Fused similarities of several descriptors are torch's."""
     faiss_gpu: bool = False
     """FAISS on the GPU; needs a FAISS built for it."""
     normalize: bool = True

@@ -13,6 +13,7 @@ from toolkit.capture.devices import color_of
 from toolkit.capture.images import read_for_display
 from toolkit.capture.tables import read_query_table
 from toolkit.capture.world_up import up_of_cameras
+from toolkit.embedders import embedding_folders, open_descriptors
 from toolkit.errors import CaptureError
 from toolkit.files import image_name, read_references
 from toolkit.geometry import Floats, unit
@@ -166,22 +167,29 @@ def draw_sequence(capture: Capture, path: str | Path, up: ArrayLike | None = Non
 def draw_similarity(embeddings: str | Path, limit: int = 300) -> "Figure":
     """Return a figure of the cosine similarity of a query session's images to another device's map.
 
+    Of several descriptors the similarities are fused, as they are for retrieval.
+
     Args:
         embeddings: folder of the descriptors, `<device>_<split>/<subsession>/<subsession>.npy`.
         limit: at most so many images of a session, evenly spread, are shown.
     """
-    sessions = {folder.name: folder for folder in sorted(Path(embeddings).iterdir()) if folder.is_dir()}
+    from toolkit.embedders.search import fuse  # loads FAISS
+
+    first = next(iter(embedding_folders(embeddings).values()))
+    sessions = [folder.name for folder in sorted(first.iterdir()) if folder.is_dir()]
     query = next((name for name in sessions if name.endswith("_query")), next(iter(sessions)))
     maps = [name for name in sessions if name.endswith("_map")] or list(sessions)
     device = query.rpartition("_")[0]
     map_ = next((name for name in maps if name.rpartition("_")[0] != device), maps[0])
     figure = new_figure(8, 4.5)
     plot = figure.subplots()
-    values = _descriptors(sessions[query], limit) @ _descriptors(sessions[map_], limit).T
+    rows, columns = (_descriptors(Path(embeddings), session, limit) for session in (query, map_))
+    products = [row @ column.T for row, column in zip(rows, columns, strict=True)]
+    values = products[0] if len(products) == 1 else fuse(products)
     image = plot.imshow(values, aspect="auto", interpolation="nearest", cmap="viridis")
     plot.set_xlabel(f"images of {map_}")
     plot.set_ylabel(f"images of {query}")
-    figure.colorbar(image, label="cosine similarity")
+    figure.colorbar(image, label="cosine similarity" if len(products) == 1 else "fused similarity")
     return figure
 
 
@@ -269,13 +277,17 @@ def draw_statuses(paths: Iterable[str | Path]) -> "Figure":
     return figure
 
 
-def _descriptors(session: Path, limit: int) -> NDArray[np.float32]:
-    """Return the unit descriptors of a session, (N <= limit, D)."""
-    parts = [np.load(file, mmap_mode="r") for file in sorted(session.rglob("*.npy"))]
+def _descriptors(embeddings: Path, session: str, limit: int) -> list[NDArray[np.float32]]:
+    """Return the unit descriptors of a session, (N <= limit, D) each."""
+    if len(embedding_folders(embeddings)) > 1:
+        vectors, _ = open_descriptors(embeddings, session, normalize=True)
+        chosen = vectors[:: max(1, -(-len(vectors) // limit))]
+        return np.split(chosen, np.cumsum(vectors.dims)[:-1], axis=1)
+    parts = [np.load(file, mmap_mode="r") for file in sorted((embeddings / session).rglob("*.npy"))]
     total = sum(len(part) for part in parts)
     step = max(1, -(-total // limit))
     rows = np.concatenate([np.asarray(part[::step], np.float32) for part in parts])
-    return unit(rows)
+    return [unit(rows)]
 
 
 def _usable(capture: Capture) -> list[Session]:
