@@ -65,6 +65,18 @@ def small_features(small_capture: Path, made_once: Callable[[str, Callable[[Path
 
 
 @pytest.fixture(scope="session")
+def tiny_embedded(made_once: Callable[[str, Callable[[Path], object]], Path]) -> Path:
+    """A folder with a capture `TINY` of photographs of walls and its `embeddings`; do not write to it."""
+    from tests.test_embed import write_tiny_capture
+    from toolkit.embed import embed_sessions
+
+    def make(folder: Path) -> None:
+        embed_sessions(write_tiny_capture(folder / "TINY") / "sessions", folder / "embeddings")
+
+    return made_once("tiny", make)
+
+
+@pytest.fixture(scope="session")
 def small_run(small_capture: Path, made_once: Callable[[str, Callable[[Path], object]], Path]) -> Path:
     """The run folder of `small_capture`, all notebooks executed by the pipeline with defaults; do not write to it.
 

@@ -27,6 +27,7 @@ from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import read_image
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.embed import embed_sessions
+from toolkit.embedders import EMBEDDERS
 from toolkit.errors import ArtifactError, CaptureError, ImageError, ManifestError, ToolkitError
 from toolkit.evaluate import evaluate_scene
 from toolkit.features import groups
@@ -1062,6 +1063,46 @@ def test_a_picture_has_the_references_of_a_run_with_an_index(small_capture: Path
     for row in rows:
         expected = [image_name(reference["path"]) for reference in row["topk"]]
         assert [names[index] for index in found[row["path"]].images] == expected
+
+
+@pytest.mark.slow
+def test_a_picture_has_the_references_of_a_run_with_several_descriptors(
+    small_capture: Path, run: SceneFiles, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(EMBEDDERS, "thumbnail", "tests.embedders.test_fusion:Thumbnail")
+    sessions = small_capture / "sessions"
+    alone = run.retrieval("ios", "ios").read_text()
+    table = embed_sessions(sessions, run.embeddings, {"model": ["thumbnail", "vlad"]}, device="ios")
+    assert (table["skipped"] == (table["model"] == "vlad")).all()
+    retrieve_pairs(sessions, run.embeddings, run.retrieval_dir, map_device="ios", query_device="ios", queries=LIST)
+    assert run.retrieval("ios", "ios").read_text() != alone
+    run_stage(small_capture, run, query_device="ios")
+    place = Map.open(run.run, run.scene, "ios")
+    session = Capture.open(small_capture)["ios_query"]
+    folders = (run.embeddings / name / "ios_query" for name in ("thumbnail", "vlad"))
+    stored, tables = zip(*map(load_embeddings, folders), strict=True)
+    answers, localize = [], place.localizer.localize
+    place.localizer = SimpleNamespace(  # type: ignore[misc, assignment]
+        localize=lambda query, references: answers.append(references) or localize(query, references),
+        image_names=place.localizer.image_names,
+    )
+    rows = {image_name(row["path"]): row["topk"] for row in read_references(run.retrieval("ios", "ios"))}
+    for line, of_query in zip(
+        run.poses_txt("ios", "ios").read_text().splitlines()[1:3],
+        session.rows_of_keyframes(session.keyframes(LIST)),
+        strict=False,
+    ):
+        camera = session.camera(session.images["sensor_id"].iloc[of_query[0]])
+        pose = localize_image(place, session.image_path(int(of_query[0])), camera).world_from_rig
+        assert ", ".join(repr(float(number)) for number in geometry.qt_from_pose(pose)) in line
+        expected = rows[session.image_name(int(of_query[0]))]
+        names = [place.localizer.image_names[index] for index in answers[-1][0].images]
+        assert names == [image_name(reference["path"]) for reference in expected]
+        stated = [reference["score"] for reference in expected]
+        np.testing.assert_allclose(answers[-1][0].scores, stated, atol=1e-6)  # a batch of another size
+        row = tables[0]["abs_path"].map(image_name).tolist().index(session.image_name(int(of_query[0])))
+        (again,) = place.retrieve([vectors[row : row + 1] for vectors in stored])
+        np.testing.assert_array_equal(again.scores, stated)
 
 
 # ------------------------------------------------------------------------------------- other features, and several

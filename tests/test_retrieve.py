@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.test_embed import HL_RIG, write_tiny_capture
+from tests.test_embed import HL_RIG
 from toolkit.capture import Capture
 from toolkit.capture.masks import Masks, near
 from toolkit.embed import embed_sessions
@@ -154,19 +154,10 @@ def test_search_limits() -> None:
     assert scores.dtype == np.float32
 
 
-@pytest.fixture(scope="module")
-def embedded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a capture `TINY` and its embeddings; do not write to it."""
-    folder = tmp_path_factory.mktemp("embedded")
-    capture = write_tiny_capture(folder / "TINY")
-    embed_sessions(capture / "sessions", folder / "embeddings")
-    return folder
-
-
 @pytest.fixture
-def tiny(embedded: Path, tmp_path: Path) -> Path:
+def tiny(tiny_embedded: Path, tmp_path: Path) -> Path:
     """A copy of the capture, its embeddings beside it."""
-    shutil.copytree(embedded, tmp_path, dirs_exist_ok=True)
+    shutil.copytree(tiny_embedded, tmp_path, dirs_exist_ok=True)
     return tmp_path / "TINY"
 
 

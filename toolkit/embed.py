@@ -101,8 +101,8 @@ def embed_sessions(
     for name in settings.models:
         # What a run with this model alone left is taken over into the model's own folder, and the other way round.
         own, other = (out_dir / name, out_dir) if several else (out_dir, out_dir / name)
+        folders = _Folders(own, other, features_dir)
         chosen = settings.model_copy(update={"model": name})
-        folders = _Folders(own, other if skip_existing else None, features_dir)
         tables.append(_embed_with_one(capture, folders, chosen, device, subsession, skip_existing))
     write_text(out_dir / "settings.json", settings.model_dump_json(indent=1) + "\n")
     return pd.concat(tables, ignore_index=True) if several else tables[0]
@@ -113,16 +113,15 @@ class _Folders:
     """Where the embeddings of one model go, and what they are made of."""
 
     out: Path
-    other: Path | None
-    """Where the same may lie; None: nothing is taken over."""
+    other: Path
+    """Where the same may lie, of a run with this model alone or with others."""
     features: Path
 
-    def take_over(self, path: Path, record: Mapping[str, Any]) -> None:
-        """Take an artifact and the files of its record from the other folder, if it is current there and not here."""
-        wanted = dict(record)
-        found = self.other / path.relative_to(self.out) if self.other is not None else path
-        if found == path or is_current(path, wanted) or not is_current(found, wanted):
-            return
+    def take_over(self, path: Path, record: dict[str, Any]) -> bool:
+        """Take an artifact and the files of its record from the other folder; False if it is not current there."""
+        found = self.other / path.relative_to(self.out)
+        if not is_current(found, record):
+            return False
         (path.parent / "failed.csv").unlink(missing_ok=True)
         # Files are replaced and never changed, so that both places can share them.
         for name in [*read_json(sidecar_path(found))["files"], sidecar_path(found).name]:
@@ -132,6 +131,7 @@ class _Folders:
                     os.link(found.with_name(name), temporary)
                 except OSError:  # a file system without links
                     shutil.copyfile(found.with_name(name), temporary)
+        return True
 
 
 def _embed_with_one(
@@ -171,8 +171,7 @@ def _embed_with_one(
             "normalize": settings.normalize,
             "dtype": settings.dtype,
         }
-        folders.take_over(matrix_path, record)
-        skipped = skip_existing and is_current(matrix_path, record)
+        skipped = skip_existing and (is_current(matrix_path, record) or folders.take_over(matrix_path, record))
         if skipped:
             sweep(matrix_path)
             embedded = len(np.load(matrix_path, mmap_mode="r"))
@@ -310,8 +309,7 @@ def _vocabulary(capture: Capture, folders: _Folders, settings: EmbedSettings, sk
         "seed": settings.seed,
     }
     path, features_dir = folders.out / "vlad.npz", folders.features
-    folders.take_over(path, record)
-    if skip_existing and is_current(path, record):
+    if skip_existing and (is_current(path, record) or folders.take_over(path, record)):
         return path
     stores = {name: extract_session(capture[name], features_dir, rows=np.array(rows)) for name, rows in chosen.items()}
     keys = [(name, capture[name].image_name(row)) for name, rows in chosen.items() for row in rows]
