@@ -1289,7 +1289,7 @@ def test_a_picture_is_localized_near_a_rough_pose(
     mapped = place.session.world_from_cam(np.array(rows))
     vectors, _ = load_embeddings(files.embeddings / "ios_map")
     for about in mapped:  # whatever the picture looks like
-        (references,) = place.retrieve(vectors[:1], near=[RoughPose(about, 1.0, 0.05)])
+        (references,) = place.retrieve([vectors[:1]], near=[RoughPose(about, 1.0, 0.05)])
         angles = np.degrees(np.arccos(np.clip(mapped[:, :3, 2] @ about[:3, 2], -1, 1)))
         assert sorted(references.images) == np.flatnonzero(angles < 63.0).tolist()
     away = geometry.make_pose(found[:3, :3], [1e6, 0.0, 0.0])

@@ -9,6 +9,7 @@ import faiss
 import numpy as np
 import pytest
 
+from toolkit.capture.masks import Masks
 from toolkit.embed import embed_sessions
 from toolkit.embedders import EMBEDDERS, load_embeddings, stored
 from toolkit.embedders import search as search_module
@@ -100,6 +101,14 @@ def test_search_is_the_sorted_fused_matrix(monkeypatch: pytest.MonkeyPatch, back
     rows = np.flatnonzero(allowed)
     scores, indices = search(query, database, 30, backend, allowed=allowed, dims=DIMS)
     np.testing.assert_array_equal(indices, rows[brute(query, database[rows], 30)[1]])
+    of_each, which = rng.random((3, 400)) < 0.3, np.array([0, 1, 2, 0, 1, -1, 2, 0])
+    masks = Masks(400, np.packbits(of_each, axis=1, bitorder="little"), which)
+    scores, indices = search(query, database, 30, backend, allowed=masks, dims=DIMS)
+    for number, mask in enumerate(which):
+        rows = np.arange(400) if mask < 0 else np.flatnonzero(of_each[mask])
+        expected_scores, expected = brute(query[number : number + 1], database[rows], 30)
+        np.testing.assert_array_equal(indices[number], rows[expected[0]])
+        np.testing.assert_array_equal(scores[number], expected_scores[0])
     with pytest.raises(ValueError, match=r"dims.*sum of 15"):
         search(query, database, 3, dims=(6, 8))
 
