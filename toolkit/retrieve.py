@@ -41,6 +41,8 @@ __all__ = ["load_embeddings", "retrieve_pairs", "search"]
 log = logging.getLogger(__name__)
 
 _OF_INDEX = {"index", "index_candidates", "nprobe"}
+_CHOICE = 3
+"""Of so many map images for each reference, radio leaves the choice to their looks: it does not know where they look."""
 
 
 def retrieve_pairs(
@@ -306,7 +308,7 @@ def _masks(
     if mask.gps:
         priors["gps"] = gps_masks(*both, mask.gps_margin_m, mask.window_s)
     if mask.radio:
-        least = max(settings.topk, int(np.ceil(mask.radio_share * len(database.rows))))
+        least = max(_CHOICE * settings.topk, int(np.ceil(mask.radio_share * len(database.rows))))
         priors["radio"] = radio_masks(*both, least, mask.window_s)
     if not priors:
         return None, {}

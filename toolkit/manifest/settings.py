@@ -225,7 +225,7 @@ class MaskSettings(Settings):
     radio: bool = False
     """Search only the map images at which WiFi and Bluetooth were received most nearly as at the query, ..."""
     radio_share: Share = 0.025
-    """... this share of the map, and at least `topk`."""
+    """... this share of the map, and at least three times `topk`."""
     window_s: PositiveNumber = 2.0
     """Scans and fixes count for images so long before and after them."""
 
