@@ -42,7 +42,7 @@ log = logging.getLogger(__name__)
 
 _OF_INDEX = {"index", "index_candidates", "nprobe"}
 _CHOICE = 3
-"""Of so many map images for each reference, radio leaves the choice to their looks: it does not know where they look."""
+"""Map images for each reference that radio leaves to choose from by their looks: it does not know where they look."""
 
 
 def retrieve_pairs(

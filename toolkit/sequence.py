@@ -30,11 +30,21 @@ from toolkit.files import (
 )
 from toolkit.geometry import Floats, Ints, pose_error
 from toolkit.localizers.base import PoseEstimate, RoughPose
+from toolkit.localizers.frames import LocalizedFrames, SequenceLocalizer, localize_sequence
 from toolkit.localizers.map import Map
-from toolkit.localizers.odometry import Odometry, PosedQueries, recordings_of, subsessions_of
+from toolkit.localizers.odometry import (
+    UNKNOWN_COVARIANCE,
+    Odometry,
+    PosedQueries,
+    recordings_of,
+    subsessions_of,
+    vote_weights,
+)
 from toolkit.localizers.picture import localize_image
 from toolkit.localizers.recording import localize_piece
 from toolkit.manifest import SequenceSettings
+
+__all__ = ["LocalizedFrames", "Odometry", "SequenceLocalizer", "localize_sequence", "sequence_pairs"]
 
 SUFFIX = "_sequence"
 """Ends the name of what the stage makes of a pair, beside what localization has made of it."""
@@ -172,19 +182,15 @@ class _Answers:
         rows, trajectory = read_query_table(table, ["status"]), Trajectory.read(poses)
         rows = rows.drop_duplicates(["timestamp", "device_id"], ignore_index=True)
         status = rows["status"].to_numpy(object)
-        # Where localization gives no probability, its word counts.
-        weights = rows.get("p_correct", pd.Series(np.nan, rows.index)).fillna(rows["status"].eq("ok") * 0.9 + 0.05)
-        # Of two poses with as much support, such as in rooms that look alike, either may be right.
-        rivals = rows.get("rival_support", pd.Series(0.0, rows.index)).fillna(0.0)
-        weights = weights.where(rows["status"] == "ok", weights / (1 + rivals))
+        known = rows.reindex(columns=["p_correct", "rival_support"]).to_numpy(float)
+        weights = vote_weights(np.asarray(status == "ok"), *known.T)
         at = trajectory.index.find(rows["timestamp"].to_numpy(), as_strings(rows["device_id"]))
-        # Nor is a pose without a covariance, such as that of `nearest`, known better than to some meters.
-        covariances = np.tile(np.diag(np.repeat([0.1, 4.0], 3)), (len(rows), 1, 1))
+        covariances = np.tile(UNKNOWN_COVARIANCE, (len(rows), 1, 1))
         if (given := trajectory.covariances) is not None:
             known = (at >= 0) & np.isfinite(given[at]).all(axis=(1, 2))
             covariances[known] = given[at[known]]
         found = trajectory.lookup(rows["timestamp"], rows["device_id"])
-        return cls(rows[["timestamp", "device_id"]], status, weights.to_numpy(float), found, covariances)
+        return cls(rows[["timestamp", "device_id"]], status, weights, found, covariances)
 
     def posed(self, rows: Ints, frames: Ints) -> PosedQueries:
         """Return some queries, which are frames of a piece of odometry."""

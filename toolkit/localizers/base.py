@@ -124,7 +124,7 @@ class PoseEstimate:
     """What the pose rests on, and what disagrees with it."""
     found_by: str = "pnp"
     """How the pose was found: `pnp`, `pnp+vggt` or `pnp+near` (from a prior), `lifted` (map features lifted by a
-    capture's depth maps), `lifted+vggt` (by predicted depth, too), `vggt` (a prediction), `nearest`."""
+    capture's depth maps), `lifted+vggt` (by predicted depth, too), `vggt` (a prediction), `nearest`, `sequence`."""
     scale_std: float = float("nan")
     """Relative standard deviation of a prediction's scale; inf if unknown, NaN without a prediction."""
     rejected: tuple[int, ...] = ()

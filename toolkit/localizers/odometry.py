@@ -60,6 +60,10 @@ class Odometry:
         # A random walk: the same for many short steps as for one long one.
         return rotation, settings.position_drift * np.sqrt(np.abs(way[first] - way[second]))
 
+    def part(self, frames: slice) -> "Odometry":
+        """Return some consecutive poses."""
+        return Odometry(self.timestamps[frames], self.odom_from_rig[frames])
+
     def at(self, timestamps: Ints, settings: SequenceSettings) -> tuple[Ints, Floats]:
         """Return which of some times are between two poses, (n,) their numbers, and poses (n, 4, 4) of these.
 
@@ -151,6 +155,28 @@ class PosedQueries:
 
     def choose(self, rows: Ints | NDArray[np.bool_]) -> "PosedQueries":
         return PosedQueries(*(values[rows] for values in vars(self).values()))
+
+    def shifted(self, frames: int) -> "PosedQueries":
+        """Return them with so much added to the indices of their frames."""
+        return replace(self, frames=self.frames + frames)
+
+    def joined(self, other: "PosedQueries") -> "PosedQueries":
+        """Return both, by frame."""
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        every = PosedQueries(*(np.concatenate(pair) for pair in pairs))
+        return every.choose(np.argsort(every.frames, kind="stable"))
+
+
+UNKNOWN_COVARIANCE = np.diag(np.repeat([0.1, 4.0], 3))
+"""Of a pose without one, such as that of `nearest`: it is not known better than to some meters."""
+
+
+def vote_weights(ok: NDArray[np.bool_], p_correct: Floats, rival_support: Floats) -> Floats:
+    """Return the probability (Q,) that each single pose is right; NaN in `p_correct` and `rival_support` is unknown."""
+    # Where localization gives no probability, its word counts.
+    weights = np.where(np.isnan(p_correct), np.where(ok, 0.95, 0.05), p_correct)
+    # Of two poses with as much support, such as in rooms that look alike, either may be right.
+    return np.where(ok, weights, weights / (1 + np.nan_to_num(rival_support)))
 
 
 def floored(covariances: Floats) -> Floats:

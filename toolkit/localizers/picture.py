@@ -59,7 +59,7 @@ def localize_image(
     pictures = list(image) if _are_several(image) else [image]
     cameras: list[Any] = list(camera) if isinstance(camera, list | tuple) else [camera]
     for of in cameras:
-        _check_camera(of)
+        check_camera(of)
     poses = np.eye(4)[None] if rig_from_cams is None else _poses(rig_from_cams)
     quarter_turns = [0] * len(cameras) if turns is None else _turns(turns)
     if not 0 < len(pictures) == len(cameras) == len(poses) == len(quarter_turns):
@@ -161,8 +161,12 @@ def _are_several(image: Any) -> bool:
     return isinstance(image, list | tuple) and not (image and isinstance(image[0], list | tuple | int | float))
 
 
-def _check_camera(camera: Any) -> None:
-    """Refuse what is no camera, or one that no picture can have been taken with."""
+def check_camera(camera: Any) -> None:
+    """Refuse what is no camera, or one that no picture can have been taken with.
+
+    Raises:
+        ImageError: it is one of these.
+    """
     if not isinstance(camera, pycolmap.Camera):
         raise ImageError(
             f"camera: found {camera!r}, a {type(camera).__name__}; expected a pycolmap.Camera, such as "

@@ -5,7 +5,7 @@ agree, a pose graph follows, then localization again with the predicted poses as
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -111,11 +111,12 @@ def with_answers(queries: PosedQueries, answers: Mapping[int, PoseEstimate]) -> 
             added.append((frame, estimate))
     if not answers:
         return queries
-    every = PosedQueries(
-        np.concatenate([queries.frames, np.array([frame for frame, _ in added], np.int64)]),
-        np.concatenate([poses, *(np.asarray(estimate.world_from_rig)[None] for _, estimate in added)]),
-        np.concatenate([covariances, *(np.asarray(estimate.covariance)[None] for _, estimate in added)]),
-        np.concatenate([queries.weights, np.zeros(len(added))]),
-        np.concatenate([queries.trusted, np.zeros(len(added), bool)]),
+    voters = replace(queries, world_from_rig=poses, covariances=covariances)
+    others = PosedQueries(
+        np.array([frame for frame, _ in added], np.int64),
+        np.array([estimate.world_from_rig for _, estimate in added]).reshape(-1, 4, 4),
+        np.array([estimate.covariance for _, estimate in added]).reshape(-1, 6, 6),
+        np.zeros(len(added)),
+        np.zeros(len(added), bool),
     )
-    return every.choose(np.argsort(every.frames, kind="stable"))
+    return voters.joined(others)
