@@ -175,37 +175,35 @@ class SequenceLocalizer:
         if latest.split(self.settings)[-1].start == len(latest) - 1:  # tracking was lost: a new piece
             del self._timestamps[:-1], self._poses[:-1]
             self._queries, self._solved = queries_of({}), None
-        frame = len(self._poses) - 1
         if image is None:
             self.single = None
-            return self._led_on(frame)
+            return self._led_on()
         given: Any = cameras
         self.single = self._pictures.localize(image, given)
-        self._queries = self._queries.joined(queries_of({frame: self.single}))
-        return self._solve(frame, image, given)
+        self._queries = self._queries.joined(queries_of({len(self._poses) - 1: self.single}))
+        return self._solve(image, given)
 
-    def _solve(self, frame: int, image: Pictures, cameras: Cameras) -> PoseEstimate:
-        length_us = np.inf if self.settings.length_s is None else self.settings.length_s * 1e6
-        start = int(np.searchsorted(self._timestamps, self._timestamps[frame] - length_us))
-        window = Odometry(np.array(self._timestamps[start:], np.int64), np.stack(self._poses[start:]))
-        inside = self._queries.frames >= start
+    def _solve(self, image: Pictures, cameras: Cameras) -> PoseEstimate:
+        if self.settings.length_s is not None:  # what is before the window is forgotten
+            start = int(np.searchsorted(self._timestamps, self._timestamps[-1] - self.settings.length_s * 1e6))
+            del self._timestamps[:start], self._poses[:start]
+            self._queries = self._queries.choose(self._queries.frames >= start).shifted(-start)
+        window = Odometry(np.array(self._timestamps, np.int64), np.stack(self._poses))
         offline = self.settings.model_copy(update={"online": False, "length_s": None})
 
         def localize_again(todo: Sequence[tuple[int, RoughPose]]) -> list[PoseEstimate]:
             return [self._pictures.localize(image, cameras, near) for _, near in todo]
 
-        asked = np.array([frame - start], np.int64)
         again = localize_again if self.settings.relocalize else None
-        done = localize_piece(window, self._queries.choose(inside).shifted(-start), asked, offline, again)
-        self._queries = self._queries.choose(~inside).joined(done.queries.shifted(start))
-        self._solved = frame, done.placed
-        placed = done.placed
+        done = localize_piece(window, self._queries, np.array([len(window) - 1]), offline, again)
+        self._queries, placed = done.queries, done.placed
+        self._solved = len(window) - 1, placed
         if not np.isfinite(placed.world_from_rig[-1]).all():
             return PoseEstimate(str(placed.status[-1]), found_by="sequence")
         return self._estimate(placed.world_from_rig[-1], placed.covariances[-1], str(placed.status[-1]))
 
-    def _led_on(self, frame: int) -> PoseEstimate:
-        """Return the pose of a frame as odometry leads to it from the last picture."""
+    def _led_on(self) -> PoseEstimate:
+        """Return the latest pose as odometry leads to it from the last picture."""
         if self._solved is None:
             return PoseEstimate("failed: no query of this piece has a pose", found_by="sequence")
         last, placed = self._solved
