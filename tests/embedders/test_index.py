@@ -81,7 +81,7 @@ def test_rows_that_are_not_allowed_are_not_found(place: Path, tmp_path: Path, fa
         assert (scores == expected).mean() > 0.8
 
 
-@pytest.mark.parametrize("factory", ["IVF16,Flat", "PQ16"])
+@pytest.mark.parametrize("factory", ["IVF16,Flat", "PQ16np"])
 def test_each_query_finds_what_it_may(place: Path, tmp_path: Path, factory: str) -> None:
     vectors = stored(place)
     settings = RetrieveSettings(index=factory, index_candidates=200, nprobe=16)
@@ -101,7 +101,7 @@ def test_each_query_finds_what_it_may(place: Path, tmp_path: Path, factory: str)
     assert all(distinct[mask][row[row >= 0]].all() for mask, row in zip(which, found[1], strict=True) if mask >= 0)
 
 
-@pytest.mark.parametrize("factory", ["LSH", "PQ16", "NSG16", "IVF16,PQ16+8", "PQ16,RFlat"])
+@pytest.mark.parametrize("factory", ["LSH", "PQ16np", "NSG16", "IVF16,PQ16+8", "PQ16np,RFlat"])
 def test_rows_are_selected_from_what_an_index_finds_that_knows_no_selection(
     place: Path, tmp_path: Path, factory: str
 ) -> None:
