@@ -68,9 +68,9 @@ def localize_piece(
     singles[queries.frames] = queries.world_from_rig
     voted = np.full((len(asked), 4, 4), np.nan)
     if len(queries) and not settings.online:
-        seed = place(odometry, queries, settings)[0].seed
-        laid = queries.world_from_rig[seed] @ geometry.invert(odometry.odom_from_rig[queries.frames[seed]])
-        voted = laid @ odometry.odom_from_rig[asked]
+        voted = _laid(odometry, queries.choose(place(odometry, queries, settings)[0].members)) @ (
+            odometry.odom_from_rig[asked]
+        )
     graph = first.world_from_rig[asked]
     for frame, estimate in answers.items():
         if estimate.world_from_rig is not None:
@@ -82,6 +82,14 @@ def _placed(odometry: Odometry, queries: PosedQueries, asked: Ints, settings: Se
     if settings.online:
         return place_online(odometry, queries, asked, settings)
     return place_piece(odometry, queries, settings)
+
+
+def _laid(odometry: Odometry, agreeing: PosedQueries) -> Floats:
+    """Return world_from_odom (4, 4) of that query whose placement is the nearest to the others', in the median."""
+    moved, poses = odometry.odom_from_rig[agreeing.frames], agreeing.world_from_rig
+    candidates = poses @ geometry.invert(moved)
+    _, off_m = geometry.pose_error(candidates[:, None] @ moved, np.broadcast_to(poses, (len(poses), *poses.shape)))
+    return np.asarray(candidates[int(np.argmin(np.median(off_m, axis=1)))])
 
 
 def _rough(placed: PlacedPiece, frame: int) -> RoughPose:
