@@ -173,6 +173,18 @@ def test_a_damaged_map_or_index_makes_its_stage_run_again(place: Path, stage: st
     assert job.outputs() != before
 
 
+@pytest.mark.parametrize("name", [".csv", "_steps.csv", ".txt.meta.json"])
+def test_what_the_sequence_stage_writes_is_not_of_localize(place: Path, name: str) -> None:
+    files = SceneFiles(place / "runs", "A_sequence")
+    localize, sequence = (pipeline.Job(stage, files, LocalizeSettings(), {}) for stage in ("localize", "sequence"))
+    pair = "A_sequence_map_ios_query_hl"
+    write_text(files.poses_dir / f"{pair}.txt", "single")
+    before = localize.outputs(), sequence.outputs()
+    write_text(files.poses_dir / f"{pair}_sequence{name}", "frames")
+    assert localize.outputs() == before[0]
+    assert sequence.outputs() != before[1]
+
+
 def test_a_stage_with_something_to_try_again_is_not_reused(place: Path, go: Callable[..., dict[str, str]]) -> None:
     jsonl = place / "runs/run/P/retrieval/P_map_all_query_all.jsonl"
     write_text(jsonl, "10")

@@ -349,6 +349,11 @@ def pair_name(scene: str, map_device: str, query_device: str) -> str:
     return f"{scene}_map_{map_device}_query_{query_device}"
 
 
+def of_sequence(name: str) -> bool:
+    """Tell whether a file, by its name, is of the sequence stage, which writes beside the poses of single queries."""
+    return "_sequence" in name.rpartition("_query_")[2]
+
+
 def map_record_path(poses_dir: str | Path, scene: str, map_device: str) -> Path:
     """Return where the localize stage says what is known of a map."""
     return Path(poses_dir) / f"{scene}_map_{map_device}.json"

@@ -31,6 +31,7 @@ from toolkit.files import (
     checksum,
     files_fingerprint,
     fingerprint,
+    of_sequence,
     read_json,
     write_text,
 )  # fmt: skip
@@ -100,7 +101,7 @@ class Job:
 
     def makes(self, name: str) -> bool:
         """Tell whether a file of the stage's folder of results, by its path there, is one of the job's."""
-        return self.label in name and (self.stage == "sequence") == ("_sequence." in name)
+        return self.label in name and (self.stage == "sequence") == of_sequence(name)
 
     def outputs(self) -> str:
         """Return what identifies the files that the job has made."""

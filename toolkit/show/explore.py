@@ -132,7 +132,8 @@ def draw_sequence(capture: Capture, path: str | Path, up: ArrayLike | None = Non
     map_device = path.stem.removeprefix(f"{capture.name}_map_").split("_query_")[0]
     mapped = _poses(capture[f"{map_device}_map"])
     axes, labels = ground_axes(up_of_cameras(mapped) if up is None else up, unit)
-    whole, single = (Trajectory.read(one) for one in (path, path.with_name(path.name.replace("_sequence", ""))))
+    alone = path.with_name(f"{path.stem.removesuffix('_sequence')}.txt")
+    whole, single = Trajectory.read(path), Trajectory.read(alone)
     table = read_query_table(path.with_suffix(".csv"), ["recording", "piece", "used"])
     keys = list(zip(whole.timestamps.tolist(), whole.device_ids.tolist(), strict=True))
     rows = table.set_index(["timestamp", "device_id"]).loc[keys]

@@ -15,7 +15,7 @@ from urllib.parse import quote
 import pandas as pd
 
 from toolkit.errors import ArtifactError
-from toolkit.files import SceneFiles, read_map_record, sidecar_path, write_text
+from toolkit.files import SceneFiles, of_sequence, read_map_record, sidecar_path, write_text
 from toolkit.show.figures import number, percent
 from toolkit.show.metrics import REASONS, THRESHOLDS, WRONG, parse_threshold, small_unit, unit_of, worst_first
 
@@ -309,7 +309,8 @@ def _pairs_of(files: SceneFiles) -> dict[tuple[str, str], Path]:
     """Return the path, without suffix, of the results of each pair that has any."""
     pairs = {}
     for path in sorted([*files.poses_dir.glob("*.csv"), *files.poses_dir.glob("*.txt")]):
-        if devices := re.fullmatch(f"{re.escape(files.scene)}_map_(.+)_query_(.+)(?<!_sequence)", path.stem):
+        devices = re.fullmatch(f"{re.escape(files.scene)}_map_(.+)_query_(.+)", path.stem)
+        if devices and not of_sequence(path.stem):
             pairs[devices[1], devices[2]] = path.with_suffix("")
     return pairs
 
