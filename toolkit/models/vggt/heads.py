@@ -169,14 +169,15 @@ def add_position(x: Tensor, aspect: float, factor: float = 0.1) -> Tensor:
     """
     _, C, height, width = x.shape
     diagonal = (1 + aspect**2) ** 0.5
-    frequencies = 1.0 / 100.0 ** (torch.arange(C // 4, dtype=torch.float64, device=x.device) / (C / 4))
+    # In float64 on the CPU: Apple's GPUs have none.
+    frequencies = 1.0 / 100.0 ** (torch.arange(C // 4, dtype=torch.float64) / (C / 4))
     for channels, span, count, axis in (
         (slice(0, C // 2), aspect / diagonal, width, 1),
         (slice(C // 2, C), 1 / diagonal, height, 2),
     ):
         last = span * (count - 1) / count
-        angles = frequencies[:, None] * torch.linspace(-last, last, count, device=x.device)
-        waves = torch.cat([angles.sin(), angles.cos()]).float() * factor
+        angles = frequencies[:, None] * torch.linspace(-last, last, count)
+        waves = (torch.cat([angles.sin(), angles.cos()]).float() * factor).to(x.device)
         x[:, channels].add_(waves.unsqueeze(axis))
     return x
 
