@@ -1,6 +1,7 @@
 """Devices, precisions, and batches that do not fit."""
 
 import logging
+from typing import Self
 from unittest.mock import MagicMock, call
 
 import pytest
@@ -8,7 +9,7 @@ import torch
 
 from toolkit.errors import ManifestError, ToolkitError
 from toolkit.models import compute
-from toolkit.models.compute import Fitting, resolve_device, resolve_precision, upload
+from toolkit.models.compute import Fitting, full_float32, on_device, resolve_device, resolve_precision, upload
 
 
 @pytest.mark.parametrize("name", ["gpu", "cuda:", "cuda:x", "cuda0", "", "CPU", "xpu"])
@@ -26,6 +27,8 @@ def test_devices_that_are_not_here(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ToolkitError, match="compute_device is mps"):
         resolve_device("mps")
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    assert resolve_device("auto").type == "cpu", "GPUs that the driver is too old for"
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert resolve_device("auto").type == "cuda"
     assert resolve_device("cuda:1").index == 1
     with pytest.raises(ToolkitError, match=r"cuda:2.*cuda:0 to cuda:1"):
@@ -107,7 +110,17 @@ def test_not_even_one_row_fits() -> None:
         Fitting(Memory(0), "images")(torch.arange(3))
 
 
-@pytest.mark.parametrize("message", ["DefaultCPUAllocator: can't allocate memory", "MPS backend out of memory"])
+@pytest.mark.parametrize(
+    "message",
+    [
+        "DefaultCPUAllocator: can't allocate memory",
+        "MPS backend out of memory",
+        "Invalid buffer size: 24.00 GiB",
+        "CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`",
+        "cuDNN error: CUDNN_STATUS_ALLOC_FAILED",
+        "GET was unable to find an engine to execute this computation",
+    ],
+)
 def test_other_devices_say_it_in_words(message: str) -> None:
     tried: list[int] = []
 
@@ -119,6 +132,48 @@ def test_other_devices_say_it_in_words(message: str) -> None:
 
     assert len(Fitting(run, "images")(torch.arange(4))) == 4
     assert tried == [4, 2, 2]
+
+
+class Full(torch.nn.Module):
+    """A network that a device has no room for, or does not know."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__()
+        self.message = message
+
+    def to(self, *_: object) -> Self:
+        raise RuntimeError(self.message)
+
+
+def test_weights_that_do_not_fit() -> None:
+    with pytest.raises(ToolkitError, match=r"memory of cuda:0.*weights of VGGT.*Tried to allocate"):
+        on_device(Full("CUDA out of memory. Tried to allocate 2 GiB"), torch.device("cuda:0"), "VGGT")
+    with pytest.raises(RuntimeError, match="no kernel image"):
+        on_device(Full("no kernel image is available"), torch.device("cuda:0"), "VGGT")
+
+
+def test_a_gpu_multiplies_float32_in_full_and_then_as_before() -> None:
+    flags = [torch.backends.cudnn.conv, torch.backends.cuda.matmul]
+    before = [owner.fp32_precision for owner in flags]
+    assert before[0] == "tf32", "cuDNN's default"
+    with full_float32(torch.device("cuda")):
+        assert [owner.fp32_precision for owner in flags] == ["ieee", "ieee"]
+    assert [owner.fp32_precision for owner in flags] == before
+    assert torch.get_float32_matmul_precision() == "highest"
+
+
+def test_a_batch_is_moved_by_the_parts_that_fit() -> None:
+    """On a device without memory for any numbers, that of `torch.device("meta")`, where they are stays to be seen."""
+    seen: list[tuple[int, str]] = []
+
+    def run(batch: torch.Tensor) -> torch.Tensor:
+        seen.append((len(batch), batch.device.type))
+        if len(batch) > 2:
+            raise torch.OutOfMemoryError
+        return batch
+
+    Fitting(run, "images", torch.device("meta"))(torch.arange(4))
+    assert seen == [(4, "meta"), (2, "meta"), (2, "meta")]
 
 
 def test_other_errors_are_not_taken_for_it() -> None:

@@ -15,7 +15,7 @@ from toolkit.errors import ManifestError, ToolkitError
 from toolkit.features.features import LocalFeatures
 from toolkit.features.matching import MATCHER_WEIGHTS, PairMatches
 from toolkit.files import Remade
-from toolkit.models.compute import Fitting, in_single_threads, precision_of_matches, resolve_device
+from toolkit.models.compute import Fitting, in_single_threads, on_device, precision_of_matches, resolve_device
 from toolkit.models.lightglue import LightGlue, official_names
 from toolkit.models.weights import given_or_resolved, load_checkpoint, weights_digest
 
@@ -77,9 +77,9 @@ class LightGlueMatcher(Remade):
         load_checkpoint(model, given_or_resolved(source, checkpoint), source.model, ignore, official_names)
         self._weights = weights_digest(model)
         model.fold_(self._dtype)
-        self._model = model.to(self._device)
-        self._fitting_images = Fitting(self._encode, "images")
-        self._fitting_pairs = Fitting(self._forward, "pairs of images")
+        self._model: Any = on_device(model, self._device, "LightGlue")
+        self._fitting_images = Fitting(self._encode, "images", self._device)
+        self._fitting_pairs = Fitting(self._forward, "pairs of images", self._device)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -148,7 +148,7 @@ class LightGlueMatcher(Remade):
         for start in range(0, len(new), count):
             part = new[start : start + count]
             batch = pad_sequence([torch.from_numpy(_pack(features)) for features in part], batch_first=True)
-            for features, rows in zip(part, self._fitting_images(batch.to(self._device)), strict=True):
+            for features, rows in zip(part, self._fitting_images(batch), strict=True):
                 encoded[id(features)] = rows[: len(features)]
 
     def _encode(self, batch: Tensor) -> Tensor:

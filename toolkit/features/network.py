@@ -14,7 +14,7 @@ from toolkit.errors import ToolkitError
 from toolkit.features.features import LocalFeatures
 from toolkit.files import Remade
 from toolkit.manifest import AlikedSettings, SuperPointSettings
-from toolkit.models.compute import Fitting, precision_of_matches, resolve_device
+from toolkit.models.compute import Fitting, on_device, precision_of_matches, resolve_device
 from toolkit.models.weights import weights_digest
 
 # Few images keep a CPU busy; more at once take more memory and no less time.
@@ -49,7 +49,7 @@ class NetworkExtractor(Remade):
         self.batch_size = batch_size or _BATCH.get(self._device.type, _BATCH_ELSEWHERE)
         model = self._load(checkpoint)
         self._weights = weights_digest(model)
-        self._model: Any = model.to(self._device)
+        self._model: Any = on_device(model, self._device, self.title)
         self._fitting: dict[tuple[int, ...], Fitting] = {}
 
     @property
@@ -85,12 +85,12 @@ class NetworkExtractor(Remade):
             of_shape.setdefault(image.shape, []).append(number)
         features: dict[int, LocalFeatures] = {}
         for shape, numbers in of_shape.items():
-            fitting = self._fitting.setdefault(shape, Fitting(self._forward, "images"))
+            fitting = self._fitting.setdefault(shape, Fitting(self._forward, "images", self._device))
             for start in range(0, len(numbers), self.batch_size):
                 part = numbers[start : start + self.batch_size]
                 batch = torch.from_numpy(np.stack([prepared[number] for number in part]))
                 with torch.inference_mode():
-                    packed = fitting(batch.to(self._device)).cpu().numpy()
+                    packed = fitting(batch).cpu().numpy()
                 for number, rows in zip(part, packed, strict=True):
                     features[number] = self._unpack(rows, shape, images[number].shape)
         return [features[number] for number in range(len(images))]

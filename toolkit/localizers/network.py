@@ -19,7 +19,7 @@ from toolkit.files import files_fingerprint
 from toolkit.geometry import Floats, invert, make_pose
 from toolkit.localizers.base import View
 from toolkit.localizers.prediction import Prediction
-from toolkit.models.compute import PRECISIONS, Fitting, resolve_device, resolve_precision
+from toolkit.models.compute import PRECISIONS, Fitting, on_device, resolve_device, resolve_precision
 from toolkit.models.weights import VGGT as WEIGHTS
 from toolkit.models.weights import resolve_weights
 
@@ -378,11 +378,11 @@ class NetworkPredictor:
 
         # Measured: float16 changes depth by 1.2e-4 of its size, a trunk in bfloat16 by 4e-3 whatever is kept.
         dtype = torch.float32 if self._dtype == torch.float32 else torch.float16
-        fitting = Fitting(self._model.encode, "images")
+        fitting = Fitting(self._model.encode, "images", self._device)
         found = {}
         for start in range(0, len(images), _IMAGES_AT_A_TIME):
             part = images[start : start + _IMAGES_AT_A_TIME]
-            batch = torch.stack([image for _, image in part]).to(self._device)
+            batch = torch.stack([image for _, image in part])
             for (placed, _), tokens in zip(part, fitting(batch).to("cpu", dtype), strict=True):
                 # A copy: a part of the batch would hold all of it in memory.
                 found[placed.key] = tokens.clone()
@@ -417,10 +417,11 @@ class NetworkPredictor:
 
         while True:
             views = min(tokens.shape[1], self._most_views.get(size, tokens.shape[1]))
-            run = self._fitting.setdefault((views, size), Fitting(self._network(size), f"groups of {views} views"))
+            new = Fitting(self._network(size), f"groups of {views} views", self._device)
+            run = self._fitting.setdefault((views, size), new)
             try:
                 with torch.inference_mode():
-                    return run(tokens[:, :views].to(self._device))
+                    return run(tokens[:, :views])
             except ToolkitError as error:
                 if views <= _LEAST_VIEWS:
                     raise ToolkitError(
@@ -484,7 +485,7 @@ def _load_network(checkpoint: Path, heads: tuple[str, ...], dtype: "torch.dtype"
     if key not in _loaded:
         _loaded.clear()  # before the load: the memory may hold one network, and not two
         model = VGGT.from_checkpoint(checkpoint, heads=heads, compute_dtype=dtype)
-        _loaded[key] = model.to(device)
+        _loaded[key] = on_device(model, device, "VGGT")
     return _loaded[key]
 
 

@@ -5,13 +5,14 @@ import os
 import platform
 import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from toolkit.errors import ManifestError, ToolkitError
+from toolkit.errors import ManifestError, ToolkitError, first_line
 
 if TYPE_CHECKING:
     import torch
@@ -42,7 +43,9 @@ def resolve_device(name: str = "auto") -> "torch.device":
 
     if not re.fullmatch(DEVICE_NAME, name):
         raise ManifestError(f"compute_device is {name!r}; expected auto, cpu, cuda, cuda:<number> or mps.")
-    gpus, apple = torch.cuda.device_count(), torch.backends.mps.is_available()
+    # Where the driver is too old for this torch, GPUs are counted and cannot be used.
+    gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    apple = torch.backends.mps.is_available()
     if name == "auto":
         name = "cuda" if gpus else "mps" if apple else "cpu"
     kind, _, number = name.partition(":")
@@ -170,6 +173,48 @@ def upload(batch: "torch.Tensor", device: "torch.device") -> "torch.Tensor":
     return copied
 
 
+def on_device(model: "torch.nn.Module", device: "torch.device", title: str) -> "torch.nn.Module":
+    """Return a network that was moved to a device; `title` is its name, for messages.
+
+    Raises:
+        ToolkitError: the device's memory does not hold its weights.
+    """
+    try:
+        return model.to(device)
+    except RuntimeError as error:
+        if not is_out_of_memory(error):
+            raise
+        reason = first_line(error)
+    raise ToolkitError(
+        f"The memory of {device} does not hold the weights of {title} ({reason}). Free some, use dtype_compute: "
+        "bfloat16, or compute_device: cpu."
+    )
+
+
+@contextmanager
+def full_float32(device: "torch.device") -> Iterator[None]:
+    """Multiply float32 as float32 on a GPU, whatever the process has chosen; then as before.
+
+    By its default, cuDNN rounds what a convolution multiplies to TF32, which has the 10 bits of float16.
+    """
+    import torch
+
+    cudnn: Any = torch.backends.cudnn
+    matmul: Any = torch.backends.cuda.matmul
+    # torch 2.9 has new flags; with them set, the older ones cannot be read.
+    new = hasattr(cudnn, "conv")
+    owners = [] if device.type != "cuda" else [cudnn.conv, matmul] if new else [cudnn, matmul]
+    name, exact = ("fp32_precision", "ieee") if new else ("allow_tf32", False)
+    before = [getattr(owner, name) for owner in owners]
+    try:
+        for owner in owners:
+            setattr(owner, name, exact)
+        yield
+    finally:
+        for owner, value in zip(owners, before, strict=True):
+            setattr(owner, name, value)
+
+
 @cache
 def _copy_stream(device: "torch.device") -> "torch.cuda.Stream":
     """Return the stream for copies to a GPU: one, as torch keeps memory apart for each stream that had some."""
@@ -179,16 +224,21 @@ def _copy_stream(device: "torch.device") -> "torch.cuda.Stream":
 
 
 class Fitting:
-    """Runs a function on batches; splits them into smaller parts once one did not fit the memory of the device."""
+    """Runs a function on a device; splits batches into smaller parts once one did not fit its memory."""
 
-    def __init__(self, run: "Callable[[torch.Tensor], torch.Tensor]", what: str) -> None:
+    def __init__(
+        self, run: "Callable[[torch.Tensor], torch.Tensor]", what: str, device: "torch.device | None" = None
+    ) -> None:
         """`run` maps (B, ...) to (B, ...), each row on its own; `what` the rows are, in the plural, is for messages."""
         self._run = run
+        self._device = device
         self._what = what
         self._limit: int | None = None
 
     def __call__(self, batch: "torch.Tensor") -> "torch.Tensor":
         """Return `run(batch)`; halves the batch as often as needed, logs a warning, and remembers the size that fits.
+
+        A batch that is elsewhere is moved to the device by parts. float32 is computed in full, see `full_float32`.
 
         Raises:
             ToolkitError: not even one row fits.
@@ -197,33 +247,41 @@ class Fitting:
 
         parts = []
         start = 0
+        device = self._device or batch.device
         while start < len(batch):
             count = min(self._limit or len(batch), len(batch) - start)
             try:
-                parts.append(self._run(batch[start : start + count]))
+                with full_float32(device):
+                    parts.append(self._run(batch[start : start + count].to(device)))
                 start += count
                 continue
             except RuntimeError as error:
-                if not _is_out_of_memory(error):
+                if not is_out_of_memory(error):
                     raise
-                reason = str(error).strip().split("\n")[0]
+                reason = first_line(error)
             # Outside the handler, where the traceback would keep the tensors of the failed attempt alive.
             if count == 1:
                 raise ToolkitError(
-                    f"The memory of {batch.device} does not hold the network with one of the {self._what} "
+                    f"The memory of {device} does not hold the network with one of the {self._what} "
                     f"({reason}). Use a smaller image_size, dtype_compute: bfloat16, or compute_device: cpu."
                 )
             self._limit = count // 2
             log.warning("%d %s do not fit the memory of %s, going on with %d at a time",
-                        count, self._what, batch.device, self._limit)  # fmt: skip
-            if batch.device.type == "cuda":
+                        count, self._what, device, self._limit)  # fmt: skip
+            if device.type == "cuda":
                 torch.cuda.empty_cache()
         return parts[0] if len(parts) == 1 else torch.cat(parts)
 
 
-def _is_out_of_memory(error: Exception) -> bool:
+_NO_MEMORY = re.compile(
+    r"out of memory|can't allocate memory|CU(BLAS|DNN|SOLVER|SPARSE)_STATUS_ALLOC_FAILED"
+    r"|unable to find an engine|Invalid buffer size", re.IGNORECASE
+)  # fmt: skip
+"""What CUDA's libraries, cuDNN without room for any of its engines, Metal and the CPU's allocator say."""
+
+
+def is_out_of_memory(error: Exception) -> bool:
+    """Tell whether torch says by an error that a device's memory does not suffice."""
     import torch
 
-    # Only CUDA raises its own exception type.
-    text = str(error)
-    return isinstance(error, torch.OutOfMemoryError) or "out of memory" in text or "can't allocate memory" in text
+    return isinstance(error, torch.OutOfMemoryError) or bool(_NO_MEMORY.search(str(error)))
