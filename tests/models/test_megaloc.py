@@ -74,7 +74,9 @@ def test_the_state_dict_is_the_official_one(golden_root: Path) -> None:
 
 @pytest.fixture(scope="module")
 def official_bfloat16(golden: ModuleType) -> MegaLoc:
-    return MegaLoc.from_checkpoint(golden.state("megaloc")).to(torch.bfloat16)
+    model = MegaLoc.from_checkpoint(golden.state("megaloc"))
+    model.compute_in(torch.bfloat16)
+    return model
 
 
 @pytest.mark.slow
@@ -86,7 +88,7 @@ def test_bfloat16_on_the_cpu_points_the_same_way(
     with torch.inference_mode():
         exact, rough = official(images), official_bfloat16(images)
     assert rough.dtype == torch.float32
-    assert (exact * rough).sum(dim=1).min() >= 0.999
+    assert (exact * rough).sum(dim=1).min() >= 1 - 1e-5
 
 
 def tiny_megaloc(seed: int = 0, out: int = 32) -> MegaLoc:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from toolkit.errors import ManifestError, ToolkitError
 from toolkit.files import Remade
-from toolkit.models.compute import Fitting, resolve_device, resolve_precision, upload
+from toolkit.models.compute import Fitting, is_out_of_memory, on_device, resolve_device, resolve_precision, upload
 from toolkit.models.megaloc import PATCH, MegaLoc
 from toolkit.models.vit import IMAGENET_MEAN, IMAGENET_STD
 from toolkit.models.weights import MEGALOC, given_or_resolved, weights_digest
@@ -60,10 +60,11 @@ class MegaLocEmbedder(Remade):
         model = deepcopy(weights) if isinstance(weights, MegaLoc) else MegaLoc.from_checkpoint(weights)
         self._weights = weights_digest(model)
         self.dim = model.dim
-        self._model = model.to(self._device, self._dtype).eval()
+        model.compute_in(self._dtype)
+        self._model = on_device(model, self._device, "MegaLoc").eval()
         self._mean = torch.tensor(IMAGENET_MEAN, device=self._device).view(1, 3, 1, 1)
         self._std = torch.tensor(IMAGENET_STD, device=self._device).view(1, 3, 1, 1)
-        self._fitting = Fitting(self._forward, "images")
+        self._fitting = Fitting(self._forward, "images", self._device)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -94,8 +95,14 @@ class MegaLocEmbedder(Remade):
         return np.asarray(Image.fromarray(np.ascontiguousarray(image)).resize(square, Image.Resampling.BILINEAR))
 
     def stack(self, inputs: Sequence[NDArray[np.uint8]]) -> Tensor:
-        """Return images (H, W, 3), uint8 RGB, of any sizes as a batch (B, S, S, 3) on the device."""
-        return upload(torch.from_numpy(np.stack([self.prepare(image) for image in inputs])), self._device)
+        """Return images (H, W, 3), uint8 RGB, of any sizes as a batch (B, S, S, 3), on the device if it has room."""
+        batch = torch.from_numpy(np.stack([self.prepare(image) for image in inputs]))
+        try:
+            return upload(batch, self._device)
+        except RuntimeError as error:
+            if not is_out_of_memory(error):
+                raise
+        return batch  # goes there in parts
 
     def embed(self, inputs: Sequence[NDArray[np.uint8]] | Tensor) -> NDArray[np.float32]:
         """Return unit vectors (B, 8448) of images (H, W, 3), uint8 RGB, of any sizes, or of what `stack` made of them.

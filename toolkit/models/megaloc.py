@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from toolkit.models.vit import PATCH, Dinov2
+from toolkit.models.vit import PATCH, Dinov2, set_matrix_type
 from toolkit.models.weights import load_checkpoint
 
 _SINKHORN_STEPS = 3
@@ -145,6 +145,13 @@ class MegaLoc(nn.Module):
             model = cls()
         load_checkpoint(model, checkpoint, "MegaLoc")
         return model
+
+    def compute_in(self, dtype: torch.dtype) -> None:
+        """Choose the type of the transformer's matrix products; its sums and the aggregation stay float32.
+
+        Cosines with the descriptors in float32 are above 1 - 1e-5 in bfloat16; above 1 - 1e-4 with sums in it, too.
+        """
+        set_matrix_type(self.backbone, dtype)
 
     def forward(self, images: Tensor) -> Tensor:
         """Return descriptors (B, 8448) float32, of length 1.
