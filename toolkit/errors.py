@@ -15,7 +15,8 @@ log = logging.getLogger(__name__)
 INTERNAL = "internal: "
 """Before the reason of a row that is there for a fault of the toolkit: the next run tries it again."""
 _OF_THE_MACHINE = ("out of memory", "allocate memory", "insufficient memory", "not enough memory", "bad_alloc",
-                   "cuda error", "device-side assert")  # fmt: skip
+                   "cuda error", "device-side assert", "hip error", "cublas", "cudnn", "find an engine",
+                   "invalid buffer size", "mps framework", "mps device")  # fmt: skip
 
 
 class ToolkitError(Exception):

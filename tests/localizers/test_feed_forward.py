@@ -215,7 +215,17 @@ def test_one_bad_query_is_a_failed_answer_and_the_others_go_on(world: World, how
         np.testing.assert_array_equal(answers[index].estimate.world_from_rig, good[index].estimate.world_from_rig)
 
 
-@pytest.mark.parametrize("error", [RuntimeError("CUDA error: an illegal access"), MemoryError(), OSError(5, "disk")])
+@pytest.mark.parametrize(
+    "error",
+    [
+        RuntimeError("CUDA error: no kernel image is available for execution on the device"),
+        RuntimeError("cuDNN error: CUDNN_STATUS_NOT_INITIALIZED"),
+        RuntimeError("GET was unable to find an engine to execute this computation"),
+        TypeError("Cannot convert a MPS Tensor to float64 dtype as the MPS framework doesn't support float64."),
+        MemoryError(),
+        OSError(5, "disk"),
+    ],
+)
 def test_what_a_device_refuses_is_no_answer_to_a_query(
     world: World, error: Exception, monkeypatch: pytest.MonkeyPatch
 ) -> None:
