@@ -20,13 +20,16 @@ from toolkit.capture.turning import turn_image, turn_points, turned_from_cam
 from toolkit.errors import ManifestError, ToolkitError, WeightsError
 from toolkit.geometry import invert
 from toolkit.localizers import network
+from toolkit.localizers.architectures import ARCHITECTURES, estimate_bytes
 from toolkit.localizers.base import View
-from toolkit.localizers.network import NetworkPredictor, TokenCache, estimate_bytes
+from toolkit.localizers.network import NetworkPredictor, TokenCache
 from toolkit.localizers.prediction import Prediction
 from toolkit.models.vggt import VGGT, cameras_from_pose_encoding, load_images
 
 # In the network 518 x 112, 518 x 126 and 112 x 518 pixels.
 WIDE, HIGHER, PORTRAIT = (370, 80), (333, 81), (80, 370)
+
+VGGT_ROW = ARCHITECTURES["vggt"]
 
 Make = Callable[..., NetworkPredictor]
 
@@ -230,17 +233,17 @@ def test_the_next_call_is_decoded_while_the_network_runs(
     shared = photographs.view()
     first, second = ([photographs.view(in_map=False), photographs.view(), shared] for _ in range(2))
     expected = make(cache_bytes=0).predict([first, second])
-    read, begun, done = network._read, list[Path](), threading.Semaphore(0)
+    read, begun, done = NetworkPredictor._read, list[Path](), threading.Semaphore(0)
 
-    def reads(placed: Any) -> Any:
+    def reads(predictor: NetworkPredictor, placed: Any) -> Any:
         if placed is not None:
             begun.append(placed.view.image)
-        image = read(placed)
+        image = read(predictor, placed)
         if placed is not None and placed.view in second[:2]:
             done.release()
         return image
 
-    monkeypatch.setattr(network, "_read", reads)
+    monkeypatch.setattr(NetworkPredictor, "_read", reads)
     predictor = make()
     forward = predictor._model.forward
 
@@ -280,7 +283,7 @@ def test_smaller_batches_where_memory_is_short(
     predictor = make(batch_size=5)
     expected = predictor.predict(groups)
     shapes = record_shapes(predictor, monkeypatch)
-    two = estimate_bytes(2, 3, (112, 518), channels=32, depth=False)
+    two = estimate_bytes(VGGT_ROW, 2, 3, (112, 518), channels=32, depth=False)
     monkeypatch.setattr(network, "free_bytes", lambda _: 1.3 * two)
     for found, other in zip(predictor.predict(groups), expected, strict=True):
         assert_same(found, other)
@@ -293,7 +296,7 @@ def test_fewer_views_where_memory_is_shorter(
     group = photographs.group(*[WIDE] * 5)
     predictor = make(needs_depth=True)
     [expected] = predictor.predict([group[:3]])
-    three = estimate_bytes(1, 3, (112, 518), channels=32)
+    three = estimate_bytes(VGGT_ROW, 1, 3, (112, 518), channels=32)
     monkeypatch.setattr(network, "free_bytes", lambda _: 1.26 * three)
     [found] = predictor.predict([group])
     assert "the first 3 go on" in caplog.text
@@ -361,10 +364,11 @@ def test_memory_for_not_even_two_views(make: Make, photographs: Photographs, mon
 
 def test_estimates_are_as_measured() -> None:
     """Followed allocations: 6 views of 294 x 518, cameras alone 196 MB; 2 views, with depth 279 MB."""
-    assert 196e6 < estimate_bytes(1, 6, (294, 518), depth=False) < 1.1 * 196e6
-    assert 279e6 < estimate_bytes(1, 2, (294, 518)) < 1.2 * 279e6
-    assert estimate_bytes(3, 2, (140, 140)) == estimate_bytes(2, 3, (140, 140)) > estimate_bytes(1, 3, (140, 140))
-    assert estimate_bytes(1, 11, (518, 518), on_cpu=False) > estimate_bytes(1, 11, (518, 518))
+    assert 196e6 < estimate_bytes(VGGT_ROW, 1, 6, (294, 518), depth=False) < 1.1 * 196e6
+    assert 279e6 < estimate_bytes(VGGT_ROW, 1, 2, (294, 518)) < 1.2 * 279e6
+    three, six, other = (estimate_bytes(VGGT_ROW, *shape, (140, 140)) for shape in ((1, 3), (2, 3), (3, 2)))
+    assert other == six > three
+    assert estimate_bytes(VGGT_ROW, 1, 11, (518, 518), on_cpu=False) > estimate_bytes(VGGT_ROW, 1, 11, (518, 518))
 
 
 # What is wrong with files

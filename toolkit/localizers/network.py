@@ -1,10 +1,9 @@
-"""VGGT as a predictor: the adapter between `toolkit.models.vggt` and the localizers."""
+"""A network as a predictor: which views run together, on which device, what is kept, and what memory allows."""
 
 import logging
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,28 +12,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from toolkit.capture.images import default_workers, prefetch, read_image
-from toolkit.capture.turning import turn_image, turn_points, turned_from_cam
+from toolkit.capture.turning import turn_image, turned_from_cam
 from toolkit.errors import ImageError, ManifestError, ToolkitError
 from toolkit.files import files_fingerprint
-from toolkit.geometry import Floats, invert, make_pose
+from toolkit.geometry import invert, make_pose
+from toolkit.localizers.architectures import ARCHITECTURES, Architecture, Size, estimate_bytes
 from toolkit.localizers.base import View
+from toolkit.localizers.placed import PlacedView, shown_size
 from toolkit.localizers.prediction import Prediction
-from toolkit.models.compute import PRECISIONS, Fitting, on_device, resolve_device, resolve_precision
-from toolkit.models.weights import VGGT as WEIGHTS
+from toolkit.models.compute import PRECISIONS, Fitting, free_bytes, on_device, resolve_device, resolve_precision
 from toolkit.models.weights import resolve_weights
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-    _Begun = dict[tuple[Path | int, tuple[int, int], int], Future[Tensor | ImageError | None]]
+    _Begun = dict[tuple[Path | int, Size, int], Future[Tensor | ImageError | None]]
 
 log = logging.getLogger(__name__)
 
 CACHE_BYTES = 2 << 30
 """Of encodings of map images that are kept: 500 of them at 518 x 392 in float32, twice as many in bfloat16."""
-_SIDE = 518
-_PATCH = 14
 # A CPU is kept busy by one group; more of them at once take memory and no less time.
 _GROUPS_AT_A_TIME = {"cpu": 1}
 _GROUPS_AT_A_TIME_ELSEWHERE = 8
@@ -42,125 +40,6 @@ _IMAGES_AT_A_TIME = 8
 # Part of the free memory to plan with: the rest is for what else runs, and for what the estimate leaves out.
 _MEMORY_SHARE = 0.8
 _LEAST_VIEWS = 2
-
-# Bytes that VGGT holds at most, measured in float32: for each number of the tokens (views x tokens x channels) during
-# a block and, with depth, kept of four layers; for each pixel of a frame in the depth head, and apart from pixels.
-_TRUNK_BYTES = 42
-_KEPT_BYTES = 32
-_DENSE_BYTES_PER_PIXEL = 1500
-_DENSE_BYTES = 32 << 20
-_DENSE_FRAMES = 8
-_RESULT_BYTES_PER_PIXEL = 24
-
-
-def estimate_bytes(
-    groups: int, views: int, size: tuple[int, int], channels: int = 1024, depth: bool = True, on_cpu: bool = True
-) -> int:
-    """Return the memory that VGGT needs, beside its weights, for so many groups of views at once.
-
-    Args:
-        groups, views: how many groups, of how many views each.
-        size: (H, W) of the network's images.
-        channels: of a token.
-        depth: whether the depth head runs.
-        on_cpu: where the depth head takes one frame at a time, elsewhere 8.
-    """
-    height, width = size
-    frames = groups * views
-    numbers = frames * (5 + (height // _PATCH) * (width // _PATCH)) * channels
-    trunk = _TRUNK_BYTES * numbers
-    if not depth:
-        return trunk
-    dense = _DENSE_BYTES_PER_PIXEL * height * width * (1 if on_cpu else min(frames, _DENSE_FRAMES)) + _DENSE_BYTES
-    return _KEPT_BYTES * numbers + max(trunk, dense) + _RESULT_BYTES_PER_PIXEL * frames * height * width
-
-
-def free_bytes(device: "torch.device") -> int:
-    """Return the memory of a device that nobody uses; of Apple's, that of the machine."""
-    import psutil
-    import torch
-
-    if device.type == "cuda":
-        # What torch has reserved and not handed out is as good as free.
-        reserved = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-        return int(torch.cuda.mem_get_info(device)[0]) + reserved
-    return int(psutil.virtual_memory().available)
-
-
-@dataclass(frozen=True)
-class _Placed:
-    """A view, and how it lies in the network's image."""
-
-    view: View
-    mode: str
-    """Of `load_images`."""
-    size: tuple[int, int]
-    """(H, W) of the network's images of its group."""
-
-    @property
-    def key(self) -> tuple[Path | int, tuple[int, int], int]:
-        """Of its encoding: in images of one size a photograph lies in one way."""
-        image = self.view.image
-        return image if isinstance(image, Path) else id(image), self.size, self.view.turns
-
-    @property
-    def map_from_image(self) -> Floats:
-        """(4,), see `Prediction`: from the photograph as it is stored to the network's image turned back to it."""
-        camera, (height, width) = self.view.camera, self.size
-        corners = np.array([[0, 0], [camera.width, camera.height]], np.float64)
-        turned = turn_points(corners, camera.width, camera.height, self.view.turns)
-        shown = turned * self._resized / _shown_size(self.view) + self.offset
-        first, last = turn_points(shown, width, height, -self.view.turns)
-        scale = (last - first) / corners[1]
-        return np.concatenate([scale, first])
-
-    def turned_back(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return numbers (H, W) of the network's image in the orientation of the photograph as it is stored."""
-        return turn_image(values, -self.view.turns)
-
-    @property
-    def offset(self) -> Floats:
-        """(2,): of x and of y, pixels of the network's image."""
-        return np.asarray((np.array(self.size[::-1]) - self._resized) // 2)
-
-    @property
-    def _resized(self) -> Floats:
-        return np.array(_resized(*_shown_size(self.view)), np.float64)
-
-    @property
-    def outside(self) -> NDArray[np.bool_]:
-        """(H, W): pixels of the network's image that the photograph does not cover."""
-        (left, top), (width, height) = self.offset.astype(int), self._resized.astype(int)
-        outside = np.ones(self.size, bool)
-        outside[top : top + height, left : left + width] = False
-        return outside
-
-
-def _shown_size(view: View) -> tuple[int, int]:
-    """Return the width and height of a photograph after its turns."""
-    size = (view.camera.width, view.camera.height)
-    return size[::-1] if view.turns % 2 else size
-
-
-def _resized(width: int, height: int) -> tuple[int, int]:
-    """Return the width and height to which the loader resizes a photograph that it does not cut."""
-    from toolkit.models.vggt.preprocess import resized_size
-
-    return resized_size(width, height, "pad")  # of a landscape photograph "crop" makes the same
-
-
-def _place(group: Sequence[View]) -> list[_Placed]:
-    """Return how the views of a group lie in images of one size, of which nothing is cut.
-
-    "crop" would cut a portrait photograph of a phone to its middle 75 % (3:4) or 56 % (9:16); "pad" keeps all of it,
-    in an image of the same 518 x 518. Of a landscape photograph "crop" cuts nothing, and without white bars it has a
-    quarter to two fifths fewer tokens.
-    """
-    sizes = [_shown_size(view) for view in group]
-    portrait = any(height > width for width, height in sizes)
-    heights = [_resized(*size)[1] for size in sizes]
-    height = _SIDE if portrait else max(heights, default=0)
-    return [_Placed(view, "pad" if portrait else "crop", (height, _SIDE)) for view in group]
 
 
 class TokenCache:
@@ -191,12 +70,11 @@ class TokenCache:
 
 
 class NetworkPredictor:
-    """Runs VGGT. The weights are looked for at once, and loaded when the first prediction is asked for.
+    """Runs a network. The weights are looked for at once, and loaded when the first prediction is asked for.
 
-    Photographs go in whole, see `_place`. The encoding of map images, a fifth of the work, is kept.
+    The encoding of map images, of VGGT a fifth of the work, is kept.
     """
 
-    name = "vggt"
     simulated = False
 
     def __init__(
@@ -208,6 +86,7 @@ class NetworkPredictor:
         needs_depth: bool = True,
         batch_size: int | None = None,
         cache_bytes: int = CACHE_BYTES,
+        architecture: Architecture = ARCHITECTURES["vggt"],
     ) -> None:
         """
         Args:
@@ -217,6 +96,7 @@ class NetworkPredictor:
             needs_depth: whether to predict depth too, for a fifth more time.
             batch_size: groups at a time, at most; None: what is usual for the device.
             cache_bytes: memory for the encodings of map images.
+            architecture: which network.
 
         Raises:
             ManifestError: no such device or precision.
@@ -224,14 +104,16 @@ class NetworkPredictor:
         """
         expected = [name for name in PRECISIONS if name != "float16"]
         if dtype_compute not in expected:
-            raise ManifestError(f"dtype_compute is {dtype_compute!r}; VGGT expects one of {', '.join(expected)}.")
-        self.checkpoint = resolve_weights(WEIGHTS, checkpoint)
+            title = architecture.title
+            raise ManifestError(f"dtype_compute is {dtype_compute!r}; {title} expects one of {', '.join(expected)}.")
+        self._architecture, self.name = architecture, architecture.name
+        self.checkpoint = resolve_weights(architecture.weights, checkpoint)
         self.compute_device, self.dtype_compute = compute_device, dtype_compute
         self.needs_depth = needs_depth
         self._batch_size = batch_size
         self._cache = TokenCache(cache_bytes)
-        self._fitting: dict[tuple[int, tuple[int, int]], Fitting] = {}
-        self._most_views: dict[tuple[int, int], int] = {}
+        self._fitting: dict[tuple[int, Size], Fitting] = {}
+        self._most_views: dict[Size, int] = {}
         self._begun: _Begun = {}
 
     @cached_property
@@ -258,7 +140,7 @@ class NetworkPredictor:
 
     @cached_property
     def _model(self) -> Any:
-        return _load_network(self.checkpoint, self._heads, self._dtype, self._device)
+        return _load_network(self._architecture, self.checkpoint, self._heads, self._dtype, self._device)
 
     def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
         """Return a prediction for each group of views, in order: the query first, then its references.
@@ -278,13 +160,13 @@ class NetworkPredictor:
             following: groups of the next call, whose first photographs are decoded while the network runs.
 
         Raises:
-            WeightsError: at the first call, the file is not of VGGT.
+            WeightsError: at the first call, the file is not of this network.
             ToolkitError: there is no such device; or the memory does not hold a query and one reference.
         """
-        placed = [_place(group) for group in groups]
-        begun = self._read_ahead(placed, [_place(group) for group in following])
+        placed = [self._place(group) for group in groups]
+        begun = self._read_ahead(placed, [self._place(group) for group in following])
         results = [_nothing(len(group)) for group in groups]
-        alike: dict[tuple[int, tuple[int, int]], list[int]] = {}
+        alike: dict[tuple[int, Size], list[int]] = {}
         for number, group in enumerate(placed):
             if group:
                 alike.setdefault((len(group), group[0].size), []).append(number)
@@ -298,11 +180,17 @@ class NetworkPredictor:
                     results[number] = prediction
         return results
 
-    def _plan(self, count: int, views: int, size: tuple[int, int]) -> tuple[int, int]:
+    def _place(self, group: Sequence[View]) -> list[PlacedView]:
+        """Return how the views of a group lie in images of one size."""
+        layout = self._architecture.lay_out([shown_size(view) for view in group])
+        return [PlacedView(view, layout, number) for number, view in enumerate(group)]
+
+    def _plan(self, count: int, views: int, size: Size) -> Size:
         """Return how many groups to run at a time, and how many views of each, by the memory that is free."""
         channels = self._model.aggregator.camera_token.shape[-1]
         on_cpu = self._device.type == "cpu"
-        estimate = partial(estimate_bytes, size=size, channels=channels, depth=self.needs_depth, on_cpu=on_cpu)
+        about = partial(estimate_bytes, self._architecture)
+        estimate = partial(about, size=size, channels=channels, depth=self.needs_depth, on_cpu=on_cpu)
         free = int(_MEMORY_SHARE * free_bytes(self._device))
         batch = self._batch_size or _GROUPS_AT_A_TIME.get(self._device.type, _GROUPS_AT_A_TIME_ELSEWHERE)
         batch = min(batch, count)
@@ -316,7 +204,7 @@ class NetworkPredictor:
                         views, *size[::-1], estimate(1, views) / 1e9, self._device, free / 1e9, fitting)  # fmt: skip
         return batch, fitting
 
-    def _read_ahead(self, groups: Sequence[list[_Placed]], following: Sequence[list[_Placed]]) -> "_Begun":
+    def _read_ahead(self, groups: Sequence[list[PlacedView]], following: Sequence[list[PlacedView]]) -> "_Begun":
         """Return what the call before began to decode, and begin with the first photographs of the following groups.
 
         Those whose encoding is kept, or will be after these groups, are not decoded.
@@ -327,26 +215,26 @@ class NetworkPredictor:
         new = [key for key in files if key not in encoded and key not in self._cache]
         workers = default_workers()
         pool = ThreadPoolExecutor(workers)
-        self._begun = {key: pool.submit(_read, files[key]) for key in new[: workers + _IMAGES_AT_A_TIME]}
+        self._begun = {key: pool.submit(self._read, files[key]) for key in new[: workers + _IMAGES_AT_A_TIME]}
         pool.shutdown(wait=False)
         return begun
 
     def _encoded(
-        self, batches: Sequence[Sequence[Sequence[_Placed]]], begun: "_Begun"
+        self, batches: Sequence[Sequence[Sequence[PlacedView]]], begun: "_Begun"
     ) -> "Iterator[list[list[Tensor | str]]]":
         """Yield the tokens (P, C) of each view of each group of each batch, or why it cannot be read.
 
         Photographs are decoded in other threads meanwhile, those whose encoding is kept not at all.
         """
 
-        def read(placed: _Placed | None) -> "Tensor | ImageError | None":
+        def read(placed: PlacedView | None) -> "Tensor | ImageError | None":
             future = begun.pop(placed.key, None) if placed else None
-            return future.result() if future else _read(placed)
+            return future.result() if future else self._read(placed)
 
         decoded = prefetch(read, self._to_read(batches), workers=default_workers(), ahead=_IMAGES_AT_A_TIME)
         for batch in batches:
             found: dict[Any, Tensor | str] = {}
-            waiting: dict[Any, tuple[_Placed, Tensor]] = {}
+            waiting: dict[Any, tuple[PlacedView, Tensor]] = {}
             for placed in (placed for group in batch for placed in group):
                 image = next(decoded)
                 kept = self._cache.get(placed.key)
@@ -355,7 +243,7 @@ class NetworkPredictor:
                 if kept is not None or placed.key in waiting:
                     continue
                 # Known when its turn to be read came, and forgotten since.
-                image = _read(placed) if image is None else image
+                image = self._read(placed) if image is None else image
                 if isinstance(image, ImageError):
                     log.warning("%s: left out. %s", placed.view.name, image)
                     found[placed.key] = str(image)
@@ -364,7 +252,7 @@ class NetworkPredictor:
             found.update(self._encode(list(waiting.values())))
             yield [[found[placed.key] for placed in group] for group in batch]
 
-    def _to_read(self, batches: Sequence[Sequence[Sequence[_Placed]]]) -> Iterator[_Placed | None]:
+    def _to_read(self, batches: Sequence[Sequence[Sequence[PlacedView]]]) -> Iterator[PlacedView | None]:
         """Yield each view, or None for a map image whose encoding is kept, or will be by then."""
         asked = set()
         for placed in (placed for batch in batches for group in batch for placed in group):
@@ -372,7 +260,27 @@ class NetworkPredictor:
             if placed.view.in_map:
                 asked.add(placed.key)
 
-    def _encode(self, images: "Sequence[tuple[_Placed, Tensor]]") -> "dict[Any, Tensor]":
+    def _read(self, placed: PlacedView | None) -> "Tensor | ImageError | None":
+        """Return the image (3, H, W) for the network, or why it cannot be had; nothing of nothing."""
+        if placed is None:
+            return None
+        try:
+            image, turns = placed.view.image, placed.view.turns
+            if turns:
+                image = turn_image(read_image(image) if isinstance(image, Path) else image, turns)
+            pixels, found = self._architecture.read(image, placed.layout)
+        except ImageError as error:
+            return error
+        expected = shown_size(placed.view)
+        if found != expected:
+            turned = " when upright" if turns else ""
+            return ImageError(
+                f"Image of {found[0]} x {found[1]} pixels{turned}: {placed.view.name}; its camera has "
+                f"{expected[0]} x {expected[1]}. Correct the size in `sensors.txt`, or the image."
+            )
+        return pixels
+
+    def _encode(self, images: "Sequence[tuple[PlacedView, Tensor]]") -> "dict[Any, Tensor]":
         """Return tokens (P, C), on the CPU, of images (3, H, W) of one size, by key; keep those of map images."""
         import torch
 
@@ -391,12 +299,12 @@ class NetworkPredictor:
         return found
 
     def _run(
-        self, numbers: Sequence[int], groups: Sequence[list[_Placed]], tokens: "Sequence[list[Tensor | str]]"
+        self, numbers: Sequence[int], groups: Sequence[list[PlacedView]], tokens: "Sequence[list[Tensor | str]]"
     ) -> dict[int, Prediction]:
         """Return the predictions of a batch by number of the group."""
         import torch
 
-        alike: dict[int, list[tuple[int, list[_Placed], list[int], Tensor]]] = {}
+        alike: dict[int, list[tuple[int, list[PlacedView], list[int], Tensor]]] = {}
         results = {}
         for number, group, found in zip(numbers, groups, tokens, strict=True):
             seen = [index for index, one in enumerate(found) if not isinstance(one, str)]
@@ -411,7 +319,7 @@ class NetworkPredictor:
                 results[number] = self._prediction(group, seen[: len(values)], values)
         return results
 
-    def _forward(self, tokens: "Tensor", size: tuple[int, int]) -> "Tensor":
+    def _forward(self, tokens: "Tensor", size: Size) -> "Tensor":
         """Return (B, S, 9 + numbers of the depth head), on the CPU, of tokens (B, S, P, C); fewer views if need be."""
         import torch
 
@@ -425,13 +333,13 @@ class NetworkPredictor:
             except ToolkitError as error:
                 if views <= _LEAST_VIEWS:
                     raise ToolkitError(
-                        f"The memory of {self._device} does not hold VGGT with {views} views of {size[1]} x {size[0]} "
-                        "pixels. Use dtype_compute: bfloat16, or compute_device: cpu."
+                        f"The memory of {self._device} does not hold {self._architecture.title} with {views} views of "
+                        f"{size[1]} x {size[0]} pixels. Use dtype_compute: bfloat16, or compute_device: cpu."
                     ) from error
             self._most_views[size] = max(_LEAST_VIEWS, views // 2)
             log.warning("going on with the first %d views of each group", self._most_views[size])
 
-    def _network(self, size: tuple[int, int]) -> "Callable[[Tensor], Tensor]":
+    def _network(self, size: Size) -> "Callable[[Tensor], Tensor]":
         """Return the network as a function of tokens (B, S, P, C), for images (H, W)."""
         import torch
 
@@ -445,15 +353,13 @@ class NetworkPredictor:
 
         return run
 
-    def _prediction(self, group: list[_Placed], seen: Sequence[int], numbers: NDArray[np.float32]) -> Prediction:
+    def _prediction(self, group: list[PlacedView], seen: Sequence[int], numbers: NDArray[np.float32]) -> Prediction:
         """Return the prediction of a group, of numbers (seen views, 9 + numbers of the depth head)."""
-        from toolkit.models.vggt import cameras_from_pose_encoding
-
         poses = np.full((len(group), 4, 4), np.nan)
         size = group[0].size
         for index, encoding in zip(seen, numbers[:, :9].astype(np.float64), strict=True):
             if np.isfinite(encoding).all() and encoding[3:7].any():
-                cam_from_model, _ = cameras_from_pose_encoding(encoding, size)
+                cam_from_model, _ = self._architecture.cameras(encoding, size)
                 model_from_turned = invert(make_pose(cam_from_model[:, :3], cam_from_model[:, 3]))
                 poses[index] = model_from_turned @ turned_from_cam(group[index].view.turns)
         map_from_image = np.stack([placed.map_from_image for placed in group])
@@ -473,47 +379,20 @@ _loaded: dict[tuple[Any, ...], Any] = {}
 """The network that was asked for last, if any."""
 
 
-def _load_network(checkpoint: Path, heads: tuple[str, ...], dtype: "torch.dtype", device: "torch.device") -> Any:
-    """Return VGGT, ready to run.
+def _load_network(
+    architecture: Architecture, checkpoint: Path, heads: tuple[str, ...], dtype: "torch.dtype", device: "torch.device"
+) -> Any:
+    """Return a network, ready to run.
 
     The last network is kept until another is asked for: a notebook that looks into one query after a run makes a
     predictor anew, and the weights are gigabytes.
     """
-    from toolkit.models.vggt import VGGT
-
-    key = (checkpoint.resolve(), files_fingerprint([checkpoint]), heads, dtype, device)
+    key = (checkpoint.resolve(), files_fingerprint([checkpoint]), architecture.name, heads, dtype, device)
     if key not in _loaded:
         _loaded.clear()  # before the load: the memory may hold one network, and not two
-        model = VGGT.from_checkpoint(checkpoint, heads=heads, compute_dtype=dtype)
-        _loaded[key] = on_device(model, device, "VGGT")
+        _loaded[key] = on_device(architecture.load(checkpoint, heads, dtype), device, architecture.title)
     return _loaded[key]
 
 
 def _nothing(views: int, reason: str = "") -> Prediction:
     return Prediction(np.full((views, 4, 4), np.nan), reason=reason)
-
-
-def _read(placed: _Placed | None) -> "Tensor | ImageError | None":
-    """Return the image (3, H, W) for the network, or why it cannot be had; nothing of nothing."""
-    if placed is None:
-        return None
-    import torch.nn.functional as F
-
-    from toolkit.models.vggt import load_images
-
-    try:
-        image, turns = placed.view.image, placed.view.turns
-        if turns:
-            image = turn_image(read_image(image) if isinstance(image, Path) else image, turns)
-        loaded = load_images([image], placed.mode)
-    except ImageError as error:
-        return error
-    found, expected = tuple(loaded.sizes[0].tolist()), _shown_size(placed.view)
-    if found != expected:
-        turned = " when upright" if turns else ""
-        return ImageError(
-            f"Image of {found[0]} x {found[1]} pixels{turned}: {placed.view.name}; its camera has "
-            f"{expected[0]} x {expected[1]}. Correct the size in `sensors.txt`, or the image."
-        )
-    missing = placed.size[0] - loaded.images.shape[2]
-    return F.pad(loaded.images[0], (0, 0, missing // 2, missing - missing // 2), value=1.0)

@@ -5,11 +5,12 @@ from pathlib import Path
 
 from toolkit.capture import Session
 from toolkit.errors import ManifestError
+from toolkit.localizers.architectures import ARCHITECTURES
 from toolkit.localizers.network import NetworkPredictor
 from toolkit.localizers.prediction import Predictor
 from toolkit.localizers.simulated import SimulatedPredictor
 
-PREDICTORS = ("vggt", "simulated")
+PREDICTORS = (*ARCHITECTURES, "simulated")
 """Names that `create_predictor` takes. `simulated` is taken only where it is asked for by name."""
 
 
@@ -42,4 +43,4 @@ def create_predictor(
         raise ManifestError(f"Unknown predictor {name!r}. Known: {', '.join(PREDICTORS)}.")
     if name == "simulated":
         return SimulatedPredictor(sessions, map_dir, features, seed=seed)
-    return NetworkPredictor(checkpoint, compute_device, dtype_compute)
+    return NetworkPredictor(checkpoint, compute_device, dtype_compute, architecture=ARCHITECTURES[name])

@@ -191,6 +191,18 @@ def on_device(model: "torch.nn.Module", device: "torch.device", title: str) -> "
     )
 
 
+def free_bytes(device: "torch.device") -> int:
+    """Return the memory of a device that nobody uses; of Apple's, that of the machine."""
+    import psutil
+    import torch
+
+    if device.type == "cuda":
+        # What torch has reserved and not handed out is as good as free.
+        reserved = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+        return int(torch.cuda.mem_get_info(device)[0]) + reserved
+    return int(psutil.virtual_memory().available)
+
+
 @contextmanager
 def full_float32(device: "torch.device") -> Iterator[None]:
     """Multiply float32 as float32 on a GPU, whatever the process has chosen; then as before.

@@ -1,0 +1,169 @@
+"""What the scheduling of `NetworkPredictor` has to know of a network, and the networks that there are."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from toolkit.geometry import Floats
+from toolkit.models import weights
+from toolkit.models.weights import WeightsSource
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+Size = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How the photographs of a group lie in a network's images, which have one size."""
+
+    mode: str
+    """Of the network's loader."""
+    size: Size
+    """(H, W) of the network's images."""
+    scale: Floats
+    """(S, 2): of x and of y. The point (x, y) of photograph i is at scale[i] * (x, y) + offset[i]; the center of the
+    top-left pixel is (0.5, 0.5) in both."""
+    offset: Floats
+    """(S, 2), pixels of the network's images."""
+
+
+@dataclass(frozen=True)
+class Memory:
+    """Bytes that a network holds at most beside its weights, measured in float32."""
+
+    trunk: int
+    """For each number of the tokens (views x tokens x channels) during a block."""
+    kept: int
+    """For each number of the tokens, with depth: what its head reads of the layers."""
+    dense_pixel: int
+    """For each pixel of a frame in the depth head."""
+    dense: int
+    """Of the depth head, apart from pixels."""
+    dense_frames: int
+    """Frames that the depth head takes at a time; on a CPU one."""
+    result_pixel: int
+    """For each pixel of the result."""
+
+
+class Architecture(Protocol):
+    """A network that tells cameras, and depth, of the views of one scene."""
+
+    name: str
+    """The predictor's."""
+    title: str
+    """For messages."""
+    weights: WeightsSource
+    patch: int
+    """Side of a patch, pixels."""
+    special_tokens: int
+    """Tokens of a view beside its patches."""
+    memory: Memory
+
+    def lay_out(self, sizes: Sequence[Size]) -> Layout:
+        """Return how photographs of these (width, height), of which nothing is cut, are shown to the network."""
+
+    def load(self, checkpoint: Path, heads: tuple[str, ...], dtype: "torch.dtype") -> Any:
+        """Return the network, on the CPU: `encode(images)`, and `(images, heads, tokens)` -> the outputs of its heads.
+
+        Raises:
+            WeightsError: the file is not of this network.
+        """
+
+    def read(self, image: Path | NDArray[np.uint8], layout: Layout) -> "tuple[Tensor, Size]":
+        """Return the network's image (3, H, W) of a photograph, and the photograph's (width, height).
+
+        Raises:
+            ImageError: the file is missing or cannot be decoded.
+        """
+
+    def cameras(self, encoding: ArrayLike, size: Size) -> tuple[Floats, Floats]:
+        """Return `cam_from_model` (..., 3, 4) and K (..., 3, 3), pixels of the network's images (H, W)."""
+
+
+def estimate_bytes(
+    architecture: Architecture,
+    groups: int,
+    views: int,
+    size: Size,
+    channels: int = 1024,
+    depth: bool = True,
+    on_cpu: bool = True,
+) -> int:
+    """Return the memory that a network needs, beside its weights, for so many groups of views at once.
+
+    Args:
+        groups, views: how many groups, of how many views each.
+        size: (H, W) of the network's images.
+        channels: of a token.
+        depth: whether the depth head runs.
+        on_cpu: where the depth head takes one frame at a time.
+    """
+    (height, width), memory, frames = size, architecture.memory, groups * views
+    patches = (height // architecture.patch) * (width // architecture.patch)
+    numbers = frames * (architecture.special_tokens + patches) * channels
+    trunk = memory.trunk * numbers
+    if not depth:
+        return trunk
+    together = 1 if on_cpu else min(frames, memory.dense_frames)
+    dense = memory.dense_pixel * height * width * together + memory.dense
+    return memory.kept * numbers + max(trunk, dense) + memory.result_pixel * frames * height * width
+
+
+class VggtArchitecture:
+    """VGGT-1B. Photographs go in whole.
+
+    The official "crop" would cut a portrait photograph of a phone to its middle 75 % (3:4) or 56 % (9:16); "pad" keeps
+    all of it, in an image of the same 518 x 518. Of a landscape photograph "crop" cuts nothing, and without white bars
+    it has a quarter to two fifths fewer tokens.
+    """
+
+    name = "vggt"
+    title = "VGGT"
+    weights = weights.VGGT
+    patch = 14
+    special_tokens = 5
+    memory = Memory(trunk=42, kept=32, dense_pixel=1500, dense=32 << 20, dense_frames=8, result_pixel=24)
+    _side = 518
+
+    def lay_out(self, sizes: Sequence[Size]) -> Layout:
+        from toolkit.models.vggt.preprocess import resized_size
+
+        portrait = any(height > width for width, height in sizes)
+        # Of a landscape photograph "crop" makes the same.
+        resized = np.array([resized_size(*size, "pad") for size in sizes]).reshape(-1, 2)
+        height = self._side if portrait else int(resized[:, 1].max(initial=0))
+        offset = (np.array([self._side, height]) - resized) // 2
+        scale = resized / np.array(sizes, np.float64).reshape(-1, 2)
+        return Layout("pad" if portrait else "crop", (height, self._side), scale, offset.astype(np.float64))
+
+    def load(self, checkpoint: Path, heads: tuple[str, ...], dtype: "torch.dtype") -> Any:
+        from toolkit.models.vggt import VGGT
+
+        return VGGT.from_checkpoint(checkpoint, heads=heads, compute_dtype=dtype)
+
+    def read(self, image: Path | NDArray[np.uint8], layout: Layout) -> "tuple[Tensor, Size]":
+        import torch.nn.functional as F
+
+        from toolkit.models.vggt import load_images
+
+        loaded = load_images([image], layout.mode)
+        width, height = loaded.sizes[0].tolist()
+        missing = layout.size[0] - loaded.images.shape[2]
+        pixels = F.pad(loaded.images[0], (0, 0, missing // 2, missing - missing // 2), value=1.0)
+        return pixels, (width, height)
+
+    def cameras(self, encoding: ArrayLike, size: Size) -> tuple[Floats, Floats]:
+        from toolkit.models.vggt import cameras_from_pose_encoding
+
+        return cameras_from_pose_encoding(encoding, size)
+
+
+ARCHITECTURES: dict[str, Architecture] = {one.name: one for one in (VggtArchitecture(),)}
+"""By the predictor's name."""

@@ -1,0 +1,65 @@
+"""A view in the image that a network is shown, and the way back."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from toolkit.capture.turning import turn_image, turn_points
+from toolkit.geometry import Floats
+from toolkit.localizers.architectures import Layout, Size
+from toolkit.localizers.base import View
+
+
+def shown_size(view: View) -> Size:
+    """Return the width and height of a photograph after its turns."""
+    size = (view.camera.width, view.camera.height)
+    return size[::-1] if view.turns % 2 else size
+
+
+@dataclass(frozen=True)
+class PlacedView:
+    """A view, and how it lies in the network's image."""
+
+    view: View
+    layout: Layout
+    """Of its group."""
+    number: int
+    """In its group."""
+
+    @property
+    def size(self) -> Size:
+        """(H, W) of the network's image."""
+        return self.layout.size
+
+    @property
+    def key(self) -> tuple[Path | int, Size, int]:
+        """Of its encoding: in images of one size a photograph lies in one way."""
+        image = self.view.image
+        return image if isinstance(image, Path) else id(image), self.size, self.view.turns
+
+    @property
+    def map_from_image(self) -> Floats:
+        """(4,), see `Prediction`: from the photograph as it is stored to the network's image turned back to it."""
+        camera, (height, width) = self.view.camera, self.size
+        corners = np.array([[0, 0], [camera.width, camera.height]], np.float64)
+        turned = turn_points(corners, camera.width, camera.height, self.view.turns)
+        shown = turned * self.layout.scale[self.number] + self.layout.offset[self.number]
+        first, last = turn_points(shown, width, height, -self.view.turns)
+        scale = (last - first) / corners[1]
+        return np.concatenate([scale, first])
+
+    def turned_back(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return numbers (H, W) of the network's image in the orientation of the photograph as it is stored."""
+        return turn_image(values, -self.view.turns)
+
+    @property
+    def outside(self) -> NDArray[np.bool_]:
+        """(H, W): pixels of the network's image that the photograph does not cover."""
+        scale, offset = self.layout.scale[self.number], self.layout.offset[self.number]
+        ends = np.rint(np.array([offset, offset + scale * shown_size(self.view)])).astype(int)
+        (left, top), (right, bottom) = np.maximum(ends, 0)
+        outside = np.ones(self.size, bool)
+        outside[top:bottom, left:right] = False
+        return outside
