@@ -67,6 +67,53 @@ def test_the_covariance_is_that_of_the_rig(world: World) -> None:
     assert abs(far.estimate.position_std_m / np.hypot(arm_m, near.estimate.position_std_m) - 1) < 0.2
 
 
+class Told(SimulatedPredictor):
+    """Is told the poses of the first references, and gives them back."""
+
+    told = 0
+    focal_factors = (1.0, 1.0)
+    """Of the query's focal length, and of the references'."""
+
+    def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
+        found = []
+        for group, prediction in zip(groups, super().predict(groups), strict=True):
+            conditioned = np.arange(len(group)) - 1 < self.told
+            conditioned[0] = False
+            K = np.stack([view.camera.calibration_matrix() for view in group])
+            K[:, [0, 1], [0, 1]] *= np.where(np.arange(len(group)) == 0, *self.focal_factors)[:, None]
+            found.append(replace(prediction, conditioned=conditioned, intrinsics=K))
+        return found
+
+
+def test_references_whose_poses_were_told_confirm_nothing(world: World) -> None:
+    queries, _ = world.queries("ios")
+    predictor = Told(world.sessions, world.files.maps, **LOW)  # type: ignore[arg-type]
+    count = len(world.localizer(predictor).predict(queries)[0].cameras[0].references)
+    predictor.told = count - 1
+    for answer in world.localizer(predictor).predict(queries):
+        assert answer.estimate.num_inliers == 1
+        assert answer.estimate.status == "low_confidence"
+    predictor.told = count - 3
+    for answer in world.localizer(predictor).predict(queries):
+        assert answer.estimate.num_inliers == 3
+    predictor.told = count
+    for answer in world.localizer(predictor).predict(queries):
+        assert answer.estimate.status == "failed: no usable reference"
+
+
+@pytest.mark.parametrize(("factors", "sees"), [((1.3, 1.0), 1.3), ((1.3, 1.3), None), ((1.1, 1.0), None)])
+def test_a_network_sees_a_wrong_camera(world: World, factors: tuple[float, float], sees: float | None) -> None:
+    """One that errs alike of all photographs, or by 10 %, tells nothing."""
+    queries, _ = world.queries("ios")
+    predictor = Told(world.sessions, world.files.maps, **LOW)  # type: ignore[arg-type]
+    predictor.focal_factors = factors
+    for (query, _), answer in zip(queries, world.localizer(predictor).predict(queries), strict=True):
+        estimate, focal_px = answer.estimate, query.views[0].camera.mean_focal_length()
+        assert estimate.status == ("ok" if sees is None else "low_confidence: camera?")
+        assert estimate.focals_px == (() if sees is None else (pytest.approx(sees * focal_px),))
+        assert ("sees a focal length" in estimate.reason) == (sees is not None)
+
+
 def test_wrong_references_are_left_out(world: World) -> None:
     right, rejected, wrong = 0, 0, 0
     for seed in range(3):

@@ -23,6 +23,7 @@ from toolkit.localizers import network
 from toolkit.localizers.architectures import ARCHITECTURES, estimate_bytes
 from toolkit.localizers.base import View
 from toolkit.localizers.network import NetworkPredictor, TokenCache
+from toolkit.localizers.placed import PlacedView, shown_size
 from toolkit.localizers.prediction import Prediction
 from toolkit.models.vggt import VGGT, cameras_from_pose_encoding, load_images
 
@@ -123,6 +124,25 @@ def test_a_prediction_is_what_the_network_says(make: Make, photographs: Photogra
     x, y = loaded.scale[0] * pixel[0] + loaded.offset[0] - 0.5
     between = map_coordinates(found.depth[0].astype(float), [[y], [x]], order=1)  # bilinear
     np.testing.assert_allclose(found.depth_at(0, pixel), between, rtol=1e-6)
+
+
+@pytest.mark.parametrize("turns", [0, 1, 2, 3])
+@pytest.mark.parametrize("size", [WIDE, PORTRAIT])
+def test_a_point_is_seen_where_the_intrinsics_say(size: tuple[int, int], turns: int) -> None:
+    """Projected by the network's camera and moved to the photograph, or by the photograph's camera: the same pixel."""
+    width, height = size
+    camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=[width, width, 5, 5])
+    view = View("v", Path("v"), camera, False, turns)
+    placed = PlacedView(view, VGGT_ROW.lay_out([shown_size(view), WIDE]), 0)
+    shown_height, shown_width = placed.size
+    K = np.array([[300.0, 0, shown_width / 2], [0, 320.0, shown_height / 2], [0, 0, 1]])
+    point = np.array([0.3, -0.2, 2.0])
+    turned = turned_from_cam(turns)[:3, :3] @ point
+    in_network = (K @ turned)[:2] / turned[2]
+    [stored] = turn_points(in_network[None], shown_width, shown_height, -turns)
+    scale, offset = placed.map_from_image[:2], placed.map_from_image[2:]
+    seen = placed.intrinsics(K) @ point
+    np.testing.assert_allclose(seen[:2] / seen[2], (stored - offset) / scale, atol=1e-9)
 
 
 def test_nothing_of_a_portrait_photograph_is_cut(

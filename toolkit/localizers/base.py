@@ -42,6 +42,8 @@ class View:
     turns: int = 0
     """Counter-clockwise quarter turns that bring gravity down, see `capture.upright`. A network is shown the image
     turned; what comes back is of the image as it is stored."""
+    world_from_cam: Floats | None = None
+    """(4, 4) of a map image, for networks that take known poses; see `Prediction.conditioned`."""
 
 
 @dataclass(frozen=True)

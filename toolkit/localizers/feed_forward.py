@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pycolmap
 
 from toolkit import geometry
 from toolkit.capture import Session
@@ -13,7 +14,7 @@ from toolkit.capture.upright import Turns
 from toolkit.errors import first_line, reason_of
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.alignment import Alignment, align_to_map, is_trustworthy, query_pose
-from toolkit.localizers.base import Asked, PoseEstimate, Prior, Query, References, View
+from toolkit.localizers.base import CAMERA, Asked, PoseEstimate, Prior, Query, References, View
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.pose_mean import robust_mean_pose
 from toolkit.localizers.prediction import Prediction, Predictor
@@ -22,6 +23,10 @@ from toolkit.localizers.robust import AlignmentError
 from toolkit.manifest import PredictorSettings
 
 log = logging.getLogger(__name__)
+
+FOCAL_TOLERANCE = 0.2
+"""Difference of the logarithms of predicted and stated focal length, beside that of the references, that tells a wrong
+camera: several times what networks err by."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +47,8 @@ class CameraAnswer:
     """What was left out or is unknown; without a pose, why there is none."""
     depth_ratios: tuple[Floats, ...] = ()
     """For each reference, metric over predicted depth at points that the map knows."""
+    focal_px: float = np.nan
+    """What the network sees, where the camera says something else; NaN where they agree or nothing is known."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +125,7 @@ class FeedForwardLocalizer:
         answers = []
         for number, (query, _) in enumerate(queries):
             cameras = tuple(
-                self._camera_answer(references, predictions.get((number, camera), "no references"))
+                self._camera_answer(query.views[camera], references, predictions.get((number, camera), "no references"))
                 for camera, references in enumerate(chosen[number])
             )
             answers.append(FeedForwardAnswer(_combine(query, cameras), cameras))
@@ -142,7 +149,8 @@ class FeedForwardLocalizer:
         name = self.map.image_names[index]
         row = self._session.row_of_name[name]
         turns = int(self._turns[row])
-        return View(name, self._session.image_path(row), self.map.cameras[index], in_map=True, turns=turns)
+        pose = self.map.world_from_cams[index]
+        return View(name, self._session.image_path(row), self.map.cameras[index], True, turns, pose)
 
     def _choose(self, references: References) -> Ints:
         """Return the references of one query image to use."""
@@ -173,11 +181,12 @@ class FeedForwardLocalizer:
                 return [reason_of(error, f"predicting {groups[0][0].name}")]
         return [prediction for group in groups for prediction in self._predict([group])]
 
-    def _camera_answer(self, references: Ints, prediction: Prediction | str) -> CameraAnswer:
+    def _camera_answer(self, view: View, references: Ints, prediction: Prediction | str) -> CameraAnswer:
         if isinstance(prediction, str):
             return CameraAnswer(references, reason=prediction)
         try:
-            return self._align(references, prediction)
+            cameras = [view.camera, *(self.map.cameras[int(index)] for index in references)]
+            return replace(self._align(references, prediction), focal_px=_other_focal(prediction, cameras))
         except AlignmentError as error:  # of this prediction alone
             return CameraAnswer(references, prediction, reason=first_line(error))
         except Exception as error:  # a prediction may be anything
@@ -190,7 +199,8 @@ class FeedForwardLocalizer:
             return CameraAnswer(references, prediction, reason=reason)
         ratios = [self._depth_ratios(int(index), prediction, view) for view, index in enumerate(references, start=1)]
         world = self.map.world_from_cams[references]
-        alignment = align_to_map(model[1:], world, depth_ratios=ratios if any(len(r) for r in ratios) else None)
+        told = np.zeros(len(references), bool) if prediction.conditioned is None else prediction.conditioned[1:]
+        alignment = align_to_map(model[1:], world, ~told, ratios if any(len(r) for r in ratios) else None)
         if not np.isfinite(alignment.rotation_std_deg):
             reason = alignment.reason or "the rotation is unknown"
             return CameraAnswer(references, prediction, alignment, reason=reason, depth_ratios=tuple(ratios))
@@ -253,10 +263,15 @@ def _combine(query: Query, cameras: tuple[CameraAnswer, ...]) -> PoseEstimate:
         pose, sure = _pose(cameras[kept[0]]) @ geometry.invert(rig_from_cam), False
         turn, covariance = rig_from_cam[:3, :3], np.diag(np.full(6, np.inf))
         covariance[:3, :3] = turn @ _covariance(cameras[kept[0]])[:3, :3] @ turn.T
+    focals = tuple(answer.focal_px for answer in cameras)
+    misfit = bool(np.isfinite(focals).any())
+    if misfit:
+        seen = ", ".join(f"{focal:.0f}" for focal in focals if np.isfinite(focal))
+        reasons = "; ".join(part for part in (reasons, f"the network sees a focal length of {seen} px") if part)
     consistent = [int(i) for c in kept for i in cameras[c].references[_alignment(cameras[c]).inliers]]
     shown = [int(i) for answer in cameras if answer.prediction is not None for i in answer.references]
     return PoseEstimate(
-        status="ok" if sure else "low_confidence",
+        status=CAMERA if misfit else "ok" if sure else "low_confidence",
         world_from_rig=pose,
         covariance=covariance,
         num_matches=count,
@@ -266,7 +281,27 @@ def _combine(query: Query, cameras: tuple[CameraAnswer, ...]) -> PoseEstimate:
         scale_std=min(_alignment(cameras[index]).scale_std for index in kept),
         rejected=tuple(index for index in dict.fromkeys(shown) if index not in consistent),
         reason=reasons,
+        misfit=misfit,
+        focals_px=focals if misfit else (),
     )
+
+
+def _other_focal(prediction: Prediction, cameras: Sequence[pycolmap.Camera]) -> float:
+    """Return the focal length that a network sees in the first of a group's photographs, if its camera is wrong.
+
+    A network errs by some percent, of all photographs of a group alike: the references tell by how much.
+    """
+    if prediction.intrinsics is None:
+        return np.nan
+    predicted_px = prediction.intrinsics[:, [0, 1], [0, 1]].mean(axis=1)
+    ratios = predicted_px / [camera.mean_focal_length() for camera in cameras]
+    logs = np.log(np.where(np.isfinite(ratios) & (ratios > 0), ratios, np.nan))
+    known = logs[1:][np.isfinite(logs[1:])]
+    if not len(known) or not np.isfinite(logs[0]):
+        return np.nan
+    middle = float(np.median(known))
+    limit = max(FOCAL_TOLERANCE, 4 * float(np.median(np.abs(known - middle))))
+    return float(cameras[0].mean_focal_length() * np.exp(logs[0] - middle)) if abs(logs[0] - middle) > limit else np.nan
 
 
 def _alignment(answer: CameraAnswer) -> Alignment:

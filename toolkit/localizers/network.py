@@ -355,16 +355,17 @@ class NetworkPredictor:
 
     def _prediction(self, group: list[PlacedView], seen: Sequence[int], numbers: NDArray[np.float32]) -> Prediction:
         """Return the prediction of a group, of numbers (seen views, 9 + numbers of the depth head)."""
-        poses = np.full((len(group), 4, 4), np.nan)
+        poses, intrinsics = np.full((len(group), 4, 4), np.nan), np.full((len(group), 3, 3), np.nan)
         size = group[0].size
         for index, encoding in zip(seen, numbers[:, :9].astype(np.float64), strict=True):
             if np.isfinite(encoding).all() and encoding[3:7].any():
-                cam_from_model, _ = self._architecture.cameras(encoding, size)
+                cam_from_model, K = self._architecture.cameras(encoding, size)
                 model_from_turned = invert(make_pose(cam_from_model[:, :3], cam_from_model[:, 3]))
                 poses[index] = model_from_turned @ turned_from_cam(group[index].view.turns)
+                intrinsics[index] = group[index].intrinsics(K)
         map_from_image = np.stack([placed.map_from_image for placed in group])
         if not self.needs_depth:
-            return Prediction(poses, map_from_image=map_from_image)
+            return Prediction(poses, map_from_image=map_from_image, intrinsics=intrinsics)
         depth = [placed.turned_back(np.full(size, np.nan, np.float32)) for placed in group]
         confidence = [placed.turned_back(np.zeros(size, np.float32)) for placed in group]
         maps = numbers[:, 9:].reshape(len(seen), 2, *size)
@@ -372,7 +373,7 @@ class NetworkPredictor:
             placed, outside = group[index], group[index].outside
             depth[index] = placed.turned_back(np.where(outside, np.float32(np.nan), of_depth))
             confidence[index] = placed.turned_back(np.where(outside, np.float32(np.nan), of_confidence))
-        return Prediction(poses, depth, confidence, map_from_image)
+        return Prediction(poses, depth, confidence, map_from_image, intrinsics)
 
 
 _loaded: dict[tuple[Any, ...], Any] = {}

@@ -54,6 +54,15 @@ class PlacedView:
         """Return numbers (H, W) of the network's image in the orientation of the photograph as it is stored."""
         return turn_image(values, -self.view.turns)
 
+    def intrinsics(self, K: Floats) -> Floats:
+        """Return K (3, 3) of the photograph as it is stored, pixels, of that of the network's image."""
+        height, width = self.size
+        [center] = turn_points(K[None, :2, 2], width, height, -self.view.turns)
+        scale, offset = self.map_from_image[:2], self.map_from_image[2:]
+        focal = np.diag(K)[:2][:: -1 if self.view.turns % 2 else 1] / scale
+        x, y = (center - offset) / scale
+        return np.array([[focal[0], 0, x], [0, focal[1], y], [0, 0, 1]])
+
     @property
     def outside(self) -> NDArray[np.bool_]:
         """(H, W): pixels of the network's image that the photograph does not cover."""

@@ -27,6 +27,11 @@ class Prediction:
     map_from_image: Floats | None = None
     """(S, 4) scale_x, scale_y, offset_x, offset_y of each view, from pixels of the photograph to those of the depth
     map; the center of the top-left pixel is (0.5, 0.5) in both."""
+    intrinsics: Floats | None = None
+    """(S, 3, 3) K, pixels of the photographs; NaN where unknown."""
+    conditioned: NDArray[np.bool_] | None = None
+    """(S,) views whose poses the network was told. Those agree with the map by construction and confirm nothing: only
+    the others are aligned to it. None: it was told none."""
     simulated: bool = False
     reason: str = ""
     """Why there are no cameras, where that is known."""
