@@ -53,7 +53,7 @@ def run_stage(
     capture: Path, files: SceneFiles, predictor: Mapping[str, object] | None = None, **more: object
 ) -> pd.DataFrame:
     """Localize; `predictor` holds what differs from a simulation with the default settings."""
-    settings = {"method": "vggt", "predictor": {"name": "simulated"} | dict(predictor or {})}
+    settings = {"method": "feed_forward", "predictor": {"name": "simulated"} | dict(predictor or {})}
     options = {"map_device": "ios", "queries": LIST, "workers": 1} | settings | more
     folders = (files.retrieval_dir, files.poses_dir, files.features, files.maps)
     return call(localize_pairs, capture / "sessions", *folders, **options)  # type: ignore[arg-type]

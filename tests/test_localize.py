@@ -741,7 +741,7 @@ def test_a_picture_is_turned_for_what_the_run_turned_images_for(
 ) -> None:
     files = finished[0]
     place = Map.open(files.run, files.scene, "ios")
-    place.settings = LocalizeSettings.of({"method": "vggt", "predictor": {"upright": upright is None}})
+    place.settings = LocalizeSettings.of({"method": "feed_forward", "predictor": {"upright": upright is None}})
     place.embed_settings = EmbedSettings.of({"upright": upright})  # type: ignore[misc]
     learned = Learned(np.ones(place._descriptors[0].shape[1], np.float32))
     place.embedders = [learned]  # type: ignore[misc]
@@ -817,7 +817,7 @@ def test_a_localizer_of_another_method_sees_images_upright_as_its_settings_say(
     directions: list[object] = []
     monkeypatch.setattr(maps, "upright_turns", lambda _, direction: directions.append(direction))
     for predictor in ({"name": "simulated"}, {"name": "simulated", "upright": False}):
-        settings = {"method": "vggt", "predictor": predictor, "world_up": [0, 0, 1]}
+        settings = {"method": "feed_forward", "predictor": predictor, "world_up": [0, 0, 1]}
         create_localizer(LocalizeSettings.of(opened.settings, settings), opened)
     assert directions == [[0, 0, 1]]
 
@@ -986,14 +986,14 @@ ESCALATES = {"features": {"kinds": ["sift"], "escalation": ["other"]}, "pnp": {"
     [
         {"method": "pnp"},
         {"method": "nearest"},
-        {"method": "vggt"},
+        {"method": "feed_forward"},
         {"method": "hybrid"},
         {"map": None},
         ESCALATES,
         pytest.param({**ESCALATES, "method": "hybrid"}, marks=pytest.mark.slow),
         pytest.param({**ESCALATES, "map": None}, marks=pytest.mark.slow),
     ],
-    ids=["pnp", "nearest", "vggt", "hybrid", "no map", "escalates", "hybrid escalates", "no map escalates"],
+    ids=["pnp", "nearest", "feed_forward", "hybrid", "no map", "escalates", "hybrid escalates", "no map escalates"],
 )
 def test_pictures_get_the_pose_of_the_run_byte_for_byte(
     small_capture: Path, run: SceneFiles, monkeypatch: pytest.MonkeyPatch, method: dict[str, Any], device: str

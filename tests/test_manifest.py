@@ -216,6 +216,13 @@ def test_wrong_overrides_are_named(tmp_path: Path, override: str, expected: str)
     assert expected in str(error.value)
 
 
+def test_the_old_name_of_a_method_is_read_on(tmp_path: Path) -> None:
+    manifest = load_manifest(write(tmp_path, "captures: [a]"), ["localize.method=vggt"])
+    assert manifest.localize.method == "feed_forward"
+    with pytest.raises(ManifestError, match=r"found 'vggtt'.*feed_forward"):
+        load_manifest(write(tmp_path, "captures: [a]"), ["localize.method=vggtt"])
+
+
 def test_a_missing_manifest_is_named(tmp_path: Path) -> None:
     with pytest.raises(ManifestError, match=r"none\.yaml"):
         load_manifest(tmp_path / "none.yaml")

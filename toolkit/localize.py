@@ -361,7 +361,7 @@ class _PairRun:
         """Of each query image, by timestamp and sensor."""
         self.stores: list[FeatureStore] = []
         self.matches: list[MatchStore | None] = []
-        if place.settings.method != "vggt":
+        if place.settings.method != "feed_forward":
             for kind in place.kinds:
                 self._add_kind(kind, range(len(self.keys)))
 
@@ -710,8 +710,8 @@ def explain_query(
         ArtifactError: the retrieval is missing.
     """
     if not settings.predicts:
-        raise ToolkitError(f"The method {settings.method} asks no network. Use vggt or hybrid.")
-    settings = resolve_auto(LocalizeSettings.of(settings, {"method": "vggt"}))
+        raise ToolkitError(f"The method {settings.method} asks no network. Use feed_forward or hybrid.")
+    settings = resolve_auto(LocalizeSettings.of(settings, {"method": "feed_forward"}))
     folders = _Folders(*map(Path, (sessions_root, retrieval_dir, retrieval_dir, features_dir, map_dir)))
     run = _Stage(folders, settings, queries, skip_existing=True, workers=1).run(map_device, query_device)
     localizer = run.localizer.inner if isinstance(run.localizer, ScaledLocalizer) else run.localizer

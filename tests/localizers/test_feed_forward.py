@@ -49,7 +49,7 @@ def test_poses_are_metric_and_right(world: World, device: str) -> None:
     for answer in answers:
         assert np.linalg.eigvalsh(answer.estimate.covariance).min() > 0
         assert answer.estimate.scale_std < 0.1
-        assert answer.estimate.found_by == "vggt"
+        assert answer.estimate.found_by == "feed_forward"
 
 
 def test_the_covariance_is_that_of_the_rig(world: World) -> None:
@@ -312,7 +312,7 @@ def test_rows_say_that_they_are_simulated(finished: SceneFiles, small_capture: P
     for device in ("ios", "hl", "spot"):
         found = pd.read_csv(finished.poses_csv("ios", device))
         assert list(found.columns) == [*COLUMNS, *PREDICTION_COLUMNS]
-        assert found["method"].isin(["vggt:simulated/vggt", "vggt:simulated"]).all()
+        assert found["method"].isin(["feed_forward:simulated/feed_forward", "feed_forward:simulated"]).all()
         session = Capture.open(small_capture)[f"{device}_query"]
         assert len(found) == len(session.keyframes(LIST))
         estimated = Trajectory.read(finished.poses_txt("ios", device))
@@ -331,7 +331,7 @@ def test_the_log_says_that_it_is_simulated(
     assert "simulated looks up the true poses" in caplog.text
 
 
-@pytest.mark.parametrize("method", ["vggt", "hybrid"])
+@pytest.mark.parametrize("method", ["feed_forward", "hybrid"])
 def test_the_network_is_never_replaced_by_the_simulation(
     run: SceneFiles, small_capture: Path, method: str, no_hub: None
 ) -> None:
@@ -362,7 +362,7 @@ def test_wrong_parameters_are_refused(run: SceneFiles, small_capture: Path, wron
 
 @pytest.mark.parametrize(
     ("method", "more"),
-    [("vggt", {"predictor": {"batch_size": 1}}), ("hybrid", {"predictor": {"batch_size": 3}, "workers": 2})],
+    [("feed_forward", {"predictor": {"batch_size": 1}}), ("hybrid", {"predictor": {"batch_size": 3}, "workers": 2})],
 )
 def test_rows_do_not_depend_on_batches_threads_or_being_killed(
     run: SceneFiles, small_capture: Path, monkeypatch: pytest.MonkeyPatch, method: str, more: dict

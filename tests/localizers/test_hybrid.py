@@ -62,7 +62,7 @@ def test_without_a_usable_prediction_the_hybrid_is_pnp(
     assert expected.status == "ok"
     assert same(hybrid.localize(*asked, FeedForwardAnswer(PoseEstimate("failed: no references"))), expected)
     unknown = np.diag([1e-4] * 3 + [np.inf] * 3)
-    far = PoseEstimate("low_confidence", np.eye(4), unknown, found_by="vggt")
+    far = PoseEstimate("low_confidence", np.eye(4), unknown, found_by="feed_forward")
     assert same(hybrid.localize(*asked, FeedForwardAnswer(far)), expected)
 
 
@@ -80,7 +80,7 @@ def test_a_wrong_prediction_does_no_harm(
 def predicted_at(world_from_rig: Floats, references: Sequence[int]) -> PoseEstimate:
     covariance = np.diag([1e-4] * 3 + [1e-3] * 3)
     rests_on = tuple(int(image) for image in references)
-    return PoseEstimate("ok", world_from_rig, covariance, references=rests_on, found_by="vggt")
+    return PoseEstimate("ok", world_from_rig, covariance, references=rests_on, found_by="feed_forward")
 
 
 def prediction_near(true: Floats, references: Sequence[int], seed: int = 0) -> PoseEstimate:
@@ -101,7 +101,7 @@ def test_a_prediction_finds_what_descriptors_alone_do_not(world: World, hybrid: 
     assert alone.status.startswith("failed")
     prediction = FeedForwardAnswer(prediction_near(true, near))
     found = HybridLocalizer(strict, hybrid.feed_forward).localize(query, references, prediction)
-    assert found.found_by == "pnp+vggt"
+    assert found.found_by == "pnp+feed_forward"
     assert found.status == "ok"
     error_deg, error_m = geometry.pose_error(found.world_from_rig, true)
     assert error_deg < 0.3
@@ -115,7 +115,7 @@ def test_where_nothing_matches_the_prediction_is_the_answer(world: World, hybrid
     true = world.queries("ios")[1][0]
     prediction = prediction_near(true, references[0].images[:4])
     found = hybrid.localize(blind, references, FeedForwardAnswer(prediction))
-    assert found.found_by == "vggt"
+    assert found.found_by == "feed_forward"
     assert found.status == "ok"
     np.testing.assert_array_equal(found.world_from_rig, prediction.world_from_rig)
     assert "failed: too few matches" in found.reason
@@ -132,7 +132,7 @@ def test_a_prior_is_found_again_in_whatever_order(world: World, pnp: PnpLocalize
     asked = asked_of(world, "spot", 1)
     true = world.queries("spot")[1][1]
     images = np.unique(np.concatenate([retrieved.images for retrieved in asked[1]]))
-    priors = [Prior(prediction_near(true, [], seed).world_from_rig, images, 2.0, "vggt") for seed in range(2)]
+    priors = [Prior(prediction_near(true, [], seed).world_from_rig, images, 2.0, "feed_forward") for seed in range(2)]
     found = [pnp.localize(*asked, priors=priors) for _ in range(2)]
     assert same(*found)
     assert same(found[0], pnp.localize(*asked, priors=priors[::-1]))
@@ -155,4 +155,4 @@ def test_the_hybrid_run_is_as_good_as_pnp(run: SceneFiles, small_capture: Path) 
             counts = [int(((r[0] < limits[0]) & (r[1] < limits[1])).sum()) for r in right]
             assert counts[1] >= counts[0]
         rows = pd.read_csv(run.poses_csv("ios", device))
-        assert rows["method"].str.fullmatch(r"hybrid:simulated/((pnp|lifted)(\+vggt)?|vggt)").all()
+        assert rows["method"].str.fullmatch(r"hybrid:simulated/((pnp|lifted)(\+feed_forward)?|feed_forward)").all()

@@ -123,7 +123,7 @@ def test_predicted_depth_localizes_without_depth_maps(world: World, index: int) 
     feed_forward, answer = world.answer(index, world.predictor, world.without_depth)
     found = DepthLifter(world.pnp, feed_forward).localize(*world.queries[index], answer)
     assert found is not None
-    assert found.found_by == "lifted+vggt"
+    assert found.found_by == "lifted+feed_forward"
     rotation_deg, distance_m = world.error(index, found)
     assert rotation_deg < 1
     assert distance_m < 0.1

@@ -125,8 +125,9 @@ class PoseEstimate:
     correspondences: Correspondences = field(default_factory=Correspondences)
     """What the pose rests on, and what disagrees with it."""
     found_by: str = "pnp"
-    """How the pose was found: `pnp`, `pnp+vggt` or `pnp+near` (from a prior), `lifted` (map features lifted by a
-    capture's depth maps), `lifted+vggt` (by predicted depth, too), `vggt` (a prediction), `nearest`, `sequence`."""
+    """How the pose was found: `pnp`, `pnp+feed_forward` or `pnp+near` (from a prior), `lifted` (map features lifted by
+    a capture's depth maps), `lifted+feed_forward` (by predicted depth, too), `feed_forward` (a prediction), `nearest`,
+    `sequence`."""
     scale_std: float = float("nan")
     """Relative standard deviation of a prediction's scale; inf if unknown, NaN without a prediction."""
     rejected: tuple[int, ...] = ()
@@ -188,7 +189,7 @@ class Prior:
     radius_deg: float
     """How far from where the pose puts a map point its feature may be."""
     source: str
-    """What gave it: `vggt`, `near`."""
+    """What gave it: `feed_forward`, `near`."""
 
     @classmethod
     def about(

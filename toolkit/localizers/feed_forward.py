@@ -244,7 +244,7 @@ def _combine(query: Query, cameras: tuple[CameraAnswer, ...]) -> PoseEstimate:
     reasons = "; ".join(dict.fromkeys(answer.reason for answer in cameras if answer.reason))
     posed = [index for index, answer in enumerate(cameras) if answer.world_from_cam is not None]
     if not posed:
-        return PoseEstimate(f"failed: {reasons}", num_matches=count, found_by="vggt")
+        return PoseEstimate(f"failed: {reasons}", num_matches=count, found_by="feed_forward")
     known = [index for index in posed if np.isfinite(_covariance(cameras[index])).all()]
     if known:
         poses = np.stack([_pose(cameras[index]) for index in known]) @ geometry.invert(query.rig_from_cams[known])
@@ -277,7 +277,7 @@ def _combine(query: Query, cameras: tuple[CameraAnswer, ...]) -> PoseEstimate:
         num_matches=count,
         num_inliers=len(consistent),
         references=tuple(dict.fromkeys(consistent)),
-        found_by="vggt",
+        found_by="feed_forward",
         scale_std=min(_alignment(cameras[index]).scale_std for index in kept),
         rejected=tuple(index for index in dict.fromkeys(shown) if index not in consistent),
         reason=reasons,

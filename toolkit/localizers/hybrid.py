@@ -42,11 +42,11 @@ class HybridLocalizer:
     ) -> PoseEstimate:
         """Return one pose for the cameras of a rig, or for a single camera; `found_by` says from what.
 
-        `pnp`: the prediction has changed nothing. `pnp+vggt`: features sought around the predicted pose, in its
-        consistent references, support the answer better than those matched without it. `lifted`, `lifted+vggt`: where
-        that is not `ok`, and features placed by a capture's depth maps, or by predicted depth too, support a pose
-        better. `vggt`: the predicted pose itself, where matching finds none, or only an uncertain one that a certain
-        prediction contradicts.
+        `pnp`: the prediction has changed nothing. `pnp+feed_forward`: features sought around the predicted pose, in its
+        consistent references, support the answer better than those matched without it. `lifted`,
+        `lifted+feed_forward`: where that is not `ok`, and features placed by a capture's depth maps, or by predicted
+        depth too, support a pose better. `feed_forward`: the predicted pose itself, where matching finds none, or only
+        an uncertain one that a certain prediction contradicts.
         """
         answer = self.predict([(query, references)])[0] if prediction is None else prediction
         predicted = answer.estimate
@@ -80,4 +80,4 @@ def _prior(predicted: PoseEstimate) -> Prior | None:
         return None
     images = np.array(predicted.references, np.int64)
     stds = predicted.rotation_std_deg, predicted.position_std_m
-    return Prior.about(predicted.world_from_rig, images, *stds, "vggt")
+    return Prior.about(predicted.world_from_rig, images, *stds, "feed_forward")

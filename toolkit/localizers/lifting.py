@@ -103,7 +103,7 @@ class DepthLifter:
         found_by = np.where(source >= 0, f"{self._first.name}/lifted", matched.found_by)
         estimate = replace(
             estimate,
-            found_by="lifted+vggt" if any(depth.predicted for depth in used) else "lifted",
+            found_by="lifted+feed_forward" if any(depth.predicted for depth in used) else "lifted",
             correspondences=replace(matched, point_index=whole[matched.point_index], found_by=found_by),
         )
         guessed = any(not depth.measured for depth in used)

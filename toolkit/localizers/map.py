@@ -492,7 +492,7 @@ def create_localizer(settings: LocalizeSettings, map: Map, predictor: Predictor 
     Args:
         settings: those that the map was built or opened with, or others that need the same features.
         map: the map.
-        predictor: of `vggt` and `hybrid`; None: opened as the settings say.
+        predictor: of `feed_forward` and `hybrid`; None: opened as the settings say.
 
     Raises:
         ArtifactError: the map is of a run of `nearest` and has no points.
@@ -520,7 +520,7 @@ def create_localizer(settings: LocalizeSettings, map: Map, predictor: Predictor 
         turns = None
     local_map = map.in_lengths[0].map
     feed_forward = FeedForwardLocalizer(local_map, map.session, predictor, settings.predictor, turns, map.length)
-    if settings.method == "vggt":
+    if settings.method == "feed_forward":
         return _scaled(feed_forward, map)
     return _escalating(_scaled(HybridLocalizer(pnp, feed_forward), map), settings, map)
 

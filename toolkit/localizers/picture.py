@@ -77,7 +77,7 @@ def localize_image(
     ]
     none = [0] * len(pixels)
     features: list[list[LocalFeatures]] = []
-    if place.settings.method != "vggt" and place.kinds:
+    if place.settings.method != "feed_forward" and place.kinds:
         # As a run reads them: the file of features rounds keypoints at the border.
         extracted = [
             [

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from toolkit.errors import ManifestError
 from toolkit.manifest.messages import explain, nested_model
@@ -489,7 +489,7 @@ class PredictorSettings(Settings):
 
     shorthand = "name"
     name: Literal["vggt", "simulated"] = "vggt"
-    """What `vggt` and `hybrid` ask; `simulated` looks up true poses, for trying things out."""
+    """What `feed_forward` and `hybrid` ask; `simulated` looks up true poses, for trying things out."""
     checkpoint: str | None = None
     """File with the network's weights; null: the hub's cache, else a download."""
     num_references: Positive = 5
@@ -506,15 +506,18 @@ class PredictorSettings(Settings):
     """With fewer, the capture's depth map of the reference is asked, where there is one."""
 
 
-Method = Literal["pnp", "nearest", "vggt", "hybrid"]
+Method = Annotated[
+    Literal["pnp", "nearest", "feed_forward", "hybrid"],
+    BeforeValidator(lambda value: "feed_forward" if value == "vggt" else value),  # its name until there were others
+]
 
 
 class LocalizeSettings(Settings):
     """How poses are found."""
 
     method: Method = "pnp"
-    """pnp: matches with map points; nearest: the pose of the best reference, to compare against; vggt: a network's
-    cameras, aligned to the map; hybrid: the better supported of pnp and vggt, each helped by the other."""
+    """pnp: matches with map points; nearest: the pose of the best reference, to compare against; feed_forward: a
+    network's cameras, aligned to the map; hybrid: the better supported of pnp and that, each helped by the other."""
     features: FeaturesSettings = FeaturesSettings()
     """Local features."""
     matcher: MatcherSettings = MatcherSettings()
@@ -524,7 +527,7 @@ class LocalizeSettings(Settings):
     pnp: PnpSettings = PnpSettings()
     """How a pose is found from matches."""
     predictor: PredictorSettings = PredictorSettings()
-    """Of `vggt` and `hybrid`."""
+    """Of `feed_forward` and `hybrid`."""
     compute_device: ComputeDevice = "auto"
     """Where networks run: auto, cpu, cuda, cuda:<number> or mps."""
     dtype_compute: Precision = "auto"
@@ -539,7 +542,7 @@ class LocalizeSettings(Settings):
     @property
     def predicts(self) -> bool:
         """Whether the method asks a network for cameras."""
-        return self.method in ("vggt", "hybrid")
+        return self.method in ("feed_forward", "hybrid")
 
     @model_validator(mode="after")
     def _a_map_or_meters(self) -> Self:

@@ -140,7 +140,7 @@ class QueryDetails:
 
 def support_of(row: pd.Series) -> str:
     """Return what a row of a pair's csv says that its pose rests on, such as `120 inliers`."""
-    by_network = str(row.get("method", "")).rpartition("/")[2].startswith("vggt")
+    by_network = str(row.get("method", "")).rpartition("/")[2].startswith(("feed_forward", "vggt"))  # older runs
     return f"{row['num_inliers']:.0f} {'consistent references' if by_network else 'inliers'}"
 
 
