@@ -35,6 +35,7 @@ from toolkit.files import (
     read_json,
     write_text,
 )  # fmt: skip
+from toolkit.localizers.architectures import ARCHITECTURES
 from toolkit.localizers.pose_graph import require_gtsam
 from toolkit.manifest import (
     STAGES,
@@ -48,7 +49,7 @@ from toolkit.manifest import (
     nearest,
 )
 from toolkit.manifest.messages import nested_model
-from toolkit.models.weights import VGGT, WeightsSource, check_weights, find_weights, resolve_weights
+from toolkit.models.weights import WeightsSource, check_weights, find_weights, resolve_weights
 from toolkit.notebook import (
     UPSTREAM,
     Say,
@@ -330,8 +331,8 @@ def _weights_needed(stage: str, settings: Settings) -> list[tuple[WeightsSource,
     if isinstance(settings, LocalizeSettings):
         if settings.method == "nearest":
             return []
-        if settings.predicts and settings.predictor.name == "vggt":
-            needed.append((VGGT, settings.predictor.checkpoint))
+        if settings.predicts and (network := ARCHITECTURES.get(settings.predictor.name)):
+            needed.append((network.weights, settings.predictor.checkpoint))
         local = local_weights(resolve_auto(settings))
     elif isinstance(settings, RerankSettings):
         local = local_weights(resolve_auto(settings))
