@@ -11,7 +11,7 @@ PYTEST := $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadscope
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo run test test-slow test-browser test-rest browser-setup docs-images docs-view lab lint bench clean
+.PHONY: help demo run test test-slow test-browser test-rest browser-setup docs-images docs-view lab lint bench clean test-gpu bench-gpu
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */  make \1|/' | column -t -s '|'
@@ -60,6 +60,14 @@ lab: $(INSTALLED)  ## JupyterLab on the notebooks
 lint: $(INSTALLED)  ## ruff and mypy
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m mypy
+
+test-gpu: $(INSTALLED)  ## the networks, memory and the whole chain on a GPU; skipped with a reason where there is none
+	$(BIN)/python -m pytest -m gpu -rs -s
+
+bench-gpu: $(INSTALLED)  ## the rows of the benchmarks that need a GPU
+	$(BIN)/python -m benchmarks embed --device cuda
+	$(BIN)/python -m benchmarks vggt --device cuda
+	$(BIN)/python -m benchmarks matching --device cuda
 
 bench: $(INSTALLED)  ## timings: every script in benchmarks/; each has --help
 	$(BIN)/python -m benchmarks all

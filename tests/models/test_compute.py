@@ -9,7 +9,7 @@ import torch
 
 from toolkit.errors import ManifestError, ToolkitError
 from toolkit.models import compute
-from toolkit.models.compute import Fitting, full_float32, on_device, resolve_device, resolve_precision, upload
+from toolkit.models.compute import Fitting, full_float32, linear, on_device, resolve_device, resolve_precision, upload
 
 
 @pytest.mark.parametrize("name", ["gpu", "cuda:", "cuda:x", "cuda0", "", "CPU", "xpu"])
@@ -174,6 +174,14 @@ def test_a_batch_is_moved_by_the_parts_that_fit() -> None:
 
     Fitting(run, "images", torch.device("meta"))(torch.arange(4))
     assert seen == [(4, "meta"), (2, "meta"), (2, "meta")]
+
+
+def test_a_layer_in_any_precision() -> None:
+    x, weight, bias = torch.rand(3, 5), torch.rand(4, 5), torch.rand(4)
+    for dtype in (torch.float32, torch.bfloat16, torch.float16):
+        with torch.inference_mode():
+            found = linear(x.to(dtype), weight.to(dtype), bias.to(dtype))
+        torch.testing.assert_close(found.float(), x @ weight.T + bias, atol=2e-2, rtol=2e-2)
 
 
 def test_other_errors_are_not_taken_for_it() -> None:

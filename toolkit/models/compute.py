@@ -113,6 +113,7 @@ def has_onednn(x: "torch.Tensor") -> bool:
 
     return (
         x.device.type == "cpu"
+        and x.dtype != torch.float16  # few processors have products for it
         and not torch.is_grad_enabled()
         and torch.backends.mkldnn.is_available()
         and platform.machine().lower() in ("x86_64", "amd64")
