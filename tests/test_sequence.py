@@ -47,7 +47,7 @@ def localized(folder: Path, capture: Path, truth: Trajectory, rows: np.ndarray, 
     stem = folder / "poses" / pair_name(capture.name, "ios", "ios")
     stem.parent.mkdir(exist_ok=True)
     rng = np.random.default_rng(0)
-    poses = np.stack([truth.world_from_device[row] @ small_motion(rng, 0.002, 0.02) for row in rows])
+    poses = np.array([truth.world_from_device[row] @ small_motion(rng, 0.002, 0.02) for row in rows]).reshape(-1, 4, 4)
     covariances = np.tile(np.diag(np.repeat([0.002, 0.02], 3) ** 2), (len(rows), 1, 1))
     keys = truth.timestamps[rows], truth.device_ids[rows]
     Trajectory.from_poses(*keys, poses, covariances).write(stem.with_name(f"{stem.name}.txt"))
@@ -99,6 +99,36 @@ def test_a_query_without_odometry_keeps_its_own_pose(place: Path, tmp_path: Path
     row = pd.read_csv(str(done["path"]).replace(".txt", ".csv")).iloc[-1]
     assert (row["timestamp"], row["device_id"]) == (key[0][0], key[1][0])
     assert pd.isna(row["recording"])
+
+
+def test_a_pair_without_queries_has_failed_frames_alone(place: Path, tmp_path: Path) -> None:
+    truth = Session(place / "sessions/ios_query").ground_truth
+    assert truth is not None
+    localized(tmp_path, place, truth, np.arange(0))
+    done = sequence_pairs(place / "sessions", tmp_path / "poses", map_device="ios", query_device="ios").iloc[0]
+    assert done["frames"] == done["failed"] == len(truth)
+
+
+@pytest.mark.parametrize("odd", ["a line twice", "another device", "other ids", "ids without time"])
+def test_ids_that_have_the_time_are_of_one_device(place: Path, tmp_path: Path, odd: str) -> None:
+    path = place / "sessions/ios_query/trajectories.txt"
+    odometry, lines = Trajectory.read(path), path.read_text().splitlines(keepends=True)
+    assert len(set(odometry.device_ids)) == len(odometry)
+    if odd == "a line twice":
+        path.write_text("".join([*lines, lines[2]]))
+    elif odd == "another device":  # beside the phone, at the same times, and somewhere else
+        others = [line.replace("cam_phone", "cam_other").rsplit(",", 1)[0] + ", 70.0\n" for line in lines[1:]]
+        path.write_text("".join([lines[0], *np.ravel(list(zip(lines[1:], others, strict=True)))]))
+    else:
+        ids = [id_.split("/")[0] + f"/tracker{'' if 'without' in odd else f'_{time}'}"
+               for time, id_ in zip(odometry.timestamps, odometry.device_ids, strict=True)]  # fmt: skip
+        Trajectory(odometry.timestamps, ids, odometry.qt).write(path)
+    done = sequence_pairs(place / "sessions", tmp_path / "poses", map_device="ios", query_device="ios").iloc[0]
+    recordings = len(Session(place / "sessions/ios_query").subsessions)
+    assert done["pieces"] == recordings * (2 if odd == "another device" else 1)
+    assert done["ok"] == len(odometry) + (done["queries"] if "ids" in odd else 0)
+    assert done["failed"] == (len(odometry) if odd == "another device" else 0)
+    assert done["used"] == done["queries"] == len(range(0, len(odometry), 2))
 
 
 def test_pieces_end_where_tracking_was_lost(place: Path, tmp_path: Path) -> None:

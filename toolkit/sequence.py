@@ -36,6 +36,7 @@ from toolkit.localizers.odometry import (
     UNKNOWN_COVARIANCE,
     Odometry,
     PosedQueries,
+    device_names,
     recordings_of,
     subsessions_of,
     vote_weights,
@@ -159,8 +160,9 @@ class _Piece:
 
     recording: str
     number: int
-    rows: Ints
-    """(N,) of the session's odometry."""
+    device_ids: NDArray[np.object_]
+    """(N,)."""
+    motion: Odometry
 
 
 @dataclass(frozen=True)
@@ -199,8 +201,11 @@ class _Answers:
 
     def of(self, timestamps: Ints, device_ids: Any) -> Ints:
         """Return which query each frame (N,) is, -1 where it is none."""
-        index = KeyIndex(self.keys["timestamp"].to_numpy(), as_strings(self.keys["device_id"]))
-        return index.find(timestamps, as_strings(device_ids))
+        return self._index.find(timestamps, as_strings(device_ids))
+
+    @cached_property
+    def _index(self) -> KeyIndex:
+        return KeyIndex(self.keys["timestamp"].to_numpy(), as_strings(self.keys["device_id"]))
 
 
 class _Relocalizer:
@@ -244,17 +249,16 @@ def _frames(
     session: Session, answers: _Answers, settings: SequenceSettings, relocalizer: _Relocalizer | None
 ) -> tuple[pd.DataFrame, pd.DataFrame, Trajectory]:
     """Return the table of all frames and queries, that of steps, and the poses of those frames that have one."""
-    assert session.odometry is not None
-    odometry = _with_queries(session, answers.keys, settings)
-    query_of = answers.of(odometry.timestamps, odometry.arrow_ids)
     tables, poses, covariances = list[pd.DataFrame](), list[Floats](), list[Floats]()
-    steps = [pd.DataFrame(columns=list(STEP_COLUMNS))]
-    for piece in _pieces(session, odometry, settings):
-        asked = query_of[piece.rows]
-        frames = np.flatnonzero((asked >= 0) & np.isfinite(answers.poses[asked]).all(axis=(1, 2)))
+    steps, with_odometry = [pd.DataFrame(columns=list(STEP_COLUMNS))], np.zeros(len(answers.keys), bool)
+    for piece in _pieces(session, answers.keys, settings):
+        motion = piece.motion
+        asked = answers.of(motion.timestamps, piece.device_ids)
+        with_odometry[asked[asked >= 0]] = True
+        frames = np.flatnonzero(asked >= 0)
+        frames = frames[np.isfinite(answers.poses[asked[frames]]).all(axis=(1, 2))]
         queries = answers.posed(asked[frames], frames)
-        motion = Odometry(odometry.timestamps[piece.rows], odometry.world_from_device[piece.rows])
-        keys = pd.DataFrame({"timestamp": motion.timestamps, "device_id": odometry.device_ids[piece.rows]})
+        keys = pd.DataFrame({"timestamp": motion.timestamps, "device_id": piece.device_ids})
         again = None
         if relocalizer is not None:
 
@@ -270,10 +274,10 @@ def _frames(
             table = keys[asked >= 0][posed].assign(step=name)
             table[list(POSE_NAMES)] = geometry.qt_from_pose(of_queries[posed]).round(9)
             steps.append(table[list(STEP_COLUMNS)])
-        table = pd.DataFrame(dict.fromkeys(COLUMNS), index=range(len(piece.rows)))
+        table = pd.DataFrame(dict.fromkeys(COLUMNS), index=range(len(motion)))
         table[list(keys)] = keys
         table["recording"], table["piece"], table["status"] = piece.recording, piece.number, placed.status
-        table["single_status"] = np.where(asked >= 0, answers.status[asked], "")
+        table["single_status"] = np.append(answers.status, "")[asked]
         table.loc[list(done.again), "again_status"] = [estimate.status for estimate in done.again.values()]
         turned, moved = pose_error(placed.world_from_rig[frames], queries.world_from_rig)
         for name, values in (("moved_m", moved.round(6)), ("turned_deg", turned.round(6))):
@@ -283,7 +287,7 @@ def _frames(
         tables.append(table)
         poses.append(placed.world_from_rig)
         covariances.append(placed.covariances)
-    alone = np.setdiff1d(np.arange(len(answers.keys)), query_of)
+    alone = np.flatnonzero(~with_odometry)
     table = answers.keys.iloc[alone].assign(status=answers.status[alone], single_status=answers.status[alone])
     tables.append(table.reindex(columns=list(COLUMNS)))
     every = np.concatenate([*poses, answers.poses[alone]])
@@ -301,29 +305,19 @@ def _frames(
     return frames_table, pd.concat([part.astype(object) for part in steps], ignore_index=True), trajectory
 
 
-def _with_queries(session: Session, queries: pd.DataFrame, settings: SequenceSettings) -> Trajectory:
-    """Return a session's odometry with poses of queries between two of it, where tracking was not lost."""
+def _pieces(session: Session, queries: pd.DataFrame, settings: SequenceSettings) -> Iterator[_Piece]:
+    """Yield the pieces of each recording's odometry, in the order of time, with poses of queries between two of it."""
     odometry = session.odometry
     assert odometry is not None
+    poses = odometry.world_from_device
     known = odometry.index.find(queries["timestamp"].to_numpy(), as_strings(queries["device_id"])) >= 0
-    if known.all():
-        return odometry
-    poses, missing = odometry.world_from_device, queries[~known]
-    times, devices = missing["timestamp"].to_numpy(np.int64), missing["device_id"].to_numpy(object)
-    of_each = subsessions_of(session, devices)
-    of_device = np.array([f"{name} {device}".strip() for name, device in zip(of_each, devices, strict=True)], object)
-    added = [(odometry.timestamps, odometry.device_ids, poses)]
+    times, ids = (queries.loc[~known, name].to_numpy() for name in ("timestamp", "device_id"))
+    within, names = subsessions_of(session, ids), device_names(times, ids)
     for recording, rows in recordings_of(session, odometry).items():
-        asked = np.flatnonzero((of_each == recording) | (of_device == recording))
-        between, found = Odometry(odometry.timestamps[rows], poses[rows]).at(times[asked], settings)
-        added.append((times[asked[between]], devices[asked[between]], found))
-    times, names, every = (np.concatenate(part) for part in zip(*added, strict=True))
-    return Trajectory.from_poses(times, names, every)
-
-
-def _pieces(session: Session, odometry: Trajectory, settings: SequenceSettings) -> Iterator[_Piece]:
-    """Yield the pieces of each recording, in the order of time."""
-    for recording, rows in recordings_of(session, odometry).items():
-        whole = Odometry(odometry.timestamps[rows], odometry.world_from_device[rows])
+        asked = np.flatnonzero((within == recording) | (names == recording))
+        whole = Odometry(odometry.timestamps[rows], poses[rows])
         for number, part in enumerate(whole.split(settings)):
-            yield _Piece(recording, number, rows[part])
+            piece, devices = whole.part(part), odometry.device_ids[rows[part]]
+            between, found = piece.at(times[asked])
+            piece, order = piece.joined(times[asked[between]], found)
+            yield _Piece(recording, number, np.append(devices, ids[asked[between]])[order], piece)

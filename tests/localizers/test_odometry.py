@@ -148,9 +148,12 @@ def test_scale_is_fitted_where_drift_has_bent_the_way() -> None:
 
 def test_between_two_poses_motion_is_steady() -> None:
     turn = Rotation.from_rotvec([0.0, 0.0, 0.4]).as_matrix()
-    poses = np.stack([np.eye(4), *(geometry.make_pose(turn, at) for at in ([1.0, 2.0, 0.0], [900.0, 0.0, 0.0]))])
-    odometry = Odometry(np.array([0, 1_000_000, 2_000_000]), poses)
-    which, found = odometry.at(np.array([-1, 250_000, 1_500_000, 2_000_001]), SequenceSettings())
-    assert which.tolist() == [1]  # outside, and where tracking was lost, nothing is known
+    poses = np.stack([np.eye(4), geometry.make_pose(turn, [1.0, 2.0, 0.0])])
+    odometry = Odometry(np.array([0, 1_000_000]), poses)
+    which, found = odometry.at(np.array([-1, 250_000, 0, 1_000_000, 1_000_001]))
+    assert which.tolist() == [1, 2, 3]  # outside nothing is known
     expected = geometry.make_pose(Rotation.from_rotvec([0.0, 0.0, 0.1]).as_matrix(), [0.25, 0.5, 0.0])
-    np.testing.assert_allclose(found[0], expected, atol=1e-12)
+    np.testing.assert_allclose(found, [expected, *poses], atol=1e-12)
+    every, order = odometry.joined(np.array([1_000_000, 250_000]), found[[2, 0]])
+    assert order.tolist() == [0, 3, 1, 2]
+    np.testing.assert_allclose(every.odom_from_rig, [poses[0], expected, poses[1], poses[1]], atol=1e-12)

@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from toolkit import geometry
 from toolkit.capture import Session, Trajectory
@@ -64,24 +65,27 @@ class Odometry:
         """Return some consecutive poses."""
         return Odometry(self.timestamps[frames], self.odom_from_rig[frames])
 
-    def at(self, timestamps: Ints, settings: SequenceSettings) -> tuple[Ints, Floats]:
-        """Return which of some times are between two poses, (n,) their numbers, and poses (n, 4, 4) of these.
+    def at(self, timestamps: Ints) -> tuple[Ints, Floats]:
+        """Return which of some times are between two poses or at one, (n,) their numbers, and their poses (n, 4, 4).
 
-        Between two, it turns and moves at a constant rate. Times outside, or where tracking was lost, are left out.
+        Between two, it turns and moves at a constant rate.
         """
-        after = np.searchsorted(self.timestamps, timestamps)
-        inside = (after > 0) & (after < len(self))
-        piece = np.zeros(len(self), int)
-        for number, part in enumerate(self.split(settings)):
-            piece[part] = number
-        inside[inside] = piece[after[inside]] == piece[after[inside] - 1]
-        if not inside.any():
-            return np.flatnonzero(inside), np.zeros((0, 4, 4))
-        seconds = (self.timestamps - self.timestamps[0]) / 1e6
-        asked = (timestamps[inside] - self.timestamps[0]) / 1e6
-        turned = Slerp(seconds, Rotation.from_matrix(self.odom_from_rig[:, :3, :3]))(asked)
-        moved = [np.interp(asked, seconds, self.odom_from_rig[:, axis, 3]) for axis in range(3)]
-        return np.flatnonzero(inside), geometry.make_pose(turned.as_matrix(), np.stack(moved, axis=1))
+        after = np.searchsorted(self.timestamps, timestamps).clip(max=len(self) - 1)
+        before = np.maximum(after - (self.timestamps[after] > timestamps), 0)
+        inside = np.flatnonzero((self.timestamps[before] <= timestamps) & (timestamps <= self.timestamps[after]))
+        first, second = (self.odom_from_rig[each[inside]] for each in (before, after))
+        past, whole = ((each - self.timestamps[before])[inside] for each in (timestamps, self.timestamps[after]))
+        share = (past / np.maximum(whole, 1))[:, None]
+        turn = Rotation.from_matrix(second[:, :3, :3] @ first[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
+        turned = Rotation.from_rotvec(share * turn).as_matrix() @ first[:, :3, :3]
+        moved = first[:, :3, 3] + share * (second - first)[:, :3, 3]
+        return inside, geometry.make_pose(turned, moved)
+
+    def joined(self, timestamps: Ints, odom_from_rig: Floats) -> tuple["Odometry", Ints]:
+        """Return it with more poses, and where each is from: its own, then those."""
+        times = np.append(self.timestamps, timestamps)
+        order = np.argsort(times, kind="stable")
+        return Odometry(times[order], np.concatenate([self.odom_from_rig, odom_from_rig])[order]), order
 
     def split(self, settings: SequenceSettings) -> list[slice]:
         """Return the pieces between losses of tracking: gaps in time, and steps that no device makes.
@@ -114,17 +118,27 @@ class Odometry:
 
 
 def recordings_of(session: Session, odometry: Trajectory) -> dict[str, Ints]:
-    """Return the rows of each recording, in the order of time: a subsession, or one device of those that move in it."""
+    """Return the rows of each recording, in the order of time: a subsession, or one device of those that move in it.
+
+    Of a pose that is there twice the first counts.
+    """
     subsessions, recordings = subsessions_of(session, odometry.device_ids), dict[str, Ints]()
+    names, times = device_names(odometry.timestamps, odometry.device_ids), odometry.timestamps
+    repeated = pd.DataFrame({"device": names, "timestamp": times}).duplicated().to_numpy()
     for name in dict.fromkeys(subsessions.tolist()):
-        rows = np.flatnonzero(subsessions == name)
-        rows = rows[np.argsort(odometry.timestamps[rows], kind="stable")]
-        if len(np.unique(odometry.timestamps[rows])) == len(rows):
-            recordings[name] = rows
-            continue
-        devices = odometry.device_ids[rows]
-        recordings |= {f"{name} {device}".strip(): rows[devices == device] for device in dict.fromkeys(devices)}
+        rows = np.flatnonzero((subsessions == name) & ~repeated)
+        rows = rows[np.argsort(times[rows], kind="stable")]
+        devices = dict.fromkeys(names[rows].tolist())
+        # Ids of one device may have something else in them that changes; but it is not at two places at once.
+        several = 1 < len(devices) <= len(rows) / 2 or len(np.unique(times[rows])) < len(rows)
+        recordings |= {device: rows[names[rows] == device] for device in devices} if several else {name: rows}
     return recordings
+
+
+def device_names(timestamps: Ints, device_ids: NDArray[np.object_]) -> NDArray[np.object_]:
+    """Return a name (N,) of each device that is the same at all times: some ids of rigs and sensors have the time."""
+    pairs = zip(device_ids.tolist(), timestamps.tolist(), strict=True)
+    return np.array([device.replace(str(time), "") for device, time in pairs], object)
 
 
 def subsessions_of(session: Session, device_ids: NDArray[np.object_]) -> NDArray[np.object_]:
