@@ -3,6 +3,7 @@
 import shutil
 import tempfile
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
@@ -129,6 +130,24 @@ def test_ids_that_have_the_time_are_of_one_device(place: Path, tmp_path: Path, o
     assert done["ok"] == len(odometry) + (done["queries"] if "ids" in odd else 0)
     assert done["failed"] == (len(odometry) if odd == "another device" else 0)
     assert done["used"] == done["queries"] == len(range(0, len(odometry), 2))
+
+
+def test_odometry_that_drifts_ten_times_as_much_does_no_harm(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("toolkit.localizers.odometry._LEAST_MOTIONS", 4)
+    session = Session(place / "sessions/ios_query")
+    truth, rng = session.ground_truth, np.random.default_rng(0)
+    assert truth is not None
+    poses = truth.world_from_device
+    steps = [step @ small_motion(rng, 0.02, 0.12) for step in geometry.invert(poses[:-1]) @ poses[1:]]
+    drifting = np.stack(list(accumulate(steps, np.matmul, initial=np.eye(4))))
+    Trajectory.from_poses(truth.timestamps, truth.device_ids, drifting).write(session.path / "trajectories.txt")
+    localized(tmp_path, place, truth, np.arange(len(truth)))
+    done = sequence_pairs(place / "sessions", tmp_path / "poses", map_device="ios", query_device="ios").iloc[0]
+    found = Trajectory.read(done["path"]).lookup(truth.timestamps, truth.device_ids)
+    assert geometry.pose_error(found, poses)[1].max() < 0.1
+    assert done["used"] == done["ok"] == len(truth)
 
 
 def test_pieces_end_where_tracking_was_lost(place: Path, tmp_path: Path) -> None:

@@ -40,6 +40,7 @@ from toolkit.localizers.odometry import (
     recordings_of,
     subsessions_of,
     vote_weights,
+    with_measured_drift,
 )
 from toolkit.localizers.picture import localize_image
 from toolkit.localizers.recording import localize_piece
@@ -194,8 +195,12 @@ class _Answers:
         found = trajectory.lookup(rows["timestamp"], rows["device_id"])
         return cls(rows[["timestamp", "device_id"]], status, weights, found, covariances)
 
-    def posed(self, rows: Ints, frames: Ints) -> PosedQueries:
-        """Return some queries, which are frames of a piece of odometry."""
+    def posed(self, timestamps: Ints, device_ids: Any) -> PosedQueries:
+        """Return those that have a pose, of the frames (N,) of a piece of odometry."""
+        rows = self.of(timestamps, device_ids)
+        frames = np.flatnonzero(rows >= 0)
+        frames = frames[np.isfinite(self.poses[rows[frames]]).all(axis=(1, 2))]
+        rows = rows[frames]
         trusted = np.asarray(self.status[rows] == "ok")
         return PosedQueries(frames, self.poses[rows], self.covariances[rows], self.weights[rows], trusted)
 
@@ -251,13 +256,15 @@ def _frames(
     """Return the table of all frames and queries, that of steps, and the poses of those frames that have one."""
     tables, poses, covariances = list[pd.DataFrame](), list[Floats](), list[Floats]()
     steps, with_odometry = [pd.DataFrame(columns=list(STEP_COLUMNS))], np.zeros(len(answers.keys), bool)
-    for piece in _pieces(session, answers.keys, settings):
-        motion = piece.motion
+    pieces = list(_pieces(session, answers.keys, settings))
+    queries_of_each = [answers.posed(piece.motion.timestamps, piece.device_ids) for piece in pieces]
+    if not settings.online:
+        motions = [piece.motion for piece in pieces]
+        settings = with_measured_drift(zip(motions, queries_of_each, strict=True), settings)
+    for piece, queries in zip(pieces, queries_of_each, strict=True):
+        motion, frames = piece.motion, queries.frames
         asked = answers.of(motion.timestamps, piece.device_ids)
         with_odometry[asked[asked >= 0]] = True
-        frames = np.flatnonzero(asked >= 0)
-        frames = frames[np.isfinite(answers.poses[asked[frames]]).all(axis=(1, 2))]
-        queries = answers.posed(asked[frames], frames)
         keys = pd.DataFrame({"timestamp": motion.timestamps, "device_id": piece.device_ids})
         again = None
         if relocalizer is not None:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.localizers.drifting import PLACE, Drive, drive
 from toolkit import geometry
-from toolkit.localizers.odometry import Odometry, PosedQueries, first_guess, fitted_scale, place
+from toolkit.localizers.odometry import Odometry, PosedQueries, first_guess, fitted_scale, place, with_measured_drift
 from toolkit.manifest import SequenceSettings
 
 SETTINGS = SequenceSettings()
@@ -137,6 +137,29 @@ def test_the_first_guess_follows_odometry_from_the_next_query() -> None:
     np.testing.assert_allclose(guess, way.world_from_rig, atol=1e-9)
     places = guess @ geometry.invert(way.odometry.odom_from_rig)
     np.testing.assert_allclose(places, np.tile(PLACE, (len(guess), 1, 1)), atol=1e-9)
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.2])
+@pytest.mark.parametrize("drift", [0.1, 1.0, 3.0, 10.0])
+def test_drift_is_measured_by_the_queries(drift: float, wrong: float) -> None:
+    ways = [drive(np.random.default_rng(seed), frames=80, every=4, wrong=wrong, drift=drift) for seed in range(3)]
+    found = with_measured_drift([(way.odometry, way.queries) for way in ways], SETTINGS)
+    factors = found.rotation_drift_deg / SETTINGS.rotation_drift_deg, found.position_drift / SETTINGS.position_drift
+    if drift <= 1:
+        assert 1.0 <= min(factors) <= max(factors) < 2.5  # never less than the settings say
+    else:
+        assert factors == pytest.approx([drift, drift], rel=0.7)
+    doubtful = [(way.odometry, replace(way.queries, trusted=~way.queries.trusted)) for way in ways]
+    assert with_measured_drift(doubtful, SETTINGS) == SETTINGS
+
+
+def test_what_is_no_odometry_measures_nothing() -> None:
+    way = drive(np.random.default_rng(0))
+    still = replace(way.odometry, odom_from_rig=np.tile(np.eye(4), (len(way.odometry), 1, 1)))
+    assert with_measured_drift([(still, way.queries)], SETTINGS).position_drift == SETTINGS.position_drift
+    assert with_measured_drift([(way.odometry.scaled(3.0), way.queries)], SETTINGS) == SETTINGS
+    assert with_measured_drift([(way.odometry, way.queries.choose(np.arange(4)))], SETTINGS) == SETTINGS
+    assert with_measured_drift([], SETTINGS) == SETTINGS
 
 
 def test_scale_is_fitted_where_drift_has_bent_the_way() -> None:

@@ -8,7 +8,7 @@ import pytest
 from tests.localizers.drifting import drive
 from toolkit import geometry
 from toolkit.errors import ManifestError
-from toolkit.localizers.odometry import Odometry, PosedQueries
+from toolkit.localizers.odometry import Odometry, PosedQueries, with_measured_drift
 from toolkit.localizers.pose_graph import _logarithm, place_online, place_piece
 from toolkit.manifest import SequenceSettings
 
@@ -87,7 +87,8 @@ def test_online_only_the_past_counts() -> None:
     whole = place_online(way.odometry, way.queries, asked, SequenceSettings(online=True))
     frame = int(asked[12])
     until = Odometry(way.odometry.timestamps[: frame + 1], way.odometry.odom_from_rig[: frame + 1])
-    alone = place_piece(until, way.queries.choose(asked <= frame), SETTINGS)
+    past = way.queries.choose(asked <= frame)
+    alone = place_piece(until, past, with_measured_drift([(until, past)], SETTINGS))
     np.testing.assert_allclose(whole.world_from_rig[frame], alone.world_from_rig[-1], atol=1e-9)
     assert np.isnan(whole.world_from_rig[frame + 1]).all()  # not asked for
     assert whole.status[frame + 1] == ""

@@ -13,7 +13,7 @@ from toolkit.errors import ImageError
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import PoseEstimate, RoughPose
 from toolkit.localizers.map import Map
-from toolkit.localizers.odometry import UNKNOWN_COVARIANCE, Odometry, PosedQueries, vote_weights
+from toolkit.localizers.odometry import UNKNOWN_COVARIANCE, Odometry, PosedQueries, vote_weights, with_measured_drift
 from toolkit.localizers.picture import Picture, check_camera, localize_image
 from toolkit.localizers.pose_graph import PlacedPiece
 from toolkit.localizers.recording import localize_piece
@@ -98,7 +98,15 @@ def localize_sequence(
     }
     piece, again = np.zeros(len(odometry), int), dict[int, PoseEstimate]()
     parts = list[PlacedPiece]()
-    for number, rows in enumerate(odometry.split(settings)):
+    pieces = odometry.split(settings)
+    queries_of_each = [
+        queries_of({frame - rows.start: each for frame, each in single.items() if rows.start <= frame < rows.stop})
+        for rows in pieces
+    ]
+    if not settings.online:
+        motions = map(odometry.part, pieces)
+        settings = with_measured_drift(zip(motions, queries_of_each, strict=True), settings)
+    for number, (rows, queries) in enumerate(zip(pieces, queries_of_each, strict=True)):
         piece[rows] = number
         asked = np.array([frame for frame in single if rows.start <= frame < rows.stop], np.int64)
 
@@ -107,7 +115,7 @@ def localize_sequence(
 
         done = localize_piece(
             odometry.part(rows),
-            queries_of({frame - rows.start: single[frame] for frame in asked.tolist()}),
+            queries,
             asked - rows.start,
             settings,
             localize_again if settings.relocalize else None,
@@ -139,7 +147,7 @@ class SequenceLocalizer:
         turns: Sequence[int] | None = None,
     ) -> None:
         """See `localize_sequence`; `settings.length_s` is the window."""
-        self.settings = SequenceSettings.of({"online": True}, settings)
+        self.settings = self._drift = SequenceSettings.of({"online": True}, settings)
         self._pictures = _Pictures(place, rig_from_cams, turns)
         self._timestamps, self._poses = list[int](), list[Floats]()
         self._queries = queries_of({})
@@ -189,7 +197,8 @@ class SequenceLocalizer:
             del self._timestamps[:start], self._poses[:start]
             self._queries = self._queries.choose(self._queries.frames >= start).shifted(-start)
         window = Odometry(np.array(self._timestamps, np.int64), np.stack(self._poses))
-        offline = self.settings.model_copy(update={"online": False, "length_s": None})
+        self._drift = with_measured_drift([(window, self._queries)], self.settings)
+        offline = self._drift.model_copy(update={"online": False, "length_s": None})
 
         def localize_again(todo: Sequence[tuple[int, RoughPose]]) -> list[PoseEstimate]:
             return [self._pictures.localize(image, cameras, near) for _, near in todo]
@@ -212,7 +221,7 @@ class SequenceLocalizer:
             return PoseEstimate(status, found_by="sequence")
         way = Odometry(np.array(self._timestamps[last:], np.int64), np.stack(self._poses[last:])).scaled(placed.scale)
         step = geometry.invert(way.odom_from_rig[0]) @ way.odom_from_rig[-1]
-        turn, shift = way.drift(self.settings, np.array([0]), np.array([len(way) - 1]))
+        turn, shift = way.drift(self._drift, np.array([0]), np.array([len(way) - 1]))
         shift = np.hypot(shift, self.settings.scale_std * np.linalg.norm(step[:3, 3]))
         moved = _adjoint(geometry.invert(step))
         covariance = moved @ placed.covariances[-1] @ moved.T + np.diag(np.repeat([turn[0], shift[0]], 3) ** 2)

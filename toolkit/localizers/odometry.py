@@ -5,6 +5,7 @@ Of a recording whose tracking was lost, each piece has a frame of its own. Odome
 say of each other becomes less sure with the way and the time between them.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -28,6 +29,12 @@ _TELLING = 2 / 3
 """Probability of a pose that says where it is without the others: more than half as likely is no other pose."""
 _CHI2_99 = 16.81
 """99 % quantile of the chi-squared distribution with 6 degrees of freedom."""
+_SHARE, _CHI2_3 = 0.25, 1.213
+"""Quantile of the chi-squared distribution with 3 degrees of freedom."""
+_LEAST_MOTIONS = 6
+"""Fewer do not say how large a drift is."""
+_MOST_DRIFT = 20.0
+"""Times what the settings say. With more, odometry is none, or most single poses are wrong."""
 
 
 @dataclass(frozen=True)
@@ -249,24 +256,72 @@ def _agreement(odometry: Odometry, queries: PosedQueries, settings: SequenceSett
     """Return (Q, Q) whether two poses fit the motion between them."""
     count = len(queries)
     first, second = (each.ravel() for each in np.indices((count, count)))
-    frames = queries.frames
-    moved = odometry.odom_from_rig[frames]
-    expected = (geometry.invert(moved)[:, None] @ moved[None]).reshape(-1, 4, 4)
-    poses = queries.world_from_rig
-    found = (geometry.invert(poses)[:, None] @ poses[None]).reshape(-1, 4, 4)
-    difference = geometry.invert(expected) @ found
-    rotation_std, position_std = odometry.drift(settings, frames[first], frames[second])
-    distance = np.linalg.norm(expected[:, :3, 3], axis=1)
-    variances = np.trace(floored(queries.covariances)[:, :3, :3], axis1=1, axis2=2) / 3
-    rotation_var = rotation_std**2 + variances[first] + variances[second]
-    variances = np.trace(floored(queries.covariances)[:, 3:, 3:], axis1=1, axis2=2) / 3
-    # A wrong heading at the first puts the second aside, a wrong scale before or behind.
-    position_var = position_std**2 + variances[first] + variances[second]
-    position_var += distance**2 * (rotation_var / 2 + settings.scale_std**2)
-    angle = np.deg2rad(geometry.rotation_angle_deg(difference[:, :3, :3]))
-    chi2 = angle**2 / rotation_var + (difference[:, :3, 3] ** 2).sum(axis=1) / position_var
+    off = _Differences.between(odometry, queries, settings, first, second)
+    chi2 = off.angle2 / (off.drift[0] ** 2 + off.rotation_var) + off.distance2 / (off.drift[1] ** 2 + off.position_var)
     agree = (chi2 < _CHI2_99).reshape(count, count)
     return agree | agree.T
+
+
+@dataclass(frozen=True)
+class _Differences:
+    """How far n pairs of poses are from the motion between them, and how far they may be, by axis."""
+
+    angle2: Floats
+    """(n,) radians squared."""
+    distance2: Floats
+    """(n,) square meters."""
+    drift: tuple[Floats, Floats]
+    """Standard deviations (n,) of the odometry: radians, meters."""
+    rotation_var: Floats
+    """(n,) of the two poses, besides."""
+    position_var: Floats
+    """(n,) of the two poses, and of the odometry's rotation and scale."""
+
+    @classmethod
+    def between(
+        cls, odometry: Odometry, queries: PosedQueries, settings: SequenceSettings, first: Ints, second: Ints
+    ) -> "_Differences":
+        inverse = geometry.invert(odometry.odom_from_rig[queries.frames]), geometry.invert(queries.world_from_rig)
+        expected = inverse[0][first] @ odometry.odom_from_rig[queries.frames[second]]
+        difference = geometry.invert(expected) @ inverse[1][first] @ queries.world_from_rig[second]
+        drift = odometry.drift(settings, queries.frames[first], queries.frames[second])
+        covariances = floored(queries.covariances)
+        rotation, position = (
+            np.trace(covariances[:, part, part], axis1=1, axis2=2) / 3 for part in (slice(3), slice(3, 6))
+        )
+        rotation_var = rotation[first] + rotation[second]
+        # A wrong heading at the first puts the second aside, a wrong scale before or behind.
+        length2 = (expected[:, :3, 3] ** 2).sum(axis=1)
+        position_var = position[first] + position[second]
+        position_var += length2 * ((drift[0] ** 2 + rotation_var) / 2 + settings.scale_std**2)
+        angle = np.deg2rad(geometry.rotation_angle_deg(difference[:, :3, :3]))
+        return cls(angle**2, (difference[:, :3, 3] ** 2).sum(axis=1), drift, rotation_var, position_var)
+
+
+def with_measured_drift(
+    pieces: Iterable[tuple[Odometry, PosedQueries]], settings: SequenceSettings
+) -> SequenceSettings:
+    """Return the settings with more drift, if the motions between `ok` queries of a device's pieces ask for it.
+
+    Each asks for a drift; what a quarter of them stays below is compared with what would by chance. Single poses that
+    are wrong do not move it, up to 40 % of them, nor does a loss of tracking that was not seen.
+    """
+    sure = [(odometry, queries.choose(queries.trusted)) for odometry, queries in pieces]
+    values = settings.model_dump()
+    for name, turns in (("rotation_drift_deg", True), ("position_drift", False)):
+        asked = [np.zeros(0)]
+        for odometry, queries in sure:
+            second: Ints = np.arange(1, len(queries))
+            off = _Differences.between(odometry, queries, settings.model_copy(update=values), second - 1, second)
+            square, others = (off.angle2, off.rotation_var) if turns else (off.distance2, off.position_var)
+            drift2 = off.drift[0 if turns else 1] ** 2
+            asked.append((square / _CHI2_3 - others)[drift2 > 0] / drift2[drift2 > 0])
+        every = np.concatenate(asked)
+        factor = float(np.sqrt(max(1.0, np.quantile(every, _SHARE)))) if len(every) >= _LEAST_MOTIONS else 1.0
+        if factor > _MOST_DRIFT:
+            return settings
+        values[name] *= factor
+    return settings.model_copy(update=values)
 
 
 def fitted_scale(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> float:

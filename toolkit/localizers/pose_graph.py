@@ -14,7 +14,15 @@ from numpy.typing import NDArray
 from toolkit import geometry
 from toolkit.errors import ManifestError
 from toolkit.geometry import Floats, Ints
-from toolkit.localizers.odometry import Odometry, PosedQueries, first_guess, fitted_scale, floored, place
+from toolkit.localizers.odometry import (
+    Odometry,
+    PosedQueries,
+    first_guess,
+    fitted_scale,
+    floored,
+    place,
+    with_measured_drift,
+)
 from toolkit.manifest import SequenceSettings
 
 MISSING = (
@@ -62,7 +70,8 @@ def place_online(odometry: Odometry, queries: PosedQueries, asked: Ints, setting
         within = (queries.frames >= start) & (queries.frames <= frame)
         past = Odometry(odometry.timestamps[start : frame + 1], odometry.odom_from_rig[start : frame + 1])
         chosen = queries.choose(within)
-        placed = place_piece(past, replace(chosen, frames=chosen.frames - start), settings)
+        chosen = chosen.shifted(-start)
+        placed = place_piece(past, chosen, with_measured_drift([(past, chosen)], settings))
         every.world_from_rig[frame], every.covariances[frame] = placed.world_from_rig[-1], placed.covariances[-1]
         every.status[frame] = placed.status[-1]
         own = queries.frames[within] == frame

@@ -403,7 +403,8 @@ class SequenceSettings(Settings):
     """How odometry and the poses of single queries are joined to poses of a whole recording."""
 
     position_drift: PositiveNumber = 0.03
-    """Standard deviation, by axis, that a meter of odometry adds to a position, meters; grows with the way's root."""
+    """Standard deviation, by axis, that a meter of odometry adds to a position, meters; grows with the way's root. This
+    and the next become larger, up to 20 times, where the motions between `ok` queries ask for that."""
     rotation_drift_deg: PositiveNumber = 0.15
     """Standard deviation, by axis, that a second of odometry adds to a rotation; grows with the time's root."""
     scale_std: PositiveNumber = 0.02
