@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.localizers.drifting import PLACE, small_motion
+from tests.localizers.drifting import PLACE, drive, lost_in_a_gap, small_motion
 from toolkit import geometry
 from toolkit.capture import Session, Trajectory
 from toolkit.capture.tables import as_strings
@@ -164,6 +164,19 @@ def test_pieces_end_where_tracking_was_lost(place: Path, tmp_path: Path) -> None
     found = Trajectory.read(done["path"])
     there = truth.lookup(found.timestamps, found.device_ids)
     assert geometry.pose_error(found.world_from_device, there)[1].max() < 0.1
+
+
+def test_pieces_end_where_only_queries_tell_a_loss_of_tracking(place: Path, tmp_path: Path) -> None:
+    way, session = lost_in_a_gap(drive(np.random.default_rng(0))), Session(place / "sessions/ios_query")
+    times, name = way.odometry.timestamps, next(iter(session.subsessions))
+    ids = [f"{name}/cam_phone_{time}" for time in times]
+    Trajectory.from_poses(times, ids, way.odometry.odom_from_rig).write(session.path / "trajectories.txt")
+    localized(tmp_path, place, Trajectory.from_poses(times, ids, way.world_from_rig), way.queries.frames)
+    done = sequence_pairs(place / "sessions", tmp_path / "poses", map_device="ios", query_device="ios").iloc[0]
+    table = pd.read_csv(str(done["path"]).replace(".txt", ".csv"))
+    assert table["piece"].tolist() == [0] * 21 + [1] * 16
+    assert set(table["status"]) == {"ok"}
+    assert geometry.pose_error(Trajectory.read(done["path"]).world_from_device, way.world_from_rig)[1].max() < 0.3
 
 
 def test_online_there_are_poses_of_queries_alone(place: Path, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """The sequence stage: the poses of single queries and the odometry between them in, a pose of every frame out."""
 
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -36,6 +37,7 @@ from toolkit.localizers.odometry import (
     UNKNOWN_COVARIANCE,
     Odometry,
     PosedQueries,
+    cut,
     device_names,
     recordings_of,
     subsessions_of,
@@ -160,10 +162,14 @@ class _Piece:
     """A piece of a recording's odometry."""
 
     recording: str
-    number: int
     device_ids: NDArray[np.object_]
     """(N,)."""
     motion: Odometry
+
+    def cut(self, queries: PosedQueries, settings: SequenceSettings) -> Iterator["_Piece"]:
+        """Yield the parts between losses of tracking that the queries tell."""
+        for part in cut(self.motion, queries, settings):
+            yield _Piece(self.recording, self.device_ids[part], self.motion.part(part))
 
 
 @dataclass(frozen=True)
@@ -261,6 +267,9 @@ def _frames(
     if not settings.online:
         motions = [piece.motion for piece in pieces]
         settings = with_measured_drift(zip(motions, queries_of_each, strict=True), settings)
+        pieces = [part for piece, own in zip(pieces, queries_of_each, strict=True) for part in piece.cut(own, settings)]
+        queries_of_each = [answers.posed(piece.motion.timestamps, piece.device_ids) for piece in pieces]
+    numbers = Counter[str]()
     for piece, queries in zip(pieces, queries_of_each, strict=True):
         motion, frames = piece.motion, queries.frames
         asked = answers.of(motion.timestamps, piece.device_ids)
@@ -283,7 +292,8 @@ def _frames(
             steps.append(table[list(STEP_COLUMNS)])
         table = pd.DataFrame(dict.fromkeys(COLUMNS), index=range(len(motion)))
         table[list(keys)] = keys
-        table["recording"], table["piece"], table["status"] = piece.recording, piece.number, placed.status
+        table["recording"], table["piece"], table["status"] = piece.recording, numbers[piece.recording], placed.status
+        numbers[piece.recording] += 1
         table["single_status"] = np.append(answers.status, "")[asked]
         table.loc[list(done.again), "again_status"] = [estimate.status for estimate in done.again.values()]
         turned, moved = pose_error(placed.world_from_rig[frames], queries.world_from_rig)
@@ -323,8 +333,8 @@ def _pieces(session: Session, queries: pd.DataFrame, settings: SequenceSettings)
     for recording, rows in recordings_of(session, odometry).items():
         asked = np.flatnonzero((within == recording) | (names == recording))
         whole = Odometry(odometry.timestamps[rows], poses[rows])
-        for number, part in enumerate(whole.split(settings)):
+        for part in whole.split(settings):
             piece, devices = whole.part(part), odometry.device_ids[rows[part]]
             between, found = piece.at(times[asked])
             piece, order = piece.joined(times[asked[between]], found)
-            yield _Piece(recording, number, np.append(devices, ids[asked[between]])[order], piece)
+            yield _Piece(recording, np.append(devices, ids[asked[between]])[order], piece)

@@ -1,6 +1,6 @@
 """A device that drives through the world, its odometry, and poses of single queries, with the truth."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +56,18 @@ def drive(
         asked, poses, np.tile(covariance, (len(asked), 1, 1)), np.full(len(asked), 0.9), np.ones(len(asked), bool)
     )
     return Drive(world_from_rig, Odometry(times, np.stack(measured)), queries, is_wrong)
+
+
+def lost_in_a_gap(way: Drive, at: int = 21, frames: int = 3) -> Drive:
+    """Return a drive without some frames, and with another frame of odometry after them."""
+    kept = np.delete(np.arange(len(way.odometry)), np.arange(at, at + frames))
+    elsewhere = geometry.make_pose(Rotation.from_rotvec([0.0, 0.0, 1.0]).as_matrix(), [1.0, -2.0, 0.0])
+    poses = way.odometry.odom_from_rig.copy()
+    poses[at:] = elsewhere @ geometry.invert(poses[at]) @ poses[at:]
+    own = np.isin(way.queries.frames, kept)
+    queries = replace(way.queries.choose(own), frames=np.searchsorted(kept, way.queries.frames[own]))
+    odometry = Odometry(way.odometry.timestamps[kept], poses[kept])
+    return Drive(way.world_from_rig[kept], odometry, queries, way.is_wrong[own])
 
 
 def small_motion(rng: np.random.Generator, turn: float, shift: float) -> Floats:

@@ -7,7 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from tests.localizers.drifting import Drive, drive
+from tests.localizers.drifting import Drive, drive, lost_in_a_gap
 from toolkit import geometry
 from toolkit.errors import ImageError
 from toolkit.localizers import frames
@@ -82,6 +82,24 @@ def test_pieces_are_placed_each_on_its_own(answering: Any) -> None:
     assert all(status == "ok" for status in done.status[:25])
     assert all(status.startswith("failed") for status in done.status[25:])
     assert np.isnan(done.world_from_rig[25:]).all()
+
+
+def test_a_loss_of_tracking_that_pictures_tell(answering: Any) -> None:
+    way = lost_in_a_gap(drive(np.random.default_rng(1), every=1))
+    answering(way)
+    done = localize_sequence(PLACE, pictures_of(way), CAMERA, way.odometry)
+    assert done.piece.tolist() == [0] * 21 + [1] * 16
+    assert errors_of(done, way).max() < 0.3
+    online = localize_sequence(PLACE, pictures_of(way), CAMERA, way.odometry, {"online": True, "relocalize": False})
+    live = SequenceLocalizer(PLACE, {"relocalize": False})
+    latest = [
+        live.add(time, pose, picture, CAMERA).world_from_rig
+        for time, pose, picture in zip(way.odometry.timestamps, way.odometry.odom_from_rig, pictures_of(way),
+                                       strict=True)
+    ]  # fmt: skip
+    # The first two pictures after it could be wrong.
+    for poses in (np.stack(latest), online.world_from_rig):  # type: ignore[arg-type]
+        assert geometry.pose_error(poses[26:], way.world_from_rig[26:])[1].max() < 0.3
 
 
 def test_frames_and_cameras_that_do_not_fit_are_refused(answering: Any) -> None:

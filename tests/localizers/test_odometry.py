@@ -6,9 +6,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.localizers.drifting import PLACE, Drive, drive
+from tests.localizers.drifting import PLACE, Drive, drive, lost_in_a_gap
 from toolkit import geometry
-from toolkit.localizers.odometry import Odometry, PosedQueries, first_guess, fitted_scale, place, with_measured_drift
+from toolkit.localizers.odometry import (
+    Odometry,
+    PosedQueries,
+    cut,
+    first_guess,
+    fitted_scale,
+    place,
+    with_measured_drift,
+)
 from toolkit.manifest import SequenceSettings
 
 SETTINGS = SequenceSettings()
@@ -160,6 +168,20 @@ def test_what_is_no_odometry_measures_nothing() -> None:
     assert with_measured_drift([(way.odometry.scaled(3.0), way.queries)], SETTINGS) == SETTINGS
     assert with_measured_drift([(way.odometry, way.queries.choose(np.arange(4)))], SETTINGS) == SETTINGS
     assert with_measured_drift([], SETTINGS) == SETTINGS
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.2])
+def test_queries_tell_a_loss_of_tracking_that_no_step_shows(wrong: float) -> None:
+    for seed in range(5):
+        whole = drive(np.random.default_rng(seed), wrong=wrong)
+        way = lost_in_a_gap(whole)
+        assert way.odometry.split(SETTINGS) == [slice(0, len(way.odometry))]
+        assert cut(way.odometry, way.queries, SETTINGS) == [slice(0, 21), slice(21, 37)]
+        assert cut(whole.odometry, whole.queries, SETTINGS) == [slice(0, 40)]
+        doubtful = replace(way.queries, trusted=~way.queries.trusted)
+        assert cut(way.odometry, doubtful, SETTINGS) == [slice(0, 37)]
+    one_after = way.queries.choose(way.queries.frames <= way.queries.frames[way.queries.frames >= 21][0])
+    assert cut(way.odometry, one_after, SETTINGS) == [slice(0, 37)], "it may be wrong"
 
 
 def test_scale_is_fitted_where_drift_has_bent_the_way() -> None:

@@ -13,7 +13,14 @@ from toolkit.errors import ImageError
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import PoseEstimate, RoughPose
 from toolkit.localizers.map import Map
-from toolkit.localizers.odometry import UNKNOWN_COVARIANCE, Odometry, PosedQueries, vote_weights, with_measured_drift
+from toolkit.localizers.odometry import (
+    UNKNOWN_COVARIANCE,
+    Odometry,
+    PosedQueries,
+    cut,
+    vote_weights,
+    with_measured_drift,
+)
 from toolkit.localizers.picture import Picture, check_camera, localize_image
 from toolkit.localizers.pose_graph import PlacedPiece
 from toolkit.localizers.recording import localize_piece
@@ -99,13 +106,21 @@ def localize_sequence(
     piece, again = np.zeros(len(odometry), int), dict[int, PoseEstimate]()
     parts = list[PlacedPiece]()
     pieces = odometry.split(settings)
-    queries_of_each = [
-        queries_of({frame - rows.start: each for frame, each in single.items() if rows.start <= frame < rows.stop})
-        for rows in pieces
-    ]
+
+    def queries_within(rows: slice) -> PosedQueries:
+        own = {frame - rows.start: each for frame, each in single.items() if rows.start <= frame < rows.stop}
+        return queries_of(own)
+
+    queries_of_each = [queries_within(rows) for rows in pieces]
     if not settings.online:
         motions = map(odometry.part, pieces)
         settings = with_measured_drift(zip(motions, queries_of_each, strict=True), settings)
+        pieces = [
+            slice(rows.start + part.start, rows.start + part.stop)
+            for rows, queries in zip(pieces, queries_of_each, strict=True)
+            for part in cut(odometry.part(rows), queries, settings)
+        ]
+        queries_of_each = [queries_within(rows) for rows in pieces]
     for number, (rows, queries) in enumerate(zip(pieces, queries_of_each, strict=True)):
         piece[rows] = number
         asked = np.array([frame for frame in single if rows.start <= frame < rows.stop], np.int64)
@@ -191,13 +206,21 @@ class SequenceLocalizer:
         self._queries = self._queries.joined(queries_of({len(self._poses) - 1: self.single}))
         return self._solve(image, given)
 
+    @property
+    def _window(self) -> Odometry:
+        return Odometry(np.array(self._timestamps, np.int64), np.stack(self._poses))
+
+    def _forget(self, start: int) -> None:
+        """Leave out the frames before one."""
+        del self._timestamps[:start], self._poses[:start]
+        self._queries = self._queries.choose(self._queries.frames >= start).shifted(-start)
+
     def _solve(self, image: Pictures, cameras: Cameras) -> PoseEstimate:
-        if self.settings.length_s is not None:  # what is before the window is forgotten
-            start = int(np.searchsorted(self._timestamps, self._timestamps[-1] - self.settings.length_s * 1e6))
-            del self._timestamps[:start], self._poses[:start]
-            self._queries = self._queries.choose(self._queries.frames >= start).shifted(-start)
-        window = Odometry(np.array(self._timestamps, np.int64), np.stack(self._poses))
-        self._drift = with_measured_drift([(window, self._queries)], self.settings)
+        if self.settings.length_s is not None:
+            self._forget(int(np.searchsorted(self._timestamps, self._timestamps[-1] - self.settings.length_s * 1e6)))
+        self._drift = with_measured_drift([(self._window, self._queries)], self.settings)
+        self._forget(cut(self._window, self._queries, self._drift)[-1].start)
+        window = self._window
         offline = self._drift.model_copy(update={"online": False, "length_s": None})
 
         def localize_again(todo: Sequence[tuple[int, RoughPose]]) -> list[PoseEstimate]:

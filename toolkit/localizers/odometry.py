@@ -25,6 +25,8 @@ JUMP_M, JUMP_DEG = 0.2, 20.0
 """A step is off by no more, beyond what `ACCELERATION` makes of those beside it."""
 ACCELERATION_M_S2, ACCELERATION_DEG_S2 = 10.0, 500.0
 """Of a hand, a head or a wheel at most."""
+_BLIND_S = 0.8
+"""In a longer step a device may accelerate and stop again: it does not show that tracking was lost."""
 _TELLING = 2 / 3
 """Probability of a pose that says where it is without the others: more than half as likely is no other pose."""
 _CHI2_99 = 16.81
@@ -260,6 +262,25 @@ def _agreement(odometry: Odometry, queries: PosedQueries, settings: SequenceSett
     chi2 = off.angle2 / (off.drift[0] ** 2 + off.rotation_var) + off.distance2 / (off.drift[1] ** 2 + off.position_var)
     agree = (chi2 < _CHI2_99).reshape(count, count)
     return agree | agree.T
+
+
+def cut(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> list[slice]:
+    """Return the parts between losses of tracking that no step shows, those of seconds, but that `ok` queries tell.
+
+    None before one agrees with any after it, and on both sides at least two agree with each other.
+    """
+    sure = queries.choose(queries.trusted)
+    agree, ends, between = _agreement(odometry, sure, settings), [0], slice(0, 0)
+    seconds = np.diff(odometry.timestamps) / 1e6
+    for count in range(2, len(sure)):
+        sides = agree[:count, :count], agree[count:, count:]
+        if not agree[:count, count:].any() and min(int(side.sum(axis=1).max()) for side in sides) > 1:
+            between = slice(between.start or int(sure.frames[count - 1]), int(sure.frames[count]))
+        elif between.stop:  # around who agrees with none
+            step = between.start + int(np.argmax(seconds[between]))
+            ends += [step + 1] * bool(seconds[step] > _BLIND_S)
+            between = slice(0, 0)
+    return [slice(start, end) for start, end in pairwise([*ends, len(odometry)])]
 
 
 @dataclass(frozen=True)

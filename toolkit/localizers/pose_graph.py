@@ -17,6 +17,7 @@ from toolkit.geometry import Floats, Ints
 from toolkit.localizers.odometry import (
     Odometry,
     PosedQueries,
+    cut,
     first_guess,
     fitted_scale,
     floored,
@@ -71,7 +72,11 @@ def place_online(odometry: Odometry, queries: PosedQueries, asked: Ints, setting
         past = Odometry(odometry.timestamps[start : frame + 1], odometry.odom_from_rig[start : frame + 1])
         chosen = queries.choose(within)
         chosen = chosen.shifted(-start)
-        placed = place_piece(past, chosen, with_measured_drift([(past, chosen)], settings))
+        drifting = with_measured_drift([(past, chosen)], settings)
+        start = cut(past, chosen, drifting)[-1].start  # what is after a loss of tracking that the queries tell
+        past, within[within] = past.part(slice(start, None)), chosen.frames >= start
+        chosen = chosen.choose(chosen.frames >= start).shifted(-start)
+        placed = place_piece(past, chosen, drifting)
         every.world_from_rig[frame], every.covariances[frame] = placed.world_from_rig[-1], placed.covariances[-1]
         every.status[frame] = placed.status[-1]
         own = queries.frames[within] == frame
