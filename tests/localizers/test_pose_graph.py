@@ -81,6 +81,17 @@ def test_a_wrong_scale_of_odometry_is_found() -> None:
     assert geometry.pose_error(placed.world_from_rig, way.world_from_rig)[1].max() < 0.3
 
 
+@pytest.mark.parametrize("scale", [0.3, 3.0, -1.0])
+def test_odometry_that_contradicts_the_queries_takes_no_pose_from_them(scale: float) -> None:
+    way = drive(np.random.default_rng(9))
+    placed = place_piece(way.odometry.scaled(scale), way.queries, SETTINGS)  # -1: of a mirrored frame
+    frames = way.queries.frames
+    assert geometry.pose_error(placed.world_from_rig[frames], way.world_from_rig[frames])[1].max() < 0.3
+    others = np.delete(placed.status, frames)
+    assert set(others) == {"low_confidence: odometry contradicts the queries"}
+    assert (placed.status[frames] == "ok").mean() > 0.8
+
+
 def test_online_only_the_past_counts() -> None:
     way = drive(np.random.default_rng(7), wrong=0.3)
     asked = way.queries.frames

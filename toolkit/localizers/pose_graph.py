@@ -109,11 +109,19 @@ def place_piece(odometry: Odometry, queries: PosedQueries, settings: SequenceSet
             break
         used = fit
     mask = np.isin(np.arange(len(queries)), used)
-    status = "ok"
+    status = np.full(count, "ok", object)
     if not best.trusted:
-        rivaled = best.rival_support >= 0.5 * best.support > 0
-        status = f"low_confidence: {'another place is as likely' if rivaled else 'no query of this piece is sure'}"
-    return PlacedPiece(poses, covariances, mask, np.full(count, status, object), scale)
+        # Where odometry contradicts the queries, those that were sure without it do not lose their poses to it.
+        alone = queries.choose(queries.trusted & ~mask)
+        reason = "no query of this piece is sure"
+        if 2 * len(alone) > np.count_nonzero(queries.trusted):
+            reason = "odometry contradicts the queries"
+        elif best.rival_support >= 0.5 * best.support > 0:
+            reason = "another place is as likely"
+        status[:] = f"low_confidence: {reason}"
+        status[alone.frames], poses[alone.frames] = "ok", alone.world_from_rig
+        covariances[alone.frames] = floored(alone.covariances)
+    return PlacedPiece(poses, covariances, mask, status, scale)
 
 
 def _chi2(poses: Floats, covariances: Floats, queries: PosedQueries) -> Floats:
