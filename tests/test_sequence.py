@@ -3,14 +3,13 @@
 import shutil
 import tempfile
 from dataclasses import dataclass
-from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from tests.localizers.drifting import PLACE, drive, lost_in_a_gap, small_motion
+from tests.localizers.drifting import PLACE, Drive, drive, lost_in_a_gap, small_motion
 from toolkit import geometry
 from toolkit.capture import Session, Trajectory
 from toolkit.capture.tables import as_strings
@@ -54,6 +53,16 @@ def localized(folder: Path, capture: Path, truth: Trajectory, rows: np.ndarray, 
     Trajectory.from_poses(*keys, poses, covariances).write(stem.with_name(f"{stem.name}.txt"))
     table = pd.DataFrame({"timestamp": keys[0], "device_id": keys[1], "status": status, "p_correct": 0.9})
     table.to_csv(stem.with_name(f"{stem.name}.csv"), index=False)
+
+
+def drive_through(folder: Path, capture: Path, way: Drive) -> Trajectory:
+    """Make a drive the only recording of the ios queries, with poses of its queries; return the true poses."""
+    session, times = Session(capture / "sessions/ios_query"), way.odometry.timestamps
+    ids = [f"{next(iter(session.subsessions))}/cam_phone_{time}" for time in times]
+    Trajectory.from_poses(times, ids, way.odometry.odom_from_rig).write(session.path / "trajectories.txt")
+    truth = Trajectory.from_poses(times, ids, way.world_from_rig)
+    localized(folder, capture, truth, way.queries.frames)
+    return truth
 
 
 def test_every_frame_of_the_odometry_has_a_pose(place: Path, tmp_path: Path) -> None:
@@ -110,6 +119,17 @@ def test_a_pair_without_queries_has_failed_frames_alone(place: Path, tmp_path: P
     assert done["frames"] == done["failed"] == len(truth)
 
 
+def test_ground_truth_is_not_taken_for_odometry_in_silence(
+    place: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    truth = drive_through(tmp_path, place, drive(np.random.default_rng(0)))
+    for poses, warned in ((None, False), (truth, True)):
+        if poses is not None:
+            poses.write(place / "sessions/ios_query/trajectories.txt")
+        sequence_pairs(place / "sessions", tmp_path / "poses", map_device="ios", query_device="ios")
+        assert ("in the frame of the map" in caplog.text) == warned
+
+
 @pytest.mark.parametrize("odd", ["a line twice", "another device", "other ids", "ids without time"])
 def test_ids_that_have_the_time_are_of_one_device(place: Path, tmp_path: Path, odd: str) -> None:
     path = place / "sessions/ios_query/trajectories.txt"
@@ -132,22 +152,14 @@ def test_ids_that_have_the_time_are_of_one_device(place: Path, tmp_path: Path, o
     assert done["used"] == done["queries"] == len(range(0, len(odometry), 2))
 
 
-def test_odometry_that_drifts_ten_times_as_much_does_no_harm(
-    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("toolkit.localizers.odometry._LEAST_MOTIONS", 4)
-    session = Session(place / "sessions/ios_query")
-    truth, rng = session.ground_truth, np.random.default_rng(0)
-    assert truth is not None
-    poses = truth.world_from_device
-    steps = [step @ small_motion(rng, 0.02, 0.12) for step in geometry.invert(poses[:-1]) @ poses[1:]]
-    drifting = np.stack(list(accumulate(steps, np.matmul, initial=np.eye(4))))
-    Trajectory.from_poses(truth.timestamps, truth.device_ids, drifting).write(session.path / "trajectories.txt")
-    localized(tmp_path, place, truth, np.arange(len(truth)))
+def test_odometry_that_drifts_ten_times_as_much_does_no_harm(place: Path, tmp_path: Path) -> None:
+    way = drive(np.random.default_rng(0), drift=10.0)
+    truth = drive_through(tmp_path, place, way)
     done = sequence_pairs(place / "sessions", tmp_path / "poses", map_device="ios", query_device="ios").iloc[0]
-    found = Trajectory.read(done["path"]).lookup(truth.timestamps, truth.device_ids)
-    assert geometry.pose_error(found, poses)[1].max() < 0.1
-    assert done["used"] == done["ok"] == len(truth)
+    found = Trajectory.read(done["path"]).world_from_device[way.queries.frames]
+    assert geometry.pose_error(found, truth.world_from_device[way.queries.frames])[1].max() < 0.1
+    assert done["used"] == done["queries"] == len(way.queries)
+    assert done["ok"] == len(way.odometry)
 
 
 def test_pieces_end_where_tracking_was_lost(place: Path, tmp_path: Path) -> None:
@@ -167,11 +179,8 @@ def test_pieces_end_where_tracking_was_lost(place: Path, tmp_path: Path) -> None
 
 
 def test_pieces_end_where_only_queries_tell_a_loss_of_tracking(place: Path, tmp_path: Path) -> None:
-    way, session = lost_in_a_gap(drive(np.random.default_rng(0))), Session(place / "sessions/ios_query")
-    times, name = way.odometry.timestamps, next(iter(session.subsessions))
-    ids = [f"{name}/cam_phone_{time}" for time in times]
-    Trajectory.from_poses(times, ids, way.odometry.odom_from_rig).write(session.path / "trajectories.txt")
-    localized(tmp_path, place, Trajectory.from_poses(times, ids, way.world_from_rig), way.queries.frames)
+    way = lost_in_a_gap(drive(np.random.default_rng(0)))
+    drive_through(tmp_path, place, way)
     done = sequence_pairs(place / "sessions", tmp_path / "poses", map_device="ios", query_device="ios").iloc[0]
     table = pd.read_csv(str(done["path"]).replace(".txt", ".csv"))
     assert table["piece"].tolist() == [0] * 21 + [1] * 16

@@ -1,5 +1,6 @@
 """The sequence stage: the poses of single queries and the odometry between them in, a pose of every frame out."""
 
+import logging
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -47,6 +48,8 @@ from toolkit.localizers.odometry import (
 from toolkit.localizers.picture import localize_image
 from toolkit.localizers.recording import localize_piece
 from toolkit.manifest import SequenceSettings
+
+log = logging.getLogger(__name__)
 
 __all__ = ["LocalizedFrames", "Odometry", "SequenceLocalizer", "localize_sequence", "sequence_pairs"]
 
@@ -264,6 +267,7 @@ def _frames(
     steps, with_odometry = [pd.DataFrame(columns=list(STEP_COLUMNS))], np.zeros(len(answers.keys), bool)
     pieces = list(_pieces(session, answers.keys, settings))
     queries_of_each = [answers.posed(piece.motion.timestamps, piece.device_ids) for piece in pieces]
+    _warn_of_truth(session, pieces, queries_of_each)
     if not settings.online:
         motions = [piece.motion for piece in pieces]
         settings = with_measured_drift(zip(motions, queries_of_each, strict=True), settings)
@@ -320,6 +324,21 @@ def _frames(
     times = kept["timestamp"].to_numpy(np.int64)
     trajectory = Trajectory.from_poses(times, kept["device_id"].to_list(), every[posed], known[posed])
     return frames_table, pd.concat([part.astype(object) for part in steps], ignore_index=True), trajectory
+
+
+def _warn_of_truth(session: Session, pieces: Sequence[_Piece], queries_of_each: Sequence[PosedQueries]) -> None:
+    """Warn if odometry has the places in the map that the queries have: then it is none."""
+    within = list[bool]()
+    for piece, queries in zip(pieces, queries_of_each, strict=True):
+        sure = queries.choose(queries.trusted)
+        turned_deg, moved_m = pose_error(piece.motion.odom_from_rig[sure.frames], sure.world_from_rig)
+        within += ((turned_deg < 5.0) & (moved_m < 0.5)).tolist()
+    if len(within) >= 3 and np.mean(within) > 0.5:
+        log.warning(
+            "%s: %d of %d `ok` queries are within 5 degrees and 0.5 m of its trajectories.txt, which is in the frame "
+            "of the map. Expected is the device's own odometry. If it is ground truth, what this stage makes of it is "
+            "no result: remove the file.", session.id, sum(within), len(within),
+        )  # fmt: skip
 
 
 def _pieces(session: Session, queries: pd.DataFrame, settings: SequenceSettings) -> Iterator[_Piece]:
