@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import nbformat
+import pandas as pd
 import pytest
 
 from toolkit import pipeline
@@ -118,6 +119,11 @@ def test_a_run_with_all_stages_is_reused_and_repeated(small_capture: Path, small
     table = (run / "SMALL" / "evaluation" / "overlap.csv").read_text()
     assert "reranked_mean" in table
     assert rows["sequence"]["counts"]["frames"] == rows["sequence"]["counts"]["ok"] == 3 * 3 * 3
+    assert "<h3>Sequences</h3>" in (run / "report.html").read_text()
+    steps = pd.read_csv(run / "SMALL" / "evaluation" / "sequence.csv")["step"].value_counts()
+    assert set(steps) == {9}
+    assert {"single", "graph", "online 10 s", "sequence"} <= set(steps.index)
+    assert len(list((run / "SMALL" / "visualization").glob("*_sequence.png"))) == 9
     poses = sorted((run / "SMALL" / "poses").glob("*.txt"))
     before = {path.name: path.read_bytes() for path in poses}
     assert len(before) == 18

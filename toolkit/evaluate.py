@@ -49,6 +49,7 @@ from toolkit.show.metrics import (
     recall,
     threshold_name,
 )
+from toolkit.show.sequences import SequencePair
 
 if TYPE_CHECKING:
     import pycolmap
@@ -58,11 +59,12 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
-FIGURES = ("recall", "median_errors", "error_curves", "losses", "reliability", "deviations", "retrieval")
+FIGURES = ("recall", "median_errors", "error_curves", "losses", "reliability", "deviations", "retrieval", "sequence")
 ERROR_COLUMNS = ["map_device", "query_device", "timestamp", "device_id", "status", "num_inliers", "p_correct",
                  "position_std_m", "rotation_error_deg", "translation_error_m"]  # fmt: skip
 DETAILS = ("num_inliers", "p_correct", "position_std_m")
 """Columns of a pair's table that are compared with its errors."""
+_PAIR = ["map_device", "query_device"]
 LEAST_OVERLAP = 0.1
 """A first reference overlaps with the query if the query sees at least this share of the map points that it sees."""
 
@@ -178,6 +180,9 @@ def evaluate_scene(
         limits,
         list(dict.fromkeys(messages)),
         unit,
+        *evaluate_sequences(
+            *(capture, poses_dir, limits, map_devices, capture.devices_with("query", query_device), queries, pairs)
+        ),
     )
     for message in evaluation.messages:
         logger.warning(message)
@@ -187,43 +192,43 @@ def evaluate_scene(
     return evaluation
 
 
-def sequence_table(
-    sessions_root: str | Path,
+def evaluate_sequences(
+    capture: Capture,
     poses_dir: str | Path,
-    settings: EvaluateSettings | Mapping[str, Any] | None = None,
-    *,
-    map_device: str = "all",
-    query_device: str = "all",
+    limits: Sequence[Threshold],
+    map_devices: Sequence[str],
+    query_devices: Sequence[str],
     queries: str = "keyframes_pruned_subsampled",
-) -> pd.DataFrame:
-    """Compare the poses of single queries with those that the sequence stage makes of them.
+    pairs: Sequence[Sequence[str]] | None = None,
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Compare the poses of single queries with those that the sequence stage makes of them, by its steps.
 
     Args:
-        sessions_root, poses_dir, settings, map_device, query_device, queries: as `evaluate_scene` has them.
+        limits: (degrees, lengths); `rescued` and `broken` count at the last.
+        poses_dir, queries, pairs: as `evaluate_scene` has them.
 
     Returns:
-        One row a pair that has poses of sequences and queries with ground truth: map_device, query_device, queries; for
-        each threshold the recall of single poses and of sequences; how many queries are within the last threshold by
-        their sequence alone (`rescued`), and how many by their single pose alone (`broken`).
+        A row a pair and step, see `SequencePair.recalls`; and a row a query that the sequence has rescued or broken,
+        see `SequencePair.changes`. Both are empty where there are no sequences, or no truth.
     """
-    limits = [(float(degrees), float(meters)) for degrees, meters in EvaluateSettings.of(settings).thresholds]
-    capture = Capture.from_sessions_root(sessions_root)
-    rows: list[dict[str, Any]] = []
-    for map_, query in product(capture.devices_with("map", map_device), capture.devices_with("query", query_device)):
-        stem = Path(poses_dir) / pair_name(capture.name, map_, query)
-        paths = {"single": stem.with_name(f"{stem.name}.txt"), "sequence": stem.with_name(f"{stem.name}_sequence.txt")}
-        if not all(path.is_file() for path in paths.values()):
+    steps, changes = [pd.DataFrame()], [pd.DataFrame()]
+    for map_, query in product(map_devices, query_devices):
+        found = SequencePair.find(poses_dir, capture.name, map_, query)
+        if found is None or not (pairs is None or [map_, query] in map(list, pairs)):
             continue
-        keys, truth = _queries_with_truth(capture[f"{query}_query"], queries, [])
-        if truth is None or not len(keys):
-            continue
-        row: dict[str, Any] = {"map_device": map_, "query_device": query, "queries": len(keys)}
-        errors = {name: pose_errors(Trajectory.read(path), truth, keys) for name, path in paths.items()}
-        for limit in limits:
-            row |= {f"{name} {threshold_name(limit)}": recall(*errors[name], [limit])[0] for name in paths}
-        single, sequence = (is_below(*errors[name], limits[-1]) for name in paths)
-        rows.append(row | {"rescued": int((sequence & ~single).sum()), "broken": int((single & ~sequence).sum())})
-    return pd.DataFrame(rows)
+        try:
+            keys, truth = _queries_with_truth(capture[f"{query}_query"], queries, [])
+            if truth is None or not len(keys):
+                continue
+            unit, length = length_unit(read_map_record(map_record_path(poses_dir, capture.name, map_)))
+            pair = {"map_device": map_, "query_device": query}
+            steps.append(pd.DataFrame(found.recalls(keys, truth, limits, unit, length)).assign(**pair))
+            changes.append(found.changes(keys, truth, limits[-1], length).assign(**pair))
+        except (CaptureError, ArtifactError) as error:
+            logger.warning("%s: its sequences are not evaluated. %s", found.stem.name, error)
+    tables = (pd.concat(parts, ignore_index=True) for parts in (steps, changes))
+    first, second = (table[[*_PAIR, *table.columns.drop(_PAIR)]] if len(table) else table for table in tables)
+    return first, second
 
 
 def _unreadable(capture: Capture, session_id: str) -> str:
@@ -239,9 +244,16 @@ def write_evaluation(evaluation: Evaluation, out_dir: str | Path, settings: dict
     """Write the tables as CSV, the figures as PNG, and beside recall.csv how they were made."""
     out = Path(out_dir)
     made = [out / f"{name}.csv" for name in ("recall", "errors", "retrieval", "losses", "overlap")]
-    for path in made:
+    tables = {path: getattr(evaluation, path.stem) for path in made}
+    for path, table in ((out / "sequence.csv", evaluation.sequences), (out / "changes.csv", evaluation.changes)):
+        if len(evaluation.sequences):
+            tables[path] = table
+            made.append(path)
+        else:  # of an earlier run with sequences
+            path.unlink(missing_ok=True)
+    for path, table in tables.items():
         with write_atomic(path) as temporary:
-            getattr(evaluation, path.stem).to_csv(temporary, index=False)
+            table.to_csv(temporary, index=False)
     figures = draw_evaluation(evaluation)
     for name in FIGURES:
         if name in figures:

@@ -45,8 +45,8 @@ UPSTREAM: dict[str, tuple[str, ...]] = {
     "rerank": ("retrieve",),
     "localize": ("retrieve", "rerank"),
     "sequence": ("localize",),
-    "evaluate": ("retrieve", "rerank", "localize"),
-    "visualize": ("retrieve", "localize"),
+    "evaluate": ("retrieve", "rerank", "localize", "sequence"),
+    "visualize": ("retrieve", "localize", "sequence"),
 }
 
 if TEXT_BARS in os.environ:

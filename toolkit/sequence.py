@@ -46,6 +46,7 @@ from toolkit.localizers.odometry import (
     with_measured_drift,
 )
 from toolkit.localizers.picture import localize_image
+from toolkit.localizers.pose_graph import place_online
 from toolkit.localizers.recording import localize_piece
 from toolkit.manifest import SequenceSettings
 
@@ -289,7 +290,8 @@ def _frames(
 
         done = localize_piece(motion, queries, np.flatnonzero(asked >= 0), settings, again)
         placed = done.placed
-        for name, of_queries in done.steps.items():
+        windows = _online_steps(motion, queries, np.flatnonzero(asked >= 0), settings)
+        for name, of_queries in {**done.steps, **windows}.items():
             posed = np.isfinite(of_queries).all(axis=(1, 2))
             table = keys[asked >= 0][posed].assign(step=name)
             table[list(POSE_NAMES)] = geometry.qt_from_pose(of_queries[posed]).round(9)
@@ -324,6 +326,23 @@ def _frames(
     times = kept["timestamp"].to_numpy(np.int64)
     trajectory = Trajectory.from_poses(times, kept["device_id"].to_list(), every[posed], known[posed])
     return frames_table, pd.concat([part.astype(object) for part in steps], ignore_index=True), trajectory
+
+
+def _online_steps(
+    motion: Odometry, queries: PosedQueries, asked: Ints, settings: SequenceSettings
+) -> dict[str, Floats]:
+    """Return poses (A, 4, 4) of frames from single queries of the past alone, by the window's name.
+
+    What was localized again near a predicted pose does not count: other queries, of the future too, predicted it.
+    """
+    if settings.online or not settings.windows_s:
+        return {}
+    steps = {}
+    for length_s in (*settings.windows_s, None):
+        past = settings.model_copy(update={"online": True, "length_s": length_s})
+        name = "online" if length_s is None else f"online {length_s:g} s"
+        steps[name] = place_online(motion, queries, asked, past).world_from_rig[asked]
+    return steps
 
 
 def _warn_of_truth(session: Session, pieces: Sequence[_Piece], queries_of_each: Sequence[PosedQueries]) -> None:

@@ -12,12 +12,15 @@ from tqdm.auto import tqdm
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError
 from toolkit.files import pair_name
+from toolkit.geometry import Floats
 from toolkit.manifest import VisualizeSettings
 from toolkit.runs.pairs import PairRows, left_out
+from toolkit.show.figures import save_figure
 from toolkit.show.localization_view import record_localizations
 from toolkit.show.localized import LocalizedPair, support_of, sure_points
 from toolkit.show.metrics import is_posed, worst_first
 from toolkit.show.recordings import record_session, session_tracks
+from toolkit.show.sequences import SequencePair, draw_sequence
 from toolkit.show.stills import WorstQuery, draw_localization, draw_scene_png, draw_worst
 
 WORST = 10
@@ -39,7 +42,8 @@ def visualize_scene(
 ) -> pd.DataFrame:
     """Draw every pair of a scene, and record every pair and session for the rerun viewer.
 
-    Writes `<pair>.png`, the map from above; `localization_<pair>_<k>.png`, a query beside its references;
+    Writes `<pair>.png`, the map from above; `<pair>_sequence.png`, the recordings of its queries, where there are
+    poses of sequences; `localization_<pair>_<k>.png`, a query beside its references;
     `worst_<scene>.png`, the worst queries of all pairs; `<pair>.rrd`, the queries of a pair in their map; and
     `<scene>_<session>.rrd`, what a session holds.
 
@@ -78,7 +82,8 @@ def visualize_scene(
             table.check_upstream()
             started = time.perf_counter()
             pair = LocalizedPair.open(capture, m, q, poses_dir, map_dir)
-            worst.append(_draw_pair(pair, out, settings))
+            found = SequencePair.find(poses_dir, capture.name, m, q)
+            worst.append(_draw_pair(capture, pair, found, out, settings))
             row |= {
                 "queries": len(pair.table),
                 "localized": int(is_posed(pair.world_from_rig).sum()),
@@ -88,7 +93,8 @@ def visualize_scene(
             }
         if row["reason"]:
             name = pair_name(capture.name, m, q)  # pictures of an earlier run would mislead
-            for stale in (*out.glob(f"{name}.png"), *out.glob(f"{name}.rrd"), *out.glob(f"localization_{name}_*.png")):
+            pictures = (f"{name}.png", f"{name}_sequence.png", f"{name}.rrd", f"localization_{name}_*.png")
+            for stale in (path for pattern in pictures for path in out.glob(pattern)):
                 stale.unlink()
     frame = table.frame()
     present = [(row["map_device"], row["query_device"]) for row in table.rows if not row["reason"]]
@@ -116,7 +122,9 @@ def visualize_scene(
     return frame
 
 
-def _draw_pair(pair: LocalizedPair, out: Path, settings: VisualizeSettings) -> pd.DataFrame:
+def _draw_pair(
+    capture: Capture, pair: LocalizedPair, sequences: SequencePair | None, out: Path, settings: VisualizeSettings
+) -> pd.DataFrame:
     """Draw and record a pair; return its worst queries, rows of `Localizations.ranked` with their details."""
     m, q = pair.map_session.device, pair.query_session.device
     shown, cloud, map_poses = pair.localizations, sure_points(pair.local_map), pair.map_session.world_from_cam()
@@ -134,9 +142,16 @@ def _draw_pair(pair: LocalizedPair, out: Path, settings: VisualizeSettings) -> p
     for number, k in enumerate((order[place] for place in chosen), start=1):
         title = f"{q} query in the {m} map: {pair.table['status'].iloc[k]}"
         draw_localization(pair.details(k), out / f"localization_{pair.name}_{number}.png", title, pair.unit)
+    ways: dict[str, list[Floats]] = {}
+    if sequences is None:
+        (out / f"{pair.name}_sequence.png").unlink(missing_ok=True)
+    else:
+        figure = draw_sequence(capture, sequences, m, q, settings.world_up, pair.unit)
+        save_figure(figure, out / f"{pair.name}_sequence.png")
+        ways = {"odometry": sequences.laid_odometry(pair.query_session), "frames": sequences.ways()}
     if settings.recordings:
         details = ((k, pair.details(k)) for k in sorted(order[: settings.matched_queries]))
-        record_localizations(recording, pair.name, map_poses, *cloud, shown, details, up=settings.world_up)
+        record_localizations(recording, pair.name, map_poses, *cloud, shown, details, up=settings.world_up, ways=ways)
     candidates = order[:WORST]
     rows = shown.ranked.iloc[candidates]
     details_of = [pair.details(k) for k in candidates]

@@ -420,6 +420,10 @@ class SequenceSettings(Settings):
     length_s: PositiveNumber | None = None
     """Seconds before a query that its pose rests on, if `online`; null: all that was before it in its piece."""
 
+    windows_s: list[PositiveNumber] = [10.0, 20.0]
+    """Seconds before a query: what it would be online, by single queries of so long, and of all that was before it, is
+    written beside the result for comparison; `[]`: not."""
+
     @model_validator(mode="after")
     def _of_the_past(self) -> Self:
         if self.length_s is not None and not self.online:

@@ -21,6 +21,7 @@ from toolkit.show.metrics import (
     threshold_name,
     unit_of,
 )
+from toolkit.show.sequences import draw_steps
 
 BEYOND = 5
 """Stated deviations beyond which an error is no chance."""
@@ -49,6 +50,10 @@ class Evaluation:
     """What was not evaluated, and why; empty where all was."""
     unit: str = "m"
     """Of lengths: m, or `metrics.UNKNOWN_UNIT`."""
+    sequences: pd.DataFrame = field(default_factory=pd.DataFrame)
+    """One row a pair and step of the sequence stage: recall, medians, queries rescued and broken; empty without it."""
+    changes: pd.DataFrame = field(default_factory=pd.DataFrame)
+    """One row a query that the sequence has rescued or broken, with its errors before and after."""
 
     @property
     def pairs(self) -> pd.DataFrame:
@@ -86,6 +91,8 @@ def draw_evaluation(evaluation: Evaluation) -> dict[str, "Figure"]:
             figures["deviations"] = draw_deviations(evaluation.errors, unit)
         if evaluation.losses["missed"].sum():
             figures["losses"] = draw_losses(evaluation.losses)
+    if len(evaluation.sequences):
+        figures["sequence"] = draw_steps(evaluation.sequences)
     retrieval = evaluation.retrieval
     ks = [c for c in retrieval.columns if c.startswith("recall@")]
     if ks:

@@ -8,10 +8,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from toolkit.capture import Capture, Session, Trajectory
+from toolkit.capture import Capture, Session
 from toolkit.capture.devices import color_of
 from toolkit.capture.images import read_for_display
-from toolkit.capture.tables import read_query_table
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.embedders import embedding_folders, open_descriptors
 from toolkit.errors import CaptureError
@@ -115,52 +114,6 @@ def draw_top_view(capture: Capture, up: ArrayLike | None = None, unit: str | Non
     plots[0].set_ylabel(labels[1])
     plots[0].legend(fontsize=8)
     figure.suptitle("Cameras from above: maps (dots), queries where their pose is known (crosses)")
-    return figure
-
-
-@styled
-def draw_sequence(capture: Capture, path: str | Path, up: ArrayLike | None = None, unit: str | None = "m") -> "Figure":
-    """Return a figure of the recordings of one pair from above: frames along the way, and the poses of single queries.
-
-    Args:
-        capture: its map is drawn, too; places far from all others get a panel of their own.
-        path: `<pair>_sequence.txt` of the sequence stage, beside `<pair>.txt` of localization.
-        up: (3,) direction that is up; None: estimated from how the map's cameras are held.
-        unit: that of the poses, None if it is not known.
-    """
-    path = Path(path)
-    map_device = path.stem.removeprefix(f"{capture.name}_map_").split("_query_")[0]
-    mapped = _poses(capture[f"{map_device}_map"])
-    axes, labels = ground_axes(up_of_cameras(mapped) if up is None else up, unit)
-    alone = path.with_name(f"{path.stem.removesuffix('_sequence')}.txt")
-    whole, single = Trajectory.read(path), Trajectory.read(alone)
-    table = read_query_table(path.with_suffix(".csv"), ["recording", "piece", "used"])
-    keys = list(zip(whole.timestamps.tolist(), whole.device_ids.tolist(), strict=True))
-    rows = table.set_index(["timestamp", "device_id"]).loc[keys]
-    frames = whole.world_from_device[:, :3, 3] @ axes.T
-    centers, every = mapped[:, :3, 3] @ axes.T, single.world_from_device[:, :3, 3] @ axes.T
-    used = table[table["used"] == "True"].set_index(["timestamp", "device_id"]).index
-    is_used = pd.MultiIndex.from_arrays([single.timestamps, single.device_ids]).isin(used)
-    # Poses that are far off are not drawn: the map and the way are what there is to see.
-    place = places_of(np.concatenate([centers, frames]))
-    count = min(place.max(initial=0) + 1, MAX_PLACES)
-    figure = new_figure(4.2 * count + 1, 4.6)
-    plots = figure.subplots(1, count, squeeze=False)[0]
-    for number, plot in enumerate(plots):
-        shown = np.concatenate([centers, frames])[place == number]
-        plot.scatter(*centers[place[: len(centers)] == number].T, s=14, c="0.75", label=f"map, {map_device}")
-        here = place[len(centers) :] == number
-        for _, one in rows.assign(row=np.arange(len(rows)))[here].groupby(["recording", "piece"], dropna=True):
-            plot.plot(*frames[one["row"]].T, "-o", markersize=3, linewidth=1, color="C0")
-        low, high = shown.min(axis=0) - 3, shown.max(axis=0) + 3
-        inside = ((every > low) & (every < high)).all(axis=1)
-        for chosen, color, name in ((is_used, "C2", "agree"), (~is_used, "C3", "do not agree")):
-            plot.scatter(*every[inside & chosen].T, s=36, marker="x", c=color, label=f"single queries that {name}")
-        plot.set_xlabel(labels[0])
-        plot.set_aspect("equal", adjustable="datalim")
-    plots[0].set_ylabel(labels[1])
-    plots[0].legend(fontsize=8)
-    figure.suptitle("Recordings from above: frames along the way (line), poses of single queries (crosses)")
     return figure
 
 

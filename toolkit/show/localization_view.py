@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,10 +51,12 @@ def record_localizations(
     details: Iterable[tuple[int, QueryDetails]] = (),
     up: ArrayLike | None = None,
     image_size: int = 480,
+    ways: Mapping[str, Sequence[Floats]] | None = None,
 ) -> Path:
     """Write a recording of queries in a map, and return its path.
 
-    Entities: `world/{points,map_cameras}`, `world/queries/{estimated,true,error,failed}`; and for the query chosen on
+    Entities: `world/{points,map_cameras}`, `world/queries/{estimated,true,error,failed}`,
+    `world/recording/{odometry,frames}`; and for the query chosen on
     the timeline `query`: `world/chosen/camera_<k>`, `world/truth/camera_0`, `world/references/<rank>`,
     `world/chosen_points`, and a page about it, `about`. Errors are colored by `figures.error_colors`.
 
@@ -65,6 +67,8 @@ def record_localizations(
         details: number and details of those that can be chosen; taken one at a time.
         up: direction (3,) that is up; None: estimated from the map's cameras.
         image_size: longer side of the images, pixels.
+        ways: of the queries' recordings, the places (n, 3) of each piece: `odometry`, laid in the map as a whole, and
+            `frames`, as the sequence stage has found them.
     """
     started = time.perf_counter()
     poses = map_poses[is_posed(map_poses)]
@@ -76,6 +80,7 @@ def record_localizations(
         log_points(stream, points, colors)
         _log_map_cameras(stream, poses, size)
         _log_overview(stream, localizations)
+        _log_ways(stream, ways or {})
         writer = _ChosenWriter(stream, localizations, image_size, 2 * size)
         for number, chosen in details:
             writer.write(number, chosen)
@@ -146,6 +151,15 @@ def _log_overview(stream: "rr.RecordingStream", queries: Localizations) -> None:
         dots("world/queries/failed", lost, queries.nearest_reference, rgb(ESTIMATED), 9)
     legend = draw_error_legend(queries.unit[0])
     stream.log("legend", rr.EncodedImage(contents=legend, media_type="image/png"), static=True)
+
+
+def _log_ways(stream: "rr.RecordingStream", ways: Mapping[str, Sequence[Floats]]) -> None:
+    """Log the ways of recordings as lines."""
+    import rerun as rr
+
+    for name, color in (("odometry", ORANGE), ("frames", SKY)):
+        if ways.get(name):
+            stream.log(f"world/recording/{name}", rr.LineStrips3D(ways[name], colors=rgb(color)), static=True)
 
 
 class _ChosenWriter:

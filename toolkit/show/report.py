@@ -18,6 +18,7 @@ from toolkit.errors import ArtifactError
 from toolkit.files import SceneFiles, of_sequence, read_map_record, sidecar_path, write_text
 from toolkit.show.figures import number, percent
 from toolkit.show.metrics import REASONS, THRESHOLDS, WRONG, parse_threshold, small_unit, unit_of, worst_first
+from toolkit.show.sequences import CHANGES
 
 # All pictures of a page together, before base64 makes them a third larger: the page stays below 10 MB.
 PICTURE_BUDGET = 7_000_000
@@ -107,8 +108,8 @@ def write_report(run_dir: str | Path) -> Path:
 
     Pictures are embedded, so that the one file can be mailed; links to poses, notebooks and recordings are relative
     and work beside them. What is missing is left out, what cannot be read is named. In the folder `visualization`,
-    pictures named `worst*` are shown with the worst queries, `localization*` as samples, others as maps; a title is
-    the PNG's `Title` or `Description`.
+    pictures named `worst*` are shown with the worst queries, `localization*` as samples, `<pair>_sequence*` with the
+    sequences, others as maps; a title is the PNG's `Title` or `Description`.
 
     Raises:
         ArtifactError: there is no `run.json`, or it is torn.
@@ -229,8 +230,9 @@ def _not_done(run: dict[str, Any]) -> Table | None:
 def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> dict[str, Any]:
     """Return what the page shows of one scene, by the names that the template has for it."""
     messages: list[str] = []
-    recall, errors, losses, retrieval = (
-        _read_table(files.evaluation / f"{name}.csv", messages) for name in ("recall", "errors", "losses", "retrieval")
+    tables = ("recall", "errors", "losses", "retrieval", "sequence", "changes")
+    recall, errors, losses, retrieval, sequences, changes = (
+        _read_table(files.evaluation / f"{name}.csv", messages) for name in tables
     )
     thresholds = [column for column in recall.columns if column.startswith("recall@")]
     statuses = _read_statuses(files, messages)
@@ -250,6 +252,8 @@ def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> dict[str, An
     stills = sorted(files.visualization.glob("*.png"), key=_natural)
     worst = [path for path in stills if path.name.startswith("worst")]
     samples = [path for path in stills if path.name.startswith("localization")]
+    recordings = [path for path in stills if of_sequence(path.name)]
+    maps = [path for path in stills if path not in (*worst, *samples, *recordings)]
     figures = {files.evaluation / f"{name}.png": texts for name, texts in EVALUATION_FIGURES.items()}
     return {
         "name": files.scene,
@@ -275,7 +279,10 @@ def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> dict[str, An
         # What fails to be understood without a picture comes first, while there is room.
         "worst_pictures": [album.picture(path) for path in worst],
         "figures": [album.picture(path, *texts) for path, texts in figures.items() if path.is_file()],
-        "maps": [album.picture(path) for path in stills if path not in worst and path not in samples],
+        "steps": _steps(sequences, thresholds) if len(sequences) else None,
+        "changes": _changes(changes, unit) if len(changes) else None,
+        "sequences": [album.picture(path) for path in recordings],
+        "maps": [album.picture(path) for path in maps],
         "samples": [album.picture(path) for path in samples],
         "recordings": _linked(files.run, files.visualization.glob("*.rrd")),
         "files": _files(files),
@@ -400,6 +407,40 @@ def _pairs(recall: pd.DataFrame, thresholds: list[str]) -> Table:
         rows.append([text if isinstance(text, Cell) else Cell(text) for text in texts])
     titles = [title for title, _ in shown.values()]
     return Table("Counts of queries, recall and median errors of every pair", titles, rows)
+
+
+def _steps(sequences: pd.DataFrame, thresholds: list[str]) -> Table:
+    """Return the mean over the pairs of each step of the sequence stage."""
+    small, factor = small_unit(unit_of(*thresholds))
+    rows = []
+    for step, pairs in sequences.groupby("step", sort=False):
+        shares = [_share(float(pairs[name].mean())) for name in thresholds]
+        medians = [float(pairs[f"median_{name}"].median()) for name in ("rotation_deg", "translation_m")]
+        cells = [Cell(str(step)), Cell(str(int(pairs["queries"].sum()))), *shares]
+        cells += [Cell(number(medians[0])), Cell(number(factor * medians[1]))]
+        rows.append(cells + [Cell(str(int(pairs[name].sum()))) for name in ("rescued", "broken")])
+    titles = ["step", "queries", *(f"recall {_threshold(name)}" for name in thresholds)]
+    titles += ["median [°]", f"median [{small}]", "rescued", "broken"]
+    caption = "Queries after each step of the sequence stage: mean recall and median error of the pairs"
+    return Table(caption, titles, rows)
+
+
+def _changes(changes: pd.DataFrame, unit: str) -> Table:
+    """List queries that a sequence has broken, and rescued."""
+    rows = []
+    for row in changes.sort_values("change", kind="stable")[:WORST].to_dict("records"):
+        errors = [
+            f"{number(row[f'{of}rotation_error_deg'])}°, {_length(row[f'{of}translation_error_m'], unit)}"
+            if math.isfinite(row[f"{of}rotation_error_deg"])
+            else "no pose"
+            for of in ("single_", "")
+        ]
+        texts = [f"{row['query_device']} in {row['map_device']} map", row["change"], *errors]
+        rows.append([Cell(text) for text in (*texts, str(row["device_id"]), str(row["timestamp"]))])
+    counts = changes["change"].value_counts()
+    caption = ", ".join(f"{counts.get(name, 0)} {name}" for name in CHANGES)
+    caption = f"Queries within the last threshold by their sequence alone, or by their single pose alone: {caption}"
+    return Table(caption, ["query", "change", "single", "sequence", "device", "timestamp [µs]"], rows)
 
 
 def _losses(losses: pd.DataFrame) -> Table | None:
