@@ -202,3 +202,11 @@ def test_between_two_poses_motion_is_steady() -> None:
     every, order = odometry.joined(np.array([1_000_000, 250_000]), found[[2, 0]])
     assert order.tolist() == [0, 3, 1, 2]
     np.testing.assert_allclose(every.odom_from_rig, [poses[0], expected, poses[1], poses[1]], atol=1e-12)
+
+
+def test_many_queries_are_compared_by_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    way = drive(np.random.default_rng(10), wrong=0.3)
+    whole = place(way.odometry, way.queries, SETTINGS)
+    monkeypatch.setattr("toolkit.localizers.odometry._PAIRS", 30)
+    parts = place(way.odometry, way.queries, SETTINGS)
+    assert [placement.members.tolist() for placement in parts] == [placement.members.tolist() for placement in whole]

@@ -33,6 +33,8 @@ _CHI2_99 = 16.81
 """99 % quantile of the chi-squared distribution with 6 degrees of freedom."""
 _SHARE, _CHI2_3 = 0.25, 1.213
 """Quantile of the chi-squared distribution with 3 degrees of freedom."""
+_PAIRS = 1 << 18
+"""Pairs of queries that are looked at at a time."""
 _LEAST_MOTIONS = 6
 """Fewer do not say how large a drift is."""
 _MOST_DRIFT = 20.0
@@ -257,10 +259,11 @@ def place(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings)
 def _agreement(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> NDArray[np.bool_]:
     """Return (Q, Q) whether two poses fit the motion between them."""
     count = len(queries)
-    first, second = (each.ravel() for each in np.indices((count, count)))
-    off = _Differences.between(odometry, queries, settings, first, second)
-    chi2 = off.angle2 / (off.drift[0] ** 2 + off.rotation_var) + off.distance2 / (off.drift[1] ** 2 + off.position_var)
-    agree = (chi2 < _CHI2_99).reshape(count, count)
+    agree, every = np.zeros((count, count), bool), np.arange(count)
+    for rows in np.array_split(every, 1 + count**2 // _PAIRS):
+        off = _Differences.between(odometry, queries, settings, np.repeat(rows, count), np.tile(every, len(rows)))
+        rotation_var, position_var = off.drift[0] ** 2 + off.rotation_var, off.drift[1] ** 2 + off.position_var
+        agree[rows] = (off.angle2 / rotation_var + off.distance2 / position_var < _CHI2_99).reshape(len(rows), count)
     return agree | agree.T
 
 
@@ -377,7 +380,8 @@ def fitted_scale(odometry: Odometry, queries: PosedQueries, settings: SequenceSe
 def first_guess(odometry: Odometry, queries: PosedQueries) -> Floats:
     """Return world_from_rig (N, 4, 4): each pose as odometry leads to it from the next query along the way."""
     way = odometry.way_m
-    nearest = np.argmin(np.abs(way[:, None] - way[queries.frames]), axis=1)
+    between = (way[queries.frames[1:]] + way[queries.frames[:-1]]) / 2
+    nearest = np.searchsorted(between, way)
     moved = odometry.odom_from_rig
     return queries.world_from_rig[nearest] @ geometry.invert(moved[queries.frames[nearest]]) @ moved
 

@@ -88,7 +88,8 @@ def _laid(odometry: Odometry, agreeing: PosedQueries) -> Floats:
     """Return world_from_odom (4, 4) of that query whose placement is the nearest to the others', in the median."""
     moved, poses = odometry.odom_from_rig[agreeing.frames], agreeing.world_from_rig
     candidates = poses @ geometry.invert(moved)
-    _, off_m = geometry.pose_error(candidates[:, None] @ moved, np.broadcast_to(poses, (len(poses), *poses.shape)))
+    laid = (candidates[:, :3] @ moved[:, :, 3].T).transpose(0, 2, 1)
+    off_m = np.linalg.norm(laid - poses[:, :3, 3], axis=2)
     return np.asarray(candidates[int(np.argmin(np.median(off_m, axis=1)))])
 
 
