@@ -269,10 +269,15 @@ class Alike:
         poses = Trajectory.read(done["path"]).lookup(*keys)
         frames["deg"], frames["m"] = geometry.pose_error(poses, truth.lookup(*keys))
         pieces = frames.groupby(["recording", "piece"])
-        assert pieces["status"].nunique().eq(1).all()
+        status = pieces["status"].agg(lambda of_frames: of_frames.mode().iloc[0])
+        # In a piece whose place is in doubt, `ok` queries keep their own poses.
+        alone = frames[frames["status"] != pieces["status"].transform(lambda of_frames: of_frames.mode().iloc[0])]
+        assert (alone["status"] == "ok").all()
+        assert (alone["single_status"] == "ok").all()
+        assert (alone["m"] < 0.5).all()
         return pd.DataFrame(
             {
-                "status": pieces["status"].first(), "frames": pieces.size(),
+                "status": status, "frames": pieces.size(),
                 "queries": pieces["used"].apply(lambda used: (used != "").sum()),
                 "wrong": pieces["m"].apply(lambda m: (m > 5).mean()),
                 "median_m": pieces["m"].median(), "median_deg": pieces["deg"].median(),
