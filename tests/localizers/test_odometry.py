@@ -161,13 +161,16 @@ def test_drift_is_measured_by_the_queries(drift: float, wrong: float) -> None:
     assert with_measured_drift(doubtful, SETTINGS) == SETTINGS
 
 
-def test_what_is_no_odometry_measures_nothing() -> None:
-    way = drive(np.random.default_rng(0))
+def test_what_drift_is_measured_by() -> None:
+    way = drive(np.random.default_rng(0), every=6, drift=5.0)
+    few = way.queries.choose(np.arange(5))  # four motions, and three over two of them
+    assert with_measured_drift([(way.odometry, few)], SETTINGS).rotation_drift_deg > 2 * SETTINGS.rotation_drift_deg
+    assert with_measured_drift([(way.odometry, few.choose(np.arange(4)))], SETTINGS) == SETTINGS
+    assert with_measured_drift([], SETTINGS) == SETTINGS
     still = replace(way.odometry, odom_from_rig=np.tile(np.eye(4), (len(way.odometry), 1, 1)))
     assert with_measured_drift([(still, way.queries)], SETTINGS).position_drift == SETTINGS.position_drift
-    assert with_measured_drift([(way.odometry.scaled(3.0), way.queries)], SETTINGS) == SETTINGS
-    assert with_measured_drift([(way.odometry, way.queries.choose(np.arange(4)))], SETTINGS) == SETTINGS
-    assert with_measured_drift([], SETTINGS) == SETTINGS
+    no_odometry = with_measured_drift([(way.odometry.scaled(30.0), way.queries)], SETTINGS)
+    assert no_odometry.position_drift == pytest.approx(20 * SETTINGS.position_drift)
 
 
 @pytest.mark.parametrize("wrong", [0.0, 0.2])

@@ -7,7 +7,7 @@ say of each other becomes less sure with the way and the time between them.
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 import pandas as pd
@@ -38,7 +38,7 @@ _PAIRS = 1 << 18
 _LEAST_MOTIONS = 6
 """Fewer do not say how large a drift is."""
 _MOST_DRIFT = 20.0
-"""Times what the settings say. With more, odometry is none, or most single poses are wrong."""
+"""Times what the settings say, at most. What drifts more is no odometry, or most single poses are wrong."""
 
 
 @dataclass(frozen=True)
@@ -331,20 +331,20 @@ def with_measured_drift(
     are wrong do not move it, up to 40 % of them, nor does a loss of tracking that was not seen.
     """
     sure = [(odometry, queries.choose(queries.trusted)) for odometry, queries in pieces]
+    # Over two motions more is seen of turning and less of moving.
+    lags = (1,) if sum(max(len(queries) - 1, 0) for _, queries in sure) >= _LEAST_MOTIONS else (1, 2)
     values = settings.model_dump()
     for name, turns in (("rotation_drift_deg", True), ("position_drift", False)):
         asked = [np.zeros(0)]
-        for odometry, queries in sure:
-            second: Ints = np.arange(1, len(queries))
-            off = _Differences.between(odometry, queries, settings.model_copy(update=values), second - 1, second)
+        for (odometry, queries), lag in product(sure, lags):
+            second: Ints = np.arange(lag, len(queries))
+            off = _Differences.between(odometry, queries, settings.model_copy(update=values), second - lag, second)
             square, others = (off.angle2, off.rotation_var) if turns else (off.distance2, off.position_var)
             drift2 = off.drift[0 if turns else 1] ** 2
             asked.append((square / _CHI2_3 - others)[drift2 > 0] / drift2[drift2 > 0])
         every = np.concatenate(asked)
         factor = float(np.sqrt(max(1.0, np.quantile(every, _SHARE)))) if len(every) >= _LEAST_MOTIONS else 1.0
-        if factor > _MOST_DRIFT:
-            return settings
-        values[name] *= factor
+        values[name] *= min(factor, _MOST_DRIFT)
     return settings.model_copy(update=values)
 
 
