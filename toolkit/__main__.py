@@ -145,6 +145,7 @@ def submit(
     queries: Annotated[str | None, typer.Option(help="Keyframe list to answer; else the challenge's.")] = None,
     scene: Annotated[list[str] | None, typer.Option(help="Only this scene; repeat for more.")] = None,
     capture: Annotated[list[Path] | None, typer.Option(help="Capture folder, if it has moved since the run.")] = None,
+    sequence: Annotated[bool, typer.Option("--sequence", help="Take the poses of the stage `sequence`.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would be in the zip, write nothing.")] = False,
 ) -> None:
     """Check the poses of runs and write the zip file that the challenge takes; missing pairs are listed."""
@@ -152,7 +153,7 @@ def submit(
 
     if not description.strip() and not dry_run:
         raise ManifestError("--description is missing: a text, or a file. The challenge wants to know what was done.")
-    submission = collect(runs, description, out, failed, queries, scene or (), capture or ())
+    submission = collect(runs, description, out, failed, queries, scene or (), capture or (), sequence)
     print(submission.text())
     if not dry_run:
         print(f"Submission: {submission.write()}")

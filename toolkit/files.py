@@ -338,6 +338,9 @@ class SceneFiles:
     def poses_csv(self, map_device: str, query_device: str) -> Path:
         return self.poses_dir / f"{pair_name(self.scene, map_device, query_device)}.csv"
 
+    def sequence_txt(self, map_device: str, query_device: str) -> Path:
+        return self.poses_dir / f"{pair_name(self.scene, map_device, query_device)}_sequence.txt"
+
 
 def image_name(path: str) -> str:
     """Return the name of an image (`<session>/raw_data/<path>`) that outputs give as `<scene>/sessions/<name>`."""

@@ -157,6 +157,21 @@ def test_what_failed_can_be_left_out(run: Path, tmp_path: Path) -> None:
     assert left["reason"].str.contains("no retrieval to fill it from: .*jsonl is missing").all()
 
 
+def test_poses_of_the_sequence_are_taken_where_asked_for(run: Path, tmp_path: Path) -> None:
+    files, times = SceneFiles(run, "HYDRO"), (90, *TIMES)  # a frame that is no query, too
+    ids, qt = [device_of("hl", time) for time in times], [pose_of("other", "hl", time) for time in times]
+    Trajectory(times, ids, qt).write(files.sequence_txt("ios", "hl"))
+    rows = pd.DataFrame({"timestamp": times, "device_id": ids, "status": "low_confidence: drift"})
+    rows.to_csv(files.sequence_txt("ios", "hl").with_suffix(".csv"), index=False)
+    submission = collect([run], "Ours.", sequence=True)
+    assert [entry.name for entry in submission.entries if entry.poses is not None] == ["HYDRO_map_ios_query_hl.txt"]
+    assert "of the stage `sequence`" in submission.missing[0].state
+    row = submission.table().set_index("file").loc["HYDRO_map_ios_query_hl.txt"]
+    assert (row["written"], row["low_confidence"], row["not_asked"]) == (3, 3, 1)
+    found = poses_in(submission.write(), "HYDRO_map_ios_query_hl.txt", tmp_path)
+    np.testing.assert_allclose(found.qt, qt[:0:-1], atol=1e-15)
+
+
 def test_missing_pairs_are_reported_and_the_rest_is_written(run: Path) -> None:
     SceneFiles(run, "HYDRO").poses_txt("spot", "ios").unlink()
     submission = collect([run], "Ours.")

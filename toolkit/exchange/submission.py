@@ -160,6 +160,7 @@ def collect(
     queries: str | None = None,
     scenes: Sequence[str] = (),
     captures: Sequence[str | Path] = (),
+    sequence: bool = False,
 ) -> Submission:
     """Gather and check the poses of runs for submission; `.write()` then writes the zip file.
 
@@ -175,6 +176,7 @@ def collect(
         queries: the list of query keyframes to answer, in the query session's `proc/`; None: the challenge's.
         scenes: only these; none: see above.
         captures: folders of captures that have moved since the runs.
+        sequence: take the poses of the stage `sequence`, and not those of single queries.
 
     Raises:
         ManifestError: an unknown value, no such run, or a file that cannot be read as a description.
@@ -204,7 +206,7 @@ def collect(
         for map_device, query_device in rules.pairs:
             entry = Entry(scene, map_device, query_device, rules.file_name(scene, map_device, query_device))
             submission.entries.append(entry)
-            _fill_entry(entry, folders, places, queries or rules.queries, failed, submission.sources)
+            _fill_entry(entry, folders, places, queries or rules.queries, failed, submission.sources, sequence)
     total = submission.table()[COUNTS].sum()
     if total["filled"]:
         submission.description += (
@@ -261,22 +263,26 @@ def _description(text: str) -> str:
 
 
 def _fill_entry(
-    entry: Entry, runs: Sequence[Path], captures: Captures, queries: str, failed: str, sources: dict[str, str]
-) -> None:
+    entry: Entry, runs: Sequence[Path], captures: Captures, queries: str, failed: str, sources: dict[str, str],
+    sequence: bool,
+) -> None:  # fmt: skip
     """Read the poses of a pair from the run that has them, and set what is written for each query of the list."""
     pair = (entry.map_device, entry.query_device)
-    with_poses = [files for run in runs if (files := SceneFiles(run, entry.scene)).poses_txt(*pair).is_file()]
+    of_runs = [SceneFiles(run, entry.scene) for run in runs]
+    paths = [files.sequence_txt(*pair) if sequence else files.poses_txt(*pair) for files in of_runs]
+    with_poses = [(files, path) for files, path in zip(of_runs, paths, strict=True) if path.is_file()]
     if not with_poses:
-        entry.state = "missing: no poses in " + ", ".join(str(run / entry.scene / "poses") for run in runs)
+        what = "poses of the stage `sequence`" if sequence else "poses"
+        entry.state = f"missing: no {what} in " + ", ".join(str(files.poses_dir) for files in of_runs)
         return
     if len(with_poses) > 1:
-        both = " and ".join(str(files.poses_txt(*pair)) for files in with_poses)
+        both = " and ".join(str(path) for _, path in with_poses)
         raise ArtifactError(f"Two runs have poses of the same pair: {both}. Give one of the two runs.")
-    files = with_poses[0]
+    files, path = with_poses[0]
     keyframes = captures[entry.scene][f"{entry.query_device}_query"].keyframes(queries)
     timestamps, device_ids = keyframes["timestamp"].to_numpy(np.int64), keyframes["device_id"]
-    poses = _read_poses(files.poses_txt(*pair))
-    statuses, sources[entry.name] = _statuses(files.poses_csv(*pair)), file_fingerprint(files.poses_txt(*pair))
+    poses = _read_poses(path)
+    statuses, sources[entry.name] = _statuses(path.with_suffix(".csv")), file_fingerprint(path)
     rows = poses.index.find(timestamps, device_ids)
     entry.not_asked = len(poses) - int(np.sum(rows >= 0))
     nearest, why_not = dict[Key, np.ndarray](), "not localized"
