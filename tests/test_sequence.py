@@ -205,6 +205,9 @@ def test_what_cannot_be_done_has_a_reason(place: Path, tmp_path: Path) -> None:
     assert "Localize first" in table.loc[("hl", "ios"), "reason"]
     assert "trajectories.txt" in table.loc[("ios", "hl"), "reason"]
     assert (table.drop(("ios", "ios"))["frames"] == 0).all()
+    (tmp_path / "poses" / f"{pair_name(place.name, 'ios', 'ios')}.csv").unlink()
+    table = sequence_pairs(place / "sessions", tmp_path / "poses", map_device="ios", query_device="ios")
+    assert "no table of the queries" in table["reason"].item()
     with pytest.raises(ManifestError):
         sequence_pairs(place / "sessions", tmp_path / "poses", {"scale": 1.0})
 

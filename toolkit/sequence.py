@@ -126,8 +126,9 @@ def _place_pair(
     poses, table, out = (stem.with_name(f"{stem.name}{end}") for end in (".txt", ".csv", f"{SUFFIX}.txt"))
     if session.odometry is None:
         raise ArtifactError(f"{session.path} has no trajectories.txt: there is no odometry of {session.id}.")
-    if not poses.exists():
-        raise ArtifactError(f"{poses}: no poses of this pair. Localize first.")
+    for path, what in ((poses, "poses"), (table, "table of the queries")):
+        if not path.exists():
+            raise ArtifactError(f"{path}: no {what} of this pair. Localize first.")
     require_whole(poses)
     record: dict[str, Any] = {
         "sequence": settings.model_dump(),
