@@ -19,6 +19,7 @@ from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import default_workers, prefetch
 from toolkit.capture.tables import POSE_NAMES, KeyIndex, as_strings, read_query_table
+from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import OF_THE_DATA, ArtifactError, reason_of
 from toolkit.files import (
     SceneFiles,
@@ -33,6 +34,7 @@ from toolkit.files import (
 from toolkit.geometry import Floats, Ints, pose_error
 from toolkit.localizers.base import PoseEstimate, RoughPose
 from toolkit.localizers.frames import LocalizedFrames, SequenceLocalizer, localize_sequence
+from toolkit.localizers.gravity import Gravity, measured_gravity
 from toolkit.localizers.map import Map
 from toolkit.localizers.odometry import (
     UNKNOWN_COVARIANCE,
@@ -140,7 +142,8 @@ def _place_pair(
     skipped = skip_existing and is_current(out, record)
     if not skipped:
         again = _Relocalizer(poses_dir, capture.name, map_device, session) if settings.relocalize else None
-        frames, steps, trajectory = _frames(session, _Answers.read(poses, table), settings, again)
+        up = up_of_cameras(capture[f"{map_device}_map"].world_from_cam())
+        frames, steps, trajectory = _frames(session, _Answers.read(poses, table), settings, again, up)
         csvs = {out.with_suffix(".csv"): frames, out.with_name(f"{out.stem}_steps.csv"): steps}
         for path, rows in csvs.items():
             with write_atomic(path) as temporary:
@@ -262,7 +265,11 @@ class _Relocalizer:
 
 
 def _frames(
-    session: Session, answers: _Answers, settings: SequenceSettings, relocalizer: _Relocalizer | None
+    session: Session,
+    answers: _Answers,
+    settings: SequenceSettings,
+    relocalizer: _Relocalizer | None,
+    map_up: Floats,
 ) -> tuple[pd.DataFrame, pd.DataFrame, Trajectory]:
     """Return the table of all frames and queries, that of steps, and the poses of those frames that have one."""
     tables, poses, covariances = list[pd.DataFrame](), list[Floats](), list[Floats]()
@@ -275,6 +282,8 @@ def _frames(
         settings = with_measured_drift(zip(motions, queries_of_each, strict=True), settings)
         pieces = [part for piece, own in zip(pieces, queries_of_each, strict=True) for part in piece.cut(own, settings)]
         queries_of_each = [answers.posed(piece.motion.timestamps, piece.device_ids) for piece in pieces]
+    motions = [piece.motion for piece in pieces]
+    gravity = measured_gravity(list(zip(motions, queries_of_each, strict=True)), map_up, settings)
     numbers = Counter[str]()
     for piece, queries in zip(pieces, queries_of_each, strict=True):
         motion, frames = piece.motion, queries.frames
@@ -289,9 +298,9 @@ def _frames(
             ) -> list[PoseEstimate]:
                 return ask(keys.iloc[[frame for frame, _ in todo]], [pose for _, pose in todo])
 
-        done = localize_piece(motion, queries, np.flatnonzero(asked >= 0), settings, again)
+        done = localize_piece(motion, queries, np.flatnonzero(asked >= 0), settings, again, gravity)
         placed = done.placed
-        windows = _online_steps(motion, queries, np.flatnonzero(asked >= 0), settings)
+        windows = _online_steps(motion, queries, np.flatnonzero(asked >= 0), settings, gravity)
         for name, of_queries in {**done.steps, **windows}.items():
             posed = np.isfinite(of_queries).all(axis=(1, 2))
             table = keys[asked >= 0][posed].assign(step=name)
@@ -330,7 +339,7 @@ def _frames(
 
 
 def _online_steps(
-    motion: Odometry, queries: PosedQueries, asked: Ints, settings: SequenceSettings
+    motion: Odometry, queries: PosedQueries, asked: Ints, settings: SequenceSettings, gravity: Gravity | None
 ) -> dict[str, Floats]:
     """Return poses (A, 4, 4) of frames from single queries of the past alone, by the window's name.
 
@@ -342,7 +351,7 @@ def _online_steps(
     for length_s in (*settings.windows_s, None):
         past = settings.model_copy(update={"online": True, "length_s": length_s})
         name = "online" if length_s is None else f"online {length_s:g} s"
-        steps[name] = place_online(motion, queries, asked, past).world_from_rig[asked]
+        steps[name] = place_online(motion, queries, asked, past, gravity).world_from_rig[asked]
     return steps
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -9,9 +10,11 @@ import pycolmap
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit import geometry
+from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import ImageError
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import PoseEstimate, RoughPose
+from toolkit.localizers.gravity import measured_gravity
 from toolkit.localizers.map import Map
 from toolkit.localizers.odometry import (
     UNKNOWN_COVARIANCE,
@@ -54,6 +57,11 @@ class _Pictures:
 
     def __init__(self, place: Map, rig_from_cams: NDArray[np.float64] | None, turns: Sequence[int] | None) -> None:
         self._place, self._rig, self._turns = place, rig_from_cams, turns
+
+    @cached_property
+    def up(self) -> Floats:
+        """(3,) direction that is about up in the map."""
+        return up_of_cameras(self._place.session.world_from_cam())
 
     def localize(self, picture: Pictures, cameras: Cameras, near: RoughPose | None = None) -> PoseEstimate:
         """Return an estimate; one picture that cannot be read does not end a recording."""
@@ -113,7 +121,7 @@ def localize_sequence(
 
     queries_of_each = [queries_within(rows) for rows in pieces]
     if not settings.online:
-        motions = map(odometry.part, pieces)
+        motions = [odometry.part(rows) for rows in pieces]
         settings = with_measured_drift(zip(motions, queries_of_each, strict=True), settings)
         pieces = [
             slice(rows.start + part.start, rows.start + part.stop)
@@ -121,6 +129,8 @@ def localize_sequence(
             for part in cut(odometry.part(rows), queries, settings)
         ]
         queries_of_each = [queries_within(rows) for rows in pieces]
+    motions = [odometry.part(rows) for rows in pieces]
+    gravity = measured_gravity(list(zip(motions, queries_of_each, strict=True)), pictures.up, settings)
     for number, (rows, queries) in enumerate(zip(pieces, queries_of_each, strict=True)):
         piece[rows] = number
         asked = np.array([frame for frame in single if rows.start <= frame < rows.stop], np.int64)
@@ -134,6 +144,7 @@ def localize_sequence(
             asked - rows.start,
             settings,
             localize_again if settings.relocalize else None,
+            gravity,
         )
         again |= {rows.start + frame: estimate for frame, estimate in done.again.items()}
         parts.append(done.placed)
@@ -227,7 +238,8 @@ class SequenceLocalizer:
             return [self._pictures.localize(image, cameras, near) for _, near in todo]
 
         again = localize_again if self.settings.relocalize else None
-        done = localize_piece(window, self._queries, np.array([len(window) - 1]), offline, again)
+        gravity = measured_gravity([(window, self._queries)], self._pictures.up, offline)
+        done = localize_piece(window, self._queries, np.array([len(window) - 1]), offline, again, gravity)
         self._queries, placed = done.queries, done.placed
         self._solved = len(window) - 1, placed
         if not np.isfinite(placed.world_from_rig[-1]).all():

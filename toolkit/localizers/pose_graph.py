@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from toolkit import geometry
 from toolkit.errors import ManifestError
 from toolkit.geometry import Floats, Ints
+from toolkit.localizers.gravity import Gravity
 from toolkit.localizers.odometry import (
     Odometry,
     PosedQueries,
@@ -51,11 +52,18 @@ class PlacedPiece:
     """Factor of the odometry's lengths; online that of the last pose."""
 
 
-def place_online(odometry: Odometry, queries: PosedQueries, asked: Ints, settings: SequenceSettings) -> PlacedPiece:
+def place_online(
+    odometry: Odometry,
+    queries: PosedQueries,
+    asked: Ints,
+    settings: SequenceSettings,
+    gravity: Gravity | None = None,
+) -> PlacedPiece:
     """Return the poses of some frames of a piece, each from what was before it alone, at most `settings.length_s`.
 
     Args:
         asked: indices of the frames.
+        gravity: see `place_piece`.
 
     Raises:
         ManifestError: GTSAM is not installed.
@@ -76,7 +84,7 @@ def place_online(odometry: Odometry, queries: PosedQueries, asked: Ints, setting
         start = cut(past, chosen, drifting)[-1].start  # what is after a loss of tracking that the queries tell
         past, within[within] = past.part(slice(start, None)), chosen.frames >= start
         chosen = chosen.choose(chosen.frames >= start).shifted(-start)
-        placed = place_piece(past, chosen, drifting)
+        placed = place_piece(past, chosen, drifting, gravity)
         every.world_from_rig[frame], every.covariances[frame] = placed.world_from_rig[-1], placed.covariances[-1]
         every.status[frame] = placed.status[-1]
         own = queries.frames[within] == frame
@@ -85,8 +93,13 @@ def place_online(odometry: Odometry, queries: PosedQueries, asked: Ints, setting
     return every
 
 
-def place_piece(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> PlacedPiece:
+def place_piece(
+    odometry: Odometry, queries: PosedQueries, settings: SequenceSettings, gravity: Gravity | None = None
+) -> PlacedPiece:
     """Return the poses of a piece of odometry, from the poses of single queries in it.
+
+    Args:
+        gravity: which direction is up; None: not known.
 
     Raises:
         ManifestError: GTSAM is not installed.
@@ -95,13 +108,15 @@ def place_piece(odometry: Odometry, queries: PosedQueries, settings: SequenceSet
     if not len(queries):
         nothing = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan), np.zeros(0, bool)
         return PlacedPiece(*nothing, np.full(count, "failed: no query of this piece has a pose", object))
+    if gravity is not None:
+        queries = gravity.upright(odometry, queries)
     best = place(odometry, queries, settings)[0]
     used, seen = best.members, set[bytes]()
     for _ in range(_ROUNDS):
         chosen = queries.choose(used)
         scale = fitted_scale(odometry, chosen, settings)
         moved = odometry.scaled(scale)
-        poses, covariances = _optimized(moved, chosen, settings)
+        poses, covariances = _optimized(moved, chosen, settings, gravity)
         seen.add(used.tobytes())
         # Who fits is used, whether it voted for this place or not; who does not fit is not.
         fit = np.flatnonzero(_chi2(poses, covariances, queries) < _CHI2_999)
@@ -139,7 +154,9 @@ def _logarithm(poses: Floats) -> Floats:
     return np.concatenate([geometry.unit(axis) * angle[:, None], poses[:, :3, 3]], axis=1)
 
 
-def _optimized(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> tuple[Floats, Floats]:
+def _optimized(
+    odometry: Odometry, queries: PosedQueries, settings: SequenceSettings, gravity: Gravity | None
+) -> tuple[Floats, Floats]:
     """Return poses (N, 4, 4) and covariances (N, 6, 6)."""
     gtsam = require_gtsam()
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -155,6 +172,10 @@ def _optimized(odometry: Odometry, queries: PosedQueries, settings: SequenceSett
     for number, step in enumerate(steps):
         noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([rotation_std[number], position_std[number]], 3))
         graph.add(gtsam.BetweenFactorPose3(number, number + 1, gtsam.Pose3(_rigid(step)), noise))
+    if gravity is not None and settings.gravity_std_deg is not None:
+        noise = gtsam.noiseModel.Isotropic.Sigma(2, np.deg2rad(settings.gravity_std_deg))
+        in_rig = odometry.odom_from_rig[0, :3, :3].T @ gravity.in_odometry
+        graph.add(gtsam.AttitudeFactorPose3(0, gtsam.Unit3(gravity.in_map), noise, gtsam.Unit3(in_rig)))
     kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(3.0)
     for frame, pose, covariance in zip(queries.frames.tolist(), queries.world_from_rig, floored(queries.covariances),
                                        strict=True):  # fmt: skip

@@ -12,6 +12,7 @@ import numpy as np
 from toolkit import geometry
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import PoseEstimate, RoughPose, agree
+from toolkit.localizers.gravity import Gravity
 from toolkit.localizers.odometry import Odometry, PosedQueries, place
 from toolkit.localizers.pose_graph import PlacedPiece, place_online, place_piece
 from toolkit.manifest import SequenceSettings
@@ -44,6 +45,7 @@ def localize_piece(
     asked: Ints,
     settings: SequenceSettings,
     again: Again | None = None,
+    gravity: Gravity | None = None,
 ) -> LocalizedPiece:
     """Return the poses of a piece of odometry: of all frames, or of those that are asked for if `settings.online`.
 
@@ -51,11 +53,12 @@ def localize_piece(
         queries: those with a pose.
         asked: (A,) frames of all queries, ascending.
         again: asked about queries that are not `ok`, or that contradict the others; None: they stay as they are.
+        gravity: which direction is up; None: not known.
 
     Raises:
         ManifestError: GTSAM is not installed.
     """
-    first = _placed(odometry, queries, asked, settings)
+    first = _placed(odometry, queries, asked, settings, gravity)
     sure = queries.frames[first.used & queries.trusted]
     doubted = [int(frame) for frame in np.setdiff1d(asked, sure) if np.isfinite(first.world_from_rig[frame]).all()]
     answers: dict[int, PoseEstimate] = {}
@@ -63,14 +66,14 @@ def localize_piece(
         found = again([(frame, _rough(first, frame)) for frame in doubted])
         answers = dict(zip(doubted, found, strict=True))
     every = with_answers(queries, answers)
-    second = first if every is queries else _placed(odometry, every, asked, settings)
+    second = first if every is queries else _placed(odometry, every, asked, settings, gravity)
     singles = np.full((len(odometry), 4, 4), np.nan)
     singles[queries.frames] = queries.world_from_rig
     voted = np.full((len(asked), 4, 4), np.nan)
     if len(queries) and not settings.online:
-        voted = _laid(odometry, queries.choose(place(odometry, queries, settings)[0].members)) @ (
-            odometry.odom_from_rig[asked]
-        )
+        voters = queries if gravity is None else gravity.upright(odometry, queries)
+        agreeing = queries.choose(place(odometry, voters, settings)[0].members)
+        voted = _laid(odometry, agreeing) @ odometry.odom_from_rig[asked]
     graph = first.world_from_rig[asked]
     for frame, estimate in answers.items():
         if estimate.world_from_rig is not None:
@@ -78,10 +81,12 @@ def localize_piece(
     return LocalizedPiece(second, every, answers, dict(zip(STEPS, (voted, graph, singles[asked]), strict=True)))
 
 
-def _placed(odometry: Odometry, queries: PosedQueries, asked: Ints, settings: SequenceSettings) -> PlacedPiece:
+def _placed(
+    odometry: Odometry, queries: PosedQueries, asked: Ints, settings: SequenceSettings, gravity: Gravity | None
+) -> PlacedPiece:
     if settings.online:
-        return place_online(odometry, queries, asked, settings)
-    return place_piece(odometry, queries, settings)
+        return place_online(odometry, queries, asked, settings, gravity)
+    return place_piece(odometry, queries, settings, gravity)
 
 
 def _laid(odometry: Odometry, agreeing: PosedQueries) -> Floats:
