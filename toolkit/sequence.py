@@ -33,6 +33,8 @@ from toolkit.files import (
 )
 from toolkit.geometry import Floats, Ints, pose_error
 from toolkit.localizers.base import PoseEstimate, RoughPose
+from toolkit.localizers.bundle import Observations
+from toolkit.localizers.correspondences import LocalizedQueries
 from toolkit.localizers.frames import LocalizedFrames, SequenceLocalizer, localize_sequence
 from toolkit.localizers.gravity import Gravity, measured_gravity
 from toolkit.localizers.map import Map
@@ -193,6 +195,8 @@ class _Answers:
     """(Q, 4, 4), NaN where there is none."""
     covariances: Floats
     """(Q, 6, 6)."""
+    shown: LocalizedQueries | None = None
+    """What their poses rest on."""
 
     @classmethod
     def read(cls, poses: Path, table: Path) -> "_Answers":
@@ -207,7 +211,9 @@ class _Answers:
             known = (at >= 0) & np.isfinite(given[at]).all(axis=(1, 2))
             covariances[known] = given[at[known]]
         found = trajectory.lookup(rows["timestamp"], rows["device_id"])
-        return cls(rows[["timestamp", "device_id"]], status, weights, found, covariances)
+        path = poses.with_suffix(".h5")
+        shown = LocalizedQueries(path) if path.is_file() else None
+        return cls(rows[["timestamp", "device_id"]], status, weights, found, covariances, shown)
 
     def posed(self, timestamps: Ints, device_ids: Any) -> PosedQueries:
         """Return those that have a pose, of the frames (N,) of a piece of odometry."""
@@ -298,7 +304,12 @@ def _frames(
             ) -> list[PoseEstimate]:
                 return ask(keys.iloc[[frame for frame, _ in todo]], [pose for _, pose in todo])
 
-        done = localize_piece(motion, queries, np.flatnonzero(asked >= 0), settings, again, gravity)
+        def observe(
+            frame: int, again: PoseEstimate | None, keys: pd.DataFrame = keys
+        ) -> Observations | None:
+            return _observations(session, answers, keys.iloc[[frame]], again)
+
+        done = localize_piece(motion, queries, np.flatnonzero(asked >= 0), settings, again, gravity, observe)
         placed = done.placed
         windows = _online_steps(motion, queries, np.flatnonzero(asked >= 0), settings, gravity)
         for name, of_queries in {**done.steps, **windows}.items():
@@ -336,6 +347,22 @@ def _frames(
     times = kept["timestamp"].to_numpy(np.int64)
     trajectory = Trajectory.from_poses(times, kept["device_id"].to_list(), every[posed], known[posed])
     return frames_table, pd.concat([part.astype(object) for part in steps], ignore_index=True), trajectory
+
+
+def _observations(
+    session: Session, answers: _Answers, query: pd.DataFrame, again: PoseEstimate | None
+) -> Observations | None:
+    """Return what a query shows: what its first pose rests on, or that which was found again."""
+    key = int(query["timestamp"].iloc[0]), str(query["device_id"].iloc[0])
+    if again is not None:
+        [rows], found = session.rows_of_keyframes(query), again.correspondences
+    elif answers.shown is not None and key in answers.shown:
+        stored = answers.shown[key]
+        rows, found = np.array([session.row_of_name[name] for name in stored.images]), stored.correspondences
+    else:
+        return None
+    cameras = [session.camera(sensor) for sensor in session.images["sensor_id"].iloc[rows]]
+    return Observations.of(found, cameras, session.rig_from_cam(rows))
 
 
 def _online_steps(

@@ -14,6 +14,7 @@ from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import ImageError
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import PoseEstimate, RoughPose
+from toolkit.localizers.bundle import Observations
 from toolkit.localizers.gravity import measured_gravity
 from toolkit.localizers.map import Map
 from toolkit.localizers.odometry import (
@@ -138,6 +139,12 @@ def localize_sequence(
         def localize_again(todo: Sequence[tuple[int, RoughPose]], start: int = rows.start) -> list[PoseEstimate]:
             return [pictures.localize(images[start + frame], of_each[start + frame], near) for frame, near in todo]
 
+        def observe(frame: int, again: PoseEstimate | None, start: int = rows.start) -> Observations:
+            estimate, each = again or single[start + frame], of_each[start + frame]
+            rig = np.eye(4)[None] if rig_from_cams is None else np.asarray(rig_from_cams, np.float64)
+            cameras = each if isinstance(each, list | tuple) else [each]
+            return Observations.of(estimate.correspondences, cameras, rig)
+
         done = localize_piece(
             odometry.part(rows),
             queries,
@@ -145,6 +152,7 @@ def localize_sequence(
             settings,
             localize_again if settings.relocalize else None,
             gravity,
+            observe,
         )
         again |= {rows.start + frame: estimate for frame, estimate in done.again.items()}
         parts.append(done.placed)

@@ -159,9 +159,24 @@ def _optimized(
 ) -> tuple[Floats, Floats]:
     """Return poses (N, 4, 4) and covariances (N, 6, 6)."""
     gtsam = require_gtsam()
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph, values = motion_graph(odometry, queries, settings), gtsam.Values()
     for number, pose in enumerate(first_guess(odometry, queries)):
-        values.insert(number, gtsam.Pose3(_rigid(pose)))
+        values.insert(number, gtsam.Pose3(rigid(pose)))
+    if gravity is not None and settings.gravity_std_deg is not None:
+        noise = gtsam.noiseModel.Isotropic.Sigma(2, np.deg2rad(settings.gravity_std_deg))
+        in_rig = odometry.odom_from_rig[0, :3, :3].T @ gravity.in_odometry
+        graph.add(gtsam.AttitudeFactorPose3(0, gtsam.Unit3(gravity.in_map), noise, gtsam.Unit3(in_rig)))
+    result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    marginals = gtsam.Marginals(graph, result)
+    numbers = range(len(odometry))
+    poses = np.stack([result.atPose3(number).matrix() for number in numbers])
+    return poses, np.stack([marginals.marginalCovariance(number) for number in numbers])
+
+
+def motion_graph(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> Any:
+    """Return GTSAM's graph of N poses: a factor for each step of odometry, and one for the pose of each query."""
+    gtsam = require_gtsam()
+    graph = gtsam.NonlinearFactorGraph()
     steps = geometry.invert(odometry.odom_from_rig[:-1]) @ odometry.odom_from_rig[1:]
     first: Ints = np.arange(len(steps))
     rotation_std, position_std = odometry.drift(settings, first, first + 1)
@@ -171,24 +186,16 @@ def _optimized(
     rotation_std, position_std = np.maximum(rotation_std, 1e-4), np.maximum(position_std, 1e-3)
     for number, step in enumerate(steps):
         noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([rotation_std[number], position_std[number]], 3))
-        graph.add(gtsam.BetweenFactorPose3(number, number + 1, gtsam.Pose3(_rigid(step)), noise))
-    if gravity is not None and settings.gravity_std_deg is not None:
-        noise = gtsam.noiseModel.Isotropic.Sigma(2, np.deg2rad(settings.gravity_std_deg))
-        in_rig = odometry.odom_from_rig[0, :3, :3].T @ gravity.in_odometry
-        graph.add(gtsam.AttitudeFactorPose3(0, gtsam.Unit3(gravity.in_map), noise, gtsam.Unit3(in_rig)))
+        graph.add(gtsam.BetweenFactorPose3(number, number + 1, gtsam.Pose3(rigid(step)), noise))
     kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(3.0)
     for frame, pose, covariance in zip(queries.frames.tolist(), queries.world_from_rig, floored(queries.covariances),
                                        strict=True):  # fmt: skip
         noise = gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Gaussian.Covariance(covariance))
-        graph.add(gtsam.PriorFactorPose3(frame, gtsam.Pose3(_rigid(pose)), noise))
-    result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-    marginals = gtsam.Marginals(graph, result)
-    numbers = range(len(odometry))
-    poses = np.stack([result.atPose3(number).matrix() for number in numbers])
-    return poses, np.stack([marginals.marginalCovariance(number) for number in numbers])
+        graph.add(gtsam.PriorFactorPose3(frame, gtsam.Pose3(rigid(pose)), noise))
+    return graph
 
 
-def _rigid(pose: Floats) -> Floats:
+def rigid(pose: Floats) -> Floats:
     """Return a pose (4, 4) whose rotation is one up to the last digit; files have some of them."""
     return geometry.pose_from_qt(geometry.qt_from_pose(pose))
 

@@ -12,6 +12,7 @@ import numpy as np
 from toolkit import geometry
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import PoseEstimate, RoughPose, agree
+from toolkit.localizers.bundle import Observations, Observe, adjusted
 from toolkit.localizers.gravity import Gravity
 from toolkit.localizers.odometry import Odometry, PosedQueries, place
 from toolkit.localizers.pose_graph import PlacedPiece, place_online, place_piece
@@ -34,9 +35,11 @@ class LocalizedPiece:
     """world_from_rig (A, 4, 4) of the frames that were asked for, NaN where there is none, after each of `STEPS`."""
 
 
+GRAPH_AGAIN = "graph again"
+"""The step before bundle adjustment, where that is asked for."""
 STEPS = ("voted", "graph", "again")
 """Odometry laid as a whole where most single poses agree; the first pose graph; single poses, the doubtful ones found
-again. What the second graph makes of these is the result."""
+again. What the second graph makes of these is the result, or bundle adjustment after it."""
 
 
 def localize_piece(
@@ -46,6 +49,7 @@ def localize_piece(
     settings: SequenceSettings,
     again: Again | None = None,
     gravity: Gravity | None = None,
+    observe: Observe | None = None,
 ) -> LocalizedPiece:
     """Return the poses of a piece of odometry: of all frames, or of those that are asked for if `settings.online`.
 
@@ -54,6 +58,7 @@ def localize_piece(
         asked: (A,) frames of all queries, ascending.
         again: asked about queries that are not `ok`, or that contradict the others; None: they stay as they are.
         gravity: which direction is up; None: not known.
+        observe: what queries show, for `settings.bundle_adjust`.
 
     Raises:
         ManifestError: GTSAM is not installed.
@@ -78,7 +83,33 @@ def localize_piece(
     for frame, estimate in answers.items():
         if estimate.world_from_rig is not None:
             singles[frame] = estimate.world_from_rig
-    return LocalizedPiece(second, every, answers, dict(zip(STEPS, (voted, graph, singles[asked]), strict=True)))
+    steps = dict(zip(STEPS, (voted, graph, singles[asked]), strict=True))
+    if settings.bundle_adjust and observe is not None and not settings.online:
+        steps[GRAPH_AGAIN] = second.world_from_rig[asked]
+        second = _adjusted(odometry, second, every, answers, observe, settings)
+    return LocalizedPiece(second, every, answers, steps)
+
+
+def _adjusted(
+    odometry: Odometry,
+    placed: PlacedPiece,
+    queries: PosedQueries,
+    answers: Mapping[int, PoseEstimate],
+    observe: Observe,
+    settings: SequenceSettings,
+) -> PlacedPiece:
+    """Return a piece after bundle adjustment of what the queries that are used show."""
+    used, shown = queries.choose(placed.used), dict[int, Observations]()
+    if not np.isfinite(placed.world_from_rig).all():
+        return placed
+    for frame, pose, trusted in zip(used.frames.tolist(), used.world_from_rig, used.trusted, strict=True):
+        answer = answers.get(frame)
+        same = answer is not None and answer.world_from_rig is not None and np.allclose(answer.world_from_rig, pose)
+        sure = answer is not None and answer.status == "ok" if same else trusted
+        seen = observe(frame, answer if same else None) if sure else None
+        if seen is not None and len(seen.points):
+            shown[frame] = seen
+    return adjusted(odometry, placed, used, shown, settings) if shown else placed
 
 
 def _placed(
