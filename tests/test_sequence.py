@@ -17,6 +17,7 @@ from toolkit.embed import embed_sessions
 from toolkit.errors import ManifestError
 from toolkit.files import SceneFiles, pair_name
 from toolkit.localize import localize_pairs
+from toolkit.localizers.pose_graph import FAR
 from toolkit.retrieve import retrieve_pairs
 from toolkit.sequence import COLUMNS, sequence_pairs
 from toolkit.synthetic import capture as rendering
@@ -159,7 +160,8 @@ def test_odometry_that_drifts_ten_times_as_much_does_no_harm(place: Path, tmp_pa
     found = Trajectory.read(done["path"]).world_from_device[way.queries.frames]
     assert geometry.pose_error(found, truth.world_from_device[way.queries.frames])[1].max() < 0.1
     assert done["used"] == done["queries"] == len(way.queries)
-    assert done["ok"] == len(way.odometry)
+    # Between two queries such odometry does not say enough.
+    assert (done["ok"], done["low_confidence"]) == (len(way.queries), len(way.odometry) - len(way.queries))
 
 
 def test_pieces_end_where_tracking_was_lost(place: Path, tmp_path: Path) -> None:
@@ -268,6 +270,7 @@ class Alike:
         assert truth is not None
         frames = pd.read_csv(str(done["path"]).replace(".txt", ".csv"), keep_default_na=False)
         frames = frames[frames["recording"] != ""]
+        frames["status"] = frames["status"].replace(FAR, "ok")  # in the right room, but not where in it
         keys = frames["timestamp"], frames["device_id"]
         poses = Trajectory.read(done["path"]).lookup(*keys)
         frames["deg"], frames["m"] = geometry.pose_error(poses, truth.lookup(*keys))

@@ -1,5 +1,6 @@
 """The sequence stage: the poses of single queries and the odometry between them in, a pose of every frame out."""
 
+import glob
 import logging
 import time
 from collections import Counter
@@ -113,6 +114,10 @@ def sequence_pairs(
             row |= _place_pair(capture, *devices, Path(poses_dir), settings, skip_existing)
         except OF_THE_DATA as error:
             row["reason"] = str(error)
+            # Those of an earlier run would be taken for results of this one.
+            stem = pair_name(capture.name, *devices)
+            for stale in Path(poses_dir).glob(f"{glob.escape(stem)}{SUFFIX}*"):
+                stale.unlink()
         rows.append(row)
     return pd.DataFrame(rows)
 

@@ -9,7 +9,7 @@ from tests.localizers.drifting import drive
 from toolkit import geometry
 from toolkit.errors import ManifestError
 from toolkit.localizers.odometry import Odometry, PosedQueries, with_measured_drift
-from toolkit.localizers.pose_graph import _logarithm, place_online, place_piece
+from toolkit.localizers.pose_graph import FAR, _logarithm, place_online, place_piece
 from toolkit.manifest import SequenceSettings
 
 pytest.importorskip("gtsam")
@@ -51,6 +51,16 @@ def test_a_pose_is_less_sure_the_farther_it_is_from_a_query() -> None:
     placed = place_piece(way.odometry, way.queries.choose(np.array([0])), SETTINGS)
     stds = np.sqrt(np.trace(placed.covariances[:, 3:, 3:], axis1=1, axis2=2))
     assert (np.diff(stds) > 0).all()
+
+
+def test_far_from_a_query_a_pose_is_not_sure() -> None:
+    way = drive(np.random.default_rng(0), frames=60)
+    placed = place_piece(way.odometry, way.queries.choose(np.arange(3)), SequenceSettings())
+    stds = np.sqrt(np.trace(placed.covariances[:, 3:, 3:], axis1=1, axis2=2))
+    assert (stds < 0.2).any()
+    assert (stds > 0.5).any()
+    assert all((status == "ok") == (std <= 0.2) for status, std in zip(placed.status, stds, strict=True))
+    assert {status for status in placed.status if status != "ok"} == {FAR}
 
 
 def test_a_piece_without_a_sure_query_says_so() -> None:

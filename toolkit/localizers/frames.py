@@ -26,7 +26,7 @@ from toolkit.localizers.odometry import (
     with_measured_drift,
 )
 from toolkit.localizers.picture import Picture, check_camera, localize_image
-from toolkit.localizers.pose_graph import PlacedPiece
+from toolkit.localizers.pose_graph import FAR, PlacedPiece, is_sure
 from toolkit.localizers.recording import localize_piece
 from toolkit.manifest import SequenceSettings
 
@@ -268,6 +268,7 @@ class SequenceLocalizer:
         shift = np.hypot(shift, self.settings.scale_std * np.linalg.norm(step[:3, 3]))
         moved = _adjoint(geometry.invert(step))
         covariance = moved @ placed.covariances[-1] @ moved.T + np.diag(np.repeat([turn[0], shift[0]], 3) ** 2)
+        status = FAR if status == "ok" and not is_sure(covariance[None])[0] else status
         return self._estimate(placed.world_from_rig[-1] @ step, covariance, status)
 
     def _estimate(self, pose: Floats, covariance: Floats, status: str) -> PoseEstimate:

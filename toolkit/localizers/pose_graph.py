@@ -34,6 +34,9 @@ MISSING = (
 _CHI2_999 = 22.46
 """99.9 % quantile of the chi-squared distribution with 6 degrees of freedom."""
 _ROUNDS = 8
+MAX_STD_DEG, MAX_STD_M = 2.25, 0.2
+"""Largest standard deviation, as a length, of an `ok` pose: 5 degrees and 0.5 m are more than 2.2 of them away."""
+FAR = "low_confidence: odometry is not sure so far from a query"
 
 
 @dataclass(frozen=True)
@@ -136,7 +139,15 @@ def place_piece(
         status[:] = f"low_confidence: {reason}"
         status[alone.frames], poses[alone.frames] = "ok", alone.world_from_rig
         covariances[alone.frames] = floored(alone.covariances)
+    status[(status == "ok") & ~is_sure(covariances)] = FAR
     return PlacedPiece(poses, covariances, mask, status, scale)
+
+
+def is_sure(covariances: Floats) -> NDArray[np.bool_]:
+    """Return which poses are known well enough to be `ok`, by their covariances (n, 6, 6)."""
+    variances = np.diagonal(covariances, axis1=1, axis2=2)
+    turns, shifts = variances[:, :3].sum(axis=1), variances[:, 3:].sum(axis=1)
+    return np.asarray((turns <= np.deg2rad(MAX_STD_DEG) ** 2) & (shifts <= MAX_STD_M**2))
 
 
 def _chi2(poses: Floats, covariances: Floats, queries: PosedQueries) -> Floats:
