@@ -497,6 +497,7 @@ def test_a_query_without_references_asks_for_nothing_more(
     assert not list(run.features.glob("*/other*"))
 
 
+@pytest.mark.slow
 def test_a_network_is_asked_once_about_a_query_that_escalates(
     small_capture: Path, run: SceneFiles, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -989,7 +990,7 @@ ESCALATES = {"features": {"kinds": ["sift"], "escalation": ["other"]}, "pnp": {"
         {"method": "feed_forward"},
         {"method": "hybrid"},
         {"map": None},
-        ESCALATES,
+        pytest.param(ESCALATES, marks=pytest.mark.slow),
         pytest.param({**ESCALATES, "method": "hybrid"}, marks=pytest.mark.slow),
         pytest.param({**ESCALATES, "map": None}, marks=pytest.mark.slow),
     ],

@@ -158,6 +158,7 @@ def test_a_worker_that_would_compute_in_another_precision_refuses(monkeypatch: p
 # -------------------------------------------------------------------------------------------------------- stages
 
 
+@pytest.mark.slow
 def test_features_and_maps_are_those_of_one_process(small_capture: Path, tmp_path: Path, here: Here) -> None:
     session, settings = Capture.open(small_capture)["ios_map"], MapSettings(tile_images=3)
     made = {}
