@@ -1,4 +1,4 @@
-"""The parts of a vision transformer (Dosovitskiy et al., ICLR 2021), with the structure and key names of DINOv2.
+"""The parts of a vision transformer (Dosovitskiy et al., ICLR 2021), with the key names of DINOv2 and DINOv3.
 
 The matrices of a block may have another type than its input (`set_matrix_type`): the block then computes in the type
 of its matrices and adds the result to its input in the type of the input.
@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 PATCH = 14
-"""Side of a patch in pixels."""
+"""Side of a patch of DINOv2 in pixels."""
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
@@ -48,26 +48,36 @@ def _linear(x: Tensor, weight: Tensor, bias: Tensor, buffer: SharedBuffer | None
     return F.linear(x, weight, bias) if buffer is None else buffer.linear(x, weight, bias)
 
 
-def rotate_(x: Tensor, rope: Rope) -> Tensor:
+def rotate_(x: Tensor, rope: Rope, groups: int = 2) -> Tensor:
     """Rotate each pair of channels of queries or keys (B, heads, N, D) by its own angle, in place.
 
-    This is rotary position embedding (Su et al., RoFormer, 2021) in two dimensions. The first two quarters of D hold
-    pairs (first, second) for y, the last two for x. The sines are negative for the first element of each pair.
+    This is rotary position embedding (Su et al., RoFormer, 2021). The channels are in groups of D / groups; the first
+    half of a group holds the first elements of its pairs, the second half the second ones. With two groups, one may be
+    for y and one for x. The sines are negative for the first element of each pair.
     """
     cosine, sine = rope
-    first_y, second_y, first_x, second_x = x.chunk(4, dim=-1)
-    swapped = torch.cat([second_y, first_y, second_x, first_x], dim=-1)
+    halves = x.chunk(2 * groups, dim=-1)
+    swapped = torch.cat([halves[index ^ 1] for index in range(2 * groups)], dim=-1)
     return x.mul_(cosine).addcmul_(swapped, sine)
 
 
 class Attention(nn.Module):
     """Self-attention of all tokens of a sequence, (B, N, C) -> (B, N, C)."""
 
-    def __init__(self, dim: int, num_heads: int, qk_norm_eps: float | None = None) -> None:
-        """`qk_norm_eps` is the epsilon of a LayerNorm on the queries and keys of each head; None: no such norm."""
+    def __init__(self, dim: int, num_heads: int, qk_norm_eps: float | None = None, dinov3: bool = False) -> None:
+        """
+        Args:
+            dim, num_heads: C, and in how many heads.
+            qk_norm_eps: epsilon of a LayerNorm on the queries and keys of each head; None: no such norm.
+            dinov3: as there, the bias of queries, keys and values has a factor for each element (0 for keys), and a
+                position rotates pairs of channels that are half a head apart.
+        """
         super().__init__()
         self.num_heads = num_heads
         self.qkv = nn.Linear(dim, 3 * dim)
+        self.dinov3 = dinov3
+        if dinov3:
+            self.qkv.register_buffer("bias_mask", torch.empty(3 * dim))
         self.has_qk_norm = qk_norm_eps is not None
         if qk_norm_eps is not None:
             self.q_norm = nn.LayerNorm(dim // num_heads, eps=qk_norm_eps)
@@ -75,15 +85,18 @@ class Attention(nn.Module):
         self.proj = nn.Linear(dim, dim)
 
     def forward(
-        self, x: Tensor, rope: Rope | None = None, every: int = 1, buffer: SharedBuffer | None = None
+        self, x: Tensor, rope: Rope | None = None, kept: Tensor | None = None, buffer: SharedBuffer | None = None
     ) -> Tensor:
-        """Return the attention output of tokens 0, every, 2 * every, ... over all tokens, (B, ceil(N / every), C)."""
+        """Return the attention output over all tokens, (B, N, C), or of the kept ones only, (B, len(kept), C)."""
         C = x.shape[-1]
-        weight, bias = self.qkv.weight, self.qkv.bias
-        if every == 1:
+        weight: Tensor = self.qkv.weight
+        bias: Tensor = self.qkv.bias
+        if self.dinov3:
+            bias = bias * self.qkv.get_buffer("bias_mask")
+        if kept is None:
             parts = _linear(x, weight, bias, buffer).split(C, dim=-1)
         else:
-            q = F.linear(x[:, ::every], weight[:C], bias[:C])
+            q = F.linear(x[:, kept], weight[:C], bias[:C])
             parts = (q, *_linear(x, weight[C:], bias[C:], buffer).split(C, dim=-1))
         q, k, v = (part.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for part in parts)  # (B, heads, tokens, D)
         del parts
@@ -92,7 +105,9 @@ class Attention(nn.Module):
             q = self.q_norm(q.to(torch.float32, memory_format=torch.contiguous_format))
             k = self.k_norm(k.to(torch.float32, memory_format=torch.contiguous_format))
         if rope is not None:
-            q, k = rotate_(q, (rope[0][::every], rope[1][::every])), rotate_(k, rope)
+            rope_of_q = rope if kept is None else (rope[0][kept], rope[1][kept])
+            groups = 1 if self.dinov3 else 2
+            q, k = rotate_(q.float(), rope_of_q, groups), rotate_(k.float(), rope, groups)
         gathered = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v)
         del q, k, v  # a fifth of the memory of a pass where they are normalized: free it before the projection
         return self.proj(gathered.transpose(1, 2).reshape(len(x), -1, C))
@@ -126,37 +141,41 @@ class LayerScale(nn.Module):
 class Block(nn.Module):
     """A transformer block: attention, then an MLP. Each reads the normalized tokens; its scaled output is added."""
 
-    def __init__(self, dim: int, num_heads: int, eps: float = 1e-6, qk_norm_eps: float | None = None) -> None:
+    def __init__(
+        self, dim: int, num_heads: int, eps: float = 1e-6, qk_norm_eps: float | None = None, dinov3: bool = False
+    ) -> None:
+        """`qk_norm_eps` and `dinov3` are of `Attention`."""
         super().__init__()
         self.norm1 = nn.LayerNorm(dim, eps=eps)
-        self.attn = Attention(dim, num_heads, qk_norm_eps)
+        self.attn = Attention(dim, num_heads, qk_norm_eps, dinov3)
         self.ls1 = LayerScale(dim)
         self.norm2 = nn.LayerNorm(dim, eps=eps)
         self.mlp = Mlp(dim, 4 * dim)
         self.ls2 = LayerScale(dim)
 
     def forward(
-        self, x: Tensor, rope: Rope | None = None, every: int = 1, buffer: SharedBuffer | None = None
+        self, x: Tensor, rope: Rope | None = None, kept: Tensor | None = None, buffer: SharedBuffer | None = None
     ) -> Tensor:
         """Return the tokens (B, N, C) one block further.
 
         Args:
             x: (B, N, C).
             rope: position of each token, for queries and keys.
-            every: return only tokens 0, every, 2 * every, ...; of the others, only keys and values are computed.
+            kept: return only the tokens of these indices; of the others, only keys and values are computed.
             buffer: of this forward pass, shared by its blocks.
         """
         matrix_type = self.attn.qkv.weight.dtype
-        x = self.ls1(x[:, ::every], self.attn(self.norm1(x).to(matrix_type), rope, every, buffer))
+        stream = x if kept is None else x[:, kept]
+        x = self.ls1(stream, self.attn(self.norm1(x).to(matrix_type), rope, kept, buffer))
         return self.ls2(x, self.mlp(self.norm2(x).to(matrix_type), buffer))
 
 
 class PatchEmbed(nn.Module):
-    """Cut images (B, 3, H, W) into patches and embed each: (B, H / PATCH * W / PATCH, C), row by row."""
+    """Cut images (B, 3, H, W) into patches and embed each: (B, H / patch * W / patch, C), row by row."""
 
-    def __init__(self, dim: int) -> None:
+    def __init__(self, dim: int, patch: int = PATCH) -> None:
         super().__init__()
-        self.proj = nn.Conv2d(3, dim, kernel_size=PATCH, stride=PATCH)
+        self.proj = nn.Conv2d(3, dim, kernel_size=patch, stride=patch)
 
     def forward(self, images: Tensor) -> Tensor:
         return self.proj(images).flatten(2).transpose(1, 2)

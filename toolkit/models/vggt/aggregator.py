@@ -92,9 +92,10 @@ class Aggregator(nn.Module):
         buffer = SharedBuffer.for_device(tokens.device)
         kept = {}
         for layer in range(max(layers) + 1):
-            every = T if cameras_only and layer == max(layers) else 1
+            cameras = cameras_only and layer == max(layers)
             within = self.frame_blocks[layer](tokens.view(B * S, T, C), rope, buffer=buffer).view(B, S * T, C)
-            tokens = self.global_blocks[layer](within, rope_of_views, every, buffer)
+            indices = torch.arange(0, S * T, T, device=within.device) if cameras else None
+            tokens = self.global_blocks[layer](within, rope_of_views, indices, buffer)
             if layer in layers:
-                kept[layer] = (within.view(B, S, T, C)[:, :, ::every], tokens.view(B, S, -1, C))
+                kept[layer] = (within.view(B, S, T, C)[:, :, : 1 if cameras else T], tokens.view(B, S, -1, C))
         return kept
