@@ -16,6 +16,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from toolkit.errors import ImageError, WeightsError
+from toolkit.models.dpt import add_position, dense_output
 from toolkit.models.vggt import (
     HEADS,
     VGGT,
@@ -24,7 +25,6 @@ from toolkit.models.vggt import (
     unproject_depth,
 )
 from toolkit.models.vggt.aggregator import SPECIAL, rope_of_view
-from toolkit.models.vggt.heads import add_position, dense_output
 from toolkit.models.vit import rotate_
 
 REPOSITORY = Path(__file__).resolve().parents[2]

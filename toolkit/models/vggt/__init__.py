@@ -2,4 +2,5 @@
 
 from toolkit.models.vggt.network import HEADS, VGGT
 from toolkit.models.vggt.pose_encoding import cameras_from_pose_encoding, unproject_depth
-from toolkit.models.vggt.preprocess import Views, load_images
+from toolkit.models.vggt.preprocess import load_images
+from toolkit.models.views import Views

@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from toolkit.models.dpt import LayerTokens
 from toolkit.models.vit import IMAGENET_MEAN, IMAGENET_STD, Block, Dinov2, Rope, SharedBuffer
 
 REGISTERS = 4
@@ -14,9 +15,6 @@ SPECIAL = 1 + REGISTERS
 before the patches are as many: a class token and its registers.)"""
 _ROPE_BASE = 100.0
 _EPS = 1e-5
-
-LayerTokens = tuple[Tensor, Tensor]
-"""Tokens (B, S, T, C) after a layer's attention within views, and after its attention among views."""
 
 
 class PatchEncoder(Dinov2):

@@ -1,12 +1,13 @@
 """VGGT's heads: one for cameras, and dense ones for depth or points, with a confidence for each pixel."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from toolkit.models.vggt.aggregator import SPECIAL, LayerTokens
+from toolkit.models import dpt
+from toolkit.models.dpt import LayerTokens, add_position, resize
 from toolkit.models.vit import PATCH, Block, Mlp
 
 _EPS = 1e-5
@@ -50,137 +51,31 @@ class CameraHead(nn.Module):
         return returned
 
 
-class ResidualUnit(nn.Module):
-    """Two 3 x 3 convolutions, added to the *rectified* input: the official code's ReLU overwrites the input."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.conv1 = nn.Conv2d(channels, channels, 3, padding=1)
-        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        x = F.relu(x)
-        return self.conv2(F.relu(self.conv1(x))).add_(x)
-
-
-class Fusion(nn.Module):
-    """Adds a finer map to a coarser one and enlarges the sum."""
-
-    def __init__(self, channels: int, has_residual: bool) -> None:
-        super().__init__()
-        self.out_conv = nn.Conv2d(channels, channels, 1)
-        if has_residual:
-            self.resConfUnit1 = ResidualUnit(channels)
-        self.resConfUnit2 = ResidualUnit(channels)
-
-    def forward(self, coarse: Tensor | None, fine: Tensor, size: Sequence[int]) -> Tensor:
-        """Return (N, C, *size) of maps (N, C, h, w)."""
-        coarse = fine if coarse is None else self.resConfUnit1(fine).add_(coarse)
-        # A 1 x 1 convolution and an interpolation commute: convolving the small map is cheaper.
-        return _resize(self.out_conv(self.resConfUnit2(coarse)), size)
-
-
-class Scratch(nn.Module):
-    """Fuses the maps of the four layers. (The name is the checkpoint's.)"""
+class Scratch(dpt.Scratch):
+    """Fuses the maps and enlarges them to the image."""
 
     def __init__(self, channels: Sequence[int], features: int, out: int) -> None:
-        super().__init__()
-        for level, channel in enumerate(channels, start=1):
-            self.add_module(f"layer{level}_rn", nn.Conv2d(channel, features, 3, padding=1, bias=False))
-            self.add_module(f"refinenet{level}", Fusion(features, has_residual=level < len(channels)))
+        super().__init__(channels, features, overwrites=True)
         self.output_conv1 = nn.Conv2d(features, features // 2, 3, padding=1)
         self.output_conv2 = nn.Sequential(
             nn.Conv2d(features // 2, 32, 3, padding=1), nn.ReLU(inplace=True), nn.Conv2d(32, out, 1)
         )
 
-    def forward(self, maps: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
+    def forward(self, maps: Sequence[Tensor], size: Sequence[int]) -> Tensor:
         """Return (N, out, H, W), size = (H, W), of maps from fine to coarse, (N, channels[level], h, w)."""
-        sizes = [[2 * side for side in maps[0].shape[2:]], *(x.shape[2:] for x in maps[:-1])]
-        x = None
-        for level in range(len(maps), 0, -1):
-            fine = self.get_submodule(f"layer{level}_rn")(maps[level - 1])
-            x = self.get_submodule(f"refinenet{level}")(x, fine, sizes[level - 1])
-        x = _resize(self.output_conv1(x), size)
-        return self.output_conv2(add_position(x, size[1] / size[0]))
-
-
-class DenseHead(nn.Module):
-    """Dense Prediction Transformer (Ranftl et al., ICCV 2021): maps of four layers, fused from coarse to fine."""
-
-    def __init__(self, dim: int, out: int, channels: Sequence[int], features: int) -> None:
-        """
-        Args:
-            dim: channels of the concatenated tokens of both blocks of a layer.
-            out: channels of the result, including the confidence.
-            channels: of the maps of the four layers.
-            features: channels of the fused maps.
-        """
-        super().__init__()
-        self.out = out
-        self.norm = nn.LayerNorm(dim, eps=_EPS)
-        self.projects = nn.ModuleList([nn.Conv2d(dim, channel, 1) for channel in channels])
-        self.resize_layers = nn.ModuleList(
-            [
-                nn.ConvTranspose2d(channels[0], channels[0], 4, stride=4),
-                nn.ConvTranspose2d(channels[1], channels[1], 2, stride=2),
-                nn.Identity(),
-                nn.Conv2d(channels[3], channels[3], 3, stride=2, padding=1),
-            ]
-        )
-        self.scratch = Scratch(channels, features, out)
-
-    def forward(self, layers: Sequence[LayerTokens], size: tuple[int, int]) -> Tensor:
-        """Return (N, out, H, W) before activation, size = (H, W), for tokens (N, T, C) of the four layers."""
-        grid = (size[0] // PATCH, size[1] // PATCH)
-        maps = []
-        for (within, among), project, resize in zip(layers, self.projects, self.resize_layers, strict=True):
-            tokens = self.norm(torch.cat([within[:, SPECIAL:], among[:, SPECIAL:]], dim=-1).float())
-            x = project(tokens.transpose(1, 2).unflatten(2, grid))
-            maps.append(resize(add_position(x, size[1] / size[0])))
-        output: Tensor = self.scratch(maps, size)
+        x = super().forward(maps, [2 * side for side in maps[0].shape[2:]])
+        x = resize(self.output_conv1(x), size)
+        output: Tensor = self.output_conv2(add_position(x, size[1] / size[0]))
         return output
 
 
-def dense_output(
-    head: DenseHead, layers: Mapping[int, LayerTokens], read: Sequence[int], size: tuple[int, int], frames: int
-) -> tuple[Tensor, Tensor]:
-    """Return the values (B, S, H, W, out - 1) before activation, and the confidence (B, S, H, W), above 1.
+class DenseHead(dpt.DenseHead):
+    """A map of depth or points, and a confidence."""
 
-    Args:
-        layers: tokens (B, S, T, C) by layer.
-        read: the four layers that the head reads.
-        size: (H, W) of the images.
-        frames: number of frames to compute at a time. A frame's maps take many times the memory of its tokens.
-    """
-    B, S = layers[read[0]][0].shape[:2]
-    flat = [(layers[layer][0].flatten(0, 1), layers[layer][1].flatten(0, 1)) for layer in read]
-    result = torch.empty(B * S, *size, head.out, device=flat[0][0].device)
-    for start in range(0, B * S, frames):
-        part = slice(start, start + frames)
-        result[part] = head([(within[part], among[part]) for within, among in flat], size).permute(0, 2, 3, 1)
-    result = result.unflatten(0, (B, S))
-    return result[..., :-1], 1 + result[..., -1].exp()
+    def __init__(self, dim: int, out: int, channels: Sequence[int], features: int) -> None:
+        """`features` is the number of channels of the fused maps; the others as for `dpt.DenseHead`."""
+        super().__init__(dim, channels, PATCH, out, Scratch(channels, features, out))
 
-
-def add_position(x: Tensor, aspect: float, factor: float = 0.1) -> Tensor:
-    """Add sines and cosines of each pixel's x (in the first C / 2 channels) and y to maps (N, C, h, w), in place.
-
-    x and y are coordinates on an image plane whose half diagonal is 1, for width / height = `aspect`.
-    """
-    _, C, height, width = x.shape
-    diagonal = (1 + aspect**2) ** 0.5
-    # In float64 on the CPU: Apple's GPUs have none.
-    frequencies = 1.0 / 100.0 ** (torch.arange(C // 4, dtype=torch.float64) / (C / 4))
-    for channels, span, count, axis in (
-        (slice(0, C // 2), aspect / diagonal, width, 1),
-        (slice(C // 2, C), 1 / diagonal, height, 2),
-    ):
-        last = span * (count - 1) / count
-        angles = frequencies[:, None] * torch.linspace(-last, last, count)
-        waves = (torch.cat([angles.sin(), angles.cos()]).float() * factor).to(x.device)
-        x[:, channels].add_(waves.unsqueeze(axis))
-    return x
-
-
-def _resize(x: Tensor, size: Sequence[int]) -> Tensor:
-    return F.interpolate(x, list(size), mode="bilinear", align_corners=True)
+    def decode(self, maps: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
+        output: Tensor = self.scratch(maps, size)
+        return output

@@ -10,8 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from toolkit.models.dpt import dense_output
 from toolkit.models.vggt.aggregator import Aggregator
-from toolkit.models.vggt.heads import CameraHead, DenseHead, dense_output
+from toolkit.models.vggt.heads import CameraHead, DenseHead
 from toolkit.models.vit import PATCH, set_matrix_type
 from toolkit.models.weights import load_checkpoint
 

@@ -1,0 +1,90 @@
+"""Photographs as the images of a network that takes several views at once, and where their pixels come from."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+from torch import Tensor
+
+from toolkit.capture.images import read_file
+from toolkit.errors import ImageError
+from toolkit.geometry import Floats, Ints
+
+Source = str | Path | Image.Image | NDArray[np.uint8]
+"""A path, a Pillow image, or an array (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) gray, uint8."""
+
+
+@dataclass(frozen=True)
+class Views:
+    """Images for the network, and how their pixels map to those of the given images.
+
+    Image coordinates (x, y) are in pixels; the center of the top-left one is (0.5, 0.5).
+    """
+
+    images: Tensor
+    """(S, 3, H, W) float32, RGB in [0, 1]."""
+    scale: Floats
+    """(S, 2): for x and y. The point (x, y) of the given image i is at scale[i] * (x, y) + offset[i] in images[i]."""
+    offset: Floats
+    """(S, 2), network pixels."""
+    sizes: Ints
+    """(S, 2): width and height of the given images."""
+
+
+def open_image(source: Source) -> Image.Image:
+    """Return an RGB image; one with an alpha channel is blended with white. EXIF orientation is not applied.
+
+    Raises:
+        ImageError: the file is missing or cannot be decoded.
+    """
+    if isinstance(source, Image.Image):
+        image = source
+    elif isinstance(source, np.ndarray):
+        image = Image.fromarray(source)
+    else:
+        try:
+            with Image.open(BytesIO(read_file(source))) as opened:
+                opened.load()
+                image = opened
+        except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+            raise ImageError(f"Image cannot be decoded: {source} ({error}); expected a whole image file.") from None
+    if image.mode == "RGBA":
+        image = Image.alpha_composite(Image.new("RGBA", image.size, (255, 255, 255, 255)), image)
+    return image.convert("RGB")
+
+
+def check_arguments(sources: Sequence[Source], mode: str, modes: Sequence[str]) -> None:
+    """Refuse no images, and unknown modes.
+
+    Raises:
+        ValueError: one of them.
+    """
+    if mode not in modes:
+        raise ValueError(f"mode is {mode!r}; expected one of {list(modes)}.")
+    if not len(sources):
+        raise ValueError("found no images; expected at least one.")
+
+
+def stack(
+    pixels: Sequence[Image.Image], scales: Sequence[Sequence[float]], offsets: Sequence[Sequence[float]],
+    sizes: Sequence[tuple[int, int]], least: tuple[int, int] = (0, 0),
+) -> Views:  # fmt: skip
+    """Return images of one size: each in the middle of white, at the upper left of it where that is between pixels.
+
+    Args:
+        pixels: the images, RGB.
+        scales, offsets, sizes: as of `Views`, for these images.
+        least: (W, H) of the result where none of the images is larger.
+    """
+    width, height = (max(least[axis], *(image.size[axis] for image in pixels)) for axis in (0, 1))
+    images = torch.ones(len(pixels), 3, height, width)
+    borders = np.array([((width - image.width) // 2, (height - image.height) // 2) for image in pixels])
+    for whole, image, (left, top) in zip(images, pixels, borders, strict=True):
+        tensor = torch.from_numpy(np.array(image)).permute(2, 0, 1)
+        whole[:, top : top + image.height, left : left + image.width] = tensor.float() / 255
+    return Views(images, np.array(scales), np.array(offsets) + borders, np.array(sizes, np.int64))
