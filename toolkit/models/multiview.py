@@ -1,0 +1,126 @@
+"""What VGGT and its successor have in common: heads on a trunk, tokens of single images, official checkpoints."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor, nn
+
+from toolkit.models.weights import load_checkpoint
+
+FRAMES_AT_A_TIME = 8
+"""Of the dense heads, on a GPU; on a CPU, one frame keeps all cores busy."""
+
+
+class MultiView(nn.Module):
+    """A network for several views of a scene, with a patch encoder that sees each view by itself.
+
+    It may hold only some of the official heads. A whole official checkpoint loads strictly all the same: the keys of
+    other heads are ignored.
+    """
+
+    title: ClassVar[str]
+    """For messages."""
+    patch: ClassVar[int]
+    """Side of a patch, pixels."""
+    known_heads: ClassVar[tuple[str, ...]]
+    prefixes: ClassVar[Mapping[str, str]]
+    """Prefixes of the keys of the official heads, held or not."""
+    aggregator: Any
+    """The trunk: `patch_embed` encodes patches, `camera_token` is a parameter (..., C)."""
+
+    def __init__(self, heads: Sequence[str], compute_dtype: torch.dtype) -> None:
+        super().__init__()
+        self.heads = _ordered_heads(heads, self.known_heads)
+        self.compute_dtype = compute_dtype
+
+    @classmethod
+    def from_checkpoint(
+        cls,
+        checkpoint: str | Path | Mapping[str, Tensor],
+        heads: Sequence[str] | None = None,
+        compute_dtype: torch.dtype = torch.float32,
+    ) -> Self:
+        """Return the network with official weights, on the CPU, in evaluation mode.
+
+        Args:
+            checkpoint: the official file, `.pt` or `.safetensors`, or its tensors by name (shared, not copied, where
+                the type stays).
+            heads: the heads to hold; None: all.
+            compute_dtype: as for the constructor. bfloat16 halves the memory of the weights.
+
+        Raises:
+            WeightsError: the file is no checkpoint, or of another model; names missing, unexpected, mis-shaped keys.
+            ValueError: unknown head.
+        """
+        with torch.device("meta"):
+            model = cls(cls.known_heads if heads is None else heads, compute_dtype)
+        load_checkpoint(model, checkpoint, cls.title, ignore=model._ignored_keys)
+        return model
+
+    @property
+    def _ignored_keys(self) -> tuple[str, ...]:
+        """Prefixes of the official checkpoint's keys that the model does not need."""
+        return tuple(prefix for head, prefix in self.prefixes.items() if head not in self.heads)
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
+        """As `torch.nn.Module.load_state_dict`; keys of heads that are not held are ignored, strict or not."""
+        held = {key: value for key, value in state_dict.items() if not key.startswith(self._ignored_keys)}
+        return super().load_state_dict(held, strict=strict, assign=assign)
+
+    @torch.no_grad()
+    def encode(self, images: Tensor) -> Tensor:
+        """Return the patch tokens (N, P, C) float32 of images (N, 3, H, W), P = H / patch * W / patch.
+
+        The tokens of an image depend on no other image: compute those of a map once and give them to `forward`.
+
+        Raises:
+            ValueError: wrong shape.
+        """
+        if images.ndim != 4:
+            raise ValueError(f"images have shape {tuple(images.shape)}; expected (N, 3, H, W).")
+        self._check_images(images)
+        tokens: Tensor = self.aggregator.patch_embed(images.float())
+        return tokens
+
+    def _checked(
+        self, images: Tensor, heads: Sequence[str] | None, patch_tokens: Tensor | None
+    ) -> tuple[tuple[int, int], tuple[str, ...], Tensor]:
+        """Return (H, W), the heads to compute and the patch tokens (B, S, P, C) of what `forward` is given.
+
+        Raises:
+            ValueError: wrong shape, or a head that is not held.
+        """
+        if images.ndim == 4:
+            images = images[None]
+            patch_tokens = patch_tokens if patch_tokens is None else patch_tokens[None]
+        if images.ndim != 5:
+            raise ValueError(f"images have shape {tuple(images.shape)}; expected (B, S, 3, H, W) or (S, 3, H, W).")
+        self._check_images(images)
+        B, S, _, H, W = images.shape
+        heads = self.heads if heads is None else _ordered_heads(heads, self.heads)
+        if patch_tokens is None:
+            patch_tokens = self.encode(images.flatten(0, 1)).unflatten(0, (B, S))
+        expected = (B, S, H // self.patch * (W // self.patch), self.aggregator.camera_token.shape[-1])
+        if patch_tokens.shape != expected:
+            raise ValueError(
+                f"patch_tokens have shape {tuple(patch_tokens.shape)}; expected {expected} for images of shape "
+                f"{tuple(images.shape)}."
+            )
+        return (H, W), heads, patch_tokens
+
+    def _check_images(self, images: Tensor) -> None:
+        channels, height, width = images.shape[-3:]
+        if channels != 3 or height % self.patch or width % self.patch or not images.numel():
+            raise ValueError(
+                f"images have shape {tuple(images.shape)}; expected 3 channels, at least one image, and height and "
+                f"width that are multiples of {self.patch}. `load_images` makes such."
+            )
+
+
+def _ordered_heads(heads: Sequence[str], held: Sequence[str]) -> tuple[str, ...]:
+    """Return heads without repetition, in the order of `held`; refuse others."""
+    if isinstance(heads, str) or not heads or not set(heads) <= set(held):
+        raise ValueError(f"heads are {heads!r}; expected some of {list(held)}, in a list.")
+    return tuple(head for head in held if head in heads)
