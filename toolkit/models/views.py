@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
@@ -71,8 +71,8 @@ def check_arguments(sources: Sequence[Source], mode: str, modes: Sequence[str]) 
 
 
 def stack(
-    pixels: Sequence[Image.Image], scales: Sequence[Sequence[float]], offsets: Sequence[Sequence[float]],
-    sizes: Sequence[tuple[int, int]], least: tuple[int, int] = (0, 0),
+    pixels: Sequence[Image.Image], scales: ArrayLike, offsets: ArrayLike, sizes: ArrayLike,
+    least: tuple[int, int] = (0, 0),
 ) -> Views:  # fmt: skip
     """Return images of one size: each in the middle of white, at the upper left of it where that is between pixels.
 
