@@ -13,6 +13,7 @@ from tests.features.test_aliked import random_state as aliked_state
 from tests.features.test_lightglue import features, state
 from tests.features.test_superpoint import planted_state
 from tests.localizers.test_network_predictor import HIGHER, WIDE, Photographs, assert_same
+from tests.models import test_omega as omega
 from tests.models.test_megaloc import tiny_megaloc
 from tests.models.test_vggt import tiny
 from tests.pretend import DEVICE, PretendTensor, pretending, resolved
@@ -81,6 +82,14 @@ def test_vggt(device: None, needs_depth: bool, tmp_path: Path, monkeypatch: pyte
     for _ in range(2):  # the second time from what is kept
         for found, other in zip(there.predict(groups, groups), expected, strict=True):
             assert_same(found, other)
+
+
+def test_omega(device: None) -> None:
+    model, images = omega.tiny(), torch.rand(2, 2, 3, 48, 64, generator=torch.Generator().manual_seed(0))
+    expected = model(images)
+    for name, found in model.to(DEVICE)(images.to(DEVICE)).items():
+        assert isinstance(found, PretendTensor)
+        torch.testing.assert_close(found.cpu(), expected[name], atol=1e-5, rtol=1e-4)
 
 
 def make_aliked(name: str) -> NetworkExtractor:

@@ -4,10 +4,10 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
@@ -20,6 +20,7 @@ from toolkit.models.dpt import add_position, dense_output
 from toolkit.models.vggt import (
     HEADS,
     VGGT,
+    Views,
     cameras_from_pose_encoding,
     load_images,
     unproject_depth,
@@ -53,6 +54,14 @@ def tiny(heads: tuple[str, ...] = HEADS, compute_dtype: torch.dtype = torch.floa
         dense_channels=(8, 12, 16, 20),
         dense_features=16,
     )
+    return fill_randomly(model)
+
+
+Network = TypeVar("Network", bound=torch.nn.Module)
+
+
+def fill_randomly(model: Network) -> Network:
+    """Return a network with random weights, which depend on the names of its parameters only."""
     for name, parameter in model.named_parameters():
         seed = int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "little")
         noise = torch.randn(parameter.shape, generator=torch.Generator().manual_seed(seed))
@@ -450,23 +459,30 @@ def test_keys_are_the_official_ones(golden: ModuleType) -> None:
     assert {key: tuple(value.shape) for key, value in model.state_dict().items()} == official
 
 
-def test_images_are_as_of_the_official_loader(golden: ModuleType, tmp_path: Path) -> None:
+def assert_official_images(
+    golden: ModuleType, network: str, load: Callable[..., Views], modes: Sequence[str], folder: Path
+) -> None:
+    """Compare a loader with the official one of a network; writes images to a folder."""
     image_u8 = golden.weights.image_u8
-    spec = golden.info("vggt")["loader"]
+    spec = golden.info(network)["loader"]
     paths = []
     for name, height, width in spec["images"]:
-        Image.fromarray(image_u8(name, height, width)).save(tmp_path / f"{name}.png")
-        paths.append(tmp_path / f"{name}.png")
+        Image.fromarray(image_u8(name, height, width)).save(folder / f"{name}.png")
+        paths.append(folder / f"{name}.png")
     alpha = image_u8("load-alpha-mask", 80, 110)[..., :1]
-    Image.fromarray(np.concatenate([image_u8("load-alpha", 80, 110), alpha], axis=2)).save(tmp_path / "alpha.png")
-    with np.load(golden.HERE / "vggt.golden.npz") as data:
-        for mode in ("crop", "pad"):
-            for which, sources in (("all", paths), ("first", paths[:1]), ("alpha", [tmp_path / "alpha.png"])):
-                images = load_images(sources, mode).images
+    Image.fromarray(np.concatenate([image_u8("load-alpha", 80, 110), alpha], axis=2)).save(folder / "alpha.png")
+    with np.load(golden.HERE / f"{network}.golden.npz") as data:
+        for mode in modes:
+            for which, sources in (("all", paths), ("first", paths[:1]), ("alpha", [folder / "alpha.png"])):
+                images = load(sources, mode).images
                 assert list(images.shape) == spec[f"{mode}/{which}"]["shape"]
                 found = np.rint(255 * images.numpy()).astype(int)[:, :, 2::11, 1::13]
                 assert np.abs(found - data[f"loader/{mode}/{which}"]).max() <= 1  # Pillow versions differ by that
                 assert images.mean().item() == pytest.approx(spec[f"{mode}/{which}"]["mean"], abs=1e-3)
+
+
+def test_images_are_as_of_the_official_loader(golden: ModuleType, tmp_path: Path) -> None:
+    assert_official_images(golden, "vggt", load_images, ("crop", "pad"), tmp_path)
 
 
 @pytest.mark.slow

@@ -28,6 +28,7 @@ from toolkit.models.weights import (
     LIGHTGLUE,
     MEGALOC,
     SUPERPOINT,
+    VGGT_OMEGA,
     ReleasedWeights,
     WeightsError,
     WeightsSource,
@@ -96,6 +97,19 @@ def test_the_hub_refuses(hub: FakeHub, status: int, code: str, says: str) -> Non
     assert says in failure()
     assert [method for method, _ in hub.requests] == ["HEAD"]  # no patience with what will not change
     assert_recovers(hub)
+
+
+def test_omega_is_behind_a_form(hub: FakeHub) -> None:
+    hub.weights = f"/{VGGT_OMEGA.repo_id}/resolve/main/{VGGT_OMEGA.filename}"
+    hub.status, hub.error_code = 403, "GatedRepo"
+    with pytest.raises(WeightsError) as caught:
+        resolve_weights(VGGT_OMEGA)
+    folder = Path(constants.HF_HUB_CACHE, "models--facebook--VGGT-Omega", "snapshots", "main")
+    for part in ("accept the license", f"at {folder / 'vggt_omega_1b_512.pt'}", "`localize.predictor.checkpoint`"):
+        assert part in str(caught.value)
+    folder.mkdir(parents=True)
+    (folder / VGGT_OMEGA.filename).write_bytes(BODY)
+    assert find_weights(VGGT_OMEGA) == folder / VGGT_OMEGA.filename
 
 
 def test_something_that_is_no_hub_answers(hub: FakeHub) -> None:

@@ -128,6 +128,14 @@ VGGT = replace(
     license="non-commercial, as the code's README says of the original checkpoint",
     others=(VGGT_1B_COMMERCIAL,),
 )
+VGGT_OMEGA = WeightsSource(
+    model="VGGT-Omega-1B-512",
+    repo_id="facebook/VGGT-Omega",
+    filename="vggt_omega_1b_512.pt",
+    license="FAIR Noncommercial Research License; access by form",
+    alternative="set `localize.method: pnp`, which needs none",
+    setting="localize.predictor.checkpoint",
+)
 SUPERPOINT = WeightsSource(
     model="SuperPoint",
     repo_id="magic-leap-community/superpoint",
