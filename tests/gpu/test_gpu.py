@@ -37,6 +37,7 @@ from toolkit.localizers.network import NetworkPredictor
 from toolkit.manifest import AlikedSettings
 from toolkit.models.compute import full_float32
 from toolkit.models.megaloc import MegaLoc
+from toolkit.models.omega import VGGTOmega
 from toolkit.models.vggt import VGGT
 
 __all__ = ["golden", "lightglue_state"]  # fixtures
@@ -98,7 +99,7 @@ def run_as(precision: str, run: Callable[[], dict[str, Tensor]]) -> dict[str, ND
 
 
 PRECISIONS = [("float32", 1e-3, 1e-6), ("tf32", 3e-2, 1e-4), ("bfloat16", 1e-1, 1e-4)]
-"""Each with the largest difference of VGGT's cameras and, in the median, depths, and of the cosine of MegaLoc."""
+"""Each with the largest difference of cameras and, in the median, depths, and of the cosine of MegaLoc."""
 
 
 @pytest.mark.parametrize(("precision", "_", "least"), PRECISIONS)
@@ -115,15 +116,18 @@ def test_megaloc_gives_the_official_numbers(golden: ModuleType, precision: str, 
 
 
 @pytest.mark.parametrize(("precision", "most", "_"), PRECISIONS)
-def test_vggt_gives_the_official_numbers(golden: ModuleType, precision: str, most: float, _: float) -> None:
+@pytest.mark.parametrize(("network", "name"), [(VGGT, "vggt"), (VGGTOmega, "omega")])
+def test_cameras_and_depth_are_the_official_numbers(
+    golden: ModuleType, network: type[VGGT | VGGTOmega], name: str, precision: str, most: float, _: float
+) -> None:
     dtype = torch.bfloat16 if precision == "bfloat16" else torch.float32
-    model = VGGT.from_checkpoint(golden.state("vggt"), ("camera", "depth"), dtype).to(GPU)
-    for case, spec in golden.info("vggt")["cases"].items():
-        images, expected = golden.case_images("vggt", spec).to(GPU), golden.expected("vggt", case)
+    model = network.from_checkpoint(golden.state(name), ("camera", "depth"), dtype).to(GPU)
+    for case, spec in golden.info(name)["cases"].items():
+        images, expected = golden.case_images(name, spec).to(GPU), golden.expected(name, case)
         output = run_as(precision, lambda images=images: {k: model(images[None])[k] for k in ("pose_enc", "depth")})
         cameras = np.abs(output["pose_enc"] - expected["pose_enc"]).max()
         depths = np.median(np.abs(output["depth"] / expected["depth"] - 1))
-        print(f"VGGT, {precision}, case {case}: cameras within {cameras:.1e}, depths within {depths:.1e} (median)")
+        print(f"{name}, {precision}, case {case}: cameras within {cameras:.1e}, depths within {depths:.1e} (median)")
         assert max(cameras, depths) < most
 
 
