@@ -356,7 +356,7 @@ def test_the_network_is_never_replaced_by_the_simulation(
 def test_wrong_parameters_are_refused(run: SceneFiles, small_capture: Path, wrong: dict, message: str) -> None:
     with pytest.raises(ManifestError, match=message):
         run_stage(small_capture, run, **wrong)
-    with pytest.raises(ManifestError, match=r"Unknown predictor 'magic'. Known: vggt, simulated"):
+    with pytest.raises(ManifestError, match=r"Unknown predictor 'magic'. Known: vggt, vggt-omega, simulated"):
         create_predictor("magic")
 
 

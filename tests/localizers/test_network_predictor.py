@@ -14,6 +14,7 @@ import torch
 from PIL import Image
 from scipy.ndimage import map_coordinates
 
+from tests.models.test_omega import tiny as omega
 from tests.models.test_vggt import tiny
 from toolkit.capture.images import read_image
 from toolkit.capture.turning import turn_image, turn_points, turned_from_cam
@@ -25,6 +26,9 @@ from toolkit.localizers.base import View
 from toolkit.localizers.network import NetworkPredictor, TokenCache
 from toolkit.localizers.placed import PlacedView, shown_size
 from toolkit.localizers.prediction import Prediction
+from toolkit.localizers.predictors import create_predictor
+from toolkit.models.omega import VGGTOmega
+from toolkit.models.omega import load_images as load_omega_images
 from toolkit.models.vggt import VGGT, cameras_from_pose_encoding, load_images
 
 # In the network 518 x 112, 518 x 126 and 112 x 518 pixels.
@@ -143,6 +147,32 @@ def test_a_point_is_seen_where_the_intrinsics_say(size: tuple[int, int], turns: 
     scale, offset = placed.map_from_image[:2], placed.map_from_image[2:]
     seen = placed.intrinsics(K) @ point
     np.testing.assert_allclose(seen[:2] / seen[2], (stored - offset) / scale, atol=1e-9)
+
+
+@pytest.mark.parametrize("sizes", [[(370, 280), (370, 280)], [(370, 280), (280, 370), (500, 100)]])
+def test_omega_is_another_row(
+    photographs: Photographs, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, sizes: list[tuple[int, int]]
+) -> None:
+    monkeypatch.setattr(VGGTOmega, "from_checkpoint", lambda _, heads, compute_dtype: omega(heads, compute_dtype))
+    checkpoint = tmp_path / "omega.pt"
+    checkpoint.write_bytes(b"stands for weights")
+    predictor = create_predictor(
+        "vggt-omega", checkpoint=checkpoint, compute_device="cpu", dtype_compute="float32"
+    )
+    group = photographs.group(*sizes)
+    for _ in range(2):  # the second time from what is kept
+        [found] = predictor.predict([group])
+        loaded = load_omega_images([view.image for view in group])
+        output = omega()(loaded.images)
+        cam_from_model, K = cameras_from_pose_encoding(output["pose_enc"][0], loaded.images.shape[2:])
+        np.testing.assert_allclose(invert(found.model_from_cams)[:, :3], cam_from_model, atol=1e-5)
+        np.testing.assert_allclose(found.map_from_image, np.hstack([loaded.scale, loaded.offset]))
+        assert found.intrinsics is not None
+        np.testing.assert_allclose(found.intrinsics[:, 0, 0], K[:, 0, 0] / loaded.scale[:, 0], rtol=1e-4)
+        assert found.depth is not None
+        inside = np.isfinite(found.depth[0])
+        assert inside.mean() > 0.4
+        np.testing.assert_allclose(found.depth[0][inside], output["depth"][0, 0, ..., 0].numpy()[inside], rtol=1e-4)
 
 
 def test_nothing_of_a_portrait_photograph_is_cut(

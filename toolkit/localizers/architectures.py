@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
+    from toolkit.models.views import Views
+
 Size = tuple[int, int]
 
 
@@ -67,7 +69,7 @@ class Architecture(Protocol):
     memory: Memory
 
     def lay_out(self, sizes: Sequence[Size]) -> Layout:
-        """Return how photographs of these (width, height), of which nothing is cut, are shown to the network."""
+        """Return how photographs of these (width, height) are shown to the network."""
 
     def load(self, checkpoint: Path, heads: tuple[str, ...], dtype: "torch.dtype") -> Any:
         """Return the network, on the CPU: `encode(images)`, and `(images, heads, tokens)` -> the outputs of its heads.
@@ -149,15 +151,9 @@ class VggtArchitecture:
         return VGGT.from_checkpoint(checkpoint, heads=heads, compute_dtype=dtype)
 
     def read(self, image: Path | NDArray[np.uint8], layout: Layout) -> "tuple[Tensor, Size]":
-        import torch.nn.functional as F
-
         from toolkit.models.vggt import load_images
 
-        loaded = load_images([image], layout.mode)
-        width, height = loaded.sizes[0].tolist()
-        missing = layout.size[0] - loaded.images.shape[2]
-        pixels = F.pad(loaded.images[0], (0, 0, missing // 2, missing - missing // 2), value=1.0)
-        return pixels, (width, height)
+        return _padded(load_images([image], layout.mode), layout)
 
     def cameras(self, encoding: ArrayLike, size: Size) -> tuple[Floats, Floats]:
         from toolkit.models.vggt import cameras_from_pose_encoding
@@ -165,5 +161,54 @@ class VggtArchitecture:
         return cameras_from_pose_encoding(encoding, size)
 
 
-ARCHITECTURES: dict[str, Architecture] = {one.name: one for one in (VggtArchitecture(),)}
+class OmegaArchitecture:
+    """VGGT-Omega, 1B-512. Photographs are shown with about as many pixels of any shape; of one with sides of more than
+    2 to 1 the middle is shown, as by the official loader."""
+
+    name = "vggt-omega"
+    title = "VGGT-Omega"
+    weights = weights.VGGT_OMEGA
+    patch = 16
+    special_tokens = 17
+    memory = Memory(trunk=42, kept=32, dense_pixel=630, dense=0, dense_frames=8, result_pixel=24)
+
+    def lay_out(self, sizes: Sequence[Size]) -> Layout:
+        from toolkit.models.omega.preprocess import cropped_size, resized_size
+
+        given = np.array(sizes, np.int64).reshape(-1, 2)
+        cropped = np.array([cropped_size(*size) for size in sizes], np.int64).reshape(-1, 2)
+        shown = [resized_size(width, height, "balanced") for width, height in cropped.tolist()]
+        resized = np.array(shown, np.float64).reshape(-1, 2)
+        width, height = resized.max(axis=0, initial=0).tolist()
+        scale = resized / cropped
+        offset = (np.array([width, height]) - resized) // 2 - scale * ((given - cropped) // 2)
+        return Layout("balanced", (int(height), int(width)), scale, offset)
+
+    def load(self, checkpoint: Path, heads: tuple[str, ...], dtype: "torch.dtype") -> Any:
+        from toolkit.models.omega import VGGTOmega
+
+        return VGGTOmega.from_checkpoint(checkpoint, heads=heads, compute_dtype=dtype)
+
+    def read(self, image: Path | NDArray[np.uint8], layout: Layout) -> "tuple[Tensor, Size]":
+        from toolkit.models.omega import load_images
+
+        return _padded(load_images([image], layout.mode), layout)
+
+    def cameras(self, encoding: ArrayLike, size: Size) -> tuple[Floats, Floats]:
+        from toolkit.models.omega import cameras_from_pose_encoding
+
+        return cameras_from_pose_encoding(encoding, size)
+
+
+def _padded(loaded: "Views", layout: Layout) -> "tuple[Tensor, Size]":
+    """Return one image with a white border up to the size of its group, and the photograph's (width, height)."""
+    import torch.nn.functional as F
+
+    width, height = loaded.sizes[0].tolist()
+    down, right = (all_ - own for all_, own in zip(layout.size, loaded.images.shape[2:], strict=True))
+    border = (right // 2, right - right // 2, down // 2, down - down // 2)
+    return F.pad(loaded.images[0], border, value=1.0), (width, height)
+
+
+ARCHITECTURES: dict[str, Architecture] = {one.name: one for one in (VggtArchitecture(), OmegaArchitecture())}
 """By the predictor's name."""

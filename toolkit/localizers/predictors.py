@@ -28,16 +28,16 @@ def create_predictor(
     """Return a ready predictor.
 
     Args:
-        name: `vggt`, or `simulated`, which looks up true poses and is for tests and for trying things out.
+        name: `vggt`, `vggt-omega`, or `simulated`, which looks up true poses and is for tests and for trying out.
         sessions: of `simulated`: where the true poses are.
         map_dir, features: of `simulated`: folder of the triangulated maps, for depth, and their kind of features.
-        checkpoint: of `vggt`: file with the weights; None: the hub's cache, else a download.
-        compute_device, dtype_compute: of `vggt`, as `toolkit.models.compute` takes them.
+        checkpoint: of a network: file with the weights; None: the hub's cache, else a download.
+        compute_device, dtype_compute: of a network, as `toolkit.models.compute` takes them.
         seed: of `simulated`.
 
     Raises:
         ManifestError: unknown name, device or precision.
-        WeightsError: `vggt` and no weights to be had; says what to do.
+        WeightsError: a network and no weights to be had; says what to do.
     """
     if name not in PREDICTORS:
         raise ManifestError(f"Unknown predictor {name!r}. Known: {', '.join(PREDICTORS)}.")

@@ -498,7 +498,7 @@ class PredictorSettings(Settings):
     """The network that predicts cameras, and what it is shown."""
 
     shorthand = "name"
-    name: Literal["vggt", "simulated"] = "vggt"
+    name: Literal["vggt", "vggt-omega", "simulated"] = "vggt"
     """What `feed_forward` and `hybrid` ask; `simulated` looks up true poses, for trying things out."""
     checkpoint: str | None = None
     """File with the network's weights; null: the hub's cache, else a download."""
