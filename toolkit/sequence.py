@@ -4,7 +4,7 @@ import glob
 import logging
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -37,7 +37,7 @@ from toolkit.localizers.base import PoseEstimate, RoughPose
 from toolkit.localizers.bundle import Observations
 from toolkit.localizers.correspondences import LocalizedQueries
 from toolkit.localizers.frames import LocalizedFrames, SequenceLocalizer, localize_sequence
-from toolkit.localizers.gravity import Gravity, measured_gravity
+from toolkit.localizers.gravity import measured_gravity
 from toolkit.localizers.map import Map
 from toolkit.localizers.odometry import (
     UNKNOWN_COVARIANCE,
@@ -149,8 +149,10 @@ def _place_pair(
     skipped = skip_existing and is_current(out, record)
     if not skipped:
         again = _Relocalizer(poses_dir, capture.name, map_device, session) if settings.relocalize else None
-        up = up_of_cameras(capture[f"{map_device}_map"].world_from_cam())
-        frames, steps, trajectory = _frames(session, _Answers.read(poses, table), settings, again, up)
+        frames, steps, trajectory = _frames(
+            session, _Answers.read(poses, table), settings, again,
+            lambda: up_of_cameras(capture[f"{map_device}_map"].world_from_cam()),
+        )  # fmt: skip
         csvs = {out.with_suffix(".csv"): frames, out.with_name(f"{out.stem}_steps.csv"): steps}
         for path, rows in csvs.items():
             with write_atomic(path) as temporary:
@@ -280,7 +282,7 @@ def _frames(
     answers: _Answers,
     settings: SequenceSettings,
     relocalizer: _Relocalizer | None,
-    map_up: Floats,
+    map_up: Callable[[], Floats],
 ) -> tuple[pd.DataFrame, pd.DataFrame, Trajectory]:
     """Return the table of all frames and queries, that of steps, and the poses of those frames that have one."""
     tables, poses, covariances = list[pd.DataFrame](), list[Floats](), list[Floats]()
@@ -316,7 +318,7 @@ def _frames(
 
         done = localize_piece(motion, queries, np.flatnonzero(asked >= 0), settings, again, gravity, observe)
         placed = done.placed
-        windows = _online_steps(motion, queries, np.flatnonzero(asked >= 0), settings, gravity)
+        windows = _online_steps(motion, queries, np.flatnonzero(asked >= 0), settings)
         for name, of_queries in {**done.steps, **windows}.items():
             posed = np.isfinite(of_queries).all(axis=(1, 2))
             table = keys[asked >= 0][posed].assign(step=name)
@@ -371,7 +373,7 @@ def _observations(
 
 
 def _online_steps(
-    motion: Odometry, queries: PosedQueries, asked: Ints, settings: SequenceSettings, gravity: Gravity | None
+    motion: Odometry, queries: PosedQueries, asked: Ints, settings: SequenceSettings
 ) -> dict[str, Floats]:
     """Return poses (A, 4, 4) of frames from single queries of the past alone, by the window's name.
 
@@ -383,7 +385,7 @@ def _online_steps(
     for length_s in (*settings.windows_s, None):
         past = settings.model_copy(update={"online": True, "length_s": length_s})
         name = "online" if length_s is None else f"online {length_s:g} s"
-        steps[name] = place_online(motion, queries, asked, past, gravity).world_from_rig[asked]
+        steps[name] = place_online(motion, queries, asked, past).world_from_rig[asked]
     return steps
 
 

@@ -49,7 +49,6 @@ def answering(monkeypatch: pytest.MonkeyPatch) -> Callable[[Drive], list[tuple[i
             return PoseEstimate("ok", pose, covariance, p_correct=0.99)
 
         monkeypatch.setattr(frames, "localize_image", localize)
-        monkeypatch.setattr(frames._Pictures, "up", np.array([0.0, 0.0, 1.0]))
         return asked
 
     return answer
@@ -120,7 +119,7 @@ def test_frames_and_cameras_that_do_not_fit_are_refused(answering: Any) -> None:
 def test_frame_by_frame_the_latest_pose_rests_on_the_past(answering: Any) -> None:
     way = drive(np.random.default_rng(3))
     answering(way)
-    localizer = SequenceLocalizer(PLACE, {"relocalize": False, "gravity_std_deg": None})
+    localizer = SequenceLocalizer(PLACE, {"relocalize": False})
     estimates = [
         localizer.add(time, pose, picture, CAMERA)
         for time, pose, picture in zip(

@@ -14,6 +14,7 @@ from toolkit import geometry
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import PoseEstimate
 from toolkit.localizers.correspondences import Correspondences
+from toolkit.localizers.gravity import Gravity
 from toolkit.localizers.odometry import Odometry, PosedQueries
 from toolkit.localizers.pose_graph import PlacedPiece, motion_graph, require_gtsam, rigid
 from toolkit.manifest import SequenceSettings
@@ -69,6 +70,7 @@ def adjusted(
     queries: PosedQueries,
     shown: Mapping[int, Observations],
     settings: SequenceSettings,
+    gravity: Gravity | None = None,
 ) -> PlacedPiece:
     """Return a placed piece whose poses fit what its queries show; covariances stay as they were.
 
@@ -77,13 +79,14 @@ def adjusted(
     Args:
         queries: those that the poses rest on; one without observations keeps its pose as a prior.
         shown: by frame what its query shows, of those whose matches are trusted.
+        gravity: which direction is up; None: not known.
 
     Raises:
         ManifestError: GTSAM is not installed.
     """
     gtsam = require_gtsam()
     others = queries.choose(~np.isin(queries.frames, list(shown)))
-    graph = motion_graph(odometry.scaled(placed.scale), others, settings)
+    graph = motion_graph(odometry.scaled(placed.scale), others, settings, gravity)
     values = gtsam.Values()
     for number, pose in enumerate(placed.world_from_rig):
         values.insert(number, gtsam.Pose3(rigid(pose)))

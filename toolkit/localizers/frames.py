@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -59,9 +58,8 @@ class _Pictures:
     def __init__(self, place: Map, rig_from_cams: NDArray[np.float64] | None, turns: Sequence[int] | None) -> None:
         self._place, self._rig, self._turns = place, rig_from_cams, turns
 
-    @cached_property
     def up(self) -> Floats:
-        """(3,) direction that is about up in the map."""
+        """Return the direction (3,) that is about up in the map."""
         return up_of_cameras(self._place.session.world_from_cam())
 
     def localize(self, picture: Pictures, cameras: Cameras, near: RoughPose | None = None) -> PoseEstimate:
@@ -246,8 +244,7 @@ class SequenceLocalizer:
             return [self._pictures.localize(image, cameras, near) for _, near in todo]
 
         again = localize_again if self.settings.relocalize else None
-        gravity = measured_gravity([(window, self._queries)], self._pictures.up, offline)
-        done = localize_piece(window, self._queries, np.array([len(window) - 1]), offline, again, gravity)
+        done = localize_piece(window, self._queries, np.array([len(window) - 1]), offline, again)
         self._queries, placed = done.queries, done.placed
         self._solved = len(window) - 1, placed
         if not np.isfinite(placed.world_from_rig[-1]).all():

@@ -55,18 +55,11 @@ class PlacedPiece:
     """Factor of the odometry's lengths; online that of the last pose."""
 
 
-def place_online(
-    odometry: Odometry,
-    queries: PosedQueries,
-    asked: Ints,
-    settings: SequenceSettings,
-    gravity: Gravity | None = None,
-) -> PlacedPiece:
+def place_online(odometry: Odometry, queries: PosedQueries, asked: Ints, settings: SequenceSettings) -> PlacedPiece:
     """Return the poses of some frames of a piece, each from what was before it alone, at most `settings.length_s`.
 
     Args:
         asked: indices of the frames.
-        gravity: see `place_piece`.
 
     Raises:
         ManifestError: GTSAM is not installed.
@@ -87,7 +80,7 @@ def place_online(
         start = cut(past, chosen, drifting)[-1].start  # what is after a loss of tracking that the queries tell
         past, within[within] = past.part(slice(start, None)), chosen.frames >= start
         chosen = chosen.choose(chosen.frames >= start).shifted(-start)
-        placed = place_piece(past, chosen, drifting, gravity)
+        placed = place_piece(past, chosen, drifting)
         every.world_from_rig[frame], every.covariances[frame] = placed.world_from_rig[-1], placed.covariances[-1]
         every.status[frame] = placed.status[-1]
         own = queries.frames[within] == frame
@@ -112,7 +105,7 @@ def place_piece(
         nothing = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan), np.zeros(0, bool)
         return PlacedPiece(*nothing, np.full(count, "failed: no query of this piece has a pose", object))
     if gravity is not None:
-        queries = gravity.upright(odometry, queries)
+        queries = gravity.upright(odometry, queries, settings)
     best = place(odometry, queries, settings)[0]
     used, seen = best.members, set[bytes]()
     for _ in range(_ROUNDS):
@@ -170,13 +163,9 @@ def _optimized(
 ) -> tuple[Floats, Floats]:
     """Return poses (N, 4, 4) and covariances (N, 6, 6)."""
     gtsam = require_gtsam()
-    graph, values = motion_graph(odometry, queries, settings), gtsam.Values()
+    graph, values = motion_graph(odometry, queries, settings, gravity), gtsam.Values()
     for number, pose in enumerate(first_guess(odometry, queries)):
         values.insert(number, gtsam.Pose3(rigid(pose)))
-    if gravity is not None and settings.gravity_std_deg is not None:
-        noise = gtsam.noiseModel.Isotropic.Sigma(2, np.deg2rad(settings.gravity_std_deg))
-        in_rig = odometry.odom_from_rig[0, :3, :3].T @ gravity.in_odometry
-        graph.add(gtsam.AttitudeFactorPose3(0, gtsam.Unit3(gravity.in_map), noise, gtsam.Unit3(in_rig)))
     result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     marginals = gtsam.Marginals(graph, result)
     numbers = range(len(odometry))
@@ -184,8 +173,10 @@ def _optimized(
     return poses, np.stack([marginals.marginalCovariance(number) for number in numbers])
 
 
-def motion_graph(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> Any:
-    """Return GTSAM's graph of N poses: a factor for each step of odometry, and one for the pose of each query."""
+def motion_graph(
+    odometry: Odometry, queries: PosedQueries, settings: SequenceSettings, gravity: Gravity | None
+) -> Any:
+    """Return GTSAM's graph of N poses: a factor for each step of odometry, for the pose of each query, and for up."""
     gtsam = require_gtsam()
     graph = gtsam.NonlinearFactorGraph()
     steps = geometry.invert(odometry.odom_from_rig[:-1]) @ odometry.odom_from_rig[1:]
@@ -203,6 +194,12 @@ def motion_graph(odometry: Odometry, queries: PosedQueries, settings: SequenceSe
                                        strict=True):  # fmt: skip
         noise = gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Gaussian.Covariance(covariance))
         graph.add(gtsam.PriorFactorPose3(frame, gtsam.Pose3(rigid(pose)), noise))
+    if gravity is not None:
+        # From the first pose on odometry drifts in tilt, too: the others know no better. A piece may lean by far more.
+        noise = gtsam.noiseModel.Isotropic.Sigma(2, np.deg2rad(gravity.std_deg))
+        in_rig = odometry.odom_from_rig[0, :3, :3].T @ gravity.in_odometry
+        up = gtsam.Unit3(gravity.in_map), gtsam.noiseModel.Robust.Create(kernel, noise), gtsam.Unit3(in_rig)
+        graph.add(gtsam.AttitudeFactorPose3(0, *up))
     return graph
 
 

@@ -57,7 +57,7 @@ def localize_piece(
         queries: those with a pose.
         asked: (A,) frames of all queries, ascending.
         again: asked about queries that are not `ok`, or that contradict the others; None: they stay as they are.
-        gravity: which direction is up; None: not known.
+        gravity: which direction is up; None: not known. Online it is not used: other pieces tell it.
         observe: what queries show, for `settings.bundle_adjust`.
 
     Raises:
@@ -76,7 +76,7 @@ def localize_piece(
     singles[queries.frames] = queries.world_from_rig
     voted = np.full((len(asked), 4, 4), np.nan)
     if len(queries) and not settings.online:
-        voters = queries if gravity is None else gravity.upright(odometry, queries)
+        voters = queries if gravity is None else gravity.upright(odometry, queries, settings)
         agreeing = queries.choose(place(odometry, voters, settings)[0].members)
         voted = _laid(odometry, agreeing) @ odometry.odom_from_rig[asked]
     graph = first.world_from_rig[asked]
@@ -86,7 +86,7 @@ def localize_piece(
     steps = dict(zip(STEPS, (voted, graph, singles[asked]), strict=True))
     if settings.bundle_adjust and observe is not None and not settings.online:
         steps[GRAPH_AGAIN] = second.world_from_rig[asked]
-        second = _adjusted(odometry, second, every, answers, observe, settings)
+        second = _adjusted(odometry, second, every, answers, observe, settings, gravity)
     return LocalizedPiece(second, every, answers, steps)
 
 
@@ -97,6 +97,7 @@ def _adjusted(
     answers: Mapping[int, PoseEstimate],
     observe: Observe,
     settings: SequenceSettings,
+    gravity: Gravity | None,
 ) -> PlacedPiece:
     """Return a piece after bundle adjustment of what the queries that are used show."""
     used, shown = queries.choose(placed.used), dict[int, Observations]()
@@ -109,14 +110,14 @@ def _adjusted(
         seen = observe(frame, answer if same else None) if sure else None
         if seen is not None and len(seen.points):
             shown[frame] = seen
-    return adjusted(odometry, placed, used, shown, settings) if shown else placed
+    return adjusted(odometry, placed, used, shown, settings, gravity) if shown else placed
 
 
 def _placed(
     odometry: Odometry, queries: PosedQueries, asked: Ints, settings: SequenceSettings, gravity: Gravity | None
 ) -> PlacedPiece:
     if settings.online:
-        return place_online(odometry, queries, asked, settings, gravity)
+        return place_online(odometry, queries, asked, settings)
     return place_piece(odometry, queries, settings, gravity)
 
 

@@ -409,9 +409,9 @@ class SequenceSettings(Settings):
     """Standard deviation, by axis, that a second of odometry adds to a rotation; grows with the time's root."""
     scale_std: PositiveNumber = 0.02
     """Relative standard deviation of the lengths of a recording's odometry."""
-    gravity_std_deg: PositiveNumber | None = 0.5
-    """Standard deviation, by axis, of the direction that is up at the first pose of each piece, where one axis of the
-    odometry's frame is found to be up; null: odometry may lean by any angle."""
+    gravity_std_deg: PositiveNumber | None = None
+    """Standard deviation, by axis, of the direction that is up at the first pose of each piece, such as 0.5, where one
+    axis of the odometry's frame is found to be up, and not online; null: odometry may lean by any angle."""
     max_gap_s: PositiveNumber = 10.0
     """A longer time without a pose is a loss of tracking: a new piece, with a frame of its own, begins."""
     max_speed_m_s: PositiveNumber = 15.0
