@@ -5,6 +5,7 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -135,13 +136,14 @@ def _place_pair(
     poses, table, out = (stem.with_name(f"{stem.name}{end}") for end in (".txt", ".csv", f"{SUFFIX}.txt"))
     if session.odometry is None:
         raise ArtifactError(f"{session.path} has no trajectories.txt: there is no odometry of {session.id}.")
-    for path, what in ((poses, "poses"), (table, "table of the queries")):
+    shown = [poses.with_suffix(".h5")] * settings.bundle_adjust
+    for path, what in zip([poses, table, *shown], ("poses", "table of the queries", "correspondences"), strict=False):
         if not path.exists():
             raise ArtifactError(f"{path}: no {what} of this pair. Localize first.")
     require_whole(poses)
     record: dict[str, Any] = {
         "sequence": settings.model_dump(),
-        "poses": [file_fingerprint(path) for path in (poses, table)],
+        "poses": [file_fingerprint(path) for path in (poses, table, *shown)],
         "odometry": file_fingerprint(session.path / "trajectories.txt"),
     }
     if settings.relocalize:
@@ -149,10 +151,11 @@ def _place_pair(
     skipped = skip_existing and is_current(out, record)
     if not skipped:
         again = _Relocalizer(poses_dir, capture.name, map_device, session) if settings.relocalize else None
-        frames, steps, trajectory = _frames(
-            session, _Answers.read(poses, table), settings, again,
-            lambda: up_of_cameras(capture[f"{map_device}_map"].world_from_cam()),
-        )  # fmt: skip
+        answers, map_session = _Answers.read(poses, table), capture[f"{map_device}_map"]
+        with closing(LocalizedQueries(shown[0])) if shown else nullcontext() as queries:
+            frames, steps, trajectory = _frames(
+                session, answers, settings, again, lambda: up_of_cameras(map_session.world_from_cam()), queries
+            )
         csvs = {out.with_suffix(".csv"): frames, out.with_name(f"{out.stem}_steps.csv"): steps}
         for path, rows in csvs.items():
             with write_atomic(path) as temporary:
@@ -202,8 +205,6 @@ class _Answers:
     """(Q, 4, 4), NaN where there is none."""
     covariances: Floats
     """(Q, 6, 6)."""
-    shown: LocalizedQueries | None = None
-    """What their poses rest on."""
 
     @classmethod
     def read(cls, poses: Path, table: Path) -> "_Answers":
@@ -218,9 +219,7 @@ class _Answers:
             known = (at >= 0) & np.isfinite(given[at]).all(axis=(1, 2))
             covariances[known] = given[at[known]]
         found = trajectory.lookup(rows["timestamp"], rows["device_id"])
-        path = poses.with_suffix(".h5")
-        shown = LocalizedQueries(path) if path.is_file() else None
-        return cls(rows[["timestamp", "device_id"]], status, weights, found, covariances, shown)
+        return cls(rows[["timestamp", "device_id"]], status, weights, found, covariances)
 
     def posed(self, timestamps: Ints, device_ids: Any) -> PosedQueries:
         """Return those that have a pose, of the frames (N,) of a piece of odometry."""
@@ -283,6 +282,7 @@ def _frames(
     settings: SequenceSettings,
     relocalizer: _Relocalizer | None,
     map_up: Callable[[], Floats],
+    shown: LocalizedQueries | None,
 ) -> tuple[pd.DataFrame, pd.DataFrame, Trajectory]:
     """Return the table of all frames and queries, that of steps, and the poses of those frames that have one."""
     tables, poses, covariances = list[pd.DataFrame](), list[Floats](), list[Floats]()
@@ -311,10 +311,13 @@ def _frames(
             ) -> list[PoseEstimate]:
                 return ask(keys.iloc[[frame for frame, _ in todo]], [pose for _, pose in todo])
 
-        def observe(
-            frame: int, again: PoseEstimate | None, keys: pd.DataFrame = keys
-        ) -> Observations | None:
-            return _observations(session, answers, keys.iloc[[frame]], again)
+        observe = None
+        if shown is not None:
+
+            def observe(
+                frame: int, again: PoseEstimate | None, keys: pd.DataFrame = keys, shown: LocalizedQueries = shown
+            ) -> Observations | None:
+                return _observations(session, shown, keys.iloc[[frame]], again)
 
         done = localize_piece(motion, queries, np.flatnonzero(asked >= 0), settings, again, gravity, observe)
         placed = done.placed
@@ -357,15 +360,18 @@ def _frames(
 
 
 def _observations(
-    session: Session, answers: _Answers, query: pd.DataFrame, again: PoseEstimate | None
+    session: Session, shown: LocalizedQueries, query: pd.DataFrame, again: PoseEstimate | None
 ) -> Observations | None:
     """Return what a query shows: what its first pose rests on, or that which was found again."""
     key = int(query["timestamp"].iloc[0]), str(query["device_id"].iloc[0])
     if again is not None:
         [rows], found = session.rows_of_keyframes(query), again.correspondences
-    elif answers.shown is not None and key in answers.shown:
-        stored = answers.shown[key]
-        rows, found = np.array([session.row_of_name[name] for name in stored.images]), stored.correspondences
+    elif key in shown:
+        stored = shown[key]
+        found = stored.correspondences
+        if missing := [name for name in stored.images if name not in session.row_of_name]:
+            raise ArtifactError(f"{shown.path}: {session.path} has no image {missing[0]}. Localize again.")
+        rows = np.array([session.row_of_name[name] for name in stored.images], np.int64)
     else:
         return None
     cameras = [session.camera(sensor) for sensor in session.images["sensor_id"].iloc[rows]]

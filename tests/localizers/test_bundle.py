@@ -86,6 +86,28 @@ def test_points_that_contradict_all_else_change_nothing() -> None:
     assert adjusted(way.odometry, placed, way.queries, shown, SETTINGS) is placed
 
 
+def test_errors_are_as_large_as_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each neighborhood of the map is off by itself, and so are all points that a query shows."""
+    monkeypatch.undo()
+    squares = []
+    for seed in range(3):
+        way = drive(np.random.default_rng(seed))
+        placed, rng = place_piece(way.odometry, way.queries, SETTINGS), np.random.default_rng(seed)
+        shown = {}
+        for frame in way.queries.frames.tolist():
+            found = seen(way, frame)
+            found = replace(
+                found, points=found.points + rng.normal(0, 0.03, 3) + rng.normal(0, 0.02, found.points.shape),
+                pixels=found.pixels + rng.normal(0, 2, found.pixels.shape),
+            )  # fmt: skip
+            shown[frame] = Observations.of(found, [CAMERA], ALONG[None])
+        moved = adjusted(way.odometry, placed, way.queries, shown, SETTINGS)
+        assert moved is not placed
+        variances = np.trace(moved.covariances[:, 3:, 3:], axis1=1, axis2=2)
+        squares.append((errors(moved, way) ** 2 / variances).mean())
+    assert 0.2 < np.mean(squares) < 1.5
+
+
 def test_what_is_observed() -> None:
     way = drive(np.random.default_rng(3))
     many = seen(way, 0, count=3 * MAX_POINTS)

@@ -419,7 +419,7 @@ class SequenceSettings(Settings):
     relocalize: bool = True
     """Whether queries that are not `ok`, or contradict the others, are localized again near their predicted pose."""
     bundle_adjust: bool = False
-    """Whether the poses at last fit the map points that queries show, as well, in place of their poses alone."""
+    """Whether the poses at last fit the map points that `ok` queries show, in place of their poses; not online."""
     online: bool = False
     """Whether the pose of a query rests on what was before it alone; other frames then have none."""
     length_s: PositiveNumber | None = None
