@@ -286,11 +286,16 @@ def _frames(
 ) -> tuple[pd.DataFrame, pd.DataFrame, Trajectory]:
     """Return the table of all frames and queries, that of steps, and the poses of those frames that have one."""
     tables, poses, covariances = list[pd.DataFrame](), list[Floats](), list[Floats]()
-    steps, with_odometry = [pd.DataFrame(columns=list(STEP_COLUMNS))], np.zeros(len(answers.keys), bool)
+    steps, online = [pd.DataFrame(columns=list(STEP_COLUMNS))], list[pd.DataFrame]()
+    with_odometry = np.zeros(len(answers.keys), bool)
     pieces = list(_pieces(session, answers.keys, settings))
     queries_of_each = [answers.posed(piece.motion.timestamps, piece.device_ids) for piece in pieces]
     _warn_of_truth(session, pieces, queries_of_each)
     if not settings.online:
+        # Before the drift is measured and pieces are cut, of which the future tells.
+        for piece, queries in zip(pieces, queries_of_each, strict=True):
+            asked = np.flatnonzero(answers.of(piece.motion.timestamps, piece.device_ids) >= 0)
+            online += _step_rows(piece, asked, _online_steps(piece.motion, queries, asked, settings))
         motions = [piece.motion for piece in pieces]
         settings = with_measured_drift(zip(motions, queries_of_each, strict=True), settings)
         pieces = [part for piece, own in zip(pieces, queries_of_each, strict=True) for part in piece.cut(own, settings)]
@@ -321,12 +326,7 @@ def _frames(
 
         done = localize_piece(motion, queries, np.flatnonzero(asked >= 0), settings, again, gravity, observe)
         placed = done.placed
-        windows = _online_steps(motion, queries, np.flatnonzero(asked >= 0), settings)
-        for name, of_queries in {**done.steps, **windows}.items():
-            posed = np.isfinite(of_queries).all(axis=(1, 2))
-            table = keys[asked >= 0][posed].assign(step=name)
-            table[list(POSE_NAMES)] = geometry.qt_from_pose(of_queries[posed]).round(9)
-            steps.append(table[list(STEP_COLUMNS)])
+        steps += _step_rows(piece, np.flatnonzero(asked >= 0), done.steps)
         table = pd.DataFrame(dict.fromkeys(COLUMNS), index=range(len(motion)))
         table[list(keys)] = keys
         table["recording"], table["piece"], table["status"] = piece.recording, numbers[piece.recording], placed.status
@@ -356,7 +356,7 @@ def _frames(
     kept = frames_table[posed]
     times = kept["timestamp"].to_numpy(np.int64)
     trajectory = Trajectory.from_poses(times, kept["device_id"].to_list(), every[posed], known[posed])
-    return frames_table, pd.concat([part.astype(object) for part in steps], ignore_index=True), trajectory
+    return frames_table, pd.concat([part.astype(object) for part in steps + online], ignore_index=True), trajectory
 
 
 def _observations(
@@ -378,6 +378,17 @@ def _observations(
     return Observations.of(found, cameras, session.rig_from_cam(rows))
 
 
+def _step_rows(piece: _Piece, asked: Ints, steps: Mapping[str, Floats]) -> Iterator[pd.DataFrame]:
+    """Yield tables with `STEP_COLUMNS` of the poses (A, 4, 4) of some frames (A,) after each step."""
+    for name, poses in steps.items():
+        posed = np.isfinite(poses).all(axis=(1, 2))
+        rows = asked[posed]
+        table = pd.DataFrame({"step": name, "timestamp": piece.motion.timestamps[rows]})
+        table["device_id"] = piece.device_ids[rows]
+        table[list(POSE_NAMES)] = geometry.qt_from_pose(poses[posed]).round(9)
+        yield table
+
+
 def _online_steps(
     motion: Odometry, queries: PosedQueries, asked: Ints, settings: SequenceSettings
 ) -> dict[str, Floats]:
@@ -385,7 +396,7 @@ def _online_steps(
 
     What was localized again near a predicted pose does not count: other queries, of the future too, predicted it.
     """
-    if settings.online or not settings.windows_s:
+    if not settings.windows_s:
         return {}
     steps = {}
     for length_s in (*settings.windows_s, None):

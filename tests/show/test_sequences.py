@@ -6,7 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.test_sequence import localized, place
+from tests.localizers.drifting import drive, small_motion
+from tests.test_sequence import drive_through, localized, place
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.evaluate import evaluate_scene
@@ -95,6 +96,32 @@ def test_online_poses_know_the_past_alone(place: Path, tmp_path: Path) -> None:
         assert same[same.index < single.timestamps[last]].all()
         assert not same[single.timestamps[last]]
     assert not (before.loc["graph"] == after.loc["graph"]).all(axis=None)
+
+
+def test_drift_and_a_loss_that_later_queries_tell_change_no_online_pose(place: Path, tmp_path: Path) -> None:
+    stem = tmp_path / "poses" / pair_name(place.name, "ios", "ios")
+    drive_through(tmp_path, place, drive(np.random.default_rng(0), frames=24))
+    single = Trajectory.read(f"{stem}.txt")
+    middle = single.timestamps[len(single) // 2]
+
+    def steps(poses: np.ndarray) -> pd.DataFrame:
+        Trajectory.from_poses(single.timestamps, single.device_ids, poses, single.covariances).write(f"{stem}.txt")
+        sequence_of(place, tmp_path, windows_s=[10])
+        return pd.read_csv(f"{stem}_sequence_steps.csv").set_index(["step", "timestamp"])
+
+    poses, rng = single.world_from_device, np.random.default_rng(1)
+    late = np.flatnonzero(single.timestamps >= middle)
+    drifted = poses.copy()
+    drifted[late] = np.stack([poses[row] @ small_motion(rng, 0.02, 0.5) for row in late])
+    elsewhere = poses.copy()
+    elsewhere[late, :3, 3] += [30.0, 0.0, 0.0]
+    before = steps(poses)
+    for changed in (drifted, elsewhere):
+        after = steps(changed)
+        for step in ("online 10 s", "online"):
+            early = before.loc[step].query("timestamp < @middle")
+            assert len(early) > 5
+            pd.testing.assert_frame_equal(early, after.loc[step].loc[early.index])
 
 
 def test_tables_and_figures_of_a_run(place: Path, tmp_path: Path) -> None:
