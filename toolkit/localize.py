@@ -717,4 +717,4 @@ def explain_query(
     localizer = run.localizer.inner if isinstance(run.localizer, ScaledLocalizer) else run.localizer
     assert isinstance(localizer, FeedForwardLocalizer)
     query, references = run.query(index)
-    return localizer, query, localizer.predict([(query, references)])[0]
+    return localizer, query, localizer.answer(query, references)

@@ -20,13 +20,19 @@ from toolkit.errors import ImageError, ManifestError, WeightsError
 from toolkit.files import SceneFiles
 from toolkit.localize import COLUMNS, PREDICTION_COLUMNS
 from toolkit.localizers.base import PoseEstimate, References, View
-from toolkit.localizers.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
+from toolkit.localizers.feed_forward import FeedForwardAnswer, FeedForwardLocalizer, Predicted
 from toolkit.localizers.prediction import Prediction
 from toolkit.localizers.predictors import create_predictor
 from toolkit.localizers.simulated import SimulatedPredictor
 from toolkit.show.visualize_prediction import draw_prediction
 
 Floats = NDArray[np.float64]
+
+
+def answers_of(localizer: FeedForwardLocalizer, queries: Sequence[Asked]) -> list[FeedForwardAnswer]:
+    """Return the answers of queries that the network is asked about in one call."""
+    predicted = localizer.predict(queries)
+    return [localizer.answer(*asked, one) for asked, one in zip(queries, predicted, strict=True)]
 
 
 def errors(answers: Sequence[FeedForwardAnswer], true: Floats) -> tuple[Floats, Floats]:
@@ -41,7 +47,7 @@ def errors(answers: Sequence[FeedForwardAnswer], true: Floats) -> tuple[Floats, 
 @pytest.mark.parametrize("device", ["ios", "hl", "spot"])
 def test_poses_are_metric_and_right(world: World, device: str) -> None:
     queries, true = world.queries(device)
-    answers = world.localizer(world.predictor(**LOW)).predict(queries)
+    answers = answers_of(world.localizer(world.predictor(**LOW)), queries)
     rotation_deg, distance_m = errors(answers, true)
     assert (rotation_deg < 1).all()
     assert (distance_m < 0.1).all()
@@ -56,9 +62,9 @@ def test_the_covariance_is_that_of_the_rig(world: World) -> None:
     """A rig whose origin is 10 m from its camera turns about it: its place is as uncertain as that arm is long."""
     ((query, references), *_), _ = world.queries("ios")
     localizer = world.localizer(world.predictor(**LOW))
-    (near,) = localizer.predict([(query, references)])
+    (near,) = answers_of(localizer, [(query, references)])
     rig_from_cam = geometry.make_pose(np.eye(3), [10.0, 0.0, 0.0])[None]
-    (far,) = localizer.predict([(replace(query, rig_from_cams=rig_from_cam), references)])
+    (far,) = answers_of(localizer, [(replace(query, rig_from_cams=rig_from_cam), references)])
     np.testing.assert_allclose(
         far.estimate.world_from_rig @ rig_from_cam[0], near.estimate.world_from_rig, atol=1e-9
     )
@@ -88,16 +94,16 @@ class Told(SimulatedPredictor):
 def test_references_whose_poses_were_told_confirm_nothing(world: World) -> None:
     queries, _ = world.queries("ios")
     predictor = Told(world.sessions, world.files.maps, **LOW)  # type: ignore[arg-type]
-    count = len(world.localizer(predictor).predict(queries)[0].cameras[0].references)
+    count = len(answers_of(world.localizer(predictor), queries)[0].cameras[0].references)
     predictor.told = count - 1
-    for answer in world.localizer(predictor).predict(queries):
+    for answer in answers_of(world.localizer(predictor), queries):
         assert answer.estimate.num_inliers == 1
         assert answer.estimate.status == "low_confidence"
     predictor.told = count - 3
-    for answer in world.localizer(predictor).predict(queries):
+    for answer in answers_of(world.localizer(predictor), queries):
         assert answer.estimate.num_inliers == 3
     predictor.told = count
-    for answer in world.localizer(predictor).predict(queries):
+    for answer in answers_of(world.localizer(predictor), queries):
         assert answer.estimate.status == "failed: no usable reference"
 
 
@@ -107,7 +113,7 @@ def test_a_network_sees_a_wrong_camera(world: World, factors: tuple[float, float
     queries, _ = world.queries("ios")
     predictor = Told(world.sessions, world.files.maps, **LOW)  # type: ignore[arg-type]
     predictor.focal_factors = factors
-    for (query, _), answer in zip(queries, world.localizer(predictor).predict(queries), strict=True):
+    for (query, _), answer in zip(queries, answers_of(world.localizer(predictor), queries), strict=True):
         estimate, focal_px = answer.estimate, query.views[0].camera.mean_focal_length()
         assert estimate.status == ("ok" if sees is None else "low_confidence: camera?")
         assert estimate.focals_px == (() if sees is None else (pytest.approx(sees * focal_px),))
@@ -119,7 +125,7 @@ def test_wrong_references_are_left_out(world: World) -> None:
     for seed in range(3):
         predictor = world.predictor(**LOW, wrong_references=0.25, seed=seed)
         queries, true = world.queries("ios")
-        answers = world.localizer(predictor, num_references=8).predict(queries)
+        answers = answers_of(world.localizer(predictor, num_references=8), queries)
         rotation_deg, distance_m = errors(answers, true)
         right += int(((rotation_deg < 1) & (distance_m < 0.1)).sum())
         for answer, found in zip(answers, zip(rotation_deg, distance_m, strict=True), strict=True):
@@ -159,7 +165,7 @@ def test_an_unknown_scale_is_never_ok(world: World) -> None:
     localizer.map = replace(world.map, world_from_cams=places)
     for device in ("ios", "spot"):
         queries, true = world.queries(device)
-        answers = localizer.predict(queries)
+        answers = answers_of(localizer, queries)
         rotation_deg, _ = errors(answers, true)
         for answer, error in zip(answers, rotation_deg, strict=True):
             assert answer.estimate.status == "low_confidence"
@@ -174,7 +180,7 @@ def test_depth_of_the_map_gives_the_scale_that_baselines_do_not(world: World) ->
     query, (references,) = world.queries("ios")[0][0]
     best = References(references.images[:1], references.scores[:1])
     without, with_depth = (
-        world.localizer(world.predictor(depth, **LOW)).predict([(query, [best])])[0] for depth in (False, True)
+        answers_of(world.localizer(world.predictor(depth, **LOW)), [(query, [best])])[0] for depth in (False, True)
     )
     assert np.isinf(without.estimate.scale_std)
     assert with_depth.estimate.scale_std < 0.1
@@ -196,7 +202,7 @@ def test_depth_maps_stand_in_for_points(world: World) -> None:
     ratio = in_cam[0][near, 2] / in_cam[1][:, 2]
     assert np.median(np.abs(ratio - 1)) < 0.1, "both lie on what the camera sees"
     queries, true = world.queries("ios")
-    answers = localizer.predict(queries)
+    answers = answers_of(localizer, queries)
     assert (errors(answers, true)[1] < 0.15).all()
     assert all(answer.estimate.scale_std < 0.1 for answer in answers)
 
@@ -206,10 +212,10 @@ def test_a_rig_knows_better_than_its_cameras(world: World) -> None:
     for seed in range(4):
         localizer = world.localizer(world.predictor(seed=seed))
         queries, true = world.queries("spot")
-        together += errors(localizer.predict(queries), true)[1].tolist()
+        together += errors(answers_of(localizer, queries), true)[1].tolist()
         for camera in range(len(queries[0][0].views)):
             single = [(query.part([camera]), [references[camera]]) for query, references in queries]
-            alone += errors(localizer.predict(single), true)[1].tolist()
+            alone += errors(answers_of(localizer, single), true)[1].tolist()
     assert np.median(together) < 0.9 * np.median(alone)
 
 
@@ -252,10 +258,10 @@ class Failing(SimulatedPredictor):
 )
 def test_one_bad_query_is_a_failed_answer_and_the_others_go_on(world: World, how: str, reason: str) -> None:
     queries, _ = world.queries("ios")
-    good = world.localizer(world.predictor(**LOW)).predict(queries)
+    good = answers_of(world.localizer(world.predictor(**LOW)), queries)
     predictor = Failing(world.sessions, world.files.maps, **LOW)  # type: ignore[arg-type]
     predictor.bad, predictor.how = queries[1][0].views[0].name, how
-    answers = world.localizer(predictor).predict(queries)
+    answers = answers_of(world.localizer(predictor), queries)
     assert answers[1].estimate.status == reason
     assert answers[1].estimate.world_from_rig is None
     for index in (0, 2):
@@ -282,21 +288,21 @@ def test_what_a_device_refuses_is_no_answer_to_a_query(
     monkeypatch.setattr(SimulatedPredictor, "predict", refuse)
     queries, _ = world.queries("ios")
     with pytest.raises(type(error)):
-        world.localizer(world.predictor(**LOW)).predict(queries)
+        answers_of(world.localizer(world.predictor(**LOW)), queries)
 
 
 def test_a_rig_goes_on_without_a_camera_that_fails(world: World) -> None:
     queries, true = world.queries("spot")
     predictor = Failing(world.sessions, world.files.maps, **LOW)  # type: ignore[arg-type]
     predictor.bad = queries[0][0].views[0].name
-    (answer,) = world.localizer(predictor).predict(queries[:1])
+    (answer,) = answers_of(world.localizer(predictor), queries[:1])
     assert geometry.pose_error(answer.estimate.world_from_rig, true[0])[1] < 0.1
     assert "RuntimeError: out of luck" in answer.estimate.reason
 
 
 def test_without_references_there_is_no_pose(world: World) -> None:
     ((query, _), *_), _ = world.queries("ios")
-    (answer,) = world.localizer(world.predictor()).predict([(query, [References.of([])])])
+    (answer,) = answers_of(world.localizer(world.predictor()), [(query, [References.of([])])])
     assert answer.estimate.status == "failed: no references"
     assert world.localizer(world.predictor()).predict([]) == []
 
@@ -428,7 +434,7 @@ def test_a_killed_run_goes_on_where_it_was(
 
     def counted(
         self: FeedForwardLocalizer, queries: Sequence[Asked], following: Sequence[Asked]
-    ) -> list[FeedForwardAnswer]:
+    ) -> list[Predicted]:
         asked.extend(query.views[0].name for query, _ in queries)
         return predict(self, queries)
 
@@ -462,7 +468,7 @@ def test_other_noise_references_or_weights_make_poses_anew(run: SceneFiles, smal
 def test_a_prediction_is_drawn_and_labeled(world: World, tmp_path: Path) -> None:
     queries, _ = world.queries("spot")
     localizer = world.localizer(world.predictor(wrong_references=0.3, seed=2))
-    (answer,) = localizer.predict(queries[:1])
+    (answer,) = answers_of(localizer, queries[:1])
     figure = draw_prediction(localizer, queries[0][0], answer, out=tmp_path / "prediction.png")
     assert (tmp_path / "prediction.png").stat().st_size > 20_000
     assert figure.get_suptitle().startswith("SIMULATED, no result")
@@ -490,5 +496,5 @@ def test_wrong_weights_end_the_run_and_a_bad_image_does_not(world: World) -> Non
     queries, _ = world.queries("ios")
     with pytest.raises(WeightsError, match="of another network"):
         world.localizer(Refuses(WeightsError("of another network"))).predict(queries)
-    answers = world.localizer(Refuses(ImageError("torn.jpg"))).predict(queries)
+    answers = answers_of(world.localizer(Refuses(ImageError("torn.jpg"))), queries)
     assert {answer.estimate.status for answer in answers} == {"failed: ImageError: torn.jpg"}

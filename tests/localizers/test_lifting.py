@@ -20,7 +20,7 @@ from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import SceneFiles, write_text
 from toolkit.localize import localize_pairs
 from toolkit.localizers.base import PoseEstimate, Query, References, View
-from toolkit.localizers.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
+from toolkit.localizers.feed_forward import FeedForwardAnswer, FeedForwardLocalizer, Predicted
 from toolkit.localizers.hybrid import HybridLocalizer
 from toolkit.localizers.lifting import DepthLifter
 from toolkit.localizers.local_map import LocalMap
@@ -49,11 +49,11 @@ class World:
         self, index: int, predictor: object, session: Session
     ) -> tuple[FeedForwardLocalizer, FeedForwardAnswer]:
         localizer = FeedForwardLocalizer(self.map, session, predictor)  # type: ignore[arg-type]
-        return localizer, localizer.predict([self.queries[index]])[0]
+        return localizer, localizer.answer(*self.queries[index])
 
     def localize(self, index: int, predictor: object, session: Session) -> PoseEstimate:
-        feed_forward, answer = self.answer(index, predictor, session)
-        return HybridLocalizer(self.pnp, feed_forward).localize(*self.queries[index], answer)
+        feed_forward = FeedForwardLocalizer(self.map, session, predictor)  # type: ignore[arg-type]
+        return HybridLocalizer(self.pnp, feed_forward).localize(*self.queries[index])
 
     def error(self, index: int, found: PoseEstimate) -> tuple[float, float]:
         rotation_deg, distance_m = geometry.pose_error(found.world_from_rig, self.true[index])
@@ -187,8 +187,10 @@ def test_a_wrong_scale_of_one_image_is_in_the_covariance(world: World) -> None:
 def test_without_depth_nothing_is_lifted(world: World) -> None:
     feed_forward, _ = world.answer(0, world.predictor, world.without_depth)
     nothing = FeedForwardAnswer(PoseEstimate("failed: no references"))
-    assert DepthLifter(world.pnp, feed_forward).localize(*world.queries[0], nothing) is None
-    found = HybridLocalizer(world.pnp, feed_forward).localize(*world.queries[0], nothing)
+    query, references = world.queries[0]
+    assert DepthLifter(world.pnp, feed_forward).localize(query, references, nothing) is None
+    untold = Predicted((np.zeros(0, np.int64),) * len(query.views), ("no references",) * len(query.views))
+    found = HybridLocalizer(world.pnp, feed_forward).localize(query, references, untold)
     assert found.status == "failed: too few matches"
 
 

@@ -52,6 +52,16 @@ class CameraAnswer:
 
 
 @dataclass(frozen=True)
+class Predicted:
+    """What a network says of a query, not yet aligned to the map."""
+
+    references: tuple[Ints, ...]
+    """Those chosen for each image of the query, see `CameraAnswer`."""
+    predictions: tuple[Prediction | str, ...]
+    """Of each image; why there is none."""
+
+
+@dataclass(frozen=True)
 class FeedForwardAnswer:
     """The estimate for a query device, and how it came about."""
 
@@ -100,17 +110,29 @@ class FeedForwardLocalizer:
         self,
         query: Query,
         references: Sequence[References],
-        prediction: FeedForwardAnswer | None = None,
+        prediction: Predicted | None = None,
         priors: Sequence[Prior] = (),
     ) -> PoseEstimate:
         """Return the predicted pose of a query; see `Localizer`."""
-        answer = self.predict([(query, references)])[0] if prediction is None else prediction
-        return answer.estimate
+        return self.answer(query, references, prediction).estimate
 
-    def predict(self, queries: Sequence[Asked], following: Sequence[Asked] = ()) -> list[FeedForwardAnswer]:
-        """Return an answer for each query; all go to the predictor in one call; see `Localizer`.
+    def answer(
+        self, query: Query, references: Sequence[References], prediction: Predicted | None = None
+    ) -> FeedForwardAnswer:
+        """Return the predicted pose of a query, and how it came about; the arguments are those of `localize`.
 
-        Nothing that goes wrong with one query is raised or touches another: its answer says `failed: <reason>`.
+        Nothing that goes wrong is raised: the answer says `failed: <reason>`.
+        """
+        predicted = self.predict([(query, references)])[0] if prediction is None else prediction
+        found = zip(query.views, predicted.references, predicted.predictions, strict=True)
+        cameras = tuple(self._camera_answer(*one) for one in found)
+        return FeedForwardAnswer(_combine(query, cameras), cameras)
+
+    def predict(self, queries: Sequence[Asked], following: Sequence[Asked] = ()) -> list[Predicted]:
+        """Return what the predictor, asked once for all, says of each query; see `Localizer`.
+
+        Aligning it to the map is left to `localize`, which other threads can do while the network goes on. Nothing that
+        goes wrong with one query is raised or touches another.
 
         Raises:
             Exception: what no other query would do better with: no such device, other weights, too little memory; see
@@ -122,14 +144,13 @@ class FeedForwardLocalizer:
         self._next = following, next_groups
         found = self._predict(list(groups.values()), list(next_groups[1].values()))
         predictions = dict(zip(groups, found, strict=True))
-        answers = []
-        for number, (query, _) in enumerate(queries):
-            cameras = tuple(
-                self._camera_answer(query.views[camera], references, predictions.get((number, camera), "no references"))
-                for camera, references in enumerate(chosen[number])
+        return [
+            Predicted(
+                tuple(references),
+                tuple(predictions.get((number, camera), "no references") for camera in range(len(references))),
             )
-            answers.append(FeedForwardAnswer(_combine(query, cameras), cameras))
-        return answers
+            for number, references in enumerate(chosen)
+        ]
 
     def _groups(self, queries: Sequence[Asked]) -> _Groups:
         chosen = [[self._choose(retrieved) for retrieved in references] for _, references in queries]

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.localizers.base import Asked, PoseEstimate, Prior, Query, References, agree, rank
-from toolkit.localizers.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
+from toolkit.localizers.feed_forward import FeedForwardLocalizer, Predicted
 from toolkit.localizers.lifting import DepthLifter
 from toolkit.localizers.pnp import PnpLocalizer
 
@@ -29,7 +29,7 @@ class HybridLocalizer:
     def batch_size(self) -> int:
         return self.feed_forward.batch_size
 
-    def predict(self, queries: Sequence[Asked], following: Sequence[Asked] = ()) -> list[FeedForwardAnswer]:
+    def predict(self, queries: Sequence[Asked], following: Sequence[Asked] = ()) -> list[Predicted]:
         """Return what the network says of each query; see `Localizer`."""
         return self.feed_forward.predict(queries, following)
 
@@ -37,7 +37,7 @@ class HybridLocalizer:
         self,
         query: Query,
         references: Sequence[References],
-        prediction: FeedForwardAnswer | None = None,
+        prediction: Predicted | None = None,
         priors: Sequence[Prior] = (),
     ) -> PoseEstimate:
         """Return one pose for the cameras of a rig, or for a single camera; `found_by` says from what.
@@ -48,7 +48,7 @@ class HybridLocalizer:
         depth too, support a pose better. `feed_forward`: the predicted pose itself, where matching finds none, or only
         an uncertain one that a certain prediction contradicts.
         """
-        answer = self.predict([(query, references)])[0] if prediction is None else prediction
+        answer = self.feed_forward.answer(query, references, prediction)
         predicted = answer.estimate
         prior = _prior(predicted)
         priors = (*priors, *(() if prior is None else (prior,)))
