@@ -178,7 +178,7 @@ def test_megaloc_goes_on_in_smaller_batches(weights: dict[str, Path], caplog: py
 @pytest.mark.parametrize("views", [6, 11])
 @pytest.mark.parametrize("depth", [False, True])
 def test_estimates_are_as_measured(weights: dict[str, Path], views: int, depth: bool) -> None:
-    predictor = NetworkPredictor(weights["vggt"], "cuda", "float32", needs_depth=depth)
+    predictor = NetworkPredictor(weights["vggt"], "cuda", "float32", needs_depth=depth, cache_bytes=0)
     predictor.predict([group(2)])
     before = torch.cuda.memory_allocated()
     torch.cuda.reset_peak_memory_stats()
@@ -191,7 +191,7 @@ def test_estimates_are_as_measured(weights: dict[str, Path], views: int, depth: 
 
 def test_vggt_goes_on_with_what_fits(weights: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     """The estimate is wrong here: the memory runs out in earnest."""
-    predictor = NetworkPredictor(weights["vggt"], "cuda", "float32", batch_size=8)
+    predictor = NetworkPredictor(weights["vggt"], "cuda", "float32", batch_size=8, cache_bytes=0)
     expected = [predictor.predict([group(6)])[0] for _ in range(8)]
     baseline = torch.cuda.memory_allocated()
     monkeypatch.setattr(network, "free_bytes", lambda _: 1 << 60)

@@ -37,6 +37,8 @@ CACHE_BYTES = 2 << 30
 _GROUPS_AT_A_TIME = {"cpu": 1}
 _GROUPS_AT_A_TIME_ELSEWHERE = 8
 _IMAGES_AT_A_TIME = 8
+# An accelerator holds the encodings itself if so many times their most is free, beside the weights.
+_ROOM_FOR_CACHE = 4
 # Part of the free memory to plan with: the rest is for what else runs, and for what the estimate leaves out.
 _MEMORY_SHARE = 0.8
 _LEAST_VIEWS = 2
@@ -68,6 +70,11 @@ class TokenCache:
         while self.bytes > self.max_bytes:
             self.bytes -= self._kept.popitem(last=False)[1].nbytes
 
+    def clear(self) -> None:
+        """Forget everything."""
+        self._kept.clear()
+        self.bytes = 0
+
 
 class NetworkPredictor:
     """Runs a network. The weights are looked for at once, and loaded when the first prediction is asked for.
@@ -95,7 +102,7 @@ class NetworkPredictor:
                 be larger than it can hold. `auto` is float32 where it would be that. The heads are always float32.
             needs_depth: whether to predict depth too, for a fifth more time.
             batch_size: groups at a time, at most; None: what is usual for the device.
-            cache_bytes: memory for the encodings of map images.
+            cache_bytes: memory for the encodings of map images: of the device where that has plenty, else of the CPU.
             architecture: which network.
 
         Raises:
@@ -141,6 +148,14 @@ class NetworkPredictor:
     @cached_property
     def _model(self) -> Any:
         return _load_network(self._architecture, self.checkpoint, self._heads, self._dtype, self._device)
+
+    @cached_property
+    def _kept_on(self) -> "torch.device":
+        """Where encodings are held."""
+        import torch
+
+        plenty = free_bytes(self._device) >= _ROOM_FOR_CACHE * self._cache.max_bytes
+        return self._device if plenty else torch.device("cpu")
 
     def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
         """Return a prediction for each group of views, in order: the query first, then its references.
@@ -191,7 +206,8 @@ class NetworkPredictor:
         on_cpu = self._device.type == "cpu"
         about = partial(estimate_bytes, self._architecture)
         estimate = partial(about, size=size, channels=channels, depth=self.needs_depth, on_cpu=on_cpu)
-        free = int(_MEMORY_SHARE * free_bytes(self._device))
+        growing = 0 if self._kept_on.type == "cpu" else self._cache.max_bytes - self._cache.bytes
+        free = int(_MEMORY_SHARE * free_bytes(self._device)) - growing
         batch = self._batch_size or _GROUPS_AT_A_TIME.get(self._device.type, _GROUPS_AT_A_TIME_ELSEWHERE)
         batch = min(batch, count)
         while batch > 1 and estimate(batch, views) > free:
@@ -281,7 +297,7 @@ class NetworkPredictor:
         return pixels
 
     def _encode(self, images: "Sequence[tuple[PlacedView, Tensor]]") -> "dict[Any, Tensor]":
-        """Return tokens (P, C), on the CPU, of images (3, H, W) of one size, by key; keep those of map images."""
+        """Return tokens (P, C) of images (3, H, W) of one size, by key; keep those of map images."""
         import torch
 
         # Measured: float16 changes depth by 1.2e-4 of its size, a trunk in bfloat16 by 4e-3 whatever is kept.
@@ -291,12 +307,30 @@ class NetworkPredictor:
         for start in range(0, len(images), _IMAGES_AT_A_TIME):
             part = images[start : start + _IMAGES_AT_A_TIME]
             batch = torch.stack([image for _, image in part])
-            for (placed, _), tokens in zip(part, fitting(batch).to("cpu", dtype), strict=True):
+            try:
+                encoded = fitting(batch)
+            except ToolkitError:
+                if not self._makes_room():
+                    raise
+                encoded = fitting(batch)
+            for (placed, _), tokens in zip(part, encoded.to(self._kept_on, dtype), strict=True):
                 # A copy: a part of the batch would hold all of it in memory.
                 found[placed.key] = tokens.clone()
                 if placed.view.in_map:
                     self._cache.put(placed.key, found[placed.key])
         return found
+
+    def _makes_room(self) -> bool:
+        """Hold encodings on the CPU from now on; tell whether that frees memory of the device."""
+        import torch
+
+        if self._kept_on.type == "cpu" or not self._cache.bytes:
+            return False
+        log.warning("%s has no room for the encodings of map images any more: the CPU holds them", self._device)
+        self._cache.clear()
+        self._fitting.clear()
+        self._kept_on = torch.device("cpu")
+        return True
 
     def _run(
         self, numbers: Sequence[int], groups: Sequence[list[PlacedView]], tokens: "Sequence[list[Tensor | str]]"
@@ -311,7 +345,7 @@ class NetworkPredictor:
             if isinstance(found[0], str):
                 results[number] = _nothing(len(group), found[0])
             else:
-                stacked = torch.stack([one for one in found if not isinstance(one, str)])
+                stacked = torch.stack([one.to(self._kept_on) for one in found if not isinstance(one, str)])
                 alike.setdefault(len(seen), []).append((number, group, seen, stacked))
         for rows in alike.values():
             output = self._forward(torch.stack([stacked for *_, stacked in rows]), rows[0][1][0].size).numpy()
@@ -331,6 +365,8 @@ class NetworkPredictor:
                 with torch.inference_mode():
                     return run(tokens[:, :views])
             except ToolkitError as error:
+                if self._makes_room():
+                    continue
                 if views <= _LEAST_VIEWS:
                     raise ToolkitError(
                         f"The memory of {self._device} does not hold {self._architecture.title} with {views} views of "
