@@ -137,3 +137,13 @@ def test_a_run_with_all_stages_is_reused_and_repeated(small_capture: Path, small
         stage: "done" if stage == "localize" else "reused" for stage in STAGES
     }
     assert {path.name: path.read_bytes() for path in poses} == before, "the same seed gives the same poses"
+
+
+def test_a_notebook_starts_without_nbformat() -> None:
+    """Its schemas take two seconds to import, in each kernel."""
+    code = (
+        "import sys; from toolkit.notebook import notebook_parameters, notebook_path;"
+        "notebook_parameters(notebook_path('localize')); sys.exit('nbformat' in sys.modules)"
+    )
+    root = notebook_path("localize").parents[1]
+    assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
