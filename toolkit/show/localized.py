@@ -242,22 +242,22 @@ class LocalizedPair:
             pixels = query.correspondences.pixels[matches]
             cameras.append(_shown_image(session, row, pose, query.correspondences, matches, pixels))
         cameras.sort(key=lambda camera: -camera.num_inliers)
-        references = [self._reference(name, query, number) for number, name in enumerate(query.references)]
-        rejected = [self._reference(name, query) for name in query.rejected]
         return QueryDetails(
             cameras,
-            [image for image in references if image is not None][:REFERENCES],
-            [image for image in rejected if image is not None][:REFERENCES],
+            self._references(query, list(enumerate(query.references))),
+            self._references(query, [(-1, name) for name in query.rejected]),
         )
 
-    def _reference(self, name: str, query: LocalizedQuery, number: int = -1) -> ShownImage | None:
-        """Return a map image with the correspondences that it sees as reference `number`; None: no such image."""
-        row, found = self.map_session.row_of_name.get(name), query.correspondences
-        if row is None:
-            return None
-        views = np.flatnonzero(found.view_reference == number)
-        pose = self.map_session.world_from_cam([row])[0]
-        return _shown_image(self.map_session, row, pose, found, found.view_of[views], found.view_pixels[views])
+    def _references(self, query: LocalizedQuery, names: Sequence[tuple[int, str]]) -> list[ShownImage]:
+        """Return the first few map images, of (number, name), with what each sees as the reference of that number."""
+        session, found = self.map_session, query.correspondences
+        known = [(number, session.row_of_name[name]) for number, name in names if name in session.row_of_name]
+        poses = session.world_from_cam([row for _, row in known[:REFERENCES]])
+        images = []
+        for (number, row), pose in zip(known, poses, strict=False):
+            views = np.flatnonzero(found.view_reference == number)
+            images.append(_shown_image(session, row, pose, found, found.view_of[views], found.view_pixels[views]))
+        return images
 
 
 def _shown_image(
