@@ -74,7 +74,9 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def execute_here(path: Path, output: Path, parameters: dict[str, Any], progress: object = None) -> tuple[Any, float]:
+def execute_here(
+    path: Path, output: Path, parameters: dict[str, Any], progress: object = None, kernels: object = None
+) -> tuple[Any, float]:
     """Do what `pipeline.execute` does, without the seconds that a kernel takes to start."""
     notebook.check_parameters(path, parameters)
     content = nbformat.read(path, as_version=4)

@@ -49,7 +49,7 @@ class Events:
 
 
 def execute_cells(
-    events: Events, path: Path, output: Path, parameters: dict[str, Any], progress: object = None
+    events: Events, path: Path, output: Path, parameters: dict[str, Any], *_: object
 ) -> tuple[Any, float]:
     """Do what `toolkit.notebook.execute` does, in this process; of what cells display, counts alone are kept."""
     import IPython.display

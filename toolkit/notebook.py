@@ -11,7 +11,6 @@ import os
 import re
 import shutil
 import sys
-import tempfile
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,12 +20,11 @@ import tqdm.std
 
 from toolkit import errors
 from toolkit.errors import ManifestError, StageError, shortage
-from toolkit.files import SceneFiles, process_tag
+from toolkit.files import SceneFiles
 from toolkit.manifest import OPTIONAL, DemoData, Manifest, nearest
 from toolkit.runs.folder import LOG_VARIABLE, log_to
-from toolkit.runs.kernel import MemoryWatch, end_children, kernel_class, kernel_error
+from toolkit.runs.kernel import TEXT_BARS, Kernels, MemoryWatch, kernel_error
 from toolkit.runs.pairs import left_out_of
-from toolkit.show import TEXT_BARS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -314,7 +312,11 @@ class StatusLine:
 
 
 def execute(
-    path: Path, output: Path, parameters: dict[str, Any], progress: StatusLine | None = None
+    path: Path,
+    output: Path,
+    parameters: dict[str, Any],
+    progress: StatusLine | None = None,
+    kernels: Kernels | None = None,
 ) -> tuple[Any, float]:
     """Execute the notebook `path` in a fresh kernel and write the executed copy to `output`.
 
@@ -323,6 +325,7 @@ def execute(
         output: where the executed copy goes, also of a notebook that failed.
         parameters: replacing those of its parameters cell.
         progress: shows what the kernel writes to stderr.
+        kernels: gives the kernel; None: one is started for this notebook.
 
     Returns:
         The executed notebook, and the highest memory (MB) of this process and the kernel's together.
@@ -332,24 +335,22 @@ def execute(
         StageError: a cell failed, or the kernel died; `output` shows where.
     """
     check_parameters(path, parameters)
+    if kernels is None:
+        with Kernels(output.parent) as own:
+            return execute(path, output, parameters, progress, own)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    memory, kernel = MemoryWatch(), kernels.take()  # it starts meanwhile
     # papermill takes seconds to import, and a run that reuses everything does not need it.
     import papermill
     from jupyter_client.kernelspec import NoSuchKernel
     from nbclient.exceptions import DeadKernelError
     from nbformat.reader import NotJSONError
     from papermill.exceptions import PapermillExecutionError
-    from traitlets.config import Config
 
-    output.parent.mkdir(parents=True, exist_ok=True)
     partial = output.with_name(f".{output.stem}.partial.ipynb")
-    # For the connection file and the sockets. Sockets in the file system: other users of the machine cannot listen in;
-    # their paths have to be short.
-    folder = tempfile.TemporaryDirectory(prefix=f"kernel.{process_tag()}-", ignore_cleanup_errors=True)
-    ipc = os.name == "posix" and len(folder.name) < 80
-    sockets = {"transport": "ipc", "ip": f"{folder.name}/s"} if ipc else {}
-    memory, kernels = MemoryWatch(), kernel_class()
-    os.environ[TEXT_BARS] = "1"
+    answers = False
     try:
+        kernel.started.result()
         notebook = papermill.execute_notebook(
             # papermill formats paths with the parameters, so braces in them need escaping.
             *(str(file).replace("{", "{{").replace("}", "}}") for file in (path, partial)),
@@ -357,25 +358,21 @@ def execute(
             kernel_name="python3",
             progress_bar=False,
             stderr_file=progress,
-            # What the kernel has to say of its own shutdown is of no use to anybody.
-            extra_arguments=["--log-level=CRITICAL"],
-            cwd=str(output.parent),
-            kernel_manager_class=kernels,
-            config=Config({"KernelManager": {"connection_file": f"{folder.name}/kernel.json"} | sockets}),
+            km=kernel.manager,
         )
+        answers = True
     except PapermillExecutionError as error:
+        answers = True
         raise _cell_error(error, output) from None
     except (DeadKernelError, RuntimeError, NoSuchKernel) as error:
-        raise kernel_error(error, kernels.ended_by, memory.stop(), output) from error
+        raise kernel_error(error, kernel.ended_by, memory.stop(), output) from error
     except KeyboardInterrupt:
         # Of the tasks that are left behind asyncio would print tracebacks.
         logging.getLogger("asyncio").setLevel(logging.CRITICAL)
         raise
     finally:
-        del os.environ[TEXT_BARS]
-        end_children(folder.name)
+        kernels.end(kernel, by_force=not answers)
         memory.stop()
-        folder.cleanup()
         if partial.exists():
             try:
                 _tidy_streams(partial)

@@ -65,6 +65,7 @@ from toolkit.notebook import (
 )
 from toolkit.runs.cluster import open_cluster
 from toolkit.runs.folder import LOG, held
+from toolkit.runs.kernel import Kernels
 from toolkit.runs.pairs import pair_text, way_out
 from toolkit.runs.record import RunLog, failures
 
@@ -208,14 +209,15 @@ def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: boo
     try:
         record.write()
         failed: list[tuple[Job, StageError]] = []
-        for i, job in enumerate(jobs, 1):
-            head = f"[{i}/{len(jobs)}] {job.stage:<9} {job.name}"
-            try:
-                _run_or_reuse(job, inputs[job.files.scene], failed, force, head, record, say)
-            except StageError as error:
-                if not error.of_the_data:
-                    raise
-                failed.append((job, error))  # other captures and pairs may do
+        with Kernels(run_dir / "notebooks", len(jobs)) as kernels:
+            for i, job in enumerate(jobs, 1):
+                head = f"[{i}/{len(jobs)}] {job.stage:<9} {job.name}"
+                try:
+                    _run_or_reuse(job, inputs[job.files.scene], failed, force, head, record, say, kernels)
+                except StageError as error:
+                    if not error.of_the_data:
+                        raise
+                    failed.append((job, error))  # other captures and pairs may do
         last = [row["status"] for row in record.rows if row["stage"] == stages[-1]]
         if failed and not {"done", "reused"} & set(last):
             raise failed[0][1]
@@ -233,7 +235,14 @@ def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: boo
 
 
 def _run_or_reuse(
-    job: Job, capture: str, failed: list[tuple[Job, StageError]], force: bool, head: str, record: RunLog, say: Say
+    job: Job,
+    capture: str,
+    failed: list[tuple[Job, StageError]],
+    force: bool,
+    head: str,
+    record: RunLog,
+    say: Say,
+    kernels: Kernels,
 ) -> None:
     """Execute a job, or say why not, and add its row to the record."""
     wanted = _inputs_of(job, capture)
@@ -243,7 +252,7 @@ def _run_or_reuse(
     elif not force and (reusable := _reusable(job, wanted)):
         row, said = reusable, "reused"
     else:
-        row, said = _run_job(job, wanted, force, head, record, say), ""
+        row, said = _run_job(job, wanted, force, head, record, say, kernels), ""
     if said:
         say(f"{head}  {said}")
         log.info("%s  %s", head, said)
@@ -471,7 +480,9 @@ def _reusable(job: Job, wanted: str) -> dict[str, Any] | None:
     return None if record["row"].get("left_out") else {**record["row"], "status": "reused"}
 
 
-def _run_job(job: Job, wanted: str, force: bool, head: str, record: RunLog, say: Say) -> dict[str, Any]:
+def _run_job(
+    job: Job, wanted: str, force: bool, head: str, record: RunLog, say: Say, kernels: Kernels
+) -> dict[str, Any]:
     """Execute a job and return its row of `run.json`."""
     line = StatusLine(head, say)
     row: dict[str, Any] = {"stage": job.stage, "scene": job.files.scene, "part": job.label}
@@ -483,7 +494,7 @@ def _run_job(job: Job, wanted: str, force: bool, head: str, record: RunLog, say:
         job.forget()
     started = time.perf_counter()
     try:
-        notebook, memory = execute(notebook_path(job.stage), job.notebook, job.parameters, line)
+        notebook, memory = execute(notebook_path(job.stage), job.notebook, job.parameters, line, kernels)
     except BaseException as error:
         status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
         line.end(status)

@@ -1,12 +1,29 @@
-"""The kernels of a run: how they ended, how much memory they took."""
+"""The kernels of a run: how they start and end, how much memory they take."""
 
+import asyncio
+import os
 import signal
+import tempfile
 import threading
+from collections.abc import Coroutine
+from concurrent.futures import Future
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from toolkit.errors import FREE_MEMORY, StageError, first_line
+from toolkit.files import process_tag
+
+TEXT_BARS = "TOOLKIT_TEXT_BARS"
+"""Variable of the environment that is set where no one sees widgets: progress bars are text then."""
+_PATIENCE_S = 10.0
+_ARGUMENTS = [
+    # What the kernel has to say of its own shutdown is of no use to anybody.
+    "--log-level=CRITICAL",
+    # What takes long to import, while the notebook before still runs.
+    "--IPKernelApp.exec_lines=__import__('toolkit.notebook'); __import__('toolkit.evaluate'); __import__('matplotlib.pyplot')",
+]
 
 
 def kernel_error(error: Exception, ended_by: int | None, memory_mb: float, output: Path) -> StageError:
@@ -25,23 +42,99 @@ def kernel_error(error: Exception, ended_by: int | None, memory_mb: float, outpu
     return StageError(text + where)
 
 
-def kernel_class() -> Any:
-    """Return a class of kernel managers that keeps how its kernel ended."""
-    from jupyter_client.manager import AsyncKernelManager
+@dataclass(frozen=True)
+class RunningKernel:
+    """A kernel that has been started, or is being."""
 
-    class Kernel(AsyncKernelManager):
-        ended_by: int | None = None
-        """Exit status, negative for a signal; None: no kernel has died."""
+    manager: Any
+    """Of `jupyter_client`."""
+    folder: tempfile.TemporaryDirectory[str]
+    """Of its connection file and its sockets."""
+    started: Future[None]
 
-        async def is_alive(self) -> bool:  # type: ignore[override]
-            status = await self.provisioner.poll() if self.provisioner else None
-            type(self).ended_by = status or type(self).ended_by
-            return bool(await super().is_alive())
+    @property
+    def ended_by(self) -> int | None:
+        """Exit status, negative for a signal; None: it has not died."""
+        process = getattr(self.manager.provisioner, "process", None)
+        return None if process is None else process.poll()
 
-    return Kernel
+
+class Kernels:
+    """Starts the kernels of notebooks, that of the next one while one runs, and ends them in the background."""
+
+    def __init__(self, cwd: Path, notebooks: int = 1) -> None:
+        """`cwd` is the working folder of the kernels, `notebooks` how many there will be at most."""
+        self._cwd, self._left = cwd, notebooks
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
+        self._thread.start()
+        self._spare: RunningKernel | None = None
+        self._started: list[RunningKernel] = []
+        self._ended: dict[str, Future[None]] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End all kernels."""
+        for kernel in self._started:
+            self.end(kernel, by_force=True)
+        for kernel in self._started:
+            with suppress(Exception):
+                self._ended[kernel.folder.name].result(timeout=_PATIENCE_S)
+            _end_children(kernel.folder.name)
+            kernel.folder.cleanup()
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(_PATIENCE_S)
+
+    def take(self) -> RunningKernel:
+        """Return a kernel, and begin to start that of the next notebook, if there will be one."""
+        kernel = self._spare or self._start()
+        self._left -= 1
+        self._spare = self._start() if self._left > 0 else None
+        return kernel
+
+    def end(self, kernel: RunningKernel, by_force: bool) -> None:
+        """Begin to end a kernel, if that has not been asked for yet."""
+        if kernel.folder.name not in self._ended:
+            self._ended[kernel.folder.name] = self._in_thread(_shut_down(kernel, by_force))
+
+    def _start(self) -> RunningKernel:
+        from jupyter_client.manager import AsyncKernelManager
+        from traitlets.config import Config
+
+        # Sockets in the file system: other users of the machine cannot listen in; their paths have to be short.
+        folder = tempfile.TemporaryDirectory(prefix=f"kernel.{process_tag()}-", ignore_cleanup_errors=True)
+        ipc = os.name == "posix" and len(folder.name) < 80
+        sockets = {"transport": "ipc", "ip": f"{folder.name}/s"} if ipc else {}
+        config = Config({"KernelManager": {"connection_file": f"{folder.name}/kernel.json"} | sockets})
+        manager = AsyncKernelManager(kernel_name="python3", config=config)
+        given = {"cwd": str(self._cwd), "env": os.environ | {TEXT_BARS: "1"}, "extra_arguments": _ARGUMENTS}
+        kernel = RunningKernel(manager, folder, self._in_thread(_start_up(manager, given)))
+        self._started.append(kernel)
+        return kernel
+
+    def _in_thread(self, work: Coroutine[Any, Any, None]) -> Future[None]:
+        return asyncio.run_coroutine_threadsafe(work, self._loop)
 
 
-def end_children(folder: str) -> None:
+async def _start_up(manager: Any, given: dict[str, Any]) -> None:
+    await manager.start_kernel(**given)
+
+
+async def _shut_down(kernel: RunningKernel, by_force: bool) -> None:
+    with suppress(Exception):  # what does not start need not end
+        await asyncio.wrap_future(kernel.started)
+    if kernel.manager.has_kernel and by_force:
+        # The manager would interrupt it first, of which a kernel that is starting prints a traceback.
+        await kernel.manager.provisioner.kill()
+        await kernel.manager.provisioner.wait()
+        await kernel.manager.cleanup_resources()
+    elif kernel.manager.has_kernel:
+        await kernel.manager.shutdown_kernel()
+
+
+def _end_children(folder: str) -> None:
     """End the kernel whose connection file lies in a folder: one that was starting when the run was interrupted."""
     import psutil
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from toolkit.errors import ArtifactError
-from toolkit.show import TEXT_BARS
+from toolkit.runs.kernel import TEXT_BARS
 from toolkit.show.recordings import open_command
 
 ASSETS = "RERUN_NOTEBOOK_ASSET"
