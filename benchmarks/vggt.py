@@ -1,11 +1,12 @@
-"""VGGT's cameras of a query and its references: seconds and memory, beside the official forward.
+"""VGGT on a query and its references: seconds and memory, beside the official forward.
 
     python benchmarks/vggt.py [--official CHECKOUT] [--checkpoint FILE] [--views 6] [--size 294x518] [--threads 2]
 
-The toolkit computes what a pose needs: one new query is encoded, its references' encodings are kept from earlier
-queries, and the camera head alone runs. The official code computes what its forward computes: all encodings, and the
-camera, depth and point heads, in float32. Both get the same images and weights on the same cores, one right after the
-other, each in a process of its own; the difference between their cameras shows that they did the same work. Wall
+On equal terms, both compute all encodings and the same heads: the camera head alone, and those of camera, depth and
+points, as the official forward has them. A last row is what localization computes: one new query is encoded, its
+references' encodings are kept from earlier queries, and the camera head alone runs. Both get the same images and
+weights on the same cores, one right after the other, each in a process of its own; the difference between their outputs
+shows that they did the same work. The official code runs in float32 on a CPU. Wall
 seconds mean little while others use the machine; CPU seconds mean more. Peak memory is what is held at most above the
 weights and the input. Without a checkpoint, weights are random (4.4 GB in the folder for temporary files).
 """
@@ -16,12 +17,13 @@ import os
 import subprocess
 import sys
 import tempfile
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 from common import add_out, check_out, in_own_process, limit_cores, markdown_table, write_out
 from embed import describe_machine
-from vggt_worker import measure
+from vggt_worker import HEADS, OUTPUTS, measure
 
 WORKER = Path(__file__).with_name("vggt_worker.py")
 GPU_VIEWS = (6, 11)
@@ -66,7 +68,7 @@ def write_random_weights(path: Path) -> None:
 
 
 def run_toolkit(job: dict[str, Any]) -> dict[str, Any]:
-    """Predict cameras in this process, which should be a fresh one: `measure`, precision, load; writes them."""
+    """Predict in this process, which should be a fresh one: `measure`, precision, load; writes the outputs."""
     import torch
 
     from toolkit.models.compute import resolve_precision
@@ -75,29 +77,31 @@ def run_toolkit(job: dict[str, Any]) -> dict[str, Any]:
     torch.set_num_threads(job["threads"])
     device = torch.device(job["device"])
     dtype = resolve_precision(job["precision"], device)
-    model = VGGT.from_checkpoint(job["weights"], heads=("camera",), compute_dtype=dtype).to(device)
+    model = VGGT.from_checkpoint(job["weights"], heads=job["heads"], compute_dtype=dtype).to(device)
     before = os.getloadavg()[0]
     images = torch.load(job["images"]).to(device)
     with torch.inference_mode():
-        references = torch.stack([model.encode(group[1:]) for group in images])
+        kept = torch.stack([model.encode(group[1:]) for group in images]) if job["kept"] else None
 
         def run() -> Any:
-            queries = model.encode(images[:, 0])[:, None]
-            tokens = torch.cat([queries, references], dim=1)
-            return model(torch.empty(images.shape, device="meta"), patch_tokens=tokens)["pose_enc"].cpu()
+            tokens = None
+            if kept is not None:
+                tokens = torch.cat([model.encode(images[:, 0])[:, None], kept], dim=1)
+            output = model(images, patch_tokens=tokens)
+            return {name: output[name].cpu() for name in OUTPUTS if name in output}
 
         model(images[..., :28, :28])
         if device.type == "cuda":
             run()
         found = [measure(run, job["device"]) for _ in range(job["repeat"])]
-    pose_enc, best = min(found, key=lambda one: one[1]["seconds"])
-    torch.save(pose_enc, job["out"])
+    output, best = min(found, key=lambda one: one[1]["seconds"])
+    torch.save(output, job["out"])
     precision = str(dtype).removeprefix("torch.")
     return best | {"precision": precision, "load": [before, os.getloadavg()[0]]}
 
 
 def run_official(checkout: str, job: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Run the official forward in a process of its own: `measure`, precision, load; writes its cameras."""
+    """Run the official forward in a process of its own: `measure`, precision, load; writes its outputs."""
     files = [folder / "job.json", folder / "result.json"]
     files[0].write_text(json.dumps(job))
     if subprocess.run([sys.executable, WORKER, checkout, *files], check=False).returncode:
@@ -109,25 +113,30 @@ def run_official(checkout: str, job: dict[str, Any], folder: Path) -> dict[str, 
 def compare(
     checkout: str, job: dict[str, Any], precisions: list[str], official: str, folder: Path
 ) -> list[dict[str, Any]]:
-    """Return a row for the official forward, if there is a checkout, and one for each precision of the toolkit."""
+    """Return rows of each set of heads: the official forward, if there is a checkout, and each precision of ours."""
     import torch
 
     rows = []
-    if checkout:
-        theirs = job | {"out": str(folder / "official.pt"), "precision": official}
-        rows.append({"name": "official", **run_official(checkout, theirs, folder)})
-        print(f"official {rows[-1]['seconds']:.3f} s", file=sys.stderr)
-    for precision in precisions:
-        ours = job | {"out": str(folder / "toolkit.pt"), "precision": precision}
-        row = {"name": "toolkit", **in_own_process(run_toolkit, ours)}
-        print(f"toolkit, {precision} {row['seconds']:.3f} s", file=sys.stderr)
+    for title, heads in (("all heads", HEADS), ("camera head", HEADS[:1])):
+        base = None
         if checkout:
-            found, expected = torch.load(ours["out"]), torch.load(folder / "official.pt")
-            row["largest_difference"] = float((found - expected).abs().max())
-            row["relative_difference"] = float((found - expected).norm() / expected.norm())
-            for name in ("seconds", "cpu", "peak_mb"):
-                row[f"{name}_ratio"] = row[name] / rows[0][name]
-        rows.append(row)
+            theirs = job | {"out": str(folder / "official.pt"), "precision": official, "heads": heads}
+            base = {"name": f"official, {title}", **run_official(checkout, theirs, folder)}
+            rows.append(base)
+            print(f"{base['name']} {base['seconds']:.3f} s", file=sys.stderr)
+        for precision, kept in product(precisions, (False, True) if heads == HEADS[:1] else (False,)):
+            ours = job | {"out": str(folder / "toolkit.pt"), "precision": precision, "heads": heads, "kept": kept}
+            name = f"toolkit, {title}{', references kept' if kept else ''}"
+            row = {"name": name, **in_own_process(run_toolkit, ours)}
+            print(f"{name}, {precision} {row['seconds']:.3f} s", file=sys.stderr)
+            if base:
+                found, expected = torch.load(ours["out"]), torch.load(folder / "official.pt")
+                row["relative_difference"] = max(
+                    float((found[output] - expected[output]).norm() / expected[output].norm()) for output in expected
+                )
+                for measured in ("seconds", "cpu", "peak_mb"):
+                    row[f"{measured}_ratio"] = row[measured] / base[measured]
+            rows.append(row)
     return rows
 
 
@@ -140,8 +149,7 @@ def table(rows: list[dict[str, Any]]) -> str:
         "CPU ratio": ("cpu_ratio", "{:.2f}"),
         "peak MB": ("peak_mb", "{:.0f}"),
         "peak ratio": ("peak_mb_ratio", "{:.2f}"),
-        "pose_enc: largest difference": ("largest_difference", "{:.1e}"),
-        "relative": ("relative_difference", "{:.1e}"),
+        "largest relative difference": ("relative_difference", "{:.1e}"),
     }
     lines = []
     for row in rows:

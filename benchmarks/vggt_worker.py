@@ -1,10 +1,10 @@
-"""The official VGGT on a job that vggt.py writes: its forward as it comes, with all heads. Without the toolkit.
+"""The official VGGT on a job that vggt.py writes: its forward as it comes. Without the toolkit.
 
     python benchmarks/vggt_worker.py OFFICIAL [JOB RESULT]
 
 OFFICIAL is a checkout of facebookresearch/vggt, JOB and RESULT are JSON files; without them, only the import is
-checked. All heads are camera, depth and points. The track head is not built, as it runs only when asked for points to
-follow; what it alone imports (einops) is not needed.
+checked. The job says which heads run, of camera, depth and points. The track head is not built, as it runs only when
+asked for points to follow; what it alone imports (einops) is not needed.
 """
 
 import gc
@@ -12,12 +12,16 @@ import json
 import os
 import sys
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
 from megaloc_worker import clocks, peak_bytes
+
+HEADS = ("camera", "depth", "point")
+OUTPUTS = ("pose_enc", "depth", "world_points")
+"""That are compared, where their heads run."""
 
 
 def measure(run: Callable[[], Any], device: str) -> tuple[Any, dict[str, float]]:
@@ -65,8 +69,8 @@ def import_official(checkout: str) -> Any:
     return VGGT
 
 
-def load_official(checkout: str, weights: str, device: str) -> Any:
-    """Return the official network with the weights of a safetensors file, float32."""
+def load_official(checkout: str, weights: str, device: str, heads: Sequence[str] = HEADS) -> Any:
+    """Return the official network with the weights of a safetensors file, float32, and these heads."""
     import torch
     from safetensors.torch import load_file
     from torch.nn import init
@@ -76,10 +80,12 @@ def load_official(checkout: str, weights: str, device: str) -> Any:
     drawn = {name: getattr(init, name) for name in ("trunc_normal_", "normal_", "kaiming_uniform_", "uniform_")}
     for name in drawn:
         setattr(init, name, lambda tensor, *_, **__: tensor)
-    model = official(enable_track=False)
+    enabled = {f"enable_{head}": head in heads for head in (*HEADS, "track")}
+    model = official(**enabled)
     for name, function in drawn.items():
         setattr(init, name, function)
-    state = {key: value for key, value in load_file(weights).items() if not key.startswith("track_head.")}
+    left_out = tuple(f"{head}_head." for head in (*HEADS, "track") if head not in heads)
+    state = {key: value for key, value in load_file(weights).items() if not key.startswith(left_out)}
     model.load_state_dict(state, strict=True, assign=True)
     return model.eval().requires_grad_(False).to(torch.device(device))
 
@@ -105,7 +111,7 @@ def main() -> None:
     job, result = json.loads(Path(sys.argv[2]).read_text()), Path(sys.argv[3])
     torch.set_num_threads(job["threads"])
     device, precision = job["device"], job["precision"]
-    model = load_official(sys.argv[1], job["weights"], device)
+    model = load_official(sys.argv[1], job["weights"], device, job["heads"])
     before = os.getloadavg()[0]
     images = torch.load(job["images"]).to(device)
     with torch.inference_mode():
@@ -116,11 +122,12 @@ def main() -> None:
         def run() -> Any:
             # The heads turn autocast off for CUDA alone: on a CPU it would reach into them.
             with autocast(device, precision):
-                return model(images)["pose_enc"].float().cpu()
+                output = model(images)
+            return {name: output[name].float().cpu() for name in OUTPUTS if name in output}
 
         found = [measure(run, device) for _ in range(job["repeat"])]
-    pose_enc, best = min(found, key=lambda one: one[1]["seconds"])
-    torch.save(pose_enc, job["out"])
+    output, best = min(found, key=lambda one: one[1]["seconds"])
+    torch.save(output, job["out"])
     result.write_text(json.dumps(best | {"precision": precision, "load": [before, os.getloadavg()[0]]}))
 
 
