@@ -262,7 +262,7 @@ class _Pair:
         if predictor is not None:
             record |= {
                 "predictor": {"name": predictor.name} | predictor.settings,
-                "references": settings.predictor.model_dump(exclude={"name", "checkpoint", "batch_size"}),
+                "references": settings.predictor.model_dump(exclude={"name", "checkpoint", "batch_size", "compile"}),
                 "depths": map_session.depths_fingerprint,
             }
         return record

@@ -421,6 +421,29 @@ def test_estimates_are_as_measured() -> None:
     assert estimate_bytes(VGGT_ROW, 1, 11, (518, 518), on_cpu=False) > estimate_bytes(VGGT_ROW, 1, 11, (518, 518))
 
 
+# Compiled
+
+
+@pytest.mark.slow
+def test_compiled_blocks_give_the_same(make: Make, photographs: Photographs) -> None:
+    groups = [photographs.group(*sizes) for sizes in ([WIDE] * 3, [WIDE] * 4, [HIGHER, WIDE])]
+    expected = make(needs_depth=True).predict(groups)
+    for found, other in zip(make(needs_depth=True, compile=True).predict(groups), expected, strict=True):
+        assert_same(found, other)
+
+
+def test_what_does_not_compile_says_so_at_the_start(
+    make: Make, photographs: Photographs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: Any) -> Any:
+        raise RuntimeError("InvalidCxxCompiler: no g++\nand much more")
+
+    monkeypatch.setattr(VGGT, "compile_blocks", lambda _: None)
+    monkeypatch.setattr(VGGT, "forward", fails)
+    with pytest.raises(ToolkitError, match=r"cannot compile VGGT on cpu \(.*no g\+\+\)\. Use localize"):
+        make(compile=True).predict([photographs.group(WIDE, WIDE)])
+
+
 # What is wrong with files
 
 

@@ -473,6 +473,7 @@ def open_predictor(settings: LocalizeSettings, capture: Capture, map_dir: Path) 
         checkpoint=settings.predictor.checkpoint,
         compute_device=settings.compute_device,
         dtype_compute=settings.dtype_compute,
+        compile=settings.predictor.compile,
         seed=settings.seed,
     )
     if predictor.simulated:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from toolkit.capture.images import default_workers, prefetch, read_image
 from toolkit.capture.turning import turn_image, turned_from_cam
-from toolkit.errors import ImageError, ManifestError, ToolkitError
+from toolkit.errors import ImageError, ManifestError, ToolkitError, first_line
 from toolkit.files import files_fingerprint
 from toolkit.geometry import invert, make_pose
 from toolkit.localizers.architectures import ARCHITECTURES, Architecture, Size, estimate_bytes
@@ -94,6 +94,7 @@ class NetworkPredictor:
         batch_size: int | None = None,
         cache_bytes: int = CACHE_BYTES,
         architecture: Architecture = ARCHITECTURES["vggt"],
+        compile: bool = False,  # noqa: A002
     ) -> None:
         """
         Args:
@@ -104,6 +105,7 @@ class NetworkPredictor:
             batch_size: groups at a time, at most; None: what is usual for the device.
             cache_bytes: memory for the encodings of map images: of the device where that has plenty, else of the CPU.
             architecture: which network.
+            compile: see `PredictorSettings`.
 
         Raises:
             ManifestError: no such device or precision.
@@ -118,6 +120,7 @@ class NetworkPredictor:
         self.compute_device, self.dtype_compute = compute_device, dtype_compute
         self.needs_depth = needs_depth
         self._batch_size = batch_size
+        self._compile = compile
         self._cache = TokenCache(cache_bytes)
         self._fitting: dict[tuple[int, Size], Fitting] = {}
         self._most_views: dict[Size, int] = {}
@@ -147,7 +150,9 @@ class NetworkPredictor:
 
     @cached_property
     def _model(self) -> Any:
-        return _load_network(self._architecture, self.checkpoint, self._heads, self._dtype, self._device)
+        return _load_network(
+            self._architecture, self.checkpoint, self._heads, self._dtype, self._device, self._compile
+        )
 
     @cached_property
     def _kept_on(self) -> "torch.device":
@@ -417,18 +422,42 @@ _loaded: dict[tuple[Any, ...], Any] = {}
 
 
 def _load_network(
-    architecture: Architecture, checkpoint: Path, heads: tuple[str, ...], dtype: "torch.dtype", device: "torch.device"
+    architecture: Architecture,
+    checkpoint: Path,
+    heads: tuple[str, ...],
+    dtype: "torch.dtype",
+    device: "torch.device",
+    compiled: bool,
 ) -> Any:
     """Return a network, ready to run.
 
     The last network is kept until another is asked for: a notebook that looks into one query after a run makes a
     predictor anew, and the weights are gigabytes.
     """
-    key = (checkpoint.resolve(), files_fingerprint([checkpoint]), architecture.name, heads, dtype, device)
+    key = (checkpoint.resolve(), files_fingerprint([checkpoint]), architecture.name, heads, dtype, device, compiled)
     if key not in _loaded:
         _loaded.clear()  # before the load: the memory may hold one network, and not two
-        _loaded[key] = on_device(architecture.load(checkpoint, heads, dtype), device, architecture.title)
+        network = on_device(architecture.load(checkpoint, heads, dtype), device, architecture.title)
+        if compiled:
+            _compile(network, architecture, device)
+        _loaded[key] = network
     return _loaded[key]
+
+
+def _compile(network: Any, architecture: Architecture, device: "torch.device") -> None:
+    """Compile a network's blocks, and run them once: what does not compile says so before there are queries."""
+    import torch
+
+    network.compile_blocks()
+    side = 2 * architecture.patch
+    try:
+        with torch.inference_mode():
+            network(torch.zeros(1, _LEAST_VIEWS, 3, side, side, device=device), ("camera",))
+    except Exception as error:  # of torch, of its compilers, and of the programs that these call
+        raise ToolkitError(
+            f"torch cannot compile {architecture.title} on {device} ({first_line(error)}). Use "
+            "localize.predictor.compile: false."
+        ) from error
 
 
 def _nothing(views: int, reason: str = "") -> Prediction:

@@ -23,6 +23,7 @@ def create_predictor(
     checkpoint: str | Path | None = None,
     compute_device: str = "auto",
     dtype_compute: str = "auto",
+    compile: bool = False,  # noqa: A002
     seed: int = 0,
 ) -> Predictor:
     """Return a ready predictor.
@@ -33,6 +34,7 @@ def create_predictor(
         map_dir, features: of `simulated`: folder of the triangulated maps, for depth, and their kind of features.
         checkpoint: of a network: file with the weights; None: the hub's cache, else a download.
         compute_device, dtype_compute: of a network, as `toolkit.models.compute` takes them.
+        compile: of a network, see `PredictorSettings`.
         seed: of `simulated`.
 
     Raises:
@@ -43,4 +45,6 @@ def create_predictor(
         raise ManifestError(f"Unknown predictor {name!r}. Known: {', '.join(PREDICTORS)}.")
     if name == "simulated":
         return SimulatedPredictor(sessions, map_dir, features, seed=seed)
-    return NetworkPredictor(checkpoint, compute_device, dtype_compute, architecture=ARCHITECTURES[name])
+    return NetworkPredictor(
+        checkpoint, compute_device, dtype_compute, architecture=ARCHITECTURES[name], compile=compile
+    )

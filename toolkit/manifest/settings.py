@@ -508,6 +508,9 @@ class PredictorSettings(Settings):
     """Retrieved images to choose them from, the best so many; null: all."""
     batch_size: Positive = 4
     """Query devices that the network is given at once. Poses do not depend on it."""
+    compile: bool = False
+    """Compile the network's blocks by `torch.compile`, which takes a minute or more at the start of each run, and on a
+    CPU a C++ compiler. Changes rounding only."""
     upright: bool = True
     """Show the network images turned so that gravity points down."""
     depth_points: Positive = 200

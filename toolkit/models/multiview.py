@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor, nn
 
+from toolkit.models.vit import Block
 from toolkit.models.weights import load_checkpoint
 
 FRAMES_AT_A_TIME = 8
@@ -68,6 +69,12 @@ class MultiView(nn.Module):
         """As `torch.nn.Module.load_state_dict`; keys of heads that are not held are ignored, strict or not."""
         held = {key: value for key, value in state_dict.items() if not key.startswith(self._ignored_keys)}
         return super().load_state_dict(held, strict=strict, assign=assign)
+
+    def compile_blocks(self) -> None:
+        """Let `torch.compile` make code of the blocks, for images of any size, when they first run."""
+        for part in self.modules():
+            if isinstance(part, Block):
+                part.compile(dynamic=True)
 
     @torch.no_grad()
     def encode(self, images: Tensor) -> Tensor:
