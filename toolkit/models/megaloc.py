@@ -27,11 +27,6 @@ class Backbone(Dinov2):
         x = self.norm(self._tokens(images))
         return x[:, 1:], x[:, 0]
 
-    def _resize(self, trained: Tensor, rows: int, columns: int) -> Tensor:
-        # As in training: by factors with an offset of 0.1, which the weights have learned to expect.
-        factors = ((rows + 0.1) / self.grid, (columns + 0.1) / self.grid)
-        return F.interpolate(trained, scale_factor=factors, mode="bicubic", antialias=False)
-
 
 class PatchMlp(nn.Sequential):
     """Two linear layers on each patch, (B, N, C) -> (B, N, out), with the keys of 1 x 1 convolutions."""

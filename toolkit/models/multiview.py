@@ -1,4 +1,4 @@
-"""What VGGT and its successor have in common: heads on a trunk, tokens of single images, official checkpoints."""
+"""What networks for several views have in common: heads on a trunk, tokens of single images, official checkpoints."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from toolkit.models.vit import Block
-from toolkit.models.weights import load_checkpoint
+from toolkit.models.weights import checkpoint_tensors, load_checkpoint
 
 FRAMES_AT_A_TIME = 8
 """Of the dense heads, on a GPU; on a CPU, one frame keeps all cores busy."""
@@ -28,6 +28,10 @@ class MultiView(nn.Module):
     known_heads: ClassVar[tuple[str, ...]]
     prefixes: ClassVar[Mapping[str, str]]
     """Prefixes of the keys of the official heads, held or not."""
+    unused: ClassVar[tuple[str, ...]] = ()
+    """Prefixes of the keys of official parts that are never held."""
+    class_tokens: ClassVar[int] = 0
+    """Tokens of an image that `encode` returns before its patches."""
     aggregator: Any
     """The trunk: `patch_embed` encodes patches, `camera_token` is a parameter (..., C)."""
 
@@ -55,15 +59,26 @@ class MultiView(nn.Module):
             WeightsError: the file is no checkpoint, or of another model; names missing, unexpected, mis-shaped keys.
             ValueError: unknown head.
         """
+        where, state = checkpoint_tensors(checkpoint)
         with torch.device("meta"):
-            model = cls(cls.known_heads if heads is None else heads, compute_dtype)
-        load_checkpoint(model, checkpoint, cls.title, ignore=model._ignored_keys)
+            model = cls(cls.known_heads if heads is None else heads, compute_dtype, **cls._sizes(state))
+        load_checkpoint(model, state, cls.title, ignore=model._ignored_keys, where=where)
         return model
+
+    @classmethod
+    def _sizes(cls, state: Mapping[str, Tensor]) -> dict[str, Any]:
+        """Return arguments of the constructor that the official checkpoints differ by."""
+        return {}
 
     @property
     def _ignored_keys(self) -> tuple[str, ...]:
         """Prefixes of the official checkpoint's keys that the model does not need."""
-        return tuple(prefix for head, prefix in self.prefixes.items() if head not in self.heads)
+        return (*self.unused, *(prefix for head, prefix in self.prefixes.items() if head not in self.heads))
+
+    @property
+    def channels(self) -> int:
+        """Of a token."""
+        return int(self.aggregator.camera_token.shape[-1])
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
         """As `torch.nn.Module.load_state_dict`; keys of heads that are not held are ignored, strict or not."""
@@ -78,7 +93,7 @@ class MultiView(nn.Module):
 
     @torch.no_grad()
     def encode(self, images: Tensor) -> Tensor:
-        """Return the patch tokens (N, P, C) float32 of images (N, 3, H, W), P = H / patch * W / patch.
+        """Return the tokens (N, P, C) float32 of images (N, 3, H, W), P = H / patch * W / patch + `class_tokens`.
 
         The tokens of an image depend on no other image: compute those of a map once and give them to `forward`.
 
@@ -88,7 +103,10 @@ class MultiView(nn.Module):
         if images.ndim != 4:
             raise ValueError(f"images have shape {tuple(images.shape)}; expected (N, 3, H, W).")
         self._check_images(images)
-        tokens: Tensor = self.aggregator.patch_embed(images.float())
+        return self._encoded(images.float())
+
+    def _encoded(self, images: Tensor) -> Tensor:
+        tokens: Tensor = self.aggregator.patch_embed(images)
         return tokens
 
     def _checked(
@@ -109,7 +127,7 @@ class MultiView(nn.Module):
         heads = self.heads if heads is None else _ordered_heads(heads, self.heads)
         if patch_tokens is None:
             patch_tokens = self.encode(images.flatten(0, 1)).unflatten(0, (B, S))
-        expected = (B, S, H // self.patch * (W // self.patch), self.aggregator.camera_token.shape[-1])
+        expected = (B, S, self.class_tokens + H // self.patch * (W // self.patch), self.channels)
         if patch_tokens.shape != expected:
             raise ValueError(
                 f"patch_tokens have shape {tuple(patch_tokens.shape)}; expected {expected} for images of shape "

@@ -14,6 +14,7 @@ from torch import Tensor
 from toolkit.capture.images import read_file
 from toolkit.errors import ImageError
 from toolkit.geometry import Floats, Ints
+from toolkit.models.vit import PATCH
 
 Source = str | Path | Image.Image | NDArray[np.uint8]
 """A path, a Pillow image, or an array (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) gray, uint8."""
@@ -68,6 +69,14 @@ def check_arguments(sources: Sequence[Source], mode: str, modes: Sequence[str]) 
         raise ValueError(f"mode is {mode!r}; expected one of {list(modes)}.")
     if not len(sources):
         raise ValueError("found no images; expected at least one.")
+
+
+def too_elongated(size: tuple[int, int], where: str | Path) -> ImageError:
+    """Return what is wrong with an image of this width and height of which a side vanishes."""
+    return ImageError(
+        f"Image of {size[0]} x {size[1]} pixels is too elongated for the network: {where}. Its shorter side would be "
+        f"less than half a patch of {PATCH} pixels; cut it."
+    )
 
 
 def stack(

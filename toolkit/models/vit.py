@@ -12,6 +12,7 @@ PATCH = 14
 """Side of a patch of DINOv2 in pixels."""
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
+_ROPE_BASE = 100.0
 
 Rope = tuple[Tensor, Tensor]
 """Cosines and signed sines of a rotary position embedding, each (N, C / heads): see `rotate_`."""
@@ -44,6 +45,12 @@ class SharedBuffer:
         return torch.addmm(bias, x.flatten(0, -2), weight.t(), out=out).view(*x.shape[:-1], len(weight))
 
 
+def normalized(images: Tensor) -> Tensor:
+    """Return images (..., 3, H, W) in [0, 1] with ImageNet's mean and deviation taken out of each channel."""
+    mean, std = (images.new_tensor(values).view(3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_STD))
+    return (images - mean) / std
+
+
 def _linear(x: Tensor, weight: Tensor, bias: Tensor, buffer: SharedBuffer | None) -> Tensor:
     return F.linear(x, weight, bias) if buffer is None else buffer.linear(x, weight, bias)
 
@@ -59,6 +66,31 @@ def rotate_(x: Tensor, rope: Rope, groups: int = 2) -> Tensor:
     halves = x.chunk(2 * groups, dim=-1)
     swapped = torch.cat([halves[index ^ 1] for index in range(2 * groups)], dim=-1)
     return x.mul_(cosine).addcmul_(swapped, sine)
+
+
+def places_of_view(rows: int, columns: int, special: int, device: torch.device) -> Tensor:
+    """Return the row and column of each token of a view, (special + rows * columns, 2), float32.
+
+    Special tokens, which come first, are at place 0, patches at places from 1.
+    """
+    places = torch.zeros(special + rows * columns, 2, device=device)
+    places[special:] = 1 + torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).to(places)
+    return places
+
+
+def rope_of_places(places: Tensor, head_dim: int) -> Rope:
+    """Return the rotary position embedding of tokens at places (T, 2), cosines and signed sines (T, head_dim).
+
+    The first half of D = head_dim channels rotates with the row, the second with the column; pair i of D / 4 rotates
+    by place * 100 ** (-4 i / D) radians.
+    """
+    half = head_dim // 2
+    frequencies = 1.0 / _ROPE_BASE ** (torch.arange(0, half, 2, device=places.device).float() / half)
+    angles = places[:, :, None] * frequencies  # (tokens, y and x, D / 4)
+    cosine, sine = angles.cos(), angles.sin()
+    cosine = torch.stack([cosine, cosine], dim=2).flatten(1)
+    sine = torch.stack([-sine, sine], dim=2).flatten(1)
+    return cosine, sine
 
 
 class Attention(nn.Module):
@@ -182,29 +214,50 @@ class PatchEmbed(nn.Module):
 
 
 class Dinov2(nn.Module):
-    """DINOv2 ViT-14 (Oquab et al., 2023). Subclasses add tokens and say how the position embedding is resized."""
+    """DINOv2 ViT-14 (Oquab et al., 2023). Subclasses add tokens and say what becomes of them."""
 
-    def __init__(self, dim: int, depth: int, num_heads: int, grid: int) -> None:
-        """`grid` is the number of rows and columns of patches that the position embedding was trained for."""
+    def __init__(
+        self,
+        dim: int,
+        depth: int,
+        num_heads: int,
+        grid: int,
+        norm_eps: float = 1e-6,
+        qk_norms: tuple[int, float] | None = None,
+    ) -> None:
+        """
+        Args:
+            dim, depth, num_heads: channels, blocks, and heads of each block.
+            grid: number of rows and columns of patches that the position embedding was trained for.
+            norm_eps: epsilon of the last norm.
+            qk_norms: from which block on queries and keys are normalized, and with which epsilon; None: in none.
+        """
         super().__init__()
         self.grid = grid
         self.patch_embed = PatchEmbed(dim)
         self.cls_token = nn.Parameter(torch.empty(1, 1, dim))
         self.pos_embed = nn.Parameter(torch.empty(1, grid * grid + 1, dim))
-        self.blocks = nn.ModuleList([Block(dim, num_heads) for _ in range(depth)])
-        self.norm = nn.LayerNorm(dim, eps=1e-6)
+        first, eps = qk_norms or (depth, None)
+        self.blocks = nn.ModuleList([
+            Block(dim, num_heads, qk_norm_eps=eps if block >= first else None) for block in range(depth)
+        ])  # fmt: skip
+        self.norm = nn.LayerNorm(dim, eps=norm_eps)
 
     def _tokens(self, images: Tensor, *registers: Tensor) -> Tensor:
         """Return the tokens after the last block: class token, registers (1, R, C), patches; before the norm."""
-        position = self._position(images.shape[2] // PATCH, images.shape[3] // PATCH)
-        patches = self.patch_embed(images.to(self.patch_embed.proj.weight.dtype))
-        cls_token = (self.cls_token + position[:, :1]).to(patches.dtype)
-        special = torch.cat([cls_token, *registers], dim=1).expand(len(images), -1, -1)
-        x = torch.cat([special, patches + position[:, 1:].to(patches.dtype)], dim=1)
+        x = self._embedded(images, *registers)
         buffer = SharedBuffer.for_device(x.device)
         for block in self.blocks:
             x = block(x, buffer=buffer)
         return x
+
+    def _embedded(self, images: Tensor, *registers: Tensor) -> Tensor:
+        """Return the tokens before the first block."""
+        position = self._position(images.shape[2] // PATCH, images.shape[3] // PATCH)
+        patches = self.patch_embed(images.to(self.patch_embed.proj.weight.dtype))
+        cls_token = (self.cls_token + position[:, :1]).to(patches.dtype)
+        special = torch.cat([cls_token, *registers], dim=1).expand(len(images), -1, -1)
+        return torch.cat([special, patches + position[:, 1:].to(patches.dtype)], dim=1)
 
     def _position(self, rows: int, columns: int) -> Tensor:
         """Return the position embedding of the class token and the patches, (1, 1 + rows * columns, C)."""
@@ -216,7 +269,9 @@ class Dinov2(nn.Module):
 
     def _resize(self, trained: Tensor, rows: int, columns: int) -> Tensor:
         """Return the embedding (1, C, grid, grid) for another number of patches, (1, C, rows, columns)."""
-        raise NotImplementedError
+        # As in training: by factors with an offset of 0.1, which the weights have learned to expect.
+        factors = ((rows + 0.1) / self.grid, (columns + 0.1) / self.grid)
+        return F.interpolate(trained, scale_factor=factors, mode="bicubic", antialias=False)
 
 
 def set_matrix_type(module: nn.Module, dtype: torch.dtype) -> None:

@@ -136,6 +136,18 @@ VGGT_OMEGA = WeightsSource(
     alternative="set `localize.method: pnp`, which needs none",
     setting="localize.predictor.checkpoint",
 )
+DA3 = {
+    name: WeightsSource(
+        model=name.upper(),
+        repo_id=f"depth-anything/{name.upper()}",
+        filename="model.safetensors",
+        license="Apache-2.0",
+        alternative="set `localize.method: pnp`, which needs none",
+        setting="localize.predictor.checkpoint",
+    )
+    for name in ("da3-base", "da3-small")
+}
+"""Of Depth Anything 3, by the name of the predictor."""
 SUPERPOINT = WeightsSource(
     model="SuperPoint",
     repo_id="magic-leap-community/superpoint",
@@ -313,7 +325,8 @@ def read_state_dict(path: str | Path) -> "dict[str, Tensor]":
     """Return the tensors of a checkpoint file by name, on the CPU.
 
     Reads `.safetensors`, and files of `torch.save` that hold tensors only: code in a file is never run. Tensors in a
-    dict under `model`, `state_dict` or the like are taken from there; a prefix `module.` of all names is removed.
+    dict under `model`, `state_dict` or the like are taken from there; a prefix `module.` or `model.` of all names is
+    removed.
     Tensors may be mapped from the file: do not change it while they are in use.
 
     Raises:
@@ -342,12 +355,24 @@ def read_state_dict(path: str | Path) -> "dict[str, Tensor]":
     return _tensors(content, where)
 
 
+def checkpoint_tensors(checkpoint: "str | Path | Mapping[str, Tensor]") -> "tuple[str, dict[str, Tensor]]":
+    """Return where tensors are from, for messages, and the tensors by name: of a file, or as they are given.
+
+    Raises:
+        WeightsError: as `read_state_dict`.
+    """
+    if isinstance(checkpoint, Mapping):
+        return "the given dict", _tensors(checkpoint, "the given dict")
+    return str(checkpoint), read_state_dict(checkpoint)
+
+
 def load_checkpoint(
     module: "nn.Module",
     checkpoint: "str | Path | Mapping[str, Tensor]",
     name: str = "",
     ignore: tuple[str, ...] = (),
     rename: "Callable[[Mapping[str, Tensor]], dict[str, Tensor]]" = dict,
+    where: str = "",
 ) -> None:
     """Load a checkpoint into a module and make it ready for inference: no gradients, evaluation mode.
 
@@ -360,15 +385,14 @@ def load_checkpoint(
         checkpoint: a file (see `read_state_dict`), or tensors by name.
         ignore: prefixes of keys that the checkpoint may have and the module does not need.
         rename: returns the rest under the module's names.
+        where: the tensors are from, for messages; empty: what `checkpoint` says.
 
     Raises:
         WeightsError: no checkpoint, or of another network; names the missing, unexpected, mis-shaped and mis-typed
             keys. The module is then unchanged.
     """
-    if isinstance(checkpoint, Mapping):
-        where, state = "the given dict", _tensors(checkpoint, "the given dict")
-    else:
-        where, state = str(checkpoint), read_state_dict(checkpoint)
+    given, state = checkpoint_tensors(checkpoint)
+    where = where or given
     state = rename({key: value for key, value in state.items() if not key.startswith(ignore)})
     expected: dict[str, Tensor] = module.state_dict()
     common = [(key, state[key], own) for key, own in expected.items() if key in state]
@@ -525,9 +549,11 @@ def _tensors(content: Any, where: str) -> "dict[str, Tensor]":
         raise WeightsError(
             f"{where}: {len(others)} unexpected beside the tensors: {_first(others)}; expected tensors by name only."
         )
-    # Training on several GPUs puts this prefix before all names.
-    prefix = "module." if all(key.startswith("module.") for key in state) else ""
-    return {key.removeprefix(prefix): value for key, value in state.items()}
+    # Training on several GPUs puts the first of these before all names, a class around the network the second.
+    for prefix in ("module.", "model."):
+        if all(key.startswith(prefix) for key in state):
+            state = {key.removeprefix(prefix): value for key, value in state.items()}
+    return dict(state)
 
 
 def _first(names: list[str]) -> str:

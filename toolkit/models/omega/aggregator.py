@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from toolkit.models.dpt import LayerTokens
-from toolkit.models.vit import IMAGENET_MEAN, IMAGENET_STD, Block, PatchEmbed, Rope, SharedBuffer
+from toolkit.models.vit import Block, PatchEmbed, Rope, SharedBuffer, normalized
 
 PATCH = 16
 """Side of a patch in pixels."""
@@ -58,8 +58,7 @@ class PatchEncoder(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """Return the patch tokens (N, P, C), row by row, of images (N, 3, H, W) in [0, 1]."""
-        mean, std = (images.new_tensor(values).view(3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_STD))
-        patches = self.patch_embed((images - mean) / std)
+        patches = self.patch_embed(normalized(images))
         special = torch.cat([self.cls_token, self.storage_tokens], dim=1)
         x = torch.cat([special.expand(len(images), -1, -1), patches], dim=1)
         rope = self.rope_embed(images.shape[2] // PATCH, images.shape[3] // PATCH, special.shape[1])

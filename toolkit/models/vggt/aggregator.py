@@ -7,13 +7,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from toolkit.models.dpt import LayerTokens
-from toolkit.models.vit import IMAGENET_MEAN, IMAGENET_STD, Block, Dinov2, Rope, SharedBuffer
+from toolkit.models.vit import Block, Dinov2, Rope, SharedBuffer, normalized, places_of_view, rope_of_places
 
 REGISTERS = 4
 SPECIAL = 1 + REGISTERS
 """Number of tokens of a view before its patches: one camera token, then the registers. (The encoder's own tokens
 before the patches are as many: a class token and its registers.)"""
-_ROPE_BASE = 100.0
 _EPS = 1e-5
 
 
@@ -27,28 +26,15 @@ class PatchEncoder(Dinov2):
 
     def forward(self, images: Tensor) -> Tensor:
         """Return the patch tokens (N, P, C), row by row, of images (N, 3, H, W) in [0, 1]."""
-        mean, std = (images.new_tensor(values).view(3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_STD))
-        return self.norm(self._tokens((images - mean) / std, self.register_tokens)[:, SPECIAL:])
+        return self.norm(self._tokens(normalized(images), self.register_tokens)[:, SPECIAL:])
 
     def _resize(self, trained: Tensor, rows: int, columns: int) -> Tensor:
         return F.interpolate(trained, (rows, columns), mode="bicubic", antialias=True)
 
 
 def rope_of_view(rows: int, columns: int, head_dim: int, device: torch.device) -> Rope:
-    """Return the rotary position embedding of one view's tokens, cosines and signed sines (T, head_dim).
-
-    Special tokens are at place 0, patches at places from 1. The first half of D = head_dim channels rotates with the
-    row, the second with the column; pair i of D / 4 rotates by place * 100 ** (-4 i / D) radians.
-    """
-    half = head_dim // 2
-    frequencies = 1.0 / _ROPE_BASE ** (torch.arange(0, half, 2, device=device).float() / half)
-    places = torch.zeros(SPECIAL + rows * columns, 2, device=device)
-    places[SPECIAL:] = 1 + torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).to(places)
-    angles = places[:, :, None] * frequencies  # (tokens, y and x, D / 4)
-    cosine, sine = angles.cos(), angles.sin()
-    cosine = torch.stack([cosine, cosine], dim=2).flatten(1)
-    sine = torch.stack([-sine, sine], dim=2).flatten(1)
-    return cosine, sine
+    """Return the rotary position embedding of one view's tokens, cosines and signed sines (T, head_dim)."""
+    return rope_of_places(places_of_view(rows, columns, SPECIAL, device), head_dim)
 
 
 class Aggregator(nn.Module):

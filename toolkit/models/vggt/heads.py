@@ -54,8 +54,8 @@ class CameraHead(nn.Module):
 class Scratch(dpt.Scratch):
     """Fuses the maps and enlarges them to the image."""
 
-    def __init__(self, channels: Sequence[int], features: int, out: int) -> None:
-        super().__init__(channels, features, overwrites=True)
+    def __init__(self, channels: Sequence[int], features: int, out: int, overwrites: bool) -> None:
+        super().__init__(channels, features, overwrites)
         self.output_conv1 = nn.Conv2d(features, features // 2, 3, padding=1)
         self.output_conv2 = nn.Sequential(
             nn.Conv2d(features // 2, 32, 3, padding=1), nn.ReLU(inplace=True), nn.Conv2d(32, out, 1)
@@ -72,9 +72,10 @@ class Scratch(dpt.Scratch):
 class DenseHead(dpt.DenseHead):
     """A map of depth or points, and a confidence."""
 
-    def __init__(self, dim: int, out: int, channels: Sequence[int], features: int) -> None:
-        """`features` is the number of channels of the fused maps; the others as for `dpt.DenseHead`."""
-        super().__init__(dim, channels, PATCH, out, Scratch(channels, features, out))
+    def __init__(self, dim: int, out: int, channels: Sequence[int], features: int, overwrites: bool = True) -> None:
+        """`features` is the number of channels of the fused maps; `overwrites` is of `dpt.ResidualUnit`; the others as
+        for `dpt.DenseHead`."""
+        super().__init__(dim, channels, PATCH, out, Scratch(channels, features, out, overwrites))
 
     def decode(self, maps: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
         output: Tensor = self.scratch(maps, size)

@@ -5,8 +5,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from toolkit.errors import ImageError
-from toolkit.models.views import Source, Views, check_arguments, open_image, stack
+from toolkit.models.views import Source, Views, check_arguments, open_image, stack, too_elongated
 from toolkit.models.vit import PATCH
 
 SIDE = 518
@@ -44,11 +43,7 @@ def load_images(sources: Sequence[Source], mode: str = "crop") -> Views:
         width, height = image.size
         new_width, new_height = resized_size(width, height, mode)
         if not min(new_width, new_height):
-            where = source if isinstance(source, str | Path) else f"no. {position}"
-            raise ImageError(
-                f"Image of {width} x {height} pixels is too elongated for the network: {where}. Its shorter side would "
-                f"be less than half a patch of {PATCH} pixels; cut it."
-            )
+            raise too_elongated(image.size, source if isinstance(source, str | Path) else f"no. {position}")
         image = image.resize((new_width, new_height), Image.Resampling.BICUBIC)
         top = max(0, (new_height - SIDE) // 2) if mode == "crop" else 0
         pixels.append(image.crop((0, top, new_width, min(top + SIDE, new_height))))
