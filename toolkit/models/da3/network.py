@@ -1,0 +1,214 @@
+"""Depth Anything 3 (Lin et al., 2025), Base and Small: cameras and depth of the views of a scene, in one forward pass.
+
+The official network is at github.com/ByteDance-Seed/Depth-Anything-3. Its code, and the weights of these two sizes,
+have the Apache License 2.0.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from toolkit.models.da3.backbone import Backbone, choose_reference
+from toolkit.models.da3.cameras import cameras_from_pose_encoding, normalized_poses, pose_encoding
+from toolkit.models.da3.heads import CameraEncoder, CameraHead
+from toolkit.models.dpt import dense_output
+from toolkit.models.multiview import FRAMES_AT_A_TIME, MultiView
+from toolkit.models.vggt.heads import DenseHead
+from toolkit.models.vit import PATCH, set_matrix_type
+
+HEADS = ("camera", "depth")
+_HEAD_DIM = 64
+_SIZES = (768, 384)
+"""Channels of Base and of Small."""
+
+
+class DepthAnything3(MultiView):
+    """The network: photographs in, their cameras and depth out. The defaults are the official sizes, of Base.
+
+    Of an official checkpoint, the branch for rays and the head for Gaussians are not held. `from_checkpoint` reads off
+    its shapes whether it is Base or Small.
+    """
+
+    title = "Depth Anything 3"
+    patch = PATCH
+    known_heads = HEADS
+    prefixes: ClassVar = {"camera": "cam_dec.", "depth": "head."}
+    unused = (
+        "gs_head.",
+        "gs_adapter.",
+        *(f"head.scratch.refinenet{level}_aux." for level in range(1, 5)),
+        *(f"head.scratch.output_conv{number}_aux." for number in (1, 2)),
+    )
+    class_tokens = 1
+
+    def __init__(
+        self,
+        heads: Sequence[str] = HEADS,
+        compute_dtype: torch.dtype = torch.float32,
+        dim: int = 768,
+        depth: int = 12,
+        num_heads: int = 12,
+        grid: int = 37,
+        alternate_from: int = 4,
+        camera_depth: int = 4,
+        camera_num_heads: int = 16,
+        dense_layers: Sequence[int] = (5, 7, 9, 11),
+        dense_channels: Sequence[int] = (96, 192, 384, 768),
+        dense_features: int = 128,
+    ) -> None:
+        """
+        Args:
+            heads: the heads to hold, of `HEADS`.
+            compute_dtype: float32 or bfloat16, of the trunk's matrix products and attention. Sums, norms, heads and the
+                encoder of known cameras are float32.
+            dim, depth, num_heads, grid, alternate_from: of the trunk, see `Backbone`.
+            camera_depth, camera_num_heads: of the encoder of known cameras.
+            dense_layers: the four blocks that the depth head reads.
+            dense_channels, dense_features: channels of the depth head.
+
+        Raises:
+            ValueError: unknown head.
+        """
+        super().__init__(heads, compute_dtype)
+        self.dense_layers = tuple(dense_layers)
+        self.backbone = nn.ModuleDict({"pretrained": Backbone(dim, depth, num_heads, grid, alternate_from)})
+        set_matrix_type(self.backbone, compute_dtype)
+        self.cam_enc = CameraEncoder(dim, camera_depth, camera_num_heads)
+        if "camera" in self.heads:
+            self.cam_dec = CameraHead(2 * dim)
+        if "depth" in self.heads:
+            self.head = DenseHead(2 * dim, 2, dense_channels, dense_features, overwrites=False)
+
+    @classmethod
+    def _sizes(cls, state: Mapping[str, Tensor]) -> dict[str, Any]:
+        token = state.get("backbone.pretrained.camera_token")
+        dim = 0 if token is None else token.shape[-1]
+        if dim not in _SIZES:
+            return {}  # of another network, as loading will say
+        channels = (dim // 8, dim // 4, dim // 2, dim)
+        return {"dim": dim, "num_heads": dim // _HEAD_DIM, "dense_channels": channels, "dense_features": dim // 6}
+
+    @property
+    def trunk(self) -> Backbone:
+        trunk: Any = self.backbone["pretrained"]
+        backbone: Backbone = trunk
+        return backbone
+
+    @property
+    def channels(self) -> int:
+        return self.trunk.camera_token.shape[-1]
+
+    def _encoded(self, images: Tensor) -> Tensor:
+        return self.trunk.encode(images)
+
+    @torch.no_grad()
+    def forward(
+        self,
+        images: Tensor,
+        heads: Sequence[str] | None = None,
+        patch_tokens: Tensor | None = None,
+        extrinsics: Tensor | None = None,
+        intrinsics: Tensor | None = None,
+        reference: str = "saddle_balanced",
+    ) -> dict[str, Tensor]:
+        """Return what the heads predict, under the official names, float32.
+
+        Cameras that are known may be told. Officially those of all views are, or of none. Where some are, they are
+        encoded together, and the other views have the learned token of views that are not the reference: their
+        cameras are then in the frame, and nearly the unit, of those that are told. As in the official interface, told
+        poses are taken relative to the first told camera, and divided by the median distance of told cameras from it
+        (itself included; at least 0.1).
+
+        Args:
+            images: (B, S, 3, H, W) or (S, 3, H, W), RGB in [0, 1], sides multiples of 14: S views of each of B
+                scenes. `load_images` makes such images.
+            heads: which of the held heads to compute; None: all.
+            patch_tokens: (B, S, 1 + P, C), or (S, 1 + P, C) like the images, of `encode`, if already computed. Then
+                only the shape of `images` is read: `torch.empty(shape, device="meta")` will do.
+            extrinsics: `cam_from_world` (B, S, 3 or 4, 4) of known cameras, in any one frame and unit, without the
+                first axis like the images; NaN for a view whose pose is unknown. On any device, as `intrinsics`.
+            intrinsics: K (B, S, 3, 3), pixels of `images`, read where the pose is known; of each only the focal
+                lengths.
+            reference: how the view is chosen whose frame is the world where no camera is told; see
+                `choose_reference`.
+
+        Returns:
+            For "camera": `pose_enc` (B, S, 9), see `cameras_from_pose_encoding`, and the cameras of it, `extrinsics`
+            (B, S, 3, 4), cam_from_world, and `intrinsics` (B, S, 3, 3), pixels; NaN where it is no camera. For "depth":
+            `depth` (B, S, H, W), along the camera's z, and `depth_conf` (B, S, H, W), at least 1. Cameras and depth
+            share one scale, which is not meters. B = 1 for images with four axes.
+
+        Raises:
+            ValueError: wrong shape, a head that is not held, an unknown way to choose the reference, a known pose
+                without intrinsics.
+        """
+        size, heads, tokens = self._checked(images, heads, patch_tokens)
+        cameras = self._camera_tokens(tokens, reference)
+        if extrinsics is not None:
+            self._tell(cameras, *_known(extrinsics, intrinsics, (*cameras.shape[:2],)), size)
+        last = len(self.trunk.blocks) - 1
+        read = {last, *(self.dense_layers if "depth" in heads else ())}
+        rows, columns = size[0] // PATCH, size[1] // PATCH
+        layers, camera = self.trunk(tokens, cameras, rows, columns, read, cameras_only="depth" not in heads)
+        output = {}
+        if "camera" in heads:
+            output["pose_enc"] = self.cam_dec(camera.float())
+            output["extrinsics"], output["intrinsics"] = _cameras(output["pose_enc"], size)
+        if "depth" in heads:
+            frames = 1 if tokens.device.type == "cpu" else FRAMES_AT_A_TIME
+            values, confidence = dense_output(self.head, layers, self.dense_layers, size, frames)
+            output["depth"], output["depth_conf"] = values[..., 0].exp(), confidence
+        return output
+
+    def _camera_tokens(self, tokens: Tensor, reference: str) -> Tensor:
+        """Return the learned camera tokens (B, S, C), as if no camera were known, for tokens of `encode`.
+
+        Officially the reference view is also moved before the others. That changes rounding only.
+        """
+        chosen = choose_reference(tokens[:, :, 0].float(), reference)
+        is_reference = torch.arange(tokens.shape[1], device=tokens.device) == chosen[:, None]
+        of_reference, of_others = self.trunk.camera_token[0]
+        return torch.where(is_reference[..., None], of_reference, of_others)
+
+    def _tell(self, cameras: Tensor, extrinsics: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]) -> None:
+        """Replace the camera tokens (B, S, C) of scenes with known cameras, see `forward`."""
+        for scene, poses, K in zip(cameras, extrinsics, intrinsics, strict=True):
+            told = np.isfinite(poses).all(axis=(1, 2))
+            if told.any():
+                encoding = torch.from_numpy(pose_encoding(normalized_poses(poses[told]), K[told], size)).float()
+                scene[:] = self.trunk.camera_token[0, 1]
+                views = torch.from_numpy(np.flatnonzero(told)).to(scene.device)
+                scene[views] = self.cam_enc(encoding.to(scene.device)[None])[0]
+
+
+def _known(extrinsics: Tensor, intrinsics: Tensor | None, views: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return known cameras as float64, with B and S axes, or refuse them."""
+    if intrinsics is None:
+        raise ValueError("extrinsics are given without intrinsics; expected both: a camera is told as a whole.")
+    poses, K = (np.asarray(given.detach().cpu(), np.float64) for given in (extrinsics, intrinsics))
+    if poses.ndim == K.ndim == 3:
+        poses, K = poses[None], K[None]
+    if poses.shape not in ((*views, 3, 4), (*views, 4, 4)) or K.shape != (*views, 3, 3):
+        raise ValueError(
+            f"extrinsics have shape {tuple(extrinsics.shape)} and intrinsics {tuple(intrinsics.shape)}; expected "
+            f"{(*views, 3, 4)} and {(*views, 3, 3)} for these images."
+        )
+    known = np.isfinite(poses).all(axis=(2, 3))
+    if not (K[known][:, [0, 1], [0, 1]] > 0).all():
+        raise ValueError("a view has a known pose and no intrinsics; expected focal lengths above 0, or NaN as pose.")
+    return poses, K
+
+
+def _cameras(pose_enc: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Return `cam_from_world` (B, S, 3, 4) and K (B, S, 3, 3) like the encodings, NaN where those are no camera."""
+    encoding = np.asarray(pose_enc.cpu(), np.float64)
+    wrong = ~(np.isfinite(encoding).all(axis=-1) & encoding[..., 3:7].any(axis=-1))
+    encoding[wrong] = 1.0
+    cameras = cameras_from_pose_encoding(encoding, size)
+    for part in cameras:
+        part[wrong] = np.nan
+    extrinsics, intrinsics = (torch.from_numpy(part).to(pose_enc.dtype).to(pose_enc.device) for part in cameras)
+    return extrinsics, intrinsics
