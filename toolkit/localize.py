@@ -262,7 +262,9 @@ class _Pair:
         if predictor is not None:
             record |= {
                 "predictor": {"name": predictor.name} | predictor.settings,
-                "references": settings.predictor.model_dump(exclude={"name", "checkpoint", "batch_size", "compile"}),
+                "references": settings.predictor.model_dump(
+                    exclude={"name", "checkpoint", "batch_size", "compile", "conditioned"}
+                ),
                 "depths": map_session.depths_fingerprint,
             }
         return record

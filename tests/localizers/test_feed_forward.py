@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import h5py
 import numpy as np
 import pandas as pd
+import pycolmap
 import pytest
 from numpy.typing import NDArray
 
@@ -20,7 +21,12 @@ from toolkit.errors import ImageError, ManifestError, WeightsError
 from toolkit.files import SceneFiles
 from toolkit.localize import COLUMNS, PREDICTION_COLUMNS
 from toolkit.localizers.base import PoseEstimate, References, View
-from toolkit.localizers.feed_forward import FeedForwardAnswer, FeedForwardLocalizer, Predicted
+from toolkit.localizers.feed_forward import (
+    FeedForwardAnswer,
+    FeedForwardLocalizer,
+    Predicted,
+    _other_focal,
+)
 from toolkit.localizers.prediction import Prediction
 from toolkit.localizers.predictors import create_predictor
 from toolkit.localizers.simulated import SimulatedPredictor
@@ -89,6 +95,17 @@ class Told(SimulatedPredictor):
             K[:, [0, 1], [0, 1]] *= np.where(np.arange(len(group)) == 0, *self.focal_factors)[:, None]
             found.append(replace(prediction, conditioned=conditioned, intrinsics=K))
         return found
+
+
+def test_told_cameras_say_nothing_of_a_networks_focal_lengths() -> None:
+    """It errs by 30 % of all photographs but those that it was told of."""
+    camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=100, height=80, params=[100.0, 50, 40])
+    told = np.array([False, True, True, True, True, False, False, False])
+    K = np.tile(camera.calibration_matrix(), (8, 1, 1))
+    K[~told, [[0], [1]], [[0], [1]]] *= 1.3
+    prediction = Prediction(np.tile(np.eye(4), (8, 1, 1)), intrinsics=K, conditioned=told)
+    assert np.isnan(_other_focal(prediction, [camera] * 8))
+    assert _other_focal(replace(prediction, conditioned=None), [camera] * 8) == pytest.approx(130)
 
 
 def test_references_whose_poses_were_told_confirm_nothing(world: World) -> None:
@@ -362,7 +379,8 @@ def test_the_network_is_never_replaced_by_the_simulation(
 def test_wrong_parameters_are_refused(run: SceneFiles, small_capture: Path, wrong: dict, message: str) -> None:
     with pytest.raises(ManifestError, match=message):
         run_stage(small_capture, run, **wrong)
-    with pytest.raises(ManifestError, match=r"Unknown predictor 'magic'. Known: vggt, vggt-omega, simulated"):
+    known = "vggt, vggt-omega, da3-base, da3-small, simulated"
+    with pytest.raises(ManifestError, match=f"Unknown predictor 'magic'. Known: {known}"):
         create_predictor("magic")
 
 

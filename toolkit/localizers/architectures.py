@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from toolkit.errors import WeightsError
 from toolkit.geometry import Floats
 from toolkit.models import weights
 from toolkit.models.weights import WeightsSource
@@ -66,13 +67,16 @@ class Architecture(Protocol):
     """Side of a patch, pixels."""
     special_tokens: int
     """Tokens of a view beside its patches."""
+    takes_cameras: bool
+    """Whether it can be told the cameras of some views."""
     memory: Memory
 
     def lay_out(self, sizes: Sequence[Size]) -> Layout:
         """Return how photographs of these (width, height) are shown to the network."""
 
     def load(self, checkpoint: Path, heads: tuple[str, ...], dtype: "torch.dtype") -> Any:
-        """Return the network, on the CPU: `encode(images)`, and `(images, heads, tokens)` -> the outputs of its heads.
+        """Return the network, on the CPU: `encode(images)`, and `(images, heads, tokens)` -> the outputs of its heads;
+        where it takes cameras also `(images, heads, tokens, extrinsics, intrinsics)`, see `DepthAnything3`.
 
         Raises:
             WeightsError: the file is not of this network.
@@ -131,6 +135,7 @@ class VggtArchitecture:
     weights = weights.VGGT
     patch = 14
     special_tokens = 5
+    takes_cameras = False
     memory = Memory(trunk=42, kept=32, dense_pixel=1500, dense=32 << 20, dense_frames=8, result_pixel=24)
     _side = 518
 
@@ -170,6 +175,7 @@ class OmegaArchitecture:
     weights = weights.VGGT_OMEGA
     patch = 16
     special_tokens = 17
+    takes_cameras = False
     memory = Memory(trunk=42, kept=32, dense_pixel=630, dense=0, dense_frames=8, result_pixel=24)
 
     def lay_out(self, sizes: Sequence[Size]) -> Layout:
@@ -200,6 +206,54 @@ class OmegaArchitecture:
         return cameras_from_pose_encoding(encoding, size)
 
 
+class Da3Architecture:
+    """Depth Anything 3. Of photographs of several shapes the middle is shown, as by the official loader."""
+
+    patch = 14
+    special_tokens = 1
+    takes_cameras = True
+
+    def __init__(self, name: str, channels: int, memory: Memory) -> None:
+        self.name = name
+        self.weights = weights.DA3[name]
+        self.title = self.weights.model
+        self.memory = memory
+        self._channels = channels
+
+    def lay_out(self, sizes: Sequence[Size]) -> Layout:
+        from toolkit.models.da3.preprocess import MODES, resized_sizes
+
+        resized = np.array([resized_sizes(*size)[1] for size in sizes], np.float64).reshape(-1, 2)
+        width, height = resized.min(axis=0, initial=np.inf if len(sizes) else 0).tolist()
+        scale = resized / np.array(sizes, np.float64).reshape(-1, 2)
+        return Layout(MODES[0], (int(height), int(width)), scale, -((resized - [width, height]) // 2))
+
+    def load(self, checkpoint: Path, heads: tuple[str, ...], dtype: "torch.dtype") -> Any:
+        from toolkit.models.da3 import DepthAnything3
+
+        network = DepthAnything3.from_checkpoint(checkpoint, heads=heads, compute_dtype=dtype)
+        if network.channels != self._channels:
+            raise WeightsError(
+                f"{checkpoint}: these are weights with {network.channels} channels, not {self.title}, which has "
+                f"{self._channels}. Correct `{self.weights.setting}`, or the predictor's name."
+            )
+        return network
+
+    def read(self, image: Path | NDArray[np.uint8], layout: Layout) -> "tuple[Tensor, Size]":
+        from toolkit.models.da3 import load_images
+
+        loaded = load_images([image], layout.mode)
+        rows, columns = layout.size
+        top, left = (loaded.images.shape[2] - rows) // 2, (loaded.images.shape[3] - columns) // 2
+        width, height = loaded.sizes[0].tolist()
+        return loaded.images[0, :, top : top + rows, left : left + columns], (width, height)
+
+    def cameras(self, encoding: ArrayLike, size: Size) -> tuple[Floats, Floats]:
+        from toolkit.models.da3 import cameras_from_pose_encoding
+
+        return cameras_from_pose_encoding(encoding, size)
+
+
 def _padded(loaded: "Views", layout: Layout) -> "tuple[Tensor, Size]":
     """Return one image with a white border up to the size of its group, and the photograph's (width, height)."""
     import torch.nn.functional as F
@@ -210,5 +264,15 @@ def _padded(loaded: "Views", layout: Layout) -> "tuple[Tensor, Size]":
     return F.pad(loaded.images[0], border, value=1.0), (width, height)
 
 
-ARCHITECTURES: dict[str, Architecture] = {one.name: one for one in (VggtArchitecture(), OmegaArchitecture())}
+_DA3_BASE = Memory(trunk=44, kept=32, dense_pixel=750, dense=0, dense_frames=8, result_pixel=24)
+_DA3_SMALL = Memory(trunk=44, kept=32, dense_pixel=505, dense=0, dense_frames=8, result_pixel=24)
+ARCHITECTURES: dict[str, Architecture] = {
+    one.name: one
+    for one in (
+        VggtArchitecture(),
+        OmegaArchitecture(),
+        Da3Architecture("da3-base", 768, _DA3_BASE),
+        Da3Architecture("da3-small", 384, _DA3_SMALL),
+    )
+}
 """By the predictor's name."""

@@ -317,7 +317,8 @@ def _other_focal(prediction: Prediction, cameras: Sequence[pycolmap.Camera]) -> 
     predicted_px = prediction.intrinsics[:, [0, 1], [0, 1]].mean(axis=1)
     ratios = predicted_px / [camera.mean_focal_length() for camera in cameras]
     logs = np.log(np.where(np.isfinite(ratios) & (ratios > 0), ratios, np.nan))
-    known = logs[1:][np.isfinite(logs[1:])]
+    told = np.zeros(len(cameras), bool) if prediction.conditioned is None else prediction.conditioned
+    known = logs[1:][np.isfinite(logs[1:]) & ~told[1:]]
     if not len(known) or not np.isfinite(logs[0]):
         return np.nan
     middle = float(np.median(known))

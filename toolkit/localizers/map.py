@@ -474,6 +474,7 @@ def open_predictor(settings: LocalizeSettings, capture: Capture, map_dir: Path) 
         compute_device=settings.compute_device,
         dtype_compute=settings.dtype_compute,
         compile=settings.predictor.compile,
+        conditioned=settings.predictor.conditioned,
         seed=settings.seed,
     )
     if predictor.simulated:

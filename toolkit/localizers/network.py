@@ -20,6 +20,7 @@ from toolkit.localizers.architectures import ARCHITECTURES, Architecture, Size, 
 from toolkit.localizers.base import View
 from toolkit.localizers.placed import PlacedView, shown_size
 from toolkit.localizers.prediction import Prediction
+from toolkit.localizers.telling import cameras_to_tell, told_views
 from toolkit.models.compute import PRECISIONS, Fitting, free_bytes, on_device, resolve_device, resolve_precision
 from toolkit.models.weights import resolve_weights
 
@@ -95,6 +96,7 @@ class NetworkPredictor:
         cache_bytes: int = CACHE_BYTES,
         architecture: Architecture = ARCHITECTURES["vggt"],
         compile: bool = False,  # noqa: A002
+        conditioned: bool = False,
     ) -> None:
         """
         Args:
@@ -106,16 +108,23 @@ class NetworkPredictor:
             cache_bytes: memory for the encodings of map images: of the device where that has plenty, else of the CPU.
             architecture: which network.
             compile: see `PredictorSettings`.
+            conditioned: tell it the intrinsics of all views, and the poses of every other reference where there are
+                at least `telling.LEAST_REFERENCES`.
 
         Raises:
-            ManifestError: no such device or precision.
+            ManifestError: no such device or precision, or the network takes no cameras.
             WeightsError: no weights.
         """
         expected = [name for name in PRECISIONS if name != "float16"]
         if dtype_compute not in expected:
             title = architecture.title
             raise ManifestError(f"dtype_compute is {dtype_compute!r}; {title} expects one of {', '.join(expected)}.")
+        if conditioned and not architecture.takes_cameras:
+            raise ManifestError(
+                f"conditioned is true, but {architecture.title} cannot be told cameras; set it to false."
+            )
         self._architecture, self.name = architecture, architecture.name
+        self.conditioned = conditioned
         self.checkpoint = resolve_weights(architecture.weights, checkpoint)
         self.compute_device, self.dtype_compute = compute_device, dtype_compute
         self.needs_depth = needs_depth
@@ -131,7 +140,8 @@ class NetworkPredictor:
         """What the predictions depend on besides the views. A device changes rounding only, a type more."""
         weights = files_fingerprint([self.checkpoint])
         precision = str(self._dtype).removeprefix("torch.")
-        return {"name": self.name, "weights": weights, "dtype_compute": precision, "depth": self.needs_depth}
+        settings = {"name": self.name, "weights": weights, "dtype_compute": precision, "depth": self.needs_depth}
+        return settings | ({"conditioned": True} if self.conditioned else {})
 
     @cached_property
     def _device(self) -> "torch.device":
@@ -207,7 +217,7 @@ class NetworkPredictor:
 
     def _plan(self, count: int, views: int, size: Size) -> Size:
         """Return how many groups to run at a time, and how many views of each, by the memory that is free."""
-        channels = self._model.aggregator.camera_token.shape[-1]
+        channels = self._model.channels
         on_cpu = self._device.type == "cpu"
         about = partial(estimate_bytes, self._architecture)
         estimate = partial(about, size=size, channels=channels, depth=self.needs_depth, on_cpu=on_cpu)
@@ -353,22 +363,33 @@ class NetworkPredictor:
                 stacked = torch.stack([one.to(self._kept_on) for one in found if not isinstance(one, str)])
                 alike.setdefault(len(seen), []).append((number, group, seen, stacked))
         for rows in alike.values():
-            output = self._forward(torch.stack([stacked for *_, stacked in rows]), rows[0][1][0].size).numpy()
-            for (number, group, seen, _), values in zip(rows, output, strict=True):
-                results[number] = self._prediction(group, seen[: len(values)], values)
+            shown = [[group[index] for index in seen] for _, group, seen, _ in rows]
+            output = self._forward(torch.stack([stacked for *_, stacked in rows]), shown).numpy()
+            for (number, group, seen, _), views, values in zip(rows, shown, output, strict=True):
+                told = self._told(views[: len(values)])
+                results[number] = self._prediction(group, seen[: len(values)], values, told)
         return results
 
-    def _forward(self, tokens: "Tensor", size: Size) -> "Tensor":
+    def _told(self, views: Sequence[PlacedView]) -> NDArray[np.bool_]:
+        """Return which of the views (S,) that the network is shown it is told the poses of."""
+        return told_views(views) if self.conditioned else np.zeros(len(views), bool)
+
+    def _forward(self, tokens: "Tensor", groups: Sequence[Sequence[PlacedView]]) -> "Tensor":
         """Return (B, S, 9 + numbers of the depth head), on the CPU, of tokens (B, S, P, C); fewer views if need be."""
         import torch
 
+        size = groups[0][0].size
         while True:
             views = min(tokens.shape[1], self._most_views.get(size, tokens.shape[1]))
+            cameras = []
+            if any(self._told(group[:views]).any() for group in groups):
+                known = zip(*(cameras_to_tell(group[:views]) for group in groups), strict=True)
+                cameras = [torch.from_numpy(np.stack(part)) for part in known]
             new = Fitting(self._network(size), f"groups of {views} views", self._device)
             run = self._fitting.setdefault((views, size), new)
             try:
                 with torch.inference_mode():
-                    return run(tokens[:, :views])
+                    return run(tokens[:, :views], *cameras)
             except ToolkitError as error:
                 if self._makes_room():
                     continue
@@ -380,13 +401,13 @@ class NetworkPredictor:
             self._most_views[size] = max(_LEAST_VIEWS, views // 2)
             log.warning("going on with the first %d views of each group", self._most_views[size])
 
-    def _network(self, size: Size) -> "Callable[[Tensor], Tensor]":
-        """Return the network as a function of tokens (B, S, P, C), for images (H, W)."""
+    def _network(self, size: Size) -> "Callable[..., Tensor]":
+        """Return the network as a function of tokens (B, S, P, C) and known cameras, if any, for images (H, W)."""
         import torch
 
-        def run(tokens: "Tensor") -> "Tensor":
+        def run(tokens: "Tensor", *cameras: "Tensor") -> "Tensor":
             images = torch.empty(*tokens.shape[:2], 3, *size, device="meta")
-            output = self._model(images, self._heads, tokens.float())
+            output = self._model(images, self._heads, tokens.float(), *cameras)
             flat = [output["pose_enc"]]
             if self.needs_depth:
                 flat += [output["depth"].flatten(2), output["depth_conf"].flatten(2)]
@@ -394,7 +415,9 @@ class NetworkPredictor:
 
         return run
 
-    def _prediction(self, group: list[PlacedView], seen: Sequence[int], numbers: NDArray[np.float32]) -> Prediction:
+    def _prediction(
+        self, group: list[PlacedView], seen: Sequence[int], numbers: NDArray[np.float32], told: NDArray[np.bool_]
+    ) -> Prediction:
         """Return the prediction of a group, of numbers (seen views, 9 + numbers of the depth head)."""
         poses, intrinsics = np.full((len(group), 4, 4), np.nan), np.full((len(group), 3, 3), np.nan)
         size = group[0].size
@@ -405,8 +428,9 @@ class NetworkPredictor:
                 poses[index] = model_from_turned @ turned_from_cam(group[index].view.turns)
                 intrinsics[index] = group[index].intrinsics(K)
         map_from_image = np.stack([placed.map_from_image for placed in group])
+        conditioned = np.isin(np.arange(len(group)), np.array(seen)[told]) if told.any() else None
         if not self.needs_depth:
-            return Prediction(poses, map_from_image=map_from_image, intrinsics=intrinsics)
+            return Prediction(poses, None, None, map_from_image, intrinsics, conditioned)
         depth = [placed.turned_back(np.full(size, np.nan, np.float32)) for placed in group]
         confidence = [placed.turned_back(np.zeros(size, np.float32)) for placed in group]
         maps = numbers[:, 9:].reshape(len(seen), 2, *size)
@@ -414,7 +438,7 @@ class NetworkPredictor:
             placed, outside = group[index], group[index].outside
             depth[index] = placed.turned_back(np.where(outside, np.float32(np.nan), of_depth))
             confidence[index] = placed.turned_back(np.where(outside, np.float32(np.nan), of_confidence))
-        return Prediction(poses, depth, confidence, map_from_image, intrinsics)
+        return Prediction(poses, depth, confidence, map_from_image, intrinsics, conditioned)
 
 
 _loaded: dict[tuple[Any, ...], Any] = {}

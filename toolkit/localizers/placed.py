@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from toolkit.capture.turning import turn_image, turn_points
-from toolkit.geometry import Floats
+from toolkit.capture.turning import turn_image, turn_points, turned_from_cam
+from toolkit.geometry import Floats, invert
 from toolkit.localizers.architectures import Layout, Size
 from toolkit.localizers.base import View
 
@@ -62,6 +62,24 @@ class PlacedView:
         focal = np.diag(K)[:2][:: -1 if self.view.turns % 2 else 1] / scale
         x, y = (center - offset) / scale
         return np.array([[focal[0], 0, x], [0, focal[1], y], [0, 0, 1]])
+
+    @property
+    def shown_intrinsics(self) -> Floats:
+        """K (3, 3) of the camera in the network's image, pixels; without the camera's distortion."""
+        height, width = self.size
+        odd = self.view.turns % 2
+        K = self.view.camera.calibration_matrix()
+        scale, offset = self.map_from_image[:2], self.map_from_image[2:]
+        back_width, back_height = (height, width) if odd else (width, height)
+        [center] = turn_points(K[None, :2, 2] * scale + offset, back_width, back_height, self.view.turns)
+        focal = (np.diag(K)[:2] * scale)[:: -1 if odd else 1]
+        return np.array([[focal[0], 0, center[0]], [0, focal[1], center[1]], [0, 0, 1]])
+
+    @property
+    def shown_from_world(self) -> Floats | None:
+        """(4, 4) of the camera of the network's image in the map, where its pose is known."""
+        world_from_cam = self.view.world_from_cam
+        return None if world_from_cam is None else turned_from_cam(self.view.turns) @ invert(world_from_cam)
 
     @property
     def outside(self) -> NDArray[np.bool_]:

@@ -24,21 +24,24 @@ def create_predictor(
     compute_device: str = "auto",
     dtype_compute: str = "auto",
     compile: bool = False,  # noqa: A002
+    conditioned: bool = False,
     seed: int = 0,
 ) -> Predictor:
     """Return a ready predictor.
 
     Args:
-        name: `vggt`, `vggt-omega`, or `simulated`, which looks up true poses and is for tests and for trying out.
+        name: `vggt`, `vggt-omega`, `da3-base`, `da3-small`, or `simulated`, which looks up true poses and is for tests
+            and for trying out.
         sessions: of `simulated`: where the true poses are.
         map_dir, features: of `simulated`: folder of the triangulated maps, for depth, and their kind of features.
         checkpoint: of a network: file with the weights; None: the hub's cache, else a download.
         compute_device, dtype_compute: of a network, as `toolkit.models.compute` takes them.
         compile: of a network, see `PredictorSettings`.
+        conditioned: of a network: tell it cameras of the map, see `NetworkPredictor`.
         seed: of `simulated`.
 
     Raises:
-        ManifestError: unknown name, device or precision.
+        ManifestError: unknown name, device or precision; a network that cannot be told cameras.
         WeightsError: a network and no weights to be had; says what to do.
     """
     if name not in PREDICTORS:
@@ -46,5 +49,10 @@ def create_predictor(
     if name == "simulated":
         return SimulatedPredictor(sessions, map_dir, features, seed=seed)
     return NetworkPredictor(
-        checkpoint, compute_device, dtype_compute, architecture=ARCHITECTURES[name], compile=compile
+        checkpoint,
+        compute_device,
+        dtype_compute,
+        architecture=ARCHITECTURES[name],
+        compile=compile,
+        conditioned=conditioned,
     )

@@ -494,11 +494,15 @@ class PnpSettings(Settings):
     further features are asked."""
 
 
+CONDITIONED = ("da3-base", "da3-small")
+"""Names of predictors that can be told cameras."""
+
+
 class PredictorSettings(Settings):
     """The network that predicts cameras, and what it is shown."""
 
     shorthand = "name"
-    name: Literal["vggt", "vggt-omega", "simulated"] = "vggt"
+    name: Literal["vggt", "vggt-omega", "da3-base", "da3-small", "simulated"] = "vggt"
     """What `feed_forward` and `hybrid` ask; `simulated` looks up true poses, for trying things out."""
     checkpoint: str | None = None
     """File with the network's weights; null: the hub's cache, else a download."""
@@ -517,6 +521,19 @@ class PredictorSettings(Settings):
     """Map points of a reference at most whose depth is compared, those of the longest tracks."""
     least_points: Natural = 20
     """With fewer, the capture's depth map of the reference is asked, where there is one."""
+    conditioned: bool = False
+    """Tell a network that takes cameras (da3-base, da3-small) those of the map: the intrinsics of all views, and of six
+    references or more the poses of every other one. The rest align the prediction. Officially all cameras are told or
+    none; what a partly told scene gains is not measured."""
+
+    @model_validator(mode="after")
+    def _cameras_to_who_takes_them(self) -> Self:
+        if self.conditioned and self.name not in CONDITIONED:
+            raise ValueError(
+                f"conditioned is true, but {self.name} cannot be told cameras; expected the name to be one of "
+                f"{', '.join(CONDITIONED)}, or conditioned: false"
+            )
+        return self
 
 
 Method = Annotated[

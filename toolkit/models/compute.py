@@ -239,19 +239,20 @@ def _copy_stream(device: "torch.device") -> "torch.cuda.Stream":
 class Fitting:
     """Runs a function on a device; splits batches into smaller parts once one did not fit its memory."""
 
-    def __init__(
-        self, run: "Callable[[torch.Tensor], torch.Tensor]", what: str, device: "torch.device | None" = None
-    ) -> None:
-        """`run` maps (B, ...) to (B, ...), each row on its own; `what` the rows are, in the plural, is for messages."""
+    def __init__(self, run: "Callable[..., torch.Tensor]", what: str, device: "torch.device | None" = None) -> None:
+        """`run` maps (B, ...), and what else it takes, to (B, ...), each row on its own; `what` the rows are, in the
+        plural, is for messages."""
         self._run = run
         self._device = device
         self._what = what
         self._limit: int | None = None
 
-    def __call__(self, batch: "torch.Tensor") -> "torch.Tensor":
-        """Return `run(batch)`; halves the batch as often as needed, logs a warning, and remembers the size that fits.
+    def __call__(self, batch: "torch.Tensor", *others: "torch.Tensor") -> "torch.Tensor":
+        """Return `run(batch, *others)`; halves the batch as often as needed, logs a warning, and remembers the size
+        that fits.
 
-        A batch that is elsewhere is moved to the device by parts. float32 is computed in full, see `full_float32`.
+        A batch that is elsewhere is moved to the device by parts; others (B, ...) are cut alike and stay where they
+        are. float32 is computed in full, see `full_float32`.
 
         Raises:
             ToolkitError: not even one row fits.
@@ -265,7 +266,8 @@ class Fitting:
             count = min(self._limit or len(batch), len(batch) - start)
             try:
                 with full_float32(device):
-                    parts.append(self._run(batch[start : start + count].to(device)))
+                    part = slice(start, start + count)
+                    parts.append(self._run(batch[part].to(device), *(other[part] for other in others)))
                 start += count
                 continue
             except RuntimeError as error:
