@@ -20,6 +20,7 @@ from tests.features.test_aliked import SETTINGS
 from tests.features.test_lightglue import features
 from tests.features.test_lightglue import state as lightglue_state
 from tests.features.test_superpoint import planted_state
+from tests.golden import da3
 from tests.models.test_aliked_network import photograph
 from tests.models.test_aliked_network import random_state as aliked_state
 from tests.models.test_megaloc import golden
@@ -36,6 +37,8 @@ from toolkit.localizers.base import View
 from toolkit.localizers.network import NetworkPredictor
 from toolkit.manifest import AlikedSettings
 from toolkit.models.compute import full_float32
+from toolkit.models.da3 import DepthAnything3
+from toolkit.models.da3.backbone import choose_reference
 from toolkit.models.megaloc import MegaLoc
 from toolkit.models.omega import VGGTOmega
 from toolkit.models.vggt import VGGT
@@ -128,6 +131,27 @@ def test_cameras_and_depth_are_the_official_numbers(
         cameras = np.abs(output["pose_enc"] - expected["pose_enc"]).max()
         depths = np.median(np.abs(output["depth"] / expected["depth"] - 1))
         print(f"{name}, {precision}, case {case}: cameras within {cameras:.1e}, depths within {depths:.1e} (median)")
+        assert max(cameras, depths) < most
+
+
+@pytest.mark.parametrize(("precision", "most", "_"), PRECISIONS)
+@pytest.mark.parametrize("size", da3.SIZES)
+def test_depth_anything_3_gives_the_official_numbers(size: str, precision: str, most: float, _: float) -> None:
+    dtype = torch.bfloat16 if precision == "bfloat16" else torch.float32
+    model = DepthAnything3.from_checkpoint(da3.state(da3.shapes(size)), compute_dtype=dtype).to(GPU)
+    for case, reference in da3.info()["references"][size].items():
+        given = da3.inputs(case)
+        given["images"] = given["images"].to(GPU)
+        chosen = int(choose_reference(model.encode(given["images"])[None, :, 0], "saddle_balanced"))
+        if case == "four" and chosen != reference:
+            assert precision == "bfloat16", "another view is the reference, as rounding may decide"
+            continue
+        output = run_as(precision, lambda given=given: {k: model(**given)[k][0] for k in ("pose_enc", "depth")})
+        expected = da3.expected(f"{size}/{case}")
+        found = da3.sampled(output)
+        cameras = np.abs(found["pose_enc"] - expected["pose_enc"]).max()
+        depths = np.median(np.abs(found["depth"] / expected["depth"] - 1))
+        print(f"{size}, {precision}, case {case}: cameras within {cameras:.1e}, depths within {depths:.1e} (median)")
         assert max(cameras, depths) < most
 
 
