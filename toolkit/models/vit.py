@@ -18,41 +18,10 @@ Rope = tuple[Tensor, Tensor]
 """Cosines and signed sines of a rotary position embedding, each (N, C / heads): see `rotate_`."""
 
 
-class SharedBuffer:
-    """A buffer for the widest layers of one forward pass: each layer overwrites the result of the one before.
-
-    On a CPU, glibc requests arrays above 32 MB from the system for every layer, and the system clears them page by
-    page. That costs 2 to 6 % of a network's time in float32, and more the faster the matrix products are. Use a new
-    buffer for each pass: tensors of `torch.inference_mode` cannot be overwritten outside of it.
-    """
-
-    def __init__(self) -> None:
-        self._held = torch.empty(0)
-
-    @classmethod
-    def for_device(cls, device: torch.device) -> "SharedBuffer | None":
-        """Return a buffer on a CPU, None on other devices, where it does not help, and while gradients are recorded,
-        which need the results that would be overwritten."""
-        return cls() if device.type == "cpu" and not torch.is_grad_enabled() else None
-
-    def linear(self, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        """Return `F.linear(x, weight, bias)`, (..., C); overwrites what it returned before."""
-        count = x.shape[:-1].numel() * len(weight)
-        if self._held.numel() < count or self._held.dtype != x.dtype:
-            self._held = torch.empty(0)  # free the old array before allocating the new one
-            self._held = x.new_empty(count)
-        out = self._held[:count].view(-1, len(weight))
-        return torch.addmm(bias, x.flatten(0, -2), weight.t(), out=out).view(*x.shape[:-1], len(weight))
-
-
 def normalized(images: Tensor) -> Tensor:
     """Return images (..., 3, H, W) in [0, 1] with ImageNet's mean and deviation taken out of each channel."""
     mean, std = (images.new_tensor(values).view(3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_STD))
     return (images - mean) / std
-
-
-def _linear(x: Tensor, weight: Tensor, bias: Tensor, buffer: SharedBuffer | None) -> Tensor:
-    return F.linear(x, weight, bias) if buffer is None else buffer.linear(x, weight, bias)
 
 
 def rotate_(x: Tensor, rope: Rope, groups: int = 2) -> Tensor:
@@ -116,9 +85,7 @@ class Attention(nn.Module):
             self.k_norm = nn.LayerNorm(dim // num_heads, eps=qk_norm_eps)
         self.proj = nn.Linear(dim, dim)
 
-    def forward(
-        self, x: Tensor, rope: Rope | None = None, kept: Tensor | None = None, buffer: SharedBuffer | None = None
-    ) -> Tensor:
+    def forward(self, x: Tensor, rope: Rope | None = None, kept: Tensor | None = None) -> Tensor:
         """Return the attention output over all tokens, (B, N, C), or of the kept ones only, (B, len(kept), C)."""
         C = x.shape[-1]
         weight: Tensor = self.qkv.weight
@@ -126,10 +93,10 @@ class Attention(nn.Module):
         if self.dinov3:
             bias = bias * self.qkv.get_buffer("bias_mask")
         if kept is None:
-            parts = _linear(x, weight, bias, buffer).split(C, dim=-1)
+            parts = F.linear(x, weight, bias).split(C, dim=-1)
         else:
             q = F.linear(x[:, kept], weight[:C], bias[:C])
-            parts = (q, *_linear(x, weight[C:], bias[C:], buffer).split(C, dim=-1))
+            parts = (q, *F.linear(x, weight[C:], bias[C:]).split(C, dim=-1))
         q, k, v = (part.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for part in parts)  # (B, heads, tokens, D)
         del parts
         if self.has_qk_norm:
@@ -153,9 +120,8 @@ class Mlp(nn.Module):
         self.fc1 = nn.Linear(dim, hidden)
         self.fc2 = nn.Linear(hidden, dim if out is None else out)
 
-    def forward(self, x: Tensor, buffer: SharedBuffer | None = None) -> Tensor:
-        hidden = _linear(x, self.fc1.weight, self.fc1.bias, buffer)
-        return self.fc2(torch.ops.aten.gelu_(hidden))  # in place: the hidden layer is the largest tensor
+    def forward(self, x: Tensor) -> Tensor:
+        return self.fc2(torch.ops.aten.gelu_(self.fc1(x)))  # in place: the hidden layer is the largest tensor
 
 
 class LayerScale(nn.Module):
@@ -185,21 +151,18 @@ class Block(nn.Module):
         self.mlp = Mlp(dim, 4 * dim)
         self.ls2 = LayerScale(dim)
 
-    def forward(
-        self, x: Tensor, rope: Rope | None = None, kept: Tensor | None = None, buffer: SharedBuffer | None = None
-    ) -> Tensor:
+    def forward(self, x: Tensor, rope: Rope | None = None, kept: Tensor | None = None) -> Tensor:
         """Return the tokens (B, N, C) one block further.
 
         Args:
             x: (B, N, C).
             rope: position of each token, for queries and keys.
             kept: return only the tokens of these indices; of the others, only keys and values are computed.
-            buffer: of this forward pass, shared by its blocks.
         """
         matrix_type = self.attn.qkv.weight.dtype
         stream = x if kept is None else x[:, kept]
-        x = self.ls1(stream, self.attn(self.norm1(x).to(matrix_type), rope, kept, buffer))
-        return self.ls2(x, self.mlp(self.norm2(x).to(matrix_type), buffer))
+        x = self.ls1(stream, self.attn(self.norm1(x).to(matrix_type), rope, kept))
+        return self.ls2(x, self.mlp(self.norm2(x).to(matrix_type)))
 
 
 class PatchEmbed(nn.Module):
@@ -246,9 +209,8 @@ class Dinov2(nn.Module):
     def _tokens(self, images: Tensor, *registers: Tensor) -> Tensor:
         """Return the tokens after the last block: class token, registers (1, R, C), patches; before the norm."""
         x = self._embedded(images, *registers)
-        buffer = SharedBuffer.for_device(x.device)
         for block in self.blocks:
-            x = block(x, buffer=buffer)
+            x = block(x)
         return x
 
     def _embedded(self, images: Tensor, *registers: Tensor) -> Tensor:

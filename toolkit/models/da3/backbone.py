@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from toolkit.models.dpt import LayerTokens
-from toolkit.models.vit import Dinov2, SharedBuffer, normalized, places_of_view, rope_of_places
+from toolkit.models.vit import Dinov2, normalized, places_of_view, rope_of_places
 
 REFERENCES = ("saddle_balanced", "first")
 """Ways to choose the view whose frame is the world."""
@@ -33,11 +33,10 @@ class Backbone(Dinov2):
         """Return tokens (N, 1 + P, C) of images (N, 3, H, W) in [0, 1]: the patches after the blocks before the later
         ones, and before them the class token one block earlier, where the reference view is chosen."""
         x = self._embedded(normalized(images))
-        buffer = SharedBuffer.for_device(x.device)
         class_token = x[:, :1]
         for block in self.blocks[: self.alternate_from]:
             class_token = x[:, :1]
-            x = block(x, buffer=buffer)
+            x = block(x)
         return torch.cat([class_token, x[:, 1:]], dim=1)
 
     def forward(
@@ -68,15 +67,14 @@ class Backbone(Dinov2):
         # Among views all patches are at one place: only the camera tokens differ from them.
         rope, among = (rope_of_places(part, self.head_dim) for part in (places, places.clamp(max=1)))
         rope_of_views = (among[0].repeat(S, 1), among[1].repeat(S, 1))
-        buffer = SharedBuffer.for_device(x.device)
         kept, last, within = {}, max(layers), x
         for number in range(self.alternate_from, last + 1):
             block = self.blocks[number]
             if number % 2 == 0:
-                x = within = block(x.view(B * S, T, C), rope, buffer=buffer).view(B, S, T, C)
+                x = within = block(x.view(B * S, T, C), rope).view(B, S, T, C)
                 continue
             indices = torch.arange(0, S * T, T, device=x.device) if cameras_only and number == last else None
-            x = block(x.view(B, S * T, C), rope_of_views, indices, buffer).view(B, S, -1, C)
+            x = block(x.view(B, S * T, C), rope_of_views, indices).view(B, S, -1, C)
             if number in layers and not cameras_only:
                 kept[number] = (within, self.norm(x))
         return kept, torch.cat([within[:, :, 0], x[:, :, 0]], dim=-1)

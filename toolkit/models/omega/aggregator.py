@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from toolkit.models.dpt import LayerTokens
-from toolkit.models.vit import Block, PatchEmbed, Rope, SharedBuffer, normalized
+from toolkit.models.vit import Block, PatchEmbed, Rope, normalized
 
 PATCH = 16
 """Side of a patch in pixels."""
@@ -62,9 +62,8 @@ class PatchEncoder(nn.Module):
         special = torch.cat([self.cls_token, self.storage_tokens], dim=1)
         x = torch.cat([special.expand(len(images), -1, -1), patches], dim=1)
         rope = self.rope_embed(images.shape[2] // PATCH, images.shape[3] // PATCH, special.shape[1])
-        buffer = SharedBuffer.for_device(x.device)
         for block in self.blocks:
-            x = block(x, rope, buffer=buffer)
+            x = block(x, rope)
         return self.norm(x[:, special.shape[1] :])
 
 
@@ -108,10 +107,9 @@ class Aggregator(nn.Module):
         tokens = torch.cat([special.expand(B, -1, -1, -1), patch_tokens.to(special.dtype)], dim=2)
         T = SPECIAL + P
         rope = self.rope_embed(rows, columns, SPECIAL)
-        buffer = SharedBuffer.for_device(tokens.device)
         kept = {}
         for layer in range(max(layers) + 1):
-            within = self.frame_blocks[layer](tokens.view(B * S, T, C), rope, buffer=buffer).view(B, S, T, C)
+            within = self.frame_blocks[layer](tokens.view(B * S, T, C), rope).view(B, S, T, C)
             among = self.inter_frame_blocks[layer]
             if layer in self.register_layers:
                 # What is kept shall not change.
@@ -121,7 +119,7 @@ class Aggregator(nn.Module):
                 indices = None
                 if cameras_only and layer == max(layers):
                     indices = torch.arange(S * T, device=within.device).view(S, T)[:, :SPECIAL].flatten()
-                tokens = among(within.flatten(1, 2), None, indices, buffer).view(B, S, -1, C)
+                tokens = among(within.flatten(1, 2), None, indices).view(B, S, -1, C)
             if layer in layers:
                 count = SPECIAL if cameras_only and layer == max(layers) else T
                 kept[layer] = (within[:, :, :count], tokens[:, :, :count])

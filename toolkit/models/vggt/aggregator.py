@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from toolkit.models.dpt import LayerTokens
-from toolkit.models.vit import Block, Dinov2, Rope, SharedBuffer, normalized, places_of_view, rope_of_places
+from toolkit.models.vit import Block, Dinov2, Rope, normalized, places_of_view, rope_of_places
 
 REGISTERS = 4
 SPECIAL = 1 + REGISTERS
@@ -73,13 +73,12 @@ class Aggregator(nn.Module):
         T = SPECIAL + P
         rope = rope_of_view(rows, columns, self.head_dim, tokens.device)
         rope_of_views = (rope[0].repeat(S, 1), rope[1].repeat(S, 1))
-        buffer = SharedBuffer.for_device(tokens.device)
         kept = {}
         for layer in range(max(layers) + 1):
             cameras = cameras_only and layer == max(layers)
-            within = self.frame_blocks[layer](tokens.view(B * S, T, C), rope, buffer=buffer).view(B, S * T, C)
+            within = self.frame_blocks[layer](tokens.view(B * S, T, C), rope).view(B, S * T, C)
             indices = torch.arange(0, S * T, T, device=within.device) if cameras else None
-            tokens = self.global_blocks[layer](within, rope_of_views, indices, buffer)
+            tokens = self.global_blocks[layer](within, rope_of_views, indices)
             if layer in layers:
                 kept[layer] = (within.view(B, S, T, C)[:, :, : 1 if cameras else T], tokens.view(B, S, -1, C))
         return kept
