@@ -134,6 +134,7 @@ def test_lengths_follow_the_depth_of_the_scene(small_capture: Path, small_featur
         assert 2 <= other.typical_depth() / other.length(metric=True) <= 16
 
 
+@pytest.mark.slow
 def test_a_single_wrong_pose_is_listed(small_capture: Path, small_features: Path, tmp_path: Path) -> None:
     capture = Path(shutil.copytree(small_capture, tmp_path / small_capture.name))
     path = capture / "sessions" / "ios_map" / "trajectories.txt"
