@@ -186,6 +186,7 @@ def test_python_examples_compile(page: Path) -> None:
         compile(block, page.name, "exec")
 
 
+@pytest.mark.slow
 def test_python_examples_run(
     small_capture: Path, small_features: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

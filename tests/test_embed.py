@@ -136,6 +136,7 @@ def test_reuse_and_resume(tiny: Path, tmp_path: Path) -> None:
     assert load_embeddings(out / "ios_map")[0].dtype == np.float32
 
 
+@pytest.mark.slow
 def test_a_changed_query_or_map_image(tiny: Path, tmp_path: Path) -> None:
     out = tmp_path / "e"
     embed_sessions(tiny / "sessions", out)

@@ -68,6 +68,7 @@ def test_no_queries_are_a_pair_without_rows(capture: Path, files: SceneFiles) ->
     assert recall["state"].tolist() == ["no queries"]
 
 
+@pytest.mark.slow
 def test_a_map_of_one_image_answers_with_reasons(capture: Path, files: SceneFiles) -> None:
     """More references are asked than the map has, and one image has no triangulated points."""
     keep_lines(capture / "sessions" / "ios_map" / "images.txt", 1)

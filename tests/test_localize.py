@@ -419,6 +419,7 @@ def test_a_killed_run_goes_on_where_it_was(
     assert without_times(run, device) == without_times(finished[0], device)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("killed_at", "calls_left"), [(2, 4), pytest.param(4, 2, marks=pytest.mark.slow)])
 def test_a_killed_run_goes_on_where_it_asks_for_more_features(
     small_capture: Path,
@@ -464,6 +465,7 @@ def test_a_sure_pose_asks_for_nothing_more(
     assert pd.read_csv(run.poses_txt("ios", "ios").with_suffix(".csv"))["first_status"].isna().all()
 
 
+@pytest.mark.slow
 def test_a_first_answer_that_is_not_bettered_stays(
     small_capture: Path, run: SceneFiles, finished: tuple[SceneFiles, pd.DataFrame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -987,9 +989,9 @@ ESCALATES = {"features": {"kinds": ["sift"], "escalation": ["other"]}, "pnp": {"
     [
         {"method": "pnp"},
         {"method": "nearest"},
-        {"method": "feed_forward"},
+        pytest.param({"method": "feed_forward"}, marks=pytest.mark.slow),
         {"method": "hybrid"},
-        {"map": None},
+        pytest.param({"map": None}, marks=pytest.mark.slow),
         pytest.param(ESCALATES, marks=pytest.mark.slow),
         pytest.param({**ESCALATES, "method": "hybrid"}, marks=pytest.mark.slow),
         pytest.param({**ESCALATES, "map": None}, marks=pytest.mark.slow),
@@ -1030,6 +1032,7 @@ def test_pictures_get_the_pose_of_the_run_byte_for_byte(
         np.testing.assert_array_equal(before.inlier, estimate.correspondences.inlier)
 
 
+@pytest.mark.slow
 def test_a_picture_is_reranked_as_the_run_was(small_capture: Path, run: SceneFiles) -> None:
     sessions = small_capture / "sessions"
     retrieve_pairs(sessions, run.embeddings, run.retrieval_dir, {"topk": 9}, map_device="ios", queries=LIST)
@@ -1160,6 +1163,7 @@ def other_kind(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(OtherMatcher, "asked", 0)
 
 
+@pytest.mark.slow
 def test_several_features_are_pooled_in_one_pose(
     small_capture: Path, finished: tuple[SceneFiles, pd.DataFrame], run: SceneFiles, other_kind: None
 ) -> None:

@@ -314,6 +314,7 @@ def test_the_command_line_prints_errors_without_traceback(tmp_path: Path) -> Non
     assert time.perf_counter() - started < 20
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
 def test_a_killed_run_is_taken_up_again(place: Path, go: Callable[..., dict[str, str]]) -> None:
     slow = f"{RETRIEVE}\nimport time\ntime.sleep(0 if Path(out_jsonl, 'again').exists() else 600)"

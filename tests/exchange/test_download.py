@@ -440,6 +440,7 @@ def test_another_download_into_the_same_folder(hub: FakeHub, manifest: Path) -> 
 # A kill
 
 
+@pytest.mark.slow
 def test_a_download_that_is_killed_goes_on(hub: FakeHub, manifest: Path, tmp_path: Path) -> None:
     big = {path: IMAGE * 8 if path.endswith(".jpg") else body for path, body in session("ios_query").items()}
     hub.datasets[REPO]["ios_query.zip"] = zipped(big)

@@ -344,6 +344,7 @@ def test_what_a_group_must_not_be_is_refused_by_name(tmp_path: Path, make: Calla
             groups.read_group(file, "a")
 
 
+@pytest.mark.slow
 def test_names_of_groups_are_found_without_following_links(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "file.h5", "w", libver="latest") as file:
         file["x/y/1.jpg/keypoints"] = np.zeros((3, 2))

@@ -224,6 +224,7 @@ def test_depth_maps_stand_in_for_points(world: World) -> None:
     assert all(answer.estimate.scale_std < 0.1 for answer in answers)
 
 
+@pytest.mark.slow
 def test_a_rig_knows_better_than_its_cameras(world: World) -> None:
     together, alone = [], []
     for seed in range(4):
@@ -471,6 +472,7 @@ def test_a_killed_run_goes_on_where_it_was(
     assert run.poses_txt("ios", "ios").read_bytes() == finished.poses_txt("ios", "ios").read_bytes()
 
 
+@pytest.mark.slow
 def test_other_noise_references_or_weights_make_poses_anew(run: SceneFiles, small_capture: Path) -> None:
     def skipped(**more: object) -> bool:
         return bool(run_stage(small_capture, run, query_device="ios", **more)["skipped"].iloc[0])

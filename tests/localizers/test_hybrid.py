@@ -148,6 +148,7 @@ def test_a_prior_is_found_again_in_whatever_order(world: World, pnp: PnpLocalize
     assert same(found[0], pnp.localize(*asked, priors=priors[::-1]))
 
 
+@pytest.mark.slow
 def test_the_hybrid_run_is_as_good_as_pnp(run: SceneFiles, small_capture: Path) -> None:
     run_stage(small_capture, run, method="pnp")
     before = {device: Trajectory.read(run.poses_txt("ios", device)) for device in ("ios", "hl", "spot")}

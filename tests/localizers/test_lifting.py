@@ -157,6 +157,7 @@ class WrongDepth:
         return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["twice", "half", "flat", "noise", "mirrored"])
 def test_wrong_depth_is_never_a_wrong_pose_called_ok(world: World, how: str) -> None:
     for index in range(3):

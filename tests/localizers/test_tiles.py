@@ -223,6 +223,7 @@ def test_a_tile_may_have_no_point_that_earlier_ones_have_not(
     assert len(joined.points) == len(whole.points) > 0
 
 
+@pytest.mark.slow
 def test_tiles_of_other_features_are_made_anew(phone: tuple[Session, FeatureStore], tmp_path: Path) -> None:
     session, store = phone
     settings = MapSettings(pairs_per_image=2, tile_images=2)

@@ -182,6 +182,7 @@ def test_features_and_maps_are_those_of_one_process(small_capture: Path, tmp_pat
     assert not list(tmp_path.rglob("*.parts"))
 
 
+@pytest.mark.slow
 def test_poses_are_those_of_one_process(small_capture: Path, small_features: Path, tmp_path: Path, here: Here) -> None:
     files = SceneFiles(tmp_path / "run", small_capture.name)
     shutil.copytree(small_features, files.features)

@@ -36,6 +36,7 @@ def test_a_saved_page_has_the_picture_the_link_and_the_command(files, monkeypatc
     assert "<code>rerun " in page
 
 
+@pytest.mark.slow
 def test_the_viewer_is_served_by_this_process_and_gets_the_whole_file(files, monkeypatch):
     monkeypatch.delenv(TEXT_BARS, raising=False)
     monkeypatch.delenv(ASSETS, raising=False)

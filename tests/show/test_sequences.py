@@ -124,6 +124,7 @@ def test_drift_and_a_loss_that_later_queries_tell_change_no_online_pose(place: P
             pd.testing.assert_frame_equal(early, after.loc[step].loc[early.index])
 
 
+@pytest.mark.slow
 def test_tables_and_figures_of_a_run(place: Path, tmp_path: Path) -> None:
     sessions, poses, out = place / "sessions", tmp_path / "poses", tmp_path / "evaluation"
     evaluate_scene(sessions, poses, None, out)

@@ -227,6 +227,7 @@ def test_the_walk_through_a_street_goes_on_from_block_to_block() -> None:
     assert [len(blocks[0]["query", part]) for part in range(2)] == [2, 1]
 
 
+@pytest.mark.slow
 def test_a_street_is_seen_beyond_its_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def coarse_block(seed: int, index: int) -> Scene:
         block = build_block(seed, index)
@@ -302,6 +303,7 @@ def test_look_alikes_come_in_few_models_and_other_things_do_not() -> None:
     assert len(drawn(textures.poster, True)) == 12
 
 
+@pytest.mark.slow
 def test_a_complete_capture_is_left_as_it_is_and_an_incomplete_one_is_not(
     coarse: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
