@@ -1,8 +1,10 @@
 """PnP in a synthetic map whose points, descriptors and poses are known."""
 
+import ctypes
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from threading import Event, Thread
 
 import numpy as np
 import pycolmap
@@ -504,6 +506,23 @@ def test_the_same_answer_in_whatever_order_threads_come(room: World) -> None:
         with ThreadPoolExecutor(3) as pool:
             answers = dict(zip(order, pool.map(partial(answer, room.localizer()), order), strict=True))
         assert [answers[index] for index in range(6)] == alone
+
+
+def test_a_rigs_pose_does_not_depend_on_who_else_draws_numbers(room: World) -> None:
+    """PoseLib draws from the C library's generator, as ZeroMQ does in a kernel."""
+    asked, draw, done = rig_asked(room, outliers=0.5), ctypes.CDLL(None).rand, Event()
+
+    def others() -> None:
+        while not done.wait(1e-4):
+            draw()
+
+    alone = ask(room.localizer(), *asked).world_from_rig
+    thread = Thread(target=others)
+    thread.start()
+    poses = [ask(room.localizer(), *asked).world_from_rig for _ in range(12)]
+    done.set()
+    thread.join()
+    assert all(np.array_equal(pose, alone) for pose in poses)
 
 
 def test_localizing_leaves_the_map_as_it_is(room: World) -> None:

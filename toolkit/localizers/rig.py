@@ -18,9 +18,11 @@ from toolkit.manifest import PnpSettings
 
 RANSAC_CONFIDENCE = 0.9999
 
-# PoseLib's solver for rigs draws from the C library's generator, which threads share: without a seed of its own, or two
-# at once, equal seeds would give poses that are unequal in their last digits.
+# PoseLib's solver for rigs draws from the C library's generator, which all threads share: without a seed of its own, or
+# two at once, equal seeds would give poses that are unequal in their last digits. Other libraries draw from it, too
+# (ZeroMQ in a kernel): hence a pose is rounded to what no draw changes, and refinement starts from equals.
 _RIG_RANSAC = Lock()
+_DECIMALS = 9
 
 
 @dataclass(frozen=True)
@@ -141,8 +143,10 @@ class RigQuery:
                 found, info = poselib.estimate_generalized_absolute_pose(plane, seen, places, cameras, options)
         if info["num_inliers"] < 4 or not np.isfinite(found.Rt).all():
             return None
-        pose = np.vstack([found.Rt, [0.0, 0.0, 0.0, 1.0]])
-        return np.asarray(self.rig_from_cams[0] @ pose if len(self.cameras) == 1 else pose, np.float64)
+        if len(self.cameras) == 1:
+            return np.asarray(self.rig_from_cams[0] @ _matrix(found.Rt), np.float64)
+        rotation = geometry.quaternion_to_rotation(np.round(found.q, _DECIMALS))
+        return geometry.make_pose(rotation, np.round(found.t, _DECIMALS - 3))
 
     def refine(self, rig_from_world: Floats, matches: Matches, points: Floats) -> Floats | None:
         """Minimize the reprojection error of all matches to points (P, 3), robustly (Cauchy, 1 px)."""
@@ -151,7 +155,7 @@ class RigQuery:
         if len(self.cameras) == 1:
             start = pycolmap.Rigid3d((geometry.invert(self.rig_from_cams[0]) @ rig_from_world)[:3])
             answer = pycolmap.refine_absolute_pose(start, matches.pixels, matched, mask, self.cameras[0], options)
-            return None if answer is None else self.rig_from_cams[0] @ _matrix(answer["cam_from_world"])
+            return None if answer is None else self.rig_from_cams[0] @ _matrix(answer["cam_from_world"].matrix())
         answer = pycolmap.refine_generalized_absolute_pose(
             pycolmap.Rigid3d(rig_from_world[:3]),
             matches.pixels,
@@ -162,7 +166,7 @@ class RigQuery:
             self.cameras,
             options,
         )
-        return None if answer is None else _matrix(answer["rig_from_world"])
+        return None if answer is None else _matrix(answer["rig_from_world"].matrix())
 
     def errors_px(self, rig_from_world: Floats, matches: Matches, points: Floats) -> Floats:
         """Return the reprojection errors (K,) of matches to points (P, 3), inf behind a camera."""
@@ -237,5 +241,6 @@ def least_squares_covariance(
     return np.asarray(inverse @ middle @ inverse, np.float64)
 
 
-def _matrix(rigid: pycolmap.Rigid3d) -> Floats:
-    return np.vstack([rigid.matrix(), [0.0, 0.0, 0.0, 1.0]])
+def _matrix(pose: Floats) -> Floats:
+    """Return a pose (3, 4) as (4, 4)."""
+    return np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
