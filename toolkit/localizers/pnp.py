@@ -225,14 +225,13 @@ class PnpLocalizer:
         for radius in self.settings.guided_radii_deg:
             images = self.matcher.covisible(np.unique(best.matches.point))
             near = self.matcher.guided(query, best.rig_from_world, images, radius)
-            pose = query.refine(best.rig_from_world, near, self.map.points) if len(near) >= least else None
-            if pose is None:
+            if len(near) < least:
                 break
+            pose = query.refine(best.rig_from_world, near, self.map.points)
             near = near[query.errors_deg(pose, near, self.map.points) < self.settings.max_error_deg]
-            pose = query.refine(pose, near, self.map.points) if len(near) >= least else None
-            if pose is None:
+            if len(near) < least:
                 break
-            best = _Hypothesis(pose, near)
+            best = _Hypothesis(query.refine(pose, near, self.map.points), near)
         return best
 
     def _estimate(

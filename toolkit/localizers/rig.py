@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from threading import Lock
+from typing import Any
 
 import numpy as np
 import poselib
@@ -13,10 +14,13 @@ from scipy.spatial import KDTree
 from toolkit import geometry
 from toolkit.capture.cameras import projection_jacobian, view_bounds
 from toolkit.features.features import LocalFeatures
+from toolkit.features.matching import unit_descriptors
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import PnpSettings
 
 RANSAC_CONFIDENCE = 0.9999
+POSELIB_MODELS = "SIMPLE_PINHOLE PINHOLE SIMPLE_RADIAL RADIAL OPENCV FULL_OPENCV OPENCV_FISHEYE".split()
+"""COLMAP's names of the lenses that PoseLib 2.0.5 can refine with; of others it leaves the pose as it is."""
 
 # PoseLib's solver for rigs draws from the C library's generator, which all threads share: without a seed of its own, or
 # two at once, equal seeds would give poses that are unequal in their last digits. Other libraries draw from it, too
@@ -53,7 +57,7 @@ class Matches:
     def __len__(self) -> int:
         return len(self.point)
 
-    def __getitem__(self, part: NDArray[np.bool_]) -> "Matches":
+    def __getitem__(self, part: NDArray[np.bool_] | Ints) -> "Matches":
         return Matches(self.camera[part], self.pixels[part], self.point[part])
 
 
@@ -67,12 +71,19 @@ class RigQuery:
         self.cameras = cameras
         self.rig_from_cams = rig_from_cams
         self.features = features  # of each camera, of each kind
-        self.cams_from_rig = [pycolmap.Rigid3d(pose[:3]) for pose in geometry.invert(rig_from_cams)]
+        self._places = [_poselib(pose) for pose in geometry.invert(rig_from_cams)]
         self.focals_px = np.array([camera.mean_focal_length() for camera in cameras])
         self.bounds = np.stack([view_bounds(camera) for camera in cameras])
+        self._descriptors: dict[tuple[int, int], NDArray[np.float32]] = {}
         self.trees = [
             [KDTree(f.keypoints) if len(f) else KDTree(np.zeros((1, 2)) - 1e9) for f in kinds] for kinds in features
         ]
+
+    def descriptors(self, camera: int, kind: int) -> NDArray[np.float32]:
+        """Return the descriptors (N, D) of an image's features of one kind, ready for dot products."""
+        if (camera, kind) not in self._descriptors:
+            self._descriptors[camera, kind] = unit_descriptors(self.features[camera][kind].descriptors)
+        return self._descriptors[camera, kind]
 
     def pixels(self, camera: Ints, keypoint: Ints, kind: int) -> Floats:
         """Return the places (K, 2) of keypoints of one kind."""
@@ -110,37 +121,23 @@ class RigQuery:
             matches = matches[kept]
         least_share = np.clip(least_inliers / len(matches), 1e-3, 0.99)
         trials = np.log(1 - RANSAC_CONFIDENCE) / np.log1p(-(least_share**3))  # to draw three inliers once
-        focal_px = float(self.focals_px.mean())
         options = {
             "success_prob": RANSAC_CONFIDENCE,
             "dyn_num_trials_mult": 1.0,
             "min_iterations": 100,
             "max_iterations": int(np.clip(trials, 100, settings.ransac_max_trials)),
             "seed": seed,
-            "max_reproj_error": float(np.tan(np.radians(max_error_deg)) * focal_px),
+            "max_reproj_error": float(np.tan(np.radians(max_error_deg)) * self.focals_px.mean()),
         }
-        plane, seen, cameras = [], [], []
-        for index, camera in enumerate(self.cameras):
-            part = matches.camera == index
-            xy = np.asarray(camera.cam_from_img(matches.pixels[part])).reshape(-1, 2)
-            finite = np.isfinite(xy).all(axis=1)
-            plane.append(focal_px * xy[finite])
-            seen.append(points[matches.point[part][finite]])
-            params = [focal_px, 0.0, 0.0]
-            cameras.append(
-                {"model": "SIMPLE_PINHOLE", "width": camera.width, "height": camera.height, "params": params}
-            )
+        plane, seen, cameras = self._by_camera(matches, points, flat=True)
         if sum(map(len, seen)) < 4:
             return None
         if len(self.cameras) == 1:
             found, info = poselib.estimate_absolute_pose(plane[0], seen[0], cameras[0], options)
         else:
-            places = [poselib.CameraPose() for _ in self.cameras]
-            for place, cam_from_rig in zip(places, self.cams_from_rig, strict=True):
-                place.Rt = cam_from_rig.matrix()
             with _RIG_RANSAC:
                 pycolmap.set_random_seed(seed)  # that of the C library, too
-                found, info = poselib.estimate_generalized_absolute_pose(plane, seen, places, cameras, options)
+                found, info = poselib.estimate_generalized_absolute_pose(plane, seen, self._places, cameras, options)
         if info["num_inliers"] < 4 or not np.isfinite(found.Rt).all():
             return None
         if len(self.cameras) == 1:
@@ -148,37 +145,58 @@ class RigQuery:
         rotation = geometry.quaternion_to_rotation(np.round(found.q, _DECIMALS))
         return geometry.make_pose(rotation, np.round(found.t, _DECIMALS - 3))
 
-    def refine(self, rig_from_world: Floats, matches: Matches, points: Floats) -> Floats | None:
-        """Minimize the reprojection error of all matches to points (P, 3), robustly (Cauchy, 1 px)."""
-        options = pycolmap.AbsolutePoseRefinementOptions()
-        matched, mask = points[matches.point], np.ones(len(matches), bool)
-        if len(self.cameras) == 1:
-            start = pycolmap.Rigid3d((geometry.invert(self.rig_from_cams[0]) @ rig_from_world)[:3])
-            answer = pycolmap.refine_absolute_pose(start, matches.pixels, matched, mask, self.cameras[0], options)
-            return None if answer is None else self.rig_from_cams[0] @ _matrix(answer["cam_from_world"].matrix())
-        answer = pycolmap.refine_generalized_absolute_pose(
-            pycolmap.Rigid3d(rig_from_world[:3]),
-            matches.pixels,
-            matched,
-            mask,
-            matches.camera.tolist(),
-            self.cams_from_rig,
-            self.cameras,
-            options,
-        )
-        return None if answer is None else _matrix(answer["rig_from_world"].matrix())
+    def _by_camera(
+        self, matches: Matches, points: Floats, flat: bool
+    ) -> tuple[list[Floats], list[Floats], list[dict[str, Any]]]:
+        """Return pixels (n, 2) and points (n, 3) of the matches of each camera, and the cameras, as PoseLib takes them.
 
-    def errors_px(self, rig_from_world: Floats, matches: Matches, points: Floats) -> Floats:
-        """Return the reprojection errors (K,) of matches to points (P, 3), inf behind a camera."""
-        errors = np.full(len(matches), np.inf)
+        Args:
+            flat: pixels are those of pinhole cameras of the mean focal length, not of the lenses.
+        """
+        focal_px = float(self.focals_px.mean())
+        pixels, seen, cameras = [], [], []
+        for index, camera in enumerate(self.cameras):
+            part = matches.camera == index
+            xy, place = matches.pixels[part], points[matches.point[part]]
+            model, params = camera.model.name, camera.params.tolist()
+            if flat or model not in POSELIB_MODELS:
+                xy = focal_px * np.asarray(camera.cam_from_img(xy)).reshape(-1, 2)
+                finite = np.isfinite(xy).all(axis=1)
+                xy, place = xy[finite], place[finite]
+                model, params = "SIMPLE_PINHOLE", [focal_px, 0.0, 0.0]
+            pixels.append(xy)
+            seen.append(place)
+            cameras.append({"model": model, "width": camera.width, "height": camera.height, "params": params})
+        return pixels, seen, cameras
+
+    def refine(self, rig_from_world: Floats, matches: Matches, points: Floats) -> Floats:
+        """Return rig_from_world (4, 4) of the least reprojection error of matches to points (P, 3), by PoseLib.
+
+        The loss is Cauchy's, 1 px. Where PoseLib does not know the model of a lens, errors are those of `ransac`.
+        """
+        pixels, seen, cameras = self._by_camera(matches, points, flat=False)
+        refined, _ = poselib.refine_generalized_absolute_pose(
+            pixels, seen, _poselib(rig_from_world), self._places, cameras, {"loss_type": "CAUCHY", "loss_scale": 1.0}
+        )
+        return _matrix(refined.Rt)
+
+    def projected(self, rig_from_world: Floats, matches: Matches, points: Floats) -> Floats:
+        """Return where a pose puts the points of matches in their images (K, 2), pixels; inf behind a camera."""
+        pixels = np.full((len(matches), 2), np.inf)
         for index in np.unique(matches.camera):
             part = matches.camera == index
             cam_from_world = geometry.invert(self.rig_from_cams[index]) @ rig_from_world
             in_cam = geometry.transform(cam_from_world, points[matches.point[part]])
             projected = np.asarray(self.cameras[index].img_from_cam(in_cam))
-            error = np.linalg.norm(projected - matches.pixels[part], axis=1)
-            errors[part] = np.where((in_cam[:, 2] > 1e-3) & np.isfinite(error), error, np.inf)
-        return errors
+            seen = (in_cam[:, 2] > 1e-3) & np.isfinite(projected).all(axis=1)
+            pixels[part] = np.where(seen[:, None], projected, np.inf)
+        return pixels
+
+    def errors_px(self, rig_from_world: Floats, matches: Matches, points: Floats) -> Floats:
+        """Return the reprojection errors (K,) of matches to points (P, 3), inf behind a camera."""
+        return np.asarray(
+            np.linalg.norm(self.projected(rig_from_world, matches, points) - matches.pixels, axis=1), np.float64
+        )
 
     def errors_deg(self, rig_from_world: Floats, matches: Matches, points: Floats) -> Floats:
         """Return the reprojection errors (K,) as angles."""
@@ -239,6 +257,12 @@ def least_squares_covariance(
     middle = np.einsum("oki,okl,olj->ij", of_unknowns, noise, of_unknowns) + variance**2 * known
     inverse = np.linalg.inv(information)
     return np.asarray(inverse @ middle @ inverse, np.float64)
+
+
+def _poselib(pose: Floats) -> poselib.CameraPose:
+    converted = poselib.CameraPose()
+    converted.Rt = pose[:3]
+    return converted
 
 
 def _matrix(pose: Floats) -> Floats:
