@@ -17,7 +17,7 @@ CAMERAS = [
 ]
 STRANGE = [
     pycolmap.Camera(model="FOV", **SIZE, params=[500, 500, 480, 320, 0.8]),
-    pycolmap.Camera(model="THIN_PRISM_FISHEYE", **SIZE, params=[500, 505, 478, 322, 0.05, -0.01, 0, 0, 0, 0, 0.01, 0.01]),
+    pycolmap.Camera(model="THIN_PRISM_FISHEYE", **SIZE, params=[500, 505, 478, 322, 0.05, *[0.0] * 5, 0.01, 0]),
     pycolmap.Camera(model="RADIAL_FISHEYE", **SIZE, params=[500, 480, 320, 0.05, -0.01]),
 ]
 TURN = Rotation.from_rotvec(np.radians([[0, 0, 0], [0, 90, 0], [0, 180, 0]])).as_matrix()

@@ -1,7 +1,7 @@
 """Match the images of a query with the points of a map: by descriptors alone, and near where a pose puts them."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from threading import Lock
 
@@ -98,7 +98,7 @@ class MappedFeatures:
         points[keypoint] = point
         return points
 
-    def match_guided(
+    def candidates(
         self,
         query: RigQuery,
         kind: int,
@@ -106,8 +106,8 @@ class MappedFeatures:
         references: Sequence[int],
         radius_deg: float,
         settings: PnpSettings,
-    ) -> Iterator[Matches]:
-        """Yield, for each query image, the matches of map points near where a pose puts them.
+    ) -> Iterator["Candidates"]:
+        """Yield, for each query image, its keypoints near where a pose puts map points that look like them.
 
         Args:
             query: the query's cameras and features.
@@ -115,16 +115,19 @@ class MappedFeatures:
             rig_from_world: the pose, (4, 4).
             references: indices of this map's images, whose points are projected.
             radius_deg: largest distance of a keypoint from the projection.
-            settings: how many features and matches.
+            settings: how many features of an image.
         """
         references = [index for index in references if len(self.map.observations(index)[0])]
         if not references:
             return
         images = [self.image(index, settings.max_map_features) for index in references]
-        point = np.concatenate([image.points for image in images])
-        image_of = np.concatenate([np.full(len(m.points), i) for m, i in zip(images, references, strict=True)])
+        # A point that several images see is projected once.
+        point, which = np.unique(np.concatenate([image.points for image in images]), return_inverse=True)
+        by_point, counts = np.argsort(which, kind="stable"), np.bincount(which)
+        starts, places = np.cumsum(counts) - counts, self.map.points[point]
+        image_of = np.repeat(references, [len(image.points) for image in images])
         descriptors = np.concatenate([image.features.descriptors for image in images])
-        depth = np.einsum("oj,oj->o", self.map.cams_from_world[image_of, 2, :3], self.map.points[point])
+        depth = np.einsum("oj,oj->o", self.map.cams_from_world[image_of, 2, :3], places[which])
         depth += self.map.cams_from_world[image_of, 2, 3]
         # Size of the feature on the surface, meters: it looks that large from everywhere.
         size = np.concatenate([image.features.scales for image in images]) * depth / self.map.focals_px[image_of]
@@ -132,7 +135,7 @@ class MappedFeatures:
             features = kinds[kind]
             radius = np.tan(np.radians(radius_deg)) * query.focals_px[camera]
             cam_from_world = geometry.invert(query.rig_from_cams[camera]) @ rig_from_world
-            in_cam = geometry.transform(cam_from_world, self.map.points[point])
+            in_cam = geometry.transform(cam_from_world, places)
             visible = np.flatnonzero(in_view(in_cam[None], query.bounds[camera][None])[0])
             if not len(visible) or not len(features):
                 continue
@@ -141,24 +144,86 @@ class MappedFeatures:
             visible, projected = visible[finite], projected[finite]
             tree = query.trees[camera][kind]
             near = KDTree(projected).sparse_distance_matrix(tree, radius, output_type="ndarray")
-            order = np.lexsort((near["j"], near["i"]))
-            observed, keypoint = visible[near["i"][order]], near["j"][order]
-            expected = size[observed] * query.focals_px[camera] / in_cam[observed, 2]
+            seen = visible[near["i"]]
+            keypoint = np.repeat(near["j"], counts[seen])
+            within = np.arange(len(keypoint)) - np.repeat(np.cumsum(counts[seen]) - counts[seen], counts[seen])
+            observed = by_point[np.repeat(starts[seen], counts[seen]) + within]
+            expected = size[observed] * query.focals_px[camera] / in_cam[which[observed], 2]
             octaves = np.abs(np.log2(features.scales[keypoint] / np.maximum(expected, 1e-6)))
             similar = octaves < self.kind.scale_octaves
             observed, keypoint = observed[similar], keypoint[similar]
             score = np.einsum(
-                "od,od->o", unit_descriptors(descriptors[observed]), unit_descriptors(features.descriptors[keypoint])
+                "od,od->o", unit_descriptors(descriptors[observed]), query.descriptors(camera, kind)[keypoint]
             )
-            order = np.argsort(-score, kind="stable")
-            order = order[score[order] > self.kind.guided_min_score]
-            candidate, keypoint = point[observed[order]], keypoint[order]
-            # Best first: the first of each keypoint and of each point, where they are the same match.
-            first_of_keypoint = np.unique(keypoint, return_index=True)[1]
-            first_of_point = np.unique(candidate, return_index=True)[1]
-            mutual = np.intersect1d(first_of_keypoint, first_of_point)[: settings.max_guided_matches]
-            pixels = features.keypoints[keypoint[mutual]].astype(np.float64)
-            yield Matches(np.full(len(mutual), camera), pixels, candidate[mutual])
+            alike = np.flatnonzero(score > self.kind.guided_min_score)
+            alike = alike[np.lexsort((keypoint[alike], observed[alike], -score[alike]))]
+            keypoint, of_camera = keypoint[alike], np.full(len(alike), camera)
+            pixels = features.keypoints[keypoint].astype(np.float64)
+            yield Candidates(Matches(of_camera, pixels, point[which[observed[alike]]]), keypoint)
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """K matches of a query image with one kind of features, the most alike first; some may exclude each other."""
+
+    matches: Matches
+    keypoint: Ints
+    """(K,) of the query image."""
+
+    def mutual(self, part: Ints) -> Ints:
+        """Return those of a part, ascending, whose keypoint and point are the most alike to each other."""
+        first_of_keypoint = np.unique(self.keypoint[part], return_index=True)[1]
+        first_of_point = np.unique(self.matches.point[part], return_index=True)[1]
+        return part[np.intersect1d(first_of_keypoint, first_of_point)]
+
+
+class Vicinity:
+    """What a query shows near where a pose puts the points of map images: poses nearby choose their matches from it."""
+
+    def __init__(
+        self,
+        query: RigQuery,
+        candidates: Sequence[Candidates],
+        points: Floats,
+        rig_from_world: Floats,
+        radius_deg: float,
+    ) -> None:
+        """
+        Args:
+            query: its cameras and features.
+            candidates: all that are within the radius of the projections.
+            points: (P, 3) the map points.
+            rig_from_world: the pose, (4, 4).
+            radius_deg: of the search.
+        """
+        self._query, self._candidates, self._points, self._radius_deg = query, candidates, points, radius_deg
+        self._projected = [query.projected(rig_from_world, part.matches, points) for part in candidates]
+
+    def reaches(self, rig_from_world: Floats, radius_deg: float) -> bool:
+        """Tell whether all that is within a radius of what another pose projects was found."""
+        return all(
+            (self._angles_deg(rig_from_world, part, before) <= self._radius_deg - radius_deg).all()
+            for part, before in zip(self._candidates, self._projected, strict=True)
+        )
+
+    def guided(self, rig_from_world: Floats, radius_deg: float, most: int) -> Matches:
+        """Return the matches of a pose.
+
+        Args:
+            rig_from_world: the pose, (4, 4).
+            radius_deg: largest distance of a keypoint from the projection.
+            most: matches of a camera and a kind at most, the most alike.
+        """
+        chosen = []
+        for part in self._candidates:
+            near = self._angles_deg(rig_from_world, part, part.matches.pixels) <= radius_deg
+            chosen.append(part.matches[part.mutual(np.flatnonzero(near))[:most]])
+        return Matches.pooled(chosen)
+
+    def _angles_deg(self, rig_from_world: Floats, part: Candidates, pixels: Floats) -> Floats:
+        """Return how far a pose puts the points of candidates from pixels (K, 2), as angles (K,)."""
+        offsets = self._query.projected(rig_from_world, part.matches, self._points) - pixels
+        return np.degrees(np.arctan(np.linalg.norm(offsets, axis=1) / self._query.focals_px[part.matches.camera]))
 
 
 class MapMatcher:
@@ -196,15 +261,16 @@ class MapMatcher:
             parts.append(Matches(camera_index, query.pixels(camera_index, keypoint, kind), point))
         return Matches.pooled(parts)
 
-    def guided(self, query: RigQuery, rig_from_world: Floats, images: Ints, radius_deg: float) -> Matches:
-        """Match the points of map images near where the pose puts them, those of each kind alone."""
-        return Matches.pooled([
-            Matches(part.camera, part.pixels, part.point + int(self._first_point[kind]))
+    def vicinity(self, query: RigQuery, rig_from_world: Floats, images: Ints, radius_deg: float) -> Vicinity:
+        """Return what is near where the pose puts the points of map images, those of each kind alone."""
+        candidates = [
+            replace(part, matches=replace(part.matches, point=part.matches.point + int(self._first_point[kind])))
             for kind, features in enumerate(self.mapped)
-            for part in features.match_guided(
+            for part in features.candidates(
                 query, kind, rig_from_world, self._of_kind(kind, images), radius_deg, self.settings
             )
-        ])  # fmt: skip
+        ]
+        return Vicinity(query, candidates, self.map.points, rig_from_world, radius_deg)
 
     def covisible(self, points: Ints) -> Ints:
         """Return the map images that see the most of the points, in a fixed order."""

@@ -18,7 +18,7 @@ from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import CAMERA, Asked, PoseEstimate, Prior, Query, References, agree
 from toolkit.localizers.confidence import EVIDENCE, probability_right
 from toolkit.localizers.correspondences import Correspondences
-from toolkit.localizers.matches import MapMatcher, MappedFeatures
+from toolkit.localizers.matches import MapMatcher, MappedFeatures, Vicinity
 from toolkit.localizers.misfit import find_misfit
 from toolkit.localizers.rig import Matches, RigQuery, least_squares_covariance
 from toolkit.manifest import PnpSettings
@@ -138,9 +138,9 @@ class PnpLocalizer:
         """Return the estimate that was found without a prior, or the one found with it if it is better supported."""
         if estimate.status == "ok" and agree(estimate.world_from_rig, prior.world_from_rig):
             return estimate  # each confirms the other
-        near = self.matcher.guided(
-            query, geometry.invert(prior.world_from_rig), self._seeing_the_same(prior.images), prior.radius_deg
-        )
+        of_prior = geometry.invert(prior.world_from_rig)
+        vicinity = self.matcher.vicinity(query, of_prior, self._seeing_the_same(prior.images), prior.radius_deg)
+        near = vicinity.guided(of_prior, prior.radius_deg, self.settings.max_guided_matches)
         start = self._ransac(query, near, self.settings.ransac_max_error_deg) if len(near) else None
         if start is None:
             return estimate
@@ -220,18 +220,23 @@ class PnpLocalizer:
 
     def _improve(self, query: RigQuery, rig_from_world: Floats, matches: Matches) -> _Hypothesis:
         """Match again around a pose and refine it, as long as that finds support."""
+        settings = self.settings
         best = _Hypothesis(rig_from_world, matches[self._inliers(query, rig_from_world, matches)])
         least = max(4, 0.5 * len(np.unique(best.matches.point)))
-        for radius in self.settings.guided_radii_deg:
-            images = self.matcher.covisible(np.unique(best.matches.point))
-            near = self.matcher.guided(query, best.rig_from_world, images, radius)
+        vicinity: Vicinity | None = None
+        for radius in settings.guided_radii_deg:
+            pose = best.rig_from_world
+            if vicinity is None or not vicinity.reaches(pose, radius):
+                images = self.matcher.covisible(np.unique(best.matches.point))
+                vicinity = self.matcher.vicinity(query, pose, images, radius)
+            near = vicinity.guided(pose, radius, settings.max_guided_matches)
             if len(near) < least:
                 break
-            pose = query.refine(best.rig_from_world, near, self.map.points)
-            near = near[query.errors_deg(pose, near, self.map.points) < self.settings.max_error_deg]
+            refined = query.refine(pose, near, self.map.points)
+            near = near[query.errors_deg(refined, near, self.map.points) < settings.max_error_deg]
             if len(near) < least:
                 break
-            best = _Hypothesis(query.refine(pose, near, self.map.points), near)
+            best = _Hypothesis(query.refine(refined, near, self.map.points), near)
         return best
 
     def _estimate(

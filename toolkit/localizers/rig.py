@@ -19,7 +19,7 @@ from toolkit.geometry import Floats, Ints
 from toolkit.manifest import PnpSettings
 
 RANSAC_CONFIDENCE = 0.9999
-POSELIB_MODELS = "SIMPLE_PINHOLE PINHOLE SIMPLE_RADIAL RADIAL OPENCV FULL_OPENCV OPENCV_FISHEYE".split()
+POSELIB_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
 """COLMAP's names of the lenses that PoseLib 2.0.5 can refine with; of others it leaves the pose as it is."""
 
 # PoseLib's solver for rigs draws from the C library's generator, which all threads share: without a seed of its own, or
