@@ -178,9 +178,11 @@ class MutualMatcher:
 
     def match(self, pairs: Sequence[tuple[LocalFeatures, LocalFeatures]]) -> list[PairMatches]:
         """Return the matches of pairs of images; the ratio test is of the first image's features."""
-        matches = []
+        matches, first, unit_a = [], None, np.zeros((0, 0), np.float32)
         for a, b in pairs:
-            scores = unit_descriptors(a.descriptors) @ unit_descriptors(b.descriptors).T
+            if a is not first:  # mostly one image is matched with several
+                first, unit_a = a, unit_descriptors(a.descriptors)
+            scores = unit_a @ unit_descriptors(b.descriptors).T
             indices = mutual_matches(scores, self.ratio, self.min_score)
             matches.append(PairMatches(indices, scores[indices[:, 0], indices[:, 1]]))
         return matches
@@ -274,8 +276,9 @@ def mutual_matches(scores: NDArray[np.float32], ratio: float = 0.8, min_score: f
     top = scores[rows, best]
     # |a - b|^2 = 2 - 2 a.b for unit vectors
     keep = np.flatnonzero(((1.0 - top) < ratio**2 * (1.0 - second)) & (top > min_score))
-    # Only columns that are the best of a row need to be checked from the other side.
-    keep = keep[np.argmax(scores[:, best[keep]], axis=0) == keep]
+    keep = keep[top[keep] == scores.max(axis=0)[best[keep]]]
+    # Of rows that are equally near to a column, the first.
+    keep = keep[np.sort(np.unique(best[keep], return_index=True)[1])]
     return np.stack([keep, best[keep]], axis=1)
 
 
@@ -329,38 +332,47 @@ def match_along_epipolar_lines(
     reach_b = np.arcsin(np.minimum(max_angle_b / np.maximum(np.sin(elevation_b), 1e-9), 1.0))
     order_a = np.argsort(turn_a, kind="stable")
     order_b = np.argsort(turn_b, kind="stable")
-    # Turns wrap around: b's are repeated three times so that every window is one slice.
     m = len(order_b)
-    wrapped = np.concatenate([turn_b[order_b] - 2 * np.pi, turn_b[order_b], turn_b[order_b] + 2 * np.pi])
+    (turns_a, reach_a, near_a), (turns_b, reach_b, near_b) = (
+        np.stack(values)[:, order].astype(np.float32)
+        for order, values in ((order_a, (turn_a, reach_a, elevation_a)), (order_b, (turn_b, reach_b, elevation_b)))
+    )
+    descriptors_a, descriptors_b = descriptors_a[order_a], descriptors_b[order_b]
+    # Turns wrap around: b's are repeated three times so that every window is one slice.
+    wrapped = np.concatenate([turns_b - 2 * np.pi, turns_b, turns_b + 2 * np.pi], dtype=np.float32)
     row_best = np.full(len(rays_a), -1, np.int64)
     column_best = np.full(m, -1, np.int64)
     column_score = np.full(m, -2.0, np.float32)
-    slack = max_angle_a + max_angle_b
+    near_a = near_a + np.float32(max_angle_a + max_angle_b)
     for start in range(0, len(order_a), 64):
-        rows = order_a[start : start + 64]
-        low = np.searchsorted(wrapped, (turn_a[rows] - reach_a[rows]).min())
-        high = np.searchsorted(wrapped, (turn_a[rows] + reach_a[rows]).max())
-        if high - low > m:
+        rows = slice(start, start + 64)
+        low = np.searchsorted(wrapped, (turns_a[rows] - reach_a[rows]).min())
+        high = np.searchsorted(wrapped, (turns_a[rows] + reach_a[rows]).max())
+        whole = high - low > m
+        if whole:
             low, high = m, 2 * m
         if high <= low:
             continue
-        columns = order_b[np.arange(low, high) % m]
-        apart = np.abs(turn_a[rows, None] - wrapped[None, low:high])
-        apart = np.minimum(apart, 2 * np.pi - apart)
+        inside = low // m == (high - 1) // m
+        columns: slice | Ints = slice(low % m, low % m + high - low) if inside else np.arange(low, high) % m
+        apart = np.abs(turns_a[rows, None] - wrapped[low:high])
+        if whole:
+            apart = np.minimum(apart, np.float32(2 * np.pi) - apart)
         # In their half-plane the rays meet in front of both cameras only if b's is nearer to the axis.
-        allowed = (apart < np.minimum(reach_a[rows, None], reach_b[columns])) & (
-            elevation_b[columns] < elevation_a[rows, None] + slack
-        )
-        scores = np.where(allowed, descriptors_a[rows] @ descriptors_b[columns].T, np.float32(-2.0))
+        excluded = apart >= reach_a[rows, None]
+        excluded |= apart >= reach_b[columns]
+        excluded |= near_b[columns] >= near_a[rows, None]
+        scores = descriptors_a[rows] @ descriptors_b[columns].T
+        scores[excluded] = -2.0
         best, second = _two_best(scores)
-        top = scores[np.arange(len(rows)), best]
-        good = (top > min_score) & ((1.0 - top) < ratio**2 * (1.0 - second))
-        row_best[rows[good]] = columns[best[good]]
-        winners = np.argmax(scores, axis=0)
-        winning = scores[winners, np.arange(len(columns))]
-        better = winning > column_score[columns]
-        column_best[columns[better]] = rows[winners[better]]
-        column_score[columns[better]] = winning[better]
+        top = scores[np.arange(len(scores)), best]
+        good = np.flatnonzero((top > min_score) & ((1.0 - top) < ratio**2 * (1.0 - second)))
+        number_b = order_b[columns]
+        row_best[order_a[rows][good]] = number_b[best[good]]
+        winning = scores.max(axis=0)
+        better = np.flatnonzero(winning > column_score[number_b])
+        column_best[number_b[better]] = order_a[rows][np.argmax(scores[:, better], axis=0)]
+        column_score[number_b[better]] = winning[better]
     matched = np.flatnonzero(row_best >= 0)
     matched = matched[column_best[row_best[matched]] == matched]
     return np.stack([matched, row_best[matched]], axis=1)
