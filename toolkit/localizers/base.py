@@ -90,6 +90,10 @@ class References:
         """Return references; without scores, all are equally similar."""
         return cls(np.array(images, np.int64), np.array(scores if scores is not None else [1.0] * len(images)))
 
+    def take(self, part: slice | NDArray[np.bool_]) -> "References":
+        """Return some of them."""
+        return References(self.images[part], self.scores[part])
+
 
 Asked = tuple[Query, Sequence[References]]
 """A query with the references of each of its images."""

@@ -23,6 +23,10 @@ CACHED_IMAGES = 256
 """Map images whose features are kept in memory."""
 
 
+KnownMatches = dict[tuple[int, int, int], tuple[Ints, Ints]]
+"""By query image, kind of features and map image: keypoints of the query and map points, each (K,)."""
+
+
 @dataclass(frozen=True)
 class MapImage:
     """The features of a map image that see a point, longest tracks first."""
@@ -59,8 +63,8 @@ class MappedFeatures:
         references: Sequence[int],
         settings: PnpSettings,
         network_matches: NetworkMatches | None = None,
-    ) -> tuple[Ints, Ints]:
-        """Match a query image with references; returns keypoints of the query and map points, each (K,).
+    ) -> list[tuple[Ints, Ints]]:
+        """Match a query image with references; returns for each keypoints of the query and map points, each (K,).
 
         Args:
             references: indices of this map's images.
@@ -80,10 +84,11 @@ class MappedFeatures:
                 with self._network:
                     pairs = self.matcher.match([(query, self.features[name]) for name in names])
             points = [self._point_of_each_feature(index) for index in references]
-        nothing = np.zeros(0, np.int64)
-        keypoint = np.concatenate([nothing, *(pair.indices[:, 0] for pair in pairs)])
-        point = np.concatenate([nothing, *(of[pair.indices[:, 1]] for of, pair in zip(points, pairs, strict=True))])
-        return keypoint[point >= 0], point[point >= 0]
+        found = []
+        for pair, of_feature in zip(pairs, points, strict=True):
+            keypoint, point = pair.indices[:, 0], of_feature[pair.indices[:, 1]]
+            found.append((keypoint[point >= 0], point[point >= 0]))
+        return found
 
     def _image(self, index: int, max_features: int) -> MapImage:
         """Return the features of a map image that see points, those of the longest tracks."""
@@ -247,16 +252,29 @@ class MapMatcher:
         query: RigQuery,
         references: Sequence[References],
         network_matches: Sequence[Sequence[NetworkMatches | None]] = (),
+        known: KnownMatches | None = None,
     ) -> Matches:
-        """Match each query image with its references by descriptors, those of each kind alone."""
-        parts = []
+        """Match each query image with its references by descriptors, those of each kind alone.
+
+        Args:
+            query: its cameras and features.
+            references: of each query image.
+            network_matches: those that networks made before, of each query image and kind.
+            known: those of the query that were made before; the others are added.
+        """
+        parts, known = [], KnownMatches() if known is None else known
         for kind, features in enumerate(self.mapped):
-            rows = []
+            rows = [np.zeros((0, 3), np.int64)]
             for camera, retrieved in enumerate(references):
                 before = network_matches[camera][kind] if network_matches else None
                 images = self._of_kind(kind, retrieved.images)
-                keypoint, point = features.match(query.features[camera][kind], images, self.settings, before)
-                rows.append(np.column_stack([np.full(len(point), camera), keypoint, point + self._first_point[kind]]))
+                new = [image for image in images if (camera, kind, image) not in known]
+                found = features.match(query.features[camera][kind], new, self.settings, before)
+                known |= {(camera, kind, image): part for image, part in zip(new, found, strict=True)}
+                for keypoint, point in (known[camera, kind, image] for image in images):
+                    rows.append(
+                        np.column_stack([np.full(len(point), camera), keypoint, point + self._first_point[kind]])
+                    )
             camera_index, keypoint, point = np.unique(np.concatenate(rows), axis=0).T
             parts.append(Matches(camera_index, query.pixels(camera_index, keypoint, kind), point))
         return Matches.pooled(parts)

@@ -15,14 +15,18 @@ from numpy.typing import NDArray
 
 from toolkit import geometry
 from toolkit.geometry import Floats, Ints
-from toolkit.localizers.base import CAMERA, Asked, PoseEstimate, Prior, Query, References, agree
+from toolkit.localizers.base import CAMERA, Asked, NetworkMatches, PoseEstimate, Prior, Query, References, agree
 from toolkit.localizers.confidence import EVIDENCE, probability_right
 from toolkit.localizers.correspondences import Correspondences
-from toolkit.localizers.matches import MapMatcher, MappedFeatures, Vicinity
+from toolkit.localizers.matches import KnownMatches, MapMatcher, MappedFeatures, Vicinity
 from toolkit.localizers.misfit import find_misfit
 from toolkit.localizers.rig import Matches, RigQuery, least_squares_covariance
 from toolkit.manifest import PnpSettings
 
+FIRST_REFERENCES = 4
+"""References of an image that are matched first."""
+ENOUGH_INLIERS = 100
+"""Independent inliers with which the pose found with these needs no other to start from."""
 VIEWS = 4
 """References of an estimate whose keypoints are kept with its correspondences, those that see the most of them."""
 
@@ -87,13 +91,12 @@ class PnpLocalizer:
             np.asarray(query.rig_from_cams, np.float64),
             [features for features in query.features if not isinstance(features, str)],
         )
-        matches = self.matcher.by_descriptors(rig, references, query.network_matches)
-        distinct = len(np.unique(matches.point))
-        hypotheses = self._hypotheses(rig, matches, references) if distinct >= 4 else []
+        matches, start = self._first_pose(rig, references, query.network_matches)
+        hypotheses = [] if start is None else self._hypotheses(rig, start, matches, references)
         if hypotheses:
             estimate = self._estimate(rig, matches, hypotheses, references)
         else:
-            status = "failed: no consistent pose" if distinct >= 4 else "failed: too few matches"
+            status = f"failed: {'no consistent pose' if len(np.unique(matches.point)) >= 4 else 'too few matches'}"
             estimate = PoseEstimate(status, num_matches=len(matches), correspondences=self._rejected(matches))
         for prior in priors:
             estimate = self._compare(rig, matches, hypotheses, estimate, references, prior)
@@ -167,8 +170,40 @@ class PnpLocalizer:
         points = [self.map.observations(int(image))[1] for image in images]
         return self.matcher.covisible(np.unique(np.concatenate([np.zeros(0, np.int64), *points])))
 
-    def _hypotheses(self, query: RigQuery, matches: Matches, references: Sequence[References]) -> list[_Hypothesis]:
-        """Return refined poses, best supported first.
+    def _first_pose(
+        self,
+        query: RigQuery,
+        references: Sequence[References],
+        network_matches: Sequence[Sequence[NetworkMatches | None]],
+    ) -> tuple[Matches, Floats | None]:
+        """Return matches by descriptors, and the pose that the most of them agree with, or None.
+
+        The best references have most of the right matches, the further ones mostly wrong ones, which slow RANSAC down.
+        So its pose is sought with the best, and again with all if it has few inliers. Where hardly anything else is in
+        the matches of the best, further references are matched only if they show another place, which may be a rival.
+        """
+        settings, known = self.settings, KnownMatches()
+        start: Floats | None = None
+        if any(len(part.images) > FIRST_REFERENCES for part in references):
+            best = [part.take(np.arange(len(part.images)) < FIRST_REFERENCES) for part in references]
+            matches = self.matcher.by_descriptors(query, best, network_matches, known)
+            start = self._ransac(query, matches, settings.ransac_max_error_deg)
+            inliers = matches[np.zeros(len(matches), bool) if start is None else self._inliers(query, start, matches)]
+            if self._independent(inliers) < ENOUGH_INLIERS:
+                start = None
+            elif len(inliers) > settings.clear_inlier_ratio * len(matches):
+                same = self.map.images_seeing(np.unique(inliers.point)) >= settings.min_inliers
+                references = [
+                    part.take((np.arange(len(part.images)) < FIRST_REFERENCES) | ~same[part.images])
+                    for part in references
+                ]
+        matches = self.matcher.by_descriptors(query, references, network_matches, known)
+        return matches, self._ransac(query, matches, settings.ransac_max_error_deg) if start is None else start
+
+    def _hypotheses(
+        self, query: RigQuery, start: Floats, matches: Matches, references: Sequence[References]
+    ) -> list[_Hypothesis]:
+        """Return refined poses, best supported first; one of them is refined from `start`, RANSAC's pose.
 
         Repeated structure (a row of like windows) gives several poses that many descriptors agree with, and
         RANSAC may take one of them or something in between. So unless the first is clear, others are sought, with a
@@ -176,26 +211,23 @@ class PnpLocalizer:
         guided matches decide: only the right pose puts the rest of the map where it is seen.
         """
         settings = self.settings
-        start = self._ransac(query, matches, settings.ransac_max_error_deg)
-        if start is None:
-            return []
         hypotheses = [self._improve(query, start, matches)]
         inliers = self._inliers(query, hypotheses[0].rig_from_world, matches)
         share = float(inliers.mean())
         if share > settings.clear_inlier_ratio:
             return hypotheses
         if share < settings.contested_inlier_ratio:
-            start = self._ransac(query, matches, settings.max_error_deg)
-            if start is not None:
-                hypotheses.append(self._improve(query, start, matches))
+            other = self._ransac(query, matches, settings.max_error_deg)
+            if other is not None:
+                hypotheses.append(self._improve(query, other, matches))
                 inliers |= self._inliers(query, hypotheses[1].rig_from_world, matches)
         rest = matches[~inliers]
         # No need to look for less than half of the support.
-        start = self._ransac(query, rest, settings.ransac_max_error_deg, least_inliers=int(inliers.sum() / 2))
-        if start is not None:
-            support = self._inliers(query, start, rest).sum()
+        other = self._ransac(query, rest, settings.ransac_max_error_deg, least_inliers=int(inliers.sum() / 2))
+        if other is not None:
+            support = self._inliers(query, other, rest).sum()
             if share < settings.contested_inlier_ratio or support >= inliers.sum() / 2:
-                hypotheses.append(self._improve(query, start, matches))
+                hypotheses.append(self._improve(query, other, matches))
         if share < settings.contested_inlier_ratio:
             self._add_by_reference(query, matches, references, hypotheses)
         return sorted(hypotheses, key=lambda hypothesis: -len(hypothesis.matches))
@@ -213,6 +245,12 @@ class PnpLocalizer:
                 agree(hypothesis.world_from_rig, geometry.invert(start)) for hypothesis in hypotheses
             ):
                 hypotheses.append(self._improve(query, start, matches))
+
+    def _independent(self, inliers: Matches) -> int:
+        """Return how many of the matches are independent evidence."""
+        # A point matched in several ways, or several points on one keypoint, are one piece of it.
+        keypoints = np.column_stack([inliers.camera, inliers.pixels])
+        return min(len(np.unique(inliers.point)), len(np.unique(keypoints, axis=0)))
 
     def _inliers(self, query: RigQuery, rig_from_world: Floats, matches: Matches) -> NDArray[np.bool_]:
         errors = query.errors_deg(rig_from_world, matches, self.map.points)
@@ -246,9 +284,7 @@ class PnpLocalizer:
         settings = self.settings
         rig_from_world, guided = hypotheses[0].rig_from_world, hypotheses[0].matches
         inliers = matches[self._inliers(query, rig_from_world, matches)]
-        # A point matched in several ways, or several points on one keypoint, are one piece of evidence.
-        keypoints = np.column_stack([inliers.camera, inliers.pixels])
-        independent = min(len(np.unique(inliers.point)), len(np.unique(keypoints, axis=0)))
+        independent = self._independent(inliers)
         if independent < settings.min_inliers:
             return PoseEstimate(
                 f"failed: too few inliers ({independent} within {settings.ransac_max_error_deg} deg)",
@@ -260,12 +296,13 @@ class PnpLocalizer:
         # Guided matches were sought around the pose, so their errors are small wherever it is. The covariance rests on
         # those that descriptors alone found, too.
         found_twice = guided[np.isin(guided.rows(), inliers.rows())]
-        images = np.unique(np.concatenate([retrieved.images for retrieved in references]))
-        seen = self.map.images_seeing(np.unique(inliers.point))[images]
-        shown = [int(images[index]) for index in np.argsort(-seen, kind="stable") if seen[index]]
         others = matches[~np.isin(matches.rows(), guided.rows())]
         others_agree = query.errors_deg(rig_from_world, others, self.map.points) < settings.max_error_deg
         every = Matches.pooled([guided, others])
+        agreeing = np.concatenate([np.ones(len(guided), bool), others_agree])
+        images = np.unique(np.concatenate([retrieved.images for retrieved in references]))
+        seen = self.map.images_seeing(np.unique(every.point[agreeing]))[images]
+        shown = [int(images[index]) for index in np.argsort(-seen, kind="stable") if seen[index]]
         estimate = PoseEstimate(
             status="ok",
             world_from_rig=geometry.invert(rig_from_world),
@@ -278,9 +315,7 @@ class PnpLocalizer:
             coverage=self._coverage(query, inliers),
             agreement=self._agreement(inliers),
             references=tuple(shown),
-            correspondences=self._correspondences(
-                every, np.concatenate([np.ones(len(guided), bool), others_agree]), len(guided), shown
-            ),
+            correspondences=self._correspondences(every, agreeing, len(guided), shown),
         )
         evidence = {name: getattr(estimate, name) for name in EVIDENCE}
         estimate = replace(estimate, p_correct=float(probability_right(evidence)))
