@@ -91,8 +91,8 @@ class PnpLocalizer:
             np.asarray(query.rig_from_cams, np.float64),
             [features for features in query.features if not isinstance(features, str)],
         )
-        matches, start = self._first_pose(rig, references, query.network_matches)
-        hypotheses = [] if start is None else self._hypotheses(rig, start, matches, references)
+        matches, best, start = self._first_pose(rig, references, query.network_matches)
+        hypotheses = [] if start is None else self._hypotheses(rig, start, best, matches, references)
         if hypotheses:
             estimate = self._estimate(rig, matches, hypotheses, references)
         else:
@@ -175,8 +175,8 @@ class PnpLocalizer:
         query: RigQuery,
         references: Sequence[References],
         network_matches: Sequence[Sequence[NetworkMatches | None]],
-    ) -> tuple[Matches, Floats | None]:
-        """Return matches by descriptors, and the pose that the most of them agree with, or None.
+    ) -> tuple[Matches, Matches, Floats | None]:
+        """Return matches by descriptors, those among which a pose is sought, and the pose that the most agree with.
 
         The best references have most of the right matches, the further ones mostly wrong ones, which slow RANSAC down.
         So its pose is sought with the best, and again with all if it has few inliers. Where hardly anything else is in
@@ -186,22 +186,24 @@ class PnpLocalizer:
         start: Floats | None = None
         if any(len(part.images) > FIRST_REFERENCES for part in references):
             best = [part.take(np.arange(len(part.images)) < FIRST_REFERENCES) for part in references]
-            matches = self.matcher.by_descriptors(query, best, network_matches, known)
-            start = self._ransac(query, matches, settings.ransac_max_error_deg)
-            inliers = matches[np.zeros(len(matches), bool) if start is None else self._inliers(query, start, matches)]
+            among = self.matcher.by_descriptors(query, best, network_matches, known)
+            start = self._ransac(query, among, settings.ransac_max_error_deg)
+            inliers = among[np.zeros(len(among), bool) if start is None else self._inliers(query, start, among)]
             if self._independent(inliers) < ENOUGH_INLIERS:
                 start = None
-            elif len(inliers) > settings.clear_inlier_ratio * len(matches):
+            elif len(inliers) > settings.clear_inlier_ratio * len(among):
                 same = self.map.images_seeing(np.unique(inliers.point)) >= settings.min_inliers
                 references = [
                     part.take((np.arange(len(part.images)) < FIRST_REFERENCES) | ~same[part.images])
                     for part in references
                 ]
         matches = self.matcher.by_descriptors(query, references, network_matches, known)
-        return matches, self._ransac(query, matches, settings.ransac_max_error_deg) if start is None else start
+        if start is not None:
+            return matches, among, start
+        return matches, matches, self._ransac(query, matches, settings.ransac_max_error_deg)
 
     def _hypotheses(
-        self, query: RigQuery, start: Floats, matches: Matches, references: Sequence[References]
+        self, query: RigQuery, start: Floats, best: Matches, matches: Matches, references: Sequence[References]
     ) -> list[_Hypothesis]:
         """Return refined poses, best supported first; one of them is refined from `start`, RANSAC's pose.
 
@@ -217,7 +219,7 @@ class PnpLocalizer:
         if share > settings.clear_inlier_ratio:
             return hypotheses
         if share < settings.contested_inlier_ratio:
-            other = self._ransac(query, matches, settings.max_error_deg)
+            other = self._ransac(query, best, settings.max_error_deg)
             if other is not None:
                 hypotheses.append(self._improve(query, other, matches))
                 inliers |= self._inliers(query, hypotheses[1].rig_from_world, matches)

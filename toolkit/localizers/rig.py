@@ -18,7 +18,7 @@ from toolkit.features.matching import unit_descriptors
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import PnpSettings
 
-RANSAC_CONFIDENCE = 0.9999
+RANSAC_CONFIDENCE = 0.999
 POSELIB_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
 """COLMAP's names of the lenses that PoseLib 2.0.5 can refine with; of others it leaves the pose as it is."""
 
