@@ -3,7 +3,7 @@
 import io
 import math
 from collections.abc import Callable
-from functools import wraps
+from functools import cache, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
@@ -52,11 +52,21 @@ def new_figure(width: float, height: float) -> "Figure":
 @styled
 def save_figure(figure: "Figure", path: str | Path, caption: str = "") -> Path:
     """Write a figure as PNG, the caption kept in the file where the report finds it, and return the path."""
+    import matplotlib as mpl
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    # To lay a figure out and find its border, `savefig` would draw all of it once more.
+    figure.dpi = mpl.rcParams["savefig.dpi"]
+    renderer, engine = FigureCanvasAgg(figure).get_renderer(), figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
+        figure.set_layout_engine(None)
+    border = figure.get_tightbbox(renderer).padded(mpl.rcParams["savefig.pad_inches"])
     # Software would name the version of matplotlib: the same data shall give the same bytes.
     metadata = {"Software": None, "Description": caption}
     with write_atomic(path) as temporary:
         # Of figures, stronger compression takes thrice the time and saves nothing.
-        figure.savefig(temporary, metadata=metadata, pil_kwargs={"compress_level": 2})
+        figure.savefig(temporary, bbox_inches=border, metadata=metadata, pil_kwargs={"compress_level": 2})
     return Path(path)
 
 
@@ -90,6 +100,7 @@ def error_bar(figure: "Figure", unit: str = "m", **where: Any) -> None:
     bar.set_ticks([0.01, 0.1, 1.0], labels=["0.01", "0.1", "1"])
 
 
+@cache
 @styled
 def draw_error_legend(unit: str = "m") -> bytes:
     """Return the legend of errors' colors, PNG; `unit` is that of the errors."""

@@ -126,7 +126,7 @@ def _log_map_cameras(stream: "rr.RecordingStream", poses: Floats, size: float) -
     corners = size * np.array([[0, 0, 0], [-0.4, -0.3, 1], [0.4, -0.3, 1], [0.4, 0.3, 1], [-0.4, 0.3, 1.0]])
     outline = corners[[0, 1, 2, 0, 3, 4, 0, 1, 4, 3, 2]]
     lines = np.einsum("nij,kj->nki", poses[:, :3, :3], outline) + poses[:, None, :3, 3]
-    stream.log("world/map_cameras", rr.LineStrips3D(list(lines), colors=rgb(MAP)), static=True)
+    stream.log("world/map_cameras", rr.LineStrips3D(lines.astype(np.float32), colors=rgb(MAP)), static=True)
 
 
 def _log_overview(stream: "rr.RecordingStream", queries: Localizations) -> None:
@@ -145,7 +145,7 @@ def _log_overview(stream: "rr.RecordingStream", queries: Localizations) -> None:
     dots("world/queries/estimated", located, queries.estimated[:, :3, 3], colors[located], 5)
     both = located & has_truth
     lines = np.stack([queries.estimated[both, :3, 3], queries.true[both, :3, 3]], axis=1)
-    stream.log("world/queries/error", rr.LineStrips3D(list(lines), colors=colors[both]), static=True)
+    stream.log("world/queries/error", rr.LineStrips3D(lines.astype(np.float32), colors=colors[both]), static=True)
     if len(queries.nearest_reference):
         lost = ~located & np.isfinite(queries.nearest_reference).all(1)
         dots("world/queries/failed", lost, queries.nearest_reference, rgb(ESTIMATED), 9)
@@ -216,7 +216,8 @@ class _ChosenWriter:
         import rerun as rr
 
         stream = self._stream
-        measured, inlier, predicted, lines = np.zeros((0, 2)), np.zeros(0, bool), np.zeros((0, 2)), list[Floats]()
+        measured, inlier = np.zeros((0, 2)), np.zeros(0, bool)
+        predicted, lines = np.zeros((0, 2)), np.zeros((0, 2, 2))
         if image is None:
             # Of the last one's size: the viewer takes pictures of an entity for frames of a film.
             width, height = self._sizes.get(path, (4, 3))
@@ -237,7 +238,7 @@ class _ChosenWriter:
             if located and residuals and inlier.any():
                 pixels, visible = project(image.points[inlier], image.camera, image.world_from_cam)
                 predicted = pixels[visible] * scale
-                lines = list(np.stack([measured[inlier][visible], predicted], axis=1))
+                lines = np.stack([measured[inlier][visible], predicted], axis=1)
         for name, marks, shade, radius in (
             ("reprojected", predicted, rgb(GREEN), 2.5),
             ("measured", measured[inlier], WHITE, 1.5),
@@ -245,7 +246,7 @@ class _ChosenWriter:
         ):
             dots = rr.Points2D(marks, colors=shade, radii=rr.Radius.ui_points(radius))
             stream.log(f"{path}/marks/{name}", dots)
-        stream.log(f"{path}/marks/residuals", rr.LineStrips2D(lines, colors=WHITE))
+        stream.log(f"{path}/marks/residuals", rr.LineStrips2D(lines.astype(np.float32), colors=WHITE))
 
 
 def describe(queries: Localizations, k: int) -> str:
