@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 NEAR_M = 0.05
 SAMPLES = 2  # a side of a pixel
+OFFSETS = np.array([[-0.125, 0.125], [0.375, 0.625]], np.float32)  # of their mip levels
 
 
 @dataclass
@@ -122,16 +123,14 @@ def render(quads: list[Quad], world_from_cam: Floats, rays: Rays, gray: bool) ->
             np.copyto(owner[area], np.int16(k), where=inside)
             seen[k] = area, linear, distance
     picture = np.zeros((height * width, 1 if gray else 3), np.uint8)
+    samples = np.arange(height * width).reshape(height, width)
+    offsets = np.tile(OFFSETS, (height // SAMPLES, width // SAMPLES)).ravel()
     focal = SAMPLES * (rays.camera.focal_length_x * rays.camera.focal_length_y) ** 0.5
     for k, (area, linear, distance) in seen.items():
-        quad = quads[k]
-        rows, columns = np.nonzero(owner[area] == k)
-        if not len(rows):
+        quad, index = quads[k], samples[area][owner[area] == k]
+        if not len(index):
             continue
-        rows, columns = rows + area[0].start, columns + area[1].start
-        index = rows * width + columns
-        x, y = rays.x.ravel()[index], rays.y.ravel()[index]
-        z = 1 / nearest.ravel()[index]
+        x, y, z = rays.x.ravel()[index], rays.y.ravel()[index], 1 / nearest.ravel()[index]
         s, t = ((a * x + (b * y + c)) * z for a, b, c in linear[1:])
         pyramid = quad.gray if gray else quad.color
         th, tw = pyramid[0].shape[:2]
@@ -139,15 +138,16 @@ def render(quads: list[Quad], world_from_cam: Floats, rays: Rays, gray: bool) ->
         # level at four offsets, which blends the levels; the quarter keeps slanted surfaces from flickering.
         scale = tw / quad.width / focal / np.sqrt(distance)
         level = np.log2(scale * z**1.5) + 0.25 * np.log2(np.maximum(z / distance, 1))
-        level += 0.25 * ((rows % 2) * 2 + (columns % 2)) - 0.125
-        level = np.clip(level.astype(np.int8), 0, LEVELS - 1)
-        for at in np.unique(level):
-            chosen = level == at
+        level = np.clip((level + offsets[index]).astype(np.int8), 0, LEVELS - 1)
+        for at in range(LEVELS):
+            chosen = np.flatnonzero(level == at)
+            if not len(chosen):
+                continue
             lx, ly = tw / quad.width / 2.0**at, th / quad.height / 2.0**at
             picture[index[chosen]] = _texture(pyramid[at], s[chosen] * np.float32(lx), t[chosen] * np.float32(ly))
     size = (width // SAMPLES, height // SAMPLES)
-    samples = picture.reshape(height, width, -1).astype(np.float32)
-    return cv2.resize(samples, size, interpolation=cv2.INTER_AREA), _depth(quads, owner, nearest)
+    picture = picture.reshape(height, width, -1).astype(np.float32)
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA), _depth(quads, owner, nearest)
 
 
 def _depth(quads: list[Quad], owner: Image, nearest: Image) -> Image:
