@@ -3,11 +3,12 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
+from IPython.core.formatters import PNGFormatter
 from PIL import Image
 
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.geometry import make_pose, project
-from toolkit.show.figures import error_colors
+from toolkit.show.figures import error_colors, new_figure, save_figure
 from toolkit.show.localized import QueryDetails, ShownImage
 from toolkit.show.stills import WorstQuery, draw_localization, draw_scene_png, draw_worst
 
@@ -158,3 +159,16 @@ def test_errors_have_the_colors_of_the_legend_and_styles_stay_where_they_are():
     figure = draw_scene_png(np.zeros((0, 3)), None, looking([80, 90]), looking([80, 90]), looking([80, 90]))
     assert figure._suptitle.get_fontweight() == "bold"
     assert mpl.rcParams["figure.titleweight"] == before != "bold"
+
+
+def test_a_notebook_shows_a_figure_as_a_file_has_it_with_what_reaches_beyond_its_border(tmp_path):
+    def figure():
+        made = new_figure(2, 1)
+        made.subplots().plot([0, 1])
+        made.suptitle("a title that is wider than the figure of two inches that it belongs to")
+        return made
+
+    whole, path = figure(), save_figure(figure(), tmp_path / "figure.png")
+    assert PNGFormatter()(whole) == path.read_bytes()
+    with Image.open(path) as picture:
+        assert picture.width > 2 * 110 + 22

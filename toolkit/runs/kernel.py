@@ -22,7 +22,7 @@ _ARGUMENTS = [
     # What the kernel has to say of its own shutdown is of no use to anybody.
     "--log-level=CRITICAL",
     # What takes long to import, while the notebook before still runs.
-    "--IPKernelApp.exec_lines=__import__('toolkit.notebook'); __import__('toolkit.evaluate'); __import__('matplotlib.pyplot')",
+    "--IPKernelApp.exec_lines=__import__('toolkit.notebook'); __import__('toolkit.evaluate'); __import__('matplotlib.backends.backend_agg')",
 ]
 
 

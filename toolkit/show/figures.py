@@ -3,7 +3,7 @@
 import io
 import math
 from collections.abc import Callable
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
@@ -43,15 +43,23 @@ def styled(draw: Callable[P, R]) -> Callable[P, R]:
 
 
 def new_figure(width: float, height: float) -> "Figure":
-    """Return an empty figure of a size in inches, laid out so that labels do not collide."""
+    """Return an empty figure of a size in inches, laid out so that labels do not collide; notebooks show it."""
     from matplotlib.figure import Figure  # not pyplot: no state, and nothing is shown twice in a notebook
 
-    return Figure(figsize=(width, height), layout="constrained")
+    figure = Figure(figsize=(width, height), layout="constrained")
+    figure._repr_png_ = partial(_png_of, figure)  # type: ignore[attr-defined]
+    return figure
+
+
+def save_figure(figure: "Figure", path: str | Path, caption: str = "") -> Path:
+    """Write a figure as PNG, the caption kept in the file where the report finds it, and return the path."""
+    with write_atomic(path) as temporary:
+        temporary.write_bytes(_png_of(figure, caption))
+    return Path(path)
 
 
 @styled
-def save_figure(figure: "Figure", path: str | Path, caption: str = "") -> Path:
-    """Write a figure as PNG, the caption kept in the file where the report finds it, and return the path."""
+def _png_of(figure: "Figure", caption: str = "") -> bytes:
     import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -63,11 +71,10 @@ def save_figure(figure: "Figure", path: str | Path, caption: str = "") -> Path:
         figure.set_layout_engine(None)
     border = figure.get_tightbbox(renderer).padded(mpl.rcParams["savefig.pad_inches"])
     # Software would name the version of matplotlib: the same data shall give the same bytes.
-    metadata = {"Software": None, "Description": caption}
-    with write_atomic(path) as temporary:
-        # Of figures, stronger compression takes thrice the time and saves nothing.
-        figure.savefig(temporary, bbox_inches=border, metadata=metadata, pil_kwargs={"compress_level": 2})
-    return Path(path)
+    metadata, stream = {"Software": None, "Description": caption}, io.BytesIO()
+    # Of figures, stronger compression takes thrice the time and saves nothing.
+    figure.savefig(stream, bbox_inches=border, metadata=metadata, pil_kwargs={"compress_level": 2})
+    return stream.getvalue()
 
 
 def error_scale() -> "tuple[Colormap, LogNorm]":
@@ -106,9 +113,7 @@ def draw_error_legend(unit: str = "m") -> bytes:
     """Return the legend of errors' colors, PNG; `unit` is that of the errors."""
     figure = new_figure(1.3, 2.4)
     error_bar(figure, unit, cax=figure.subplots())
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", metadata={"Software": None})
-    return stream.getvalue()
+    return _png_of(figure)
 
 
 def percent(share: float) -> str:
