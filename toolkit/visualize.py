@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -129,6 +130,7 @@ def _draw_pair(
     m, q = pair.map_session.device, pair.query_session.device
     shown, cloud, map_poses = pair.localizations, sure_points(pair.local_map), pair.map_session.world_from_cam()
     still, recording = out / f"{pair.name}.png", out / f"{pair.name}.rrd"
+    details_of = lru_cache(2 * WORST)(pair.details)  # the worst are drawn and recorded
     draw_scene_png(
         *(*cloud, map_poses, shown.estimated, shown.true, still),
         up=settings.world_up,
@@ -141,7 +143,7 @@ def _draw_pair(
     chosen = np.unique(np.linspace(0, len(order) - 1, min(settings.samples, len(order))).round().astype(int))
     for number, k in enumerate((order[place] for place in chosen), start=1):
         title = f"{q} query in the {m} map: {pair.table['status'].iloc[k]}"
-        draw_localization(pair.details(k), out / f"localization_{pair.name}_{number}.png", title, pair.unit)
+        draw_localization(details_of(k), out / f"localization_{pair.name}_{number}.png", title, pair.unit)
     ways: dict[str, list[Floats]] = {}
     if sequences is None:
         (out / f"{pair.name}_sequence.png").unlink(missing_ok=True)
@@ -150,12 +152,11 @@ def _draw_pair(
         save_figure(figure, out / f"{pair.name}_sequence.png")
         ways = {"odometry": sequences.laid_odometry(pair.query_session), "frames": sequences.ways()}
     if settings.recordings:
-        details = ((k, pair.details(k)) for k in sorted(order[: settings.matched_queries]))
+        details = ((k, details_of(k)) for k in sorted(order[: settings.matched_queries]))
         record_localizations(recording, pair.name, map_poses, *cloud, shown, details, up=settings.world_up, ways=ways)
     candidates = order[:WORST]
     rows = shown.ranked.iloc[candidates]
-    details_of = [pair.details(k) for k in candidates]
-    rows = rows.assign(unit=pair.unit[0], pair=f"{q} in the {m} map", details=details_of)
+    rows = rows.assign(unit=pair.unit[0], pair=f"{q} in the {m} map", details=[details_of(k) for k in candidates])
     pair.queries.close()
     return rows
 
