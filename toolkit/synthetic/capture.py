@@ -5,6 +5,7 @@ from the seed and the name of the thing that is drawn, never from the order of w
 number of cores.
 """
 
+import ctypes
 import json
 import os
 import shutil
@@ -12,6 +13,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -394,6 +396,8 @@ def _render(out: Path, world: World, settings: dict[str, int], progress: bool) -
     finally:
         cv2.setNumThreads(threads)
         shutil.rmtree(partial_out, ignore_errors=True)
+        with suppress(AttributeError, OSError, TypeError):  # not glibc, which keeps what threads have freed
+            ctypes.CDLL(None).malloc_trim(0)
     return out
 
 
