@@ -21,7 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -67,7 +67,9 @@ class Measurement:
         return sum(value for stage, value in self.seconds.items() if stage != "imports")
 
 
-def run_toolkit(sessions_root: Path, run: Path, queries: str, threads: int) -> dict[str, Any]:
+def run_toolkit(
+    sessions_root: Path, run: Path, queries: str, threads: int, kinds: Sequence[str]
+) -> dict[str, Any]:
     """Run the stages in this process, which should be a fresh one; returns the fields of a `Measurement`."""
     start = _clocks()
     import torch  # noqa: F401  # the stages import it when they need it
@@ -92,6 +94,7 @@ def run_toolkit(sessions_root: Path, run: Path, queries: str, threads: int) -> d
         files.poses_dir,
         files.features,
         files.maps,
+        {"features": list(kinds)},
         queries=queries,
         workers=threads,
     )
@@ -147,12 +150,14 @@ def _clocks() -> NDArray[np.float64]:
     return np.array([time.perf_counter(), sum(usage.ru_utime + usage.ru_stime for usage in usages)])
 
 
-def measure_toolkit(sessions_root: Path, run: Path, queries: str, threads: int) -> Measurement:
+def measure_toolkit(
+    sessions_root: Path, run: Path, queries: str, threads: int, features: Sequence[str]
+) -> Measurement:
     """Measure the toolkit in a process of its own."""
     from toolkit.files import SceneFiles
 
     before = os.getloadavg()[0]
-    fields = in_own_process(run_toolkit, sessions_root, run, queries, threads)
+    fields = in_own_process(run_toolkit, sessions_root, run, queries, threads, features)
     measured = Measurement(**fields, load=[before, os.getloadavg()[0]])
     measured.pairs = accuracy(sessions_root, SceneFiles(run, sessions_root.parent.name).poses_dir, queries)
     return measured
@@ -373,6 +378,9 @@ def main() -> None:
     parser.add_argument("--query", default="all", help="query device, likewise (default: all)")
     parser.add_argument("--queries", default="keyframes_pruned_subsampled", help="keyframe list (default: %(default)s)")
     parser.add_argument("--threads", type=int, default=2, help="cores for each tool (default: %(default)s)")
+    parser.add_argument(
+        "--features", nargs="+", default=["auto"], help="local features of the toolkit (default: %(default)s)"
+    )
     parser.add_argument("--hloc", help="checkout of cvg/Hierarchical-Localization, to run hloc too")
     parser.add_argument(
         "--hloc-features", choices=["sift", "aliked"], default="sift", help="local features of hloc (default: sift)"
@@ -411,7 +419,7 @@ def main() -> None:
             sys.exit(str(error))
         for turn in range(options.repeat):
             run = Path(folder) / f"run{turn}"
-            ours.append(measure_toolkit(sessions_root, run, options.queries, options.threads))
+            ours.append(measure_toolkit(sessions_root, run, options.queries, options.threads, options.features))
             print(f"toolkit {ours[-1].total:.1f} s", file=sys.stderr)
             if checkout:
                 arguments = (sessions_root, run, options.queries, options.threads, options.hloc_map_pairs)
