@@ -344,8 +344,8 @@ def match_along_epipolar_lines(
     column_best = np.full(m, -1, np.int64)
     column_score = np.full(m, -2.0, np.float32)
     near_a = near_a + np.float32(max_angle_a + max_angle_b)
-    for start in range(0, len(order_a), 64):
-        rows = slice(start, start + 64)
+    for start in range(0, len(order_a), 128):
+        rows = slice(start, start + 128)
         low = np.searchsorted(wrapped, (turns_a[rows] - reach_a[rows]).min())
         high = np.searchsorted(wrapped, (turns_a[rows] + reach_a[rows]).max())
         whole = high - low > m

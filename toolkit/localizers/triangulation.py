@@ -74,8 +74,7 @@ def _tracks(
     ):
         camera = pycolmap.Camera(camera.todict() | {"camera_id": index})
         reconstruction.add_camera_with_trivial_rig(camera)
-        points2D = pycolmap.Point2DList([pycolmap.Point2D(p) for p in np.asarray(xy, np.float64)])
-        image = pycolmap.Image(name=name, camera_id=index, image_id=index, points2D=points2D)
+        image = pycolmap.Image(name=name, camera_id=index, image_id=index, keypoints=np.asarray(xy, np.float64))
         reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(cam_from_world[:3]))
         graph.add_image(index, len(xy))
     for (i, j), found in zip(pairs, matches, strict=True):
@@ -101,9 +100,10 @@ def _tracks(
     ids = np.array(sorted(places), np.uint64)
     rows = [np.zeros((0, 3), np.int64)]
     for index in range(len(names)):
-        of_keypoint = np.array([point.point3D_id for point in reconstruction.image(index + 1).points2D], np.uint64)
-        seen = np.flatnonzero(np.isin(of_keypoint, ids))
-        rows.append(np.column_stack([np.full(len(seen), index), seen, np.searchsorted(ids, of_keypoint[seen])]))
+        image = reconstruction.image(index + 1)
+        seen = np.array(image.get_observation_point2D_idxs(), np.int64)
+        points = np.array([point.point3D_id for point in image.get_observation_points2D()], np.uint64)
+        rows.append(np.column_stack([np.full(len(seen), index), seen, np.searchsorted(ids, points)]))
     return np.array([places[number] for number in sorted(places)]).reshape(-1, 3), np.concatenate(rows)
 
 
