@@ -98,11 +98,11 @@ def markdown(results: dict[str, dict[str, Any]]) -> str:
             parts = {f"{name}, SIFT is sure": ~escalated, f"{name}, SIFT is not sure": escalated}
         for label, part in ((label, part) for label, part in parts.items() if part.any()):
             of_part = result["warm"][part]
-            cells = [f"{value:.2f}" for column in of_part.T for value in np.percentile(column, (50, 90))]
+            cells = [f"{value:.2f}" for column in of_part.T for value in np.percentile(column, (50, 95))]
             warm.append([label, str(len(of_part)), *cells, str(int(result["ok"][part].sum()))])
         cells = [f"{value:.2f}" for stage in ("imports", "open", "first") for value in result[stage]]
         loading.append([name, *cells, f"{result['peak_mb']:.0f}"])
-    header = ["features", "pictures", "s: median", "90 %", "CPU s: median", "90 %", "ok"]
+    header = ["features", "pictures", "s: p50", "p95", "CPU s: p50", "p95", "ok"]
     before = ["features", "imports: s", "CPU s", "open the map: s", "CPU s", "first picture: s", "CPU s", "peak MB"]
     return f"{markdown_table(header, warm)}\n\n{markdown_table(before, loading)}\n"
 

@@ -51,6 +51,8 @@ class RunningKernel:
     folder: tempfile.TemporaryDirectory[str]
     """Of its connection file and its sockets."""
     started: Future[None]
+    clients: list[Any]
+    """Of `jupyter_client`, that talk with it."""
 
     @property
     def ended_by(self) -> int | None:
@@ -97,6 +99,8 @@ class Kernels:
     def end(self, kernel: RunningKernel, by_force: bool) -> None:
         """Begin to end a kernel, if that has not been asked for yet."""
         if kernel.folder.name not in self._ended:
+            for client in kernel.clients:  # nbclient leaves them open where the kernel is not its own
+                client.stop_channels()
             self._ended[kernel.folder.name] = self._in_thread(_shut_down(kernel, by_force))
 
     def _start(self) -> RunningKernel:
@@ -110,7 +114,14 @@ class Kernels:
         config = Config({"KernelManager": {"connection_file": f"{folder.name}/kernel.json"} | sockets})
         manager = AsyncKernelManager(kernel_name="python3", config=config)
         given = {"cwd": str(self._cwd), "env": os.environ | {TEXT_BARS: "1"}, "extra_arguments": _ARGUMENTS}
-        kernel = RunningKernel(manager, folder, self._in_thread(_start_up(manager, given)))
+        connect, clients = manager.client, []
+
+        def client(**options: Any) -> Any:
+            clients.append(connect(**options))
+            return clients[-1]
+
+        manager.client = client
+        kernel = RunningKernel(manager, folder, self._in_thread(_start_up(manager, given)), clients)
         self._started.append(kernel)
         return kernel
 
