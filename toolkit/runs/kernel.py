@@ -120,7 +120,7 @@ class Kernels:
             clients.append(connect(**options))
             return clients[-1]
 
-        manager.client = client
+        manager.client = client  # type: ignore[method-assign]
         kernel = RunningKernel(manager, folder, self._in_thread(_start_up(manager, given)), clients)
         self._started.append(kernel)
         return kernel
