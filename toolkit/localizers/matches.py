@@ -55,6 +55,8 @@ class MappedFeatures:
         self.name = name
         self.image = lru_cache(CACHED_IMAGES)(self._image)
         """Returns what `_image` does, and keeps it for those that ask again."""
+        self.keypoints = lru_cache(CACHED_IMAGES)(self._keypoints)
+        """Returns what `_keypoints` does, and keeps it for those that ask again."""
         self._network = Lock()
 
     def match(
@@ -95,6 +97,10 @@ class MappedFeatures:
         keypoint, point = self.map.observations(index)
         order = np.argsort(-self.map.track_lengths(point), kind="stable")[:max_features]
         return MapImage(self.features[self.map.image_names[index]].take(keypoint[order]), point[order])
+
+    def _keypoints(self, index: int) -> NDArray[np.float32]:
+        """Return where the features of a map image are, (N, 2) pixels."""
+        return self.features[self.map.image_names[index]].keypoints
 
     def _point_of_each_feature(self, index: int) -> Ints:
         """Return the point that each feature of a map image sees, -1 for none."""
@@ -310,8 +316,8 @@ class MapMatcher:
         pixels = np.zeros((len(at), 2))
         kinds = np.searchsorted(self._first_point, points[at], side="right") - 1
         for kind in np.unique(kinds):
-            features = self.mapped[kind].features[self.map.image_names[image]]
-            pixels[kinds == kind] = features.keypoints[keypoint[where[kinds == kind]]]
+            of_kind = self._of_kind(int(kind), [image])[0]
+            pixels[kinds == kind] = self.mapped[kind].keypoints(of_kind)[keypoint[where[kinds == kind]]]
         return at, pixels
 
     def _of_kind(self, kind: int, images: Ints | Sequence[int]) -> list[int]:
