@@ -259,7 +259,7 @@ class SiftSettings(Settings):
 
     min_long_side: Natural = 640
     """Smaller images are enlarged to this long side, pixels, before detection."""
-    max_long_side: Positive = 1600
+    max_long_side: Positive = 1280
     """Larger images are reduced to this long side, pixels, before detection."""
     max_keypoints: Positive = 3072
     """The strongest responses are kept."""
