@@ -207,7 +207,7 @@ def test_bytes_do_not_depend_on_threads(small_capture: Path, files: SceneFiles) 
     before = reranked(files).read_bytes()
     table = run(small_capture, files, skip_existing=False, workers=3)
     assert reranked(files).read_bytes() == before
-    assert table["queries"].tolist() == (table["confirmed"] + table["kept"]).tolist()
+    assert table["query_images"].tolist() == (table["confirmed"] + table["kept"]).tolist()
     assert table["changed"].item() > 0
 
 
@@ -266,7 +266,7 @@ def test_a_query_that_fails_keeps_the_order_of_retrieval(
     monkeypatch.setattr(MutualMatcher, "match", broken)
     table = run(small_capture, files)
     found = read_references(reranked(files))
-    assert table["kept"].item() == table["queries"].item() == len(rows)
+    assert table["kept"].item() == table["query_images"].item() == len(rows)
     assert "no reference" in found[0]["reason"]
     for old, new in zip(rows[1:], found[1:], strict=True):
         assert new["reason"] == "internal: RuntimeError: no such luck"
@@ -322,7 +322,7 @@ def test_a_network_matches_all_references_of_a_query_at_once(
     assert settings.features.kinds == ["superpoint"]
     assert (settings.matcher.name, settings.matcher.checkpoint) == ("lightglue", "glue.safetensors")
     assert not table["skipped"].item(), "other matches, another file"
-    assert batches == [6] * table["queries"].item()
+    assert batches == [6] * table["query_images"].item()
     assert reranked(files).read_bytes() == expected
 
 

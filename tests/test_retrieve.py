@@ -167,7 +167,7 @@ def lines(path: str | Path) -> list[dict]:
 
 def test_all_pairs(tiny: Path, tmp_path: Path) -> None:
     table = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", settings={"topk": 4})
-    assert table[["map_device", "query_device", "queries", "database"]].to_numpy().tolist() == [
+    assert table[["map_device", "query_device", "query_images", "database"]].to_numpy().tolist() == [
         ["ios", "ios", 3, 6],
         ["ios", "hl", 6, 6],
         ["hl", "ios", 3, 12],
@@ -234,7 +234,7 @@ def test_missing_images_and_poses_are_reported(
     embed_sessions(tiny / "sessions", tmp_path / "embeddings", device="hl")
     out = tmp_path / "one.jsonl"
     row = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", out, map_device="hl", query_device="hl").iloc[0]
-    assert (row["keyframes"], row["keyframes_missing"], row["queries"], row["images_missing"]) == (3, 1, 3, 3)
+    assert (row["keyframes"], row["keyframes_missing"], row["query_images"], row["images_missing"]) == (3, 1, 3, 3)
     assert (row["database"], row["unposed"]) == (10, 2)
     assert "1 of 3 keyframes have no embedded image" in caplog.text
     assert len(lines(out)) == 3
@@ -245,7 +245,7 @@ def test_only_listed_keyframes(tiny: Path, tmp_path: Path) -> None:
     listed.write_text("1010, ios_a/cam\n1020, another_device\n")
     options = {"map_device": "ios", "query_device": "ios", "queries": "keyframes_few"}
     row = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", **options).iloc[0]
-    assert (row["keyframes"], row["keyframes_missing"], row["queries"]) == (2, 1, 1)
+    assert (row["keyframes"], row["keyframes_missing"], row["query_images"]) == (2, 1, 1)
     assert [record["timestamp"] for record in lines(row["path"])] == ["1010"]
     listed.write_text("1000, ios_a/cam\n1020, another_device\n")
     row = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", **options).iloc[0]
@@ -311,10 +311,10 @@ def test_an_unusable_session_stops_its_own_pairs_alone(
     lost = table[table["reason"] != ""]
     assert sorted(zip(lost["map_device"], lost["query_device"], strict=True)) == left_out
     assert lost["reason"].str.contains(named).all()
-    assert (lost["queries"] == 0).all()
+    assert (lost["query_images"] == 0).all()
     done = table[table["reason"] == ""]
     assert len(done) == 2
-    assert all(len(lines(path)) == count > 0 for path, count in zip(done["path"], done["queries"], strict=True))
+    assert all(len(lines(path)) == count > 0 for path, count in zip(done["path"], done["query_images"], strict=True))
     path.write_text(before)
     assert (retrieve_pairs(tiny / "sessions", tmp_path / "embeddings")["reason"] == "").all()
 
@@ -329,7 +329,7 @@ def test_a_vector_that_is_not_finite_stops_its_own_pairs_alone(tiny: Path, tmp_p
     table = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings")
     lost = table["query_device"] == "hl"
     assert table["reason"][lost].str.contains(r"query hl_query: query has 1 rows with NaN .* first row 1").all()
-    assert (table["queries"] > 0).tolist() == (table["reason"] == "").tolist() == (~lost).tolist()
+    assert (table["query_images"] > 0).tolist() == (table["reason"] == "").tolist() == (~lost).tolist()
     for before, after in zip(expected["path"][~lost], table["path"][~lost], strict=True):
         assert [row["topk"] for row in lines(before)] == [row["topk"] for row in lines(after)]
 

@@ -244,7 +244,7 @@ def _row(query: dict[str, Any], references: list[dict[str, Any]], reason: str) -
 def _counts(rows: list[dict[str, Any]]) -> dict[str, int]:
     kept = sum(bool(row["reason"]) for row in rows)
     changed = sum(bool(row["topk"]) and row["topk"][0]["retrieval_rank"] != 1 for row in rows)
-    return {"queries": len(rows), "confirmed": len(rows) - kept, "kept": kept, "changed": changed}
+    return {"query_images": len(rows), "confirmed": len(rows) - kept, "kept": kept, "changed": changed}
 
 
 def _name(entry: dict[str, Any]) -> str:

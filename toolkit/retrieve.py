@@ -124,7 +124,7 @@ def retrieve_pairs(
                 row |= {
                     "keyframes": query.keyframes,
                     "keyframes_missing": query.keyframes_missing,
-                    "queries": len(query.rows),
+                    "query_images": len(query.rows),
                     "images_missing": query.images_missing,
                     "database": len(database.rows),
                     "unposed": database.unposed,

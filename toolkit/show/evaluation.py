@@ -9,7 +9,7 @@ import pandas as pd
 
 from toolkit.capture.devices import color_of, in_order
 from toolkit.runs.pairs import LEFT_OUT
-from toolkit.show.figures import ORANGE, SKY, VERMILLION, new_figure, number, percent, styled
+from toolkit.show.figures import ORANGE, SKY, VERMILLION, new_figure, number, percent, plain_log, styled
 from toolkit.show.metrics import (
     REASONS,
     THRESHOLDS,
@@ -185,9 +185,10 @@ def draw_error_curves(errors: pd.DataFrame, thresholds: Sequence[Threshold] = TH
                 axis.step([low / 2, *ascending, high * 2], [*share, share[-1]], where="post", lw=1.8,
                           color=color_of(map_), label=f"{map_} map")  # fmt: skip
             for mark in marks:
-                axis.axvline(mark, color="0.45", lw=0.9, ls=":")
+                axis.axvline(mark, color="0.45", lw=0.9, ls=":", label="thresholds" if mark == marks[0] else None)
             axis.set_xscale("log")
             axis.set_xlim(low / 1.5, high * 1.5)
+            plain_log(axis, "x")
             axis.set_ylim(0, 102)
             axis.set_xlabel(label)
             axis.grid(alpha=0.25)
@@ -211,7 +212,7 @@ def draw_reliability(errors: pd.DataFrame, unit: str = "m") -> "Figure":
     bin_of = np.digitize(stated, RELIABILITY_BINS[1:-1])
     figure = new_figure(5.2, 4.6)
     axis = figure.subplots()
-    axis.plot([0, 100], [0, 100], color="0.6", lw=1, ls=":")
+    axis.plot([0, 100], [0, 100], color="0.6", lw=1, ls=":", label="as stated")
     for number_of_bin in np.unique(bin_of):
         mine = bin_of == number_of_bin
         count, share = int(mine.sum()), float(right[mine].mean())
@@ -228,6 +229,7 @@ def draw_reliability(errors: pd.DataFrame, unit: str = "m") -> "Figure":
     axis.set_ylim(-3, 103)
     axis.set_xlabel("stated probability of being right [%]")
     axis.set_ylabel("poses that are right [%]")
+    axis.legend(frameon=False, fontsize=8, loc="upper left")
     axis.grid(alpha=0.25)
     figure.suptitle(f"How far stated probabilities hold (right: {_limit(WRONG, unit)})")
     return figure
@@ -257,6 +259,7 @@ def draw_deviations(errors: pd.DataFrame, unit: str = "m") -> "Figure":
     middles = np.array([(np.median(stated[part]), np.median(actual[part])) for part in tenths])
     axis.plot(*middles.T, color="0.15", lw=1.5, marker="o", ms=3, label="median of a tenth of the poses")
     axis.set(xscale="log", yscale="log", xlim=(low, high), ylim=(low, high))
+    plain_log(axis, "xy")
     axis.set_xlabel(f"stated standard deviation of the position [{unit}]")
     axis.set_ylabel(f"error of the position [{unit}]")
     axis.grid(alpha=0.25)

@@ -18,7 +18,7 @@ from toolkit.files import image_name, read_references
 from toolkit.geometry import Floats, unit
 from toolkit.localizers.odometry import Odometry, recordings_of
 from toolkit.manifest import SequenceSettings
-from toolkit.show.figures import GREEN, ORANGE, VERMILLION, new_figure, styled
+from toolkit.show.figures import GREEN, ORANGE, VERMILLION, new_figure, plain_log, styled
 from toolkit.show.metrics import is_posed
 from toolkit.show.top_view import ground_axes, places_of
 
@@ -226,6 +226,7 @@ def draw_statuses(paths: Iterable[str | Path]) -> "Figure":
     plot.set_yticks(range(len(tables)), [name.replace("_query_", " map, query ") for name in tables])
     plot.invert_yaxis()
     plot.set_xscale("log")
+    plain_log(plot, "x")
     plot.set_xlabel("inliers of a query (log scale; none at the left edge)")
     figure.legend(fontsize=8, loc="outside lower center", ncols=3)
     return figure

@@ -13,6 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from toolkit.files import write_atomic
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.colors import Colormap, LogNorm
     from matplotlib.figure import Figure
 
@@ -49,6 +51,18 @@ def new_figure(width: float, height: float) -> "Figure":
     figure = Figure(figsize=(width, height), layout="constrained")
     figure._repr_png_ = partial(_png_of, figure)  # type: ignore[attr-defined]
     return figure
+
+
+def plain_log(axes: "Axes", sides: str) -> None:
+    """Number logarithmic axes plainly, 0.001 and not 10^-3; `sides`: x, y or xy. Their limits are set before."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    for side in sides:
+        axis: Axis = getattr(axes, f"{side}axis")
+        low, high = axis.get_view_interval()
+        axis.set_major_locator(LogLocator(subs=(1.0,) if high > 100 * low else (1.0, 2.0, 5.0)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: np.format_float_positional(value, 6, trim="-")))
+        axis.set_minor_formatter(NullFormatter())
 
 
 def save_figure(figure: "Figure", path: str | Path, caption: str = "") -> Path:
