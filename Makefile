@@ -11,7 +11,7 @@ PYTEST := $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadscope
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo run test test-slow test-browser test-rest browser-setup docs-images docs-view lab lint bench clean test-gpu bench-gpu
+.PHONY: help demo run test test-slow test-browser test-rest browser-setup docs docs-setup docs-images docs-view lab lint bench clean test-gpu bench-gpu
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */  make \1|/' | column -t -s '|'
@@ -47,6 +47,16 @@ test-rest: $(INSTALLED)  ## the browser tests and the slow ones together, for th
 	@$(BIN)/python -m pip install $(PIP_ARGS) --quiet --constraint constraints.txt --editable '.[dev,fuzz]' || \
 	  echo "The fuzzers cannot be installed here: their tests are skipped."
 	$(PYTEST) -m "browser or slow" -rs
+
+docs-setup: $(INSTALLED)  ## install what the pages of the documentation are built with (pip)
+	@$(BIN)/python -m pip install $(PIP_ARGS) --quiet --constraint constraints.txt --editable '.[dev,docs]' || \
+	  { echo "MkDocs, its theme or mkdocstrings cannot be installed from this registry: the pages cannot be built."; exit 1; }
+
+# Needs no network, and fails at a warning: a link or a name that is not there, a page that fetches from elsewhere.
+docs: $(INSTALLED)  ## build the pages of the documentation: build/docs/index.html
+	@$(BIN)/python -c 'import latex2mathml, material, mkdocstrings' 2> /dev/null || $(MAKE) --no-print-directory docs-setup
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+	@echo "Documentation: build/docs/index.html (for its search: $(BIN)/python -m http.server --directory build/docs)"
 
 docs-images: $(INSTALLED)  ## draw the pictures of the documentation from a demo run; first: make browser-setup
 	$(BIN)/python -m docs.make_images

@@ -5,6 +5,7 @@ the viewer in JupyterLab.
 """
 
 import io
+import re
 import sys
 import tempfile
 from pathlib import Path
@@ -21,6 +22,8 @@ ROOT = Path(__file__).resolve().parents[1]
 IMAGES = ROOT / "docs" / "images"
 LARGEST = 300_000
 """Largest size of a picture in bytes: pages are also read over slow lines."""
+DPI = 165
+"""Pixels an inch of the picture of a result."""
 
 
 def main() -> None:
@@ -29,22 +32,38 @@ def main() -> None:
         sys.exit(f"make docs-images {reason}.")
     run = pipeline.run(ROOT / "data_manifests" / "demo.yaml")
     capture = run.parent.parent / "data" / run.name
-    save(result(run), IMAGES / "result.png")
+    save(result(run, capture / "sessions"), IMAGES / "result.webp")
     with chromium.open_browser() as browser:
         save(report(browser, run), IMAGES / "report.png")
         save(viewer(browser, run, capture / "sessions"), IMAGES / "inline.png")
 
 
-def result(run: Path) -> bytes:
-    """Return the picture of a query of the phone in the headset's map, with the map from above below it."""
+def result(run: Path, sessions_root: Path) -> bytes:
+    """Return the picture of a query of the phone in the headset's map, with the map from above below it.
+
+    Drawn again with more pixels than those of a run: it is the first that people see, on screens of any density.
+    """
+    from unittest import mock
+
     from PIL import Image
 
-    folder, pair = run / run.name / "visualization", f"{run.name}_map_hl_query_ios"
-    stills = [Image.open(folder / f"localization_{pair}_2.png"), Image.open(folder / f"{pair}.png")]
-    stills = [still.convert("RGB").resize((1087, 1087 * still.height // still.width)) for still in stills]
-    page = Image.new("RGB", (1087, sum(still.height for still in stills)))
+    from toolkit.files import SceneFiles
+    from toolkit.show import figures
+    from toolkit.visualize import visualize_scene
+
+    files, pair = SceneFiles(run, run.name), f"{run.name}_map_hl_query_ios"
+    with tempfile.TemporaryDirectory() as folder:
+        style = Path(folder) / "sharp.mplstyle"
+        style.write_text(re.sub(r"savefig\.dpi: \d+", f"savefig.dpi: {DPI}", figures.STYLE.read_text()))
+        alone = {"recordings": False, "session_recordings": False}
+        with mock.patch.object(figures, "STYLE", style):
+            where = (sessions_root, files.poses_dir, files.maps, folder)
+            visualize_scene(*where, alone, map_device="hl", query_device="ios")
+        stills = [Image.open(Path(folder) / f"{name}.png").convert("RGB") for name in (f"localization_{pair}_2", pair)]
+    width = max(still.width for still in stills)
+    page = Image.new("RGB", (width, sum(still.height for still in stills)), "white")
     for still, top in zip(stills, (0, stills[0].height), strict=True):
-        page.paste(still, (0, top))
+        page.paste(still, ((width - still.width) // 2, top))
     stream = io.BytesIO()
     page.save(stream, "PNG")
     return stream.getvalue()
@@ -77,13 +96,18 @@ def viewer(browser: "Browser", run: Path, sessions_root: Path) -> bytes:
 
 
 def save(png: bytes, path: Path) -> None:
-    """Write a picture with a palette of as many colors as fit in `LARGEST` bytes."""
+    """Write a picture in at most `LARGEST` bytes: a photograph as .webp, of as high a quality, anything else as .png,
+    with a palette of as many colors, as fit in that.
+    """
     from PIL import Image
 
     image = Image.open(io.BytesIO(png)).convert("RGB")
-    for count in (256, 128, 64, 32):
+    for quality, count in ((90, 256), (82, 128), (74, 64), (66, 32)):
         stream = io.BytesIO()
-        image.quantize(count, dither=Image.Dither.NONE).save(stream, "PNG", optimize=True)
+        if path.suffix == ".webp":
+            image.save(stream, "WEBP", quality=quality, method=6)
+        else:
+            image.quantize(count, dither=Image.Dither.NONE).save(stream, "PNG", optimize=True)
         if stream.tell() <= LARGEST:
             break
     with write_atomic(path) as temporary:

@@ -77,7 +77,8 @@ class Session:
 
     Attributes:
         path: the folder.
-        device, split: a key of `toolkit.capture.devices`, and `map` or `query`; from the folder's name.
+        device: a key of `toolkit.capture.devices`; like `split`, from the folder's name.
+        split: `map` or `query`.
         id: `<device>_<split>`, the name of all that is made of the session.
         images: table [timestamp, sensor_id, path], in the order of images.txt; path is relative to raw_data/.
         sensors: table [sensor_id, name, sensor_type, params], params as written.
