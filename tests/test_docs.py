@@ -132,7 +132,7 @@ def blocks(page: Path, language: str) -> list[str]:
 
 
 def test_the_readme_is_one_page_and_leads_to_the_others() -> None:
-    assert len((ROOT / "README.md").read_text().splitlines()) <= 150
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 80
     assert ROOT / "docs" / "index.md" in [target for page, target in links() if page == PAGES[0]]
 
 
