@@ -37,6 +37,26 @@ Device = Annotated[str, typer.Option(help="The kind of device: ios, hl, spot or 
 Placing = Annotated[str, typer.Option("--images", metavar="link|copy", help="Link the images, or copy them.")]
 Run = Annotated[Path, typer.Argument(help="Run folder.")]
 Scene = Annotated[str, typer.Argument(help="Name of the capture.")]
+MapDevice = Annotated[str, typer.Argument(help="Map device.")]
+QueryDevice = Annotated[str, typer.Argument(help="Query device.")]
+TextFile = Annotated[Path, typer.Argument(help="Text file.")]
+Axes = Annotated[
+    str,
+    typer.Option(
+        "--axes",
+        metavar="opencv|opengl",
+        help="Camera axes of the poses: x right, y down, z forward; or x right, y up, z backward.",
+    ),
+]
+Names = Annotated[
+    str,
+    typer.Option(
+        "--names",
+        metavar="own|capture",
+        help="Call imported images as you do, or as the run's HDF5 files do; others have one name.",
+    ),
+]
+Capture = Annotated[Path | None, typer.Option(help="Capture folder, if it has moved since the run.")]
 Json = Annotated[
     bool, typer.Option("--json", help="Print a summary as JSON, and nothing else, to stdout; the rest to stderr.")
 ]
@@ -231,6 +251,11 @@ def import_images(
     poses_are: Annotated[
         str, typer.Option(metavar="world_from_cam|cam_from_world", help="Direction of the table's poses.")
     ] = "world_from_cam",
+    axes: Axes = "opencv",
+    unit: Annotated[float, typer.Option(metavar="METERS", help="Meters in a unit of the poses, e.g. 0.01.")] = 1.0,
+    truth: Annotated[
+        Path | None, typer.Option(help="CSV as the table, with the true poses of queries, to evaluate against.")
+    ] = None,
     camera: Annotated[
         str | None, typer.Option(metavar="'MODEL, W, H, ...'", help="Intrinsics of all images; else guessed from EXIF.")
     ] = None,
@@ -240,8 +265,32 @@ def import_images(
     """Make a session of a folder of images: a map with poses, or queries."""
     from toolkit.exchange import interchange
 
-    report = interchange.import_images(images, capture, device, split, table, poses_are, camera, cameras, placing)
+    report = interchange.import_images(
+        images, capture, device, split, table, poses_are, camera, cameras, placing, axes, unit, truth
+    )
     print(report.text())
+
+
+@import_app.command("transforms")
+def import_transforms(
+    transforms: Annotated[Path, typer.Argument(help="File of nerfstudio or instant-ngp, beside the images.")],
+    capture: Annotated[Path, typer.Argument(help="Capture folder; the session is sessions/<device>_<split>.")],
+    device: Device = "ios",
+    split: Annotated[str, typer.Option(metavar="map|query", help="Poses of queries become ground truth.")] = "map",
+    hold_out: Annotated[
+        int, typer.Option(metavar="N", help="Every Nth image becomes a query with ground truth; 0: none.")
+    ] = 0,
+    unit: Annotated[
+        float | None, typer.Option(metavar="METERS", help="Meters in a unit of the poses; else it is not known.")
+    ] = None,
+    axes: Axes = "opengl",
+    placing: Placing = "link",
+) -> None:
+    """Make a session of a transforms.json: cameras with distortion, poses."""
+    from toolkit.exchange.transforms import import_transforms
+
+    for report in import_transforms(transforms, capture, device, split, placing, axes, unit, hold_out):
+        print(report.text())
 
 
 @export_app.command("colmap")

@@ -342,9 +342,22 @@ class SceneFiles:
         return self.poses_dir / f"{pair_name(self.scene, map_device, query_device)}_sequence.txt"
 
 
+IMPORTED = "import/images/"
+"""Where `import` puts images, relative to a session's `raw_data`."""
+
+
 def image_name(path: str) -> str:
     """Return the name of an image (`<session>/raw_data/<path>`) that outputs give as `<scene>/sessions/<name>`."""
     return path.split("/sessions/", 1)[-1]
+
+
+def own_name(name: str) -> str:
+    """Return what the user calls an image: of an imported one its path in the folder that it was imported from.
+
+    Args:
+        name: the image's path relative to `raw_data`, or its `image_name`. Of other images, this is what is returned.
+    """
+    return re.sub(f"^([^/]+/raw_data/)?{IMPORTED}", "", name)
 
 
 def pair_name(scene: str, map_device: str, query_device: str) -> str:

@@ -190,6 +190,51 @@ def test_a_table_of_poses_becomes_a_map(folder: Path, tmp_path: Path, direction:
     assert check_capture(tmp_path / "PLACE").problems == []
 
 
+@pytest.mark.parametrize("direction", ["world_from_cam", "cam_from_world"])
+def test_poses_may_have_the_axes_of_opengl_and_another_unit(folder: Path, tmp_path: Path, direction: str) -> None:
+    """In centimeters, of a camera that has y up and looks along -z."""
+    true = pose(3)
+    written = true @ np.diag([1.0, -1.0, -1.0, 1.0])
+    written[:3, 3] *= 100
+    written = written if direction == "world_from_cam" else invert(written)
+    table = write_table(tmp_path / "poses.csv", ["b/1.jpg"], [written])
+    command = ["import", "images", str(folder), str(tmp_path / "PLACE"), "--split", "map", "--table", str(table)]
+    command += ["--camera", CAMERA, "--axes", "opengl", "--unit", "0.01", "--poses-are", direction]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 0, done.output
+    found = poses_of(Capture.open(tmp_path / "PLACE")["ios_map"])
+    np.testing.assert_allclose(found["b/1.jpg"], true, rtol=0, atol=1e-9)
+    with pytest.raises(ManifestError, match=r"axes: unknown 'openGL'. Did you mean 'opengl'"):
+        import_images(folder, tmp_path / "OTHER", camera=CAMERA, axes="openGL")
+    with pytest.raises(ManifestError, match="unit: found -1, expected the meters"):
+        import_images(folder, tmp_path / "OTHER", camera=CAMERA, unit_m=-1)
+
+
+def test_the_truth_of_queries_is_in_their_table_or_in_a_file(folder: Path, tmp_path: Path) -> None:
+    names = ["a/2.jpg", "b/1.jpg"]
+    truth = write_table(tmp_path / "truth.csv", names, [pose(1), pose(2)])
+    import_images(folder, tmp_path / "ONE", table=truth, camera=CAMERA)
+    report = import_images(folder, tmp_path / "TWO", truth=truth, camera=CAMERA)
+    assert f"ground truth of 2 of 3 images: {truth}" in report.text()
+    one, two = (poses_of(Capture.open(tmp_path / name)["ios_query"]) for name in ("ONE", "TWO"))
+    for name, expected in zip(names, (pose(1), pose(2)), strict=True):
+        np.testing.assert_allclose(one[name], expected, rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(two[name], one[name])
+    assert np.isnan(two["a/10.png"]).all()
+    assert len(Capture.open(tmp_path / "TWO")["ios_query"].keyframes()) == 3
+    assert check_capture(tmp_path / "TWO").ok
+    with pytest.raises(ManifestError, match=r"truth: .* the images of a map"):
+        import_images(folder, tmp_path / "THREE", split="map", table=truth, truth=truth, camera=CAMERA)
+    with pytest.raises(ManifestError, match=r"truth: .* whose table has poses"):
+        import_images(folder, tmp_path / "THREE", table=truth, truth=truth, camera=CAMERA)
+    other = write_table(tmp_path / "other.csv", ["2.jpg"], [pose(1)])
+    with pytest.raises(CaptureError, match=r"other\.csv: no row .* '2\.jpg' and others, expected 'a/10\.png'"):
+        import_images(folder, tmp_path / "THREE", truth=other, camera=CAMERA)
+    other.write_text("image\na/2.jpg\n")
+    with pytest.raises(CaptureError, match=r"other\.csv: no poses"):
+        import_images(folder, tmp_path / "THREE", truth=other, camera=CAMERA)
+
+
 def test_a_folder_becomes_queries_without_ground_truth(folder: Path, tmp_path: Path) -> None:
     report = import_images(folder, tmp_path / "PLACE", "drone", camera=CAMERA)
     session = Capture.open(tmp_path / "PLACE")["drone_query"]
@@ -252,7 +297,12 @@ def test_a_focal_length_is_guessed_from_exif(tmp_path: Path, tags: dict[int, obj
 def test_images_without_a_focal_length_are_left_out(folder: Path, tmp_path: Path) -> None:
     save(folder / "c.jpg", tags={0xA405: 30})
     report = import_images(folder, tmp_path / "PLACE")
-    assert (report.images["status"] == "no focal length in EXIF: give the camera, or cameras.txt").sum() == 3
+    left_out = report.images["status"][report.images["status"].str.startswith("no focal length in EXIF: give ")]
+    assert len(left_out) == 3
+    # What is given so is taken.
+    camera = left_out.iloc[0].split("such as '")[1].split("'")[0].replace("FOCAL_PX", "50")
+    assert "--camera 'MODEL,W,H,...'" in left_out.iloc[0]
+    assert import_images(folder, tmp_path / "OTHER", camera=camera).images["status"].eq("imported").all()
     assert "1 images: a guess from EXIF" in report.text()
     assert read_number({1: "many", 2: float("inf")}, 1) == read_number({2: float("inf")}, 2) == 0
 

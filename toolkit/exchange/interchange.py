@@ -1,199 +1,41 @@
-"""Bring your own: COLMAP models and folders of images become sessions of a capture.
-
-A session's images are linked or copied to `raw_data/import/images/`, under their names. The status of each image is a
-row of `proc/import.csv`. Images stay as they are stored, and intrinsics belong to the stored pixels, whether or not
-EXIF asks to turn the image.
+"""Bring your own: COLMAP models and folders of images become sessions of a capture (see `drafts`).
 
 The table of a folder of images is a CSV file with a header. Column `image` is the path in the folder; `qw qx qy qz tx
 ty tz` are the image's pose; `camera_id` names a camera of a `cameras.txt` in COLMAP's format, or `model width height
 params` (params separated by spaces) are the camera itself. Columns may stand in any order; an unknown one is refused.
 """
 
-import os
-import re
-import shutil
 import subprocess
 import sys
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pycolmap
 
-from toolkit.capture import RAW_DATA, Trajectory, parse_camera, write_session
-from toolkit.capture.devices import SPLITS
-from toolkit.capture.exif import ORIENTATION, exif_camera, read_header, read_number, time_taken
-from toolkit.capture.names import EXPECTED_NAME, is_bad_name, note_linked_here
+from toolkit.capture import parse_camera
+from toolkit.capture.exif import exif_camera
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import CaptureError, ImageError, ManifestError
-from toolkit.files import write_folder
+from toolkit.exchange.drafts import (
+    SUBSESSION,
+    DraftImage,
+    ImportReport,
+    list_images,
+    posed_camera,
+    require_convention,
+    start,
+)
 from toolkit.geometry import Floats, invert, make_pose, pose_from_qt
-from toolkit.localizers.mapping import camera_text
 from toolkit.manifest import nearest
 
-SUBSESSION = "import"
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 POSE_DIRECTIONS = ("world_from_cam", "cam_from_world")
-PLACING = ("link", "copy")
 PROBE_S = 60
 """How long COLMAP may take to read a model, besides 10 s a megabyte; at damaged files it may take for ever."""
 _CAMERA_COLUMNS = ("model", "width", "height", "params")
-
-
-@dataclass
-class ImportReport:
-    """What an import made."""
-
-    session: Path
-    images: pd.DataFrame
-    """One row an image: image, status (`imported` or why not), path, timestamp, sensor_id, device_id, camera."""
-    notes: list[str] = field(default_factory=list)
-    """What was guessed, made up, or deserves a look."""
-
-    def text(self) -> str:
-        """Return what was made, as text."""
-        done = self.images["status"] == "imported"
-        cameras = self.images[done]["sensor_id"].nunique()
-        lines = [f"{self.session}: {done.sum()} of {len(self.images)} images, {cameras} cameras", *self.notes]
-        left_out = self.images[~done]
-        lines += [f"left out: {row.image}: {row.status}" for row in left_out.head(10).itertuples()]
-        if len(left_out) > 10:
-            lines.append(f"... and {len(left_out) - 10} more, see proc/import.csv")
-        return "\n".join(lines)
-
-
-@dataclass
-class _Image:
-    """An image that is to become part of a session."""
-
-    name: str
-    camera: pycolmap.Camera
-    sensor: str
-    frame: str
-    """Images of one frame were taken at one time."""
-    rig: str | None = None
-    time_us: int | None = None
-    turned: bool = False
-    """Whether EXIF asks to turn the image."""
-
-    @property
-    def path(self) -> str:
-        """Relative to raw_data."""
-        return f"{SUBSESSION}/images/{self.name}"
-
-    @property
-    def device(self) -> str:
-        return self.rig or self.sensor
-
-
-@dataclass
-class _Draft:
-    """A session that is being put together."""
-
-    session: Path
-    folder: Path
-    """Of the images."""
-    placing: str
-    images: list[_Image] = field(default_factory=list)
-    rows: list[dict[str, Any]] = field(default_factory=list)
-    """Of `proc/import.csv`."""
-    poses: dict[str, Floats] = field(default_factory=dict)
-    """world_from_device, (4, 4), by frame."""
-    rigs: list[tuple[str, str, Floats]] = field(default_factory=list)
-    """Rig, sensor, rig_from_sensor."""
-    notes: list[str] = field(default_factory=list)
-
-    def write(self) -> ImportReport:
-        """Leave out the images that cannot be used, and write the session of the others."""
-        problems = {image.name: self._problem(image) for image in self.images}
-        self.rows += [{"image": name, "status": problem} for name, problem in problems.items() if problem]
-        self.images = [image for image in self.images if not problems[image.name]]
-        if not self.images:
-            why = f" First: {self.rows[0]['image']}: {self.rows[0]['status']}." if self.rows else ""
-            raise CaptureError(f"{self.folder}: none of {len(self.rows)} images can be imported.{why}")
-        if turned := sum(image.turned for image in self.images):
-            self.notes.append(f"{turned} images have an EXIF tag that asks for turning: the pixels are used as stored")
-        times = self._choose_times()
-        self.rows += [
-            {"image": image.name, "status": "imported", "path": image.path, "timestamp": times[image.frame],
-             "sensor_id": image.sensor, "device_id": image.device, "camera": camera_text(image.camera)}
-            for image in self.images
-        ]  # fmt: skip
-        columns = ["image", "status", "path", "timestamp", "sensor_id", "device_id", "camera"]
-        table = pd.DataFrame(self.rows, columns=columns).astype({"timestamp": "Int64"})
-        with write_folder(self.session) as part:
-            for image in self.images:
-                source, target = self.folder / image.name, part / RAW_DATA / image.path
-                target.parent.mkdir(parents=True, exist_ok=True)
-                if self.placing == "copy":
-                    shutil.copyfile(source, target)
-                else:
-                    target.symlink_to(os.path.abspath(source))  # noqa: PTH100 - a link in the source stays one
-            self._write_tables(part, times)
-            table.to_csv(part / "proc" / "import.csv", index=False)
-            if self.placing == "link":
-                note_linked_here(part)
-        return ImportReport(self.session, table, self.notes)
-
-    def _write_tables(self, session: Path, times: Mapping[str, int]) -> None:
-        """Write the text files of the capture format, `times` being those of frames."""
-        frame_of = {(times[image.frame], image.device): image.frame for image in self.images}
-        keys = pd.DataFrame(sorted(frame_of), columns=["timestamp", "device_id"])
-        trajectory = None
-        if self.poses:
-            poses = np.stack([self.poses[frame_of[key]] for key in sorted(frame_of)])
-            trajectory = Trajectory.from_poses(keys["timestamp"], keys["device_id"], poses)
-        cameras = {image.sensor: image.camera for image in self.images}
-        rigs = {image.rig for image in self.images}
-        is_map = self.session.name.endswith("_map")
-        write_session(
-            session,
-            [(name, "", "camera", *camera_text(camera).split(", ")) for name, camera in sorted(cameras.items())],
-            [row for row in self.rigs if row[0] in rigs and row[1] in cameras] or None,
-            trajectory if is_map else None,
-            sorted((times[image.frame], image.sensor, image.path) for image in self.images),
-            subsessions=[SUBSESSION],
-            keyframes=None if is_map else {"pruned_subsampled": keys},  # the list that is localized by default
-            ground_truth=None if is_map else trajectory,
-        )
-
-    def _problem(self, image: _Image) -> str:
-        """Set what an image's header says; return why the image cannot be used, or nothing."""
-        name = PurePosixPath(image.name)
-        if "," in image.name:
-            return "the capture format cannot hold the comma in its name"
-        if image.name.startswith("/") or ".." in name.parts:
-            return "not a path inside the folder of images"
-        if is_bad_name(image.name):
-            return f"the capture format cannot hold this name, expected {EXPECTED_NAME}"
-        try:
-            size, exif = read_header(self.folder / name)
-        except ImageError as error:
-            return str(error)
-        orientation, camera = read_number(exif, ORIENTATION), image.camera
-        image.turned, image.time_us = orientation > 1, time_taken(exif)
-        if size == (camera.width, camera.height):
-            return ""
-        stored = f"{size[0]} x {size[1]}"
-        problem = f"the image is stored as {stored} pixels, its camera is of {camera.width} x {camera.height}"
-        if orientation > 4 and size == (camera.height, camera.width):
-            problem += "; the camera is of the turned image: turn the pixels and remove the EXIF orientation"
-        return problem
-
-    def _choose_times(self) -> dict[str, int]:
-        """Return the time of each frame, microseconds: from EXIF if that tells the frames apart."""
-        frames = list(dict.fromkeys(image.frame for image in self.images))
-        taken = {image.frame: image.time_us for image in reversed(self.images) if image.time_us is not None}
-        if len(taken) == len(frames) == len(set(taken.values())):
-            self.notes.append("timestamps: of the camera's clock, from EXIF")
-            return taken
-        why = "some images have no time" if len(taken) < len(frames) else "some images have the same time"
-        self.notes.append(f"timestamps: made up, a second apart in the order of the images ({why} in EXIF)")
-        return {frame: (number + 1) * 10**6 for number, frame in enumerate(frames)}
 
 
 def import_colmap(
@@ -221,7 +63,7 @@ def import_colmap(
         CaptureError: no model in the folder, the session exists already, or no image is left.
         ManifestError: an unknown split or placing, or a device that cannot be part of a name.
     """
-    draft = _start(capture, device, split, Path(images), placing)
+    draft = start(capture, device, split, Path(images), placing)
     reconstruction = _read_model(Path(model))
     rigs = {rig_id: rig for rig_id, rig in sorted(reconstruction.rigs.items()) if rig.num_sensors() > 1}
     for rig_id, rig in rigs.items():
@@ -234,9 +76,9 @@ def import_colmap(
             continue
         rig_name = f"{SUBSESSION}/rig_{image.frame.rig_id}" if image.frame.rig_id in rigs else None
         frame, sensor_name = f"{image.frame_id}", f"{SUBSESSION}/cam_{image.camera_id}"
-        draft.images.append(_Image(image.name, image.camera, sensor_name, frame, rig_name))
+        draft.images.append(DraftImage(image.name, image.camera, sensor_name, frame, rig_name))
         draft.poses[frame] = _inverse(image.frame.rig_from_world if rig_name else image.cam_from_world())
-    not_in_model = set(_list_images(draft.folder)["image"]) - {image.name for image in draft.images}
+    not_in_model = set(list_images(draft.folder)["image"]) - {image.name for image in draft.images}
     if not_in_model:
         draft.notes.append(f"{len(not_in_model)} images of the folder are not in the model")
     return draft.write()
@@ -252,6 +94,9 @@ def import_images(
     camera: str | None = None,
     cameras: str | Path | None = None,
     placing: str = "link",
+    axes: str = "opencv",
+    unit_m: float = 1.0,
+    truth: str | Path | None = None,
 ) -> ImportReport:
     """Make a session of a folder of images, each camera on its own.
 
@@ -261,26 +106,33 @@ def import_images(
         images: folder; without a table, all JPEG and PNG files in and below it.
         capture, device, split, placing: as of `import_colmap`. A map needs poses.
         table: CSV file, see the head of this module.
-        poses_are: direction of the table's poses, `world_from_cam` or `cam_from_world`; meters.
+        poses_are: direction of the poses in table and truth, `world_from_cam` or `cam_from_world`.
         camera: intrinsics of all images, `MODEL, width, height, parameter, ...`, with COLMAP's models.
         cameras: COLMAP's cameras.txt; its only camera is of all images, else the table's `camera_id` says which.
+        axes: those of the cameras that the poses are of, see `drafts.AXES`.
+        unit_m: meters in a unit of the poses.
+        truth: CSV file like the table, whose poses become the ground truth of queries; images that it does not name
+            are queries without one.
 
     Raises:
         CaptureError: a malformed table or camera (names file and line), an image without intrinsics, a map without
-            poses, the session exists already, or no image is left.
-        ManifestError: an unknown split, placing or direction, or a device that cannot be part of a name.
+            poses, truth that names no image, the session exists already, or no image is left.
+        ManifestError: an unknown split, placing, direction or axes, a unit that is no length, truth of a map or beside
+            poses in the table, or a device that cannot be part of a name.
     """
     if poses_are not in POSE_DIRECTIONS:
         raise ManifestError(f"poses_are: unknown {poses_are!r}. {nearest(poses_are, POSE_DIRECTIONS)}")
-    draft, folder = _start(capture, device, split, Path(images), placing), Path(images)
+    require_convention(axes, unit_m)
+    draft, folder = start(capture, device, split, Path(images), placing), Path(images)
     if not folder.is_dir():
         raise CaptureError(f"{folder}: no such folder of images.")
-    rows = _read_table(Path(table)) if table is not None else _list_images(folder)
+    rows = _read_table(Path(table)) if table is not None else list_images(folder)
     if split == "map" and "qw" not in rows:
         raise CaptureError(f"A map needs poses: give a table with the columns image, {', '.join(POSE_NAMES)}.")
     listed_cameras = _read_cameras(Path(cameras)) if cameras is not None else {}
     given_camera = None if camera is None else _camera(camera, "camera")
-    sensors: dict[str, str] = {}
+    posed = rows if truth is None else _read_truth(Path(truth), rows, split)
+    poses = _poses_of(posed, poses_are, axes, unit_m)
     origins = Counter[str]()
     for row in rows.to_dict("records"):
         name, where = str(row["image"]), f"{table}, line {row['line']}"
@@ -290,27 +142,11 @@ def import_images(
             draft.rows.append({"image": name, "status": str(error)})
             continue
         origins[origin] += 1
-        sensor = sensors.setdefault(camera_text(image_camera), f"{SUBSESSION}/cam_{len(sensors) + 1}")
-        draft.images.append(_Image(name, image_camera, sensor, name))
-        if "qw" in row:
-            pose = pose_from_qt(np.array([float(row[key]) for key in POSE_NAMES]))
-            draft.poses[name] = pose if poses_are == "world_from_cam" else invert(pose)
+        draft.add(name, image_camera, poses.get(name))
+    if truth is not None:
+        draft.notes.append(f"ground truth of {len(draft.poses)} of {len(rows)} images: {truth}")
     draft.notes += [f"intrinsics of {count} images: {origin}" for origin, count in origins.items()]
     return draft.write()
-
-
-def _start(capture: str | Path, device: str, split: str, folder: Path, placing: str) -> _Draft:
-    """Return the draft of a new session, or refuse one that cannot be made."""
-    if split not in SPLITS:
-        raise ManifestError(f"split: unknown {split!r}. {nearest(split, SPLITS)}")
-    if placing not in PLACING:
-        raise ManifestError(f"images: unknown choice {placing!r}. {nearest(placing, PLACING)}")
-    if not re.fullmatch(r"[a-z0-9-]+", device):  # as `extra_devices` of a manifest has it
-        raise ManifestError(f"device: found {device!r}, expected small letters, digits and '-', such as ios or drone.")
-    session = Path(capture) / "sessions" / f"{device}_{split}"
-    if session.exists():
-        raise CaptureError(f"{session} exists already. Import into another capture or device, or remove it first.")
-    return _Draft(session, folder, placing)
 
 
 _PROBE = """
@@ -404,11 +240,30 @@ def _read_cameras(path: Path) -> dict[str, pycolmap.Camera]:
 # Tables
 
 
-def _list_images(folder: Path) -> pd.DataFrame:
-    paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
-    if not paths:
-        raise CaptureError(f"{folder}: no image in or below it. Expected {', '.join(IMAGE_SUFFIXES)}.")
-    return pd.DataFrame({"image": [path.relative_to(folder).as_posix() for path in paths], "line": 0})
+def _read_truth(path: Path, images: pd.DataFrame, split: str) -> pd.DataFrame:
+    """Read the table of true poses of queries, some of the `images`."""
+    if split != "query" or "qw" in images:
+        why = "the images of a map" if split != "query" else "images whose table has poses, which are their truth"
+        raise ManifestError(f"truth: {path} is given for {why}. Give it for queries whose table has no poses.")
+    rows = _read_table(path)
+    if "qw" not in rows:
+        raise CaptureError(f"{path}: no poses in it. Expected the columns image, {', '.join(POSE_NAMES)}.")
+    if not set(rows["image"]) & set(images["image"]):
+        names = [repr(next(iter(table["image"]), "")) for table in (rows, images)]
+        raise CaptureError(
+            f"{path}: no row is of an image that is imported: found {names[0]} and others, expected {names[1]} and "
+            "others. Images are named by their path in the folder of images."
+        )
+    return rows
+
+
+def _poses_of(rows: pd.DataFrame, poses_are: str, axes: str, unit_m: float) -> dict[str, Floats]:
+    """Return world_from_cam, (4, 4), meters, by image, of the rows of a table; none if it has no poses."""
+    if "qw" not in rows:
+        return {}
+    poses = pose_from_qt(rows[list(POSE_NAMES)].to_numpy(float))
+    poses = poses if poses_are == "world_from_cam" else invert(poses)
+    return {str(name): posed_camera(pose, axes, unit_m) for name, pose in zip(rows["image"], poses, strict=True)}
 
 
 def _read_table(path: Path) -> pd.DataFrame:

@@ -1,0 +1,215 @@
+"""Import of transforms.json: conventions, intrinsics, what is malformed."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import PIL.Image
+import pytest
+from typer.testing import CliRunner
+
+from toolkit.__main__ import app
+from toolkit.capture import Capture, Session
+from toolkit.capture.check import check_capture
+from toolkit.errors import CaptureError, ManifestError
+from toolkit.exchange.transforms import import_transforms
+from toolkit.geometry import invert, make_pose, quaternion_to_rotation, transform
+
+SIZE = (64, 48)
+SHARED = {"fl_x": 50.0, "fl_y": 51.0, "cx": 30.0, "cy": 25.0, "w": SIZE[0], "h": SIZE[1]}
+
+
+def matrix(number: int) -> list[list[float]]:
+    """world_from_cam of a frame, OpenGL axes."""
+    rng = np.random.default_rng(number)
+    pose: list[list[float]] = make_pose(quaternion_to_rotation(rng.normal(size=4)), rng.normal(size=3) * 9).tolist()
+    return pose
+
+
+def write(folder: Path, frames: list[dict[str, Any]] | None = None, **shared: Any) -> Path:
+    """Write a file with three frames, or these; their images are there."""
+    if frames is None:
+        frames = [{"file_path": f"images/{k}.jpg", "transform_matrix": matrix(k)} for k in range(3)]
+    for frame in frames:
+        path = folder / str(frame.get("file_path", "x.jpg"))
+        path = path if path.suffix else path.with_suffix(".png")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        PIL.Image.new("RGB", SIZE, (90, 120, 150)).save(path)
+    file = folder / "transforms.json"
+    file.write_text(json.dumps({**SHARED, **shared, "frames": frames}))
+    return file
+
+
+def imported(file: Path, place: Path, **options: Any) -> Session:
+    import_transforms(file, place, **options)
+    return Capture.open(place)["ios_map"]
+
+
+def camera_of(session: Session, name: str) -> Any:
+    row = session.row_of_name[f"ios_map/raw_data/import/images/{name}"]
+    return session.camera(str(session.images["sensor_id"].iloc[row]))
+
+
+def distorted(x: float, y: float, k: tuple[float, ...], p: tuple[float, float]) -> tuple[float, float]:
+    """OpenCV's distortion of a point of the plane at depth 1, k1 k2 k3 and p1 p2."""
+    r2 = x * x + y * y
+    radial = 1 + sum(one * r2 ** (power + 1) for power, one in enumerate(k))
+    return (
+        x * radial + 2 * p[0] * x * y + p[1] * (r2 + 2 * x * x),
+        y * radial + p[0] * (r2 + 2 * y * y) + 2 * p[1] * x * y,
+    )
+
+
+@pytest.mark.parametrize(
+    ("intrinsics", "model"),
+    [
+        ({}, "PINHOLE"),
+        ({"camera_model": "OPENCV", "k1": 0.1, "k2": -0.02, "p1": 0.003, "p2": -0.004}, "OPENCV"),
+        ({"k1": 0.1, "k2": -0.02, "k3": 0.05, "p1": 0.003, "p2": -0.004}, "FULL_OPENCV"),
+        ({"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k2": -0.02, "k3": 0.03, "k4": 0.01}, "OPENCV_FISHEYE"),
+        ({"is_fisheye": True, "k1": 0.1}, "OPENCV_FISHEYE"),
+    ],
+)
+def test_points_are_seen_where_the_file_says(tmp_path: Path, intrinsics: dict[str, Any], model: str) -> None:
+    """A point in front of an OpenGL camera, projected by hand, and by the session's pose and camera."""
+    session = imported(write(tmp_path, **intrinsics), tmp_path / "PLACE")
+    k = [float(intrinsics.get(f"k{i}", 0)) for i in (1, 2, 3, 4)]
+    p = float(intrinsics.get("p1", 0)), float(intrinsics.get("p2", 0))
+    for row, path in enumerate(session.images["path"]):
+        in_gl = np.array([0.3, 0.2, -1.5])  # right, up, in front
+        world = transform(np.array(matrix(int(Path(path).stem))), in_gl[None])
+        x, y = in_gl[0] / -in_gl[2], in_gl[1] / in_gl[2]  # y down
+        if model == "OPENCV_FISHEYE":
+            r = np.hypot(x, y)
+            theta = np.arctan(r)
+            scale = theta * (1 + sum(one * theta ** (2 * power) for power, one in enumerate(k, start=1))) / r
+            x, y = x * scale, y * scale
+        else:
+            x, y = distorted(x, y, (k[0], k[1], k[2]), p)
+        camera = session.camera(str(session.images["sensor_id"].iloc[row]))
+        in_cam = transform(invert(session.world_from_cam([row])[0]), world)
+        assert camera.model.name == model
+        np.testing.assert_allclose(camera.img_from_cam(in_cam)[0], [50 * x + 30, 51 * y + 25], rtol=0, atol=1e-9)
+    assert len(session.sensors) == 1
+    assert check_capture(tmp_path / "PLACE").problems == []
+
+
+def test_the_axes_may_be_those_of_opencv_and_the_unit_not_the_meter(tmp_path: Path) -> None:
+    file = write(tmp_path)
+    report = import_transforms(file, tmp_path / "A")[0]
+    assert "unit of the poses: not known" in report.text()
+    assert json.loads((report.session / "proc" / "import.json").read_text()) == {"unit": None}
+    opengl = Session.open(report.session).world_from_cam()
+    np.testing.assert_allclose(opengl[1], np.array(matrix(1)) @ np.diag([1, -1, -1, 1]), rtol=0, atol=1e-12)
+    opencv = imported(file, tmp_path / "B", axes="opencv", unit_m=0.01)
+    assert json.loads((opencv.path / "proc" / "import.json").read_text()) == {"unit": "m"}
+    np.testing.assert_allclose(opencv.world_from_cam()[1][:3, :3], np.array(matrix(1))[:3, :3], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(opencv.world_from_cam()[:, :3, 3], opengl[:, :3, 3] / 100, rtol=0, atol=1e-12)
+    for options in ({"axes": "arkit"}, {"unit_m": 0.0}, {"split": "train"}, {"hold_out": 1}, {"hold_out": 4}):
+        with pytest.raises(ManifestError, match=r"Known|expected|Give"):
+            import_transforms(file, tmp_path / "C", **options)  # type: ignore[arg-type]
+    assert not (tmp_path / "C").exists()
+
+
+def test_frames_may_have_intrinsics_of_their_own_and_no_extension(tmp_path: Path) -> None:
+    frames = [
+        {"file_path": "./train/r_0", "transform_matrix": matrix(0)},
+        {"file_path": "train/r_1.png", "transform_matrix": matrix(1)[:3], "fl_x": 60, "k1": 0.1, "cx": 31.5},
+        {"file_path": str(tmp_path / "train" / "r_2"), "transform_matrix": matrix(2)},
+    ]
+    session = imported(write(tmp_path, frames), tmp_path / "PLACE")
+    names = ["train/r_0.png", "train/r_1.png", "train/r_2.png"]
+    assert session.images["path"].tolist() == [f"import/images/{name}" for name in names]
+    assert camera_of(session, names[0]).params.tolist() == [50, 51, 30, 25]
+    assert camera_of(session, names[1]).params.tolist() == [60, 51, 31.5, 25, 0.1, 0, 0, 0]
+    assert len(session.sensors) == 2
+
+
+def test_a_field_of_view_is_a_focal_length(tmp_path: Path) -> None:
+    """As in the files of NeRF's rendered scenes, which have nothing else; a right angle has half the width."""
+    file = write(tmp_path)
+    content = json.loads(file.read_text())
+    file.write_text(json.dumps({"camera_angle_x": np.pi / 2, "frames": content["frames"], "aabb_scale": 16}))
+    assert camera_of(imported(file, tmp_path / "A"), "images/0.jpg").params.tolist() == pytest.approx([32, 32, 32, 24])
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"camera_angle_y": 2 * np.arctan(0.5)}))
+    assert camera_of(imported(file, tmp_path / "B"), "images/0.jpg").params.tolist() == pytest.approx([32, 48, 32, 24])
+
+
+def test_every_so_many_frames_become_queries_with_their_truth(tmp_path: Path) -> None:
+    names = [f"{k:02d}.jpg" for k in range(7)]
+    frames = [{"file_path": name, "transform_matrix": matrix(k)} for k, name in enumerate(names)]
+    file = write(tmp_path, frames[::-1])
+    PIL.Image.new("RGB", SIZE).save(tmp_path / "other.jpg")
+    command = ["import", "transforms", str(file), str(tmp_path / "PLACE"), "--hold-out", "3", "--unit", "2"]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 0, done.output
+    assert "5 of 5 images, 1 cameras\n1 images beside these are not in transforms.json" in done.output
+    place = Capture.open(tmp_path / "PLACE")
+    queries = place["ios_query"]
+    assert [Path(path).name for path in queries.images["path"]] == ["02.jpg", "05.jpg"]
+    assert [Path(path).name for path in place["ios_map"].images["path"]] == [f"0{k}.jpg" for k in (0, 1, 3, 4, 6)]
+    truth = queries.world_from_cam(ground_truth=True)
+    np.testing.assert_allclose(truth[1][:3, 3], 2 * np.array(matrix(5))[:3, 3], rtol=0, atol=1e-12)
+    assert queries.odometry is None
+
+
+def test_images_that_cannot_be_used_are_rows(tmp_path: Path) -> None:
+    file = write(tmp_path)
+    content = json.loads(file.read_text())
+    (tmp_path / "images" / "1.jpg").unlink()
+    content["frames"][2]["w"] = 65
+    outside = {"file_path": "../outside.jpg", "transform_matrix": matrix(4)}
+    PIL.Image.new("RGB", SIZE).save(tmp_path.parent / "outside.jpg")
+    file.write_text(json.dumps(content | {"frames": [*content["frames"], outside]}))
+    status = import_transforms(file, tmp_path / "PLACE")[0].images.set_index("image")["status"]
+    assert status["images/0.jpg"] == "imported"
+    assert status["images/1.jpg"] == "no such file"
+    assert status["images/2.jpg"] == "the image is stored as 64 x 48 pixels, its camera is of 65 x 48"
+    assert status["../outside.jpg"] == "not a path inside the folder of images"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"file_path": None}, "frame 1, file_path: found None; expected the path of an image"),
+        ({"file_path": "images/0.jpg"}, "frame 1 (images/0.jpg), file_path: found that of frame 0 again; expected one"),
+        ({"fl_x": "wide"}, "frame 1 (images/1.jpg), fl_x: found 'wide'; expected a focal length in pixels"),
+        ({"fl_x": -5}, "frame 1 (images/1.jpg), intrinsics: found PINHOLE, 64.0, 48.0, -5.0, "),
+        ({"fl_y": True}, "frame 1 (images/1.jpg), fl_y: found True; expected"),
+        ({"k1": float("nan")}, "frame 1 (images/1.jpg), k1: found nan; expected a number"),
+        ({"k4": 0.5}, "frame 1 (images/1.jpg), k4: found 0.5; expected 0 for OPENCV"),
+        ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "frame 1 (images/1.jpg), p1, p2: found 0.1, 0; expected 0, 0"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "frame 1 (images/1.jpg), camera_model: found 'EQUIRECTANGULAR'; "),
+        ({"transform_matrix": None}, "frame 1 (images/1.jpg), transform_matrix: found None; expected 4 rows of 4"),
+        ({"transform_matrix": [[1, 2], [3]]}, "frame 1 (images/1.jpg), transform_matrix: found [[1, 2], [3]]; "),
+        ({"transform_matrix": np.diag([2, 2, 2, 1]).tolist()}, "transform_matrix: found [[2. 0. 0.]"),
+        ({"transform_matrix": np.diag([1, 1, -1, 1]).tolist()}, "expected a rotation: columns of length 1"),
+        ({"transform_matrix": np.array(matrix(1)).T.tolist()}, "the last row 0 0 0 1. Correct it in the file."),
+    ],
+)
+def test_what_is_malformed_is_named_with_frame_and_key(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    file = write(tmp_path)
+    content = json.loads(file.read_text())
+    content["frames"][1] |= change
+    file.write_text(json.dumps(content))
+    with pytest.raises(CaptureError, match=re.escape(message)) as error:
+        import_transforms(file, tmp_path / "PLACE")
+    assert str(error.value).startswith(f"{file}, frame 1")
+    assert not (tmp_path / "PLACE").exists()
+
+
+def test_a_file_without_intrinsics_or_frames_is_refused(tmp_path: Path) -> None:
+    file = write(tmp_path)
+    content = json.loads(file.read_text())
+    file.write_text(json.dumps({"frames": content["frames"]}))
+    with pytest.raises(CaptureError, match=r"fl_x: found nothing; .* or camera_angle_x"):
+        import_transforms(file, tmp_path / "PLACE")
+    for text in ("", "{", "[]", '{"frames": []}', '{"frames": [1]}', '{"images": 1}', "[" * 100_000):
+        file.write_text(text)
+        with pytest.raises(CaptureError, match="an object with a list `frames`"):
+            import_transforms(file, tmp_path / "PLACE")
+    with pytest.raises(CaptureError, match="cannot be read"):
+        import_transforms(tmp_path / "nothing.json", tmp_path / "PLACE")
+    assert not (tmp_path / "PLACE").exists()

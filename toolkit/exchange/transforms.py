@@ -1,0 +1,212 @@
+"""Import of transforms.json, in which nerfstudio and instant-ngp keep images, cameras and poses.
+
+What is read, of the file or, first, of each of its `frames`:
+
+- `file_path`: relative to the folder of the file, with or without extension. `transform_matrix`: world_from_cam, whose
+  camera has the axes of OpenGL: x right, y up, z backward.
+- `fl_x fl_y cx cy` in pixels, `w h`; or, in place of the focal lengths, `camera_angle_x camera_angle_y`, the fields of
+  view in radians: f = (w / 2) / tan(angle / 2). As in COLMAP, whose numbers these are, the center of the top-left pixel
+  is (0.5, 0.5).
+- `k1 k2 k3 p1 p2`: the distortion of OpenCV. For `camera_model` OPENCV_FISHEYE, or `is_fisheye`, `k1 k2 k3 k4` are that
+  of OpenCV's fisheye model (J. Kannala and S. Brandt, "A generic camera model and calibration method for conventional,
+  wide-angle, and fish-eye lenses", PAMI 2006).
+
+What is for rendering alone (`aabb_scale`, `scale`, `offset`, masks, depths) is passed over, and so is
+`applied_transform`, which the matrices already have in them.
+"""
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from toolkit.capture import parse_camera
+from toolkit.capture.exif import read_header
+from toolkit.errors import CaptureError, ImageError, ManifestError
+from toolkit.exchange.drafts import IMAGE_SUFFIXES, ImportReport, list_images, posed_camera, require_convention, start
+from toolkit.geometry import Floats
+
+PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+FISHEYE = "OPENCV_FISHEYE"
+TOLERANCE = 1e-3
+"""Of a rotation: by so much its columns may be off from unit length and right angles."""
+
+
+def import_transforms(
+    path: str | Path,
+    capture: str | Path,
+    device: str = "ios",
+    split: str = "map",
+    placing: str = "link",
+    axes: str = "opengl",
+    unit_m: float | None = None,
+    hold_out: int = 0,
+) -> list[ImportReport]:
+    """Make a session, or two, of the frames of a transforms.json; images keep their `file_path` as names.
+
+    Args:
+        path: the file.
+        capture: folder of the capture; made where it does not exist.
+        device, split: the session is `<device>_<split>`. Poses of queries become their ground truth.
+        placing: `link` images to where they are, or `copy` them.
+        axes: those of the cameras that the matrices are of, see `drafts.AXES`.
+        unit_m: meters in a unit of the poses; None: not known, as after structure from motion. Poses are then kept as
+            they are, and the session says so.
+        hold_out: every so many frames of a map, in order of their names, becomes a query with ground truth instead;
+            0: none.
+
+    Returns:
+        The reports of the sessions: the map's first.
+
+    Raises:
+        CaptureError: a malformed file (names frame and key), a session exists already, or no image is left of one.
+        ManifestError: an unknown split, placing or axes, a unit that is no length, or frames that cannot be held out.
+    """
+    require_convention(axes, 1.0 if unit_m is None else unit_m)
+    if hold_out and (hold_out < 2 or split != "map"):
+        raise ManifestError(f"hold-out: found {hold_out} for a {split}, expected 2 or more, of a map.")
+    path = Path(path)
+    splits = (split, "query") if hold_out else (split,)
+    drafts = [start(capture, device, name, path.parent, placing) for name in splits]
+    content = _read(path)
+    frames: dict[str, _Frame] = {}
+    for number, entry in enumerate(content["frames"]):
+        frame = _Frame(path, number, entry, content)
+        if frame.name in frames:
+            raise frame.error("file_path", f"that of frame {frames[frame.name].number} again", "one frame an image")
+        frames[frame.name] = frame
+    if hold_out > len(frames):
+        raise ManifestError(f"hold-out: found {hold_out}, but there are {len(frames)} frames. Give a smaller number.")
+    for place, name in enumerate(sorted(frames)):
+        draft = drafts[1 if hold_out and place % hold_out == hold_out - 1 else 0]
+        pose = posed_camera(frames[name].world_from_named(), axes, unit_m or 1.0)
+        try:
+            draft.add(name, frames[name].camera(), pose)
+        except ImageError as error:
+            draft.rows.append({"image": name, "status": str(error)})
+    folders = {PurePosixPath(name).parent for name in frames}
+    others = {name for name in list_images(path.parent)["image"] if PurePosixPath(name).parent in folders} - set(frames)
+    if others:
+        drafts[0].notes.append(f"{len(others)} images beside these are not in {path.name}")
+    for draft in drafts:
+        if unit_m is None:
+            draft.unit = None
+            draft.notes.append(
+                "unit of the poses: not known. Say how many meters it has by --unit METERS (1 where a phone's tracking "
+                "or a scanner gave the poses); else set `unit: null` in the manifest, as `python -m toolkit new` does"
+            )
+    return [draft.write() for draft in drafts]
+
+
+def _read(path: Path) -> dict[str, Any]:
+    expected = "Expected a transforms.json of nerfstudio or instant-ngp: an object with a list `frames`."
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise CaptureError(f"{path}: cannot be read ({error}). {expected}") from None
+    frames = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+        found = f"keys {', '.join(map(repr, content))[:100]}" if isinstance(content, dict) else repr(content)[:100]
+        raise CaptureError(f"{path}: frames: found {found or 'nothing'}, no list of frames. {expected}")
+    assert isinstance(content, dict)
+    return content
+
+
+class _Frame:
+    """One image of the file; its own values go before those of the file."""
+
+    def __init__(self, path: Path, number: int, entry: Mapping[str, Any], shared: Mapping[str, Any]) -> None:
+        self.path, self.number, self.values = path, number, {**shared, **entry}
+        found = entry.get("file_path")
+        if not isinstance(found, str) or not found.strip():
+            raise self.error("file_path", repr(found), "the path of an image, relative to the folder of this file")
+        self.name = self._with_suffix(found.replace("\\", "/"))
+
+    def _with_suffix(self, found: str) -> str:
+        """Return the path of an image relative to the folder of the file, with the extension that may be missing."""
+        name = os.path.normpath(os.path.relpath(found, self.path.parent) if found.startswith("/") else found)
+        if not (self.path.parent / name).is_file():
+            suffixes = [*IMAGE_SUFFIXES, *map(str.upper, IMAGE_SUFFIXES)]
+            name = next((name + one for one in suffixes if (self.path.parent / (name + one)).is_file()), name)
+        return Path(name).as_posix()
+
+    def error(self, key: str, found: str, expected: str) -> CaptureError:
+        of = getattr(self, "name", "")
+        frame = f"frame {self.number}" + (f" ({of})" if of else "")
+        return CaptureError(f"{self.path}, {frame}, {key}: found {found}; expected {expected}. Correct it in the file.")
+
+    def _number(self, key: str, expected: str, default: float | None = None) -> float:
+        value = self.values.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+            raise self.error(key, "nothing" if value is None else repr(value), expected)
+        return float(value)
+
+    def world_from_named(self) -> Floats:
+        """Return the pose as it is, (4, 4): of a camera with the file's axes, in its unit."""
+        found = self.values.get("transform_matrix")
+        expected = "4 rows of 4 finite numbers, world_from_cam, the last row 0 0 0 1"
+        try:
+            matrix = np.array(found, np.float64)
+        except (TypeError, ValueError):
+            raise self.error("transform_matrix", repr(found)[:80], expected) from None
+        if matrix.shape == (3, 4):
+            matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
+        if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0, 0, 0, 1]):
+            raise self.error("transform_matrix", repr(found)[:80], expected)
+        rotation = matrix[:3, :3]
+        if np.abs(rotation.T @ rotation - np.eye(3)).max() > TOLERANCE or np.linalg.det(rotation) < 0:
+            expected = "a rotation: columns of length 1 at right angles, x cross y = z"
+            raise self.error("transform_matrix", np.array2string(rotation, precision=4).replace("\n", ""), expected)
+        return matrix
+
+    def camera(self) -> pycolmap.Camera:
+        """Return the intrinsics.
+
+        Raises:
+            ImageError: they do not say the size of the image, and it cannot be read.
+            CaptureError: they are missing or malformed.
+        """
+        pixels = "pixels, a number"
+        size = [self._number(key, pixels) for key in "wh" if key in self.values]
+        width, height = size if len(size) == 2 else map(float, read_header(self.path.parent / self.name)[0])
+        fx = self._focal_px("x", width)
+        fy = self._focal_px("y", height, fx)
+        center = [self._number(key, pixels, side / 2) for key, side in (("cx", width), ("cy", height))]
+        model, params = self._distortion()
+        text = ", ".join([model, *map(repr, [width, height, fx, fy, *center, *params])])
+        try:
+            return parse_camera("camera", text)
+        except ValueError as error:
+            raise self.error("intrinsics", text, f"a camera ({error.args[0].rstrip('.')})") from None
+
+    def _focal_px(self, axis: str, side_px: float, default: float | None = None) -> float:
+        if f"fl_{axis}" in self.values:
+            return self._number(f"fl_{axis}", "a focal length in pixels")
+        if f"camera_angle_{axis}" in self.values:
+            expected = "a field of view in radians, between 0 and pi"
+            angle = self._number(f"camera_angle_{axis}", expected)
+            if not 0 < angle < np.pi:
+                raise self.error(f"camera_angle_{axis}", repr(angle), expected)
+            return side_px / 2 / float(np.tan(angle / 2))
+        return self._number(f"fl_{axis}", "a focal length in pixels, or camera_angle_x in radians", default)
+
+    def _distortion(self) -> tuple[str, list[float]]:
+        """Return the model of COLMAP, and its parameters after the principal point."""
+        model = self.values.get("camera_model", FISHEYE if self.values.get("is_fisheye") else "OPENCV")
+        if model not in (*PERSPECTIVE, FISHEYE):
+            expected = f"one of {', '.join((*PERSPECTIVE, FISHEYE))}, the models that images are localized with"
+            raise self.error("camera_model", repr(model), expected)
+        k1, k2, k3, k4, p1, p2 = (self._number(key, "a number", 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+        if model == FISHEYE:
+            if p1 or p2:
+                raise self.error("p1, p2", f"{p1:g}, {p2:g}", f"0, 0, which {FISHEYE} does not have")
+            return FISHEYE, [k1, k2, k3, k4]
+        if k4:
+            raise self.error("k4", f"{k4:g}", f"0 for {model}: COLMAP's models have no term in r^8. Is it {FISHEYE}")
+        if k3:
+            return "FULL_OPENCV", [k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]
+        return ("OPENCV", [k1, k2, p1, p2]) if any((k1, k2, p1, p2)) else ("PINHOLE", [])
