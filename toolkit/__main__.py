@@ -299,27 +299,61 @@ def export_colmap(
     scene: Scene,
     device: Annotated[str, typer.Argument(help="Whose map, e.g. ios.")],
     out: Annotated[Path, typer.Argument(help="New folder for the model.")],
-    capture: Annotated[Path | None, typer.Option(help="Capture folder, if it has moved since the run.")] = None,
+    capture: Capture = None,
+    names: Names = "own",
 ) -> None:
     """Write the triangulated map of a run as a COLMAP model."""
     from toolkit.exchange import export
 
-    print(f"{out}: {export.export_colmap(run, scene, device, out, capture).summary()}")
+    print(f"{out}: {export.export_colmap(run, scene, device, out, capture, names).summary()}")
 
 
 @export_app.command("pairs")
 def export_pairs(
     run: Run,
     scene: Scene,
-    map_device: Annotated[str, typer.Argument(help="Map device.")],
-    query_device: Annotated[str, typer.Argument(help="Query device.")],
-    out: Annotated[Path, typer.Argument(help="Text file.")],
+    map_device: MapDevice,
+    query_device: QueryDevice,
+    out: TextFile,
     topk: Annotated[int | None, typer.Option(min=1, help="References a query; else all.")] = None,
+    names: Names = "own",
 ) -> None:
     """Write the retrieval of a pair as hloc reads it: `query reference` a line."""
     from toolkit.exchange import export
 
-    print(f"{out}: {export.export_pairs(run, scene, map_device, query_device, out, topk)} pairs")
+    print(f"{out}: {export.export_pairs(run, scene, map_device, query_device, out, topk, names)} pairs")
+
+
+@export_app.command("poses")
+def export_poses(
+    run: Run,
+    scene: Scene,
+    map_device: MapDevice,
+    query_device: QueryDevice,
+    out: TextFile,
+    capture: Capture = None,
+    names: Names = "own",
+) -> None:
+    """Write the poses of a pair's queries as hloc does: `name qw qx qy qz tx ty tz` a line, cam_from_world."""
+    from toolkit.exchange import export
+
+    print(f"{out}: {export.export_poses(run, scene, map_device, query_device, out, capture, names)} poses")
+
+
+@export_app.command("intrinsics")
+def export_intrinsics(
+    run: Run,
+    scene: Scene,
+    map_device: MapDevice,
+    query_device: QueryDevice,
+    out: TextFile,
+    capture: Capture = None,
+    names: Names = "own",
+) -> None:
+    """Write the cameras of a pair's queries as hloc reads them: `name MODEL width height parameters` a line."""
+    from toolkit.exchange import export
+
+    print(f"{out}: {export.export_intrinsics(run, scene, map_device, query_device, out, capture, names)} images")
 
 
 @app.command()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import pandas as pd
 import pycolmap
 import pytest
 from typer.testing import CliRunner
@@ -14,10 +15,11 @@ from typer.testing import CliRunner
 from toolkit.__main__ import app
 from toolkit.capture import Capture, Session
 from toolkit.errors import ArtifactError, ManifestError
-from toolkit.exchange.export import export_colmap, export_pairs, export_table
+from toolkit.exchange.export import colmap_model, export_colmap, export_pairs, export_poses, export_table
 from toolkit.exchange.interchange import import_colmap, import_images
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import SceneFiles, pair_name
+from toolkit.geometry import invert, pose_from_qt
 from toolkit.localizers.correspondences import MAPS
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.mapping import build_map
@@ -179,6 +181,109 @@ def test_retrieval_becomes_a_list_of_pairs(tmp_path: Path) -> None:
         export_pairs(tmp_path, "PLACE", "ios", "hl", tmp_path / "pairs.txt")
     with pytest.raises(ArtifactError, match=r"_map_hl_query_hl\.jsonl"):
         export_pairs(tmp_path, "PLACE", "hl", "hl", tmp_path / "pairs.txt")
+
+
+@pytest.fixture
+def imported_run(small_capture: Path, tmp_path: Path) -> SceneFiles:
+    """A run on images that were imported from folders of a user's own: a map, and a rig as queries, with poses."""
+    sessions, place = small_capture / "sessions", tmp_path / "PLACE"
+    map_session, queries = Session.open(sessions / "ios_map"), Session.open(sessions / "hl_query")
+    table = export_table(map_session, tmp_path / "map.csv")
+    import_images(map_session.path / "raw_data", place, "ios", "map", table)
+    model = pycolmap.Reconstruction()
+    for row, path in enumerate(queries.images["path"]):
+        camera = pycolmap.Camera(queries.camera(queries.images["sensor_id"].iloc[row]).todict())
+        camera.camera_id = row + 1
+        model.add_camera_with_trivial_rig(camera)
+        image = pycolmap.Image(path, camera_id=camera.camera_id, image_id=row + 1)
+        pose = invert(queries.world_from_cam([row], ground_truth=True)[0])
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
+    (tmp_path / "model").mkdir()
+    model.write(tmp_path / "model")
+    import_colmap(tmp_path / "model", queries.path / "raw_data", place, "hl", "query")
+    truth = Capture.open(place)["hl_query"].ground_truth
+    assert truth is not None
+    files = SceneFiles(tmp_path / "run", "PLACE")
+    files.poses_dir.mkdir(parents=True)
+    truth.write(files.poses_txt("ios", "hl"))
+    keys = pd.DataFrame({"timestamp": truth.timestamps, "device_id": truth.device_ids, "status": "ok"})
+    keys.to_csv(files.poses_csv("ios", "hl"), index=False)
+    return files
+
+
+def test_poses_and_intrinsics_are_hlocs_under_the_names_that_were_imported(
+    imported_run: SceneFiles, small_capture: Path, tmp_path: Path
+) -> None:
+    run, place = str(imported_run.run), str(tmp_path / "PLACE")
+    arguments = [run, "PLACE", "ios", "hl"]
+    for what in ("poses", "intrinsics"):
+        command = ["export", what, *arguments, str(tmp_path / f"{what}.txt"), "--capture", place]
+        done = CliRunner().invoke(app, command)
+        assert done.exit_code == 0, done.output
+    queries = Session.open(small_capture / "sessions" / "hl_query")
+    lines = [(tmp_path / f"{what}.txt").read_text().splitlines() for what in ("poses", "intrinsics")]
+    assert len(lines[0]) == len(lines[1]) == len(queries)
+    poses, cameras = ({name: values for name, *values in map(str.split, of)} for of in lines)
+    assert set(poses) == set(cameras) == set(queries.images["path"])
+    for row, name in enumerate(queries.images["path"]):
+        cam_from_world = pose_from_qt(np.array(poses[name], float))
+        expected = invert(queries.world_from_cam([row], ground_truth=True)[0])
+        np.testing.assert_allclose(cam_from_world, expected, rtol=0, atol=1e-12)
+        camera = queries.camera(queries.images["sensor_id"].iloc[row])
+        model, width, height, *params = cameras[name]
+        assert (model, int(width), int(height)) == (camera.model.name, camera.width, camera.height)
+        assert [float(one) for one in params] == camera.params.tolist()
+    assert export_poses(run, "PLACE", "ios", "hl", tmp_path / "p.txt", place, names="capture") == len(queries)
+    assert (tmp_path / "p.txt").read_text().startswith("hl_query/raw_data/import/images/")
+    with pytest.raises(ArtifactError, match=r"_map_hl_query_hl\.txt is missing"):
+        export_poses(run, "PLACE", "hl", "hl", tmp_path / "p.txt", place)
+    with pytest.raises(ManifestError, match="names: unknown 'mine'"):
+        export_poses(run, "PLACE", "ios", "hl", tmp_path / "p.txt", place, names="mine")
+
+
+def test_a_rig_has_a_line_for_each_of_its_cameras(small_capture: Path, tmp_path: Path) -> None:
+    """The pose of a rig and where its cameras are in it, together, are the poses of its cameras."""
+    session, files = Capture.open(small_capture)["hl_query"], SceneFiles(tmp_path, small_capture.name)
+    assert session.ground_truth is not None
+    files.poses_dir.mkdir(parents=True)
+    session.ground_truth.write(files.poses_txt("ios", "hl"))
+    count = export_poses(tmp_path, files.scene, "ios", "hl", tmp_path / "p.txt", small_capture)
+    read = {name: values for name, *values in map(str.split, (tmp_path / "p.txt").read_text().splitlines())}
+    assert count == len(read) == len(session) == 2 * len(session.ground_truth)
+    for row, expected in enumerate(session.world_from_cam(ground_truth=True)):
+        found = pose_from_qt(np.array(read[session.image_name(row)], float))
+        np.testing.assert_allclose(found, invert(expected), rtol=0, atol=1e-12)
+
+
+def test_a_model_has_the_names_that_were_imported_again(
+    run: SceneFiles, small_capture: Path, imported_run: SceneFiles, tmp_path: Path
+) -> None:
+    """The map of the headset, as if its images had been imported."""
+    session = session_of(small_capture)
+    table = export_table(session, tmp_path / "hl.csv")
+    import_images(session.path / "raw_data", tmp_path / "PLACE", "hl", "map", table)
+    place, local_map = Capture.open(tmp_path / "PLACE")["hl_map"], LocalMap.load(run.maps / "hl_map.npz")
+    renamed = [name.replace("raw_data/", "raw_data/import/images/") for name in local_map.image_names]
+    store = FeatureStore.of_session(run.features, "hl_map")
+    keypoints = {new: store[old].keypoints for new, old in zip(renamed, local_map.image_names, strict=True)}
+    for names, expected in (("own", set(session.images["path"])), ("capture", set(renamed))):
+        model = colmap_model(replace(local_map, image_names=renamed), place, keypoints, names)
+        assert {image.name for image in model.images.values()} == expected
+
+
+def test_pairs_with_one_name_for_two_images_are_refused(tmp_path: Path) -> None:
+    files = SceneFiles(tmp_path, "PLACE")
+    files.retrieval_dir.mkdir(parents=True)
+    paths = [f"PLACE/sessions/ios_{split}/raw_data/import/images/a/1.jpg" for split in ("query", "map")]
+    row = {"path": paths[0], "timestamp": "1", "sensor_id": "cam_1", "topk": [{"path": paths[1]}]}
+    files.retrieval("ios", "ios").write_text(json.dumps(row) + "\n")
+    with pytest.raises(ArtifactError, match=r"'a/1\.jpg' is the name of a query and of a reference.* --names capture"):
+        export_pairs(tmp_path, "PLACE", "ios", "ios", tmp_path / "pairs.txt")
+    assert export_pairs(tmp_path, "PLACE", "ios", "ios", tmp_path / "pairs.txt", names="capture") == 1
+    row["topk"] = [{"path": paths[1].replace("1.jpg", "2.jpg")}]
+    files.retrieval("ios", "ios").write_text(json.dumps(row) + "\n")
+    assert export_pairs(tmp_path, "PLACE", "ios", "ios", tmp_path / "pairs.txt") == 1
+    assert (tmp_path / "pairs.txt").read_text() == "a/1.jpg a/2.jpg\n"
 
 
 def test_a_table_of_a_session_makes_the_same_session(small_capture: Path, tmp_path: Path) -> None:

@@ -1,4 +1,9 @@
-"""What other tools read: the map as a COLMAP model, retrieval as a list of pairs for hloc, poses as a table."""
+"""What other tools read: the map as a COLMAP model; retrieval, poses and intrinsics as hloc's lists; a table of poses.
+
+Images have the names that the user knows them by (`files.own_name`): imported ones their path in the folder that they
+were imported from, others theirs relative to the capture's folder `sessions`. With `names="capture"` all are relative
+to that folder, as in the HDF5 files of local features and matches.
+"""
 
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -6,28 +11,47 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pycolmap
 from numpy.typing import NDArray
 
-from toolkit.capture import Session
-from toolkit.capture.tables import POSE_NAMES
+from toolkit.capture import Session, Trajectory
+from toolkit.capture.cameras import camera_text
+from toolkit.capture.tables import POSE_NAMES, read_query_table
 from toolkit.errors import ArtifactError, ManifestError
 from toolkit.exchange.submission import Captures
 from toolkit.features.stores import FeatureStore
-from toolkit.files import SceneFiles, image_name, pair_name, read_references, write_atomic, write_folder, write_text
-from toolkit.geometry import Floats, invert, qt_from_pose
+from toolkit.files import (
+    SceneFiles,
+    image_name,
+    own_name,
+    pair_name,
+    read_references,
+    require_whole,
+    write_atomic,
+    write_folder,
+    write_text,
+)
+from toolkit.geometry import Floats, invert, pose_from_qt, qt_from_pose
 from toolkit.localizers.correspondences import LocalizedQueries
 from toolkit.localizers.local_map import LocalMap
+from toolkit.manifest import nearest
 
+NAMES = ("own", "capture")
 Keypoints = Mapping[str, NDArray[np.floating]]
 
 
 def export_colmap(
-    run: str | Path, scene: str, device: str, out: str | Path, capture: str | Path | None = None
+    run: str | Path,
+    scene: str,
+    device: str,
+    out: str | Path,
+    capture: str | Path | None = None,
+    names: str = "own",
 ) -> pycolmap.Reconstruction:
     """Write the triangulated map that a run localized with as a COLMAP model, binary.
 
-    Image names are relative to the capture's folder `sessions`. All keypoints are written, also those that see no
+    All keypoints are written, also those that see no
     point, in COLMAP's pixels, which are ours: the center of the top-left pixel is (0.5, 0.5). Where the run has used
     several kinds of features, the keypoints and points of one kind follow those of the kind before. A rig's frame is
     that of its first camera, as COLMAP wants it; rigs with the same cameras at the same places are one rig.
@@ -35,19 +59,21 @@ def export_colmap(
     Args:
         out: folder of the model; it must be empty or absent.
         capture: the capture, where it is no longer where the run found it.
+        names: of images, `own` or `capture`: see the head of this module.
 
     Raises:
         ArtifactError: the run has not localized in such a map.
-        ManifestError: there are files in `out`, or the capture is not found.
+        ManifestError: there are files in `out`, the capture is not found, or an unknown choice of names.
     """
+    _require_names(names)
     files, session_id, out = SceneFiles(Path(run), scene), f"{device}_map", Path(out)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ManifestError(f"{out}: there are files already. Give an empty or new folder.")
-    session = Captures([Path(run)], [] if capture is None else [capture], [scene])[scene][session_id]
+    session = _session(run, scene, session_id, capture)
     paths = _maps_of(files, device)
     stores = [_features_of(files, session_id, path) for path in paths]
     local_map, keypoints = _pooled([LocalMap.load(path) for path in paths], stores)
-    model = colmap_model(local_map, session, keypoints)
+    model = colmap_model(local_map, session, keypoints, names)
     with write_folder(out) as part:
         model.write_binary(str(part))
     return model
@@ -91,11 +117,14 @@ def _pooled(maps: Sequence[LocalMap], stores: Sequence[FeatureStore]) -> tuple[L
     return LocalMap.pooled(shifted), keypoints
 
 
-def colmap_model(local_map: LocalMap, session: Session, keypoints: Keypoints) -> pycolmap.Reconstruction:
+def colmap_model(
+    local_map: LocalMap, session: Session, keypoints: Keypoints, names: str = "own"
+) -> pycolmap.Reconstruction:
     """Return a map as a COLMAP model.
 
     Args:
         keypoints: by image name, (n, 2) pixels that the map's observations count through.
+        names: of images, see the head of this module.
 
     Raises:
         ArtifactError: the session does not list an image of the map.
@@ -127,7 +156,9 @@ def colmap_model(local_map: LocalMap, session: Session, keypoints: Keypoints) ->
         model.add_frame(frame)
         for member, camera_id in zip(members, camera_ids, strict=True):
             name = local_map.image_names[member]
-            image = pycolmap.Image(name, keypoints[name].astype(np.float64), camera_id, member + 1)
+            image = pycolmap.Image(
+                _exported(name, names), keypoints[name].astype(np.float64), camera_id, member + 1
+            )
             image.frame_id = frame_id
             model.add_image(image)
     order = np.argsort(local_map.obs_point, kind="stable")
@@ -194,18 +225,26 @@ def export_table(session: Session, out: str | Path, ground_truth: bool = False) 
 
 
 def export_pairs(
-    run: str | Path, scene: str, map_device: str, query_device: str, out: str | Path, topk: int | None = None
+    run: str | Path,
+    scene: str,
+    map_device: str,
+    query_device: str,
+    out: str | Path,
+    topk: int | None = None,
+    names: str = "own",
 ) -> int:
     """Write the retrieval of a pair as hloc reads it, `query reference` a line, and return the number of lines.
 
-    Names are relative to the capture's folder `sessions`, as those of `export_colmap`.
-
     Args:
         topk: so many references a query; None: all that were retrieved.
+        names: see the head of this module.
 
     Raises:
-        ArtifactError: the run has no such retrieval, a line of it is malformed, or a name has a space in it.
+        ArtifactError: the run has no such retrieval, a line of it is malformed, a name has a space in it, or a query
+            and a reference have one name.
+        ManifestError: an unknown choice of names.
     """
+    _require_names(names)
     path = SceneFiles(Path(run), scene).retrieval(map_device, query_device)
     pairs = []
     for row in read_references(path, "path"):
@@ -213,10 +252,108 @@ def export_pairs(
         strange = [name for name in paths if "/sessions/" not in name]
         if strange:
             raise ArtifactError(f"{path}: expected images as SCENE/sessions/..., found {strange[0]!r}. Retrieve again.")
-        names = [image_name(name) for name in paths]
-        spaced = [name for name in names if len(name.split()) != 1]
-        if spaced:
-            raise ArtifactError(f"{path}: hloc's lists cannot hold the space in {spaced[0]!r}.")
-        pairs += [f"{names[0]} {name}" for name in names[1:]]
-    write_text(out, "".join(f"{pair}\n" for pair in pairs))
+        query, *references = (_listed(image_name(name), names, path) for name in paths)
+        pairs += [(query, reference) for reference in references]
+    if twice := {query for query, _ in pairs} & {reference for _, reference in pairs}:
+        raise ArtifactError(
+            f"{path}: {min(twice)!r} is the name of a query and of a reference, which hloc cannot tell apart. Use "
+            "--names capture."
+        )
+    write_text(out, "".join(f"{query} {reference}\n" for query, reference in pairs))
     return len(pairs)
+
+
+def export_poses(
+    run: str | Path,
+    scene: str,
+    map_device: str,
+    query_device: str,
+    out: str | Path,
+    capture: str | Path | None = None,
+    names: str = "own",
+) -> int:
+    """Write the poses of a pair's queries as hloc does, a line `name qw qx qy qz tx ty tz` for each image.
+
+    Poses are cam_from_world, in the unit of the capture; a rig has a line for each of its cameras. Queries without a
+    pose have no line. hloc itself writes the last part of a name alone.
+
+    Args:
+        capture: the capture, where it is no longer where the run found it.
+        names: see the head of this module.
+
+    Returns:
+        The number of lines.
+
+    Raises:
+        ArtifactError: the run has no such poses, or a name has a space in it.
+        ManifestError: the capture is not found, or an unknown choice of names.
+    """
+    _require_names(names)
+    path = _whole(SceneFiles(Path(run), scene).poses_txt(map_device, query_device))
+    session, poses = _session(run, scene, f"{query_device}_query", capture), Trajectory.read(path)
+    lines = []
+    keys = pd.DataFrame({"timestamp": poses.timestamps, "device_id": poses.device_ids})
+    for rows, world_from_rig in zip(session.rows_of_keyframes(keys), pose_from_qt(poses.qt), strict=True):
+        for row, cam_from_world in zip(rows, invert(world_from_rig @ session.rig_from_cam(rows)), strict=True):
+            numbers = (repr(float(value)) for value in qt_from_pose(cam_from_world))
+            lines.append(" ".join([_listed(session.image_name(row), names, path), *numbers]))
+    write_text(out, "".join(f"{line}\n" for line in lines))
+    return len(lines)
+
+
+def export_intrinsics(
+    run: str | Path,
+    scene: str,
+    map_device: str,
+    query_device: str,
+    out: str | Path,
+    capture: str | Path | None = None,
+    names: str = "own",
+) -> int:
+    """Write the cameras of a pair's queries as hloc reads them, `name MODEL width height parameters` for each image.
+
+    Args, Returns, Raises: as `export_poses`; queries without a pose are there as well.
+    """
+    _require_names(names)
+    path = _whole(SceneFiles(Path(run), scene).poses_csv(map_device, query_device))
+    session = _session(run, scene, f"{query_device}_query", capture)
+    lines = []
+    for rows in session.rows_of_keyframes(read_query_table(path, [])):
+        for row in rows:
+            camera = camera_text(session.camera(str(session.images["sensor_id"].iloc[row]))).replace(",", "")
+            lines.append(f"{_listed(session.image_name(row), names, path)} {camera}")
+    write_text(out, "".join(f"{line}\n" for line in lines))
+    return len(lines)
+
+
+def _require_names(names: str) -> None:
+    if names not in NAMES:
+        raise ManifestError(f"names: unknown {names!r}. {nearest(names, NAMES)}")
+
+
+def _exported(name: str, names: str) -> str:
+    """Return what an image, by its name in the capture, is called in what is exported."""
+    return own_name(name) if names == "own" else name
+
+
+def _listed(name: str, names: str, path: Path) -> str:
+    """Return what an image is called in a list of hloc's, which are separated by spaces."""
+    name = _exported(name, names)
+    if len(name.split()) != 1:
+        raise ArtifactError(f"{path}: hloc's lists cannot hold the space in {name!r}. Rename the image.")
+    return name
+
+
+def _whole(path: Path) -> Path:
+    """Return the path of a result of the localize stage, or refuse one that is missing or damaged."""
+    if not path.is_file():
+        raise ArtifactError(
+            f"No poses: {path} is missing. Run the localize stage first "
+            "(python -m toolkit run MANIFEST --only localize)."
+        )
+    require_whole(path, of=path.with_suffix(".txt"))
+    return path
+
+
+def _session(run: str | Path, scene: str, session_id: str, capture: str | Path | None) -> Session:
+    return Captures([Path(run)], [] if capture is None else [capture], [scene])[scene][session_id]
