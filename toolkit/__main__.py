@@ -1,4 +1,4 @@
-"""The command line: `python -m toolkit run|settings|report|check|record|download|submit|import|export|demo-data`."""
+"""The command line: `python -m toolkit run|settings|report|check|new|record|download|submit|import|export|...`."""
 
 import json
 import os
@@ -143,6 +143,21 @@ def check(
         print(report.text())
     if not report.ok:
         raise typer.Exit(1)
+
+
+@app.command()
+def new(
+    name: Annotated[str, typer.Argument(help="Of the manifest: letters, digits, - and _; the run is runs/<name>.")],
+    capture: Annotated[
+        Path | None, typer.Argument(help="Capture folder, with sessions/ in it; else to be filled in.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the manifest.")] = Path("data_manifests"),
+) -> None:
+    """Write a manifest for a capture, with comments and with what `check` has found in it."""
+    from toolkit.exchange.new_manifest import new_manifest
+
+    path = new_manifest(name, capture, out)
+    print(f"Manifest: {path}\nRun it: python -m toolkit run {path}")
 
 
 @app.command()
