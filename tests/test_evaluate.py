@@ -246,6 +246,8 @@ def test_camera_errors_follow_the_rig(tmp_path):
     assert len(device.errors) == 2
     assert device.errors["translation_error_m"].tolist() == [0, np.inf]
     assert camera.errors["sensor_id"].tolist() == ["left", "right"] * 2
+    assert device.errors["image"].tolist() == ["left/0.jpg;right/0.jpg", "left/1.jpg;right/1.jpg"]
+    assert camera.errors["image"].tolist() == ["left/0.jpg", "right/0.jpg", "left/1.jpg", "right/1.jpg"]
     arc = 2 * np.sin(np.radians(2))  # a camera one meter from the rig's origin moves along the arc
     np.testing.assert_allclose(camera.errors["translation_error_m"], [arc, arc, np.inf, np.inf])
     np.testing.assert_allclose(camera.errors["rotation_error_deg"][:2], 4)

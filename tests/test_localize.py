@@ -121,8 +121,10 @@ def test_counts_balance(small_capture: Path, finished: tuple[SceneFiles, pd.Data
     assert table[["map_device", "query_device"]].to_numpy().tolist() == [["ios", d] for d in DEVICES]
     np.testing.assert_array_equal(table["ok"] + table["low_confidence"] + table["failed"], table["queries"])
     for row in table.itertuples():
-        keyframes = Capture.open(small_capture)[f"{row.query_device}_query"].keyframes(LIST)
-        found = rows_of(files, row.query_device)
+        session = Capture.open(small_capture)[f"{row.query_device}_query"]
+        keyframes, found = session.keyframes(LIST), rows_of(files, row.query_device)
+        images = [";".join(session.images["path"].iloc[rows]) for rows in session.rows_of_keyframes(keyframes)]
+        assert found["image"].tolist() == images  # all of a rig's
         assert list(found.columns) == COLUMNS
         assert row.queries == len(found) == len(keyframes)
         assert found["timestamp"].tolist() == keyframes["timestamp"].tolist()  # a row each, in the list's order

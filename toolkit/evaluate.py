@@ -60,8 +60,8 @@ logger = logging.getLogger(__name__)
 
 
 FIGURES = ("recall", "median_errors", "error_curves", "losses", "reliability", "deviations", "retrieval", "sequence")
-ERROR_COLUMNS = ["map_device", "query_device", "timestamp", "device_id", "status", "num_inliers", "p_correct",
-                 "position_std_m", "rotation_error_deg", "translation_error_m"]  # fmt: skip
+ERROR_COLUMNS = ["map_device", "query_device", "timestamp", "device_id", "image", "status", "num_inliers",
+                 "p_correct", "position_std_m", "rotation_error_deg", "translation_error_m"]  # fmt: skip
 DETAILS = ("num_inliers", "p_correct", "position_std_m")
 """Columns of a pair's table that are compared with its errors."""
 _PAIR = ["map_device", "query_device"]
@@ -341,15 +341,17 @@ def _errors_of(
     `length` what the unit of lengths in it is, in that of the poses."""
     estimated, true = np.stack(results["pose"].to_list()), poses_of(truth, keys)  # type: ignore[arg-type]
     frame = results.drop(columns="pose")
+    rows = session.rows_of_keyframes(keys)
+    frame.insert(2, "image", session.own_names(rows))
     if good is not None:
         frame["good_reference"] = good
     if at == "camera":
-        rows = session.rows_of_keyframes(keys)
         device, images = np.repeat(np.arange(len(keys)), [len(r) for r in rows]), np.concatenate(rows)
         device_from_cam = session.rig_from_cam(images)
         estimated, true = estimated[device] @ device_from_cam, true[device] @ device_from_cam
         frame = frame.iloc[device].reset_index(drop=True)
         frame.insert(2, "sensor_id", session.images["sensor_id"].to_numpy()[images])
+        frame["image"] = session.own_names(images[:, None])
     rotation_deg, translation_m = pose_errors(estimated, true)
     translation_m /= length
     if "position_std_m" in frame:

@@ -83,7 +83,7 @@ __all__ = ["COLUMNS", "PREDICTION_COLUMNS", "Map", "explain_query", "localize_im
 log = logging.getLogger(__name__)
 
 COLUMNS = [
-    "timestamp", "device_id", "status", "method", "num_inliers", "num_matches", "inlier_ratio", "num_guided",
+    "timestamp", "device_id", "image", "status", "method", "num_inliers", "num_matches", "inlier_ratio", "num_guided",
     "rmse_px", "rival_support", "coverage", "agreement", "p_correct", "position_std_m", "rotation_std_deg",
     "references", "seconds", "focal_px", "reason",
 ]  # fmt: skip
@@ -454,7 +454,8 @@ class _PairRun:
                 poses.unlink(missing_ok=True)
             writer.finish()
             rows = writer.notes() | again
-        return [rows[group] for group in groups]
+        images = self.pair.session.own_names(self.rows)
+        return [rows[group] | {"image": image} for group, image in zip(groups, images, strict=True)]
 
     def share(self, name: str) -> GroupWriter:
         """Return a file that takes a share of the queries."""

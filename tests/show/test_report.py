@@ -100,6 +100,17 @@ def full(tmp_path):
     )  # fmt: skip
 
 
+def test_the_worst_queries_have_the_names_of_their_images(full):
+    """Of a run of an earlier version, which did not write them, device and time."""
+    assert "hetlf12" in text_of(write_report(full).read_text()).replace(" ", "").replace("\n", "")
+    path = next(full.rglob("errors.csv"))
+    errors = pd.read_csv(path).assign(image=["IMG_1.jpg", "left/2.jpg;right/2.jpg", "IMG_3.jpg"])
+    errors.to_csv(path, index=False)
+    text = text_of(write_report(full).read_text())
+    assert "left/2.jpg and 1 more" in text
+    assert "hetlf" not in text
+
+
 def test_full_run(full):
     page = write_report(full).read_text()
     text = text_of(page)

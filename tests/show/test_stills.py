@@ -124,18 +124,19 @@ def test_localization_pictures_of_success_and_failure(images, tmp_path):
 
 def test_the_worst_queries_are_drawn_with_the_matches_they_share_with_a_reference(images, tmp_path):
     query, reference = images
+    imported = replace(query, name="hl_query/raw_data/import/images/7.jpg")
     gone = ShownImage("x", tmp_path / "gone.jpg", CAMERA, np.eye(4))
     unmatched = ShownImage("q", query.path, CAMERA, np.eye(4))
     worst = [
         WorstQuery("hl in the ios map", "failed: too few matches, 3 matches", QueryDetails([query])),
-        WorstQuery("hl in the ios map", "ok, 5 matches", QueryDetails([query], [reference]), 2.0, 0.5),
+        WorstQuery("hl in the ios map", "ok, 5 matches", QueryDetails([imported], [reference]), 2.0, 0.5),
         WorstQuery("hl in the ios map", "ok", QueryDetails([query], [gone]), 1.0, 0.1),
         WorstQuery("hl in the ios map", "ok", QueryDetails([unmatched], [], [reference])),
     ]
     figure = draw_worst(worst, tmp_path / "worst.png", "the worst")
     first, second, third, fourth = figure.axes[:4]
-    assert first.get_title(loc="left").startswith("1. hl in the ios map: failed: too few matches")
-    assert second.get_title(loc="left") == "2. hl in the ios map: off by 2°, 50 cm; ok, 5 matches"
+    assert first.get_title(loc="left").startswith("1. q, hl in the ios map: failed: too few matches")
+    assert second.get_title(loc="left") == "2. 7.jpg, hl in the ios map: off by 2°, 50 cm; ok, 5 matches"
     rejected, agreeing = (c.get_segments() for c in second.collections if hasattr(c, "get_segments"))
     # The reference, twice as high, is drawn at half its size beside the query.
     np.testing.assert_allclose([line[0] for line in agreeing], query.pixels[[0, 4]])

@@ -12,7 +12,7 @@ A session may hold 200,000 images, sensors and rigs. So tables stay columns (Arr
 Python code loops over rows while a session is read.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -54,7 +54,7 @@ from toolkit.capture.tables import (
 )
 from toolkit.capture.trajectory import Trajectory
 from toolkit.errors import CaptureError
-from toolkit.files import files_fingerprint
+from toolkit.files import files_fingerprint, own_name
 from toolkit.geometry import pose_from_qt
 
 if TYPE_CHECKING:
@@ -218,6 +218,11 @@ class Session:
     def image_names(self) -> list[str]:
         """The names of all images, in the order of `images`."""
         return [f"{self.path.name}/{RAW_DATA}/{path}" for path in self.images["path"]]
+
+    def own_names(self, rows_of_queries: Iterable[Ints]) -> list[str]:
+        """Return what the user calls the images of queries (`files.own_name`), those of one query joined by `;`."""
+        paths = self.images["path"]
+        return [";".join(own_name(path) for path in paths.iloc[rows]) for rows in rows_of_queries]
 
     @cached_property
     def row_of_name(self) -> dict[str, int]:

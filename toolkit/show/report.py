@@ -27,7 +27,8 @@ WORST, MOST_REASONS = 10, 12
 """Rows listed of a scene: the worst queries, and the reasons of queries without a pose."""
 # Figures that say more than the page's own tables: a heading, and how to read it.
 STATUS_COLUMNS = [
-    "timestamp", "device_id", "status", "num_inliers", "position_std_m", "seconds", "first_status", "first_seconds"
+    "timestamp", "device_id", "image", "status", "num_inliers", "position_std_m", "seconds",
+    "first_status", "first_seconds",
 ]  # fmt: skip
 EVALUATION_FIGURES = {
     "error_curves": (
@@ -493,7 +494,9 @@ def _worst(queries: pd.DataFrame, thresholds: list[str]) -> Table | None:
         caption += f"translation error / {threshold[1]:g} {unit}"
     else:
         caption = f"The {len(worst)} least supported; there is no ground truth to compare with"
-    columns = ["query", *(["off by", "why"] if has_truth else []), "status", "inliers", "device", "timestamp [µs]"]
+    named = "image" in worst and bool(worst["image"].notna().all())  # tables of earlier versions have no names
+    columns = ["query", *(["off by", "why"] if has_truth else []), "status", "inliers"]
+    columns += ["image"] if named else ["device", "timestamp [µs]"]
     rows = []
     for row in worst.to_dict("records"):
         texts = [f"{row['query_device']} in {row['map_device']} map"]
@@ -502,9 +505,16 @@ def _worst(queries: pd.DataFrame, thresholds: list[str]) -> Table | None:
             located = math.isfinite(rotation_deg)
             texts += [f"{number(rotation_deg)}°, {_length(translation_m, unit)}" if located else "no pose", _why(row)]
         inliers = "–" if pd.isna(row["num_inliers"]) else f"{row['num_inliers']:.0f}"
-        texts += [str(row["status"]).replace("_", " "), inliers, str(row["device_id"]), str(row["timestamp"])]
+        texts += [str(row["status"]).replace("_", " "), inliers]
+        texts += [_shown_names(row["image"])] if named else [str(row["device_id"]), str(row["timestamp"])]
         rows.append([Cell(text) for text in texts])
     return Table(caption, columns, rows)
+
+
+def _shown_names(images: str) -> str:
+    """Return the name of a query's image, or that of the first and how many more there are."""
+    first, *others = images.split(";")
+    return first + (f" and {len(others)} more" if others else "")
 
 
 def _why(row: dict[str, Any]) -> str:

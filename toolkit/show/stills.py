@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.images import read_for_display
 from toolkit.capture.world_up import up_of_cameras
+from toolkit.files import own_name
 from toolkit.geometry import Floats, Ints, make_pose, pose_error, project
 from toolkit.show.figures import ESTIMATED, GREEN, MAP, TRUE, error_bar, error_colors, new_figure, save_figure, styled
 from toolkit.show.localized import QueryDetails
@@ -218,7 +219,8 @@ def draw_worst(
         _draw_side_by_side(axis, query.details)
         known = np.isfinite(query.translation_m)
         off = f"off by {query.rotation_deg:.2g}°, {_length(query.translation_m, query.unit)}; " if known else ""
-        axis.set_title(f"{rank}. {query.pair}: {off}{query.reason}", fontsize=8, loc="left", wrap=True)
+        name = own_name(query.details.cameras[0].name.rpartition("/raw_data/")[2])
+        axis.set_title(f"{rank}. {name}, {query.pair}: {off}{query.reason}", fontsize=8, loc="left", wrap=True)
     legend = "left: query, right: its best reference; lines: inliers (green) and rejected matches (orange) of both"
     figure.suptitle(f"{title}\n({legend})")
     if out is not None:
