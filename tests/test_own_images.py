@@ -1,12 +1,22 @@
 """Notebook 00, which is no stage: clean as committed, and it runs."""
 
+import re
 from pathlib import Path
+from typing import Any
 
 import nbformat
+import numpy as np
+import pandas as pd
+import PIL.Image
 import pytest
 
-from toolkit.notebook import NOTEBOOKS, notebook_parameters
+from toolkit.capture import Trajectory
+from toolkit.errors import CaptureError, ManifestError, StageError
+from toolkit.exchange.interchange import import_once
+from toolkit.geometry import make_pose
+from toolkit.notebook import NOTEBOOKS, notebook_parameters, own_folder
 from toolkit.pipeline import execute
+from toolkit.show.explore import list_poses
 
 PATH = NOTEBOOKS / "00_own_images.ipynb"
 
@@ -24,8 +34,65 @@ def test_it_is_committed_clean() -> None:
     assert notebook_parameters(PATH)["poses_are"] == "world_from_cam"
 
 
+def test_results_are_beside_the_pictures(tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    assert own_folder(None, "own-images", str(photos)) == tmp_path / "photos-localized"
+    assert own_folder(str(tmp_path / "there"), "own-images", str(photos)) == tmp_path / "there"
+    assert own_folder(None, "own-images") == NOTEBOOKS.parent / "data" / "own-images"
+
+
+def test_other_input_is_named_and_never_gets_an_earlier_result(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        PIL.Image.new("RGB", (64, 48)).save(tmp_path / name / "1.jpg")
+    camera, place = "SIMPLE_PINHOLE, 64, 48, 50, 32, 24", tmp_path / "PLACE"
+
+    def again(folder: Path, **options: Any) -> str:
+        return import_once(folder, place, "ios", "query", **{"table": None, "camera": camera} | options)
+
+    assert "1 of 1 images" in again(tmp_path / "a")
+    session = place / "sessions" / "ios_query"
+    before = session.stat().st_mtime_ns
+    assert again(tmp_path / "a") == f"{session}: imported before from the same input, kept"
+    table = tmp_path / "table.csv"
+    table.write_text("image\n1.jpg\n")
+    for options, named in (
+        ({"folder": tmp_path / "b"}, f"images: then '{tmp_path / 'a'}', now '{tmp_path / 'b'}'"),
+        ({"camera": None}, f"camera: then '{camera}', now None"),
+        ({"table": table}, f"table: then None, now '{table}'"),
+    ):
+        with pytest.raises(CaptureError, match=f"^{session} was imported from other input .*{re.escape(named)}"):
+            again(**{"folder": tmp_path / "a"} | options)
+    PIL.Image.new("RGB", (64, 48)).save(tmp_path / "a" / "2.jpg")
+    with pytest.raises(CaptureError, match="files of images: have changed"):
+        again(tmp_path / "a")
+    assert session.stat().st_mtime_ns == before
+    with pytest.raises(ManifestError, match="query_images: found None"):
+        import_once(None, place, "ios", "query")
+
+
+def test_poses_are_listed_with_the_names_of_images(tmp_path: Path) -> None:
+    pose = make_pose(np.eye(3), [1.0, 2.0, 3.0])
+    Trajectory.from_poses([1], ["import/cam_1"], pose[None]).write(tmp_path / "pair.txt")
+    rows = {"timestamp": [1, 2], "device_id": "import/cam_1", "image": ["1.jpg", "2.jpg"], "status": ["ok", "failed"]}
+    pd.DataFrame(rows).to_csv(tmp_path / "pair.csv", index=False)
+    table = list_poses(tmp_path / "pair.csv")
+    assert list(table.columns) == ["image", "status", "qw", "qx", "qy", "qz", "tx", "ty", "tz"]
+    assert table.iloc[0].tolist() == ["1.jpg", "ok", 1, 0, 0, 0, 1, 2, 3]
+    assert table.iloc[1][["tx", "qw"]].isna().all()
+
+
 @pytest.mark.slow
-def test_it_runs(small_capture: Path, tmp_path: Path) -> None:
-    folders = {"sessions_root": str(small_capture / "sessions"), "out_dir": str(tmp_path / "data" / "OWN")}
-    execute(PATH, tmp_path / "out.ipynb", folders)
-    assert "there and back: 6 images" in (tmp_path / "out.ipynb").read_text()
+def test_it_runs_again_and_stops_where_the_input_is_another(small_capture: Path, tmp_path: Path) -> None:
+    folders = {"sessions_root": str(small_capture / "sessions"), "out_dir": str(tmp_path / "OWN")}
+    for _ in range(2):
+        execute(PATH, tmp_path / "out.ipynb", folders)
+        page = (tmp_path / "out.ipynb").read_text()
+        assert "there and back: 6 images" in page
+        assert "OWN_map_ios_query_ios.txt" in page
+    assert "imported before from the same input, kept" in page
+    table = str(next((tmp_path / "OWN").rglob("map.csv")))
+    photos = str(small_capture / "sessions" / "ios_map" / "raw_data")
+    other = folders | {"map_images": photos, "map_table": table, "query_images": photos}
+    with pytest.raises(StageError, match=r"ios_query was imported from other input \(images: then "):
+        execute(PATH, tmp_path / "other.ipynb", other)

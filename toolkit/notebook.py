@@ -111,9 +111,19 @@ def sessions_or_demo(sessions_root: str | None) -> Path:
     return render_capture(_root() / "data" / "demo", **DemoData().model_dump()) / "sessions"
 
 
-def own_folder(folder: str | None, scene: str) -> Path:
-    """Return a folder for a capture of one's own images; None: `data/<scene>` of the repository."""
-    return _root() / "data" / scene if folder is None else Path(folder).expanduser().resolve()
+def own_folder(folder: str | None, scene: str, images: str | None = None) -> Path:
+    """Return a folder for a capture of one's own images, and for what is made of it.
+
+    Args:
+        folder: that folder; None: `<images>-localized`, beside the folder of images.
+        scene: without images, the folder is `data/<scene>` of the repository.
+    """
+    if folder is not None:
+        return Path(folder).expanduser().resolve()
+    if images is None:
+        return _root() / "data" / scene
+    beside = Path(images).expanduser().resolve()
+    return beside.with_name(f"{beside.name}-localized")
 
 
 def _root() -> Path:

@@ -5,6 +5,7 @@ ty tz` are the image's pose; `camera_id` names a camera of a `cameras.txt` in CO
 params` (params separated by spaces) are the camera itself. Columns may stand in any order; an unknown one is refused.
 """
 
+import json
 import subprocess
 import sys
 from collections import Counter
@@ -21,6 +22,7 @@ from toolkit.capture.exif import exif_camera
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.exchange.drafts import (
+    IMPORT_RECORD,
     SUBSESSION,
     DraftImage,
     ImportReport,
@@ -29,6 +31,7 @@ from toolkit.exchange.drafts import (
     require_convention,
     start,
 )
+from toolkit.files import file_fingerprint, files_fingerprint, read_json, write_text
 from toolkit.geometry import Floats, invert, make_pose, pose_from_qt
 from toolkit.manifest import nearest
 
@@ -147,6 +150,44 @@ def import_images(
         draft.notes.append(f"ground truth of {len(draft.poses)} of {len(rows)} images: {truth}")
     draft.notes += [f"intrinsics of {count} images: {origin}" for origin, count in origins.items()]
     return draft.write()
+
+
+def import_once(images: str | Path | None, capture: str | Path, device: str, split: str, **options: Any) -> str:
+    """Import images as `import_images` does, unless this was done before from the same input; return what to tell.
+
+    Args:
+        options: of `import_images`.
+
+    Raises:
+        CaptureError: the session was made from other input, which is named; or what `import_images` raises.
+        ManifestError: no folder is given; or what `import_images` raises.
+    """
+    if images is None:
+        raise ManifestError(f"{split}_images: found None, expected the folder of your images: other inputs are given.")
+    session = Path(capture) / "sessions" / f"{device}_{split}"
+    given: dict[str, Any] = {"images": str(Path(images).resolve()), **options}
+    for name in ("table", "truth", "cameras"):
+        if given.get(name) is not None:
+            given[f"content of {name}"] = file_fingerprint(given[name])
+            given[name] = str(Path(given[name]).resolve())
+    given["files of images"] = files_fingerprint([Path(images) / name for name in list_images(Path(images))["image"]])
+    record = session / IMPORT_RECORD
+    if not session.exists():
+        report = import_images(images, capture, device, split, **options)
+        write_text(record, json.dumps(read_json(record) | {"input": given}, indent=1) + "\n")
+        return report.text()
+    before = read_json(record).get("input", {})
+    if differing := [name for name in given if before.get(name) != given[name]]:
+        of = "; ".join(
+            f"{name}: have changed" if name.split()[0] in ("content", "files") and name in before
+            else f"{name}: then {before.get(name)!r}, now {given[name]!r}"
+            for name in differing
+        )  # fmt: skip
+        raise CaptureError(
+            f"{session} was imported from other input ({of}). Give another folder for the capture, or delete this one "
+            "to import it again."
+        )
+    return f"{session}: imported before from the same input, kept"
 
 
 _PROBE = """

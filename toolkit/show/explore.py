@@ -8,14 +8,15 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from toolkit.capture import Capture, Session
+from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.devices import color_of
 from toolkit.capture.images import read_for_display
+from toolkit.capture.tables import POSE_NAMES, read_query_table
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.embedders import embedding_folders, open_descriptors
 from toolkit.errors import CaptureError
 from toolkit.files import image_name, read_references
-from toolkit.geometry import Floats, unit
+from toolkit.geometry import Floats, qt_from_pose, unit
 from toolkit.localizers.odometry import Odometry, recordings_of
 from toolkit.manifest import SequenceSettings
 from toolkit.show.figures import GREEN, ORANGE, VERMILLION, new_figure, plain_log, styled
@@ -69,6 +70,19 @@ def _odometry(session: Session) -> str:
         pieces += len(Odometry(times[rows], poses[rows]).split(SequenceSettings()))
         seconds += np.ptp(times[rows]) / 1e6
     return f"{len(times):,} poses, {seconds:,.0f} s, {pieces:,} piece{'s' if pieces > 1 else ''}"
+
+
+def list_poses(path: str | Path) -> pd.DataFrame:
+    """Return image, status and world_from_device of the queries of a pair, NaN without a pose: as in its files.
+
+    Args:
+        path: of the pair's `.csv`.
+    """
+    table = read_query_table(Path(path), ["status"])
+    poses = Trajectory.read(Path(path).with_suffix(".txt")).lookup(table["timestamp"].to_numpy(), table["device_id"])
+    rows = np.full((len(table), len(POSE_NAMES)), np.nan)
+    rows[is_posed(poses)] = qt_from_pose(poses[is_posed(poses)])
+    return table.reindex(columns=["image", "status"]).join(pd.DataFrame(rows, columns=POSE_NAMES))
 
 
 @styled
