@@ -64,8 +64,13 @@ docs-images: $(INSTALLED)  ## draw the pictures of the documentation from a demo
 docs-view: $(INSTALLED)  ## draw the documentation's picture of the localization view; needs mesa-vulkan-drivers
 	$(BIN)/python -m docs.view_image
 
-lab: $(INSTALLED)  ## JupyterLab on the notebooks
-	$(BIN)/python -m jupyterlab --notebook-dir notebooks
+# What you do in a copy stays; it is replaced by a newer notebook only if you have not changed it.
+lab: $(INSTALLED)  ## JupyterLab on your own copies of the notebooks, in lab/
+	@mkdir -p lab/.from; for new in notebooks/*.ipynb; do name=$${new##*/}; \
+	if [ ! -e lab/$$name ] || cmp -s lab/$$name lab/.from/$$name; then cp $$new lab/$$name; cp $$new lab/.from/$$name; \
+	elif ! cmp -s $$new lab/.from/$$name; then \
+	  echo "$$new is newer than lab/$$name, which you have changed: delete yours to take it."; fi; done
+	$(BIN)/python -m jupyterlab --config=notebooks/lab_config.py --notebook-dir lab
 
 lint: $(INSTALLED)  ## ruff and mypy
 	$(BIN)/python -m ruff check .

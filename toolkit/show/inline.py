@@ -7,11 +7,31 @@ from typing import Any
 
 from toolkit.errors import ArtifactError
 from toolkit.runs.kernel import TEXT_BARS
+from toolkit.show.pictures import as_jpeg
 from toolkit.show.recordings import open_command
 
 ASSETS = "RERUN_NOTEBOOK_ASSET"
 """Variable of the viewer's package: where the page gets the viewer from. Read when the package is imported."""
 MAX_INLINE_BYTES = 200_000_000
+MAX_WIDTH = 1400
+"""Of a JPEG, pixels."""
+
+
+def show_picture(path: str | Path) -> Any:
+    """Return a picture for a notebook, small enough to be kept with it: as it is, or as a JPEG if that is smaller.
+
+    Raises:
+        ArtifactError: there is no such picture, or it cannot be read.
+    """
+    import PIL.Image
+    from IPython.display import Image
+
+    try:
+        with PIL.Image.open(path) as picture:
+            small = as_jpeg(picture, MAX_WIDTH)
+        return Image(data=min(Path(path).read_bytes(), small, key=len))
+    except (OSError, SyntaxError, ValueError) as error:
+        raise ArtifactError(f"{path}: no picture can be read here ({error}). Run the cells above again.") from None
 
 
 def show_recording(path: str | Path, still: str | Path | None = None, height: int = 600) -> Any:
@@ -30,13 +50,13 @@ def show_recording(path: str | Path, still: str | Path | None = None, height: in
     Raises:
         ArtifactError: there is no such recording.
     """
-    from IPython.display import HTML, Image, display
+    from IPython.display import HTML, display
 
     path = Path(path)
     if not path.is_file():
         raise ArtifactError(f"{path}: no such recording. Run the notebook's cells above, with recordings = True.")
     if still is not None and Path(still).is_file():
-        display(Image(data=Path(still).read_bytes()))
+        display(show_picture(still))
     # Relative to the notebook, so that the run folder can be moved.
     link = html.escape(os.path.relpath(path.resolve(), Path.cwd()), quote=True)
     size_mb = path.stat().st_size / 1e6

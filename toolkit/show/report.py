@@ -2,7 +2,6 @@
 
 import base64
 import glob
-import io
 import json
 import math
 import re
@@ -18,6 +17,7 @@ from toolkit.errors import ArtifactError
 from toolkit.files import SceneFiles, of_sequence, read_map_record, sidecar_path, write_text
 from toolkit.show.figures import number, percent
 from toolkit.show.metrics import REASONS, THRESHOLDS, WRONG, parse_threshold, small_unit, unit_of, worst_first
+from toolkit.show.pictures import as_jpeg
 from toolkit.show.sequences import CHANGES
 
 # All pictures of a page together, before base64 makes them a third larger: the page stays below 10 MB.
@@ -616,13 +616,10 @@ class _Album:
                 wide = image.width > 1.8 * image.height
                 data, kind = path.read_bytes(), "png"
                 if image.width > MAX_WIDTH or len(data) > 150_000:
-                    small = image.convert("RGB")
-                    small.thumbnail((MAX_WIDTH, 10 * MAX_WIDTH))
-                    stream = io.BytesIO()
-                    small.save(stream, "JPEG", quality=85, optimize=True)
+                    small = as_jpeg(image, MAX_WIDTH)
                     # Plots are often smaller as they are.
-                    if stream.tell() < len(data):
-                        data, kind = stream.getvalue(), "jpeg"
+                    if len(small) < len(data):
+                        data, kind = small, "jpeg"
         except (OSError, ValueError, SyntaxError) as error:  # the latter two: how Pillow calls some torn PNGs
             return Picture("", f"{name} cannot be read: {error}", "", link)
         if len(data) > self._room:
