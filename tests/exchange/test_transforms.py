@@ -162,10 +162,11 @@ def test_images_that_cannot_be_used_are_rows(tmp_path: Path) -> None:
     content["frames"][2]["w"] = 65
     outside = {"file_path": "../outside.jpg", "transform_matrix": matrix(4)}
     PIL.Image.new("RGB", SIZE).save(tmp_path.parent / "outside.jpg")
-    file.write_text(json.dumps(content | {"frames": [*content["frames"], outside]}))
+    long = {"file_path": "x" * 300, "transform_matrix": matrix(5)}
+    file.write_text(json.dumps(content | {"frames": [*content["frames"], outside, long]}))
     status = import_transforms(file, tmp_path / "PLACE")[0].images.set_index("image")["status"]
     assert status["images/0.jpg"] == "imported"
-    assert status["images/1.jpg"] == "no such file"
+    assert status["images/1.jpg"] == status["x" * 300] == "no such file"
     assert status["images/2.jpg"] == "the image is stored as 64 x 48 pixels, its camera is of 65 x 48"
     assert status["../outside.jpg"] == "not a path inside the folder of images"
 
@@ -176,6 +177,10 @@ def test_images_that_cannot_be_used_are_rows(tmp_path: Path) -> None:
         ({"file_path": None}, "frame 1, file_path: found None; expected the path of an image"),
         ({"file_path": "images/0.jpg"}, "frame 1 (images/0.jpg), file_path: found that of frame 0 again; expected one"),
         ({"fl_x": "wide"}, "frame 1 (images/1.jpg), fl_x: found 'wide'; expected a focal length in pixels"),
+        ({"file_path": "\ud800.jpg"}, "frame 1, file_path: found '\\ud800.jpg'; expected the path of an image"),
+        ({"fl_x": 10**400}, "frame 1 (images/1.jpg), fl_x: found 1000"),
+        ({"transform_matrix": [[1, 0, 0, 10**400]] * 4}, "transform_matrix: found [[1, 0, 0, 1000"),
+        ({"transform_matrix": [[1, 0, 0, 1e13]] * 3}, "transform_matrix: found [[1, 0, 0, 10000000000000.0]"),
         ({"fl_x": -5}, "frame 1 (images/1.jpg), intrinsics: found PINHOLE, 64.0, 48.0, -5.0, "),
         ({"fl_y": True}, "frame 1 (images/1.jpg), fl_y: found True; expected"),
         ({"k1": float("nan")}, "frame 1 (images/1.jpg), k1: found nan; expected a number"),

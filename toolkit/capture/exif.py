@@ -1,5 +1,6 @@
 """The metadata in the file of a photograph: its size as stored, when it was taken, and a guess of its intrinsics."""
 
+import os
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,13 +20,18 @@ _UNIT_MM = {0.0: 25.4, 2.0: 25.4, 3.0: 10.0, 4.0: 1.0}  # inches where it is not
 _FILM_DIAGONAL_MM = float(np.hypot(36, 24))
 
 
+def is_file(path: Path) -> bool:
+    """Tell whether there is a file; also of a name that no file can have, as it is too long."""
+    return os.path.isfile(path)  # noqa: PTH113 - Path.is_file raises then
+
+
 def read_header(path: Path) -> tuple[tuple[int, int], dict[int, Any]]:
     """Return width and height as stored, and the EXIF tags by number.
 
     Raises:
         ImageError: no such file, or no image.
     """
-    if not path.is_file():
+    if not is_file(path):
         raise ImageError("no such file")
     try:
         with PIL.Image.open(path) as image:

@@ -17,6 +17,7 @@ What is for rendering alone (`aabb_scale`, `scale`, `offset`, masks, depths) is 
 
 import json
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -25,7 +26,8 @@ import numpy as np
 import pycolmap
 
 from toolkit.capture import parse_camera
-from toolkit.capture.exif import read_header
+from toolkit.capture.exif import is_file, read_header
+from toolkit.capture.tables import FARTHEST_M
 from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.exchange.drafts import IMAGE_SUFFIXES, ImportReport, list_images, posed_camera, require_convention, start
 from toolkit.geometry import Floats
@@ -122,16 +124,15 @@ class _Frame:
     def __init__(self, path: Path, number: int, entry: Mapping[str, Any], shared: Mapping[str, Any]) -> None:
         self.path, self.number, self.values = path, number, {**shared, **entry}
         found = entry.get("file_path")
-        if not isinstance(found, str) or not found.strip():
-            raise self.error("file_path", repr(found), "the path of an image, relative to the folder of this file")
+        if not isinstance(found, str) or not found.strip() or re.search("[\ud800-\udfff]", found):
+            raise self.error("file_path", repr(found)[:80], "the path of an image, relative to the folder of this file")
         self.name = self._with_suffix(found.replace("\\", "/"))
 
     def _with_suffix(self, found: str) -> str:
         """Return the path of an image relative to the folder of the file, with the extension that may be missing."""
         name = os.path.normpath(os.path.relpath(found, self.path.parent) if found.startswith("/") else found)
-        if not (self.path.parent / name).is_file():
-            suffixes = [*IMAGE_SUFFIXES, *map(str.upper, IMAGE_SUFFIXES)]
-            name = next((name + one for one in suffixes if (self.path.parent / (name + one)).is_file()), name)
+        suffixes = ["", *IMAGE_SUFFIXES, *map(str.upper, IMAGE_SUFFIXES)]
+        name = next((name + one for one in suffixes if is_file(self.path.parent / (name + one))), name)
         return Path(name).as_posix()
 
     def error(self, key: str, found: str, expected: str) -> CaptureError:
@@ -141,8 +142,8 @@ class _Frame:
 
     def _number(self, key: str, expected: str, default: float | None = None) -> float:
         value = self.values.get(key, default)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-            raise self.error(key, "nothing" if value is None else repr(value), expected)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < FARTHEST_M:
+            raise self.error(key, "nothing" if value is None else repr(value)[:80], expected)
         return float(value)
 
     def world_from_named(self) -> Floats:
@@ -151,11 +152,12 @@ class _Frame:
         expected = "4 rows of 4 finite numbers, world_from_cam, the last row 0 0 0 1"
         try:
             matrix = np.array(found, np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise self.error("transform_matrix", repr(found)[:80], expected) from None
         if matrix.shape == (3, 4):
             matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
-        if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0, 0, 0, 1]):
+        is_pose = matrix.shape == (4, 4) and np.allclose(matrix[3], [0, 0, 0, 1])
+        if not is_pose or not (np.abs(matrix) < FARTHEST_M).all():
             raise self.error("transform_matrix", repr(found)[:80], expected)
         rotation = matrix[:3, :3]
         if np.abs(rotation.T @ rotation - np.eye(3)).max() > TOLERANCE or np.linalg.det(rotation) < 0:
@@ -199,7 +201,7 @@ class _Frame:
         model = self.values.get("camera_model", FISHEYE if self.values.get("is_fisheye") else "OPENCV")
         if model not in (*PERSPECTIVE, FISHEYE):
             expected = f"one of {', '.join((*PERSPECTIVE, FISHEYE))}, the models that images are localized with"
-            raise self.error("camera_model", repr(model), expected)
+            raise self.error("camera_model", repr(model)[:80], expected)
         k1, k2, k3, k4, p1, p2 = (self._number(key, "a number", 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
         if model == FISHEYE:
             if p1 or p2:
