@@ -135,8 +135,8 @@ def test_the_worst_queries_are_drawn_with_the_matches_they_share_with_a_referenc
     ]
     figure = draw_worst(worst, tmp_path / "worst.png", "the worst")
     first, second, third, fourth = figure.axes[:4]
-    assert first.get_title(loc="left").startswith("1. q, hl in the ios map: failed: too few matches")
-    assert second.get_title(loc="left") == "2. 7.jpg, hl in the ios map: off by 2°, 50 cm; ok, 5 matches"
+    assert first.get_title(loc="left").startswith("1. hl in the ios map: failed: too few matches")
+    assert second.get_title(loc="left") == "2. hl in the ios map: off by 2°, 50 cm; ok, 5 matches\n7.jpg"
     rejected, agreeing = (c.get_segments() for c in second.collections if hasattr(c, "get_segments"))
     # The reference, twice as high, is drawn at half its size beside the query.
     np.testing.assert_allclose([line[0] for line in agreeing], query.pixels[[0, 4]])

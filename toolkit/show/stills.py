@@ -220,7 +220,7 @@ def draw_worst(
         known = np.isfinite(query.translation_m)
         off = f"off by {query.rotation_deg:.2g}°, {_length(query.translation_m, query.unit)}; " if known else ""
         name = own_name(query.details.cameras[0].name.rpartition("/raw_data/")[2])
-        axis.set_title(f"{rank}. {name}, {query.pair}: {off}{query.reason}", fontsize=8, loc="left", wrap=True)
+        axis.set_title(f"{rank}. {query.pair}: {off}{query.reason}\n{name}", fontsize=8, loc="left", wrap=True)
     legend = "left: query, right: its best reference; lines: inliers (green) and rejected matches (orange) of both"
     figure.suptitle(f"{title}\n({legend})")
     if out is not None:
