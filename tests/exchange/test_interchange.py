@@ -254,6 +254,19 @@ def test_images_can_be_copied(folder: Path, tmp_path: Path) -> None:
     assert path.read_bytes() == (folder / "a" / "2.jpg").read_bytes()
 
 
+def test_a_list_of_queries_of_hloc_is_a_table(folder: Path, tmp_path: Path) -> None:
+    names = ["a/2.jpg", "b/1.jpg"]
+    lines = [f"{name} SIMPLE_RADIAL 64 48 {50 + number} 30 20.5 -0.01" for number, name in enumerate(names)]
+    table = tmp_path / "queries_with_intrinsics.txt"
+    table.write_text("\n".join(lines) + "\n")
+    cameras = import_images(folder, tmp_path / "ONE", split="query", table=table).images.set_index("image")["camera"]
+    expected = [f"SIMPLE_RADIAL, 64, 48, {50 + number}.0, 30.0, 20.5, -0.01" for number in range(2)]
+    assert cameras[names].tolist() == expected
+    table.write_text("\n".join([lines[0], lines[1].replace("-0.01", "x")]))
+    with pytest.raises(CaptureError, match=r"queries_with_intrinsics\.txt, line 2"):
+        import_images(folder, tmp_path / "TWO", split="query", table=table)
+
+
 def test_cameras_come_from_a_file_or_the_table(folder: Path, tmp_path: Path) -> None:
     cameras = tmp_path / "cameras.txt"
     cameras.write_text("# Camera list\n3 PINHOLE 64 48 50 51 32 24\n8 SIMPLE_RADIAL 64 48 40 32 24 0.01\n")

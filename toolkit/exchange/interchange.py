@@ -3,6 +3,7 @@
 The table of a folder of images is a CSV file with a header. Column `image` is the path in the folder; `qw qx qy qz tx
 ty tz` are the image's pose; `camera_id` names a camera of a `cameras.txt` in COLMAP's format, or `model width height
 params` (params separated by spaces) are the camera itself. Columns may stand in any order; an unknown one is refused.
+hloc's list of queries, `name MODEL width height parameters` a line, is read as such a table.
 """
 
 import json
@@ -310,7 +311,11 @@ def _poses_of(rows: pd.DataFrame, poses_are: str, axes: str, unit_m: float) -> d
 def _read_table(path: Path) -> pd.DataFrame:
     """Read the table of a folder of images, all values as text; adds the column `line`."""
     try:
-        rows = pd.read_csv(path, dtype=str, keep_default_na=False, skipinitialspace=True, skip_blank_lines=False)
+        first = next((line for line in path.read_text().splitlines() if line.strip()), "").split()
+        if len(first) > 4 and first[1] in pycolmap.CameraModelId.__members__:
+            rows = _read_hloc_list(path)
+        else:
+            rows = pd.read_csv(path, dtype=str, keep_default_na=False, skipinitialspace=True, skip_blank_lines=False)
     except (OSError, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
         raise CaptureError(f"{path}: cannot be read as a CSV table ({error}).") from None
     rows.columns = [name.strip().lstrip("# ") for name in rows.columns]
@@ -322,7 +327,7 @@ def _read_table(path: Path) -> pd.DataFrame:
         missing = [name for name in group if name not in rows]
         if missing and (group == ("image",) or len(missing) < len(group)):
             raise CaptureError(f"{path}: column {missing[0]!r} is missing; expected {', '.join(group)}.")
-    rows["line"] = np.arange(len(rows)) + 2
+    rows["line"] = rows.index + 2
     rows = rows[rows["image"].str.strip() != ""].assign(image=lambda table: table["image"].str.strip())
     twice = rows["image"].duplicated()
     if twice.any():
@@ -337,6 +342,14 @@ def _read_table(path: Path) -> pd.DataFrame:
                 f"{path}, line {row['line']}: found the pose {', '.join(row[list(POSE_NAMES)])}; expected seven finite "
                 "numbers, qw qx qy qz of length 1 and meters."
             )
+    return rows
+
+
+def _read_hloc_list(path: Path) -> pd.DataFrame:
+    """Read hloc's list of queries, `name MODEL width height parameters` a line without a header, as a table."""
+    lines = [line.split(maxsplit=4) for line in path.read_text().splitlines()]
+    rows = pd.DataFrame([line + [""] * (5 - len(line)) for line in lines], columns=["image", *_CAMERA_COLUMNS])
+    rows.index += -1  # it has no header, and its first line is the first
     return rows
 
 
