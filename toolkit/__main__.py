@@ -1,4 +1,4 @@
-"""The command line: `python -m toolkit run|settings|report|check|new|record|download|submit|import|export|...`."""
+"""The command line: `python -m toolkit run|compare|settings|check|new|import|export|...`; `--help` lists them."""
 
 import json
 import os
@@ -104,6 +104,18 @@ def run(
         _print_json(done)
     if done["exit_code"] != 0:
         raise IncompleteError(done["error"])
+
+
+@app.command()
+def compare(
+    runs: Annotated[list[Path], typer.Argument(help="Run folders, two or more; the first is compared with.")],
+    out: Annotated[Path | None, typer.Option(help="HTML file; else compare_<names>.html beside the first run.")] = None,
+    pictures: Annotated[int, typer.Option(min=0, help="Queries won or lost that are drawn, of each run.")] = 6,
+    seed: Annotated[int, typer.Option(min=0, help="Of the resamples that intervals are made from.")] = 0,
+    as_json: Json = False,
+) -> None:
+    """Compare runs: recall with intervals, queries won and lost, time, memory, settings; and write a page."""
+    _compare(runs, as_json, out, pictures, seed)
 
 
 @app.command()
@@ -398,6 +410,19 @@ def record(
         print("Note:", message)
     print(f"{done.frames} frames, {done.images} images, {done.bytes / 1e6:.1f} MB in {done.seconds:.0f} s")
     print(f"Open it: {done.command}")
+
+
+def _compare(runs: list[Path], as_json: bool, out: Path | None = None, pictures: int = 6, seed: int = 0) -> None:
+    """Print a comparison, and write its page."""
+    from toolkit.show.comparison import compare_runs, write_comparison
+
+    comparison = compare_runs(runs, seed)
+    page = write_comparison(comparison, out, pictures)
+    if as_json:
+        _print_json(comparison.summary() | {"page": str(page)})
+    else:
+        print(comparison.text())
+        print(f"Comparison: {page}")
 
 
 def _summary_of_stopped(manifest: Path, overrides: Sequence[str]) -> dict[str, Any]:

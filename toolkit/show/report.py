@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import pandas as pd
@@ -19,6 +19,9 @@ from toolkit.show.figures import number, percent
 from toolkit.show.metrics import REASONS, THRESHOLDS, WRONG, parse_threshold, small_unit, unit_of, worst_first
 from toolkit.show.pictures import as_jpeg
 from toolkit.show.sequences import CHANGES
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 # All pictures of a page together, before base64 makes them a third larger: the page stays below 10 MB.
 PICTURE_BUDGET = 7_000_000
@@ -115,24 +118,15 @@ def write_report(run_dir: str | Path) -> Path:
     Raises:
         ArtifactError: there is no `run.json`, or it is torn.
     """
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
     run_dir = Path(run_dir)
-    run = _read_run(run_dir / "run.json")
+    run = read_run(run_dir / "run.json")
     left_out: list[str] = []
     scenes = []
     for name in map(str, run["scenes"]):
         # A share for each scene: the last one is worth its pictures, too.
         album = _Album(run_dir, PICTURE_BUDGET // len(run["scenes"]), left_out)
         scenes.append(_scene(SceneFiles(run_dir, name), str(run["inputs"].get(name, "")), album))
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    page = environment.get_template("report.html.j2").render(
+    page = page_template("report.html.j2").render(
         run=run,
         scenes=scenes,
         stages=_stages(run, run_dir),
@@ -147,7 +141,26 @@ def write_report(run_dir: str | Path) -> Path:
     return run_dir / "report.html"
 
 
-def _read_run(path: Path) -> dict[str, Any]:
+def page_template(name: str) -> "Template":
+    """Return the template of a page, beside this module."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(name)
+
+
+def read_run(path: Path) -> dict[str, Any]:
+    """Return what a `run.json` says, with empty values for what it does not say.
+
+    Raises:
+        ArtifactError: it is missing, or torn.
+    """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

@@ -1,0 +1,227 @@
+"""Runs against each other, on runs written by hand whose differences are known."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from toolkit.errors import ArtifactError
+from toolkit.files import SceneFiles, write_sidecar
+from toolkit.show.comparison import Comparison, bootstrap, compare_runs, write_comparison
+
+LIMITS = ("(1deg,0.1m)", "(5deg,0.5m)")
+GOOD, FAIR, LOST = (0.5, 0.05), (2.0, 0.3), (np.inf, np.inf)
+PAIRS = (("ios", "hl"), ("hl", "hl"))
+
+
+def write_run(folder: Path, errors: dict[tuple[str, str], list[tuple[float, float]]], **record: object) -> Path:
+    """Write what a run leaves of errors (degrees, meters) of the queries of each pair."""
+    files = SceneFiles(folder, "PLACE")
+    files.evaluation.mkdir(parents=True)
+    rows = [
+        {"map_device": m, "query_device": q, "timestamp": k, "device_id": f"00{k}", "status": "ok" if error[0] < 9 else
+         "failed: too few matches", "num_inliers": 9, "rotation_error_deg": error[0], "translation_error_m": error[1]}
+        for (m, q), of_pair in errors.items() for k, error in enumerate(of_pair)
+    ]  # fmt: skip
+    columns = {f"loss@{name}": "" for name in LIMITS}
+    pd.DataFrame(rows).assign(**columns).to_csv(files.evaluation / "errors.csv", index=False)
+    (files.evaluation / "recall.csv").write_text("map_device\n")
+    write_sidecar(files.evaluation / "recall.csv", {}, [files.evaluation / "errors.csv"])
+    stages = [{"scene": "PLACE", "stage": "localize", "seconds": 4.0, "peak_memory_mb": 500, "parameters": {}}]
+    content = {"scenes": ["PLACE"], "inputs": {"PLACE": "f00"}, "stages": stages, "status": "done", **record}
+    (folder / "run.json").write_text(json.dumps(content))
+    return folder
+
+
+def manifest(name: str, **pnp: object) -> dict[str, object]:
+    return {"name": name, "output_root": f"/{name}", "localize": {"method": "pnp", "pnp": pnp}}
+
+
+@pytest.fixture
+def two(tmp_path: Path) -> list[Path]:
+    """Run b has won one query at both thresholds, one at the strict one, and lost one at the strict one."""
+    before = {pair: [GOOD] * 5 for pair in PAIRS} | {PAIRS[0]: [GOOD, GOOD, LOST, FAIR, FAIR]}
+    after = {pair: [GOOD] * 5 for pair in PAIRS} | {PAIRS[0]: [GOOD, FAIR, GOOD, GOOD, FAIR]}
+    return [
+        write_run(tmp_path / "a", before, manifest=manifest("a", min_inliers=12, seed=0)),
+        write_run(tmp_path / "b", after, manifest=manifest("b", min_inliers=20, seed=0)),
+    ]
+
+
+def rows_of(comparison: Comparison, threshold: str, run: int = 1, scene: str = "all") -> pd.DataFrame:
+    table = comparison.recall
+    return table[(table["threshold"] == threshold) & (table["run"] == run) & (table["scene"] == scene)]
+
+
+def test_won_and_lost_are_those_within_in_one_run_only(two: list[Path]) -> None:
+    comparison = compare_runs(two)
+    (strict,) = rows_of(comparison, LIMITS[0]).to_dict("records")
+    assert (strict["won"], strict["lost"], strict["queries"]) == (2, 1, 10)
+    assert strict["recall"] == pytest.approx(0.8)
+    assert strict["difference"] == pytest.approx(0.1)
+    (loose,) = rows_of(comparison, LIMITS[1]).to_dict("records")
+    assert (loose["won"], loose["lost"]) == (1, 0)
+    changes = comparison.changes
+    assert list(zip(changes["change"], changes["timestamp"], changes["at"], strict=True)) == [
+        ("lost", 1, LIMITS[0]), ("won", 2, "; ".join(LIMITS)), ("won", 3, LIMITS[0])
+    ]  # fmt: skip
+    assert set(changes["device_id"]) == {"001", "002", "003"}, "identifiers are texts"
+    of_pairs = rows_of(comparison, LIMITS[0], scene="PLACE").set_index("map_device")
+    assert of_pairs["won"].to_dict() == {"ios": 2, "hl": 0}
+
+
+def test_a_threshold_is_strict_as_in_the_evaluation(tmp_path: Path) -> None:
+    runs = [write_run(tmp_path / name, {PAIRS[0]: [(1.0, 0.05), error]}) for name, error in (("a", GOOD), ("b", GOOD))]
+    assert rows_of(compare_runs(runs), LIMITS[0])["recall"].item() == 0.5
+
+
+def test_settings_and_costs_that_differ_are_told(two: list[Path]) -> None:
+    comparison = compare_runs(two)
+    assert comparison.settings.to_numpy().tolist() == [["localize.pnp.min_inliers", "12", "20"]], "not name and folder"
+    summary = comparison.summary()
+    assert summary["resources"]["localize"]["a"] == {"seconds": 4.0, "memory_mb": 500.0}
+    assert summary["settings"]["localize.pnp.min_inliers"] == {"a": "12", "b": "20"}
+    assert [change["run"] for change in summary["changes"]] == ["b", "b", "b"]
+    assert json.loads(json.dumps(summary, allow_nan=True))["queries"] == 10
+    assert "2 won, 1 lost" in comparison.text()
+
+
+def test_identical_runs_differ_by_nothing(two: list[Path]) -> None:
+    comparison = compare_runs([two[0], two[0]])
+    assert comparison.names == ["a", "a (2)"]
+    mine = comparison.recall[comparison.recall["run"] == 1]
+    for name in ("difference", "difference_low", "difference_high", "won", "lost"):
+        assert (mine[name] == 0).all(), name
+    assert (rows_of(comparison, LIMITS[0])["recall_low"] < rows_of(comparison, LIMITS[0])["recall"]).all()
+    assert comparison.changes.empty
+    assert "No query was won or lost." in write_comparison(comparison).read_text()
+
+
+def test_intervals_repeat_with_the_seed(two: list[Path]) -> None:
+    first, again, other = (compare_runs(two, seed, 50).recall for seed in (3, 3, 4))
+    pd.testing.assert_frame_equal(first, again)
+    assert not first.equals(other)
+
+
+def test_an_interval_covers_a_binomial_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(0)
+    p, covered, apart = 0.7, 0, 0
+    for _ in range(200):
+        hits = rng.random((120, 2, 1)) < p
+        within, difference = bootstrap(hits, np.arange(120), seed=0, resamples=400)
+        covered += within[0, 0, 0] <= p <= within[1, 0, 0]
+        apart += difference[0, 1, 0] <= 0 <= difference[1, 1, 0]
+    assert 0.90 <= covered / 200 <= 0.985
+    assert 0.90 <= apart / 200 <= 0.985
+
+
+def test_an_interval_is_as_wide_as_the_binomial_says() -> None:
+    hits = (np.arange(400) < 280)[:, None, None]
+    (low, high), _ = bootstrap(hits, np.arange(400))
+    assert (high - low).item() == pytest.approx(2 * 1.96 * np.sqrt(0.7 * 0.3 / 400), rel=0.1)
+
+
+def test_pairing_takes_out_what_runs_have_in_common() -> None:
+    hits = np.random.default_rng(0).random((200, 1, 1)) < 0.5
+    both = np.concatenate([hits, hits], axis=1)
+    both[0, 1] ^= True
+    within, apart = bootstrap(both, np.arange(200))
+    assert np.ptp(within[:, 1]) > 0.1
+    assert np.ptp(apart[:, 1]) < 0.02
+
+
+def test_answers_to_one_query_in_several_maps_are_not_independent() -> None:
+    hits = np.repeat(np.random.default_rng(0).random((100, 1, 1)) < 0.5, 4, axis=0)
+    alone, _ = bootstrap(hits, np.arange(400))
+    together, _ = bootstrap(hits, np.repeat(np.arange(100), 4))
+    assert np.ptp(together) == pytest.approx(2 * np.ptp(alone), rel=0.2)
+
+
+def test_one_query_is_compared(tmp_path: Path) -> None:
+    runs = [write_run(tmp_path / name, {PAIRS[0]: [error]}) for name, error in (("a", LOST), ("b", GOOD))]
+    comparison = compare_runs(runs)
+    (row,) = rows_of(comparison, LIMITS[0]).to_dict("records")
+    assert (row["difference_low"], row["difference"], row["difference_high"]) == (1, 1, 1)
+    text = write_comparison(comparison, tmp_path / "page.html").read_text()
+    assert "no pose" in text
+
+
+def test_other_queries_are_left_out_and_counted(two: list[Path], tmp_path: Path) -> None:
+    fewer = write_run(tmp_path / "c", {PAIRS[0]: [GOOD] * 3}, inputs={"PLACE": "other"})
+    comparison = compare_runs([two[0], fewer])
+    assert len(comparison.queries) == 3
+    assert any("a 10, c 3" in text and "the 3 in common" in text for text in comparison.messages)
+    assert any("PLACE: its files are not the same" in text for text in comparison.messages)
+    assert rows_of(comparison, LIMITS[0])["recall"].item() == 1
+
+
+def test_three_runs_are_each_compared_with_the_first(two: list[Path], tmp_path: Path) -> None:
+    third = write_run(tmp_path / "c", {pair: [LOST] * 5 for pair in PAIRS})
+    comparison = compare_runs([*two, third])
+    assert rows_of(comparison, LIMITS[0], 2)[["won", "lost"]].to_numpy().tolist() == [[0, 7]]
+    assert set(comparison.changes["run"]) == {1, 2}
+    page = write_comparison(comparison, pictures=0)
+    assert page.name == "compare_a_b_c.html"
+
+
+def test_the_page_is_one_file_and_says_why_there_is_no_picture(two: list[Path]) -> None:
+    two_times = compare_runs(two)
+    page = write_comparison(two_times).read_text()
+    assert not re.search(r'(src|href)="(?!data:|#)', page), "it needs nothing else"
+    assert "the capture PLACE is not where the run had it" in page
+    assert "localize.pnp.min_inliers" in page
+    assert "+10 [" in page
+
+
+def damage(kind: str, run: Path) -> None:
+    table = SceneFiles(run, "PLACE").evaluation / "errors.csv"
+    if kind == "no run":
+        (run / "run.json").unlink()
+    elif kind == "torn record":
+        (run / "run.json").write_text("{")
+    elif kind == "not evaluated":
+        table.unlink()
+    elif kind == "torn table":
+        table.write_bytes(table.read_bytes()[:-30])
+    else:
+        content = pd.read_csv(table, dtype={"device_id": str})
+        if kind == "no truth":
+            content = content.iloc[:0]
+        elif kind == "no column":
+            content = content.drop(columns="status")
+        elif kind == "other unit":
+            content = content.rename(columns=lambda name: name.replace("m)", "L)"))
+        elif kind == "twice":
+            content = pd.concat([content, content])
+        elif kind == "other queries":
+            content["timestamp"] += 100
+        content.to_csv(table, index=False)
+        write_sidecar(table.with_name("recall.csv"), {}, [table])
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("no run", r"No run at .*b: run\.json is missing"),
+        ("torn record", r"run\.json is not whole JSON"),
+        ("not evaluated", r"b: not evaluated .*errors\.csv is missing.*python -m toolkit run"),
+        ("torn table", r"errors\.csv.*Run the stage"),
+        ("no truth", r"b: found no query with ground truth.*evaluate again"),
+        ("no column", r"errors\.csv: column 'status' is missing"),
+        ("other unit", r"b: found errors in L, expected m .*`unit`"),
+        ("twice", r"b: .*has a query twice"),
+        ("other queries", r"no query in common \(a 10, b 10\)"),
+    ],
+)
+def test_what_cannot_be_compared_is_one_clear_error(two: list[Path], kind: str, said: str) -> None:
+    damage(kind, two[1])
+    with pytest.raises(ArtifactError, match=said):
+        compare_runs(two)
+
+
+def test_one_run_is_not_enough(two: list[Path]) -> None:
+    with pytest.raises(ArtifactError, match="found 1 run folder"):
+        compare_runs(two[:1])

@@ -1,0 +1,592 @@
+"""Runs against each other: recall with intervals, the queries won and lost, time, memory, and what differs in settings.
+
+Everything is read from what the runs have left; no query is localized again.
+"""
+
+import math
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from toolkit.capture import Capture
+from toolkit.capture.devices import extra_devices
+from toolkit.capture.names import allow_outside
+from toolkit.errors import ArtifactError, ToolkitError
+from toolkit.files import SceneFiles, require_whole, write_text
+from toolkit.geometry import Floats, Ints
+from toolkit.show.figures import BLUE, GREEN, ORANGE, SKY, VERMILLION, new_figure, number, percent, save_figure, styled
+from toolkit.show.localized import LocalizedPair
+from toolkit.show.metrics import is_below, parse_threshold, unit_of
+from toolkit.show.report import (
+    PICTURE_BUDGET,
+    Cell,
+    Picture,
+    Table,
+    _Album,
+    _length,
+    _seconds,
+    _threshold,
+    page_template,
+    read_run,
+)
+from toolkit.show.stills import draw_localization
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+RESAMPLES, SEED = 2000, 0
+INTERVAL = (2.5, 97.5)
+"""Percentiles of the resamples that an interval lies between."""
+ALL = "all"
+"""Stands for scene and devices where all pairs are counted together."""
+MOST_PICTURES, MOST_ROWS = 6, 200
+"""Queries won or lost that are drawn, and that the page lists."""
+QUERY = ["scene", "map_device", "query_device", "timestamp", "device_id"]
+_PAIR = QUERY[:3]
+_ERRORS = ["rotation_error_deg", "translation_error_m"]
+_NEEDED = [*QUERY[1:], "status", *_ERRORS]
+# What every run has of its own, whatever its settings are.
+_NAMES = ("name", "description", "output_root")
+_COLORS = (VERMILLION, BLUE, GREEN, ORANGE, SKY)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Runs on the queries that they have in common; the first is what the others are compared with."""
+
+    folders: Sequence[Path]
+    names: Sequence[str]
+    records: Sequence[Mapping[str, Any]]
+    """What `run.json` of each says."""
+    thresholds: Sequence[str]
+    """Names, such as `(1deg,0.1m)`."""
+    queries: pd.DataFrame
+    """A row a common query and pair: those of `QUERY`; and `status_<i>`, `rotation_error_deg_<i>`,
+    `translation_error_m_<i>` of each run i."""
+    recall: pd.DataFrame
+    """A row a pair, threshold and run, and those of all pairs: recall and difference to the first run (0 to 1), each
+    with `_low` and `_high` of its interval; queries, won and lost."""
+    changes: pd.DataFrame
+    """A row a query that a run has won or lost: those of `QUERY`, run (its number), change, at (thresholds)."""
+    settings: pd.DataFrame
+    """What differs: key, and a column a run."""
+    resources: pd.DataFrame
+    """A row a stage, and one of all: stage; `seconds_<i>` and `memory_mb_<i>` of each run i."""
+    messages: Sequence[str] = field(default_factory=list)
+
+    def text(self) -> str:
+        """Return a short table: all pairs together, and how many queries were won and lost."""
+        rows = self.recall[self.recall["scene"] == ALL]
+        width = max(map(len, self.names))
+        lines = [f"{len(self.queries)} queries in {self.queries.groupby(_PAIR).ngroups} pairs, recall in % [95 %]"]
+        for threshold, group in rows.groupby("threshold", sort=False):
+            lines.append(f"at {_threshold(str(threshold))}")
+            for row in group.to_dict("records"):
+                line = f"  {self.names[row['run']]:<{width}}  {_interval(row, 'recall')}"
+                if row["run"]:
+                    line += f"   {_interval(row, 'difference')}   {row['won']} won, {row['lost']} lost"
+                lines.append(line)
+        for i, name in enumerate(self.names):
+            spent = self.resources.iloc[-1]
+            lines.append(f"{name}: {_seconds(spent[f'seconds_{i}'])}, {_memory(spent[f'memory_mb_{i}'])}")
+        for row in self.settings.to_dict("records"):
+            lines.append(f"{row['key']}: " + " | ".join(row[f"run_{i}"] for i in range(len(self.names))))
+        return "\n".join([*lines, *(f"Note: {message}" for message in self.messages)])
+
+    def summary(self) -> dict[str, Any]:
+        """Return the same for scripts: plain values, with every pair and every query won and lost."""
+        changes = self.changes.assign(run=[self.names[i] for i in self.changes["run"]])
+        tables = {"recall": self.recall.assign(run=[self.names[i] for i in self.recall["run"]]), "changes": changes}
+        plain = {name: table.astype(object).where(table.notna(), None) for name, table in tables.items()}
+        return {
+            "runs": dict(zip(self.names, map(str, self.folders), strict=True)),
+            "queries": len(self.queries),
+            **{name: table.to_dict("records") for name, table in plain.items()},
+            "settings": _by_run(self.settings, "key", {"run": ""}, self.names),
+            "resources": _by_run(self.resources, "stage", {"seconds": "s", "memory_mb": "mb"}, self.names),
+            "messages": list(self.messages),
+        }
+
+
+def compare_runs(run_dirs: Sequence[str | Path], seed: int = SEED, resamples: int = RESAMPLES) -> Comparison:
+    """Compare runs with the first of them, on the queries of each pair that all of them have evaluated.
+
+    A query counts as won at a threshold where a run is within it and the first run is not; lost where it is the other
+    way round. Intervals are percentile bootstrap intervals of 95 % (Efron and Tibshirani, An Introduction to the
+    Bootstrap, 1993, chapter 13), paired: every resample takes the same queries of all runs. A query that was
+    localized in several maps is one unit of the resamples, so that its answers do not count as independent. Where all
+    or none are within a threshold, an interval has no width, which says nothing of other queries.
+
+    Args:
+        run_dirs: run folders, two or more.
+        seed: of the resamples.
+        resamples: how many.
+
+    Raises:
+        ArtifactError: a folder is no run, is not evaluated, has a torn table or no query with ground truth; or the
+            runs have no query in common, or lengths of other units.
+    """
+    folders = list(map(Path, run_dirs))
+    if len(folders) < 2:
+        raise ArtifactError(f"compare: found {len(folders)} run folder, expected two or more.")
+    records = [read_run(folder / "run.json") for folder in folders]
+    tables = [_read_errors(folder, record) for folder, record in zip(folders, records, strict=True)]
+    names, messages = _names(folders), list[str]()
+    limits = [_thresholds(table) for table in tables]
+    units = [unit_of(*names_of) for names_of in limits]
+    for folder, record, unit, mine in zip(folders, records, units, limits, strict=True):
+        if unit != units[0]:
+            found = f"{folder}: found errors in {unit}, expected {units[0]} as in {folders[0]}"
+            raise ArtifactError(f"{found}. Set the same `unit` for both, and run them again.")
+        if record["status"] not in ("done", ""):
+            messages.append(f"{folder.name} is {record['status']}: {record['error'] or 'it has not ended'}")
+        if mine != limits[0]:
+            messages.append(f"{folder.name} was evaluated at other thresholds; those of {names[0]} are counted.")
+    keys = [*QUERY, *(["sensor_id"] if all("sensor_id" in table for table in tables) else [])]
+    for folder, table in zip(folders, tables, strict=True):
+        if table.duplicated(keys).any():
+            raise ArtifactError(
+                f"{folder}: evaluation/errors.csv has a query twice, expected one row each; was it evaluated a camera "
+                "(at) and the others a device? Evaluate it as the others were."
+            )
+    queries = tables[0][keys]
+    for table in tables[1:]:
+        queries = queries.merge(table[keys], on=keys)
+    counts = ", ".join(f"{name} {len(table)}" for name, table in zip(names, tables, strict=True))
+    if queries.empty:
+        raise ArtifactError(
+            f"The runs have no query in common ({counts}). Compare runs of the same capture, pairs and queries."
+        )
+    if any(len(table) > len(queries) for table in tables):
+        messages.append(f"The runs have other queries ({counts}): the {len(queries)} in common are compared.")
+    for scene in queries["scene"].unique():
+        if len({record["inputs"].get(scene) for record in records}) > 1:
+            messages.append(f"{scene}: its files are not the same, or have been moved or copied, between the runs.")
+    for i, table in enumerate(tables):
+        columns = {name: f"{name}_{i}" for name in ("status", *_ERRORS)}
+        queries = queries.merge(table[[*keys, *columns]].rename(columns=columns), on=keys)
+    hits = _hits(queries, len(tables), limits[0])
+    return Comparison(
+        *(folders, names, records, limits[0], queries),
+        _recall(queries, hits, limits[0], seed, resamples),
+        _changes(queries, hits, limits[0]),
+        _settings([record["manifest"] for record in records]),
+        _resources([record["stages"] for record in records]),
+        messages,
+    )
+
+
+def bootstrap(
+    hits: NDArray[np.bool_], unit: Ints, seed: int = SEED, resamples: int = RESAMPLES
+) -> tuple[Floats, Floats]:
+    """Return the intervals of the recall of each run, and of its difference to the first; (2, R, T) each, 0 to 1.
+
+    Args:
+        hits: (Q, R, T), whether each query is within each threshold in each run.
+        unit: (Q,) which queries are drawn together, numbers from 0.
+        seed: of the resamples.
+        resamples: how many.
+    """
+    count = np.bincount(unit)
+    sums = np.zeros((len(count), *hits.shape[1:]))
+    np.add.at(sums, unit, hits)
+    rng, shares = np.random.default_rng(seed), []
+    # Some at a time: a draw has a weight for each query.
+    steps = [*range(0, resamples, max(1, 2_000_000 // len(count))), resamples]
+    for start, end in pairwise(steps):
+        weights = rng.multinomial(len(count), np.full(len(count), 1 / len(count)), size=end - start)
+        shares.append(np.tensordot(weights, sums, 1) / (weights @ count)[:, None, None])
+    drawn = np.concatenate(shares)
+    low_high = np.percentile(drawn, INTERVAL, axis=0), np.percentile(drawn - drawn[:, :1], INTERVAL, axis=0)
+    return low_high[0], low_high[1]
+
+
+# Reading
+
+
+def _read_errors(folder: Path, record: Mapping[str, Any]) -> pd.DataFrame:
+    """Return the errors of the queries of all scenes of a run, with a column `scene`."""
+    tables, missing = [], []
+    for scene in map(str, record["scenes"]):
+        path = SceneFiles(folder, scene).evaluation / "errors.csv"
+        if not path.is_file():
+            missing.append(str(path))
+            continue
+        require_whole(path, of=path.with_name("recall.csv"))
+        try:
+            table = pd.read_csv(path, dtype={"timestamp": np.int64, "device_id": str, "sensor_id": str})
+        except (OSError, ValueError, OverflowError) as error:
+            raise ArtifactError(f"{path}: not a table of errors ({error}). Run its stage evaluate again.") from None
+        if lacking := [name for name in _NEEDED if name not in table]:
+            raise ArtifactError(f"{path}: column {lacking[0]!r} is missing. Run its stage evaluate again.")
+        tables.append(table.assign(scene=scene))
+    if not tables:
+        found = missing[0] if missing else "no scene in run.json"
+        raise ArtifactError(
+            f"{folder}: not evaluated ({found} is missing). Finish the run: python -m toolkit run MANIFEST."
+            if missing else f"{folder}: found {found}, expected the scenes of a run. Run its manifest again."
+        )  # fmt: skip
+    errors = pd.concat(tables, ignore_index=True)
+    errors = errors[errors[_ERRORS].notna().all(axis=1)]
+    if errors.empty:
+        raise ArtifactError(
+            f"{folder}: found no query with ground truth, expected some: without true poses there is no recall to "
+            "compare. Give the query sessions their ground truth, and evaluate again."
+        )
+    return errors
+
+
+def _thresholds(table: pd.DataFrame) -> list[str]:
+    found = [name.removeprefix("loss@") for name in table.columns if name.startswith("loss@")]
+    if not found:
+        raise ArtifactError("errors.csv: a column `loss@...`, which names a threshold, is missing. Evaluate again.")
+    return found
+
+
+def _names(folders: Sequence[Path]) -> list[str]:
+    """Return a short name of each run, different ones."""
+    paths = [folder.resolve() for folder in folders]
+    twice = {path.name for path in paths if len({other for other in paths if other.name == path.name}) > 1}
+    names = [f"{path.parent.name}/{path.name}" if path.name in twice else path.name for path in paths]
+    return [f"{name} ({names[:i].count(name) + 1})" if name in names[:i] else name for i, name in enumerate(names)]
+
+
+# Counting
+
+
+def _hits(queries: pd.DataFrame, runs: int, thresholds: Sequence[str]) -> NDArray[np.bool_]:
+    """Return whether each query is within each threshold in each run, (Q, R, T)."""
+    limits = [parse_threshold(name) for name in thresholds]
+    errors = [[queries[f"{name}_{i}"].to_numpy(float) for name in _ERRORS] for i in range(runs)]
+    hits = [[is_below(rotation, translation, limit) for limit in limits] for rotation, translation in errors]
+    return np.asarray(np.moveaxis(np.array(hits, bool), 2, 0))
+
+
+def _recall(
+    queries: pd.DataFrame, hits: NDArray[np.bool_], thresholds: Sequence[str], seed: int, resamples: int
+) -> pd.DataFrame:
+    places = queries.groupby(_PAIR, sort=False).indices
+    everything = np.arange(len(queries))
+    rows: list[dict[str, Any]] = []
+    for pair, chosen in [*places.items(), ((ALL, ALL, ALL), everything)]:
+        mine = hits[chosen]
+        unit = queries.iloc[chosen].groupby(["scene", "timestamp", "device_id"], sort=False).ngroup().to_numpy()
+        within, apart = bootstrap(mine, unit, seed, resamples)
+        shares = mine.mean(axis=0)
+        won, lost = ((here & ~there).sum(axis=0) for here, there in ((mine, mine[:, :1]), (mine[:, :1], mine)))
+        rows += [
+            {
+                **dict(zip(_PAIR, pair, strict=True)),
+                "threshold": threshold,
+                "run": run,
+                "queries": len(chosen),
+                "recall": shares[run, t],
+                "recall_low": within[0, run, t],
+                "recall_high": within[1, run, t],
+                "difference": shares[run, t] - shares[0, t],
+                "difference_low": apart[0, run, t],
+                "difference_high": apart[1, run, t],
+                "won": int(won[run, t]),
+                "lost": int(lost[run, t]),
+            }
+            for t, threshold in enumerate(thresholds)
+            for run in range(hits.shape[1])
+        ]
+    return pd.DataFrame(rows)
+
+
+def _changes(queries: pd.DataFrame, hits: NDArray[np.bool_], thresholds: Sequence[str]) -> pd.DataFrame:
+    """List what was lost, then what was won; that which changed most thresholds first."""
+    parts = []
+    for run in range(1, hits.shape[1]):
+        for change, changed in (("lost", hits[:, 0] & ~hits[:, run]), ("won", ~hits[:, 0] & hits[:, run])):
+            order = np.argsort(-changed.sum(axis=1), kind="stable")
+            chosen = order[changed[order].any(axis=1)]
+            at = ["; ".join(name for name, yes in zip(thresholds, changed[k], strict=True) if yes) for k in chosen]
+            parts.append(queries.iloc[chosen].assign(run=run, change=change, at=at))
+    return pd.concat(parts, ignore_index=True)
+
+
+def _settings(manifests: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """Return the settings that are not the same in all runs."""
+    flat = [dict(_leaves(manifest)) for manifest in manifests]
+    keys = [key for key in dict.fromkeys(key for leaves in flat for key in leaves) if key not in _NAMES]
+    texts = [[str(leaves[key]) if key in leaves else "–" for leaves in flat] for key in keys]
+    rows = [[key, *values] for key, values in zip(keys, texts, strict=True) if len(set(values)) > 1]
+    return pd.DataFrame(rows, columns=["key", *(f"run_{i}" for i in range(len(manifests)))])
+
+
+def _leaves(tree: Mapping[str, Any], above: str = "") -> Iterable[tuple[str, Any]]:
+    for key, value in tree.items():
+        if isinstance(value, dict) and value:
+            yield from _leaves(value, f"{above}{key}.")
+        else:
+            yield f"{above}{key}", value
+
+
+def _resources(stages: Sequence[Sequence[Mapping[str, Any]]]) -> pd.DataFrame:
+    names = dict.fromkeys(str(row.get("stage")) for rows in stages for row in rows)
+    table = []
+    for name in (*names, ALL):
+        line: dict[str, Any] = {"stage": name}
+        for i, rows in enumerate(stages):
+            mine = [row for row in rows if name in (ALL, row.get("stage"))]
+            line[f"seconds_{i}"] = sum(float(row.get("seconds") or 0) for row in mine) if mine else math.nan
+            line[f"memory_mb_{i}"] = max((float(row.get("peak_memory_mb") or 0) for row in mine), default=math.nan)
+        table.append(line)
+    return pd.DataFrame(table)
+
+
+def _by_run(
+    table: pd.DataFrame, key: str, columns: Mapping[str, str], names: Sequence[str]
+) -> dict[str, dict[str, Any]]:
+    """Return a table with columns `<name>_<i>` as key -> run -> value, or -> name -> value where there are several."""
+    found: dict[str, dict[str, Any]] = {}
+    for row in table.to_dict("records"):
+        for i, run in enumerate(names):
+            values = {name: row[f"{name}_{i}"] for name in columns}
+            plain = {name: None if isinstance(v, float) and math.isnan(v) else v for name, v in values.items()}
+            found.setdefault(str(row[key]), {})[run] = plain if len(columns) > 1 else next(iter(plain.values()))
+    return found
+
+
+# Showing
+
+
+@styled
+def draw_differences(comparison: Comparison) -> "Figure":
+    """Draw the difference of recall to the first run, with its interval, for each pair; return the figure."""
+    table = comparison.recall[comparison.recall["run"] > 0]
+    pairs = list(dict.fromkeys(map(tuple, table[_PAIR].to_numpy())))
+    several = table["scene"].nunique() > 2
+    labels = [
+        "all pairs" if pair[0] == ALL else f"{f'{pair[0]}: ' * several}{pair[2]} in {pair[1]} map" for pair in pairs
+    ]
+    runs = range(1, len(comparison.names))
+    figure = new_figure(3.6 * len(comparison.thresholds) + 1.5, 0.24 * len(pairs) * max(2, len(runs)) + 1.4)
+    panels = np.ravel(figure.subplots(1, len(comparison.thresholds), sharey=True, sharex=True, squeeze=False))
+    for panel, threshold in zip(panels, comparison.thresholds, strict=True):
+        for run in runs:
+            rows = table[(table["run"] == run) & (table["threshold"] == threshold)]
+            middle, low, high = (
+                100 * rows[name].to_numpy(float) for name in ("difference", "difference_low", "difference_high")
+            )
+            y = np.arange(len(pairs)) + 0.6 * (run / (len(comparison.names)) - 0.5)
+            color = _COLORS[(run - 1) % len(_COLORS)]
+            panel.hlines(y, low, high, color=color, lw=2)
+            panel.plot(middle, y, "o", color=color, ms=5, label=comparison.names[run])
+        panel.axvline(0, color="0.4", lw=0.8)
+        panel.set(title=f"at {_threshold(threshold)}", xlabel="difference of recall [percentage points]")
+        panel.set_yticks(range(len(pairs)), labels)
+    panels[0].invert_yaxis()
+    lowest, highest = panels[0].get_xlim()
+    panels[0].set_xlim(min(lowest, -5), max(highest, 5))  # what is hardly a difference looks so
+    figure.suptitle(f"Recall minus that of {comparison.names[0]}, with intervals of 95 %")
+    if len(runs) > 1:
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+    return figure
+
+
+def draw_change(comparison: Comparison, row: int) -> "list[tuple[str, Figure]]":
+    """Draw a query that was won or lost as the first run and the other have it, from their stored correspondences.
+
+    Args:
+        row: of `comparison.changes`.
+
+    Returns:
+        A title and a figure for each of the two runs.
+
+    Raises:
+        ToolkitError: its capture is not where it was, or a run has not kept what its poses rest on.
+    """
+    change = comparison.changes.iloc[row]
+    drawn = []
+    for i in (0, int(change["run"])):
+        record, files = comparison.records[i], SceneFiles(comparison.folders[i], change["scene"])
+        manifest = record["manifest"]
+        with extra_devices(manifest.get("extra_devices", [])), allow_outside(manifest.get("allow_outside", False)):
+            capture = Capture.open(_capture_of(record, change["scene"], comparison.folders[i]))
+            devices = change["map_device"], change["query_device"]
+            pair = LocalizedPair.open(capture, *devices, files.poses_dir, files.maps)
+            try:
+                same = (pair.table["timestamp"] == change["timestamp"]) & (
+                    pair.table["device_id"] == change["device_id"]
+                )
+                if not same.any():
+                    raise ArtifactError(f"{files.poses_dir / pair.name}.csv: no row of query {change['timestamp']}.")
+                k = int(np.flatnonzero(same)[0])
+                title = f"{comparison.names[i]}: {pair.table['status'].iloc[k]}"
+                drawn.append((title, draw_localization(pair.details(k), title=title, unit=pair.unit)))
+            finally:
+                pair.queries.close()
+    return drawn
+
+
+def _capture_of(record: Mapping[str, Any], scene: str, folder: Path) -> Path:
+    """Return the folder of a scene's capture, as a run had it."""
+    for row in record["stages"]:
+        root = (row.get("parameters") or {}).get("sessions_root")
+        if row.get("scene") == scene and root and Path(root).is_dir():
+            return Path(root).parent
+    raise ArtifactError(f"{folder}: the capture {scene} is not where the run had it, so its queries cannot be shown.")
+
+
+def write_comparison(comparison: Comparison, path: str | Path | None = None, pictures: int = MOST_PICTURES) -> Path:
+    """Write the page of a comparison, one file that needs nothing else, and return its path.
+
+    Args:
+        path: HTML file; None: `compare_<names>.html` beside the first run.
+        pictures: queries won or lost that are drawn, of each run against the first; 0 draws none.
+    """
+    if path is None:
+        stem = "_".join(name.replace("/", "-") for name in comparison.names)
+        if len(stem) > 100:
+            stem = f"{comparison.names[0].replace('/', '-')}_and_{len(comparison.names) - 1}_more"
+        path = comparison.folders[0].resolve().parent / f"compare_{stem}.html"
+    names, messages = comparison.names, list(comparison.messages)
+    with tempfile.TemporaryDirectory() as folder:
+        album = _Album(Path(folder), PICTURE_BUDGET, [])
+        save_figure(draw_differences(comparison), Path(folder) / "differences.png")
+        caption = "Right of the line a run is better than the first; an interval that crosses it may be chance."
+        figure = replace(album.picture(Path(folder) / "differences.png", "Differences", caption), path="")
+        looks = _looks(comparison, pictures, album, messages)
+    page = page_template("comparison.html.j2").render(
+        run={"name": " against ".join([", ".join(names[1:]), names[0]]), "manifest": {}, "status": ""},
+        folders=list(zip(names, map(str, comparison.folders), comparison.records, strict=True)),
+        messages=messages,
+        tiles=_tiles(comparison),
+        recall=[_recall_table(comparison, name) for name in comparison.thresholds],
+        figure=figure,
+        changes=_changes_table(comparison),
+        looks=looks,
+        resources=_resources_table(comparison),
+        settings=_settings_table(comparison),
+    )
+    write_text(path, page)
+    return Path(path)
+
+
+def _looks(comparison: Comparison, most: int, album: _Album, messages: list[str]) -> list[tuple[str, list[Picture]]]:
+    """Return pictures of queries won and lost, half of them of each where there are both."""
+    looks, table = [], comparison.changes
+    for run in range(1, len(comparison.names)):
+        rows = [table.index[(table["run"] == run) & (table["change"] == change)].tolist() for change in ("lost", "won")]
+        half = max(most // 2, most - len(rows[1]))
+        lost = rows[0][:half]
+        for row in [*lost, *rows[1][: most - len(lost)]]:
+            change = table.loc[row]
+            at = ", ".join(map(_threshold, change["at"].split("; ")))
+            what = f"{change['change']} by {comparison.names[run]} at {at}"
+            title = f"{change['query_device']} query {change['timestamp']} in the {change['map_device']} map: {what}"
+            try:
+                drawn = draw_change(comparison, row)
+            except (ToolkitError, OSError) as error:
+                messages.append(f"No picture of {change['query_device']} query {change['timestamp']}: {error}")
+                continue
+            shown = []
+            for number_, (name, figure) in enumerate(drawn):
+                file = album.run_dir / f"{row}_{number_}.png"
+                save_figure(figure, file)
+                shown.append(replace(album.picture(file, name), path=""))
+            if all(picture.data for picture in shown):
+                looks.append((title, shown))
+    return looks
+
+
+def _tiles(comparison: Comparison) -> list[tuple[str, str]]:
+    rows = comparison.recall[(comparison.recall["scene"] == ALL) & (comparison.recall["run"] > 0)]
+    tiles = []
+    for row in rows[rows["threshold"] == comparison.thresholds[0]].to_dict("records"):
+        where = f"{comparison.names[row['run']]} at {_threshold(row['threshold'])}"
+        text = f"points of recall [{_bounds(row, 'difference')}], {row['won']} won and {row['lost']} lost: {where}"
+        tiles.append((_signed(row["difference"]), text))
+    return tiles
+
+
+def _recall_table(comparison: Comparison, threshold: str) -> Table:
+    columns = ["map", "query", "queries", *comparison.names]
+    for name in comparison.names[1:]:
+        columns += [f"{name} – {comparison.names[0]}", "won", "lost"]
+    rows = []
+    chosen = comparison.recall[comparison.recall["threshold"] == threshold]
+    for pair, group in chosen.groupby(_PAIR, sort=False):
+        by_run = group.to_dict("records")
+        several = chosen["scene"].nunique() > 2 and pair[0] != ALL
+        cells = [Cell(f"{pair[0]} {pair[1]}" if several else pair[1]), Cell(pair[2]), Cell(str(by_run[0]["queries"]))]
+        cells += [Cell(_interval(row, "recall"), 0.9 * row["recall"]) for row in by_run]
+        for row in by_run[1:]:
+            cells += [Cell(_interval(row, "difference")), Cell(str(row["won"])), Cell(str(row["lost"]))]
+        rows.append(cells)
+    caption = f"Recall at {_threshold(threshold)} in %, and the differences in percentage points"
+    return Table(caption, columns, rows)
+
+
+def _changes_table(comparison: Comparison) -> Table | None:
+    """List what was won and lost; None where nothing was."""
+    table, unit = comparison.changes, unit_of(*comparison.thresholds)
+    if table.empty:
+        return None
+    rows = []
+    for row in table.head(MOST_ROWS).to_dict("records"):
+        i = row["run"]
+        errors = [_off_by(row[f"{_ERRORS[0]}_{j}"], row[f"{_ERRORS[1]}_{j}"], unit) for j in (0, i)]
+        at = ", ".join(map(_threshold, row["at"].split("; ")))
+        texts = [comparison.names[i], row["change"], at, f"{row['query_device']} in {row['map_device']} map", *errors]
+        texts += [str(row[f"status_{i}"]).replace("_", " "), str(row["timestamp"]), str(row["device_id"])]
+        rows.append([Cell(text) for text in texts])
+    rest = f"; {MOST_ROWS} of them" if len(table) > MOST_ROWS else ""
+    counts = table["change"].value_counts()
+    caption = f"Queries within a threshold in one run only: {counts.get('won', 0)} won, {counts.get('lost', 0)} lost"
+    columns = ["run", "change", "at", "query", f"off in {comparison.names[0]}", "off in the run", "status"]
+    return Table(caption + rest, [*columns, "timestamp [µs]", "device"], rows)
+
+
+def _resources_table(comparison: Comparison) -> Table:
+    columns, rows = ["stage"], []
+    for name in comparison.names:
+        columns += [f"{name}: time", "peak memory"]
+    longest = comparison.resources.filter(like="seconds_").iloc[:-1].max(axis=None)
+    for row in comparison.resources.to_dict("records"):
+        cells = [Cell(row["stage"])]
+        for i in range(len(comparison.names)):
+            seconds = row[f"seconds_{i}"]
+            bar = seconds / longest if row["stage"] != ALL and seconds > 0 else None
+            cells += [Cell(_seconds(None if math.isnan(seconds) else seconds), bar=bar)]
+            cells += [Cell(_memory(row[f"memory_mb_{i}"]))]
+        rows.append(cells)
+    return Table("Time and peak memory of every stage, start-up of its notebook included", columns, rows)
+
+
+def _settings_table(comparison: Comparison) -> Table | None:
+    if comparison.settings.empty:
+        return None
+    rows = [[Cell(str(value)) for value in row] for row in comparison.settings.to_numpy()]
+    return Table("Settings that differ", ["setting", *comparison.names], rows)
+
+
+def _off_by(rotation_deg: float, translation: float, unit: str) -> str:
+    return f"{number(rotation_deg)}°, {_length(translation, unit)}" if math.isfinite(rotation_deg) else "no pose"
+
+
+def _signed(share: float) -> str:
+    return f"{'+' if share > 0 else '−' if share < 0 else '±'}{percent(abs(share))}"
+
+
+def _bounds(row: Mapping[str, Any], name: str) -> str:
+    write = _signed if name == "difference" else percent
+    return f"{write(row[f'{name}_low'])}, {write(row[f'{name}_high'])}"
+
+
+def _interval(row: Mapping[str, Any], name: str) -> str:
+    return f"{(_signed if name == 'difference' else percent)(row[name])} [{_bounds(row, name)}]"
+
+
+def _memory(megabytes: float) -> str:
+    return f"{number(megabytes)} MB" if megabytes > 0 else "–"
