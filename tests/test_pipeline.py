@@ -146,6 +146,28 @@ def test_a_stage_runs_again_only_when_something_has_changed(
     assert go("retrieve.topk=3", only="embed")["embed"] == done
 
 
+def test_a_sweep_takes_over_what_does_not_depend_on_its_keys(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pipeline, "execute", execute_here)
+    said: list[str] = []
+    sweeps = ["embed.model=vlad,auto", "retrieve.topk=3,90,5"]
+    folders, failed = pipeline.sweep(place / "run.yaml", sweeps, say=lambda *a, **k: said.append(a[0]))
+    assert len(folders) == 4
+    assert ["found a dragon" in str(error) for error in failed] == [True, True]
+    runs = {path.name: path for path in (place / "runs").iterdir()}
+    assert set(runs) == {f"run-model-{model}-topk-{k}" for model in ("vlad", "auto") for k in (3, 90, 5)}
+    for name, run in runs.items():
+        record = json.loads((run / "run.json").read_text())
+        assert record["status"] == ("failed" if name.endswith("90") else "done"), "one does not stop the others"
+    assert (runs["run-model-vlad-topk-5"] / "P/embeddings/log.txt").stat().st_nlink == 3, "of the runs of that model"
+    assert sum("found a dragon" in line for line in said) == 2
+
+
+def test_a_sweep_with_a_wrong_value_is_refused_before_anything_runs(place: Path) -> None:
+    with pytest.raises(ManifestError, match=r"retrieve\.topk: found 'five'"):
+        pipeline.sweep(place / "run.yaml", ["retrieve.topk=3,five"])
+    assert not (place / "runs").exists()
+
+
 def test_damage_in_what_a_stage_left_makes_it_run_again(place: Path, go: Callable[..., dict[str, str]]) -> None:
     go()
     jsonl = place / "runs/run/P/retrieval/P_map_all_query_all.jsonl"

@@ -5,7 +5,7 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
@@ -79,6 +79,14 @@ def run(
             "cluster's queue starts (see docs/scaling.md).",
         ),
     ] = None,
+    sweeps: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--sweep",
+            metavar="KEY=A,B,C",
+            help="Run once with each value, in a folder each, and compare; of several, all combinations.",
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Run the notebooks of a manifest, resuming what is done, and write a report.
@@ -91,6 +99,10 @@ def run(
 
     tell = partial(print, file=sys.stderr) if as_json else print
     try:
+        if sweeps:
+            options = {"only": only, "force": force, "cluster": cluster}
+            _sweep(manifest, sweeps, overrides or (), tell, as_json, **options)
+            return
         run_dir = pipeline.run(manifest, only=only, force=force, overrides=overrides or (), say=tell, cluster=cluster)
     except BaseException as error:
         if as_json:
@@ -110,12 +122,12 @@ def run(
 def compare(
     runs: Annotated[list[Path], typer.Argument(help="Run folders, two or more; the first is compared with.")],
     out: Annotated[Path | None, typer.Option(help="HTML file; else compare_<names>.html beside the first run.")] = None,
-    pictures: Annotated[int, typer.Option(min=0, help="Queries won or lost that are drawn, of each run.")] = 6,
+    pictures: Annotated[int, typer.Option(min=0, help="Queries won or lost that are drawn, of each run.")] = 4,
     seed: Annotated[int, typer.Option(min=0, help="Of the resamples that intervals are made from.")] = 0,
     as_json: Json = False,
 ) -> None:
     """Compare runs: recall with intervals, queries won and lost, time, memory, settings; and write a page."""
-    _compare(runs, as_json, out, pictures, seed)
+    _compare(runs, print, as_json, out, pictures, seed)
 
 
 @app.command()
@@ -412,8 +424,28 @@ def record(
     print(f"Open it: {done.command}")
 
 
-def _compare(runs: list[Path], as_json: bool, out: Path | None = None, pictures: int = 6, seed: int = 0) -> None:
-    """Print a comparison, and write its page."""
+def _sweep(
+    manifest: Path, sweeps: Sequence[str], overrides: Sequence[str], tell: Callable[..., None], as_json: bool,
+    **options: Any,
+) -> None:  # fmt: skip
+    """Run a manifest with each of some values, and compare the runs that came to their end."""
+    from toolkit import pipeline
+    from toolkit.runs.record import summary
+
+    folders, failed = pipeline.sweep(manifest, sweeps, overrides, tell, **options)
+    ends = list(map(summary, folders))
+    wrong = [*failed, *(IncompleteError(f"{end['name']}: {end['error']}") for end in ends if end["exit_code"] != 0)]
+    if len(folders) > 1:
+        _compare(folders, tell, as_json and not wrong)  # else the error is what stdout holds
+    if wrong:
+        raise wrong[0]
+
+
+def _compare(
+    runs: list[Path], tell: Callable[..., None], as_json: bool, out: Path | None = None, pictures: int = 4,
+    seed: int = 0,
+) -> None:  # fmt: skip
+    """Tell of a comparison, and write its page."""
     from toolkit.show.comparison import compare_runs, write_comparison
 
     comparison = compare_runs(runs, seed)
@@ -421,8 +453,8 @@ def _compare(runs: list[Path], as_json: bool, out: Path | None = None, pictures:
     if as_json:
         _print_json(comparison.summary() | {"page": str(page)})
     else:
-        print(comparison.text())
-        print(f"Comparison: {page}")
+        tell(comparison.text())
+        tell(f"Comparison: {page}")
 
 
 def _summary_of_stopped(manifest: Path, overrides: Sequence[str]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import json
 import logging
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -22,7 +22,7 @@ from toolkit.capture.devices import extra_devices, table_record
 from toolkit.capture.names import allow_outside
 from toolkit.embedders import WEIGHTS as EMBEDDER_WEIGHTS
 from toolkit.embedders import resolve_model
-from toolkit.errors import ManifestError, StageError, exit_code, sentence
+from toolkit.errors import ManifestError, StageError, ToolkitError, exit_code, sentence
 from toolkit.exchange.download import is_unfinished
 from toolkit.features.matching import local_weights, resolve_auto
 from toolkit.files import (
@@ -68,6 +68,7 @@ from toolkit.runs.folder import LOG, held
 from toolkit.runs.kernel import Kernels
 from toolkit.runs.pairs import pair_text, way_out
 from toolkit.runs.record import RunLog, failures
+from toolkit.runs.sweep import SweptRun, swept_runs, take_over
 
 log = logging.getLogger(__name__)
 
@@ -156,6 +157,51 @@ def run(
     devices = [device.model_dump(exclude_none=True) for device in manifest.extra_devices]
     with extra_devices(devices), allow_outside(manifest.allow_outside):
         return _run(manifest, manifest_path, only, force, say, cluster)
+
+
+def sweep(
+    manifest_path: str | Path,
+    sweeps: Sequence[str],
+    overrides: Sequence[str] = (),
+    say: Say = print,
+    **options: Any,
+) -> tuple[list[Path], list[ToolkitError]]:
+    """Run a manifest with each of some values, in folders `<output_root>/<name>-<key>-<value>`.
+
+    What does not depend on the keys in which two runs differ is taken over from the earlier one; the first takes it
+    from the plain run of the manifest, if that is there. A capture to render is rendered once, for all of them. A run
+    that fails does not keep the others from running.
+
+    Args:
+        sweeps: `key=a,b,c`, see `runs.sweep.swept_runs`; several keys are all their combinations.
+        overrides, say, options: as for `run`.
+
+    Returns:
+        The run folders, and the errors that other runs have failed by.
+
+    Raises:
+        ManifestError: before anything runs, also for a value that does not fit.
+    """
+    plain = load_manifest(manifest_path, overrides)
+    runs = swept_runs(plain.name, sweeps)
+    for one in runs:  # before hours of work
+        load_manifest(manifest_path, [*overrides, *one.overrides, f"name={one.name}"])
+    captures = _captures(plain)
+    rendered = ["demo_data=null", f"captures={json.dumps(list(map(str, captures)))}"] if plain.demo_data else []
+    root, done, failed = Path(plain.output_root), dict[SweptRun, Path](), list[ToolkitError]()
+    for number, one in enumerate(runs, 1):
+        say(f"{one.name} ({number} of {len(runs)}): {', '.join(one.overrides)}")
+        # The run that differs in the fewest keys has most to give.
+        like = max(done, key=lambda other: len({*other.overrides} & {*one.overrides}), default=SweptRun(plain.name, ()))
+        keys = [override.partition("=")[0] for override in one.overrides if override not in like.overrides]
+        take_over(root / like.name, root / one.name, [capture.name for capture in captures], keys)
+        try:
+            settings = [*overrides, *rendered, *one.overrides, f"name={one.name}"]
+            done[one] = run(manifest_path, overrides=settings, say=say, **options)
+        except ToolkitError as error:
+            say(f"{one.name}: {sentence(error)}")
+            failed.append(error)
+    return list(done.values()), failed
 
 
 def _run(

@@ -46,7 +46,7 @@ INTERVAL = (2.5, 97.5)
 """Percentiles of the resamples that an interval lies between."""
 ALL = "all"
 """Stands for scene and devices where all pairs are counted together."""
-MOST_PICTURES, MOST_ROWS = 6, 200
+MOST_PICTURES, MOST_ROWS = 4, 20
 """Queries won or lost that are drawn, and that the page lists."""
 QUERY = ["scene", "map_device", "query_device", "timestamp", "device_id"]
 _PAIR = QUERY[:3]
@@ -104,7 +104,8 @@ class Comparison:
         """Return the same for scripts: plain values, with every pair and every query won and lost."""
         changes = self.changes.assign(run=[self.names[i] for i in self.changes["run"]])
         tables = {"recall": self.recall.assign(run=[self.names[i] for i in self.recall["run"]]), "changes": changes}
-        plain = {name: table.astype(object).where(table.notna(), None) for name, table in tables.items()}
+        known = {name: table.replace(np.inf, np.nan) for name, table in tables.items()}  # JSON has no infinity
+        plain = {name: table.astype(object).where(table.notna(), None) for name, table in known.items()}
         return {
             "runs": dict(zip(self.names, map(str, self.folders), strict=True)),
             "queries": len(self.queries),
@@ -133,9 +134,9 @@ def compare_runs(run_dirs: Sequence[str | Path], seed: int = SEED, resamples: in
         ArtifactError: a folder is no run, is not evaluated, has a torn table or no query with ground truth; or the
             runs have no query in common, or lengths of other units.
     """
-    folders = list(map(Path, run_dirs))
+    folders = [] if isinstance(run_dirs, str) else list(map(Path, run_dirs))
     if len(folders) < 2:
-        raise ArtifactError(f"compare: found {len(folders)} run folder, expected two or more.")
+        raise ArtifactError(f"compare: found {run_dirs!r}, expected a list of two or more run folders.")
     records = [read_run(folder / "run.json") for folder in folders]
     tables = [_read_errors(folder, record) for folder, record in zip(folders, records, strict=True)]
     names, messages = _names(folders), list[str]()
@@ -479,11 +480,10 @@ def _looks(comparison: Comparison, most: int, album: _Album, messages: list[str]
     for run in range(1, len(comparison.names)):
         rows = [table.index[(table["run"] == run) & (table["change"] == change)].tolist() for change in ("lost", "won")]
         half = max(most // 2, most - len(rows[1]))
-        lost = rows[0][:half]
-        for row in [*lost, *rows[1][: most - len(lost)]]:
+        lost = _spread(rows[0], half)
+        for row in [*lost, *_spread(rows[1], most - len(lost))]:
             change = table.loc[row]
-            at = ", ".join(map(_threshold, change["at"].split("; ")))
-            what = f"{change['change']} by {comparison.names[run]} at {at}"
+            what = f"{change['change']} by {comparison.names[run]} at {_limits(comparison, change['at'])}"
             title = f"{change['query_device']} query {change['timestamp']} in the {change['map_device']} map: {what}"
             try:
                 drawn = draw_change(comparison, row)
@@ -500,10 +500,22 @@ def _looks(comparison: Comparison, most: int, album: _Album, messages: list[str]
     return looks
 
 
+def _spread(rows: Sequence[int], most: int) -> list[int]:
+    """Return some of the rows, from all over them: neighbors are of one pair and alike."""
+    return [rows[k] for k in np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int))]
+
+
+def _limits(comparison: Comparison, at: str) -> str:
+    names = at.split("; ")
+    every = len(names) == len(comparison.thresholds) > 1
+    return "every threshold" if every else "; ".join(map(_threshold, names))
+
+
 def _tiles(comparison: Comparison) -> list[tuple[str, str]]:
     rows = comparison.recall[(comparison.recall["scene"] == ALL) & (comparison.recall["run"] > 0)]
     tiles = []
-    for row in rows[rows["threshold"] == comparison.thresholds[0]].to_dict("records"):
+    shown = comparison.thresholds if len(comparison.names) == 2 else comparison.thresholds[:1]
+    for row in rows[rows["threshold"].isin(shown)].to_dict("records"):
         where = f"{comparison.names[row['run']]} at {_threshold(row['threshold'])}"
         text = f"points of recall [{_bounds(row, 'difference')}], {row['won']} won and {row['lost']} lost: {where}"
         tiles.append((_signed(row["difference"]), text))
@@ -534,18 +546,20 @@ def _changes_table(comparison: Comparison) -> Table | None:
     if table.empty:
         return None
     rows = []
-    for row in table.head(MOST_ROWS).to_dict("records"):
+    several = len(comparison.names) > 2
+    for row in table.loc[_spread(range(len(table)), MOST_ROWS)].to_dict("records"):
         i = row["run"]
-        errors = [_off_by(row[f"{_ERRORS[0]}_{j}"], row[f"{_ERRORS[1]}_{j}"], unit) for j in (0, i)]
-        at = ", ".join(map(_threshold, row["at"].split("; ")))
-        texts = [comparison.names[i], row["change"], at, f"{row['query_device']} in {row['map_device']} map", *errors]
-        texts += [str(row[f"status_{i}"]).replace("_", " "), str(row["timestamp"]), str(row["device_id"])]
-        rows.append([Cell(text) for text in texts])
-    rest = f"; {MOST_ROWS} of them" if len(table) > MOST_ROWS else ""
+        texts = [comparison.names[i]] if several else []
+        texts += [row["change"], _limits(comparison, row["at"]), f"{row['query_device']} in {row['map_device']} map"]
+        texts += [_off_by(row[f"{_ERRORS[0]}_{j}"], row[f"{_ERRORS[1]}_{j}"], unit) for j in (0, i)]
+        rows.append([Cell(text) for text in (*texts, row[f"status_{i}"].replace("_", " "), str(row["timestamp"]))])
+    rest = f"; {MOST_ROWS} of them, all with --json" if len(table) > MOST_ROWS else ""
     counts = table["change"].value_counts()
     caption = f"Queries within a threshold in one run only: {counts.get('won', 0)} won, {counts.get('lost', 0)} lost"
-    columns = ["run", "change", "at", "query", f"off in {comparison.names[0]}", "off in the run", "status"]
-    return Table(caption + rest, [*columns, "timestamp [µs]", "device"], rows)
+    columns = ["run"] if several else []
+    columns += ["change", "at", "query", f"off in {comparison.names[0]}"]
+    columns += ["off in the run" if several else f"off in {comparison.names[1]}", "status", "timestamp [µs]"]
+    return Table(caption + rest, columns, rows)
 
 
 def _resources_table(comparison: Comparison) -> Table:
@@ -576,7 +590,7 @@ def _off_by(rotation_deg: float, translation: float, unit: str) -> str:
 
 
 def _signed(share: float) -> str:
-    return f"{'+' if share > 0 else '−' if share < 0 else '±'}{percent(abs(share))}"
+    return f"{'+' if share > 0 else '−' if share < 0 else ''}{percent(abs(share))}"
 
 
 def _bounds(row: Mapping[str, Any], name: str) -> str:

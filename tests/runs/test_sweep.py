@@ -1,0 +1,80 @@
+"""Runs of a sweep: their names and settings, and what they take over from each other."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from toolkit.errors import ManifestError
+from toolkit.files import SceneFiles
+from toolkit.runs.sweep import swept_runs, take_over
+
+
+def test_a_run_a_value() -> None:
+    runs = swept_runs("demo", ["localize.pnp.min_inliers=10, 20,40"])
+    assert [run.name for run in runs] == ["demo-min_inliers-10", "demo-min_inliers-20", "demo-min_inliers-40"]
+    assert runs[1].overrides == ("localize.pnp.min_inliers=20",)
+
+
+def test_two_keys_are_their_product() -> None:
+    runs = swept_runs("demo", ["retrieve.topk=5,10", "localize.method=pnp,nearest"])
+    assert [run.overrides for run in runs] == [
+        ("retrieve.topk=5", "localize.method=pnp"), ("retrieve.topk=5", "localize.method=nearest"),
+        ("retrieve.topk=10", "localize.method=pnp"), ("retrieve.topk=10", "localize.method=nearest"),
+    ]  # fmt: skip
+    assert runs[3].name == "demo-topk-10-method-nearest"
+
+
+def test_values_are_yaml() -> None:
+    runs = swept_runs("x", ["embed.model=vlad,[megaloc, vlad],null"])
+    values = [yaml.safe_load(run.overrides[0].partition("=")[2]) for run in runs]
+    assert values == ["vlad", ["megaloc", "vlad"], None]
+    assert [run.name for run in runs] == ["x-model-vlad", "x-model-megaloc-vlad", "x-model-null"]
+
+
+def test_keys_of_one_last_part_are_told_apart() -> None:
+    (run,) = swept_runs("x", ["embed.dtype_compute=auto", "localize.dtype_compute=auto"])
+    assert run.name == "x-embed.dtype_compute-auto-localize.dtype_compute-auto"
+
+
+@pytest.mark.parametrize(
+    ("sweeps", "said"),
+    [
+        (["retrieve.topk"], "expected key=value,value"),
+        (["retrieve.topk="], "expected key=value,value"),
+        (["=1,2"], "expected key=value,value"),
+        (["retrieve.topk=[1"], "expected key=value,value"),
+        (["retrieve.topk=1", "retrieve.topk=2"], "twice"),
+        (["embed.model=[a b],a b"], "one folder"),
+        ([f"seed={','.join(map(str, range(101)))}"], "found 101 runs"),
+    ],
+)
+def test_what_is_no_sweep_is_refused(sweeps: list[str], said: str) -> None:
+    with pytest.raises(ManifestError, match=said):
+        swept_runs("x", sweeps)
+
+
+def test_a_run_takes_over_what_is_made_before_the_swept_stage(tmp_path: Path) -> None:
+    donor = SceneFiles(tmp_path / "a", "P")
+    for folder in (donor.embeddings, donor.retrieval_dir, donor.features, donor.maps, donor.poses_dir, donor.evaluation):
+        folder.mkdir(parents=True)
+        (folder / "made.txt").write_text("a")
+        (folder / "made.h5").write_text("a")
+    take_over(donor.run, tmp_path / "b", ["P"], ["localize.method"])
+    mine = SceneFiles(tmp_path / "b", "P")
+    assert sorted(path.name for path in mine.root.iterdir()) == ["embeddings", "features", "map", "retrieval"]
+    (mine.features / "made.h5").write_text("written to in its place")
+    assert (donor.features / "made.h5").read_text() == "a", "HDF5 files are not shared"
+    assert (mine.embeddings / "made.txt").samefile(donor.embeddings / "made.txt")
+    take_over(donor.run, tmp_path / "c", ["P"], ["evaluate.thresholds"])
+    assert (tmp_path / "c" / "P" / "poses").is_dir()
+    take_over(donor.run, tmp_path / "d", ["P"], ["embed.model", "localize.method"])
+    assert sorted(path.name for path in (tmp_path / "d" / "P").iterdir()) == ["features", "map"]
+
+
+def test_a_run_that_is_there_is_left_as_it_is(tmp_path: Path) -> None:
+    donor, mine = SceneFiles(tmp_path / "a", "P"), SceneFiles(tmp_path / "b", "P")
+    donor.embeddings.mkdir(parents=True)
+    mine.root.mkdir(parents=True)
+    take_over(donor.run, mine.run, ["P"], ["localize.method"])
+    assert not mine.embeddings.exists()
