@@ -13,12 +13,10 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from toolkit.capture import Capture, Session, Trajectory
-from toolkit.capture.cameras import in_view, view_bounds
 from toolkit.capture.devices import in_order
 from toolkit.capture.tables import read_query_table
 from toolkit.errors import ArtifactError, CaptureError, ToolkitError
 from toolkit.files import (
-    image_name,
     map_record_path,
     pair_name,
     read_map_record,
@@ -27,7 +25,7 @@ from toolkit.files import (
     write_atomic,
     write_sidecar,
 )
-from toolkit.geometry import Floats, invert, transform
+from toolkit.geometry import Floats
 from toolkit.manifest import EvaluateSettings
 from toolkit.runs.pairs import LEFT_OUT, left_out
 from toolkit.show.evaluation import Evaluation, draw_evaluation
@@ -49,11 +47,10 @@ from toolkit.show.metrics import (
     recall,
     threshold_name,
 )
+from toolkit.show.overlap import LEAST_OVERLAP, overlap_in_view, seen_by
 from toolkit.show.sequences import SequencePair
 
 if TYPE_CHECKING:
-    import pycolmap
-
     from toolkit.localizers.local_map import LocalMap
 
 logger = logging.getLogger(__name__)
@@ -65,8 +62,6 @@ ERROR_COLUMNS = ["map_device", "query_device", "timestamp", "device_id", "image"
 DETAILS = ("num_inliers", "p_correct", "position_std_m")
 """Columns of a pair's table that are compared with its errors."""
 _PAIR = ["map_device", "query_device"]
-LEAST_OVERLAP = 0.1
-"""A first reference overlaps with the query if the query sees at least this share of the map points that it sees."""
 
 
 def evaluate_scene(
@@ -465,26 +460,6 @@ def _near_any(cameras: Floats, map_cameras: Floats, limits: tuple[float, float])
 # Overlap
 
 
-def overlap_in_view(points: Floats, reference: Floats, world_from_cam: Floats, camera: "pycolmap.Camera") -> float:
-    """Return the share, 0 to 1, of the points that a reference sees which lie in the view of another camera.
-
-    The overlap of two images by sparse points, as M. Dusmanu et al., "D2-Net", CVPR 2019, choose training pairs. A
-    point that the camera would look at from behind (over 90 degrees from the reference's line of sight) is not seen.
-
-    Args:
-        points: (P, 3) triangulated points that the reference observes, world, meters.
-        reference: (3,) its center.
-        world_from_cam: (4, 4) the other camera's pose.
-        camera: its intrinsics.
-    """
-    if not len(points):
-        return 0.0
-    in_cam = transform(invert(world_from_cam), points)
-    same_side = np.sum((points - reference) * (points - world_from_cam[:3, 3]), axis=1) > 0
-    seen = in_view(in_cam[None], view_bounds(camera)[None])[0] & same_side
-    return float(seen.mean())
-
-
 def overlap_table(
     sessions_root: str | Path,
     references: Mapping[str, str | Path],
@@ -544,7 +519,7 @@ def _overlap(
         for line, camera in zip(lines, cameras, strict=True):
             if is_posed(camera):
                 first = line["topk"][:1]
-                seen = _seen_by(first[0], map_session, local_map) if first else np.zeros((0, 3))
+                seen = seen_by(first[0], map_session, local_map) if first else np.zeros((0, 3))
                 center = np.array(first[0]["Tws"])[:3, 3] if first else np.zeros(3)
                 shares.append(overlap_in_view(seen, center, camera, session.camera(line["sensor_id"])))
     except (ArtifactError, OSError, ValueError, KeyError, TypeError) as error:
@@ -553,16 +528,3 @@ def _overlap(
     if shares:
         row |= {name: float(np.mean(np.array(shares) >= LEAST_OVERLAP)), f"{name}_mean": float(np.mean(shares))}
     return row
-
-
-def _seen_by(reference: dict[str, Any], session: Session, local_map: "LocalMap | None") -> Floats:
-    """Return the points (P, 3) that a reference sees, world, meters."""
-    if local_map is not None:
-        image = local_map.index_of.get(image_name(str(reference["path"])))
-        points = np.zeros(0, np.int64) if image is None else np.unique(local_map.observations(image)[1])
-        return local_map.points[points]
-    left, right, top, bottom = view_bounds(session.camera(reference["sensor_id"]))
-    x, y = np.meshgrid(np.linspace(left, right, 9), np.linspace(top, bottom, 9))
-    rays = np.stack([x, y, np.ones_like(x)], -1).reshape(1, -1, 3)
-    points = (rays * np.array([2.0, 4.0, 8.0, 16.0])[:, None, None]).reshape(-1, 3)
-    return transform(np.array(reference["Tws"], float), points)

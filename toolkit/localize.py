@@ -35,7 +35,6 @@ from toolkit.files import (
     Remade,
     file_fingerprint,
     fingerprint,
-    image_name,
     is_current,
     map_record_path,
     pair_name,
@@ -48,14 +47,13 @@ from toolkit.files import (
     write_sidecar,
     write_text,
 )
+from toolkit.localizers.asked import localized_query, references_of_images, stored_query
 from toolkit.localizers.base import (
     Localizer,
-    NetworkMatches,
     PoseEstimate,
     Query,
     References,
     ScaledLocalizer,
-    View,
 )
 from toolkit.localizers.correspondences import MAPS, LocalizedQuery, query_group
 from toolkit.localizers.escalation import EscalatingLocalizer, can_gain, is_better, is_sure
@@ -269,11 +267,6 @@ class _Pair:
             }
         return record
 
-    def references(self) -> dict[tuple[int, str], list[dict[str, Any]]]:
-        """Return for each query image (timestamp, sensor) the retrieved map images, best first."""
-        rows = read_references(self.retrieval)
-        return {(int(row["timestamp"]), str(row["sensor_id"])): row["topk"] for row in rows}
-
 
 class _Folders(NamedTuple):
     """As `localize_pairs` is given them."""
@@ -359,7 +352,7 @@ class _PairRun:
         self.rows = pair.session.rows_of_keyframes(keyframes)
         """Of each query, the rows of its images."""
         index_of = {name: index for index, name in enumerate(localizer.image_names)}
-        self.references = {key: References.of(*_indices(rows, index_of)) for key, rows in pair.references().items()}
+        self.references = references_of_images(pair.retrieval, index_of)
         """Of each query image, by timestamp and sensor."""
         self.stores: list[FeatureStore] = []
         self.matches: list[MatchStore | None] = []
@@ -398,36 +391,10 @@ class _PairRun:
 
     def query(self, number: int) -> tuple[Query, list[References]]:
         """Return a query with the references of its images."""
-        session, rows = self.pair.session, self.rows[number]
-        images = session.images.iloc[rows]
-        keys = list(zip(images["timestamp"].tolist(), images["sensor_id"].tolist(), strict=True))
         # Local features were turned when they were extracted: only a network that predicts looks at the views.
-        shown = self.place.turns if self.place.settings.predicts else None
-        turns = np.zeros(len(rows), int) if shown is None else shown.of(session, rows)
-        names = [session.image_name(int(row)) for row in rows]
-        views = [
-            View(name, session.image_path(int(row)), session.camera(sensor), in_map=False, turns=int(turn))
-            for row, name, (_, sensor), turn in zip(rows, names, keys, turns, strict=True)
-        ]
-        query = Query(
-            views,
-            session.rig_from_cam(rows),
-            [self._features(name) for name in names] if self.stores else [],
-            [self._network_matches(name) for name in names] if any(self.matches) else [],
-        )
-        return query, [self.references.get(key, References.of([])) for key in keys]
-
-    def _features(self, name: str) -> Any:
-        missing = [store for store in self.stores if name not in store]
-        if missing:
-            return next((store.failed[name] for store in missing if name in store.failed), "no features")
-        return [store[name] for store in self.stores]
-
-    def _network_matches(self, name: str) -> list[NetworkMatches | None]:
-        def of(store: MatchStore) -> NetworkMatches:
-            return lambda reference: store[name, reference]
-
-        return [None if store is None else of(store) for store in self.matches]
+        turns = self.place.turns if self.place.settings.predicts else None
+        rows = self.rows[number]
+        return stored_query(self.pair.session, rows, self.references, self.stores, self.matches, turns)
 
     def localize(self, record: dict[str, Any], about: Mapping[str, str]) -> list[dict[str, Any]]:
         """Localize the queries that a killed run has not; returns a row for each, in the list's order."""
@@ -594,13 +561,7 @@ class _PairRun:
                 estimate = PoseEstimate("failed: no images of this device at this time")
         except Exception as error:  # one bad query never ends a run
             estimate = PoseEstimate(f"failed: {reason_of(error, f'localizing {query.views[0].name}')}")
-        names = self.localizer.image_names
-        localized = LocalizedQuery(
-            [view.name for view in query.views],
-            [names[index] for index in estimate.references],
-            [names[index] for index in estimate.rejected],
-            estimate.correspondences,
-        )
+        localized = localized_query(query, estimate, self.localizer.image_names)
         found_by = "" if estimate.world_from_rig is None else estimate.found_by
         row = _row(self.keys[number], estimate, localized, label(self.place.settings, found_by), started)
         return number, row, localized
@@ -620,12 +581,6 @@ def _escalate_share(
         rest = run.not_escalated(writer, rows)
         run.add_escalation(rest)
         run.escalate_into(writer, rest, shared)
-
-
-def _indices(rows: list[dict[str, Any]], index_of: Mapping[str, int]) -> tuple[list[int], list[float]]:
-    """Return indices and scores of retrieved map images; those that the map does not have are left out."""
-    known = [(index_of[name], float(row["score"])) for row in rows if (name := image_name(row["path"])) in index_of]
-    return [index for index, _ in known], [score for _, score in known]
 
 
 def _is_internal(row: Mapping[str, Any]) -> bool:

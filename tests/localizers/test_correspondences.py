@@ -9,7 +9,15 @@ import pytest
 from tests.localized import some_correspondences
 from toolkit.errors import ArtifactError
 from toolkit.features.groups import CHECKSUM, GroupWriter
-from toolkit.localizers.correspondences import MAPS, Correspondences, LocalizedQueries, LocalizedQuery, query_group
+from toolkit.geometry import make_pose
+from toolkit.localizers.correspondences import (
+    MAPS,
+    Correspondences,
+    LocalizedQueries,
+    LocalizedQuery,
+    Rival,
+    query_group,
+)
 
 NAMES = ["ios_map/raw_data/1.jpg", "ios_map/raw_data/morning walk/2.jpg"]
 QUERIES = {
@@ -18,6 +26,7 @@ QUERIES = {
         NAMES,
         ["ios_map/raw_data/ä.jpg"],
         some_correspondences([0] * 6, [True, False] * 3),
+        (Rival(make_pose(np.eye(3), [1.0, 2.0, 3.0]), 0.8), Rival(np.eye(4), 0.25)),
     ),
     (17, "robot/body"): LocalizedQuery(
         ["spot_query/raw_data/front/17.jpg", "spot_query/raw_data/back/17.jpg"],
@@ -55,6 +64,9 @@ def test_what_is_written_is_read(stored: LocalizedQueries, key: tuple[int, str])
     assert key in stored
     read, written = stored[key], QUERIES[key]
     assert (read.images, read.references, read.rejected) == (written.images, written.references, written.rejected)
+    assert [rival.support for rival in read.rivals or ()] == [rival.support for rival in written.rivals or ()]
+    for one, other in zip(read.rivals or (), written.rivals or (), strict=True):
+        np.testing.assert_array_equal(one.world_from_rig, other.world_from_rig)
     assert len(read.correspondences) == len(written.correspondences)
     for name, array in vars(written.correspondences).items():
         again = getattr(read.correspondences, name)
@@ -110,3 +122,15 @@ def test_a_file_of_another_tool_that_is_not_as_a_run_writes_it_says_what_to_do(
             group["pixels"] = pixels
     with pytest.raises(ArtifactError, match=r"pair\.h5: 17/robot%2Fbody .*Localize again"):
         LocalizedQueries(stored.path)[17, "robot/body"]
+
+
+def test_a_file_of_an_older_run_does_not_know_of_rivals(stored: LocalizedQueries) -> None:
+    stored.close()
+    with h5py.File(stored.path, "a") as file:
+        for name in ("rivals", "rival_supports"):
+            del file["5/phone"][name]
+        del file["5/phone"].attrs[CHECKSUM]
+    again = LocalizedQueries(stored.path)
+    assert again[5, "phone"].rivals is None
+    assert again[5, "phone"].references == NAMES
+    assert again[18, "phone"].rivals == ()

@@ -364,6 +364,12 @@ def test_of_two_like_places_none_is_ok(outliers: float) -> None:
     estimate = ask(world.localizer(), [PINHOLE], np.eye(4)[None], [seen], [list(range(12))])
     assert estimate.status == "low_confidence"
     assert estimate.rival_support > 0.8
+    (rival,) = estimate.rivals  # at the other of the two places, which are 2 m apart
+    assert rival.support == estimate.rival_support
+    apart = np.abs(rival.world_from_rig[:3, 3] - estimate.world_from_rig[:3, 3])
+    np.testing.assert_allclose(apart, [2, 0, 0], atol=0.05)
+    far = estimate.scaled(10.0).rivals[0].world_from_rig
+    np.testing.assert_allclose(far[:3, 3], 10 * rival.world_from_rig[:3, 3])
 
 
 def test_what_is_there_once_decides_between_like_places() -> None:

@@ -13,7 +13,7 @@ from toolkit import geometry
 from toolkit.features.features import LocalFeatures
 from toolkit.features.matching import PairMatches
 from toolkit.geometry import Floats, Ints
-from toolkit.localizers.correspondences import Correspondences
+from toolkit.localizers.correspondences import Correspondences, Rival
 
 SEARCH_DEG = (1.0, 6.0)
 """Limits of the radius in which features are sought about a prior."""
@@ -118,6 +118,8 @@ class PoseEstimate:
     rmse_px: float = float("nan")
     rival_support: float = 0.0
     """Guided matches of the best clearly different pose, relative to this one's; 0 where there is none."""
+    rivals: tuple[Rival, ...] = ()
+    """Clearly different poses that matches agree with, too, best supported first."""
     coverage: float = 0.0
     """Share of the cells, 16 a query image, in which an inlier lies."""
     agreement: int = 0
@@ -155,7 +157,12 @@ class PoseEstimate:
             stretch = np.repeat([1.0, factor], 3)
             covariance = covariance * np.outer(stretch, stretch)
         used = replace(used, points=factor * used.points)
-        return replace(self, world_from_rig=pose, covariance=covariance, correspondences=used)
+        rivals = tuple(
+            rival._replace(world_from_rig=geometry.make_pose(of[:3, :3], factor * of[:3, 3]))
+            for rival in self.rivals
+            for of in [rival.world_from_rig]
+        )
+        return replace(self, world_from_rig=pose, covariance=covariance, correspondences=used, rivals=rivals)
 
     @property
     def position_std_m(self) -> float:

@@ -5,10 +5,10 @@ Everything that shows, exports or evaluates a localization reads this file, so t
 """
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import unquote
 
 import h5py
@@ -22,6 +22,16 @@ from toolkit.geometry import Floats, Ints
 MAPS = "maps"
 """Attribute of the file: names of the triangulated maps, one a kind of features, in the folder of maps."""
 _NAMES = ("images", "references", "rejected")
+_RIVALS = ("rivals", "rival_supports")
+
+
+class Rival(NamedTuple):
+    """A pose that is clearly another one than the answer, and that matches agree with, too."""
+
+    world_from_rig: Floats
+    """(4, 4)"""
+    support: float
+    """Its guided matches, relative to those of the answer."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +85,8 @@ class LocalizedQuery:
     rejected: list[str] = field(default_factory=list)
     """Names of the references that contradict the others."""
     correspondences: Correspondences = field(default_factory=Correspondences)
+    rivals: Sequence[Rival] | None = ()
+    """Other poses that matches agree with, best supported first; None: an older run did not keep them."""
 
     def arrays(self) -> dict[str, Any]:
         """Return what a group of the file holds, by name."""
@@ -86,6 +98,9 @@ class LocalizedQuery:
         kept |= {"pixels": kept["pixels"].astype(np.float32), "view_pixels": kept["view_pixels"].astype(np.float32)}
         kept |= {key: kept[key].astype(np.int32) for key in ("camera", "point_index", "view_of", "view_reference")}
         kept |= {"found_by": codes.astype(np.uint8), "found_by_labels": labels.astype(object).astype(text)}
+        if self.rivals is not None:
+            kept["rivals"] = np.array([rival.world_from_rig for rival in self.rivals]).reshape(-1, 4, 4)
+            kept["rival_supports"] = np.array([rival.support for rival in self.rivals], np.float64)
         return kept | names
 
 
@@ -126,13 +141,18 @@ class LocalizedQueries(Mapping[tuple[int, str], LocalizedQuery]):
             labels = np.array([label.decode() for label in stored.pop("found_by_labels")], np.str_)
             codes = stored.pop("found_by").astype(np.int64)
             names = {key: [text.decode() for text in stored.pop(key)] for key in _NAMES}
+            rivals = None
+            if "rivals" in stored:
+                poses, supports = (stored.pop(key) for key in _RIVALS)
+                pairs = zip(poses.reshape(-1, 4, 4), supports.tolist(), strict=True)
+                rivals = tuple(Rival(pose, support) for pose, support in pairs)
             wide = {"f": np.float64, "i": np.int64, "b": np.bool_}
             arrays: dict[str, Any] = {key: array.astype(wide[array.dtype.kind]) for key, array in stored.items()}
             found_by = labels[codes] if len(labels) else np.zeros(0, "U1")
             found = Correspondences(**{name: arrays[name] for name in arrays if name in _ARRAYS}, found_by=found_by)
             if wrong := [name for name in _ARRAYS if getattr(found, name).shape != _shape_of(name, found)]:
                 raise ValueError(f"{wrong[0]} has the shape {getattr(found, wrong[0]).shape}")
-            return LocalizedQuery(**names, correspondences=found)
+            return LocalizedQuery(**names, correspondences=found, rivals=rivals)
         except (*HDF5_ERRORS, AttributeError) as error:
             raise DamagedError(self.path, f"{self.path}: {name} is not as a run writes it ({first_line(error)}). "
                                "Localize again.") from None  # fmt: skip

@@ -142,23 +142,39 @@ class Map:
         pairs = sorted(files.poses_dir.glob(f"{scene}_map_{device}_query_*.h5"))
         if not pairs:
             raise ArtifactError(f"{_unknown(files, device)} Localize first: python -m toolkit run MANIFEST.")
-        settings, found, names = _last_localized(files, pairs)
-        sessions_root = Path(found[SESSIONS_ROOT])
-        reranked = Path(found[RETRIEVAL]).name == files.reranked_dir.name
+        answer = _last_localized(files, pairs)
+        reranked = Path(answer[1][RETRIEVAL]).name == files.reranked_dir.name
+        return replace(cls._stored_in(device, answer, files.features, files.maps), files=files, reranked=reranked)
+
+    @classmethod
+    def of_pair(cls, poses: str | Path, device: str, features_dir: str | Path, map_dir: str | Path) -> "Map":
+        """Open the map of a finished pair, with the settings that this pair was localized with, wherever its files lie.
+
+        Args:
+            poses: `poses/<pair>.h5`.
+            device: of the map.
+            features_dir, map_dir: as the pair was localized with.
+
+        Raises:
+            ArtifactError, WeightsError: as `open`.
+        """
+        return cls._stored_in(device, how_localized(Path(poses)), Path(features_dir), Path(map_dir))
+
+    @classmethod
+    def _stored_in(cls, device: str, answer: "Localized", features_dir: Path, map_dir: Path) -> "Map":
+        settings, found, names = answer
         kinds, escalation = create_methods(settings)
         mapped = [
             MappedFeatures(
-                LocalMap.load(files.maps / name),
-                FeatureStore.of_session(files.features, f"{device}_map", kind.extractor.settings),
+                LocalMap.load(map_dir / name),
+                FeatureStore.of_session(features_dir, f"{device}_map", kind.extractor.settings),
                 KINDS[kind.name],
                 kind.matcher,
                 kind.name,
             )
             for name, kind in zip(names, kinds if settings.map is not None else (), strict=True)
         ]
-        return cls(
-            device, sessions_root, files.maps, settings, kinds, mapped, escalation, files.features, files, reranked
-        )
+        return cls(device, Path(found[SESSIONS_ROOT]), map_dir, settings, kinds, mapped, escalation, features_dir)
 
     @cached_property
     def capture(self) -> Capture:
@@ -418,7 +434,28 @@ def _unknown(files: SceneFiles, device: str) -> str:
     return f"{files.poses_dir}: no poses of queries in the map of {device!r}. {nearest(device, devices)}"
 
 
-def _last_localized(files: SceneFiles, pairs: Sequence[Path]) -> tuple[LocalizeSettings, dict[str, Any], list[str]]:
+Localized = tuple[LocalizeSettings, dict[str, Any], list[str]]
+"""Settings that a pair was localized with, attributes of its file, and the names of its maps."""
+
+
+def how_localized(pair: Path) -> Localized:
+    """Return how the queries of a pair were localized.
+
+    Args:
+        pair: `poses/<pair>.h5`.
+
+    Raises:
+        ArtifactError: it does not tell, or is no such file.
+    """
+    try:
+        with h5py.File(pair, "r") as file:
+            found = dict(file.attrs)
+            return LocalizeSettings.of(json.loads(found[SETTINGS])), found, json.loads(found[MAPS])
+    except (*HDF5_ERRORS, ToolkitError) as error:
+        raise ArtifactError(f"{pair} does not tell how it was made ({error}). Localize again.") from None
+
+
+def _last_localized(files: SceneFiles, pairs: Sequence[Path]) -> Localized:
     """Return settings, attributes and names of the maps of the last run; pairs that it did not do may have others.
 
     Times of change do not tell which that is: clocks are set back.
@@ -429,11 +466,9 @@ def _last_localized(files: SceneFiles, pairs: Sequence[Path]) -> tuple[LocalizeS
     answers, unknown = [], ""
     for pair in pairs:
         try:
-            with h5py.File(pair, "r") as file:
-                found = dict(file.attrs)
-                answers.append((LocalizeSettings.of(json.loads(found[SETTINGS])), found, json.loads(found[MAPS])))
-        except (*HDF5_ERRORS, ToolkitError) as error:
-            unknown = f"{pair} does not tell how it was made ({error}). Localize again."
+            answers.append(how_localized(pair))
+        except ArtifactError as error:
+            unknown = str(error)
     if not answers:
         raise ArtifactError(unknown)
     return next((answer for answer in answers if answer[0] == last), answers[-1])

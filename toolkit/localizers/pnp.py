@@ -17,7 +17,7 @@ from toolkit import geometry
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import CAMERA, Asked, NetworkMatches, PoseEstimate, Prior, Query, References, agree
 from toolkit.localizers.confidence import EVIDENCE, probability_right
-from toolkit.localizers.correspondences import Correspondences
+from toolkit.localizers.correspondences import Correspondences, Rival
 from toolkit.localizers.matches import KnownMatches, MapMatcher, MappedFeatures, Vicinity
 from toolkit.localizers.misfit import find_misfit
 from toolkit.localizers.rig import Matches, RigQuery, least_squares_covariance
@@ -314,6 +314,7 @@ class PnpLocalizer:
             num_guided=len(guided),
             rmse_px=float(np.sqrt(np.mean(errors**2))) if len(errors) else float("nan"),
             rival_support=self._rival_support(hypotheses),
+            rivals=tuple(self._rivals(hypotheses)),
             coverage=self._coverage(query, inliers),
             agreement=self._agreement(inliers),
             references=tuple(shown),
@@ -385,6 +386,15 @@ class PnpLocalizer:
         first, *others = hypotheses
         rivals = (len(other.matches) for other in others if _differ(first, other))
         return next(rivals, 0) / max(len(first.matches), 1)
+
+    def _rivals(self, hypotheses: list[_Hypothesis]) -> list[Rival]:
+        """Return poses that are other ones than the best and than each other, best supported first."""
+        kept = hypotheses[:1]
+        for other in sorted(hypotheses[1:], key=lambda hypothesis: -len(hypothesis.matches)):
+            if all(_differ(known, other) for known in kept):
+                kept.append(other)
+        support = max(len(hypotheses[0].matches), 1)
+        return [Rival(other.world_from_rig, len(other.matches) / support) for other in kept[1:]]
 
     def _ransac(self, query: RigQuery, matches: Matches, max_error_deg: float, least_inliers: int = 0) -> Floats | None:
         return query.ransac(matches, self.map.points, max_error_deg, self.settings, self.seed, least_inliers)

@@ -231,10 +231,17 @@ class LocalizedPair:
         true = session.world_from_cam(first, ground_truth=True)
         return Localizations(names, self.table, estimated, true, centers, self.unit)
 
-    def details(self, k: int) -> QueryDetails:
-        """Return images, correspondences and references of query k."""
-        session, rows, query = self.query_session, self.rows[k], self.localized(k)
-        poses = self.world_from_rig[k] @ session.rig_from_cam(rows)
+    def details(
+        self, k: int, query: LocalizedQuery | None = None, world_from_rig: Floats | None = None
+    ) -> QueryDetails:
+        """Return images, correspondences and references of query k.
+
+        Args:
+            query, world_from_rig: another answer, its pose (4, 4); None: the one that the stage left.
+        """
+        session, rows = self.query_session, self.rows[k]
+        query = self.localized(k) if query is None else query
+        poses = (self.world_from_rig[k] if world_from_rig is None else world_from_rig) @ session.rig_from_cam(rows)
         cameras = []
         for row, pose in zip(rows.tolist(), poses, strict=True):
             name = session.image_name(row)
