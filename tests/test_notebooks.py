@@ -22,7 +22,7 @@ from toolkit.notebook import notebook_parameters, notebook_path
 OF_THE_RUN = {
     *("sessions_root", "out_dir", "map_feats_root", "out_jsonl", "retrieval_dir", "features_dir", "map_dir"),
     *("poses_dir", "device", "subsession", "map_device", "query_device", "queries"),
-    *("skip_existing", "pairs", "reranked_dir"),
+    *("skip_existing", "pairs", "reranked_dir", "inspect"),
 }
 FUNCTIONS = {
     "embed": "toolkit.embed:embed_sessions",
@@ -85,6 +85,8 @@ def test_parameters_of_the_run_are_arguments_of_the_stage(stage: str) -> None:
     signature = inspect.signature(function).parameters
     for name, default in notebook_parameters(notebook_path(stage)).items():
         if name not in OF_THE_RUN or (stage, name) == ("rerank", "map_dir"):  # of the table of overlaps alone
+            continue
+        if name == "inspect":  # what is shown in the end
             continue
         assert name in signature
         if default is not None and signature[name].default is not inspect.Parameter.empty:

@@ -276,6 +276,8 @@ def check_values(stage: str, values: Mapping[str, Any]) -> None:
             pairs = value if isinstance(value, list | tuple) else [value]
             fits = value is None or all(isinstance(pair, list | tuple) and len(pair) == 2 for pair in pairs)
             wanted = 'None or a list such as [["ios", "hl"]]'
+        elif name == "inspect":
+            fits, wanted = isinstance(value, int | str), "the number of a query, or the name of an image of it"
         elif default is None:
             fits, wanted = value is None or isinstance(value, str | Path), "None or the path of a folder, a text"
         else:

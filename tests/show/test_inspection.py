@@ -1,0 +1,272 @@
+"""One query of a run under the glass: it shows what was stored, and localizes again as the run did."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.localized import some_correspondences, write_pair
+from tests.rendered import LIST, write_retrieval
+from toolkit.capture import Capture
+from toolkit.errors import ArtifactError, ManifestError
+from toolkit.files import SceneFiles
+from toolkit.geometry import invert
+from toolkit.localize import localize_pairs
+from toolkit.localizers.correspondences import LocalizedQuery, Rival
+from toolkit.manifest import LocalizeSettings
+from toolkit.show.answers import reason_in_words
+from toolkit.show.choice import Choice, choose, find_query
+from toolkit.show.inspection import InspectedPair, WorstQueries, inspect_query
+from toolkit.show.inspection_view import _draw_from_above, _draw_near, _marks_of, _position_covariance
+
+
+@pytest.fixture(scope="module")
+def files(
+    small_capture: Path, small_features: Path, made_once: Callable[[str, Callable[[Path], object]], Path]
+) -> SceneFiles:
+    """A run that has localized the robot's rig in the phone's map by PnP; do not write to it."""
+
+    def make(folder: Path) -> None:
+        files = SceneFiles(folder, small_capture.name)
+        shutil.copytree(small_features, files.features)
+        capture = Capture.open(small_capture)
+        write_retrieval(files.retrieval("ios", "spot"), capture["ios_map"], capture["spot_query"])
+        folders = files.retrieval_dir, files.poses_dir, files.features, files.maps
+        devices = {"map_device": "ios", "query_device": "spot"}
+        localize_pairs(small_capture / "sessions", *folders, queries=LIST, workers=1, **devices)
+
+    return SceneFiles(made_once("inspected", make), small_capture.name)
+
+
+@pytest.fixture(scope="module")
+def pair(files: SceneFiles) -> InspectedPair:
+    return InspectedPair("ios", "spot", files.poses_dir)
+
+
+def written(
+    capture: Path, folder: Path, queries: list[LocalizedQuery], device: str = "ios", **columns: object
+) -> InspectedPair:
+    """A pair written by hand, its attributes like those of a run."""
+    import h5py
+
+    from toolkit.localizers.map import RETRIEVAL, SESSIONS_ROOT, SETTINGS
+
+    poses = folder / capture.name / "poses"
+    stem = write_pair(Capture.open(capture), poses, "ios", device, queries, **columns)  # type: ignore[arg-type]
+    with h5py.File(f"{stem}.h5", "a") as file:
+        file.attrs[SETTINGS] = LocalizeSettings(world_up=[0.0, 0.0, 1.0]).model_dump_json()
+        file.attrs[SESSIONS_ROOT] = str(capture / "sessions")
+        file.attrs[RETRIEVAL] = str(folder / capture.name / "retrieval")
+    return InspectedPair("ios", device, poses)
+
+
+def text_of(figure: object) -> str:
+    return "\n".join(text.get_text() for text in figure.findobj(lambda artist: hasattr(artist, "get_text")))  # type: ignore[attr-defined]
+
+
+def test_it_shows_what_the_stage_stored(files: SceneFiles, pair: InspectedPair) -> None:
+    one = inspect_query(files.run, files.scene, "ios", "spot", 1)
+    row = pd.read_csv(files.poses_csv("ios", "spot")).iloc[1]
+    stored = pair.localized.queries[int(row["timestamp"]), row["device_id"]]
+    assert one.status == row["status"]
+    assert one.numbers["num_inliers"] == row["num_inliers"]
+    assert one.matches["inliers"].sum() == stored.correspondences.inlier.sum() > 0
+    assert one.matches.to_numpy().sum() == len(stored.correspondences)
+    assert one.references["name"][one.references["used"]].tolist() == stored.references
+    ranked = one.references.dropna(subset="rank")
+    assert ranked["rank"].min() == 1
+    assert ranked.sort_values("rank")["score"].notna().all()
+    legend = [mark.get_label() for mark in _marks_of(one.correspondences)]
+    for kind, counts in one.matches.iterrows():
+        if counts["inliers"]:
+            assert f"{str(kind).replace('/', ', ')}: {counts['inliers']} inliers" in legend
+    shown = text_of(one.figure)
+    assert one.status in shown
+    assert f"{row['num_inliers']}" in shown
+    assert one._repr_png_().startswith(b"\x89PNG")
+
+
+def test_unchanged_settings_give_the_same_pose_and_others_are_shown_beside(pair: InspectedPair) -> None:
+    one = pair.look(0)
+    same = one.again()
+    assert same.after.pose is not None
+    np.testing.assert_allclose(same.after.pose, one.pose, atol=1e-12)
+    np.testing.assert_allclose(same.after.covariance, one.covariance, rtol=1e-9)
+    assert same.after.status == one.status
+    assert len(same.after.correspondences) == len(one.correspondences)
+    assert (same.after.rivals, one.rivals) == ((), ())
+    strict = one.again({"pnp": {"min_inliers": 5000}})
+    assert strict.after.status.startswith("failed: too few inliers")
+    assert "at least 5000 are asked for" in strict.after.reason
+    assert strict.before is one
+    assert strict.table.loc["status"].tolist() == [one.status, strict.after.status]
+    assert strict._repr_png_().startswith(b"\x89PNG")
+    nearest = one.again({"method": "nearest"})
+    assert nearest.after.method == "nearest"
+    first = one.references[one.references["rank"] == 1]  # one of each camera of the rig
+    assert nearest.after.localized.references == [first["name"][first["score"].idxmax()]]
+    with pytest.raises(ManifestError, match=r"max_keypoints|features: found other settings"):
+        one.again({"features": {"max_keypoints": 500}})
+    with pytest.raises(ManifestError, match="min_inliers"):
+        one.again({"pnp": {"min_inlier": 5}})
+
+
+def test_the_worst_is_the_worst(small_capture: Path, tmp_path: Path) -> None:
+    off = [0.0, 0.3, 0.02]
+    pair = written(small_capture, tmp_path, [LocalizedQuery()] * 3, off_m=off)
+    assert pair.look("worst").number == 1
+    assert pair.worst_first() == [1, 2, 0]
+    assert pair.look(1).error[1] == pytest.approx(0.3)
+    worst = WorstQueries.of(pair._h5.parent)
+    assert [worst.look(rank).number for rank in range(3)] == [1, 2, 0]
+    assert worst.names[0].endswith(pair.names[1])
+    with pytest.raises(ArtifactError, match="to 2"):
+        worst.look(3)
+    assert WorstQueries.of(tmp_path).names == []
+
+
+def test_a_failed_query_says_why_and_is_drawn(small_capture: Path, tmp_path: Path) -> None:
+    status = ["failed: too few inliers (4 within 0.45 deg)", "failed: no references"]
+    counts = {"num_inliers": [4, 0], "num_matches": [9, 0]}
+    pair = written(small_capture, tmp_path, [LocalizedQuery()] * 2, status=status, **counts)
+    one = pair.look(0)
+    assert one.pose is None
+    assert one.error is None
+    assert one.reason == (
+        "No pose: too few inliers (4 within 0.45 deg) of 9 matches agree on the best one, at least 12 are asked for."
+    )
+    assert "no pose" in text_of(one.figure)
+    assert one._repr_png_().startswith(b"\x89PNG")
+    assert pair.look(1).reason == "No pose: the retrieval has no references for this query."
+
+
+def test_rivals_are_drawn_where_they_are(small_capture: Path, tmp_path: Path) -> None:
+    from toolkit.show.figures import new_figure
+
+    session = Capture.open(small_capture)["ios_query"]
+    pose = session.world_from_cam([0], ground_truth=True)[0].copy()
+    pose[:3, 3] += [0.5, 0.0, 0.0]
+    found = some_correspondences([0] * 6, [True, False, True, True, False, True])
+    query = LocalizedQuery([session.image_name(0)], [], [], found, (Rival(pose, 0.93),))
+    one = written(small_capture, tmp_path, [query]).look(0)
+    axis = new_figure(4, 4).subplots()
+    _draw_from_above(axis, [(one, "estimated", "red")])
+    drawn = {each.get_label(): each.get_offsets() for each in axis.collections}
+    np.testing.assert_allclose(drawn["rival, 93% of the support"], [pose[:2, 3]], atol=1e-9)
+    assert one.matches.loc["sift/descriptors"].tolist() == [4, 2]
+
+
+def test_the_ellipse_is_of_the_camera_not_of_the_rig(pair: InspectedPair) -> None:
+    one = pair.look(0)
+    rig_from_cam = one.pair.query_session.rig_from_cam(one.pair.rows[0])
+    names = [one.pair.query_session.image_name(int(row)) for row in one.pair.rows[0]]
+    camera = names.index(one.details.cameras[0].name)
+    rng = np.random.default_rng(0)
+    moves = rng.multivariate_normal(np.zeros(6), one.covariance, 20_000)
+    at = rig_from_cam[camera][:3, 3]
+    places = at + moves[:, 3:] + np.cross(moves[:, :3], at)
+    expected = np.cov((places @ one.pose[:3, :3].T).T)
+    np.testing.assert_allclose(_position_covariance(one), expected, atol=0.05 * np.abs(expected).max())
+
+
+def test_what_is_not_known_is_not_shown(files: SceneFiles, small_capture: Path, tmp_path: Path) -> None:
+    from toolkit.show.figures import new_figure
+
+    capture = Path(shutil.copytree(small_capture, tmp_path / small_capture.name))
+    for truth in (capture / "sessions" / "spot_query").rglob("*trajector*"):
+        truth.unlink()
+    one = InspectedPair("ios", "spot", files.poses_dir, sessions_root=capture / "sessions").look(0)
+    assert one.true_pose is None
+    assert one.error is None
+    assert "true" not in text_of(one.figure)
+    axis = new_figure(4, 4).subplots()
+    _draw_near(axis, [(one, "estimated", "red")])
+    assert "true" not in axis.get_legend_handles_labels()[1]
+
+
+def test_names_and_numbers_that_are_none_are_refused(files: SceneFiles, pair: InspectedPair) -> None:
+    name = pair.localized.query_session.image_name(int(pair.localized.rows[2][-1]))
+    assert pair.number_of(name) == pair.number_of(name.partition("raw_data/")[2]) == 2
+    assert pair.number_of(f"SMALL/sessions/{name}") == 2
+    with pytest.raises(ArtifactError, match=f"The nearest of its .* images is '{name}'"):
+        pair.look(name.replace("raw_data", "raw_dat"))
+    with pytest.raises(ArtifactError, match=f"expected a number from 0 to {len(pair) - 1}"):
+        pair.look(len(pair))
+    with pytest.raises(ArtifactError, match=r"expected a number or the name of an image"):
+        pair.look(1.5)  # type: ignore[arg-type]
+    with pytest.raises(ArtifactError, match="2 queries have an image whose name ends in"):
+        find_query("b.jpg", {"x/b.jpg": 0, "y/b.jpg": 1, "y/ab.jpg": 2}, 3)
+    with pytest.raises(ArtifactError, match=r"no correspondences of queries of 'spt'.*Did you mean .*spot"):
+        inspect_query(files.run, files.scene, "ios", "spt", 0)
+    with pytest.raises(ArtifactError, match=r"no poses of the scene 'SMAL'.*Known: SMALL"):
+        inspect_query(files.run, "SMAL", "ios", "spot", 0)
+
+
+def test_a_run_without_correspondences_says_so(files: SceneFiles, tmp_path: Path) -> None:
+    poses = tmp_path / "run" / files.scene / "poses"
+    shutil.copytree(files.poses_dir, poses)
+    for stored in poses.glob("*.h5*"):
+        stored.unlink()
+    with pytest.raises(ArtifactError, match=r"no correspondences of queries of 'spot' in the map of 'ios'.*Localize"):
+        inspect_query(tmp_path / "run", files.scene, "ios", "spot", 0)
+
+
+def test_an_estimate_in_doubt_says_why() -> None:
+    numbers = {"num_inliers": 20, "num_matches": 80, "inlier_ratio": 0.25, "coverage": 0.2, "p_correct": 0.7}
+    words = reason_in_words("low_confidence", "", numbers | {"rival_support": 0.93}, LocalizeSettings())
+    assert "probability of 70% only, ok asks for 99%" in words
+    assert "Another pose has 93% of its support, ok allows 80%" in words
+    nearest = reason_in_words("low_confidence", "", {}, LocalizeSettings.of({"method": "nearest"}))
+    assert nearest == "This is the pose of the best reference as it stands, which is never called ok."
+    fits = "the focal length that fits is 500 px"
+    camera = reason_in_words("low_confidence: camera?", fits, numbers, LocalizeSettings())
+    assert camera.endswith("The focal length that fits is 500 px.")
+
+
+def test_a_list_chooses_what_is_shown(pair: InspectedPair, monkeypatch: pytest.MonkeyPatch) -> None:
+    import IPython.display
+    import ipywidgets
+
+    from toolkit.runs.kernel import TEXT_BARS
+
+    class Handle:
+        def update(self, shown: object, **more: object) -> None:
+            outputs.append(shown)
+
+    outputs: list[object] = []
+
+    def display(shown: object, **more: object) -> Handle:
+        outputs.append(shown)
+        return Handle()
+
+    monkeypatch.setattr(IPython.display, "display", display)
+    monkeypatch.delenv(TEXT_BARS, raising=False)
+    choice = choose(pair, 1)
+    listed, first = outputs
+    assert isinstance(listed, ipywidgets.Dropdown)
+    assert (first.number, listed.value) == (1, 1)  # type: ignore[attr-defined]
+    listed.value = 2
+    assert outputs[-1] is choice.shown
+    assert choice.shown.number == 2
+    monkeypatch.setenv(TEXT_BARS, "1")
+    outputs.clear()
+    choose(pair, pair.names[0])
+    assert [type(shown).__name__ for shown in outputs] == ["Inspection"]
+
+
+def test_asking_in_a_notebook_does_not_end_it(
+    capsys: pytest.CaptureFixture[str], pair: InspectedPair
+) -> None:
+    Choice(pair.look(0)).attempt(lambda query: query.again({"features": {"max_keypoints": 5}}))
+    assert "features" in capsys.readouterr().out
+    Choice(None).attempt(lambda query: pytest.fail("there is none"))
+
+
+def test_the_error_is_that_of_the_rig(pair: InspectedPair) -> None:
+    one = pair.look(0)
+    assert one.true_pose is not None
+    between = invert(one.pose) @ one.true_pose
+    assert one.error[1] == pytest.approx(np.linalg.norm(between[:3, 3]))

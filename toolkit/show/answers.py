@@ -1,0 +1,183 @@
+"""What is known of how one query was localized: its status in words, numbers, correspondences, pose and rivals."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import pandas as pd
+
+from toolkit.geometry import Floats
+from toolkit.localizers.base import CAMERA
+from toolkit.localizers.correspondences import Correspondences, LocalizedQuery, Rival
+from toolkit.manifest import LocalizeSettings
+from toolkit.show.localized import LocalizedPair, QueryDetails
+from toolkit.show.metrics import pose_errors
+
+NUMBERS = (
+    "num_inliers", "num_matches", "inlier_ratio", "num_guided", "rmse_px", "coverage", "p_correct", "rival_support",
+    "agreement", "position_std_m", "rotation_std_deg", "scale_std",
+)  # fmt: skip
+"""What the table of a pair and an estimate say of a pose, by one name."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """How one query of a pair was localized."""
+
+    pair: LocalizedPair
+    number: int
+    """Of the query, as the pair's recording counts them."""
+    status: str
+    """`ok`, `low_confidence...` or `failed: ...`."""
+    method: str
+    """How the pose was found, or the method that found none."""
+    reason: str
+    """Why it has this status, in words."""
+    numbers: dict[str, float]
+    """By the names of `NUMBERS`, as far as they are known."""
+    localized: LocalizedQuery
+    """Names of images and references, correspondences, rivals."""
+    pose: Floats | None
+    """world_from_rig (4, 4); of a single camera world_from_cam. None: there is none."""
+    covariance: Floats | None
+    """(6, 6), see `PoseEstimate`; None where it is not known."""
+    settings: LocalizeSettings
+    """That it was localized with."""
+    seconds: float
+    """That it took."""
+    true_pose: Floats | None = None
+    """world_from_rig (4, 4), None where it is not known."""
+    retrieved: dict[str, tuple[int, float]] = field(default_factory=dict)
+    """Rank, from 1, and score of the references that were retrieved, by name; of a rig's cameras the best rank."""
+
+    @property
+    def name(self) -> str:
+        """Of its first image."""
+        return str(self.pair.localizations.names[self.number])
+
+    @property
+    def headline(self) -> str:
+        """Which query this is, and its status."""
+        devices = f"{self.pair.query_session.device} in the map of {self.pair.map_session.device}"
+        return f"query {self.number} of {devices}: {self.status}"
+
+    @property
+    def correspondences(self) -> Correspondences:
+        return self.localized.correspondences
+
+    @property
+    def rivals(self) -> Sequence[Rival] | None:
+        """Other poses that matches agree with; None: the run is older than the files that keep them."""
+        return self.localized.rivals
+
+    @cached_property
+    def details(self) -> QueryDetails:
+        """Its images and references, with what is seen in each."""
+        nowhere = np.full((4, 4), np.nan)
+        return self.pair.details(self.number, self.localized, nowhere if self.pose is None else self.pose)
+
+    @property
+    def error(self) -> tuple[float, float] | None:
+        """Error of rotation, degrees, and position, meters; None without a pose, or where the truth is not known."""
+        if self.pose is None or self.true_pose is None:
+            return None
+        rotation_deg, translation_m = pose_errors(self.pose[None], self.true_pose[None])
+        return float(rotation_deg[0]), float(translation_m[0])
+
+    @cached_property
+    def matches(self) -> pd.DataFrame:
+        """Counts of the correspondences: a row a kind (`sift/guided`), columns inliers and rejected."""
+        found = self.correspondences
+        kinds = sorted(set(found.found_by.tolist()))
+        counts = [
+            (int(found.inlier[found.found_by == kind].sum()), int((~found.inlier[found.found_by == kind]).sum()))
+            for kind in kinds
+        ]
+        return pd.DataFrame(counts, pd.Index(kinds, name="found by"), ["inliers", "rejected"], dtype=int)
+
+    @cached_property
+    def references(self) -> pd.DataFrame:
+        """A row a reference that was retrieved or used, best first.
+
+        Columns: name; rank and score (of the retrieval, of the rig's camera that ranks it highest); used (whether the
+        pose rests on it); rejected (whether it contradicts the others); inliers (correspondences that it sees, of those
+        references whose views were kept; else missing).
+        """
+        retrieved, found, used = self.retrieved, self.correspondences, self.localized.references
+        names = list(dict.fromkeys([*used, *self.localized.rejected, *retrieved]))
+        kept = set(found.view_reference.tolist())
+        rows = []
+        for name in names:
+            rank, score = retrieved.get(name, (None, np.nan))
+            number = used.index(name) if name in used else -1
+            inliers = int(found.inlier[found.view_of[found.view_reference == number]].sum()) if number in kept else None
+            rows.append((name, rank, score, name in used, name in self.localized.rejected, inliers))
+        table = pd.DataFrame(rows, columns=["name", "rank", "score", "used", "rejected", "inliers"])
+        return table.astype({"rank": "Int64", "inliers": "Int64"})
+
+    def __repr__(self) -> str:
+        return f"{self.headline}\n{self.name}\n{self.reason}"
+
+
+def reason_in_words(
+    status: str, stated: str, numbers: Mapping[str, float], settings: LocalizeSettings, method: str = "pnp"
+) -> str:
+    """Return why a query has its status, for a person.
+
+    Args:
+        stated: what the localizer says beyond the status.
+        numbers: by the names of `NUMBERS`.
+        settings: that it was localized with; they hold the limits.
+        method: how the pose was found; of `feed_forward` references agree, not matches.
+    """
+    kind, _, detail = status.partition(": ")
+    also = f" {stated[0].upper()}{stated[1:]}." if stated else ""
+    if kind == "failed":
+        return _why_failed(detail, numbers, settings) + also
+    if status == CAMERA:
+        return "The matches contradict the intrinsics that are stated for the camera." + also
+    if detail:
+        return f"{detail[0].upper()}{detail[1:]}.{also}"
+    if settings.method == "nearest":
+        return "This is the pose of the best reference as it stands, which is never called ok." + also
+    if kind == "low_confidence":
+        return " ".join([*_doubts(numbers, settings), *_support(numbers, method)]) + also
+    return " ".join(_support(numbers, method)) + also
+
+
+def _why_failed(detail: str, numbers: Mapping[str, float], settings: LocalizeSettings) -> str:
+    count, least = int(numbers.get("num_matches", 0)), settings.pnp.min_inliers
+    if detail == "too few matches":
+        return f"No pose: {count} matches with the map are too few to tell one."
+    if detail == "no consistent pose":
+        return f"No pose: of {count} matches too few agree on any one."
+    if detail.startswith("too few inliers"):
+        return f"No pose: {detail} of {count} matches agree on the best one, at least {least} are asked for."
+    if detail == "no references":
+        return "No pose: the retrieval has no references for this query."
+    return f"No pose: {detail}."
+
+
+def _doubts(numbers: Mapping[str, float], settings: LocalizeSettings) -> list[str]:
+    doubts, limits = [], settings.pnp
+    probability, rival = numbers.get("p_correct", np.nan), numbers.get("rival_support", 0.0)
+    if probability < limits.ok_probability:
+        asked = f"{limits.ok_probability:.0%}"
+        doubts.append(f"It is right with a probability of {probability:.0%} only, ok asks for {asked}.")
+    if rival > limits.ok_rival_support:
+        doubts.append(f"Another pose has {rival:.0%} of its support, ok allows {limits.ok_rival_support:.0%}.")
+    return doubts or ["It has too little support to be trusted."]
+
+
+def _support(numbers: Mapping[str, float], method: str) -> list[str]:
+    if not numbers.get("num_matches"):
+        return ["The pose rests on the references as a whole, not on matches."]
+    if method.rpartition("/")[2].startswith("feed_forward"):
+        return [f"{numbers['num_inliers']:.0f} of {numbers['num_matches']:.0f} references agree on the pose."]
+    share, coverage = numbers.get("inlier_ratio", np.nan), numbers.get("coverage", np.nan)
+    text = f"{numbers['num_inliers']:.0f} of {numbers['num_matches']:.0f} matches agree on the pose ({share:.0%})"
+    parts = [text + (f", in {coverage:.0%} of the image." if coverage > 0 else ".")]
+    rival = numbers.get("rival_support", 0.0)
+    parts.append(f"The best other pose has {rival:.0%} of its support." if rival else "No other pose was found.")
+    return parts

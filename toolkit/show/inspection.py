@@ -1,0 +1,326 @@
+"""One query of a finished run under the glass: what the localize stage stored of it, in words, numbers and pictures.
+
+Nothing here localizes, except `Inspection.again`, which is asked to.
+"""
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from toolkit.capture import Capture, Trajectory
+from toolkit.errors import ArtifactError
+from toolkit.files import SceneFiles, image_name, read_references
+from toolkit.geometry import Floats
+from toolkit.localizers.again import LocalizeAgain
+from toolkit.localizers.map import RETRIEVAL, SESSIONS_ROOT, Map, how_localized, label
+from toolkit.manifest import nearest
+from toolkit.show.answers import NUMBERS, Answer, reason_in_words
+from toolkit.show.choice import find_query
+from toolkit.show.inspection_view import draw_comparison, draw_inspection
+from toolkit.show.localized import LocalizedPair
+from toolkit.show.metrics import is_posed, pose_errors, worst_first
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+WORST = "worst"
+"""Stands for the number of the worst query."""
+
+
+@dataclass(frozen=True, repr=False)
+class Inspection(Answer):
+    """One query of a pair, as it was localized. A notebook shows it as its picture."""
+
+    of: "InspectedPair" = field(kw_only=True)
+    """What it was taken from."""
+
+    def again(self, changes: Mapping[str, Any] | None = None) -> "Comparison":
+        """Localize the query again, from the stored features and references, with some settings changed.
+
+        Args:
+            changes: of the settings of the run, such as `{"pnp": {"min_inliers": 30}}`.
+
+        Returns:
+            This, and what comes out now. Nothing is written.
+
+        Raises:
+            ManifestError: no such setting, or one that the features or the map were made with.
+            ToolkitError: features, the map or weights of the run are missing.
+        """
+        return Comparison(self, self.of.localize(self.number, changes or {}), dict(changes or {}))
+
+    @cached_property
+    def figure(self) -> "Figure":
+        """The picture."""
+        return draw_inspection(self)
+
+    def _repr_png_(self) -> bytes:
+        return bytes(self.figure._repr_png_())  # type: ignore[attr-defined]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One query localized twice. A notebook shows it as its picture."""
+
+    before: Inspection
+    after: Inspection
+    changes: dict[str, Any]
+    """Of the settings."""
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """What is known of both, columns before and after."""
+        columns = {}
+        for name, one in (("before", self.before), ("after", self.after)):
+            error = dict(zip(("rotation_error_deg", "translation_error_m"), one.error or (), strict=False))
+            columns[name] = {"status": one.status, "method": one.method, **one.numbers, **error, "seconds": one.seconds}
+        return pd.DataFrame(columns, dtype=object)
+
+    @cached_property
+    def figure(self) -> "Figure":
+        """The picture: both beside each other."""
+        return draw_comparison(self.before, self.after, self.changes)
+
+    def __repr__(self) -> str:
+        return f"{self.changes or 'nothing changed'}\nbefore: {self.before!r}\nafter: {self.after!r}"
+
+    def _repr_png_(self) -> bytes:
+        return bytes(self.figure._repr_png_())  # type: ignore[attr-defined]
+
+
+class InspectedPair:
+    """The queries of one pair of a finished run, to look at one after the other."""
+
+    def __init__(
+        self,
+        map_device: str,
+        query_device: str,
+        poses_dir: str | Path,
+        features_dir: str | Path | None = None,
+        map_dir: str | Path | None = None,
+        sessions_root: str | Path | None = None,
+    ) -> None:
+        """
+        Args:
+            map_device, query_device: the pair.
+            poses_dir, features_dir, map_dir: as the localize stage had them; None: beside the poses, as a run has them.
+            sessions_root: `<capture>/sessions`; None: where it was when the pair was localized.
+
+        Raises:
+            ArtifactError: no such pair, or its files are missing or torn.
+        """
+        pairs = sorted(Path(poses_dir).glob("*_map_*_query_*.h5"))
+        names = [path.stem.rpartition("_map_")[2].partition("_query_")[::2] for path in pairs]
+        if (map_device, query_device) not in names:
+            known = [f"({map_!r}, {query!r})" for map_, query in names]
+            raise ArtifactError(
+                f"{poses_dir}: no correspondences of queries of {query_device!r} in the map of {map_device!r}, "
+                f"`<pair>.h5`. {nearest(f'({map_device!r}, {query_device!r})', known)} Localize first: "
+                "python -m toolkit run MANIFEST."
+            )
+        self.map_device, self.query_device = map_device, query_device
+        self._h5 = pairs[names.index((map_device, query_device))]
+        beside = SceneFiles(self._h5.parents[2], self._h5.parents[1].name)
+        self._features_dir, self._map_dir = Path(features_dir or beside.features), Path(map_dir or beside.maps)
+        self.settings, found, _ = how_localized(self._h5)
+        self.retrieval = Path(found[RETRIEVAL]) / f"{self._h5.stem}.jsonl"
+        capture = Capture.from_sessions_root(sessions_root or found[SESSIONS_ROOT])
+        self.localized = LocalizedPair.open(capture, map_device, query_device, poses_dir, self._map_dir)
+        self.names = self.localized.localizations.names
+        """Of the first image of each query."""
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def label(self) -> str:
+        return f"{self.query_device} in the map of {self.map_device}"
+
+    @cached_property
+    def true(self) -> Floats:
+        """world_from_rig (Q, 4, 4); NaN where it is not known."""
+        truth, table = self.localized.query_session.ground_truth, self.localized.table
+        if truth is None:
+            return np.full((len(self), 4, 4), np.nan)
+        return truth.lookup(table["timestamp"].to_numpy(), table["device_id"])
+
+    def _true(self, number: int) -> Floats | None:
+        return self.true[number] if is_posed(self.true[number]) else None
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """The pair's csv with the errors, NaN where the truth is not known: rotation_error_deg, translation_error_m."""
+        rotation_deg, translation_m = pose_errors(self.localized.world_from_rig, self.true)
+        return self.localized.table.assign(rotation_error_deg=rotation_deg, translation_error_m=translation_m)
+
+    def worst_first(self) -> list[int]:
+        """Return the numbers of the queries from the worst to the best, see `metrics.worst_first`."""
+        return [int(number) for number in worst_first(self.table)]
+
+    def number_of(self, query: int | str) -> int:
+        """Return the number of a query.
+
+        Args:
+            query: its number, the name of an image of it (or the end of the name, if no other ends so), or `worst`.
+
+        Raises:
+            ArtifactError: there is none, or several; names the nearest.
+        """
+        if query == WORST and len(self):
+            return self.worst_first()[0]
+        session = self.localized.query_session
+        of_images = {
+            session.image_name(int(row)): number for number, rows in enumerate(self.localized.rows) for row in rows
+        }
+        return find_query(query, of_images, len(self))
+
+    def look(self, query: int | str = 0) -> Inspection:
+        """Return a query as the stage left it.
+
+        Args:
+            query: see `number_of`.
+
+        Raises:
+            ArtifactError: no such query, or what is stored of it is damaged.
+        """
+        number = self.number_of(query)
+        row = self.localized.table.iloc[number]
+        pose = self.localized.world_from_rig[number]
+        numbers = {name: float(row[name]) for name in NUMBERS if name in row and pd.notna(row[name])}
+        status, stated = str(row["status"]), str(row["reason"]) if pd.notna(row.get("reason")) else ""
+        method = str(row["method"])
+        return Inspection(
+            self.localized, number, status, method, reason_in_words(status, stated, numbers, self.settings, method),
+            numbers, self.localized.localized(number), pose if is_posed(pose) else None, self._covariance(number),
+            self.settings, float(row.get("seconds", np.nan)), self._true(number), self._retrieved(number), of=self,
+        )  # fmt: skip
+
+    def localize(self, query: int | str, changes: Mapping[str, Any]) -> Inspection:
+        """Localize a query again; see `Inspection.again`."""
+        number = self.number_of(query)
+        settings = self._again.settings(changes)
+        estimate, localized, seconds = self._again.localize(self.localized.rows[number], settings)
+        method = label(settings, "" if estimate.world_from_rig is None else estimate.found_by)
+        numbers = {name: float(value) for name in NUMBERS if np.isfinite(value := getattr(estimate, name))}
+        return Inspection(
+            self.localized, number, estimate.status, method,
+            reason_in_words(estimate.status, estimate.reason, numbers, settings, method), numbers, localized,
+            estimate.world_from_rig, estimate.covariance, settings, seconds, self._true(number),
+            self._retrieved(number), of=self,
+        )  # fmt: skip
+
+    @cached_property
+    def _again(self) -> LocalizeAgain:
+        """Opens the map when it is first asked for."""
+        place = Map.of_pair(self._h5, self.map_device, self._features_dir, self._map_dir)
+        return LocalizeAgain(place, self.localized.query_session, self.retrieval)
+
+    @cached_property
+    def _covariances(self) -> dict[tuple[int, str], Floats]:
+        poses = Trajectory.read(self._h5.with_suffix(".txt"))
+        keys = zip(poses.timestamps.tolist(), map(str, poses.device_ids), strict=True)
+        return {} if poses.covariances is None else dict(zip(keys, poses.covariances, strict=True))
+
+    def _covariance(self, number: int) -> Floats | None:
+        row = self.localized.table.iloc[number]
+        found = self._covariances.get((int(row["timestamp"]), str(row["device_id"])))
+        return found if found is not None and np.isfinite(found).all() else None
+
+    @cached_property
+    def _topk(self) -> dict[tuple[int, str], list[dict[str, Any]]]:
+        with suppress(ArtifactError):  # the poses are there without the references that they were sought with
+            rows = read_references(self.retrieval)
+            return {(int(row["timestamp"]), str(row["sensor_id"])): row["topk"] for row in rows}
+        return {}
+
+    def _retrieved(self, number: int) -> dict[str, tuple[int, float]]:
+        images = self.localized.query_session.images.iloc[self.localized.rows[number]]
+        found: dict[str, tuple[int, float]] = {}
+        for key in zip(images["timestamp"].tolist(), images["sensor_id"].astype(str).tolist(), strict=True):
+            for rank, hit in enumerate(self._topk.get(key, []), start=1):
+                name = image_name(hit["path"])
+                here = rank, float(hit.get("score", np.nan))
+                found[name] = min(found.get(name, here), here, key=lambda one: (one[0], -one[1]))
+        return dict(sorted(found.items(), key=lambda item: item[1][0]))
+
+
+class WorstQueries:
+    """The queries of several pairs, the worst first, to look at one after the other."""
+
+    def __init__(self, pairs: Sequence[InspectedPair]) -> None:
+        self._pairs = list(pairs)
+        tables = [pair.table.assign(pair=at, number=range(len(pair))) for at, pair in enumerate(self._pairs)]
+        nothing = pd.DataFrame({"status": [], "pair": [], "number": []})
+        table = pd.concat(tables, ignore_index=True) if tables else nothing
+        self.table = table.iloc[worst_first(table)].reset_index(drop=True) if len(table) else table
+        """A row a query: those of `InspectedPair.table`, pair and number."""
+        of_each = zip(self.table["pair"], self.table["number"], strict=True)
+        self.names = [f"{self._pairs[at].label}: {self._pairs[at].names[number]}" for at, number in of_each]
+
+    @classmethod
+    def of(
+        cls,
+        poses_dir: str | Path,
+        map_dir: str | Path | None = None,
+        sessions_root: str | Path | None = None,
+        map_device: str = "all",
+        query_device: str = "all",
+    ) -> "WorstQueries":
+        """Return those of the pairs in a folder of poses whose correspondences were stored.
+
+        Args:
+            poses_dir, map_dir, sessions_root: as for `InspectedPair`.
+            map_device, query_device: of the pairs, or `all`.
+        """
+        pairs = []
+        for stem in sorted(path.with_suffix("") for path in Path(poses_dir).glob("*_map_*_query_*.h5")):
+            mapped, _, queried = stem.name.rpartition("_map_")[2].partition("_query_")
+            if map_device in ("all", mapped) and query_device in ("all", queried):
+                with suppress(ArtifactError):  # a pair that was not finished has no table
+                    pairs.append(InspectedPair(mapped, queried, poses_dir, None, map_dir, sessions_root))
+        return cls(pairs)
+
+    def look(self, rank: int | str = 0) -> Inspection:
+        """Return a query by its rank, 0 for the worst of all.
+
+        Raises:
+            ArtifactError: there are not so many.
+        """
+        if not isinstance(rank, int | np.integer) or not 0 <= rank < len(self.names):
+            raise ArtifactError(f"query: found {rank!r}, expected a rank from 0, the worst, to {len(self.names) - 1}.")
+        row = self.table.iloc[int(rank)]
+        return self._pairs[int(row["pair"])].look(int(row["number"]))
+
+
+def inspect_query(
+    run: str | Path,
+    scene: str,
+    map: str,  # noqa: A002
+    query: str,
+    n: int | str = 0,
+) -> Inspection:
+    """Return one query of a finished run as the localize stage left it.
+
+    Args:
+        run: the run folder, `<output_root>/<manifest name>`.
+        scene: the capture's name.
+        map, query: devices of the pair, such as `ios` and `hl`.
+        n: number of the query, name of an image of it (or its end), or `worst`.
+
+    Raises:
+        ArtifactError: no such run, pair or query (the nearest is named), or its files are missing or torn.
+    """
+    files = SceneFiles(Path(run), scene)
+    if not files.poses_dir.is_dir():
+        runs = [path.parent.parent.name for path in Path(run).glob("*/poses/settings.json")]
+        raise ArtifactError(
+            f"{files.poses_dir}: no poses of the scene {scene!r} in the run {run}. {nearest(scene, runs)} "
+            "Localize first: python -m toolkit run MANIFEST."
+        )
+    return InspectedPair(map, query, files.poses_dir, files.features, files.maps).look(n)
