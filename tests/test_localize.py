@@ -209,7 +209,7 @@ def test_nearest_is_the_pose_of_the_best_reference_and_labeled(small_capture: Pa
 @pytest.mark.parametrize(
     ("wrong", "error", "message"),
     [
-        ({"method": "magic"}, ManifestError, r"method: found 'magic'.*'pnp', 'nearest'"),
+        ({"method": "magic"}, ManifestError, r"method: found 'magic'.*nearest, pnp"),
         ({"map_device": "drone"}, ToolkitError, r"drone.*ios, hl, spot"),
         ({"query_device": "drone"}, ToolkitError, r"drone.*ios, hl, spot"),
         ({"queries": "keyframes_best"}, CaptureError, "original"),

@@ -19,7 +19,16 @@ import pytest
 
 from tests.test_pipeline import execute_here, place, write_notebook
 from toolkit import __main__, notebook, pipeline
-from toolkit.errors import OF_THE_DATA, ManifestError, StageError, ToolkitError, exit_code, sentence, shortage
+from toolkit.errors import (
+    OF_THE_DATA,
+    CaptureError,
+    ManifestError,
+    StageError,
+    ToolkitError,
+    exit_code,
+    sentence,
+    shortage,
+)
 from toolkit.runs.folder import LOG, held
 from toolkit.runs.record import RunLog
 
@@ -389,7 +398,13 @@ def test_what_builds_on_a_failed_stage_is_skipped(here: Path) -> None:
         ("retrieve", {"sessions_root": 5}, "sessions_root: found 5"),
         ("localize", {"skip_existing": "yes"}, "skip_existing: found 'yes'"),
         ("localize", {"settings": [1]}, r"\[1\]"),
-        ("localize", {"method": "pmp"}, "method"),
+        ("localize", {"method": "pmp"}, "method: found 'pmp'. Did you mean 'pnp'. Known: feed_forward, hybrid"),
+        ("localize", {"settings": {"predictor": {"num_references": "five"}}}, "num_references: found 'five'"),
+        ("localize", {"features": "sfit"}, "'sfit'. Did you mean 'sift'. Known: aliked, auto"),
+        ("localize", {"features": "auto", "matcher": "mutuel"}, "'mutuel'. Did you mean 'mutual'. Known: lightglue"),
+        ("rerank", {"matcher": "mutuel"}, "Did you mean 'mutual'"),
+        ("embed", {"model": "vald"}, "'vald'. Did you mean 'vlad'. Known: auto, megaloc"),
+        ("embed", {"settings": {"model": ["vlad", "megalok"]}}, "Did you mean 'megaloc'"),
         ("evaluate", {"pairs": "ios"}, "pairs: found 'ios'"),
         ("evaluate", {"pairs": [["ios"]]}, "pairs"),
         ("embed", {"batch_size": 0.5}, "batch_size"),
@@ -403,6 +418,19 @@ def test_notebook_parameters_of_a_wrong_type_are_named(stage: str, values: dict[
 @pytest.mark.parametrize("stage", ["explore", "embed", "retrieve", "rerank", "localize", "evaluate", "visualize"])
 def test_notebook_parameters_as_committed_fit(stage: str) -> None:
     notebook.check_values(stage, notebook.notebook_parameters(notebook.notebook_path(stage)))
+
+
+def test_a_notebook_looks_for_its_devices_before_earlier_stages_are_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for session in ("ios_map", "ios_query"):
+        (tmp_path / "P" / "sessions" / session).mkdir(parents=True)
+        (tmp_path / "P" / "sessions" / session / "images.txt").touch()
+    shell = SimpleNamespace(user_ns={"In": [""], "map_device": "all", "query_device": "oss"})
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
+    monkeypatch.setattr(notebook, "_make_upstream", lambda *_: pytest.fail("made"))
+    with pytest.raises(CaptureError, match=r"query_device: found 'oss', .*Did you mean 'ios'"):
+        notebook.start("localize", sessions_root=str(tmp_path / "P" / "sessions"))
 
 
 def test_a_notebook_looks_at_its_parameters_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:

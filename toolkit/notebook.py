@@ -19,9 +19,18 @@ import tqdm.auto
 import tqdm.std
 
 from toolkit import errors
-from toolkit.errors import ManifestError, StageError, shortage
+from toolkit.errors import CaptureError, ManifestError, StageError, shortage
 from toolkit.files import SceneFiles
-from toolkit.manifest import OPTIONAL, DemoData, Manifest, nearest
+from toolkit.manifest import (
+    OPTIONAL,
+    DemoData,
+    EmbedSettings,
+    LocalizeSettings,
+    Manifest,
+    RerankSettings,
+    Settings,
+    nearest,
+)
 from toolkit.runs.folder import LOG_VARIABLE, log_to
 from toolkit.runs.kernel import TEXT_BARS, Kernels, MemoryWatch, kernel_error
 from toolkit.runs.pairs import left_out_of
@@ -82,12 +91,14 @@ def start(stage: str, sessions_root: str | None = None, **folders: str | None) -
 
     Raises:
         ManifestError: papermill was given a parameter that the notebook does not have, or one is of a wrong type.
+        CaptureError: a device asked for has no such session.
     """
     if run_log := os.environ.get(LOG_VARIABLE):
         logging.captureWarnings(True)
         log_to(Path(run_log))
     _check_own_parameters(stage)
     sessions, root = sessions_or_demo(sessions_root), _root()
+    _check_devices(stage, sessions)
     scene = sessions.parent.name
     files = SceneFiles(root / "runs" / scene, scene)
     defaults = {**stage_folders(files), "out_dir": stage_outputs(files, stage)}
@@ -245,18 +256,58 @@ def _run_stage(stage: str, sessions: Path, files: SceneFiles) -> None:
         localize_pairs(sessions, files.retrieval_dir, files.poses_dir, files.features, files.maps)
 
 
-def _check_own_parameters(stage: str) -> None:
-    """Refuse parameters of the running notebook that do not fit, and unknown ones that papermill has injected."""
+def _user_names() -> dict[str, Any]:
+    """Return the variables of the running notebook; none outside of one."""
     ipython = sys.modules.get("IPython")
     shell = ipython.get_ipython() if ipython else None
-    for source in shell.user_ns.get("In", []) if shell else []:
+    return shell.user_ns if shell else {}
+
+
+def _check_own_parameters(stage: str) -> None:
+    """Refuse parameters of the running notebook that do not fit, and unknown ones that papermill has injected."""
+    values = _user_names()
+    for source in values.get("In", []):
         if source.startswith("# Parameters\n"):
             check_parameters(notebook_path(stage), _literals(source))
-    check_values(stage, shell.user_ns if shell else {})
+    check_values(stage, values)
+
+
+def _check_devices(stage: str, sessions: Path) -> None:
+    """Refuse devices of the running notebook that its capture does not have, before earlier stages are made."""
+    from toolkit.capture import Capture
+
+    values, known = _user_names(), notebook_parameters(notebook_path(stage))
+    for name, split in (("map_device", "map"), ("query_device", "query")):
+        if name not in values or name not in known:
+            continue
+        capture = Capture.from_sessions_root(sessions)
+        present = [device for device in capture.devices if f"{device}_{split}" in capture]
+        if values[name] not in (*present, "all", "auto"):
+            found = f"{name}: found {values[name]!r}, which has no {split} session in {capture.path}."
+            raise CaptureError(f"{found} {nearest(values[name], [*present, 'all'])}")
+
+
+def check_names(settings: Settings) -> None:
+    """Refuse embedders, local features and matchers that there are none of; for the settings tree they are texts.
+
+    Raises:
+        ManifestError: naming it, the nearest known one, and all.
+    """
+    if isinstance(settings, EmbedSettings):
+        from toolkit.embedders import resolve_name
+
+        for name in settings.models:
+            if name != "auto":  # what that stands for is found out when it is needed
+                resolve_name(name)
+    elif isinstance(settings, LocalizeSettings | RerankSettings):
+        from toolkit.features.matching import matchers_of
+
+        kinds = [kind for kind in (*settings.features.kinds, *settings.features.escalation) if kind != "auto"]
+        matchers_of(kinds or ["sift", "aliked"], settings.matcher.name)
 
 
 def check_values(stage: str, values: Mapping[str, Any]) -> None:
-    """Refuse parameters of a wrong type, before any work.
+    """Refuse parameters of a wrong type or value, before any work.
 
     Args:
         values: of the notebook's parameters, by their names; others are passed over.
@@ -268,7 +319,8 @@ def check_values(stage: str, values: Mapping[str, Any]) -> None:
     section = type(Manifest(name="x", captures=["x"]).stage(stage))
     given = {name: (default, values[name]) for name, default in notebook_parameters(path).items() if name in values}
     settings = given.pop("settings", ({}, {}))[1]
-    section.of({name: value for name, (_, value) in given.items() if name in section.model_fields}, settings)
+    named = {name: value for name, (_, value) in given.items() if name in section.model_fields}
+    check_names(section.of(named, settings))
     for name, (default, value) in given.items():
         if name in section.model_fields:
             continue

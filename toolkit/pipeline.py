@@ -54,6 +54,7 @@ from toolkit.notebook import (
     UPSTREAM,
     Say,
     StatusLine,
+    check_names,
     check_parameters,
     execute,
     handed_counts,
@@ -212,6 +213,7 @@ def _run(
         path = notebook_path(stage)
         given = settings_parameters(manifest.stage(stage), notebook_parameters(path))
         check_parameters(path, given, f"{manifest_path}: {stage}.")
+        check_names(manifest.stage(stage))
     manifest = _name_embedder(manifest, say)
     run_dir = Path(manifest.output_root) / manifest.name
     stages = [only] if only else [stage for stage in STAGES if stage in manifest.stages]

@@ -18,6 +18,7 @@ from toolkit.embedders.stored import (
     open_embeddings,
 )
 from toolkit.errors import ManifestError
+from toolkit.manifest import nearest
 from toolkit.models.weights import MEGALOC, find_weights
 
 
@@ -73,7 +74,7 @@ def resolve_name(name: str, checkpoint: str | Path | None = None) -> str:
     if name == "auto":
         return next(key for key in EMBEDDERS if key not in WEIGHTS or find_weights(WEIGHTS[key], checkpoint))
     if name not in EMBEDDERS:
-        raise ManifestError(f"Unknown embedder {name!r}. Known: {', '.join([*sorted(EMBEDDERS), 'auto'])}.")
+        raise ManifestError(f"Unknown embedder {name!r}. {nearest(name, [*EMBEDDERS, 'auto'])}")
     return name
 
 

@@ -14,7 +14,7 @@ from toolkit.capture.turning import turn_image, turn_points
 from toolkit.errors import ManifestError
 from toolkit.files import Remade
 from toolkit.geometry import Ints
-from toolkit.manifest import FeaturesSettings, SiftSettings, checkpoint_of
+from toolkit.manifest import AUTO, FeaturesSettings, SiftSettings, checkpoint_of, nearest
 
 DESCRIPTOR_SCALE = 512.0
 """RootSIFT vectors have length 1; times this they fill the range of a byte, as COLMAP stores them."""
@@ -136,7 +136,7 @@ def feature_kind(name: str) -> FeatureKind:
         ManifestError: there is none.
     """
     if name not in KINDS:
-        raise ManifestError(f"Unknown local features {name!r}. Known: {', '.join(KINDS)}.")
+        raise ManifestError(f"Unknown local features {name!r}. {nearest(name, [*KINDS, AUTO])}")
     return KINDS[name]
 
 

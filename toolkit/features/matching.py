@@ -22,7 +22,7 @@ from toolkit.features.features import (
     feature_kind,
 )  # fmt: skip
 from toolkit.geometry import Floats, Ints
-from toolkit.manifest import AUTO, LocalizeSettings, RerankSettings, checkpoint_of
+from toolkit.manifest import AUTO, LocalizeSettings, RerankSettings, checkpoint_of, nearest
 from toolkit.models.compute import has_accelerator
 from toolkit.models.weights import (
     ALIKED,
@@ -93,7 +93,7 @@ def create_matcher(name: str, **options: Any) -> Matcher:
         WeightsError: the network has no weights.
     """
     if name not in MATCHERS:
-        raise ManifestError(f"Unknown matcher {name!r}. Known: {', '.join(MATCHERS)}.")
+        raise ManifestError(f"Unknown matcher {name!r}. {nearest(name, MATCHERS)}")
     matcher: Matcher = resolve_name(MATCHERS[name])(**options)
     return matcher
 
@@ -105,6 +105,8 @@ def matchers_of(features: Sequence[str], matcher: str | None = None) -> dict[str
         ManifestError: unknown features, or a matcher that suits none of them.
     """
     suited = {name: feature_kind(name).matchers for name in features}
+    if matcher is not None and matcher not in MATCHERS:
+        raise ManifestError(f"Unknown matcher {matcher!r}. {nearest(matcher, MATCHERS)}")
     if matcher is not None and not any(matcher in known for known in suited.values()):
         text = "; ".join(f"{name}: {', '.join(known)}" for name, known in suited.items())
         raise ManifestError(f"The matcher {matcher!r} suits none of the features. Known for {text}.")

@@ -48,12 +48,19 @@ def explain(
             continue  # the other branch of `"all" | list` or `str | list`, which says what is wrong in the list
         elif of_branch and problem["type"] in ("list_type", "dict_type") and isinstance(problem["input"], list | dict):
             continue  # likewise, of `list | dict`
+        elif problem["type"] == "literal_error" and isinstance(problem["input"], str):
+            line = f"{where}: found {problem['input']!r}. {nearest(problem['input'], _choices(problem))}"
         elif problem["type"] == "missing":
             line = f"{where}: not given. {problem['msg']}."
         else:
             line = f"{where}: found {problem['input']!r}. {problem['msg']}."
         lines.append(line + origin(keys))
     return "\n  ".join([f"{source}:", *dict.fromkeys(lines)])
+
+
+def _choices(problem: Any) -> list[str]:
+    """Return the words that a value may be, of an error of pydantic."""
+    return re.findall(r"'([^']*)'", problem["ctx"]["expected"])
 
 
 def _model_at(model: type[BaseModel], keys: list[str]) -> type[BaseModel]:
