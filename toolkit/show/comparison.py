@@ -459,7 +459,7 @@ def write_comparison(comparison: Comparison, path: str | Path | None = None, pic
         figure = replace(album.picture(Path(folder) / "differences.png", "Differences", caption), path="")
         looks = _looks(comparison, pictures, album, messages)
     page = page_template("comparison.html.j2").render(
-        run={"name": " against ".join([", ".join(names[1:]), names[0]]), "manifest": {}, "status": ""},
+        run={"name": f"{names[1] if len(names) == 2 else f'{len(names) - 1} runs'} against {names[0]}"},
         folders=list(zip(names, map(str, comparison.folders), comparison.records, strict=True)),
         messages=messages,
         tiles=_tiles(comparison),
@@ -523,17 +523,19 @@ def _tiles(comparison: Comparison) -> list[tuple[str, str]]:
 
 
 def _recall_table(comparison: Comparison, threshold: str) -> Table:
-    columns = ["map", "query", "queries", *comparison.names]
+    columns = ["map", "query", "queries", comparison.names[0]]
     for name in comparison.names[1:]:
-        columns += [f"{name} – {comparison.names[0]}", "won", "lost"]
+        columns += [name, "difference", "won", "lost"]
     rows = []
     chosen = comparison.recall[comparison.recall["threshold"] == threshold]
     for pair, group in chosen.groupby(_PAIR, sort=False):
         by_run = group.to_dict("records")
         several = chosen["scene"].nunique() > 2 and pair[0] != ALL
         cells = [Cell(f"{pair[0]} {pair[1]}" if several else pair[1]), Cell(pair[2]), Cell(str(by_run[0]["queries"]))]
-        cells += [Cell(_interval(row, "recall"), 0.9 * row["recall"]) for row in by_run]
-        for row in by_run[1:]:
+        for i, row in enumerate(by_run):
+            cells.append(Cell(_interval(row, "recall"), 0.9 * row["recall"]))
+            if i == 0:
+                continue
             cells += [Cell(_interval(row, "difference")), Cell(str(row["won"])), Cell(str(row["lost"]))]
         rows.append(cells)
     caption = f"Recall at {_threshold(threshold)} in %, and the differences in percentage points"
