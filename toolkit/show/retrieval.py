@@ -256,7 +256,6 @@ def _draw_along(axis: "Axes", one: RetrievedQuery) -> None:
     """Draw the similarity of the query to the map's images, in the order that they were taken."""
     good, retrieved = _parts(one)
     x = np.arange(len(one.images))
-    axis.plot(x, one.similarity, color="0.8", lw=0.8, zorder=1)
     if one.is_known:
         axis.scatter(x[good], one.similarity[good], s=16, c=GREEN, lw=0, zorder=3, label="overlaps with the query")
     other = "map image" if not one.is_known else "does not overlap"
@@ -267,7 +266,10 @@ def _draw_along(axis: "Axes", one: RetrievedQuery) -> None:
     sensors = one.map_session.images["sensor_id"].to_numpy(str)[one.images]
     # Where each picture has a camera of its own, only recordings are told apart.
     tracks = recordings if len(set(sensors)) > len(sensors) / 2 else np.char.add(recordings, sensors)
-    for k, start in enumerate(np.flatnonzero(tracks[1:] != tracks[:-1]) + 0.5):
+    cuts = np.flatnonzero(tracks[1:] != tracks[:-1]) + 1
+    for part in np.split(x, cuts):
+        axis.plot(part, one.similarity[part], color="0.8", lw=0.8, zorder=1)
+    for k, start in enumerate(cuts - 0.5):
         axis.axvline(start, color="0.7", lw=0.8, ls=":", zorder=0, label=None if k else "next camera or recording")
     axis.set(xlabel="map images, in the order they were taken", ylabel="similarity to the query")
     axis.set_title("similarity along the map", fontsize=9)
