@@ -3,6 +3,7 @@
 import json
 import textwrap
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -47,6 +48,12 @@ LABELS = {
     "rotation_std_deg": ("deviation of rotation [deg]", "{:.2g}"), "scale_std": ("deviation of scale", "{:.1%}"),
 }  # fmt: skip
 """Of the numbers: what they are called, and how they are written."""
+OF_NETWORKS = {
+    "num_inliers": ("consistent references", "{:.0f}"), "num_matches": ("references shown to it", "{:.0f}"),
+    "inlier_ratio": ("share of them", "{:.0%}"),
+}  # fmt: skip
+OF_MATCHES = ("num_guided", "rmse_px", "coverage", "p_correct", "rival_support", "agreement")
+"""What a pose without matches does not have."""
 
 
 @styled
@@ -158,12 +165,7 @@ def _draw_photograph(
     Returns:
         Its width and height; with a `height`, its right edge and the scale of its pixels.
     """
-    picture = read_for_display(image.path)
-    rows, columns = picture.shape[:2]
-    reduced = LONGEST_SIDE / max(rows, columns)
-    if reduced < 1:
-        size = max(1, round(columns * reduced)), max(1, round(rows * reduced))
-        picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+    picture, rows, columns = _reduced(image.path)
     if height is None:
         axis.imshow(picture, extent=(0, columns, rows, 0), interpolation="antialiased")
         return float(columns), float(rows)
@@ -171,6 +173,18 @@ def _draw_photograph(
     right = offset + scale * columns
     axis.imshow(picture, extent=(offset, right, height, 0), interpolation="antialiased")
     return right, scale
+
+
+@lru_cache(maxsize=16)  # a query that is localized again is drawn again
+def _reduced(path: Path) -> tuple[NDArray[np.uint8], int, int]:
+    """Return a photograph of at most `LONGEST_SIDE` pixels, and the rows and columns that it has in full."""
+    picture = read_for_display(path)
+    rows, columns = picture.shape[:2]
+    reduced = LONGEST_SIDE / max(rows, columns)
+    if reduced < 1:
+        size = max(1, round(columns * reduced)), max(1, round(rows * reduced))
+        picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return picture, rows, columns
 
 
 def _draw_marks(
@@ -347,7 +361,11 @@ def _axis_name(label: str) -> str:
 def _draw_table(axis: "Axes", ones: Sequence[Answer]) -> None:
     """Write the numbers of answers, a column each; where two differ, they are bold."""
     rows: list[tuple[str, list[str]]] = [("method", [one.method for one in ones])]
-    for key, (text, form) in LABELS.items():
+    by_network = all(one.method.rpartition("/")[2].startswith("feed_forward") for one in ones)
+    labels = LABELS | OF_NETWORKS if by_network else LABELS
+    for key, (text, form) in labels.items():
+        if by_network and key in OF_MATCHES:
+            continue
         values = [form.format(one.numbers[key]) if key in one.numbers else "–" for one in ones]
         if set(values) != {"–"} and not (key == "agreement" and set(values) == {"0"}):
             rows.append((text, values))
