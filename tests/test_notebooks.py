@@ -14,7 +14,7 @@ import nbformat
 import pandas as pd
 import pytest
 
-from toolkit import pipeline
+from toolkit import notebook, pipeline
 from toolkit.manifest import OPTIONAL, STAGES, Manifest
 from toolkit.notebook import notebook_parameters, notebook_path
 
@@ -141,6 +141,18 @@ def test_a_run_with_all_stages_is_reused_and_repeated(small_capture: Path, small
         stage: "done" if stage == "localize" else "reused" for stage in STAGES
     }
     assert {path.name: path.read_bytes() for path in poses} == before, "the same seed gives the same poses"
+
+
+def test_a_table_on_a_page_has_medians_first_and_says_nothing_twice() -> None:
+    row = {"map_device": "ios", "query_device": "hl", "state": "evaluated", "queries": 3, "localized": 2, "ok": 2}
+    row |= {"recall@(1deg,0.1m)": 0.5, "median_rotation_deg": 0.1, "median_translation_m": 0.2, "path": "/a/b"}
+    shown = notebook.readable(pd.DataFrame([row | {"reason": ""}]))
+    assert shown.columns.tolist() == ["median_deg", "median_m", "recall@(1deg,0.1m)", "queries", "ok"]
+    assert shown.loc["hl in ios"].tolist() == [0.1, 0.2, 0.5, 3, 2]
+    left_out = notebook.readable(pd.DataFrame([row | {"state": "left out: x", "reason": "x"}]))
+    assert {"state", "reason"} <= set(left_out.columns)
+    sessions = pd.DataFrame({"session": ["ios_map"], "images": [3], "path": ["p"]})
+    assert notebook.readable(sessions).columns.tolist() == ["session", "images"]
 
 
 def test_a_notebook_starts_without_nbformat() -> None:

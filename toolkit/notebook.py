@@ -141,6 +141,22 @@ def _root() -> Path:
     return NOTEBOOKS.parent if NOTEBOOKS.is_dir() else Path.cwd()
 
 
+def readable(table: "pd.DataFrame") -> "pd.DataFrame":
+    """Return a stage's table as it fits a page: a row `<query> in <map>`, medians and recall first, no paths.
+
+    Columns are left out where they say nothing: a `reason` that no row has, `localized`, which is `ok` and
+    `low_confidence`, the state of pairs that are all evaluated.
+    """
+    nothing = {"state": "evaluated", "reason": ""}
+    dull = [name for name, text in nothing.items() if name in table and (table[name] == text).all()]
+    shown = table.drop(columns=["path", "localized", *dull], errors="ignore")
+    if "map_device" in shown:
+        shown.index = shown.pop("query_device") + " in " + shown.pop("map_device")
+    medians = {name: name.replace("_rotation", "").replace("_translation", "") for name in shown if "median" in name}
+    first = [*medians, *(name for name in shown if name.startswith("recall@"))]
+    return shown[[*first, *(name for name in shown if name not in first)]].rename(columns=medians)
+
+
 def finish(table: "pd.DataFrame | None" = None, **counts: Any) -> None:
     """Show what a notebook did and hand it to the pipeline, with the peak memory of this process.
 
