@@ -162,9 +162,23 @@ def test_a_sweep_takes_over_what_does_not_depend_on_its_keys(place: Path, monkey
     assert sum("found a dragon" in line for line in said) == 2
 
 
-def test_a_sweep_with_a_wrong_value_is_refused_before_anything_runs(place: Path) -> None:
-    with pytest.raises(ManifestError, match=r"retrieve\.topk: found 'five'"):
-        pipeline.sweep(place / "run.yaml", ["retrieve.topk=3,five"])
+def test_a_sweep_takes_over_what_a_failed_run_came_to(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pipeline, "execute", execute_here)
+    folders, failed = pipeline.sweep(place / "run.yaml", ["retrieve.topk=90,5"], say=lambda *_, **__: None)
+    assert (len(folders), len(failed)) == (1, 1)
+    assert (folders[0] / "P/embeddings/log.txt").stat().st_nlink == 2
+
+
+@pytest.mark.parametrize(
+    ("sweep", "said"),
+    [
+        ("retrieve.topk=3,five", r"retrieve\.topk: found 'five'"),
+        ("embed.model=vlad,vald", r"run\.yaml: embed: Unknown embedder 'vald'\. Did you mean 'vlad'\?"),
+    ],
+)
+def test_a_sweep_with_a_wrong_value_is_refused_before_anything_runs(place: Path, sweep: str, said: str) -> None:
+    with pytest.raises(ManifestError, match=said):
+        pipeline.sweep(place / "run.yaml", [sweep])
     assert not (place / "runs").exists()
 
 

@@ -169,9 +169,9 @@ def sweep(
 ) -> tuple[list[Path], list[ToolkitError]]:
     """Run a manifest with each of some values, in folders `<output_root>/<name>-<key>-<value>`.
 
-    What does not depend on the keys in which two runs differ is taken over from the earlier one; the first takes it
-    from the plain run of the manifest, if that is there. A capture to render is rendered once, for all of them. A run
-    that fails does not keep the others from running.
+    What does not depend on the keys in which two runs differ is taken over from the earlier one, even if that has
+    failed; the first takes it from the plain run of the manifest, if that is there. A capture to render is rendered
+    once, for all of them. A run that fails does not keep the others from running.
 
     Args:
         sweeps: `key=a,b,c`, see `runs.sweep.swept_runs`; several keys are all their combinations.
@@ -186,14 +186,18 @@ def sweep(
     plain = load_manifest(manifest_path, overrides)
     runs = swept_runs(plain.name, sweeps)
     for one in runs:  # before hours of work
-        load_manifest(manifest_path, [*overrides, *one.overrides, f"name={one.name}"])
+        _check_stages(load_manifest(manifest_path, [*overrides, *one.overrides, f"name={one.name}"]), manifest_path)
     captures = _captures(plain)
     rendered = ["demo_data=null", f"captures={json.dumps(list(map(str, captures)))}"] if plain.demo_data else []
-    root, done, failed = Path(plain.output_root), dict[SweptRun, Path](), list[ToolkitError]()
+    root, done, failed = Path(plain.output_root), dict[SweptRun, Path](), dict[SweptRun, ToolkitError]()
     for number, one in enumerate(runs, 1):
         say(f"{one.name} ({number} of {len(runs)}): {', '.join(one.overrides)}")
-        # The run that differs in the fewest keys has most to give.
-        like = max(done, key=lambda other: len({*other.overrides} & {*one.overrides}), default=SweptRun(plain.name, ()))
+        # The run that differs in the fewest keys has most to give, a failed one what it came to.
+        like = max(
+            [*done, *failed],
+            key=lambda other: (len({*other.overrides} & {*one.overrides}), other in done),
+            default=SweptRun(plain.name, ()),
+        )
         keys = [override.partition("=")[0] for override in one.overrides if override not in like.overrides]
         take_over(root / like.name, root / one.name, [capture.name for capture in captures], keys)
         try:
@@ -201,19 +205,15 @@ def sweep(
             done[one] = run(manifest_path, overrides=settings, say=say, **options)
         except ToolkitError as error:
             say(f"{one.name}: {sentence(error)}")
-            failed.append(error)
-    return list(done.values()), failed
+            failed[one] = error
+    return list(done.values()), list(failed.values())
 
 
 def _run(
     manifest: Manifest, manifest_path: str | Path, only: str | None, force: bool, say: Say, cluster: str | None
 ) -> Path:
     _require_downloads(manifest, manifest_path)
-    for stage in STAGES:  # a notebook that lacks a parameter stops the run before hours of work, not after
-        path = notebook_path(stage)
-        given = settings_parameters(manifest.stage(stage), notebook_parameters(path))
-        check_parameters(path, given, f"{manifest_path}: {stage}.")
-        check_names(manifest.stage(stage))
+    _check_stages(manifest, manifest_path)
     manifest = _name_embedder(manifest, say)
     run_dir = Path(manifest.output_root) / manifest.name
     stages = [only] if only else [stage for stage in STAGES if stage in manifest.stages]
@@ -236,6 +236,18 @@ def _run(
             text = f"{sentence(error)} The traceback is in {run_dir / LOG}."
             raise StageError(text, internal=True) from error
     return run_dir
+
+
+def _check_stages(manifest: Manifest, manifest_path: str | Path) -> None:
+    """Refuse what a stage or its notebook does not know, before hours of work, not after."""
+    for stage in STAGES:
+        path, settings = notebook_path(stage), manifest.stage(stage)
+        given = settings_parameters(settings, notebook_parameters(path))
+        check_parameters(path, given, f"{manifest_path}: {stage}.")
+        try:
+            check_names(settings)
+        except ManifestError as error:
+            raise ManifestError(f"{manifest_path}: {stage}: {error}") from None
 
 
 def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: bool, say: Say) -> None:
