@@ -21,7 +21,9 @@ def test_it_is_committed_clean() -> None:
     assert "notebook.finish(" in content.cells[-1].source
     assert all(len(cell.source.splitlines()) <= 18 for cell in code)
     assert [cell.id for cell in content.cells] == [f"07-{i:02d}" for i in range(len(content.cells))]
-    assert all("  # " in line for line in content.cells[1].source.splitlines())
+    parameters = content.cells[1].source.splitlines()
+    assert [line for line in parameters if "  # " not in line] == ["# Change these first.", "", "# The rest."]
+    assert "notebook.check_given(" in content.cells[2].source
     assert notebook_parameters(PATH)["runs"] is None
 
 

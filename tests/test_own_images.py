@@ -32,6 +32,7 @@ def test_it_is_committed_clean() -> None:
     assert [cell.id for cell in content.cells] == [f"00-{i:02d}" for i in range(len(content.cells))]
     parameters = [line for line in content.cells[1].source.splitlines() if line and not line.startswith("# ")]
     assert all("  # " in line for line in parameters)
+    assert "notebook.check_given(" in content.cells[2].source
     assert notebook_parameters(PATH)["poses_are"] == "world_from_cam"
 
 

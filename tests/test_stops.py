@@ -29,6 +29,8 @@ from toolkit.errors import (
     sentence,
     shortage,
 )
+from toolkit.exchange.interchange import POSE_DIRECTIONS
+from toolkit.manifest import STAGES
 from toolkit.runs.folder import LOG, held
 from toolkit.runs.record import RunLog
 
@@ -408,6 +410,11 @@ def test_what_builds_on_a_failed_stage_is_skipped(here: Path) -> None:
         ("evaluate", {"pairs": "ios"}, "pairs: found 'ios'"),
         ("evaluate", {"pairs": [["ios"]]}, "pairs"),
         ("embed", {"batch_size": 0.5}, "batch_size"),
+        ("own_images", {"device": 5}, "device: found 5, expected a str such as 'ios'"),
+        ("compare", {"runs": "../runs/a"}, "runs: found '../runs/a', expected None or a list of run folders"),
+        ("compare", {"runs": [5]}, r"runs: found \[5\]"),
+        ("compare", {"pictures": "two"}, "pictures: found 'two', expected a whole number, 0 or more"),
+        ("compare", {"seed": -1}, "seed: found -1"),
     ],
 )
 def test_notebook_parameters_of_a_wrong_type_are_named(stage: str, values: dict[str, Any], named: str) -> None:
@@ -415,9 +422,26 @@ def test_notebook_parameters_of_a_wrong_type_are_named(stage: str, values: dict[
         notebook.check_values(stage, values)
 
 
-@pytest.mark.parametrize("stage", ["explore", "embed", "retrieve", "rerank", "localize", "evaluate", "visualize"])
-def test_notebook_parameters_as_committed_fit(stage: str) -> None:
-    notebook.check_values(stage, notebook.notebook_parameters(notebook.notebook_path(stage)))
+@pytest.mark.parametrize("name", [*STAGES, "own_images", "compare"])
+def test_notebook_parameters_as_committed_fit(name: str) -> None:
+    notebook.check_values(name, notebook.notebook_parameters(notebook.notebook_path(name)))
+
+
+@pytest.mark.parametrize(
+    ("variables", "said"),
+    [
+        ({"poses_are": "cam_from_wrld"}, "poses_are: found 'cam_from_wrld'. Did you mean 'cam_from_world'. Known"),
+        ({"In": ["# Parameters\nquery_image = 'x'\n"]}, "query_image: 00_own_images.ipynb has no such parameter"),
+        ({"map_images": 5}, "map_images: found 5"),
+    ],
+)
+def test_a_notebook_that_is_no_stage_looks_at_its_parameters(
+    monkeypatch: pytest.MonkeyPatch, variables: dict[str, Any], said: str
+) -> None:
+    shell = SimpleNamespace(user_ns=variables)
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
+    with pytest.raises(ManifestError, match=said):
+        notebook.check_given("own_images", poses_are=POSE_DIRECTIONS)
 
 
 def test_a_notebook_looks_for_its_devices_before_earlier_stages_are_made(

@@ -23,6 +23,7 @@ from toolkit.errors import CaptureError, ManifestError, StageError, shortage
 from toolkit.files import SceneFiles
 from toolkit.manifest import (
     OPTIONAL,
+    STAGES,
     DemoData,
     EmbedSettings,
     LocalizeSettings,
@@ -96,7 +97,7 @@ def start(stage: str, sessions_root: str | None = None, **folders: str | None) -
     if run_log := os.environ.get(LOG_VARIABLE):
         logging.captureWarnings(True)
         log_to(Path(run_log))
-    _check_own_parameters(stage)
+    check_given(stage)
     sessions, root = sessions_or_demo(sessions_root), _root()
     _check_devices(stage, sessions)
     scene = sessions.parent.name
@@ -279,13 +280,24 @@ def _user_names() -> dict[str, Any]:
     return shell.user_ns if shell else {}
 
 
-def _check_own_parameters(stage: str) -> None:
-    """Refuse parameters of the running notebook that do not fit, and unknown ones that papermill has injected."""
+def check_given(name: str, **words: Iterable[str]) -> None:
+    """Refuse parameters of the running notebook that do not fit, and unknown ones that papermill has injected.
+
+    Args:
+        name: of the notebook, `<number>_<name>.ipynb`.
+        **words: what a parameter may be, where that is one of some words.
+
+    Raises:
+        ManifestError: naming the parameter, what was found and what was expected.
+    """
     values = _user_names()
     for source in values.get("In", []):
         if source.startswith("# Parameters\n"):
-            check_parameters(notebook_path(stage), _literals(source))
-    check_values(stage, values)
+            check_parameters(notebook_path(name), _literals(source))
+    check_values(name, values)
+    for key, known in words.items():
+        if key in values and values[key] not in known:
+            raise ManifestError(f"{key}: found {values[key]!r}. {nearest(values[key], known)}")
 
 
 def _check_devices(stage: str, sessions: Path) -> None:
@@ -322,36 +334,42 @@ def check_names(settings: Settings) -> None:
         matchers_of(kinds or ["sift", "aliked"], settings.matcher.name)
 
 
-def check_values(stage: str, values: Mapping[str, Any]) -> None:
+def check_values(name: str, values: Mapping[str, Any]) -> None:
     """Refuse parameters of a wrong type or value, before any work.
 
     Args:
+        name: of the notebook, `<number>_<name>.ipynb`; a stage's have settings among them.
         values: of the notebook's parameters, by their names; others are passed over.
 
     Raises:
         ManifestError: naming the parameter, what was found and what was expected.
     """
-    path = notebook_path(stage)
-    section = type(Manifest(name="x", captures=["x"]).stage(stage))
-    given = {name: (default, values[name]) for name, default in notebook_parameters(path).items() if name in values}
-    settings = given.pop("settings", ({}, {}))[1]
-    named = {name: value for name, (_, value) in given.items() if name in section.model_fields}
-    check_names(section.of(named, settings))
-    for name, (default, value) in given.items():
-        if name in section.model_fields:
-            continue
-        if name == "pairs":
+    path = notebook_path(name)
+    given = {key: (default, values[key]) for key, default in notebook_parameters(path).items() if key in values}
+    if name in STAGES:
+        section = type(Manifest(name="x", captures=["x"]).stage(name))
+        settings = given.pop("settings", ({}, {}))[1]
+        named = {key: given.pop(key)[1] for key in list(given) if key in section.model_fields}
+        check_names(section.of(named, settings))
+    for key, (default, value) in given.items():
+        if key == "pairs":
             pairs = value if isinstance(value, list | tuple) else [value]
             fits = value is None or all(isinstance(pair, list | tuple) and len(pair) == 2 for pair in pairs)
             wanted = 'None or a list such as [["ios", "hl"]]'
-        elif name == "inspect":
+        elif key == "runs":
+            listed = isinstance(value, list | tuple) and all(isinstance(run, str | Path) for run in value)
+            fits = value is None or listed
+            wanted = 'None or a list of run folders such as ["../runs/a", "../runs/b"]'
+        elif key == "inspect":
             fits, wanted = isinstance(value, int | str), "the number of a query, or the name of an image of it"
         elif default is None:
             fits, wanted = value is None or isinstance(value, str | Path), "None or the path of a folder, a text"
+        elif type(default) is int:
+            fits, wanted = type(value) is int and value >= 0, f"a whole number, 0 or more, such as {default}"
         else:
             fits, wanted = isinstance(value, type(default)), f"a {type(default).__name__} such as {default!r}"
         if not fits:
-            raise ManifestError(f"{name}: found {value!r}, expected {wanted}. It is a parameter of {path.name}.")
+            raise ManifestError(f"{key}: found {value!r}, expected {wanted}. It is a parameter of {path.name}.")
 
 
 def _literals(source: str) -> dict[str, Any]:
