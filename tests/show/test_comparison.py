@@ -89,6 +89,12 @@ def test_settings_and_costs_that_differ_are_told(two: list[Path]) -> None:
     assert "2 won, 1 lost" in comparison.text()
 
 
+def test_a_record_without_stages_costs_nothing_that_is_known(two: list[Path]) -> None:
+    record = json.loads((two[1] / "run.json").read_text())
+    (two[1] / "run.json").write_text(json.dumps(record | {"stages": []}))
+    assert "b: –, –" in compare_runs(two).text()
+
+
 def test_identical_runs_differ_by_nothing(two: list[Path]) -> None:
     comparison = compare_runs([two[0], two[0]])
     assert comparison.names == ["a", "a (2)"]
@@ -182,6 +188,8 @@ def damage(kind: str, run: Path) -> None:
         (run / "run.json").unlink()
     elif kind == "torn record":
         (run / "run.json").write_text("{")
+    elif kind == "odd record":
+        (run / "run.json").write_text('{"scenes": ["PLACE"], "stages": ["localize"]}')
     elif kind == "not evaluated":
         table.unlink()
     elif kind == "torn table":
@@ -192,6 +200,8 @@ def damage(kind: str, run: Path) -> None:
             content = content.iloc[:0]
         elif kind == "no column":
             content = content.drop(columns="status")
+        elif kind == "text for a number":
+            content["rotation_error_deg"] = "half"
         elif kind == "other unit":
             content = content.rename(columns=lambda name: name.replace("m)", "L)"))
         elif kind == "twice":
@@ -207,10 +217,12 @@ def damage(kind: str, run: Path) -> None:
     [
         ("no run", r"No run at .*b: run\.json is missing"),
         ("torn record", r"run\.json is not whole JSON"),
+        ("odd record", r"run\.json: 'stages' is not as a run writes it"),
         ("not evaluated", r"b: not evaluated .*errors\.csv is missing.*python -m toolkit run"),
         ("torn table", r"errors\.csv.*Run the stage"),
         ("no truth", r"b: found no query with ground truth.*evaluate again"),
         ("no column", r"errors\.csv: column 'status' is missing"),
+        ("text for a number", r"errors\.csv: not a table of errors .*half"),
         ("other unit", r"b: found errors in L, expected m .*`unit`"),
         ("twice", r"b: .*has a query twice"),
         ("other queries", r"no query in common \(a 10, b 10\)"),

@@ -95,7 +95,7 @@ class Comparison:
                 lines.append(line)
         for i, name in enumerate(self.names):
             spent = self.resources.iloc[-1]
-            lines.append(f"{name}: {_seconds(spent[f'seconds_{i}'])}, {_memory(spent[f'memory_mb_{i}'])}")
+            lines.append(f"{name}: {_time(spent[f'seconds_{i}'])}, {_memory(spent[f'memory_mb_{i}'])}")
         for row in self.settings.to_dict("records"):
             lines.append(f"{row['key']}: " + " | ".join(row[f"run_{i}"] for i in range(len(self.names))))
         return "\n".join([*lines, *(f"Note: {message}" for message in self.messages)])
@@ -168,7 +168,7 @@ def compare_runs(run_dirs: Sequence[str | Path], seed: int = SEED, resamples: in
     if any(len(table) > len(queries) for table in tables):
         messages.append(f"The runs have other queries ({counts}): the {len(queries)} in common are compared.")
     for scene in queries["scene"].unique():
-        if len({record["inputs"].get(scene) for record in records}) > 1:
+        if len({str(record["inputs"].get(scene)) for record in records}) > 1:
             messages.append(f"{scene}: its files are not the same, or have been moved or copied, between the runs.")
     for i, table in enumerate(tables):
         columns = {name: f"{name}_{i}" for name in ("status", *_ERRORS)}
@@ -222,7 +222,8 @@ def _read_errors(folder: Path, record: Mapping[str, Any]) -> pd.DataFrame:
             continue
         require_whole(path, of=path.with_name("recall.csv"))
         try:
-            table = pd.read_csv(path, dtype={"timestamp": np.int64, "device_id": str, "sensor_id": str})
+            kinds = {"timestamp": np.int64, "device_id": str, "sensor_id": str, "status": str}
+            table = pd.read_csv(path, dtype={**kinds, **dict.fromkeys(_ERRORS, float)})
         except (OSError, ValueError, OverflowError) as error:
             raise ArtifactError(f"{path}: not a table of errors ({error}). Run its stage evaluate again.") from None
         if lacking := [name for name in _NEEDED if name not in table]:
@@ -339,10 +340,16 @@ def _resources(stages: Sequence[Sequence[Mapping[str, Any]]]) -> pd.DataFrame:
         line: dict[str, Any] = {"stage": name}
         for i, rows in enumerate(stages):
             mine = [row for row in rows if name in (ALL, row.get("stage"))]
-            line[f"seconds_{i}"] = sum(float(row.get("seconds") or 0) for row in mine) if mine else math.nan
-            line[f"memory_mb_{i}"] = max((float(row.get("peak_memory_mb") or 0) for row in mine), default=math.nan)
+            line[f"seconds_{i}"] = sum(_measured(row, "seconds") for row in mine) if mine else math.nan
+            line[f"memory_mb_{i}"] = max((_measured(row, "peak_memory_mb") for row in mine), default=math.nan)
         table.append(line)
     return pd.DataFrame(table)
+
+
+def _measured(row: Mapping[str, Any], name: str) -> float:
+    """Return a number of a stage's row; 0 where it says none."""
+    value = row.get(name)
+    return float(value) if isinstance(value, int | float) and math.isfinite(value) else 0.0
 
 
 def _by_run(
@@ -574,7 +581,7 @@ def _resources_table(comparison: Comparison) -> Table:
         for i in range(len(comparison.names)):
             seconds = row[f"seconds_{i}"]
             bar = seconds / longest if row["stage"] != ALL and seconds > 0 else None
-            cells += [Cell(_seconds(None if math.isnan(seconds) else seconds), bar=bar)]
+            cells += [Cell(_time(seconds), bar=bar)]
             cells += [Cell(_memory(row[f"memory_mb_{i}"]))]
         rows.append(cells)
     return Table("Time and peak memory of every stage, start-up of its notebook included", columns, rows)
@@ -602,6 +609,10 @@ def _bounds(row: Mapping[str, Any], name: str) -> str:
 
 def _interval(row: Mapping[str, Any], name: str) -> str:
     return f"{(_signed if name == 'difference' else percent)(row[name])} [{_bounds(row, name)}]"
+
+
+def _time(seconds: float) -> str:
+    return _seconds(None if math.isnan(seconds) else seconds)
 
 
 def _memory(megabytes: float) -> str:

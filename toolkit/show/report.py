@@ -159,7 +159,7 @@ def read_run(path: Path) -> dict[str, Any]:
     """Return what a `run.json` says, with empty values for what it does not say.
 
     Raises:
-        ArtifactError: it is missing, or torn.
+        ArtifactError: it is missing, torn, or no record of a run.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -172,6 +172,10 @@ def read_run(path: Path) -> dict[str, Any]:
     empty = {"name": path.parent.name, "created": "", "status": "", "error": None, "total_seconds": None}
     lists: dict[str, Any] = {"manifest": {}, "versions": {}, "machine": {}, "inputs": {}, "scenes": [], "stages": []}
     run = {**empty, "peak_memory_mb": None, "work_seconds": None, "code": "", **lists, **content}
+    odd = [key for key, value in lists.items() if not isinstance(run[key], type(value))]
+    if odd or not all(isinstance(row, dict) for row in run["stages"]):
+        found = odd[0] if odd else "stages"
+        raise ArtifactError(f"{path}: {found!r} is not as a run writes it. Run the manifest again.")
     run["scenes"] = run["scenes"] or list(dict.fromkeys(row["scene"] for row in run["stages"] if row.get("scene")))
     return run
 
