@@ -10,7 +10,7 @@ import pytest
 
 from toolkit.errors import ArtifactError
 from toolkit.files import SceneFiles, write_sidecar
-from toolkit.show.comparison import Comparison, bootstrap, compare_runs, write_comparison
+from toolkit.show.comparison import Comparison, bootstrap, compare_runs, readable, write_comparison
 
 LIMITS = ("(1deg,0.1m)", "(5deg,0.5m)")
 GOOD, FAIR, LOST = (0.5, 0.05), (2.0, 0.3), (np.inf, np.inf)
@@ -171,6 +171,10 @@ def test_three_runs_are_each_compared_with_the_first(two: list[Path], tmp_path: 
     assert set(comparison.changes["run"]) == {1, 2}
     page = write_comparison(comparison, pictures=0)
     assert page.name == "compare_a_b_c.html"
+    tables = readable(comparison)
+    assert tables["recall"].xs("all", level="map")["won"].to_numpy().tolist() == [["2", "0"], ["1", "0"]]
+    assert len(tables["changes"]) == 3 + 9, "of b, of c"
+    assert tables["settings"].loc["localize.pnp.min_inliers"].tolist() == ["12", "20", "–"]
 
 
 def test_the_page_is_one_file_and_says_why_there_is_no_picture(two: list[Path]) -> None:

@@ -402,6 +402,21 @@ def draw_differences(comparison: Comparison) -> "Figure":
     return figure
 
 
+def readable(comparison: Comparison) -> dict[str, pd.DataFrame]:
+    """Return the tables of the page, in words: `recall`, `changes`, `resources` and `settings`; empty, if need be."""
+    recall = {_threshold(name): _frame(_recall_table(comparison, name)) for name in comparison.thresholds}
+    others = {"changes": _changes_table, "resources": _resources_table, "settings": _settings_table}
+    tables = {name: _frame(make(comparison)) for name, make in others.items()}
+    return {"recall": pd.concat(recall, names=["at"]), **tables}
+
+
+def _frame(table: Table | None) -> pd.DataFrame:
+    if table is None:
+        return pd.DataFrame()
+    frame = pd.DataFrame([[cell.text for cell in row] for row in table.rows], columns=table.columns)
+    return frame.set_index(table.columns[0])
+
+
 def draw_change(comparison: Comparison, row: int) -> "list[tuple[str, Figure]]":
     """Draw a query that was won or lost as the first run and the other have it, from their stored correspondences.
 
