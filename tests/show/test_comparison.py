@@ -92,7 +92,7 @@ def test_settings_and_costs_that_differ_are_told(two: list[Path]) -> None:
 def test_a_record_without_stages_costs_nothing_that_is_known(two: list[Path]) -> None:
     record = json.loads((two[1] / "run.json").read_text())
     (two[1] / "run.json").write_text(json.dumps(record | {"stages": []}))
-    assert "b: –, –" in compare_runs(two).text()
+    assert "\n  b  –, –" in compare_runs(two).text()
 
 
 def test_identical_runs_differ_by_nothing(two: list[Path]) -> None:

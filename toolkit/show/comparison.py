@@ -93,9 +93,10 @@ class Comparison:
                 if row["run"]:
                     line += f"   {_interval(row, 'difference')}   {row['won']} won, {row['lost']} lost"
                 lines.append(line)
+        lines.append("time and peak memory; what a run has reused, or taken over from another, costs it none")
         for i, name in enumerate(self.names):
             spent = self.resources.iloc[-1]
-            lines.append(f"{name}: {_time(spent[f'seconds_{i}'])}, {_memory(spent[f'memory_mb_{i}'])}")
+            lines.append(f"  {name:<{width}}  {_time(spent[f'seconds_{i}'])}, {_memory(spent[f'memory_mb_{i}'])}")
         for row in self.settings.to_dict("records"):
             lines.append(f"{row['key']}: " + " | ".join(row[f"run_{i}"] for i in range(len(self.names))))
         return "\n".join([*lines, *(f"Note: {message}" for message in self.messages)])
@@ -136,7 +137,8 @@ def compare_runs(run_dirs: Sequence[str | Path], seed: int = SEED, resamples: in
     """
     folders = [] if isinstance(run_dirs, str) else list(map(Path, run_dirs))
     if len(folders) < 2:
-        raise ArtifactError(f"compare: found {run_dirs!r}, expected a list of two or more run folders.")
+        found = run_dirs if isinstance(run_dirs, str) else [str(folder) for folder in folders]
+        raise ArtifactError(f"compare: found {found!r}, expected a list of two or more run folders.")
     records = [read_run(folder / "run.json") for folder in folders]
     tables = [_read_errors(folder, record) for folder, record in zip(folders, records, strict=True)]
     names, messages = _names(folders), list[str]()
