@@ -8,6 +8,7 @@ import pytest
 from tests.localized import instants, some_correspondences, write_pair, write_queries
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError
+from toolkit.geometry import make_pose
 from toolkit.localizers.correspondences import LocalizedQuery
 from toolkit.localizers.local_map import LocalMap
 from toolkit.show import localized
@@ -84,6 +85,15 @@ def test_a_rig_shows_the_camera_with_the_most_inliers_first(capture, open_pair):
     row = names(session, len(session)).index(images[-2])
     np.testing.assert_allclose(details.cameras[0].world_from_cam_true, session.world_from_cam([row], True)[0])
     np.testing.assert_allclose(details.cameras[0].world_from_cam, details.cameras[0].world_from_cam_true)
+
+
+def test_errors_are_those_of_the_device_as_in_the_evaluation(capture, open_pair):
+    pair = open_pair("hl", LocalizedQuery(query_images(capture, "hl"), names(capture["ios_map"], 1)))
+    turn = make_pose([[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.zeros(3))
+    shown = replace(pair, world_from_rig=pair.world_from_rig @ turn).localizations
+    assert shown.ranked["rotation_error_deg"].item() == pytest.approx(90)
+    assert shown.ranked["translation_error_m"].item() == pytest.approx(0, abs=1e-9)
+    assert np.linalg.norm((shown.estimated - shown.true)[0, :3, 3]) > 0.01, "the camera stands beside the rig's center"
 
 
 def test_lifted_points_are_shown_although_no_map_holds_them(capture, open_pair):

@@ -15,7 +15,7 @@ from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.tables import read_query_table
 from toolkit.errors import ArtifactError
 from toolkit.files import map_record_path, pair_name, read_map_record
-from toolkit.geometry import Floats, Ints
+from toolkit.geometry import Floats, Ints, invert
 from toolkit.localizers.correspondences import Correspondences, LocalizedQueries, LocalizedQuery
 from toolkit.localizers.local_map import LocalMap
 from toolkit.show.metrics import is_posed, length_unit, pose_errors, worst_first
@@ -159,11 +159,16 @@ class Localizations:
     """World position (Q, 3) of the first reference of queries without a pose; NaN where there is none."""
     unit: tuple[str, float] = ("m", 1.0)
     """What lengths are shown in, see `metrics.length_unit`."""
+    cam_from_rig: Floats = field(default_factory=lambda: np.eye(4))
+    """(Q, 4, 4), or one for all."""
 
     @cached_property
     def ranked(self) -> pd.DataFrame:
-        """The table with the errors: `rotation_error_deg`, `translation_error_m` in `unit`; infinite without a pose."""
-        rotation_deg, translation = pose_errors(self.estimated, self.true)
+        """The table with the errors of the device: `rotation_error_deg`, `translation_error_m` in `unit`.
+
+        They are those of the evaluation; infinite without a pose.
+        """
+        rotation_deg, translation = pose_errors(self.estimated @ self.cam_from_rig, self.true @ self.cam_from_rig)
         return self.table.assign(rotation_error_deg=rotation_deg, translation_error_m=translation / self.unit[1])
 
     def worst_first(self) -> Ints:
@@ -221,7 +226,8 @@ class LocalizedPair:
         """All queries."""
         session = self.query_session
         first = np.array([rows[0] for rows in self.rows], np.int64)
-        estimated = self.world_from_rig @ session.rig_from_cam(first)
+        rig_from_cam = session.rig_from_cam(first)
+        estimated = self.world_from_rig @ rig_from_cam
         centers = np.full((len(first), 3), np.nan)
         for k in np.flatnonzero(~is_posed(estimated)):
             names = [name for name in self.localized(int(k)).references if name in self.map_session.row_of_name]
@@ -229,7 +235,7 @@ class LocalizedPair:
                 centers[k] = self.map_session.world_from_cam([self.map_session.row_of_name[names[0]]])[0, :3, 3]
         names = [session.image_name(int(row)) for row in first]
         true = session.world_from_cam(first, ground_truth=True)
-        return Localizations(names, self.table, estimated, true, centers, self.unit)
+        return Localizations(names, self.table, estimated, true, centers, self.unit, invert(rig_from_cam))
 
     def details(
         self, k: int, query: LocalizedQuery | None = None, world_from_rig: Floats | None = None

@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 Window = tuple[tuple[float, float], tuple[float, float]]
 """Limits of x and y, meters."""
 
+MOST_LETTERS = 60
+"""Of an image's name on the sheet of the worst: more would run into the picture beside."""
+
 
 @dataclass(frozen=True)
 class WorstQuery:
@@ -220,6 +223,7 @@ def draw_worst(
         known = np.isfinite(query.translation_m)
         off = f"off by {query.rotation_deg:.2g}°, {_length(query.translation_m, query.unit)}; " if known else ""
         name = own_name(query.details.cameras[0].name.rpartition("/raw_data/")[2])
+        name = name if len(name) <= MOST_LETTERS else f"…{name[1 - MOST_LETTERS :]}"
         axis.set_title(f"{rank}. {query.pair}: {off}{query.reason}\n{name}", fontsize=8, loc="left", wrap=True)
     legend = "left: query, right: its best reference; lines: inliers (green) and rejected matches (orange) of both"
     figure.suptitle(f"{title}\n({legend})")
