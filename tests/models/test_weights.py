@@ -339,7 +339,7 @@ def test_kinds_that_do_not_go_together(features: dict[str, list[str]]) -> None:
 
 
 def test_checkpoints_are_of_kinds_that_exist() -> None:
-    with pytest.raises(ManifestError, match="'superpoint' or 'aliked'"):
+    with pytest.raises(ManifestError, match=r"found 'alike'\. Did you mean 'aliked'\? Known: aliked, superpoint"):
         FeaturesSettings.of({"checkpoint": {"alike": "a.pth"}})
 
 
