@@ -407,6 +407,8 @@ def test_what_builds_on_a_failed_stage_is_skipped(here: Path) -> None:
         ("rerank", {"matcher": "mutuel"}, "Did you mean 'mutual'"),
         ("embed", {"model": "vald"}, "'vald'. Did you mean 'vlad'. Known: auto, megaloc"),
         ("embed", {"settings": {"model": ["vlad", "megalok"]}}, "Did you mean 'megaloc'"),
+        ("embed", {"compute_device": "cude"}, "found 'cude'. It is: Where a network runs: auto, cpu, cuda"),
+        ("retrieve", {"settings": {"index": "IVF4096,Flot"}}, "retrieve.index: found 'IVF4096,Flot'"),
         ("evaluate", {"pairs": "ios"}, "pairs: found 'ios'"),
         ("evaluate", {"pairs": [["ios"]]}, "pairs"),
         ("embed", {"batch_size": 0.5}, "batch_size"),
@@ -444,16 +446,25 @@ def test_a_notebook_that_is_no_stage_looks_at_its_parameters(
         notebook.check_given("own_images", poses_are=POSE_DIRECTIONS)
 
 
-def test_a_notebook_looks_for_its_devices_before_earlier_stages_are_made(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"map_device": "all", "query_device": "oss"}, r"query_device: found 'oss', .*Did you mean 'ios'"),
+        ({"queries": "keyframes_evry"}, r"queries: found 'keyframes_evry', .*Did you mean 'keyframes_every'"),
+    ],
+)
+def test_a_notebook_looks_for_what_it_is_asked_before_earlier_stages_are_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: dict[str, str], message: str
 ) -> None:
     for session in ("ios_map", "ios_query"):
-        (tmp_path / "P" / "sessions" / session).mkdir(parents=True)
-        (tmp_path / "P" / "sessions" / session / "images.txt").touch()
-    shell = SimpleNamespace(user_ns={"In": [""], "map_device": "all", "query_device": "oss"})
+        (tmp_path / "P" / "sessions" / session / "proc").mkdir(parents=True)
+        for name in ("images.txt", "sensors.txt"):
+            (tmp_path / "P" / "sessions" / session / name).touch()
+    (tmp_path / "P" / "sessions" / "ios_query" / "proc" / "keyframes_every.txt").touch()
+    shell = SimpleNamespace(user_ns={"In": [""], **asked})
     monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
     monkeypatch.setattr(notebook, "_make_upstream", lambda *_: pytest.fail("made"))
-    with pytest.raises(CaptureError, match=r"query_device: found 'oss', .*Did you mean 'ios'"):
+    with pytest.raises(CaptureError, match=message):
         notebook.start("localize", sessions_root=str(tmp_path / "P" / "sessions"))
 
 

@@ -29,6 +29,7 @@ from toolkit.manifest import (
     LocalizeSettings,
     Manifest,
     RerankSettings,
+    RetrieveSettings,
     Settings,
     nearest,
 )
@@ -99,7 +100,7 @@ def start(stage: str, sessions_root: str | None = None, **folders: str | None) -
         log_to(Path(run_log))
     check_given(stage)
     sessions, root = sessions_or_demo(sessions_root), _root()
-    _check_devices(stage, sessions)
+    _check_asked(stage, sessions)
     scene = sessions.parent.name
     files = SceneFiles(root / "runs" / scene, scene)
     defaults = {**stage_folders(files), "out_dir": stage_outputs(files, stage)}
@@ -300,11 +301,19 @@ def check_given(name: str, **words: Iterable[str]) -> None:
             raise ManifestError(f"{key}: found {values[key]!r}. {nearest(values[key], known)}")
 
 
-def _check_devices(stage: str, sessions: Path) -> None:
-    """Refuse devices of the running notebook that its capture does not have, before earlier stages are made."""
+def _check_asked(stage: str, sessions: Path) -> None:
+    """Refuse what the running notebook asks for and its capture does not have, before earlier stages are made."""
     from toolkit.capture import Capture
 
     values, known = _user_names(), notebook_parameters(notebook_path(stage))
+    if "queries" in values and "queries" in known:
+        capture = Capture.from_sessions_root(sessions)
+        lists = {name for session in capture.usable("query") for name in session.keyframe_files}
+        short = str(values["queries"]).removesuffix(".txt").removeprefix("keyframes_")
+        if lists and short not in lists | {"all"}:
+            names = ["all", *(name if name == "queries" else f"keyframes_{name}" for name in lists)]
+            found = f"queries: found {values['queries']!r}, which no query session in {capture.path} has."
+            raise CaptureError(f"{found} {nearest(str(values['queries']), names)}")
     for name, split in (("map_device", "map"), ("query_device", "query")):
         if name not in values or name not in known:
             continue
@@ -316,7 +325,7 @@ def _check_devices(stage: str, sessions: Path) -> None:
 
 
 def check_names(settings: Settings) -> None:
-    """Refuse embedders, local features and matchers that there are none of; for the settings tree they are texts.
+    """Refuse embedders, local features, matchers and indices that there are none of, which are texts in the settings.
 
     Raises:
         ManifestError: naming it, the nearest known one, and all.
@@ -332,6 +341,10 @@ def check_names(settings: Settings) -> None:
 
         kinds = [kind for kind in (*settings.features.kinds, *settings.features.escalation) if kind != "auto"]
         matchers_of(kinds or ["sift", "aliked"], settings.matcher.name)
+    elif isinstance(settings, RetrieveSettings) and settings.index != "Flat":
+        from toolkit.embedders.index import check_factory
+
+        check_factory(settings.index)
 
 
 def check_values(name: str, values: Mapping[str, Any]) -> None:

@@ -219,6 +219,27 @@ def _is_needed(settings: RetrieveSettings, vectors: StoredVectors) -> bool:
     return len(vectors) > max(trained_with)
 
 
+def check_factory(factory: str) -> None:
+    """Refuse a string that FAISS's index factory cannot make an index of for vectors of any usual length.
+
+    Raises:
+        ManifestError: naming the string.
+    """
+    said = []
+    for dim in () if factory == EXACT else (8448, 15360, 512):  # MegaLoc, a length that most numbers divide, VLAD
+        try:
+            faiss.index_factory(dim, factory)
+        except RuntimeError as error:
+            said.append(_said(error))
+        else:
+            return
+    if said:
+        raise ManifestError(
+            f"retrieve.index: found {factory!r} ({said[0]}). Expected a string of FAISS's index factory, such as "
+            f"PCA512,IVF4096,RaBitQ; {EXACT} needs no index."
+        )
+
+
 def _empty(vectors: StoredVectors, factory: str) -> Any:
     # Of vectors of length 1 the nearest have the largest product, and centering by PCA does not change distances.
     metric = faiss.METRIC_L2 if vectors.normalize else faiss.METRIC_INNER_PRODUCT

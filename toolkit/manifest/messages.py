@@ -53,7 +53,7 @@ def explain(
         elif problem["type"] == "missing":
             line = f"{where}: not given. {problem['msg']}."
         else:
-            line = f"{where}: found {problem['input']!r}. {problem['msg']}."
+            line = f"{where}: found {problem['input']!r}. {_expected(problem, model, keys)}"
         lines.append(line + origin(keys))
     return "\n  ".join([f"{source}:", *dict.fromkeys(lines)])
 
@@ -61,6 +61,14 @@ def explain(
 def _choices(problem: Any) -> list[str]:
     """Return the words that a value may be, of an error of pydantic."""
     return re.findall(r"'([^']*)'", problem["ctx"]["expected"])
+
+
+def _expected(problem: Any, model: type[BaseModel], keys: list[str]) -> str:
+    """Return what pydantic expected and what the setting means; that alone where pydantic has a regex."""
+    fields = _model_at(model, keys[:-1]).model_fields
+    meaning = fields[keys[-1]].description if keys and keys[-1] in fields else None
+    said = "" if meaning and problem["type"] == "string_pattern_mismatch" else f"{problem['msg']}."
+    return f"{said} It is: {meaning}".strip() if meaning else said
 
 
 def _model_at(model: type[BaseModel], keys: list[str]) -> type[BaseModel]:
