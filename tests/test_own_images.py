@@ -10,7 +10,7 @@ import pandas as pd
 import PIL.Image
 import pytest
 
-from toolkit.capture import Trajectory
+from toolkit.capture import Session, Trajectory
 from toolkit.errors import CaptureError, ManifestError, StageError
 from toolkit.exchange.interchange import import_once
 from toolkit.geometry import make_pose
@@ -71,6 +71,24 @@ def test_other_input_is_named_and_never_gets_an_earlier_result(tmp_path: Path) -
     assert session.stat().st_mtime_ns == before
     with pytest.raises(ManifestError, match="query_images: found None"):
         import_once(None, place, "ios", "query")
+
+
+def test_a_camera_given_for_others_changes_nothing(tmp_path: Path) -> None:
+    """As for a map whose table has cameras, where the queries turn out to need `camera`."""
+    (tmp_path / "a").mkdir()
+    PIL.Image.new("RGB", (64, 48)).save(tmp_path / "a" / "1.jpg")
+    camera, other = "SIMPLE_PINHOLE, 64, 48, 50, 32, 24", "SIMPLE_PINHOLE, 64, 48, 60, 32, 24"
+    with_model, with_id, listed = tmp_path / "model.csv", tmp_path / "id.csv", tmp_path / "cameras.txt"
+    with_model.write_text("image,model,width,height,params\n1.jpg,SIMPLE_PINHOLE,64,48,50 32 24\n")
+    with_id.write_text("image,camera_id\n1.jpg,1\n")
+    listed.write_text("1 SIMPLE_PINHOLE 64 48 50 32 24\n")
+    for number, options in enumerate(({"table": with_model}, {"table": with_id, "cameras": listed})):
+        place = tmp_path / f"PLACE_{number}"
+        for given in (None, camera, other):
+            said = import_once(tmp_path / "a", place, "ios", "query", **options, camera=given)
+            assert ("1 of 1 images" if given is None else "kept") in said
+        session = Session.open(place / "sessions" / "ios_query")
+        assert session.camera(str(session.images["sensor_id"].iloc[0])).params.tolist() == [50, 32, 24]
 
 
 def test_poses_are_listed_with_the_names_of_images(tmp_path: Path) -> None:

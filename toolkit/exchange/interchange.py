@@ -171,6 +171,8 @@ def import_once(images: str | Path | None, capture: str | Path, device: str, spl
         if given.get(name) is not None:
             given[f"content of {name}"] = file_fingerprint(given[name])
             given[name] = str(Path(given[name]).resolve())
+    if given.get("camera") is not None and _has_cameras(table=options.get("table"), cameras=options.get("cameras")):
+        given["camera"] = None  # a camera that is given for other images changes nothing here
     given["files of images"] = files_fingerprint([Path(images) / name for name in list_images(Path(images))["image"]])
     record = session / IMPORT_RECORD
     if not session.exists():
@@ -261,6 +263,12 @@ def _camera_of(
     if listed:
         return next(iter(listed.values())), "the camera of cameras.txt"
     return (given, "the camera that was given") if given is not None else exif_camera(path)
+
+
+def _has_cameras(table: str | Path | None, cameras: str | Path | None) -> bool:
+    """Return whether these go before a camera that is given for all images, as `_camera_of` has it."""
+    columns = _read_table(Path(table)).columns if table is not None else []
+    return cameras is not None or not {"model", "camera_id"}.isdisjoint(columns)
 
 
 def _read_cameras(path: Path) -> dict[str, pycolmap.Camera]:
