@@ -118,10 +118,10 @@ class InspectedPair:
         pairs = sorted(Path(poses_dir).glob("*_map_*_query_*.h5"))
         names = [path.stem.rpartition("_map_")[2].partition("_query_")[::2] for path in pairs]
         if (map_device, query_device) not in names:
-            known = [f"({map_!r}, {query!r})" for map_, query in names]
+            known = [f"{query} in {map_}" for map_, query in names]
             raise ArtifactError(
                 f"{poses_dir}: no correspondences of queries of {query_device!r} in the map of {map_device!r}, "
-                f"`<pair>.h5`. {nearest(f'({map_device!r}, {query_device!r})', known)} Localize first: "
+                f"`<pair>.h5`. {nearest(f'{query_device} in {map_device}', known)} Localize first: "
                 "python -m toolkit run MANIFEST."
             )
         self.map_device, self.query_device = map_device, query_device
