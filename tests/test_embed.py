@@ -346,7 +346,7 @@ def roll_camera(capture: Path, sensor: str, k: int) -> None:
         (session / "rigs.txt").write_text("\n".join(edited) + "\n")
 
 
-@pytest.mark.parametrize("k", [1, 2, 3])
+@pytest.mark.parametrize("k", [1, *(pytest.param(k, marks=pytest.mark.slow) for k in (2, 3))])
 def test_a_rolled_camera_is_described_as_an_upright_one(
     tiny: Path, tmp_path: Path, megaloc: dict[str, object], k: int
 ) -> None:
@@ -379,6 +379,7 @@ def test_a_subsession_that_is_gone_leaves_no_embeddings(tiny: Path, tmp_path: Pa
     assert len(load_embeddings(out / "ios_map")[0]) == 6
 
 
+@pytest.mark.slow
 def test_a_session_that_lost_its_images_leaves_no_embeddings(tiny: Path, tmp_path: Path) -> None:
     out = tmp_path / "e"
     embed_sessions(tiny / "sessions", out, device="ios")

@@ -560,6 +560,7 @@ def test_a_run_killed_at_its_end_leaves_no_files_of_two_runs(small_capture: Path
     assert all(query.correspondences.inlier.any() for query in LocalizedQueries(path).values())
 
 
+@pytest.mark.slow
 def test_progress_of_another_question_is_not_taken_over(small_capture: Path, run: SceneFiles) -> None:
     with pytest.MonkeyPatch.context() as patch:
         spy(patch, fail_at=2, error=KeyboardInterrupt())
@@ -571,7 +572,7 @@ def test_progress_of_another_question_is_not_taken_over(small_capture: Path, run
     assert len(calls) == 3
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_equal_seeds_give_equal_files(
     small_capture: Path, run: SceneFiles, finished: tuple[SceneFiles, pd.DataFrame], workers: int
 ) -> None:

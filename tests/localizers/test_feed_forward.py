@@ -387,7 +387,10 @@ def test_wrong_parameters_are_refused(run: SceneFiles, small_capture: Path, wron
 
 @pytest.mark.parametrize(
     ("method", "more"),
-    [("feed_forward", {"predictor": {"batch_size": 1}}), ("hybrid", {"predictor": {"batch_size": 3}, "workers": 2})],
+    [
+        pytest.param("feed_forward", {"predictor": {"batch_size": 1}}, marks=pytest.mark.slow),
+        ("hybrid", {"predictor": {"batch_size": 3}, "workers": 2}),
+    ],
 )
 def test_rows_do_not_depend_on_batches_threads_or_being_killed(
     run: SceneFiles, small_capture: Path, monkeypatch: pytest.MonkeyPatch, method: str, more: dict
