@@ -14,6 +14,7 @@ from toolkit.__main__ import app
 from toolkit.capture import Capture, Session
 from toolkit.capture.check import check_capture
 from toolkit.errors import CaptureError, ManifestError
+from toolkit.exchange.drafts import list_images
 from toolkit.exchange.transforms import import_transforms
 from toolkit.geometry import invert, make_pose, quaternion_to_rotation, transform
 
@@ -169,6 +170,35 @@ def test_images_that_cannot_be_used_are_rows(tmp_path: Path) -> None:
     assert status["images/1.jpg"] == status["x" * 300] == "no such file"
     assert status["images/2.jpg"] == "the image is stored as 64 x 48 pixels, its camera is of 65 x 48"
     assert status["../outside.jpg"] == "not a path inside the folder of images"
+
+
+def test_images_of_another_size_or_place_say_what_to_do(tmp_path: Path) -> None:
+    file = write(tmp_path, fl_x=25.0, w=SIZE[0] // 2, h=SIZE[1] // 2)
+    with pytest.raises(CaptureError, match=r"is of 32 x 24; take images of the camera's size, or its .* times 2"):
+        import_transforms(file, tmp_path / "PLACE")
+    (tmp_path / "images").rename(tmp_path / "pictures")
+    with pytest.raises(CaptureError, match=r"First: images/0.jpg: no such file. Names are paths in this folder: corr"):
+        import_transforms(file, tmp_path / "PLACE")
+    elsewhere = tmp_path / "elsewhere" / "transforms.json"
+    elsewhere.parent.mkdir()
+    elsewhere.write_text(file.read_text().replace("images/", f"{tmp_path}/pictures/"))
+    with pytest.raises(CaptureError, match=r"not a path inside the folder of images. Names are paths in this folder"):
+        import_transforms(elsewhere, tmp_path / "PLACE")
+
+
+def test_the_folder_of_images_may_be_a_link(tmp_path: Path) -> None:
+    """As where images are on another disk. Links in circles end, and images beside the listed ones are counted."""
+    file = write(tmp_path / "here")
+    disk = tmp_path / "disk"
+    (tmp_path / "here" / "images").rename(disk)
+    PIL.Image.new("RGB", SIZE).save(disk / "other.jpg")
+    (tmp_path / "here" / "images").symlink_to(disk)
+    (disk / "circle").symlink_to(tmp_path / "here")
+    (tmp_path / "here" / "again").symlink_to(disk)
+    (report,) = import_transforms(file, tmp_path / "PLACE")
+    assert report.text().splitlines()[1] == "1 images beside these are not in transforms.json"
+    assert not check_capture(tmp_path / "PLACE").problems
+    assert len(list_images(tmp_path / "here")) == 4
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ ORIENTATION, _EXIF, _TIME, _SUBSECOND = 0x0112, 0x8769, 0x9003, 0x9291
 _FOCAL_MM, _FOCAL_35MM, _WIDTH = 0x920A, 0xA405, 0xA002
 _PLANE_X, _PLANE_UNIT = 0xA20E, 0xA210
 _UNIT_MM = {0.0: 25.4, 2.0: 25.4, 3.0: 10.0, 4.0: 1.0}  # inches where it is not said
+NO_FILE = "no such file"
 _FILM_DIAGONAL_MM = float(np.hypot(36, 24))
 
 
@@ -32,7 +33,7 @@ def read_header(path: Path) -> tuple[tuple[int, int], dict[int, Any]]:
         ImageError: no such file, or no image.
     """
     if not is_file(path):
-        raise ImageError("no such file")
+        raise ImageError(NO_FILE)
     try:
         with PIL.Image.open(path) as image:
             exif = image.getexif()

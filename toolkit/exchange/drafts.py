@@ -9,7 +9,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -21,7 +21,7 @@ import pycolmap
 from toolkit.capture import RAW_DATA, Trajectory, write_session
 from toolkit.capture.cameras import camera_text
 from toolkit.capture.devices import SPLITS
-from toolkit.capture.exif import ORIENTATION, read_header, read_number, time_taken
+from toolkit.capture.exif import NO_FILE, ORIENTATION, read_header, read_number, time_taken
 from toolkit.capture.names import EXPECTED_NAME, is_bad_name, note_linked_here
 from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.files import IMPORTED, write_folder
@@ -32,6 +32,7 @@ SUBSESSION = "import"
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 PLACING = ("link", "copy")
 IMPORT_RECORD = "proc/import.json"
+NOT_INSIDE = "not a path inside the folder of images"
 AXES = {"opencv": np.eye(4), "opengl": np.diag([1.0, -1.0, -1.0, 1.0])}
 """Conventions of camera axes, as named_from_cam: `opencv` has x right, y down, z forward, as the toolkit has them;
 `opengl` x right, y up, z backward."""
@@ -118,6 +119,8 @@ class Draft:
         self.images = [image for image in self.images if not problems[image.name]]
         if not self.images:
             why = f" First: {self.rows[0]['image']}: {self.rows[0]['status']}." if self.rows else ""
+            if self.rows and self.rows[0]["status"] in (NO_FILE, NOT_INSIDE):
+                why += " Names are paths in this folder: correct them where they are listed, or put the list beside it."
             raise CaptureError(f"{self.folder}: none of {len(self.rows)} images can be imported.{why}")
         if turned := sum(image.turned for image in self.images):
             self.notes.append(f"{turned} images have an EXIF tag that asks for turning: the pixels are used as stored")
@@ -172,7 +175,7 @@ class Draft:
         if "," in image.name:
             return "the capture format cannot hold the comma in its name"
         if image.name.startswith("/") or ".." in name.parts:
-            return "not a path inside the folder of images"
+            return NOT_INSIDE
         if is_bad_name(image.name):
             return f"the capture format cannot hold this name, expected {EXPECTED_NAME}"
         try:
@@ -185,6 +188,9 @@ class Draft:
             return ""
         stored = f"{size[0]} x {size[1]}"
         problem = f"the image is stored as {stored} pixels, its camera is of {camera.width} x {camera.height}"
+        sides = (*size, camera.width, camera.height)
+        if abs(size[0] * camera.height - size[1] * camera.width) <= max(sides) / 2:  # sides are rounded to pixels
+            problem += f"; take images of the camera's size, or its intrinsics times {size[0] / camera.width:.6g}"
         if orientation > 4 and size == (camera.height, camera.width):
             problem += "; the camera is of the turned image: turn the pixels and remove the EXIF orientation"
         return problem
@@ -218,13 +224,28 @@ def start(capture: str | Path, device: str, split: str, folder: Path, placing: s
 def list_images(folder: Path) -> pd.DataFrame:
     """Return the images in and below a folder, a table [image, line] without lines, in order of their names.
 
+    A folder in it may be a link to another disk.
+
     Raises:
         CaptureError: there are none.
     """
-    paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
+    paths = sorted(path for path in _files_below(folder) if path.suffix.lower() in IMAGE_SUFFIXES)
     if not paths:
         raise CaptureError(f"{folder}: no image in or below it. Expected {', '.join(IMAGE_SUFFIXES)}.")
     return pd.DataFrame({"image": [path.relative_to(folder).as_posix() for path in paths], "line": 0})
+
+
+def _files_below(folder: Path) -> Iterator[Path]:
+    """Yield the files in and below a folder, also in folders that it links to elsewhere, each of these once."""
+    known = [folder.resolve()]
+    for root, folders, names in os.walk(folder, followlinks=True):
+        for link in [name for name in folders if Path(root, name).is_symlink()]:
+            target = Path(root, link).resolve()
+            if any(target.is_relative_to(one) or one.is_relative_to(target) for one in known):
+                folders.remove(link)
+            else:
+                known.append(target)
+        yield from (Path(root, name) for name in names)
 
 
 def posed_camera(world_from_named: Floats, axes: str, unit_m: float) -> Floats:

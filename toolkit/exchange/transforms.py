@@ -29,7 +29,7 @@ from toolkit.capture import parse_camera
 from toolkit.capture.exif import is_file, read_header
 from toolkit.capture.tables import FARTHEST_M
 from toolkit.errors import CaptureError, ImageError, ManifestError
-from toolkit.exchange.drafts import IMAGE_SUFFIXES, ImportReport, list_images, posed_camera, require_convention, start
+from toolkit.exchange.drafts import IMAGE_SUFFIXES, ImportReport, posed_camera, require_convention, start
 from toolkit.geometry import Floats
 
 PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
@@ -91,7 +91,9 @@ def import_transforms(
         except ImageError as error:
             draft.rows.append({"image": name, "status": str(error)})
     folders = {PurePosixPath(name).parent for name in frames}
-    others = {name for name in list_images(path.parent)["image"] if PurePosixPath(name).parent in folders} - set(frames)
+    beside = [one for folder in folders for one in (path.parent / folder).glob("*")]
+    images = {one.relative_to(path.parent).as_posix() for one in beside if one.suffix.lower() in IMAGE_SUFFIXES}
+    others = images - set(frames)
     if others:
         drafts[0].notes.append(f"{len(others)} images beside these are not in {path.name}")
     for draft in drafts:
