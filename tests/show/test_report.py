@@ -241,6 +241,15 @@ def test_without_ground_truth_the_least_supported_are_listed(full):
     text = text_of(write_report(full).read_text())
     assert "The 4 least supported; there is no ground truth" in text
     assert text.index("failed: too few inliers (3") < text.index("low confidence 30")
+    assert "why" not in text[text.index("The 4 least supported") :].split(" low confidence ")[0]
+    tables = [path for path in full.rglob("poses/*.csv") if "_sequence" not in path.name]
+    for path in tables:
+        table = pd.read_csv(path)
+        table["reason"] = ["the focal length that fits is 921 px", *[None] * (len(table) - 1)]
+        table.to_csv(path, index=False)
+    text = text_of(write_report(full).read_text())
+    assert "query status inliers why" in text
+    assert "the focal length that fits is 921 px" in text
 
 
 def test_scene_without_ground_truth(tmp_path):
@@ -291,7 +300,8 @@ def test_what_is_known_of_a_map_is_said_and_lengths_without_a_unit_are_no_meters
     said = "the poses of the map contradict its images"
     (scene / "poses" / f"{scene.name}_map_ios.json").write_text(json.dumps({"unit": None, "depth": 30.0, "text": said}))
     text = text_of(write_report(full).read_text())
-    assert f"_map_ios: {said}" in text
+    assert text.index("Before you read the numbers.") < text.index(f"_map_ios: {said}") < text.index("mean recall at")
+    assert said not in text[text.index("Not everything could be evaluated.") :]
     assert "45 % mean recall at 1°, 0.1 L" in text
     assert not re.search(r"\d\s*(cm|m)\b|\[c?m\]", text)
 

@@ -30,7 +30,7 @@ WORST, MOST_REASONS = 10, 12
 """Rows listed of a scene: the worst queries, and the reasons of queries without a pose."""
 # Figures that say more than the page's own tables: a heading, and how to read it.
 STATUS_COLUMNS = [
-    "timestamp", "device_id", "image", "status", "num_inliers", "position_std_m", "seconds",
+    "timestamp", "device_id", "image", "reason", "status", "num_inliers", "position_std_m", "seconds",
     "first_status", "first_seconds",
 ]  # fmt: skip
 EVALUATION_FIGURES = {
@@ -257,14 +257,15 @@ def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> dict[str, An
     messages += _messages(files.evaluation / "recall.csv") if len(recall) else []
     unit = unit_of(*thresholds)
     small, factor = small_unit(unit)
+    remarks = []
+    for path in sorted(files.poses_dir.glob(f"{glob.escape(files.scene)}_map_*.json")):
+        record = read_map_record(path)
+        remarks += [f"{path.stem}: {record['text']}"] if record["text"] else []
     if unit != "m":
-        messages.append(f"The unit of the poses is not known: {unit} is a tenth of the median depth that a map shows.")
+        remarks.append(f"The unit of the poses is not known: {unit} is a tenth of the median depth that a map shows.")
     medians = ("median_rotation_deg", "Median rotation error [°]", 1.0), (
         "median_translation_m", f"Median translation error [{small}]", factor
     )  # fmt: skip
-    for path in sorted(files.poses_dir.glob(f"{glob.escape(files.scene)}_map_*.json")):
-        record = read_map_record(path)
-        messages += [f"{path.stem}: {record['text']}"] if record["text"] else []
     verdict, headlines = _verdict(recall, errors, statuses, thresholds)
     matrices, note = _retrieval(retrieval, headlines, unit)
     stills = sorted(files.visualization.glob("*.png"), key=_natural)
@@ -279,6 +280,7 @@ def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> dict[str, An
         "verdict": verdict,
         "headlines": headlines,
         "messages": messages,
+        "remarks": remarks,
         "recall": [
             _matrix(recall, column, f"Recall at {_threshold(column)} [%]", percent, lambda v: 0.9 * v)
             for column in thresholds
@@ -512,7 +514,8 @@ def _worst(queries: pd.DataFrame, thresholds: list[str]) -> Table | None:
     else:
         caption = f"The {len(worst)} least supported; there is no ground truth to compare with"
     named = "image" in worst and bool(worst["image"].notna().all())  # tables of earlier versions have no names
-    columns = ["query", *(["off by", "why"] if has_truth else []), "status", "inliers"]
+    reasons = not has_truth and "reason" in worst and bool(worst["reason"].notna().any())
+    columns = ["query", *(["off by", "why"] if has_truth else []), "status", "inliers", *(["why"] if reasons else [])]
     columns += ["image"] if named else ["device", "timestamp [µs]"]
     rows = []
     for row in worst.to_dict("records"):
@@ -523,6 +526,7 @@ def _worst(queries: pd.DataFrame, thresholds: list[str]) -> Table | None:
             texts += [f"{number(rotation_deg)}°, {_length(translation_m, unit)}" if located else "no pose", _why(row)]
         inliers = "–" if pd.isna(row["num_inliers"]) else f"{row['num_inliers']:.0f}"
         texts += [str(row["status"]).replace("_", " "), inliers]
+        texts += [row["reason"] if isinstance(row["reason"], str) else "–"] if reasons else []
         texts += [_shown_names(row["image"])] if named else [str(row["device_id"]), str(row["timestamp"])]
         rows.append([Cell(text) for text in texts])
     return Table(caption, columns, rows)
