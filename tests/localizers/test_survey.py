@@ -116,6 +116,7 @@ def test_the_convention_that_would_fit_is_found(
     assert found.fits.startswith(fits)
     assert bool(found.fits) == bool(fits)
     assert found.text
+    assert ("the other `--axes`" in found.text) == ("OpenGL" in fits), "where an import has turned them, they are not"
 
 
 def test_a_few_images_tell_nothing(small_capture: Path, small_features: Path) -> None:

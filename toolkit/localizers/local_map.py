@@ -28,6 +28,8 @@ IN_MEMORY = 1 << 26
 """Bytes of a map that is read when it is opened, so that it may be overwritten meanwhile."""
 _BLOCK = 1 << 18
 """Points that are looked at at once."""
+OPENGL_AXES = "camera axes as in OpenGL (x right, y up, z backward)"
+"""As a convention that would fit; so it is, too, where axes were turned that should not have been."""
 _PADDING = 0xD935
 """Of an extra field of a zip file that means nothing."""
 
@@ -56,6 +58,8 @@ class Consistency:
             cause = f"They would as: {self.fits}." if self.fits else (
                 "No usual convention fits: do the poses, names and intrinsics belong to these images?"
             )  # fmt: skip
+            if OPENGL_AXES in self.fits:
+                cause += " Of an import: give the other `--axes`, opencv or opengl, to `python -m toolkit import`."
             return (
                 "the poses of the map contradict its images: of "
                 f"{self.pairs} image pairs whose matches were verified, {self.agreeing} agree with them. {cause}"

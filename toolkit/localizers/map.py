@@ -242,7 +242,8 @@ class Map:
         plausible = self.consistency.verdict != "inconsistent"
         if plausible and self.settings.unit and self.length != 1 and not ODD_DEPTHS_M[0] < depth < ODD_DEPTHS_M[1]:
             odd = f"the map shows what is {depth:.3g} m away in the median"
-            parts.append(f"{odd}: if its poses are not in meters, write `unit: null` in the manifest")
+            mend = "write `unit: null` in the manifest, or import them with their `--unit`"
+            parts.append(f"{odd}: if its poses are not in meters, {mend}")
         return "; ".join(filter(None, parts))
 
     def record(self) -> dict[str, Any]:

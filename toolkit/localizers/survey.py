@@ -23,7 +23,7 @@ from toolkit.features.features import LocalFeatures
 from toolkit.features.matching import MutualMatcher
 from toolkit.features.verification import verified_matches
 from toolkit.geometry import Floats, Ints
-from toolkit.localizers.local_map import Consistency, LocalMap
+from toolkit.localizers.local_map import OPENGL_AXES, Consistency, LocalMap
 from toolkit.manifest import RerankSettings
 
 ANCHORS = 12
@@ -357,7 +357,7 @@ def _axes_text(axes: Floats) -> str:
     if np.array_equal(axes, np.eye(3)):
         return ""
     if np.array_equal(axes, np.diag([1, -1, -1])):
-        return "camera axes as in OpenGL (x right, y up, z backward)"
+        return OPENGL_AXES
     if axes[2, 2] == 1:
         return f"images turned by {round(float(np.degrees(np.arctan2(axes[1, 0], axes[0, 0]))))} degrees"
     return f"other camera axes (x right, y down, z forward are {_axes(axes)})"
