@@ -14,7 +14,7 @@ from toolkit import pipeline
 from toolkit.capture import Capture, Trajectory, devices, write_session
 from toolkit.capture.check import check_capture
 from toolkit.embed import embed_sessions
-from toolkit.errors import ManifestError
+from toolkit.errors import CaptureError, ManifestError
 from toolkit.evaluate import evaluate_scene
 from toolkit.exchange.submission import collect
 from toolkit.files import SceneFiles
@@ -74,6 +74,11 @@ def test_sessions_of_lamar_are_found(tmp_path: Path) -> None:
     capture = Capture.open(root)
     assert capture.devices == ["ios", "hl", "mixed"]
     assert (capture.devices_with("map"), capture.devices_with("query")) == (["mixed"], ["ios", "hl"])
+    with pytest.raises(CaptureError, match=r"'ios' .* with one: mixed "):
+        capture.devices_with("map", "ios")
+    write(tmp_path / "MAPS", "map")
+    with pytest.raises(CaptureError, match=r"MAPS: no query session. Expected .*_query, .* --split query"):
+        Capture.open(tmp_path / "MAPS").devices_with("query")
     session = capture["ios_query"]
     assert (session.id, session.device, session.split) == ("ios_query", "ios", "query")
     # Files are where they are, whatever the session is called in outputs.

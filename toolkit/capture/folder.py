@@ -84,6 +84,11 @@ class Capture:
         present = [key for key in self.devices if f"{key}_{split}" in self]
         if device in ("all", "auto") and present:
             return present
+        if not present:
+            raise CaptureError(
+                f"{self.path}: no {split} session. Expected sessions/<device>_{split}, such as "
+                f"`python -m toolkit import ... --split {split}` makes."
+            )
         if device not in present:
             raise CaptureError(
                 f"No {split} session of device {device!r} in {self.path}. "
