@@ -65,13 +65,16 @@ from toolkit.notebook import (
     work_seconds,
 )
 from toolkit.runs.cluster import open_cluster
-from toolkit.runs.folder import LOG, held
+from toolkit.runs.folder import LOG, held, warnings_of_kernels
 from toolkit.runs.kernel import Kernels
 from toolkit.runs.pairs import pair_text, way_out
 from toolkit.runs.record import RunLog, failures
 from toolkit.runs.sweep import SweptRun, swept_runs, take_over
 
 log = logging.getLogger(__name__)
+
+MOST_WARNINGS = 5
+"""Of a stage, on the terminal; `run.log` has all of them."""
 
 
 @dataclass(frozen=True)
@@ -552,7 +555,7 @@ def _run_job(
     job.record.unlink(missing_ok=True)
     if force:
         job.forget()
-    started = time.perf_counter()
+    started, logged = time.perf_counter(), (job.files.run / LOG).stat().st_size
     try:
         notebook, memory = execute(notebook_path(job.stage), job.notebook, job.parameters, line, kernels)
     except BaseException as error:
@@ -580,6 +583,12 @@ def _run_job(
     line.end(f"{summary}{summary and '; '}{work:.1f} s + {seconds - work:.1f} s start-up, {memory:.0f} MB")
     for one in row.get("left_out", ()):
         say(f"  left out: {one['what']}: {one['reason']}")
+    warnings = [one for one in warnings_of_kernels(job.files.run / LOG, logged) if one not in record.told]
+    record.told.update(warnings)
+    for one in warnings[:MOST_WARNINGS]:
+        say(f"  warning: {one}")
+    if len(warnings) > MOST_WARNINGS:
+        say(f"  ... and {len(warnings) - MOST_WARNINGS} more warnings, see {job.files.run / LOG}")
     return row
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from toolkit.errors import ToolkitError
 from toolkit.files import is_left_over, process_tag, write_atomic
-from toolkit.runs.folder import LOG, held
+from toolkit.runs.folder import LOG, held, log_to, warnings_of_kernels
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +74,21 @@ def test_temporary_names_tell_whose_they_are(tmp_path: Path) -> None:
         assert process_tag() in temporary.name
         assert not is_left_over(temporary.name)
         temporary.touch()
+
+
+def test_warnings_of_kernels_are_found_once_and_ours_are_not(tmp_path: Path) -> None:
+    path = tmp_path / LOG
+    with log_to(path):
+        logging.getLogger("toolkit.localize").warning("of an earlier stage")
+    start = path.stat().st_size
+    with log_to(path):
+        logging.getLogger("toolkit.localize").warning("camera 1: WARNING toolkit.x: é")
+        logging.getLogger("toolkit.localize").info("no warning")
+        logging.getLogger("others").warning("not ours")
+    assert warnings_of_kernels(path, start) == []
+    path.write_text(path.read_text().replace(f" {os.getpid()} ", " 1 ") * 2)
+    assert warnings_of_kernels(path, start) == ["camera 1: WARNING toolkit.x: é", "of an earlier stage"]
+    assert warnings_of_kernels(tmp_path / "nothing.log", 0) == []
 
 
 def test_the_log_has_times_and_debug_messages_and_the_terminal_warnings_alone(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+import re
 import shutil
 import socket
 import tempfile
@@ -106,6 +107,21 @@ def log_to(path: Path) -> ExitStack:
     own.setLevel(logging.DEBUG)
     ending.callback(_close, file)
     return ending
+
+
+def warnings_of_kernels(path: Path, start: int) -> list[str]:
+    """Return what kernels have warned of in a log after its first `start` bytes, each once.
+
+    Warnings of this process are on the terminal already, those of kernels are not.
+    """
+    try:
+        with path.open("rb") as file:
+            file.seek(start)
+            lines = file.read().decode("utf-8", errors="replace").splitlines()
+    except OSError:
+        return []
+    found = (re.fullmatch(r"\S+ \S+ (\d+) WARNING toolkit\.\S+: (.+)", line) for line in lines)
+    return list(dict.fromkeys(match[2] for match in found if match and int(match[1]) != os.getpid()))
 
 
 def _close(file: logging.FileHandler) -> None:
