@@ -1,5 +1,6 @@
 """Notebook 00, which is no stage: clean as committed, and it runs."""
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import pytest
 
 from toolkit.capture import Session, Trajectory
 from toolkit.errors import CaptureError, ManifestError, StageError
-from toolkit.exchange.interchange import import_once
+from toolkit.exchange.interchange import import_images, import_once
 from toolkit.geometry import make_pose
 from toolkit.notebook import NOTEBOOKS, notebook_parameters, own_folder
 from toolkit.pipeline import execute
@@ -89,6 +90,30 @@ def test_a_camera_given_for_others_changes_nothing(tmp_path: Path) -> None:
             assert ("1 of 1 images" if given is None else "kept") in said
         session = Session.open(place / "sessions" / "ios_query")
         assert session.camera(str(session.images["sensor_id"].iloc[0])).params.tolist() == [50, 32, 24]
+
+
+def test_a_transforms_json_is_taken_as_a_table(tmp_path: Path) -> None:
+    place, images, file = tmp_path / "PLACE", tmp_path / "a", tmp_path / "a" / "transforms.json"
+    images.mkdir()
+    PIL.Image.new("RGB", (64, 48)).save(images / "1.jpg")
+    frame = {"file_path": "1.jpg", "transform_matrix": np.diag([1, -1, -1, 1]).tolist()}
+    file.write_text(json.dumps({"fl_x": 50, "frames": [frame]}))
+    for said in ("1 of 1 images", "imported before from the same input, kept"):
+        assert said in import_once(images, place, "ios", "map", table=file, unit_m=None, camera="of the queries")
+    session = Session.open(place / "sessions" / "ios_map")
+    assert session.camera("import/cam_1").params.tolist() == [50, 50, 32, 24]
+    np.testing.assert_array_equal(session.world_from_cam()[0], np.eye(4))
+    assert json.loads((session.path / "proc" / "import.json").read_text())["unit"] is None
+    with pytest.raises(CaptureError, match="unit_m: then None, now 2"):
+        import_once(images, place, "ios", "map", table=file, unit_m=2.0)
+    with pytest.raises(ManifestError, match=r"query_images: found .*, expected the folder of .*transforms.json"):
+        import_once(tmp_path, place, "ios", "query", table=file)
+    with pytest.raises(ManifestError, match="poses_are: found 'cam_from_world', expected world_from_cam"):
+        import_once(images, place, "ios", "query", table=file, poses_are="cam_from_world")
+    with pytest.raises(CaptureError, match=r"no CSV table. .* python -m toolkit import transforms"):
+        import_images(images, place, "ios", "query", table=file)
+    with pytest.raises(CaptureError, match=r"A map needs poses: .*, or import a transforms.json or a COLMAP model"):
+        import_images(images, place, "hl", "map")
 
 
 def test_poses_are_listed_with_the_names_of_images(tmp_path: Path) -> None:

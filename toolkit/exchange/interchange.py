@@ -32,6 +32,7 @@ from toolkit.exchange.drafts import (
     require_convention,
     start,
 )
+from toolkit.exchange.transforms import import_transforms
 from toolkit.files import file_fingerprint, files_fingerprint, read_json, write_text
 from toolkit.geometry import Floats, invert, make_pose, pose_from_qt
 from toolkit.manifest import nearest
@@ -132,7 +133,10 @@ def import_images(
         raise CaptureError(f"{folder}: no such folder of images.")
     rows = _read_table(Path(table)) if table is not None else list_images(folder)
     if split == "map" and "qw" not in rows:
-        raise CaptureError(f"A map needs poses: give a table with the columns image, {', '.join(POSE_NAMES)}.")
+        raise CaptureError(
+            f"A map needs poses: give a table with the columns image, {', '.join(POSE_NAMES)}, or import a "
+            "transforms.json or a COLMAP model (`python -m toolkit import --help`)."
+        )
     listed_cameras = _read_cameras(Path(cameras)) if cameras is not None else {}
     given_camera = None if camera is None else _camera(camera, "camera")
     posed = rows if truth is None else _read_truth(Path(truth), rows, split)
@@ -153,20 +157,30 @@ def import_images(
     return draft.write()
 
 
-def import_once(images: str | Path | None, capture: str | Path, device: str, split: str, **options: Any) -> str:
+def import_once(
+    images: str | Path | None,
+    capture: str | Path,
+    device: str,
+    split: str,
+    unit_m: float | None = 1.0,
+    **options: Any,
+) -> str:
     """Import images as `import_images` does, unless this was done before from the same input; return what to tell.
 
     Args:
-        options: of `import_images`.
+        unit_m: meters in a unit of the poses; None: not known.
+        options: of `import_images`; `table` may be a transforms.json in the folder of images.
 
     Raises:
-        CaptureError: the session was made from other input, which is named; or what `import_images` raises.
-        ManifestError: no folder is given; or what `import_images` raises.
+        CaptureError: the session was made from other input, which is named; or what the imports raise.
+        ManifestError: no folder is given, or another than that of the transforms.json; or what the imports raise.
     """
     if images is None:
         raise ManifestError(f"{split}_images: found None, expected the folder of your images: other inputs are given.")
     session = Path(capture) / "sessions" / f"{device}_{split}"
     given: dict[str, Any] = {"images": str(Path(images).resolve()), **options}
+    if unit_m != 1:  # sessions of earlier versions do not say that it is
+        given["unit_m"] = unit_m
     for name in ("table", "truth", "cameras"):
         if given.get(name) is not None:
             given[f"content of {name}"] = file_fingerprint(given[name])
@@ -176,7 +190,10 @@ def import_once(images: str | Path | None, capture: str | Path, device: str, spl
     given["files of images"] = files_fingerprint([Path(images) / name for name in list_images(Path(images))["image"]])
     record = session / IMPORT_RECORD
     if not session.exists():
-        report = import_images(images, capture, device, split, **options)
+        if _is_transforms(options.get("table")):
+            report = _import_frames(Path(images), Path(options["table"]), capture, device, split, unit_m, options)
+        else:
+            report = import_images(images, capture, device, split, unit_m=unit_m or 1.0, **options)
         write_text(record, json.dumps(read_json(record) | {"input": given}, indent=1) + "\n")
         return report.text()
     before = read_json(record).get("input", {})
@@ -191,6 +208,27 @@ def import_once(images: str | Path | None, capture: str | Path, device: str, spl
             "to import it again."
         )
     return f"{session}: imported before from the same input, kept"
+
+
+def _is_transforms(table: str | Path | None) -> bool:
+    return table is not None and Path(table).suffix == ".json"
+
+
+def _import_frames(
+    images: Path,
+    file: Path,
+    capture: str | Path,
+    device: str,
+    split: str,
+    unit_m: float | None,
+    options: Mapping[str, Any],
+) -> ImportReport:
+    """Import a transforms.json that is given as the table of a folder of images."""
+    if images.resolve() != file.resolve().parent:
+        raise ManifestError(f"{split}_images: found {images}, expected the folder of {file}, which its paths begin in.")
+    if options.get("poses_are", POSE_DIRECTIONS[0]) != POSE_DIRECTIONS[0]:
+        raise ManifestError(f"poses_are: found {options['poses_are']!r}, expected world_from_cam, as {file} has it.")
+    return import_transforms(file, capture, device, split, unit_m=unit_m)[0]
 
 
 _PROBE = """
@@ -267,6 +305,8 @@ def _camera_of(
 
 def _has_cameras(table: str | Path | None, cameras: str | Path | None) -> bool:
     """Return whether these go before a camera that is given for all images, as `_camera_of` has it."""
+    if _is_transforms(table):
+        return True
     columns = _read_table(Path(table)).columns if table is not None else []
     return cameras is not None or not {"model", "camera_id"}.isdisjoint(columns)
 
@@ -318,6 +358,8 @@ def _poses_of(rows: pd.DataFrame, poses_are: str, axes: str, unit_m: float) -> d
 
 def _read_table(path: Path) -> pd.DataFrame:
     """Read the table of a folder of images, all values as text; adds the column `line`."""
+    if _is_transforms(path):
+        raise CaptureError(f"{path}: no CSV table. Is it a transforms.json? Then: python -m toolkit import transforms")
     try:
         first = next((line for line in path.read_text().splitlines() if line.strip()), "").split()
         if len(first) > 4 and first[1] in pycolmap.CameraModelId.__members__:
