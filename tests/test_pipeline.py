@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -336,6 +337,14 @@ def test_parameters_must_be_literals(tmp_path: Path) -> None:
 def test_what_cannot_run_is_refused(place: Path, options: dict[str, object], expected: str) -> None:
     with pytest.raises(ToolkitError, match=expected):
         pipeline.run(place / "run.yaml", **options)
+
+
+def test_another_python_is_told_which_to_take() -> None:
+    """Messages say `python -m toolkit`; without the packages of the environment this was a traceback."""
+    command = [sys.executable, "-S", "-m", "toolkit", "check"]
+    done = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert re.fullmatch(r"Error: .* has no package typer\. .*: \.venv/bin/python -m toolkit, .*\n", done.stderr)
 
 
 def test_the_command_line_prints_errors_without_traceback(tmp_path: Path) -> None:

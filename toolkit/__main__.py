@@ -13,9 +13,15 @@ from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any
 
-import typer
+try:
+    import typer
 
-from toolkit.errors import IncompleteError, ManifestError, ToolkitError, exit_code, sentence
+    from toolkit.errors import IncompleteError, ManifestError, ToolkitError, exit_code, sentence
+except ModuleNotFoundError as missing:  # messages say `python -m toolkit`, whatever python is called
+    raise SystemExit(
+        f"Error: {sys.executable} has no package {missing.name}. Take the Python that the toolkit is installed for: "
+        ".venv/bin/python -m toolkit, where `make` has installed it."
+    ) from None
 
 app = typer.Typer(
     help="Tell where photographs were taken, in a map of posed photographs.",
