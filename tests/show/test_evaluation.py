@@ -38,3 +38,7 @@ def test_errors_stand_over_the_deviations_that_were_stated() -> None:
     points = {line.get_label(): line.get_xydata() for line in axis.lines if line.get_alpha()}
     assert list(points) == ["ok: 2, 50 % above", "low confidence: 1, 0 % above"]
     np.testing.assert_allclose(np.concatenate(list(points.values())), [(0.01, 0.005), (0.01, 0.1), (0.5, 0.4)])
+    assert not [line for line in axis.lines if "median" in line.get_label()], "of three poses, they would hide them"
+    (axis,) = draw_deviations(pd.concat([errors] * 10)).axes
+    (medians,) = [line for line in axis.lines if "median" in line.get_label()]
+    assert len(medians.get_xydata()) == 10

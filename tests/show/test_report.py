@@ -3,6 +3,7 @@ import io
 import itertools
 import json
 import re
+from html import unescape
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -303,6 +304,7 @@ def test_what_is_known_of_a_map_is_said_and_lengths_without_a_unit_are_no_meters
     assert text.index("Before you read the numbers.") < text.index(f"_map_ios: {said}") < text.index("mean recall at")
     assert said not in text[text.index("Not everything could be evaluated.") :]
     assert "45 % mean recall at 1°, 0.1 L" in text
+    assert f"L is a tenth of the median depth that a map shows: 3 in {scene.name}_map_ios" in unescape(text)
     assert not re.search(r"\d\s*(cm|m)\b|\[c?m\]", text)
 
 

@@ -25,6 +25,8 @@ from toolkit.show.sequences import draw_steps
 
 BEYOND = 5
 """Stated deviations beyond which an error is no chance."""
+FEWEST_FOR_MEDIANS = 30
+"""Poses from which on medians of a tenth of them say more than the poses themselves."""
 RELIABILITY_BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, 1.0)
 
 if TYPE_CHECKING:
@@ -239,8 +241,8 @@ def draw_reliability(errors: pd.DataFrame, unit: str = "m") -> "Figure":
 def draw_deviations(errors: pd.DataFrame, unit: str = "m") -> "Figure":
     """Draw how far poses are off against the standard deviation that the localizer states of their position.
 
-    A line joins the medians of a tenth of the poses each. Where the errors are Gaussian, they lie a little below the
-    stated deviation, and hardly any pose is above the upper line.
+    A line joins the medians of a tenth of the poses each, if there are enough. Where the errors are Gaussian, they lie
+    a little below the stated deviation, and hardly any pose is above the upper line.
     """
     errors = errors[errors["position_std_m"].gt(0) & np.isfinite(errors["translation_error_m"])]
     stated, actual = (errors[name].to_numpy(float).clip(1e-5) for name in ("position_std_m", "translation_error_m"))
@@ -255,9 +257,10 @@ def draw_deviations(errors: pd.DataFrame, unit: str = "m") -> "Figure":
             beyond = float(np.mean(actual[part] > BEYOND * stated[part]))
             label = f"{name}: {part.sum()}, {percent(beyond)} % above"
             axis.plot(stated[part], actual[part], "o", ms=3.5, alpha=0.5, mew=0, color=color, label=label)
-    tenths = [part for part in np.array_split(np.argsort(stated), 10) if len(part)]
-    middles = np.array([(np.median(stated[part]), np.median(actual[part])) for part in tenths])
-    axis.plot(*middles.T, color="0.15", lw=1.5, marker="o", ms=3, label="median of a tenth of the poses")
+    if len(stated) >= FEWEST_FOR_MEDIANS:
+        tenths = np.array_split(np.argsort(stated), 10)
+        middles = np.array([(np.median(stated[part]), np.median(actual[part])) for part in tenths])
+        axis.plot(*middles.T, color="0.15", lw=1.5, marker="o", ms=3, label="median of a tenth of the poses")
     axis.set(xscale="log", yscale="log", xlim=(low, high), ylim=(low, high))
     plain_log(axis, "xy")
     axis.set_xlabel(f"stated standard deviation of the position [{unit}]")

@@ -16,7 +16,16 @@ import pandas as pd
 from toolkit.errors import ArtifactError
 from toolkit.files import SceneFiles, of_sequence, read_map_record, sidecar_path, write_text
 from toolkit.show.figures import number, percent
-from toolkit.show.metrics import REASONS, THRESHOLDS, WRONG, parse_threshold, small_unit, unit_of, worst_first
+from toolkit.show.metrics import (
+    REASONS,
+    THRESHOLDS,
+    WRONG,
+    length_unit,
+    parse_threshold,
+    small_unit,
+    unit_of,
+    worst_first,
+)
 from toolkit.show.pictures import as_jpeg
 from toolkit.show.sequences import CHANGES
 
@@ -46,8 +55,9 @@ EVALUATION_FIGURES = {
     ),
     "deviations": (
         "Stated and actual deviation",
-        "Error of each pose's position against the standard deviation that was stated of it (position_std_m), and "
-        "the median of each tenth of the poses. Above the dashed line, poses are off by more than five deviations.",
+        "Error of each pose's position against the standard deviation that was stated of it (position_std_m); "
+        "of 30 poses or more, the median of each tenth. Above the dashed line, poses are off by more than five "
+        "deviations.",
     ),
     "losses": (
         "Where accuracy was lost",
@@ -257,12 +267,14 @@ def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> dict[str, An
     messages += _messages(files.evaluation / "recall.csv") if len(recall) else []
     unit = unit_of(*thresholds)
     small, factor = small_unit(unit)
-    remarks = []
+    remarks, lengths = list[str](), list[str]()
     for path in sorted(files.poses_dir.glob(f"{glob.escape(files.scene)}_map_*.json")):
         record = read_map_record(path)
         remarks += [f"{path.stem}: {record['text']}"] if record["text"] else []
+        lengths += [f"{length_unit(record)[1]:.3g} in {path.stem}"] if record["depth"] else []
     if unit != "m":
-        remarks.append(f"The unit of the poses is not known: {unit} is a tenth of the median depth that a map shows.")
+        depth = f"a tenth of the median depth that a map shows{': ' if lengths else ''}{', '.join(lengths)}"
+        remarks.append(f"The unit of the poses is not known: {unit} is {depth}.")
     medians = ("median_rotation_deg", "Median rotation error [°]", 1.0), (
         "median_translation_m", f"Median translation error [{small}]", factor
     )  # fmt: skip
