@@ -1,11 +1,14 @@
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
+from tests.displayed import picture_of
 from toolkit.errors import ArtifactError
 from toolkit.notebook import TEXT_BARS
+from toolkit.show.figures import new_figure
 from toolkit.show.inline import ASSETS, show_recording
 from toolkit.show.recordings import open_recording
 
@@ -52,3 +55,11 @@ def test_the_viewer_is_served_by_this_process_and_gets_the_whole_file(files, mon
 def test_no_recording_is_said(tmp_path):
     with pytest.raises(ArtifactError, match=r"gone\.rrd: no such recording"):
         show_recording(Path(tmp_path / "gone.rrd"))
+
+
+def test_a_figure_of_photographs_is_kept_small_and_one_of_lines_sharp():
+    photographs, lines = new_figure(4, 3), new_figure(4, 3)
+    noise = np.random.default_rng(0).integers(0, 255, (300, 400, 3), np.uint8)
+    photographs.subplots().imshow(noise)
+    lines.subplots().plot([0, 1, 2], [0, 1, 0])
+    assert [picture_of(figure).format for figure in (photographs, lines)] == ["JPEG", "PNG"]

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.displayed import picture_of
 from tests.localized import some_correspondences, write_pair
 from tests.rendered import LIST, write_retrieval
 from toolkit.capture import Capture
@@ -86,7 +87,7 @@ def test_it_shows_what_the_stage_stored(files: SceneFiles, pair: InspectedPair) 
     shown = text_of(one.figure)
     assert one.status in shown
     assert f"{row['num_inliers']}" in shown
-    assert one._repr_png_().startswith(b"\x89PNG")
+    assert picture_of(one).width > 800
 
 
 def test_unchanged_settings_give_the_same_pose_and_others_are_shown_beside(pair: InspectedPair) -> None:
@@ -103,7 +104,7 @@ def test_unchanged_settings_give_the_same_pose_and_others_are_shown_beside(pair:
     assert "at least 5000 are asked for" in strict.after.reason
     assert strict.before is one
     assert strict.table.loc["status"].tolist() == [one.status, strict.after.status]
-    assert strict._repr_png_().startswith(b"\x89PNG")
+    assert picture_of(strict).width > 800
     nearest = one.again({"method": "nearest"})
     assert nearest.after.method == "nearest"
     first = one.references[one.references["rank"] == 1]  # one of each camera of the rig
@@ -139,7 +140,7 @@ def test_a_failed_query_says_why_and_is_drawn(small_capture: Path, tmp_path: Pat
         "No pose: too few inliers (4 within 0.45 deg) of 9 matches agree on the best one, at least 12 are asked for."
     )
     assert "no pose" in text_of(one.figure)
-    assert one._repr_png_().startswith(b"\x89PNG")
+    assert picture_of(one).width > 800
     assert pair.look(1).reason == "No pose: the retrieval has no references for this query."
 
 

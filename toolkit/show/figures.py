@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.files import write_atomic
+from toolkit.show.pictures import as_shown
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -49,8 +50,13 @@ def new_figure(width: float, height: float) -> "Figure":
     from matplotlib.figure import Figure  # not pyplot: no state, and nothing is shown twice in a notebook
 
     figure = Figure(figsize=(width, height), layout="constrained")
-    figure._repr_png_ = partial(_png_of, figure)  # type: ignore[attr-defined]
+    figure._repr_mimebundle_ = partial(shown, figure)  # type: ignore[attr-defined]
     return figure
+
+
+def shown(figure: "Figure", **_: Any) -> dict[str, bytes]:
+    """Return a figure as notebooks show and keep it, by the kind of picture."""
+    return as_shown(_png_of(figure))
 
 
 def plain_log(axes: "Axes", sides: str) -> None:

@@ -22,6 +22,7 @@ from toolkit.localizers.map import RETRIEVAL, SESSIONS_ROOT, Map, how_localized,
 from toolkit.manifest import nearest
 from toolkit.show.answers import NUMBERS, Answer, reason_in_words
 from toolkit.show.choice import find_query
+from toolkit.show.figures import shown
 from toolkit.show.inspection_view import draw_comparison, draw_inspection
 from toolkit.show.localized import LocalizedPair
 from toolkit.show.metrics import is_posed, pose_errors, worst_first
@@ -60,8 +61,8 @@ class Inspection(Answer):
         """The picture."""
         return draw_inspection(self)
 
-    def _repr_png_(self) -> bytes:
-        return bytes(self.figure._repr_png_())  # type: ignore[attr-defined]
+    def _repr_mimebundle_(self, **_: Any) -> dict[str, bytes]:
+        return shown(self.figure)
 
 
 @dataclass(frozen=True)
@@ -90,8 +91,8 @@ class Comparison:
     def __repr__(self) -> str:
         return f"{self.changes or 'nothing changed'}\nbefore: {self.before!r}\nafter: {self.after!r}"
 
-    def _repr_png_(self) -> bytes:
-        return bytes(self.figure._repr_png_())  # type: ignore[attr-defined]
+    def _repr_mimebundle_(self, **_: Any) -> dict[str, bytes]:
+        return shown(self.figure)
 
 
 class InspectedPair:

@@ -18,7 +18,7 @@ from toolkit.errors import ArtifactError
 from toolkit.files import image_name, read_references
 from toolkit.geometry import Floats, Ints
 from toolkit.show.choice import find_query
-from toolkit.show.figures import BLUE, GRAY, GREEN, MAP, ORANGE, TRUE, new_figure, styled
+from toolkit.show.figures import BLUE, GRAY, GREEN, MAP, ORANGE, TRUE, new_figure, shown, styled
 from toolkit.show.localized import load_maps, map_files
 from toolkit.show.metrics import is_posed
 from toolkit.show.overlap import LEAST_OVERLAP, overlap_in_view, seen_by
@@ -73,8 +73,8 @@ class RetrievedQuery:
         good = f", {int((self.references['overlap'] >= LEAST_OVERLAP).sum())} overlap" if self.is_known else ""
         return f"query image {self.number}: {self.name}\n{len(self.references)} references{good}"
 
-    def _repr_png_(self) -> bytes:
-        return bytes(self.figure._repr_png_())  # type: ignore[attr-defined]
+    def _repr_mimebundle_(self, **_: Any) -> dict[str, bytes]:
+        return shown(self.figure)
 
 
 class RetrievedPair:
