@@ -146,9 +146,10 @@ def test_a_run_with_all_stages_is_reused_and_repeated(small_capture: Path, small
 def test_a_table_on_a_page_has_medians_first_and_says_nothing_twice() -> None:
     row = {"map_device": "ios", "query_device": "hl", "state": "evaluated", "queries": 3, "localized": 2, "ok": 2}
     row |= {"recall@(1deg,0.1m)": 0.5, "median_rotation_deg": 0.1, "median_translation_m": 0.2, "path": "/a/b"}
-    shown = notebook.readable(pd.DataFrame([row | {"reason": ""}]))
-    assert shown.columns.tolist() == ["median_deg", "median_m", "recall@(1deg,0.1m)", "queries", "ok"]
-    assert shown.loc["hl in ios"].tolist() == [0.1, 0.2, 0.5, 3, 2]
+    shown = notebook.readable(pd.DataFrame([row | {"reason": "", "still": "/a/b/c.png", "error_rotation_deg": 1.0}]))
+    names = ["median_deg", "median_m", "recall@1°,0.1m", "queries", "ok", "still", "error_deg"]
+    assert shown.columns.tolist() == names
+    assert shown.loc["hl in ios"].tolist() == [0.1, 0.2, 0.5, 3, 2, "c.png", 1.0]
     left_out = notebook.readable(pd.DataFrame([row | {"state": "left out: x", "reason": "x"}]))
     assert {"state", "reason"} <= set(left_out.columns)
     sessions = pd.DataFrame({"session": ["ios_map"], "images": [3], "path": ["p"]})

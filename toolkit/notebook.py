@@ -144,19 +144,28 @@ def _root() -> Path:
 
 
 def readable(table: "pd.DataFrame") -> "pd.DataFrame":
-    """Return a stage's table as it fits a page: a row `<query> in <map>`, medians and recall first, no paths.
+    """Return a stage's table as it fits a page: a row `<query> in <map>`, medians and recall first, no folders.
 
     Columns are left out where they say nothing: a `reason` that no row has, `localized`, which is `ok` and
-    `low_confidence`, the state of pairs that are all evaluated.
+    `low_confidence`, the state of pairs that are all evaluated. Names are short where their units tell as much.
     """
     nothing = {"state": "evaluated", "reason": ""}
     dull = [name for name, text in nothing.items() if name in table and (table[name] == text).all()]
     shown = table.drop(columns=["path", "localized", *dull], errors="ignore")
     if "map_device" in shown:
         shown.index = shown.pop("query_device") + " in " + shown.pop("map_device")
-    medians = {name: name.replace("_rotation", "").replace("_translation", "") for name in shown if "median" in name}
-    first = [*medians, *(name for name in shown if name.startswith("recall@"))]
-    return shown[[*first, *(name for name in shown if name not in first)]].rename(columns=medians)
+    for name in {"still", "recording"} & {*shown}:
+        shown[name] = [Path(path).name for path in shown[name]]
+    first = [name for word in ("median", "recall@") for name in shown if name.startswith(word)]
+    shown = shown[[*first, *(name for name in shown if name not in first)]]
+    return shown.rename(columns=_short_column)
+
+
+def _short_column(name: str) -> str:
+    """Return `median_deg` for `median_rotation_deg`, and `recall@1°,0.1m` for `recall@(1deg,0.1m)`."""
+    if name.startswith("recall@("):
+        return name.replace("deg", "°").replace("(", "").replace(")", "")
+    return re.sub(r"(rotation|translation)_(?=\w*(deg|m)$)", "", name)
 
 
 def finish(table: "pd.DataFrame | None" = None, **counts: Any) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from toolkit.errors import ArtifactError
 from toolkit.files import SceneFiles, write_sidecar
-from toolkit.show.comparison import Comparison, bootstrap, compare_runs, readable, write_comparison
+from toolkit.show.comparison import Comparison, bootstrap, compare_runs, draw_changes, readable, write_comparison
 
 LIMITS = ("(1deg,0.1m)", "(5deg,0.5m)")
 GOOD, FAIR, LOST = (0.5, 0.05), (2.0, 0.3), (np.inf, np.inf)
@@ -104,6 +104,21 @@ def test_identical_runs_differ_by_nothing(two: list[Path]) -> None:
     assert (rows_of(comparison, LIMITS[0])["recall_low"] < rows_of(comparison, LIMITS[0])["recall"]).all()
     assert comparison.changes.empty
     assert "No query was won or lost." in write_comparison(comparison).read_text()
+
+
+def test_queries_have_the_names_of_their_images(two: list[Path]) -> None:
+    for run in two:
+        table = run / "PLACE" / "evaluation" / "errors.csv"
+        errors = pd.read_csv(table, dtype={"device_id": str})
+        errors.insert(2, "image", [f"walk/{'long/' * 20}{k}.jpg" for k in errors["timestamp"]])
+        errors.to_csv(table, index=False)
+        write_sidecar(table.with_name("recall.csv"), {}, [table])
+    comparison = compare_runs(two)
+    assert [name[-11:] for name in readable(comparison)["changes"]["image"]] == [f"…/long/{k}.jpg"[-11:] for k in "123"]
+    assert comparison.changes["image"].str.startswith("walk/").all(), "whole, for scripts"
+    titles = [title for title, drawn in draw_changes(comparison) if not drawn]
+    assert len(titles) == 3
+    assert all(title.startswith("No picture of hl query …") for title in titles), "its capture is not there"
 
 
 def test_intervals_repeat_with_the_seed(two: list[Path]) -> None:

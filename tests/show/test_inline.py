@@ -3,7 +3,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from tests.displayed import picture_of
 from toolkit.errors import ArtifactError
@@ -14,42 +13,40 @@ from toolkit.show.recordings import open_recording
 
 
 @pytest.fixture
-def files(tmp_path, monkeypatch):
+def recording(tmp_path, monkeypatch):
     import rerun.blueprint as rrb
 
-    recording, still = tmp_path / "run" / "vis & more.rrd", tmp_path / "run" / "still.png"
+    recording = tmp_path / "run" / "vis & more.rrd"
     recording.parent.mkdir()
     with open_recording(recording, "name", rrb.Blueprint()):
         pass
-    Image.new("RGB", (4, 3)).save(still)
     (tmp_path / "notebooks").mkdir()
     monkeypatch.chdir(tmp_path / "notebooks")
-    return recording, still
+    return recording
 
 
-def test_a_saved_page_has_the_picture_the_link_and_the_command(files, monkeypatch):
+def test_a_saved_page_has_the_link_and_the_command(recording, monkeypatch):
     shown = []
     monkeypatch.setattr("IPython.display.display", shown.append)
     monkeypatch.setenv(TEXT_BARS, "1")
-    assert show_recording(*files) is None
-    picture, text = shown
-    assert picture.data == files[1].read_bytes()
+    assert show_recording(recording) is None
+    (text,) = shown
     page = text.data
     assert 'href="../run/vis &amp; more.rrd"' in page
     assert "<code>rerun " in page
 
 
 @pytest.mark.slow
-def test_the_viewer_is_served_by_this_process_and_gets_the_whole_file(files, monkeypatch):
+def test_the_viewer_is_served_by_this_process_and_gets_the_whole_file(recording, monkeypatch):
     monkeypatch.delenv(TEXT_BARS, raising=False)
     monkeypatch.delenv(ASSETS, raising=False)
     monkeypatch.setattr("IPython.display.display", lambda _: None)
-    viewer = show_recording(*files)
+    viewer = show_recording(recording)
     assert os.environ[ASSETS] == "serve-local"
     assert str(viewer._esm).startswith("http://localhost:")
     ((message, buffers),) = viewer._event_queue
     assert message == {"type": "rrd"}
-    assert buffers == [files[0].read_bytes()]
+    assert buffers == [recording.read_bytes()]
 
 
 def test_no_recording_is_said(tmp_path):

@@ -3,9 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
-from IPython.core.formatters import PNGFormatter
 from PIL import Image
 
+from tests.displayed import picture_of
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.geometry import make_pose, project
 from toolkit.show.figures import error_colors, new_figure, save_figure
@@ -174,6 +174,6 @@ def test_a_notebook_shows_a_figure_as_a_file_has_it_with_what_reaches_beyond_its
         return made
 
     whole, path = figure(), save_figure(figure(), tmp_path / "figure.png")
-    assert PNGFormatter()(whole) == path.read_bytes()
+    np.testing.assert_array_equal(picture_of(whole), Image.open(path))
     with Image.open(path) as picture:
         assert picture.width > 2 * 110 + 22

@@ -5,7 +5,7 @@ Everything is read from what the runs have left; no query is localized again.
 
 import math
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -48,6 +48,8 @@ ALL = "all"
 """Stands for scene and devices where all pairs are counted together."""
 MOST_PICTURES, MOST_ROWS = 4, 20
 """Queries won or lost that are drawn, and that the page lists."""
+MOST_LETTERS = 32
+"""Of an image's name."""
 QUERY = ["scene", "map_device", "query_device", "timestamp", "device_id"]
 _PAIR = QUERY[:3]
 _ERRORS = ["rotation_error_deg", "translation_error_m"]
@@ -69,7 +71,7 @@ class Comparison:
     """Names, such as `(1deg,0.1m)`."""
     queries: pd.DataFrame
     """A row a common query and pair: those of `QUERY`; and `status_<i>`, `rotation_error_deg_<i>`,
-    `translation_error_m_<i>` of each run i."""
+    `translation_error_m_<i>` of each run i; image, its name, where the runs are not older than that."""
     recall: pd.DataFrame
     """A row a pair, threshold and run, and those of all pairs: recall and difference to the first run (0 to 1), each
     with `_low` and `_high` of its interval; queries, won and lost."""
@@ -159,7 +161,7 @@ def compare_runs(run_dirs: Sequence[str | Path], seed: int = SEED, resamples: in
                 f"{folder}: evaluation/errors.csv has a query twice, expected one row each; was it evaluated a camera "
                 "(at) and the others a device? Evaluate it as the others were."
             )
-    queries = tables[0][keys]
+    queries = tables[0][[*keys, *({"image"} & {*tables[0]})]]
     for table in tables[1:]:
         queries = queries.merge(table[keys], on=keys)
     counts = ", ".join(f"{name} {len(table)}" for name, table in zip(names, tables, strict=True))
@@ -498,30 +500,53 @@ def write_comparison(comparison: Comparison, path: str | Path | None = None, pic
     return Path(path)
 
 
-def _looks(comparison: Comparison, most: int, album: _Album, messages: list[str]) -> list[tuple[str, list[Picture]]]:
-    """Return pictures of queries won and lost, half of them of each where there are both."""
-    looks, table = [], comparison.changes
+def draw_changes(
+    comparison: Comparison, most: int = MOST_PICTURES
+) -> "Iterator[tuple[str, list[tuple[str, Figure]]]]":
+    """Draw some of the queries won and lost, from all over them; yield a title, and titles and figures of both runs.
+
+    Without figures, the title says why that query cannot be drawn.
+
+    Args:
+        most: of each run, half of them lost and half won where there are both.
+    """
+    table = comparison.changes
     for run in range(1, len(comparison.names)):
         rows = [table.index[(table["run"] == run) & (table["change"] == change)].tolist() for change in ("lost", "won")]
         half = max(most // 2, most - len(rows[1]))
         lost = _spread(rows[0], half)
         for row in [*lost, *_spread(rows[1], most - len(lost))]:
             change = table.loc[row]
+            query = f"{change['query_device']} query {_name(change)}"
             what = f"{change['change']} by {comparison.names[run]} at {_limits(comparison, change['at'])}"
-            title = f"{change['query_device']} query {change['timestamp']} in the {change['map_device']} map: {what}"
             try:
-                drawn = draw_change(comparison, row)
+                yield f"{query} in the {change['map_device']} map: {what}", draw_change(comparison, row)
             except (ToolkitError, OSError) as error:
-                messages.append(f"No picture of {change['query_device']} query {change['timestamp']}: {error}")
-                continue
-            shown = []
-            for number_, (name, figure) in enumerate(drawn):
-                file = album.run_dir / f"{row}_{number_}.png"
-                save_figure(figure, file)
-                shown.append(replace(album.picture(file, name), path=""))
-            if all(picture.data for picture in shown):
-                looks.append((title, shown))
+                yield f"No picture of {query}: {error}", []
+
+
+def _looks(comparison: Comparison, most: int, album: _Album, messages: list[str]) -> list[tuple[str, list[Picture]]]:
+    """Return pictures of queries won and lost."""
+    looks = []
+    for number_, (title, drawn) in enumerate(draw_changes(comparison, most)):
+        if not drawn:
+            messages.append(title)
+            continue
+        shown = []
+        for run, (name, figure) in enumerate(drawn):
+            file = album.run_dir / f"{number_}_{run}.png"
+            save_figure(figure, file)
+            shown.append(replace(album.picture(file, name), path=""))
+        if all(picture.data for picture in shown):
+            looks.append((title, shown))
     return looks
+
+
+def _name(change: "pd.Series[Any] | Mapping[str, Any]") -> str:
+    """Return what a query is called: the end of its image's name, or its timestamp."""
+    image = change.get("image")
+    name = image if isinstance(image, str) else str(change["timestamp"])
+    return name if len(name) <= MOST_LETTERS else f"…{name[1 - MOST_LETTERS :]}"
 
 
 def _spread(rows: Sequence[int], most: int) -> list[int]:
@@ -578,13 +603,13 @@ def _changes_table(comparison: Comparison) -> Table | None:
         texts = [comparison.names[i]] if several else []
         texts += [row["change"], _limits(comparison, row["at"]), f"{row['query_device']} in {row['map_device']} map"]
         texts += [_off_by(row[f"{_ERRORS[0]}_{j}"], row[f"{_ERRORS[1]}_{j}"], unit) for j in (0, i)]
-        rows.append([Cell(text) for text in (*texts, row[f"status_{i}"].replace("_", " "), str(row["timestamp"]))])
+        rows.append([Cell(text) for text in (*texts, row[f"status_{i}"].replace("_", " "), _name(row))])
     rest = f"; {MOST_ROWS} of them, all with --json" if len(table) > MOST_ROWS else ""
     counts = table["change"].value_counts()
     caption = f"Queries within a threshold in one run only: {counts.get('won', 0)} won, {counts.get('lost', 0)} lost"
     columns = ["run"] if several else []
     columns += ["change", "at", "query", f"off in {comparison.names[0]}"]
-    columns += ["off in the run" if several else f"off in {comparison.names[1]}", "status", "timestamp [µs]"]
+    columns += ["off in the run" if several else f"off in {comparison.names[1]}", "status", "image"]
     return Table(caption + rest, columns, rows)
 
 

@@ -120,6 +120,8 @@ def draw_top_view(capture: Capture, up: ArrayLike | None = None, unit: str | Non
     plots = figure.subplots(1, count, squeeze=False)[0]
     for number, plot in enumerate(plots):
         for name in poses:
+            if not len(poses[name]):
+                continue
             x, y = centers[(place == number) & (sessions == name)].T
             marker, size = ("o", 14) if capture[name].split == "map" else ("x", 36)
             plot.scatter(x, y, s=size, c=color_of(capture[name].device), marker=marker, label=name, alpha=0.8)
@@ -237,7 +239,8 @@ def draw_statuses(paths: Iterable[str | Path]) -> "Figure":
         heights = np.repeat(np.arange(len(rows)), [len(row) for row in rows])
         label = f"{status.replace('_', ' ')}: {len(inliers)}"
         plot.scatter(np.maximum(inliers, 0.5), heights, s=24, c=color, alpha=0.6, label=label)
-    plot.set_yticks(range(len(tables)), [name.replace("_query_", " map, query ") for name in tables])
+    pairs = [name.partition("_query_")[::2] for name in tables]
+    plot.set_yticks(range(len(tables)), [f"{queried} in {mapped} map" for mapped, queried in pairs])
     plot.invert_yaxis()
     plot.set_xscale("log")
     plain_log(plot, "x")

@@ -1,7 +1,9 @@
 """Recordings in a notebook: the viewer where someone is there to use it; where not, what is worth keeping."""
 
 import html
+import io
 import os
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -34,14 +36,13 @@ def show_picture(path: str | Path) -> Any:
         raise ArtifactError(f"{path}: no picture can be read here ({error}). Run the cells above again.") from None
 
 
-def show_recording(path: str | Path, still: str | Path | None = None, height: int = 600) -> Any:
-    """Show a recording in a notebook: a still picture, a link, the command that opens it, and the viewer itself.
+def show_recording(path: str | Path, height: int = 600) -> Any:
+    """Show a recording in a notebook: a link, the command that opens it, and the viewer itself.
 
     The viewer is served by this process and needs no network. It is left out where the pipeline runs the notebook:
     saved pages do not keep what a viewer shows.
 
     Args:
-        still: picture of the same, for the saved page.
         height: of the viewer, pixels.
 
     Returns:
@@ -55,8 +56,6 @@ def show_recording(path: str | Path, still: str | Path | None = None, height: in
     path = Path(path)
     if not path.is_file():
         raise ArtifactError(f"{path}: no such recording. Run the notebook's cells above, with recordings = True.")
-    if still is not None and Path(still).is_file():
-        display(show_picture(still))
     # Relative to the notebook, so that the run folder can be moved.
     link = html.escape(os.path.relpath(path.resolve(), Path.cwd()), quote=True)
     size_mb = path.stat().st_size / 1e6
@@ -72,7 +71,8 @@ def show_recording(path: str | Path, still: str | Path | None = None, height: in
         display(HTML("<p>It is too large to be shown here; use the command.</p>"))
         return None
     os.environ.setdefault(ASSETS, "serve-local")
-    import rerun_notebook
+    with redirect_stdout(io.StringIO()):  # it tells its address
+        import rerun_notebook
 
     viewer = rerun_notebook.Viewer(width="auto", height=height)
     viewer.send_rrd(path.read_bytes())

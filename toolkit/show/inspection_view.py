@@ -40,8 +40,8 @@ SURE = 2.4477
 """Deviations in the plane within which 95 % of a normal distribution lie."""
 MAX_POINTS = 20_000
 LABELS = {
-    "num_inliers": ("inliers", "{:.0f}"), "num_matches": ("matches by descriptors", "{:.0f}"),
-    "inlier_ratio": ("share of inliers", "{:.0%}"), "num_guided": ("matches about the pose", "{:.0f}"),
+    "num_matches": ("matches by descriptors", "{:.0f}"), "num_inliers": ("of them, inliers", "{:.0f}"),
+    "inlier_ratio": ("their share", "{:.0%}"), "num_guided": ("found again by the pose", "{:.0f}"),
     "rmse_px": ("error of reprojection [px]", "{:.2f}"), "coverage": ("image covered", "{:.0%}"),
     "p_correct": ("probability of being right", "{:.1%}"), "rival_support": ("support of the best rival", "{:.0%}"),
     "agreement": ("inliers of a second kind", "{:.0f}"), "position_std_m": ("deviation of position [m]", "{:.2g}"),
@@ -49,8 +49,8 @@ LABELS = {
 }  # fmt: skip
 """Of the numbers: what they are called, and how they are written."""
 OF_NETWORKS = {
-    "num_inliers": ("consistent references", "{:.0f}"), "num_matches": ("references shown to it", "{:.0f}"),
-    "inlier_ratio": ("share of them", "{:.0%}"),
+    "num_matches": ("references shown to it", "{:.0f}"), "num_inliers": ("of them, consistent", "{:.0f}"),
+    "inlier_ratio": ("their share", "{:.0%}"),
 }  # fmt: skip
 OF_MATCHES = ("num_guided", "rmse_px", "coverage", "p_correct", "rival_support", "agreement")
 """What a pose without matches does not have."""
@@ -279,7 +279,7 @@ def _draw_from_above(axis: "Axes", named: Named) -> None:
     low, high = _bounds([low[None], high[None], reached])
     middle, half = (low + high) / 2, 0.55 * max(float((high - low).max()), 1.0)
     outside = []
-    _dots(axis, cloud, s=1, c="0.75", lw=0, rasterized=True)
+    _dots(axis, cloud, s=1, c="0.75", lw=0, rasterized=True, label="map points")
     _dots(axis, cameras[here], s=7, c=MAP, lw=0, label="map cameras")
     length = 0.16 * half
     if len(seen):

@@ -16,15 +16,17 @@ from toolkit.capture.tables import POSE_NAMES, as_strings, read_query_table
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.files import pair_name
 from toolkit.geometry import Floats
-from toolkit.show.figures import GREEN, ORANGE, SKY, VERMILLION, new_figure, styled
+from toolkit.show.figures import GREEN, ORANGE, SKY, VERMILLION, new_figure, percent, styled
 from toolkit.show.metrics import (
     WRONG,
     Threshold,
     is_below,
     is_posed,
+    parse_threshold,
     pose_errors,
     recall,
     threshold_name,
+    unit_of,
 )
 from toolkit.show.top_view import ground_axes, places_of
 
@@ -239,9 +241,10 @@ def draw_steps(table: pd.DataFrame) -> "Figure":
         means = 100 * table.groupby("step")[column].mean().reindex(steps)
         plot.bar(range(len(steps)), means, color=SKY, alpha=0.6, width=0.6)
         for place, mean in enumerate(means):
-            plot.text(place, 3, f"{mean:.1f}", ha="center", fontsize=8)
+            plot.text(place, 3, percent(mean / 100), ha="center", fontsize=8)
         plot.set_xticks(range(len(steps)), steps, rotation=45, ha="right")
-        plot.set_title(f"recall @ {column.partition('@')[2].strip('()')}", fontsize=10)
+        degrees, length = parse_threshold(column)
+        plot.set_title(f"recall @ {degrees:g}°, {length:g} {unit_of(column)}", fontsize=10)
     plots[0].set_ylabel("queries [%]")
     figure.suptitle("Recall after each step: mean of all pairs (bars), each pair (dots)")
     return figure
