@@ -370,7 +370,7 @@ class Session:
     def keyframe_files(self) -> dict[str, str]:
         """File of each keyframe list by its name, relative to the session's folder.
 
-        `<name>` for proc/keyframes_<name>.txt, and `queries` of LaMAR.
+        `<name>` for `proc/keyframes_<name>.txt`, and `queries` of LaMAR.
         """
         names = sorted(path.name for path in (self.path / "proc").glob("keyframes_*.txt"))
         files = {name.removesuffix(".txt").removeprefix("keyframes_"): f"proc/{name}" for name in names}
