@@ -120,7 +120,7 @@ class Draft:
         if not self.images:
             why = f" First: {self.rows[0]['image']}: {self.rows[0]['status']}." if self.rows else ""
             if self.rows and self.rows[0]["status"] in (NO_FILE, NOT_INSIDE):
-                why += " Names are paths in this folder: correct them where they are listed, or put the list beside it."
+                why += " Names are paths in this folder: correct them in the list, or put the list beside the images."
             raise CaptureError(f"{self.folder}: none of {len(self.rows)} images can be imported.{why}")
         if turned := sum(image.turned for image in self.images):
             self.notes.append(f"{turned} images have an EXIF tag that asks for turning: the pixels are used as stored")
