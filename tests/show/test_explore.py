@@ -5,7 +5,7 @@ from pathlib import Path
 
 from tests.test_embed import write_tiny_capture
 from toolkit.capture import Capture
-from toolkit.show.explore import describe, draw_samples, draw_top_view
+from toolkit.show.explore import describe, draw_samples, draw_statuses, draw_top_view
 
 
 def test_unusable_sessions_have_a_reason_and_the_others_are_drawn(tmp_path: Path) -> None:
@@ -35,3 +35,21 @@ def test_odometry_and_radio_are_told(small_capture: Path, tmp_path: Path) -> Non
     (session / "trajectories.txt").unlink()
     table = describe(Capture.open(tmp_path / "C"))
     assert (table["odometry"]["ios_query"], table["radio"]["ios_query"]) == ("", "bt")
+
+
+def test_queries_without_inliers_are_at_the_left_edge(tmp_path: Path) -> None:
+    path = tmp_path / "PLACE_map_ios_query_hl.csv"
+    path.write_text("status,num_inliers\nlow_confidence,0\nok,40\n")
+    (plot,) = draw_statuses([path]).axes
+    assert plot.get_xlim()[0] == 0.5 == min(x for dots in plot.collections for x, _ in dots.get_offsets())
+    assert [label.get_text() for label in plot.get_yticklabels()] == ["hl in ios map"]
+
+
+def test_a_session_without_poses_is_not_in_the_legend(small_capture: Path, tmp_path: Path) -> None:
+    capture = Path(shutil.copytree(small_capture, tmp_path / small_capture.name))
+    for truth in (capture / "sessions" / "ios_query").rglob("*trajector*"):
+        truth.unlink()
+    plot = draw_top_view(Capture.open(capture)).axes[0]
+    names = [text.get_text() for text in plot.get_legend().get_texts()]
+    assert "hl_query" in names
+    assert "ios_query" not in names

@@ -19,7 +19,7 @@ from toolkit.localize import localize_pairs
 from toolkit.localizers.correspondences import LocalizedQuery, Rival
 from toolkit.manifest import LocalizeSettings
 from toolkit.show.answers import reason_in_words
-from toolkit.show.choice import Choice, choose, find_query
+from toolkit.show.choice import Choice, choose, find_query, shown_name
 from toolkit.show.inspection import InspectedPair, WorstQueries, inspect_query
 from toolkit.show.inspection_view import _draw_from_above, _draw_near, _marks_of, _position_covariance
 
@@ -86,6 +86,9 @@ def test_it_shows_what_the_stage_stored(files: SceneFiles, pair: InspectedPair) 
             assert f"{str(kind).replace('/', ', ')}: {counts['inliers']} inliers" in legend
     shown = text_of(one.figure)
     assert one.status in shown
+    assert f"\n{one.name.partition('/raw_data/')[2]}\n" in shown
+    assert "true error of position [m]\n0\n" not in shown
+    assert "0.000\n" not in shown
     assert f"{row['num_inliers']}" in shown
     assert picture_of(one).width > 800
 
@@ -109,6 +112,9 @@ def test_unchanged_settings_give_the_same_pose_and_others_are_shown_beside(pair:
     assert nearest.after.method == "nearest"
     first = one.references[one.references["rank"] == 1]  # one of each camera of the rig
     assert nearest.after.localized.references == [first["name"][first["score"].idxmax()]]
+    alone = text_of(nearest.after.figure)
+    assert "true error of position" in alone
+    assert not any(text in alone for text in ("inliers", "matches by descriptors", "image covered")), "it has none"
     with pytest.raises(ManifestError, match=r"max_keypoints|features: found other settings"):
         one.again({"features": {"max_keypoints": 500}})
     with pytest.raises(ManifestError, match="min_inliers"):
@@ -123,7 +129,7 @@ def test_the_worst_is_the_worst(small_capture: Path, tmp_path: Path) -> None:
     assert pair.look(1).error[1] == pytest.approx(0.3)
     worst = WorstQueries.of(pair._h5.parent)
     assert [worst.look(rank).number for rank in range(3)] == [1, 2, 0]
-    assert worst.names[0].endswith(pair.names[1])
+    assert worst.names[0] == f"ios in the map of ios: {shown_name(pair.names[1])}"
     with pytest.raises(ArtifactError, match="to 2"):
         worst.look(3)
     assert WorstQueries.of(tmp_path).names == []
@@ -248,6 +254,7 @@ def test_a_list_chooses_what_is_shown(pair: InspectedPair, monkeypatch: pytest.M
     choice = choose(pair, 1)
     listed, first = outputs
     assert isinstance(listed, ipywidgets.Dropdown)
+    assert listed.options[2][0] == f"2: {shown_name(pair.names[2])}"
     assert (first.number, listed.value) == (1, 1)  # type: ignore[attr-defined]
     listed.value = 2
     assert outputs[-1] is choice.shown

@@ -9,7 +9,7 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 
 from toolkit.errors import ArtifactError, ToolkitError
-from toolkit.files import image_name
+from toolkit.files import image_name, own_name
 from toolkit.runs.kernel import TEXT_BARS
 
 T = TypeVar("T")
@@ -23,6 +23,11 @@ class Queries(Protocol[T_co]):
 
     def look(self, query: int | str = 0) -> T_co:
         """Return one by its number or name."""
+
+
+def shown_name(name: str) -> str:
+    """Return an image's name without its session; of an imported image, that of the user's file."""
+    return own_name(name.rpartition("/raw_data/")[2])
 
 
 def find_query(query: object, images: Mapping[str, int], count: int) -> int:
@@ -96,7 +101,7 @@ def choose(queries: Queries[T], chosen: int | str = 0) -> Choice[T]:
     import ipywidgets
 
     number = chosen if isinstance(chosen, int) else getattr(choice.shown, "number", 0)
-    options = [(f"{k}: {name}", k) for k, name in enumerate(queries.names)]
+    options = [(f"{k}: {shown_name(name)}", k) for k, name in enumerate(queries.names)]
     layout = ipywidgets.Layout(width="95%")
     listed = ipywidgets.Dropdown(options=options, value=number, description="query", layout=layout)
     display(listed)

@@ -238,11 +238,14 @@ def draw_statuses(paths: Iterable[str | Path]) -> "Figure":
         inliers = np.concatenate([row["num_inliers"].fillna(0).to_numpy(float) for row in rows])
         heights = np.repeat(np.arange(len(rows)), [len(row) for row in rows])
         label = f"{status.replace('_', ' ')}: {len(inliers)}"
-        plot.scatter(np.maximum(inliers, 0.5), heights, s=24, c=color, alpha=0.6, label=label)
+        plot.scatter(np.maximum(inliers, 0.5), heights, s=24, c=color, alpha=0.6, label=label, clip_on=False)
     pairs = [name.partition("_query_")[::2] for name in tables]
     plot.set_yticks(range(len(tables)), [f"{queried} in {mapped} map" for mapped, queried in pairs])
     plot.invert_yaxis()
     plot.set_xscale("log")
+    least, most = plot.get_xlim()
+    if least < 0.5:  # of a method without matches, or of queries that failed
+        plot.set_xlim(0.5, max(most, 10.0))
     plain_log(plot, "x")
     plot.set_xlabel("inliers of a query (log scale; none at the left edge)")
     figure.legend(fontsize=8, loc="outside lower center", ncols=3)

@@ -21,7 +21,7 @@ from toolkit.localizers.again import LocalizeAgain
 from toolkit.localizers.map import RETRIEVAL, SESSIONS_ROOT, Map, how_localized, label
 from toolkit.manifest import nearest
 from toolkit.show.answers import NUMBERS, Answer, reason_in_words
-from toolkit.show.choice import find_query
+from toolkit.show.choice import find_query, shown_name
 from toolkit.show.figures import shown
 from toolkit.show.inspection_view import draw_comparison, draw_inspection
 from toolkit.show.localized import LocalizedPair
@@ -262,7 +262,7 @@ class WorstQueries:
         self.table = table.iloc[worst_first(table)].reset_index(drop=True) if len(table) else table
         """A row a query: those of `InspectedPair.table`, pair and number."""
         of_each = zip(self.table["pair"], self.table["number"], strict=True)
-        self.names = [f"{self._pairs[at].label}: {self._pairs[at].names[number]}" for at, number in of_each]
+        self.names = [f"{self._pairs[at].label}: {shown_name(self._pairs[at].names[number])}" for at, number in of_each]
 
     @classmethod
     def of(

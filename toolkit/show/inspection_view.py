@@ -17,6 +17,7 @@ from toolkit.capture.world_up import up_of_cameras
 from toolkit.geometry import Floats
 from toolkit.localizers.correspondences import Correspondences
 from toolkit.show.answers import Answer
+from toolkit.show.choice import shown_name
 from toolkit.show.figures import BLUE, ESTIMATED, GRAY, GREEN, MAP, ORANGE, SKY, TRUE, new_figure, number, styled
 from toolkit.show.localized import ShownImage, sure_points
 from toolkit.show.metrics import is_posed
@@ -75,7 +76,8 @@ def draw_inspection(one: Answer) -> "Figure":
         above.legend(handles=legend, loc="outside lower center", ncols=6, fontsize=8)
     others = references[1:]
     of_rig = [(image, f"query, {_camera_name(image)}", True) for image in details.cameras[1:]]
-    more = [(image, f"{text}: {image.num_inliers} inliers", agrees) for image, text, agrees in of_rig]
+    counted = details.has_matches
+    more = [(image, text + f": {image.num_inliers} inliers" * counted, agrees) for image, text, agrees in of_rig]
     panels = np.ravel(strip.subplots(1, max(4, min(6, len(others) + len(more))), squeeze=False))
     for panel in panels:
         panel.set_axis_off()
@@ -87,7 +89,8 @@ def draw_inspection(one: Answer) -> "Figure":
     _draw_from_above(from_above, [(one, "estimated", ESTIMATED)])
     _draw_near(near, [(one, "estimated", ESTIMATED)])
     _draw_table(table, [one])
-    figure.suptitle(f"{one.headline}\n{_short(one.name, 110)}\n{textwrap.fill(one.reason, 130)}", fontsize=10)
+    name = _short(shown_name(one.name), 110)
+    figure.suptitle(f"{one.headline}\n{name}\n{textwrap.fill(one.reason, 130)}", fontsize=10)
     return figure
 
 
@@ -279,7 +282,8 @@ def _draw_from_above(axis: "Axes", named: Named) -> None:
     low, high = _bounds([low[None], high[None], reached])
     middle, half = (low + high) / 2, 0.55 * max(float((high - low).max()), 1.0)
     outside = []
-    _dots(axis, cloud, s=1, c="0.75", lw=0, rasterized=True, label="map points")
+    _dots(axis, cloud, s=1, c="0.75", lw=0, rasterized=True)
+    _dots(axis, np.zeros((0, 2)), s=9, c="0.75", lw=0, label="map points")  # large enough for a legend
     _dots(axis, cameras[here], s=7, c=MAP, lw=0, label="map cameras")
     length = 0.16 * half
     if len(seen):
@@ -354,6 +358,11 @@ def _draw_near(axis: "Axes", named: Named) -> None:
     axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, fontsize=7.5)
 
 
+def _digits(value: float) -> str:
+    """Return a number with two digits that count: an error of a fraction of a millimeter is not 0.000 m."""
+    return np.format_float_positional(value, 2, fractional=False, trim="-") if value < 0.1 else number(value)
+
+
 def _axis_name(label: str) -> str:
     return label.partition(" [")[0]
 
@@ -363,8 +372,9 @@ def _draw_table(axis: "Axes", ones: Sequence[Answer]) -> None:
     rows: list[tuple[str, list[str]]] = [("method", [one.method for one in ones])]
     by_network = all(one.method.rpartition("/")[2].startswith("feed_forward") for one in ones)
     labels = LABELS | OF_NETWORKS if by_network else LABELS
+    without = all(one.pose is not None and not one.numbers.get("num_matches") for one in ones)
     for key, (text, form) in labels.items():
-        if by_network and key in OF_MATCHES:
+        if (by_network and key in OF_MATCHES) or (without and key in (*OF_MATCHES, *OF_NETWORKS)):
             continue
         values = [form.format(one.numbers[key]) if key in one.numbers else "–" for one in ones]
         if set(values) != {"–"} and not (key == "agreement" and set(values) == {"0"}):
@@ -375,8 +385,8 @@ def _draw_table(axis: "Axes", ones: Sequence[Answer]) -> None:
     if any(one.error is not None for one in ones):
         errors = [one.error or (np.nan, np.nan) for one in ones]
         unit = ones[0].pair.unit
-        rows.append((f"true error of position [{unit[0]}]", [number(distance / unit[1]) for _, distance in errors]))
-        rows.append(("true error of rotation [deg]", [number(angle) for angle, _ in errors]))
+        rows.append((f"true error of position [{unit[0]}]", [_digits(distance / unit[1]) for _, distance in errors]))
+        rows.append(("true error of rotation [deg]", [_digits(angle) for angle, _ in errors]))
     rows.append(("seconds", [f"{one.seconds:.2f}" for one in ones]))
     axis.set_axis_off()
     columns = [1.0] if len(ones) == 1 else [0.74, 1.0]

@@ -17,7 +17,7 @@ from toolkit.embedders import open_descriptors
 from toolkit.errors import ArtifactError
 from toolkit.files import image_name, read_references
 from toolkit.geometry import Floats, Ints
-from toolkit.show.choice import find_query
+from toolkit.show.choice import find_query, shown_name
 from toolkit.show.figures import BLUE, GRAY, GREEN, MAP, ORANGE, TRUE, new_figure, shown, styled
 from toolkit.show.localized import load_maps, map_files
 from toolkit.show.metrics import is_posed
@@ -232,7 +232,7 @@ def draw_retrieved(one: RetrievedQuery) -> "Figure":
     below.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4)
     by = "the map's points" if one.points == "map" else "points laid into the views"
     known = f"\ngreen: overlaps with the query by the true pose and {by} ({LEAST_OVERLAP:.0%} of them in view)"
-    figure.suptitle(f"query image {one.number}: {one.name}{known if one.is_known else ''}", fontsize=10)
+    figure.suptitle(f"query image {one.number}: {shown_name(one.name)}{known if one.is_known else ''}", fontsize=10)
     return figure
 
 

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.images import read_for_display
 from toolkit.capture.world_up import up_of_cameras
-from toolkit.files import own_name
 from toolkit.geometry import Floats, Ints, make_pose, pose_error, project
+from toolkit.show.choice import shown_name
 from toolkit.show.figures import ESTIMATED, GREEN, MAP, TRUE, error_bar, error_colors, new_figure, save_figure, styled
 from toolkit.show.localized import QueryDetails
 from toolkit.show.metrics import is_posed
@@ -222,7 +222,7 @@ def draw_worst(
         _draw_side_by_side(axis, query.details)
         known = np.isfinite(query.translation_m)
         off = f"off by {query.rotation_deg:.2g}°, {_length(query.translation_m, query.unit)}; " if known else ""
-        name = own_name(query.details.cameras[0].name.rpartition("/raw_data/")[2])
+        name = shown_name(query.details.cameras[0].name)
         name = name if len(name) <= MOST_LETTERS else f"…{name[1 - MOST_LETTERS :]}"
         axis.set_title(f"{rank}. {query.pair}: {off}{query.reason}\n{name}", fontsize=8, loc="left", wrap=True)
     legend = "left: query, right: its best reference; lines: inliers (green) and rejected matches (orange) of both"
