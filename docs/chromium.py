@@ -113,12 +113,13 @@ def watch(page: "Page") -> Traffic:
 
 
 @contextmanager
-def serve_lab(folder: Path, state: Path) -> Iterator[str]:
+def serve_lab(folder: Path, state: Path, config: Path | None = None) -> Iterator[str]:
     """Start JupyterLab on the notebooks of a folder; yield its URL with `{}` where a notebook's name goes.
 
     Args:
         folder: what it serves.
         state: an empty folder for its settings and logs, so that those of the user are left alone.
+        config: what it is configured by, as `make lab` does with `notebooks/lab_config.py`; None: nothing.
     """
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -139,6 +140,7 @@ def serve_lab(folder: Path, state: Path) -> Iterator[str]:
     }
     command = [sys.executable, "-m", "jupyterlab", "--no-browser", "--allow-root", "--ip=127.0.0.1", f"--port={port}"]
     command += ["--ServerApp.port_retries=0", f"--ServerApp.root_dir={folder}", "--LabApp.expose_app_in_browser=True"]
+    command += [] if config is None else [f"--config={config}"]
     log = state / "lab.log"
     with open(log, "wb") as stream:
         server = subprocess.Popen(command, env=environment, stdout=stream, stderr=stream)

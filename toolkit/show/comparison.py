@@ -543,10 +543,10 @@ def _looks(comparison: Comparison, most: int, album: _Album, messages: list[str]
 
 
 def _name(change: "pd.Series[Any] | Mapping[str, Any]") -> str:
-    """Return what a query is called: the end of its image's name, or its timestamp."""
+    """Return what a query is called: its image's name, of a long one that of the file; or its timestamp."""
     image = change.get("image")
     name = image if isinstance(image, str) else str(change["timestamp"])
-    return name if len(name) <= MOST_LETTERS else f"…{name[1 - MOST_LETTERS :]}"
+    return name if len(name) <= MOST_LETTERS else f"…/{name.rpartition('/')[2]}"
 
 
 def _spread(rows: Sequence[int], most: int) -> list[int]:
