@@ -268,6 +268,7 @@ def test_no_ground_truth_is_said_and_skipped(tmp_path, caplog):
     sessions = write_capture(tmp_path, ground_truth=False)
     result = evaluate_scene(sessions, tmp_path / "poses", tmp_path / "retrieval", tmp_path / "out")
     assert result.recall["state"].tolist() == ["no ground truth"] * 4
+    assert result.losses["missed"].isna().all()
     assert len(result.errors) == 0
     assert sorted(result.messages) == [
         "hl_query has no ground truth; it is not evaluated.",

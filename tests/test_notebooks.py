@@ -105,6 +105,21 @@ def test_a_capture_goes_from_files_to_a_report(small_run: Path) -> None:
 
 
 @pytest.mark.slow
+def test_a_capture_without_truth_has_a_report_too(small_capture: Path, small_run: Path, tmp_path: Path) -> None:
+    capture = shutil.copytree(small_capture, tmp_path / small_capture.name)
+    for truth in capture.glob("sessions/*_query/proc/alignment_trajectories.txt"):
+        truth.unlink()
+    (tmp_path / "untrue.yaml").write_text(f"captures: ['{capture}']\noutput_root: runs\nvisualize: {{samples: 1}}\n")
+    run = tmp_path / "runs" / "untrue"
+    shutil.copytree(small_run / "SMALL", run / "SMALL", ignore=shutil.ignore_patterns(".stages", "evaluation"))
+    pipeline.run(tmp_path / "untrue.yaml", say=lambda *a, **k: None)
+    rows = {row["stage"]: row for row in json.loads((run / "run.json").read_text())["stages"]}
+    assert {row["status"] for row in rows.values()} == {"done"}
+    assert set(pd.read_csv(run / "SMALL" / "evaluation" / "losses.csv")["state"]) == {"no ground truth"}
+    assert (run / "report.html").is_file()
+
+
+@pytest.mark.slow
 def test_a_run_with_all_stages_is_reused_and_repeated(small_capture: Path, small_run: Path, tmp_path: Path) -> None:
     manifest = tmp_path / "small.yaml"
     sections = "rerank: {}\nsequence: {}\nvisualize: {samples: 1}\n"

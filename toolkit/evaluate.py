@@ -166,7 +166,7 @@ def evaluate_scene(
         _table(pd.DataFrame(rows["recall"]), "queries"),
         _table(pd.concat(errors)) if errors else pd.DataFrame(columns=ERROR_COLUMNS),
         _table(pd.DataFrame(rows["retrieval"])),
-        _table(pd.DataFrame(rows["losses"]), "threshold", *REASONS),
+        _table(pd.DataFrame(rows["losses"]), "threshold", *REASONS, "queries", "missed"),
         overlap_table(
             sessions_root,
             {name: folder for name, folder in folders.items() if folder is not None},
