@@ -277,6 +277,8 @@ def test_no_ground_truth_is_said_and_skipped(tmp_path, caplog):
     assert "ios_query has no ground truth" in caplog.text
     assert len(pd.read_csv(tmp_path / "out" / "recall.csv")) == 4
     assert len(pd.read_csv(tmp_path / "out" / "errors.csv")) == 0
+    result = evaluate_scene(sessions, tmp_path / "poses", tmp_path / "retrieval", None, pairs=[["hl", "ios"]])
+    assert result.messages == ["ios_query has no ground truth; it is not evaluated."], "nothing of a device not asked"
 
 
 def test_missing_and_torn_files_are_rows_not_exceptions(scene):

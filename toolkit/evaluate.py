@@ -117,6 +117,8 @@ def evaluate_scene(
     references_dir = retrieval_dir and (reranked_dir or retrieval_dir)
     for query in capture.devices_with("query", query_device):
         asked = [map_ for map_ in map_devices if pairs is None or [map_, query] in map(list, pairs)]
+        if not asked:
+            continue
         reason = ""
         try:
             session = capture[f"{query}_query"]
