@@ -187,7 +187,8 @@ def test_three_runs_are_each_compared_with_the_first(two: list[Path], tmp_path: 
     page = write_comparison(comparison, pictures=0)
     assert page.name == "compare_a_b_c.html"
     tables = readable(comparison)
-    assert tables["recall"].xs("all", level="map")["won"].to_numpy().tolist() == [["2", "0"], ["1", "0"]]
+    of_all = tables["recall"].xs("all", level="map")[["run", "won"]].to_numpy().tolist()
+    assert of_all == [["a", ""], ["b", "2"], ["c", "0"], ["a", ""], ["b", "1"], ["c", "0"]]
     assert len(tables["changes"]) == 3 + 9, "of b, of c"
     assert tables["settings"].loc["localize.pnp.min_inliers"].tolist() == ["12", "20", "–"]
 

@@ -572,21 +572,24 @@ def _tiles(comparison: Comparison) -> list[tuple[str, str]]:
 
 
 def _recall_table(comparison: Comparison, threshold: str) -> Table:
-    columns = ["map", "query", "queries", comparison.names[0]]
-    for name in comparison.names[1:]:
-        columns += [name, "difference", "won", "lost"]
+    """List both runs beside each other, or more of them below each other, so that any number fits the page."""
+    below = len(comparison.names) > 2
+    columns = ["map", "query", "queries", *(["run", "recall"] if below else comparison.names)]
+    columns += ["difference", "won", "lost"]
     rows = []
     chosen = comparison.recall[comparison.recall["threshold"] == threshold]
     for pair, group in chosen.groupby(_PAIR, sort=False):
         by_run = group.to_dict("records")
         several = chosen["scene"].nunique() > 2 and pair[0] != ALL
         cells = [Cell(f"{pair[0]} {pair[1]}" if several else pair[1]), Cell(pair[2]), Cell(str(by_run[0]["queries"]))]
-        for i, row in enumerate(by_run):
-            cells.append(Cell(_interval(row, "recall"), 0.9 * row["recall"]))
-            if i == 0:
-                continue
-            cells += [Cell(_interval(row, "difference")), Cell(str(row["won"])), Cell(str(row["lost"]))]
-        rows.append(cells)
+        recalls = [Cell(_interval(row, "recall"), 0.9 * row["recall"]) for row in by_run]
+        changes = [[Cell(text) for text in (_interval(r, "difference"), str(r["won"]), str(r["lost"]))] for r in by_run]
+        changes[0] = [Cell("")] * 3  # to itself
+        if below:
+            named = zip(comparison.names, recalls, changes, strict=True)
+            rows += [[*cells, Cell(name), recall, *change] for name, recall, change in named]
+        else:
+            rows.append([*cells, *recalls, *changes[1]])
     caption = f"Recall at {_threshold(threshold)} in %, and the differences in percentage points"
     return Table(caption, columns, rows)
 
