@@ -72,11 +72,7 @@ def rotation_to_quaternion(rotation: ArrayLike) -> Floats:
 def pose_from_qt(qt: ArrayLike) -> Floats:
     """Return poses (..., 4, 4) from rows qw qx qy qz tx ty tz, (..., 7)."""
     qt = np.asarray(qt, np.float64)
-    pose = np.zeros((*qt.shape[:-1], 4, 4))
-    pose[..., :3, :3] = quaternion_to_rotation(qt[..., :4])
-    pose[..., :3, 3] = qt[..., 4:7]
-    pose[..., 3, 3] = 1.0
-    return pose
+    return make_pose(quaternion_to_rotation(qt[..., :4]), qt[..., 4:7])
 
 
 def qt_from_pose(pose: ArrayLike) -> Floats:
