@@ -452,16 +452,7 @@ class Remade:
     @classmethod
     def elsewhere(cls, *args: Any, **kwargs: Any) -> Any:
         """Return what is pickled as if it were made with these arguments, without making it here."""
-        return _Elsewhere(cls, (args, kwargs))
-
-
-@dataclass(frozen=True)
-class _Elsewhere:
-    kind: type
-    made_with: tuple[Any, ...]
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _remade, (self.kind, pickle.dumps(self.made_with))
+        return cls.__new__(cls, *args, **kwargs)
 
 
 _last_remade: dict[type, tuple[bytes, Any]] = {}
