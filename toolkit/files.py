@@ -56,12 +56,11 @@ def write_folder(path: str | Path) -> Iterator[Path]:
     What a killed writer of the same folder left is removed.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     for stale in path.parent.glob(f".{glob.escape(path.name)}.*-*"):
         if is_left_over(stale.name):
             shutil.rmtree(stale, ignore_errors=True)
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.{process_tag()}-", dir=path.parent) as folder:
-        part = Path(folder) / path.name
+    with temporary_folder(path) as folder:
+        part = folder / path.name
         part.mkdir()
         yield part
         part.replace(path)

@@ -7,9 +7,7 @@ number of cores.
 
 import ctypes
 import json
-import os
 import shutil
-import tempfile
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -23,7 +21,7 @@ import cv2
 import numpy as np
 
 from toolkit.errors import CaptureError
-from toolkit.files import is_left_over, process_tag
+from toolkit.files import write_folder
 from toolkit.geometry import Floats, invert, pose_from_qt
 from toolkit.synthetic.devices import DEVICES, Device, Sensor, halved, walk_street, walks
 from toolkit.synthetic.light import paint
@@ -375,27 +373,20 @@ def _render(out: Path, world: World, settings: dict[str, int], progress: bool) -
         raise CaptureError(
             f"{out} is not empty and holds no demo.json, so it was not rendered here: choose another folder."
         )
-    out.parent.mkdir(parents=True, exist_ok=True)
-    # A killed rendering leaves only a hidden folder beside OUT, which the next rendering clears away.
-    for stale in out.parent.glob(f".{out.name}.rendering.*"):
-        if is_left_over(stale.name):
-            shutil.rmtree(stale, ignore_errors=True)
-    partial_out = Path(tempfile.mkdtemp(prefix=f".{out.name}.rendering.{process_tag()}-", dir=out.parent))
     threads = cv2.getNumThreads()
     try:
         cv2.setNumThreads(1)  # the renderer's pool has a thread a core
-        _render_sessions(partial_out, world, progress)
-        count = sum(1 for path in partial_out.rglob("*") if path.is_file())
-        (partial_out / "demo.json").write_text(json.dumps({**settings, "files": count}, indent=1) + "\n")
-        partial_out.chmod(0o755)
-        if out.exists():
-            if _is_complete(out, settings):  # another process was faster
-                return out
-            shutil.rmtree(out)
-        partial_out.replace(out)
+        with write_folder(out) as part:
+            _render_sessions(part, world, progress)
+            count = sum(1 for path in part.rglob("*") if path.is_file())
+            (part / "demo.json").write_text(json.dumps({**settings, "files": count}, indent=1) + "\n")
+            if out.exists() and not _is_complete(out, settings):
+                shutil.rmtree(out)
+    except OSError:
+        if not _is_complete(out, settings):  # else another process was faster
+            raise
     finally:
         cv2.setNumThreads(threads)
-        shutil.rmtree(partial_out, ignore_errors=True)
         with suppress(AttributeError, OSError, TypeError):  # not glibc, which keeps what threads have freed
             ctypes.CDLL(None).malloc_trim(0)
     return out
@@ -440,7 +431,6 @@ def _render_sessions(out: Path, world: World, progress: bool) -> None:
                 for work in waiting:
                     work.result()
                     bar.update()
-                os.utime(out)  # still at work: no other process may take it for a leftover
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
