@@ -2,7 +2,10 @@
 
 Images have the names that the user knows them by (`files.own_name`): imported ones their path in the folder that they
 were imported from, others theirs relative to the capture's folder `sessions`. With `names="capture"` all are relative
-to that folder, as in the HDF5 files of local features and matches.
+to that folder, as in the HDF5 files of local features and matches. Another choice of names is a ManifestError.
+
+A run says where its captures are; `capture` is the place of one that has moved. If it is in neither, or there is
+another than was asked for, that is a ManifestError, too.
 """
 
 from collections.abc import Mapping, Sequence
@@ -51,19 +54,14 @@ def export_colmap(
 ) -> pycolmap.Reconstruction:
     """Write the triangulated map that a run localized with as a COLMAP model, binary.
 
-    All keypoints are written, also those that see no
-    point, in COLMAP's pixels, which are ours: the center of the top-left pixel is (0.5, 0.5). Where the run has used
-    several kinds of features, the keypoints and points of one kind follow those of the kind before. A rig's frame is
-    that of its first camera, as COLMAP wants it; rigs with the same cameras at the same places are one rig.
-
-    Args:
-        out: folder of the model; it must be empty or absent.
-        capture: the capture, where it is no longer where the run found it.
-        names: of images, `own` or `capture`: see the head of this module.
+    All keypoints are written, also those that see no point, in COLMAP's pixels, which are ours: the center of the
+    top-left pixel is (0.5, 0.5). Where the run has used several kinds of features, the keypoints and points of one kind
+    follow those of the kind before. A rig's frame is that of its first camera, as COLMAP wants it; rigs with the same
+    cameras at the same places are one rig.
 
     Raises:
         ArtifactError: the run has not localized in such a map.
-        ManifestError: there are files in `out`, the capture is not found, or an unknown choice of names.
+        ManifestError: there are files in the folder `out`.
     """
     _require_names(names)
     files, session_id, out = SceneFiles(Path(run), scene), f"{device}_map", Path(out)
@@ -120,11 +118,7 @@ def _pooled(maps: Sequence[LocalMap], stores: Sequence[FeatureStore]) -> tuple[L
 def colmap_model(
     local_map: LocalMap, session: Session, keypoints: Keypoints, names: str = "own"
 ) -> pycolmap.Reconstruction:
-    """Return a map as a COLMAP model.
-
-    Args:
-        keypoints: by image name, (n, 2) pixels that the map's observations count through.
-        names: of images, see the head of this module.
+    """Return a map as a COLMAP model; its observations count through the keypoints (n, 2) of each image.
 
     Raises:
         ArtifactError: the session does not list an image of the map.
@@ -156,9 +150,7 @@ def colmap_model(
         model.add_frame(frame)
         for member, camera_id in zip(members, camera_ids, strict=True):
             name = local_map.image_names[member]
-            image = pycolmap.Image(
-                _exported(name, names), keypoints[name].astype(np.float64), camera_id, member + 1
-            )
+            image = pycolmap.Image(_exported(name, names), keypoints[name].astype(np.float64), camera_id, member + 1)
             image.frame_id = frame_id
             model.add_image(image)
     order = np.argsort(local_map.obs_point, kind="stable")
@@ -237,12 +229,10 @@ def export_pairs(
 
     Args:
         topk: so many references a query; None: all that were retrieved.
-        names: see the head of this module.
 
     Raises:
         ArtifactError: the run has no such retrieval, a line of it is malformed, a name has a space in it, or a query
             and a reference have one name.
-        ManifestError: an unknown choice of names.
     """
     _require_names(names)
     path = SceneFiles(Path(run), scene).retrieval(map_device, query_device)
@@ -275,18 +265,10 @@ def export_poses(
     """Write the poses of a pair's queries as hloc does, a line `name qw qx qy qz tx ty tz` for each image.
 
     Poses are cam_from_world, in the unit of the capture; a rig has a line for each of its cameras. Queries without a
-    pose have no line. hloc itself writes the last part of a name alone.
-
-    Args:
-        capture: the capture, where it is no longer where the run found it.
-        names: see the head of this module.
-
-    Returns:
-        The number of lines.
+    pose have no line. hloc itself writes the last part of a name alone. Return the number of lines.
 
     Raises:
         ArtifactError: the run has no such poses, or a name has a space in it.
-        ManifestError: the capture is not found, or an unknown choice of names.
     """
     _require_names(names)
     path = _whole(SceneFiles(Path(run), scene).poses_txt(map_device, query_device))
@@ -312,7 +294,7 @@ def export_intrinsics(
 ) -> int:
     """Write the cameras of a pair's queries as hloc reads them, `name MODEL width height parameters` for each image.
 
-    Args, Returns, Raises: as `export_poses`; queries without a pose are there as well.
+    Returns and raises what `export_poses` does; queries without a pose are there as well.
     """
     _require_names(names)
     path = _whole(SceneFiles(Path(run), scene).poses_csv(map_device, query_device))
