@@ -17,9 +17,8 @@ import shutil
 import stat
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
@@ -280,15 +279,20 @@ class _CaptureDownload:
         """Fetch, unpack and lay out everything."""
         from filelock import FileLock, Timeout
 
-        with _disk_errors(self.folder):
+        try:
             self.state.mkdir(parents=True, exist_ok=True)
-            try:
-                with FileLock(self.state / "lock", timeout=0):
-                    self._run()
-            except Timeout:
-                raise DownloadError(
-                    f"{self.folder}: another download into this folder is running. Wait for it."
-                ) from None
+            with FileLock(self.state / "lock", timeout=0):
+                self._run()
+        except Timeout:
+            raise DownloadError(f"{self.folder}: another download into this folder is running. Wait for it.") from None
+        except OSError as error:
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                text = f"the disk is full ({size_text(shutil.disk_usage(self.folder).free)} free). Free some space"
+            else:
+                text = f"{first_line(error)}. See to it that you can write there, or choose another folder (`captures`)"
+            raise DownloadError(
+                f"{error.filename or self.folder}: {text}; then run the same command: it goes on where it was."
+            ) from error
 
     def _run(self) -> None:
         from huggingface_hub.utils import build_hf_headers
@@ -449,21 +453,6 @@ def _move_into(source: Path, target: Path) -> list[str]:
         place.parent.mkdir(parents=True, exist_ok=True)
         path.replace(place)
     return sorted(folders)
-
-
-@contextmanager
-def _disk_errors(folder: Path) -> Iterator[None]:
-    """Turn errors of the disk into a message that says what to do."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            text = f"the disk is full ({size_text(shutil.disk_usage(folder).free)} free). Free some space"
-        else:
-            text = f"{first_line(error)}. See to it that you can write there, or choose another folder (`captures`)"
-        raise DownloadError(
-            f"{error.filename or folder}: {text}; then run the same command: it goes on where it was."
-        ) from error
 
 
 def _file_size(path: Path) -> int | None:
