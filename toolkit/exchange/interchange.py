@@ -191,7 +191,9 @@ def import_once(
     record = session / IMPORT_RECORD
     if not session.exists():
         if _is_transforms(options.get("table")):
-            report = _import_frames(Path(images), Path(options["table"]), capture, device, split, unit_m, options)
+            poses_are = options.get("poses_are", POSE_DIRECTIONS[0])
+            _require_own_folder(Path(images), Path(options["table"]), split, poses_are)
+            report = import_transforms(options["table"], capture, device, split, unit_m=unit_m)[0]
         else:
             report = import_images(images, capture, device, split, unit_m=unit_m or 1.0, **options)
         write_text(record, json.dumps(read_json(record) | {"input": given}, indent=1) + "\n")
@@ -214,21 +216,12 @@ def _is_transforms(table: str | Path | None) -> bool:
     return table is not None and Path(table).suffix == ".json"
 
 
-def _import_frames(
-    images: Path,
-    file: Path,
-    capture: str | Path,
-    device: str,
-    split: str,
-    unit_m: float | None,
-    options: Mapping[str, Any],
-) -> ImportReport:
-    """Import a transforms.json that is given as the table of a folder of images."""
+def _require_own_folder(images: Path, file: Path, split: str, poses_are: str) -> None:
+    """Refuse a transforms.json that is given as the table of another folder than its own, or with other poses."""
     if images.resolve() != file.resolve().parent:
         raise ManifestError(f"{split}_images: found {images}, expected the folder of {file}, which its paths begin in.")
-    if options.get("poses_are", POSE_DIRECTIONS[0]) != POSE_DIRECTIONS[0]:
-        raise ManifestError(f"poses_are: found {options['poses_are']!r}, expected world_from_cam, as {file} has it.")
-    return import_transforms(file, capture, device, split, unit_m=unit_m)[0]
+    if poses_are != POSE_DIRECTIONS[0]:
+        raise ManifestError(f"poses_are: found {poses_are!r}, expected world_from_cam, as {file} has it.")
 
 
 _PROBE = """

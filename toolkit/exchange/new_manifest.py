@@ -3,7 +3,7 @@
 import json
 import os
 import re
-from collections.abc import Mapping
+from itertools import dropwhile
 from pathlib import Path
 
 from toolkit.capture import Capture
@@ -34,22 +34,22 @@ def new_manifest(name: str, capture: str | Path | None = None, folder: str | Pat
         raise ManifestError(f"{path} exists already. Give another name, or remove it first.")
     if not TEMPLATE.is_file():
         raise ManifestError(f"{TEMPLATE}: no such file. Manifests are made in a clone of the repository.")
-    head, lines = [f"# {name}. `python -m toolkit settings` tells what else can be set."], _template_lines()
+    head = [f"# {name}. `python -m toolkit settings` tells what else can be set."]
+    template = TEMPLATE.read_text(encoding="utf-8").splitlines()
+    lines = list(dropwhile(lambda line: line.startswith("# "), template))  # the comment at its head is about copying it
     if capture is None:
         head.append(f"# Name your capture below, then: python -m toolkit run {path}")
     else:
         report = check_capture(capture).text(MOST_PROBLEMS)
         head += [f"# Run it: python -m toolkit run {path}", "#", "# What `python -m toolkit check` has found:"]
         head += [f"# {line}".rstrip() for line in report.splitlines()]
-        lines = _filled(lines, _found_in(Path(capture), path.parent))
+        for begin, found in _found_in(Path(capture), path.parent).items():
+            place = next((number for number, line in enumerate(lines) if line.startswith(begin)), None)
+            if place is None:
+                raise ManifestError(f"{TEMPLATE}: no line begins with {begin!r}. Restore the file.")
+            lines[place] = found
     write_text(path, "\n".join([*head, *lines]) + "\n")
     return path
-
-
-def _template_lines() -> list[str]:
-    """Return the template without the comment at its head, which is about copying it."""
-    lines = TEMPLATE.read_text(encoding="utf-8").splitlines()
-    return lines[next(number for number, line in enumerate(lines) if not line.startswith("# ")) :]
 
 
 def _found_in(path: Path, folder: Path) -> dict[str, str]:
@@ -69,14 +69,3 @@ def _found_in(path: Path, folder: Path) -> dict[str, str]:
     if None in unit:
         found["unit: "] = "unit: null # not known, as its import said; limits are relative to the depth of the scene"
     return found
-
-
-def _filled(lines: list[str], found: Mapping[str, str]) -> list[str]:
-    """Return lines with the first that begins with each key of `found` replaced."""
-    filled, todo = [], dict(found)
-    for line in lines:
-        begin = next((key for key in todo if line.startswith(key)), None)
-        filled.append(line if begin is None else todo.pop(begin))
-    if todo:
-        raise ManifestError(f"{TEMPLATE}: no line begins with {', '.join(map(repr, todo))}. Restore the file.")
-    return filled

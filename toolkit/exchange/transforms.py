@@ -51,10 +51,7 @@ def import_transforms(
     """Make a session, or two, of the frames of a transforms.json; images keep their `file_path` as names.
 
     Args:
-        path: the file.
-        capture: folder of the capture; made where it does not exist.
-        device, split: the session is `<device>_<split>`. Poses of queries become their ground truth.
-        placing: `link` images to where they are, or `copy` them.
+        capture, device, split, placing: as of `interchange.import_colmap`.
         axes: those of the cameras that the matrices are of, see `drafts.AXES`.
         unit_m: meters in a unit of the poses; None: not known, as after structure from motion. Poses are then kept as
             they are, and the session says so.
