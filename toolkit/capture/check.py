@@ -21,8 +21,6 @@ from toolkit.errors import CaptureError, ImageError
 from toolkit.geometry import unit
 
 ERROR, WARNING = "error", "warning"
-UNUSED = {"point clouds": "pointclouds.txt"}
-"""Files of the format that the toolkit does not read; it ignores sensors of these kinds."""
 ASKED = "pruned_subsampled"
 """The list of keyframes that manifests ask for, unless they say otherwise."""
 SAME_PLACE_M = 1e-6
@@ -374,9 +372,8 @@ class _SessionCheck:
         for name, file in session.keyframe_files.items():
             keys = self._rows(file)
             add(f"keyframes {name}", len(keys), _count(keys["device_id"].nunique(), "device"))
-        for what, file in UNUSED.items():
-            if (session.path / file).exists():
-                add(what, None, f"{file} is there and is not used")
+        if (session.path / "pointclouds.txt").exists():
+            add("point clouds", None, "pointclouds.txt is there and is not used")
         return pd.DataFrame(rows, columns=["what", "count", "details"])
 
     def _camera_models(self) -> list[str]:

@@ -386,12 +386,12 @@ class Session:
         Raises:
             CaptureError: there is no such list.
         """
-        if name == "all" and self.ground_truth is not None:
-            truth = self.ground_truth
-            keys = pd.DataFrame({"timestamp": truth.timestamps, "device_id": as_pandas(truth.arrow_ids)}, copy=False)
-            return keys.drop_duplicates(ignore_index=True)
         if name == "all":
-            keys = pd.DataFrame({"timestamp": times_of(self.images), "device_id": as_pandas(self._devices[0])})
+            truth = self.ground_truth
+            times, ids = times_of(self.images), self._devices[0]
+            if truth is not None:
+                times, ids = truth.timestamps, truth.arrow_ids
+            keys = pd.DataFrame({"timestamp": times, "device_id": as_pandas(ids)}, copy=False)
             return keys.drop_duplicates(ignore_index=True)
         short, files = name.removesuffix(".txt").removeprefix("keyframes_"), self.keyframe_files
         if short not in files:
@@ -413,11 +413,13 @@ class Session:
     @cached_property
     def _devices(self) -> tuple[pa.Array, Ints]:
         """The device of each image, and the row of rigs.txt that holds it there (-1 without a rig)."""
-        sensors = as_strings(self.images["sensor_id"])
-        rig_rows = find_rigs(self.rigs, times_of(self.images), sensors, self._posed_keys())
-        if self.rigs is None or not np.any(rig_rows >= 0):
-            return sensors, rig_rows
+        return self._find_devices(times_of(self.images), as_strings(self.images["sensor_id"]))
+
+    def _find_devices(self, timestamps: Ints, sensors: pa.Array) -> tuple[pa.Array, Ints]:
+        rig_rows = find_rigs(self.rigs, timestamps, sensors, self._posed_keys())
         in_rig = rig_rows >= 0
+        if self.rigs is None or not in_rig.any():
+            return sensors, rig_rows
         rigs = as_strings(self.rigs["rig_id"]).take(pa.array(np.where(in_rig, rig_rows, 0)))
         return pc.if_else(pa.array(in_rig), rigs, sensors), rig_rows
 
@@ -426,12 +428,8 @@ class Session:
 
         The device is the rig at that time, else the sensor itself, with the identity.
         """
-        sensors = as_strings(sensor_ids)
-        rig_rows = find_rigs(self.rigs, np.asarray(timestamps, np.int64), sensors, self._posed_keys())
-        devices = sensors.to_numpy(zero_copy_only=False).copy()
-        if self.rigs is not None:
-            devices[rig_rows >= 0] = self.rigs["rig_id"].to_numpy()[rig_rows[rig_rows >= 0]]
-        return devices, self._rig_from_sensor(rig_rows)
+        devices, rig_rows = self._find_devices(np.asarray(timestamps, np.int64), as_strings(sensor_ids))
+        return devices.to_numpy(zero_copy_only=False), self._rig_from_sensor(rig_rows)
 
     def _rig_from_sensor(self, rig_rows: Ints) -> Floats:
         """Return rig_from_sensor, (n, 4, 4), of rows of rigs.txt; the identity for -1."""

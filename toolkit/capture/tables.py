@@ -233,16 +233,16 @@ def _parse_block(data: bytes, first: bool, columns: Columns, keep_extra: bool) -
     """Split and convert the whole lines of `data`; `first` tells that they start the file."""
     if first and data.startswith(b"\xef\xbb\xbf"):  # the mark that Windows editors put before UTF-8
         data = data[3:]
-    problems: list[tuple[int, str]] = []
-    try:
-        data.decode()
-    except UnicodeDecodeError:
-        repaired = [_decode(line, number, problems) for number, line in enumerate(data.split(b"\n"), 1)]
-        data = "\n".join(repaired).encode()
     if not data.endswith(b"\n"):
         data += b"\n"
-    if b"\r" in data and data.count(b"\r") > data.count(b"\r\n"):
-        data = b"\n".join(_without_returns(line, number, problems) for number, line in enumerate(data.split(b"\n"), 1))
+    problems: list[tuple[int, str]] = []
+    if _fault(data.replace(b"\r\n", b"\n")):
+        texts = data.split(b"\n")
+        for number, line in enumerate(texts, 1):
+            if fault := _fault(line):
+                problems.append((number, fault))
+                texts[number - 1] = b"#"
+        data = b"\n".join(texts)
     ends = np.flatnonzero(np.frombuffer(data, np.uint8) == ord("\n"))
     offsets = np.zeros(len(ends) + 1, np.int64)
     offsets[1:] = ends + 1
@@ -330,19 +330,15 @@ def convert(column: pa.Array, kind: str) -> tuple[pa.Array, NDArray[np.bool_]]:
     return converted, wrong
 
 
-def _decode(line: bytes, number: int, problems: list[tuple[int, str]]) -> str:
+def _fault(text: bytes) -> str:
+    """Return why a line cannot be read; empty: it can."""
     try:
-        return line.decode()
+        text.decode()
     except UnicodeDecodeError as error:
-        problems.append((number, f"found bytes that are not UTF-8 ({error.reason}), expected UTF-8 text"))
-        return "#"
-
-
-def _without_returns(line: bytes, number: int, problems: list[tuple[int, str]]) -> bytes:
-    if b"\r" not in line.removesuffix(b"\r"):
-        return line
-    problems.append((number, "found a carriage return within the line, expected each line to end in a line feed"))
-    return b"#"
+        return f"found bytes that are not UTF-8 ({error.reason}), expected UTF-8 text"
+    if b"\r" in text.removesuffix(b"\r"):
+        return "found a carriage return within the line, expected each line to end in a line feed"
+    return ""
 
 
 def _shorten(text: object) -> str:

@@ -52,10 +52,7 @@ class _TurnsByName:
     def learn(cls, names: pd.Series, up_in_cams: Floats, share: float) -> "_TurnsByName":
         """Let images vote: (n,) names, None where an image does not vote, and (n, 3) up directions in their cameras.
 
-        Every image votes for the quarter turns that bring up nearest to its top, the more the clearer.
-
-        Args:
-            share: of all votes of a name that a decision needs.
+        A decision needs a `share` of all votes of a name.
         """
         codes, unique = pd.factorize(names, sort=True)
         up_in_cams, codes = up_in_cams[codes >= 0], codes[codes >= 0]
