@@ -5,6 +5,7 @@ import threading
 import weakref
 from collections.abc import Callable
 from dataclasses import replace
+from inspect import signature
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,7 +30,7 @@ from toolkit.localizers.base import View
 from toolkit.localizers.network import NetworkPredictor, TokenCache
 from toolkit.localizers.placed import PlacedView, shown_size
 from toolkit.localizers.prediction import Prediction
-from toolkit.localizers.predictors import create_predictor
+from toolkit.localizers.predictors import open_predictor
 from toolkit.manifest import LocalizeSettings
 from toolkit.manifest.settings import CONDITIONED
 from toolkit.models.da3 import DepthAnything3
@@ -178,7 +179,7 @@ Create = Callable[..., NetworkPredictor]
 
 @pytest.fixture
 def create(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Create:
-    """Return a function that creates the predictor of that name with a small network; options as `create_predictor`."""
+    """Return a function that creates the predictor of that name with a small network; options as its settings."""
 
     def make_predictor(name: str, **options: Any) -> NetworkPredictor:
         small = ROWS[name].tiny
@@ -189,8 +190,9 @@ def create(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Create:
             monkeypatch.setattr(ARCHITECTURES[name], "_channels", small().channels)
         checkpoint = tmp_path / "weights.pt"
         checkpoint.write_bytes(b"stands for weights")
-        options = {"compute_device": "cpu", "dtype_compute": "float32"} | options
-        predictor = create_predictor(name, checkpoint=checkpoint, **options)
+        asked = {"name": name, "checkpoint": str(checkpoint), **options}
+        settings = {"predictor": asked, "compute_device": "cpu", "dtype_compute": "float32"}
+        predictor = open_predictor(LocalizeSettings.of(settings), None, tmp_path)  # type: ignore[arg-type]
         assert isinstance(predictor, NetworkPredictor)
         return predictor
 
@@ -319,16 +321,14 @@ def test_what_does_not_fit_is_not_told(
 
 
 def test_who_takes_cameras(create: Create) -> None:
-    assert tuple(name for name, row in ARCHITECTURES.items() if row.takes_cameras) == CONDITIONED
+    takes = [name for name, row in ROWS.items() if "extrinsics" in signature(row.network.forward).parameters]
+    assert tuple(takes) == CONDITIONED
     for name in CONDITIONED:
-        settings = LocalizeSettings.of({"predictor": {"name": name, "conditioned": True}})
-        predictor, plain = create(name, conditioned=settings.predictor.conditioned), create(name)
+        predictor, plain = create(name, conditioned=True), create(name)
         assert predictor.settings == plain.settings | {"conditioned": True}
     for name in ("vggt", "vggt-omega", "simulated"):
         with pytest.raises(ManifestError, match=f"{name} cannot be told cameras; expected .* da3-base, da3-small"):
             LocalizeSettings.of({"predictor": {"name": name, "conditioned": True}})
-    with pytest.raises(ManifestError, match="VGGT-Omega cannot be told cameras"):
-        create("vggt-omega", conditioned=True)
 
 
 def test_nothing_of_a_portrait_photograph_is_cut(

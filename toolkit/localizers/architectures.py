@@ -67,8 +67,6 @@ class Architecture(Protocol):
     """Side of a patch, pixels."""
     special_tokens: int
     """Tokens of a view beside its patches."""
-    takes_cameras: bool
-    """Whether it can be told the cameras of some views."""
     memory: Memory
 
     def lay_out(self, sizes: Sequence[Size]) -> Layout:
@@ -135,7 +133,6 @@ class VggtArchitecture:
     weights = weights.VGGT
     patch = 14
     special_tokens = 5
-    takes_cameras = False
     memory = Memory(trunk=42, kept=32, dense_pixel=1500, dense=32 << 20, dense_frames=8, result_pixel=24)
     _side = 518
 
@@ -175,7 +172,6 @@ class OmegaArchitecture:
     weights = weights.VGGT_OMEGA
     patch = 16
     special_tokens = 17
-    takes_cameras = False
     memory = Memory(trunk=42, kept=32, dense_pixel=630, dense=0, dense_frames=8, result_pixel=24)
 
     def lay_out(self, sizes: Sequence[Size]) -> Layout:
@@ -211,7 +207,6 @@ class Da3Architecture:
 
     patch = 14
     special_tokens = 1
-    takes_cameras = True
 
     def __init__(self, name: str, channels: int, memory: Memory) -> None:
         self.name = name

@@ -48,7 +48,7 @@ from toolkit.localizers.nearest import NearestLocalizer
 from toolkit.localizers.on_demand import OnDemandLocalizer, PosedImages
 from toolkit.localizers.pnp import PnpLocalizer
 from toolkit.localizers.prediction import Predictor
-from toolkit.localizers.predictors import create_predictor
+from toolkit.localizers.predictors import open_predictor
 from toolkit.localizers.survey import NOMINAL_DEPTH, USUAL_DEPTHS_M
 from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings, nearest
 
@@ -491,31 +491,6 @@ def session_fingerprint(session: Session) -> str:
     """Return 16 hex digits that identify the calibration, poses and image list of a session."""
     files = ["sensors.txt", "images.txt", "rigs.txt", "trajectories.txt"]
     return fingerprint([file_fingerprint(session.path / name) for name in files if (session.path / name).exists()])
-
-
-def open_predictor(settings: LocalizeSettings, capture: Capture, map_dir: Path) -> Predictor:
-    """Return what predicts cameras; warn of one that looks up the answers.
-
-    Raises:
-        ManifestError: no such device or precision.
-        WeightsError: no weights; says what to do.
-    """
-    name = settings.predictor.name
-    predictor = create_predictor(
-        name,
-        sessions=[*capture.usable("map"), *capture.usable("query")] if name == "simulated" else (),
-        map_dir=map_dir,
-        features=settings.features.kinds[0],
-        checkpoint=settings.predictor.checkpoint,
-        compute_device=settings.compute_device,
-        dtype_compute=settings.dtype_compute,
-        compile=settings.predictor.compile,
-        conditioned=settings.predictor.conditioned,
-        seed=settings.seed,
-    )
-    if predictor.simulated:
-        log.warning("predictor: %s looks up the true poses of the queries. What comes out is no result.", name)
-    return predictor
 
 
 def turns_for(settings: LocalizeSettings, kinds: Sequence[AnyMethod], capture: Capture) -> Turns | None:

@@ -109,20 +109,16 @@ class NetworkPredictor:
             architecture: which network.
             compile: see `PredictorSettings`.
             conditioned: tell it the intrinsics of all views, and the poses of every other reference where there are
-                at least `telling.LEAST_REFERENCES`.
+                at least `telling.LEAST_REFERENCES`. For a network that takes cameras.
 
         Raises:
-            ManifestError: no such device or precision, or the network takes no cameras.
+            ManifestError: no such precision.
             WeightsError: no weights.
         """
         expected = [name for name in PRECISIONS if name != "float16"]
         if dtype_compute not in expected:
             title = architecture.title
             raise ManifestError(f"dtype_compute is {dtype_compute!r}; {title} expects one of {', '.join(expected)}.")
-        if conditioned and not architecture.takes_cameras:
-            raise ManifestError(
-                f"conditioned is true, but {architecture.title} cannot be told cameras; set it to false."
-            )
         self._architecture, self.name = architecture, architecture.name
         self.conditioned = conditioned
         self.checkpoint = resolve_weights(architecture.weights, checkpoint)
