@@ -16,17 +16,10 @@ from toolkit.localizers.base import PoseEstimate, RoughPose
 from toolkit.localizers.bundle import Observations
 from toolkit.localizers.gravity import measured_gravity
 from toolkit.localizers.map import Map
-from toolkit.localizers.odometry import (
-    UNKNOWN_COVARIANCE,
-    Odometry,
-    PosedQueries,
-    cut,
-    vote_weights,
-    with_measured_drift,
-)
+from toolkit.localizers.odometry import Odometry, cut, with_measured_drift
 from toolkit.localizers.picture import Picture, check_camera, localize_image
 from toolkit.localizers.pose_graph import FAR, PlacedPiece, is_sure
-from toolkit.localizers.recording import localize_piece
+from toolkit.localizers.recording import localize_piece, queries_of
 from toolkit.manifest import SequenceSettings
 
 Pictures = Picture | Sequence[Picture] | None
@@ -114,23 +107,17 @@ def localize_sequence(
     parts = list[PlacedPiece]()
     pieces = odometry.split(settings)
 
-    def queries_within(rows: slice) -> PosedQueries:
-        own = {frame - rows.start: each for frame, each in single.items() if rows.start <= frame < rows.stop}
-        return queries_of(own)
-
-    queries_of_each = [queries_within(rows) for rows in pieces]
+    queries = queries_of(single)
     if not settings.online:
-        motions = [odometry.part(rows) for rows in pieces]
-        settings = with_measured_drift(zip(motions, queries_of_each, strict=True), settings)
+        settings = with_measured_drift([(odometry.part(rows), queries.part(rows)) for rows in pieces], settings)
         pieces = [
             slice(rows.start + part.start, rows.start + part.stop)
-            for rows, queries in zip(pieces, queries_of_each, strict=True)
-            for part in cut(odometry.part(rows), queries, settings)
+            for rows in pieces
+            for part in cut(odometry.part(rows), queries.part(rows), settings)
         ]
-        queries_of_each = [queries_within(rows) for rows in pieces]
-    motions = [odometry.part(rows) for rows in pieces]
-    gravity = measured_gravity(list(zip(motions, queries_of_each, strict=True)), pictures.up, settings)
-    for number, (rows, queries) in enumerate(zip(pieces, queries_of_each, strict=True)):
+    tracks = [(odometry.part(rows), queries.part(rows)) for rows in pieces]
+    gravity = measured_gravity(tracks, pictures.up, settings)
+    for number, rows in enumerate(pieces):
         piece[rows] = number
         asked = np.array([frame for frame in single if rows.start <= frame < rows.stop], np.int64)
 
@@ -144,8 +131,7 @@ def localize_sequence(
             return Observations.of(estimate.correspondences, cameras, rig)
 
         done = localize_piece(
-            odometry.part(rows),
-            queries,
+            *tracks[number],
             asked - rows.start,
             settings,
             localize_again if settings.relocalize else None,
@@ -230,7 +216,7 @@ class SequenceLocalizer:
     def _forget(self, start: int) -> None:
         """Leave out the frames before one."""
         del self._timestamps[:start], self._poses[:start]
-        self._queries = self._queries.choose(self._queries.frames >= start).shifted(-start)
+        self._queries = self._queries.part(slice(start, start + len(self._poses)))
 
     def _solve(self, image: Pictures, cameras: Cameras) -> PoseEstimate:
         if self.settings.length_s is not None:
@@ -276,25 +262,6 @@ class SequenceLocalizer:
             covariance=covariance,
             found_by="sequence",
         )
-
-
-def queries_of(estimates: dict[int, PoseEstimate]) -> PosedQueries:
-    """Return the estimates that have a pose, given by their frames, as a pose graph takes them."""
-    posed = {frame: each for frame, each in sorted(estimates.items()) if each.world_from_rig is not None}
-    trusted = np.array([each.status == "ok" for each in posed.values()], bool)
-    return PosedQueries(
-        np.array(list(posed), np.int64),
-        np.array([each.world_from_rig for each in posed.values()]).reshape(-1, 4, 4),
-        np.array(
-            [UNKNOWN_COVARIANCE if each.covariance is None else each.covariance for each in posed.values()]
-        ).reshape(-1, 6, 6),
-        vote_weights(
-            trusted,
-            np.array([each.p_correct for each in posed.values()]),
-            np.array([each.rival_support for each in posed.values()]),
-        ),
-        trusted,
-    )
 
 
 def _adjoint(a_from_b: Floats) -> Floats:

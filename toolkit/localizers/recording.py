@@ -14,7 +14,7 @@ from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import PoseEstimate, RoughPose, agree
 from toolkit.localizers.bundle import Observations, Observe, adjusted
 from toolkit.localizers.gravity import Gravity
-from toolkit.localizers.odometry import Odometry, PosedQueries, place
+from toolkit.localizers.odometry import UNKNOWN_COVARIANCE, Odometry, PosedQueries, place, vote_weights
 from toolkit.localizers.pose_graph import PlacedPiece, place_online, place_piece
 from toolkit.manifest import SequenceSettings
 
@@ -146,7 +146,7 @@ def with_answers(queries: PosedQueries, answers: Mapping[int, PoseEstimate]) -> 
     odometry is: it was sought where the others had put it.
     """
     poses, covariances = queries.world_from_rig.copy(), queries.covariances.copy()
-    added: list[tuple[int, PoseEstimate]] = []
+    added: dict[int, PoseEstimate] = {}
     for frame, estimate in answers.items():
         if estimate.world_from_rig is None or estimate.covariance is None:
             continue
@@ -154,15 +154,28 @@ def with_answers(queries: PosedQueries, answers: Mapping[int, PoseEstimate]) -> 
         if same:
             poses[same[0]], covariances[same[0]] = estimate.world_from_rig, estimate.covariance
         else:
-            added.append((frame, estimate))
+            added[frame] = estimate
     if not answers:
         return queries
     voters = replace(queries, world_from_rig=poses, covariances=covariances)
-    others = PosedQueries(
-        np.array([frame for frame, _ in added], np.int64),
-        np.array([estimate.world_from_rig for _, estimate in added]).reshape(-1, 4, 4),
-        np.array([estimate.covariance for _, estimate in added]).reshape(-1, 6, 6),
-        np.zeros(len(added)),
-        np.zeros(len(added), bool),
-    )
+    others = replace(queries_of(added), weights=np.zeros(len(added)), trusted=np.zeros(len(added), bool))
     return voters.joined(others)
+
+
+def queries_of(estimates: Mapping[int, PoseEstimate]) -> PosedQueries:
+    """Return the estimates that have a pose, given by their frames, as a pose graph takes them."""
+    posed = {frame: each for frame, each in sorted(estimates.items()) if each.world_from_rig is not None}
+    trusted = np.array([each.status == "ok" for each in posed.values()], bool)
+    return PosedQueries(
+        np.array(list(posed), np.int64),
+        np.array([each.world_from_rig for each in posed.values()]).reshape(-1, 4, 4),
+        np.array(
+            [UNKNOWN_COVARIANCE if each.covariance is None else each.covariance for each in posed.values()]
+        ).reshape(-1, 6, 6),
+        vote_weights(
+            trusted,
+            np.array([each.p_correct for each in posed.values()]),
+            np.array([each.rival_support for each in posed.values()]),
+        ),
+        trusted,
+    )
