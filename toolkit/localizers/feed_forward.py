@@ -97,14 +97,7 @@ class FeedForwardLocalizer:
         self._turns = np.zeros(len(session.images), np.int64) if turns is None else turns.of(session)
         self._next: tuple[Sequence[Asked], _Groups] = (), ([], {})
         """The queries of the next call."""
-
-    @property
-    def image_names(self) -> list[str]:
-        return self.map.image_names
-
-    @property
-    def batch_size(self) -> int:
-        return self.settings.batch_size
+        self.image_names, self.batch_size = local_map.image_names, self.settings.batch_size
 
     def localize(
         self,
