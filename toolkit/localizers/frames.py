@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -45,24 +46,21 @@ class LocalizedFrames:
     """What it says near its predicted pose, where it was in doubt."""
 
 
-class _Pictures:
-    """Localizes what frames show, alone or near a pose."""
-
-    def __init__(self, place: Map, rig_from_cams: NDArray[np.float64] | None, turns: Sequence[int] | None) -> None:
-        self._place, self._rig, self._turns = place, rig_from_cams, turns
-
-    def up(self) -> Floats:
-        """Return the direction (3,) that is about up in the map."""
-        return up_of_cameras(self._place.session.world_from_cam())
-
-    def localize(self, picture: Pictures, cameras: Cameras, near: RoughPose | None = None) -> PoseEstimate:
-        """Return an estimate; one picture that cannot be read does not end a recording."""
-        for camera in cameras if isinstance(cameras, list | tuple) else [cameras]:
-            check_camera(camera)
-        try:
-            return localize_image(self._place, picture, cameras, self._rig, self._turns, near=near)
-        except ImageError as error:
-            return PoseEstimate(f"failed: {error}")
+def _localize(
+    place: Map,
+    rig_from_cams: NDArray[np.float64] | None,
+    turns: Sequence[int] | None,
+    picture: Pictures,
+    cameras: Cameras,
+    near: RoughPose | None = None,
+) -> PoseEstimate:
+    """Localize what a frame shows, alone or near a pose; one picture that cannot be read does not end a recording."""
+    for camera in cameras if isinstance(cameras, list | tuple) else [cameras]:
+        check_camera(camera)
+    try:
+        return localize_image(place, picture, cameras, rig_from_cams, turns, near=near)
+    except ImageError as error:
+        return PoseEstimate(f"failed: {error}")
 
 
 def localize_sequence(
@@ -99,15 +97,11 @@ def localize_sequence(
     of_each = list(given) if isinstance(several, list | tuple) else [given] * len(images)
     if len(of_each) != len(images):
         raise ValueError(f"Found {len(of_each)} cameras and {len(images)} images: expected one for all, or for each.")
-    pictures = _Pictures(place, rig_from_cams, turns)
-    single = {
-        frame: pictures.localize(image, of_each[frame]) for frame, image in enumerate(images) if image is not None
-    }
+    localize = partial(_localize, place, rig_from_cams, turns)
+    single = {frame: localize(image, of_each[frame]) for frame, image in enumerate(images) if image is not None}
     piece, again = np.zeros(len(odometry), int), dict[int, PoseEstimate]()
     parts = list[PlacedPiece]()
-    pieces = odometry.split(settings)
-
-    queries = queries_of(single)
+    pieces, queries = odometry.split(settings), queries_of(single)
     if not settings.online:
         settings = with_measured_drift([(odometry.part(rows), queries.part(rows)) for rows in pieces], settings)
         pieces = [
@@ -116,13 +110,13 @@ def localize_sequence(
             for part in cut(odometry.part(rows), queries.part(rows), settings)
         ]
     tracks = [(odometry.part(rows), queries.part(rows)) for rows in pieces]
-    gravity = measured_gravity(tracks, pictures.up, settings)
+    gravity = measured_gravity(tracks, lambda: up_of_cameras(place.session.world_from_cam()), settings)
     for number, rows in enumerate(pieces):
         piece[rows] = number
         asked = np.array([frame for frame in single if rows.start <= frame < rows.stop], np.int64)
 
         def localize_again(todo: Sequence[tuple[int, RoughPose]], start: int = rows.start) -> list[PoseEstimate]:
-            return [pictures.localize(images[start + frame], of_each[start + frame], near) for frame, near in todo]
+            return [localize(images[start + frame], of_each[start + frame], near) for frame, near in todo]
 
         def observe(frame: int, again: PoseEstimate | None, start: int = rows.start) -> Observations:
             estimate, each = again or single[start + frame], of_each[start + frame]
@@ -130,14 +124,8 @@ def localize_sequence(
             cameras = each if isinstance(each, list | tuple) else [each]
             return Observations.of(estimate.correspondences, cameras, rig)
 
-        done = localize_piece(
-            *tracks[number],
-            asked - rows.start,
-            settings,
-            localize_again if settings.relocalize else None,
-            gravity,
-            observe,
-        )
+        ask = localize_again if settings.relocalize else None
+        done = localize_piece(*tracks[number], asked - rows.start, settings, ask, gravity, observe)
         again |= {rows.start + frame: estimate for frame, estimate in done.again.items()}
         parts.append(done.placed)
     return LocalizedFrames(
@@ -166,7 +154,7 @@ class SequenceLocalizer:
     ) -> None:
         """See `localize_sequence`; `settings.length_s` is the window."""
         self.settings = self._drift = SequenceSettings.of({"online": True}, settings)
-        self._pictures = _Pictures(place, rig_from_cams, turns)
+        self._localize = partial(_localize, place, rig_from_cams, turns)
         self._timestamps, self._poses = list[int](), list[Floats]()
         self._queries = queries_of({})
         """Of the piece, with those found again."""
@@ -197,7 +185,7 @@ class SequenceLocalizer:
             raise ValueError(f"timestamp: found {timestamp} after {self._timestamps[-1]}, expected a later one.")
         self._timestamps.append(int(timestamp))
         self._poses.append(pose)
-        latest = Odometry(np.array(self._timestamps[-4:], np.int64), np.stack(self._poses[-4:]))
+        latest = self._since(-4)
         if latest.split(self.settings)[-1].start == len(latest) - 1:  # tracking was lost: a new piece
             del self._timestamps[:-1], self._poses[:-1]
             self._queries, self._solved = queries_of({}), None
@@ -205,13 +193,12 @@ class SequenceLocalizer:
             self.single = None
             return self._led_on()
         given: Any = cameras
-        self.single = self._pictures.localize(image, given)
+        self.single = self._localize(image, given)
         self._queries = self._queries.joined(queries_of({len(self._poses) - 1: self.single}))
         return self._solve(image, given)
 
-    @property
-    def _window(self) -> Odometry:
-        return Odometry(np.array(self._timestamps, np.int64), np.stack(self._poses))
+    def _since(self, start: int) -> Odometry:
+        return Odometry(np.array(self._timestamps[start:], np.int64), np.stack(self._poses[start:]))
 
     def _forget(self, start: int) -> None:
         """Leave out the frames before one."""
@@ -221,13 +208,13 @@ class SequenceLocalizer:
     def _solve(self, image: Pictures, cameras: Cameras) -> PoseEstimate:
         if self.settings.length_s is not None:
             self._forget(int(np.searchsorted(self._timestamps, self._timestamps[-1] - self.settings.length_s * 1e6)))
-        self._drift = with_measured_drift([(self._window, self._queries)], self.settings)
-        self._forget(cut(self._window, self._queries, self._drift)[-1].start)
-        window = self._window
+        self._drift = with_measured_drift([(self._since(0), self._queries)], self.settings)
+        self._forget(cut(self._since(0), self._queries, self._drift)[-1].start)
+        window = self._since(0)
         offline = self._drift.model_copy(update={"online": False, "length_s": None})
 
         def localize_again(todo: Sequence[tuple[int, RoughPose]]) -> list[PoseEstimate]:
-            return [self._pictures.localize(image, cameras, near) for _, near in todo]
+            return [self._localize(image, cameras, near) for _, near in todo]
 
         again = localize_again if self.settings.relocalize else None
         done = localize_piece(window, self._queries, np.array([len(window) - 1]), offline, again)
@@ -245,7 +232,7 @@ class SequenceLocalizer:
         status = str(placed.status[-1])
         if not np.isfinite(placed.world_from_rig[-1]).all():
             return PoseEstimate(status, found_by="sequence")
-        way = Odometry(np.array(self._timestamps[last:], np.int64), np.stack(self._poses[last:])).scaled(placed.scale)
+        way = self._since(last).scaled(placed.scale)
         step = geometry.invert(way.odom_from_rig[0]) @ way.odom_from_rig[-1]
         turn, shift = way.drift(self._drift, np.array([0]), np.array([len(way) - 1]))
         shift = np.hypot(shift, self.settings.scale_std * np.linalg.norm(step[:3, 3]))
