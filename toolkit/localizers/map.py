@@ -21,7 +21,7 @@ from toolkit.embedders import Embedder, Vectors, create_embedder, embedding_fold
 from toolkit.embedders.index import JoinedIndex, VectorIndex, load_index
 from toolkit.embedders.search import search
 from toolkit.errors import ArtifactError, ToolkitError
-from toolkit.features.features import KINDS, LocalFeatures, extract_turned
+from toolkit.features.features import KINDS, extract_turned
 from toolkit.features.groups import HDF5_ERRORS
 from toolkit.features.matching import AnyMethod, DeferredMethod, LocalMethod, create_local_methods, weights_files
 from toolkit.features.stores import FeatureStore, OnDemandFeatures, as_stored, extract_session
@@ -512,11 +512,8 @@ def create_localizer(settings: LocalizeSettings, map: Map, predictor: Predictor 
         WeightsError: the network has no weights.
     """
     if settings.method == "nearest":
-        session = map.session
-        rows = session.camera_rows
-        poses = session.world_from_cam(rows)
-        posed = np.isfinite(poses).reshape(-1, 16).all(axis=1)
-        return NearestLocalizer([session.image_name(int(row)) for row in rows[posed]], poses[posed])
+        posed = PosedImages.of_session(map.session)
+        return NearestLocalizer(posed.names, posed.world_from_cams)
     if not map.kinds:
         raise ArtifactError(
             f"The map of {map.device!r} is of a run of the method {map.settings.method!r} and has no points, which the "
@@ -562,15 +559,11 @@ def _on_demand(
     return OnDemandLocalizer(
         PosedImages.of_session(map.session, names, map.length),
         map.in_lengths,
-        [(kind, partial(_features_of, map, kind)) for kind in kinds],
+        [(kind, partial(lambda kind, name: map.on_demand(kind)(name), kind)) for kind in kinds],
         settings.map,
         settings.pnp,
         settings.seed,
     )
-
-
-def _features_of(map: Map, kind: AnyMethod, name: str) -> LocalFeatures:  # noqa: A002
-    return map.on_demand(kind)(name)
 
 
 def create_methods(settings: LocalizeSettings) -> tuple[list[LocalMethod], list[DeferredMethod]]:
