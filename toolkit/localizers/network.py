@@ -18,9 +18,8 @@ from toolkit.files import files_fingerprint
 from toolkit.geometry import invert, make_pose
 from toolkit.localizers.architectures import ARCHITECTURES, Architecture, Size, estimate_bytes
 from toolkit.localizers.base import View
-from toolkit.localizers.placed import PlacedView, shown_size
+from toolkit.localizers.placed import PlacedView, cameras_to_tell, shown_size, told_views
 from toolkit.localizers.prediction import Prediction
-from toolkit.localizers.telling import cameras_to_tell, told_views
 from toolkit.models.compute import PRECISIONS, Fitting, free_bytes, on_device, resolve_device, resolve_precision
 from toolkit.models.weights import resolve_weights
 
@@ -109,7 +108,7 @@ class NetworkPredictor:
             architecture: which network.
             compile: see `PredictorSettings`.
             conditioned: tell it the intrinsics of all views, and the poses of every other reference where there are
-                at least `telling.LEAST_REFERENCES`. For a network that takes cameras.
+                at least `placed.LEAST_REFERENCES`. For a network that takes cameras.
 
         Raises:
             ManifestError: no such precision.
