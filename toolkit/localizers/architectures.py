@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 Size = tuple[int, int]
+HEADS = ("camera", "depth")
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class Memory:
     trunk: int
     """For each number of the tokens (views x tokens x channels) during a block."""
     kept: int
-    """For each number of the tokens, with depth: what its head reads of the layers."""
+    """For each number of the tokens: what the depth head reads of the layers."""
     dense_pixel: int
     """For each pixel of a frame in the depth head."""
     dense: int
@@ -77,14 +78,14 @@ class Architecture(ABC):
     def lay_out(self, sizes: Sequence[Size]) -> Layout:
         """Return how photographs of these (width, height) are shown to the network."""
 
-    def load(self, checkpoint: Path, heads: tuple[str, ...], dtype: "torch.dtype") -> Any:
+    def load(self, checkpoint: Path, dtype: "torch.dtype") -> Any:
         """Return the network, on the CPU: `encode(images)`, and `(images, heads, tokens)` -> the outputs of its heads;
         where it takes cameras also `(images, heads, tokens, extrinsics, intrinsics)`, see `DepthAnything3`.
 
         Raises:
             WeightsError: the file is not of this network.
         """
-        return getattr(self._imported, self.network).from_checkpoint(checkpoint, heads=heads, compute_dtype=dtype)
+        return getattr(self._imported, self.network).from_checkpoint(checkpoint, heads=HEADS, compute_dtype=dtype)
 
     def read(self, image: Path | NDArray[np.uint8], layout: Layout) -> "tuple[Tensor, Size]":
         """Return the network's image (3, H, W) of a photograph, and the photograph's (width, height).
@@ -118,7 +119,6 @@ def estimate_bytes(
     views: int,
     size: Size,
     channels: int = 1024,
-    depth: bool = True,
     on_cpu: bool = True,
 ) -> int:
     """Return the memory that a network needs, beside its weights, for so many groups of views at once.
@@ -127,18 +127,14 @@ def estimate_bytes(
         groups, views: how many groups, of how many views each.
         size: (H, W) of the network's images.
         channels: of a token.
-        depth: whether the depth head runs.
         on_cpu: where the depth head takes one frame at a time.
     """
     (height, width), memory, frames = size, architecture.memory, groups * views
     patches = (height // architecture.patch) * (width // architecture.patch)
     numbers = frames * (architecture.special_tokens + patches) * channels
-    trunk = memory.trunk * numbers
-    if not depth:
-        return trunk
     together = 1 if on_cpu else min(frames, memory.dense_frames)
     dense = memory.dense_pixel * height * width * together + memory.dense
-    return memory.kept * numbers + max(trunk, dense) + memory.result_pixel * frames * height * width
+    return memory.kept * numbers + max(memory.trunk * numbers, dense) + memory.result_pixel * frames * height * width
 
 
 class VggtArchitecture(Architecture):
@@ -217,8 +213,8 @@ class Da3Architecture(Architecture):
         scale = resized / np.array(sizes, np.float64).reshape(-1, 2)
         return Layout(MODES[0], (int(height), int(width)), scale, -((resized - [width, height]) // 2))
 
-    def load(self, checkpoint: Path, heads: tuple[str, ...], dtype: "torch.dtype") -> Any:
-        network = super().load(checkpoint, heads, dtype)
+    def load(self, checkpoint: Path, dtype: "torch.dtype") -> Any:
+        network = super().load(checkpoint, dtype)
         if network.channels != self._channels:
             raise WeightsError(
                 f"{checkpoint}: these are weights with {network.channels} channels, not {self.title}, which has "
