@@ -34,7 +34,7 @@ from toolkit.files import (
     write_sidecar,
 )
 from toolkit.geometry import Floats, Ints, pose_error
-from toolkit.localizers.base import PoseEstimate, RoughPose
+from toolkit.localizers.base import PoseEstimate, RoughPose, stds_of
 from toolkit.localizers.bundle import Observations
 from toolkit.localizers.correspondences import LocalizedQueries
 from toolkit.localizers.frames import LocalizedFrames, SequenceLocalizer, localize_sequence
@@ -337,9 +337,8 @@ def _frames(
     asked_for = (frames_table["status"] != "").to_numpy()
     frames_table, every, known = frames_table[asked_for], every[asked_for], known[asked_for]
     posed = np.isfinite(every).all(axis=(1, 2))
-    stds = np.sqrt(np.trace(known[:, 3:, 3:], axis1=1, axis2=2)), np.sqrt(np.trace(known[:, :3, :3], axis1=1, axis2=2))
-    frames_table["position_std_m"] = np.where(posed, stds[0], np.nan).round(6)
-    frames_table["rotation_std_deg"] = np.where(posed, np.degrees(stds[1]), np.nan).round(6)
+    for name, stds in zip(("rotation_std_deg", "position_std_m"), stds_of(known), strict=True):
+        frames_table[name] = np.where(posed, stds, np.nan).round(6)
     kept = frames_table[posed]
     times = kept["timestamp"].to_numpy(np.int64)
     trajectory = Trajectory.from_poses(times, kept["device_id"].to_list(), every[posed], known[posed])

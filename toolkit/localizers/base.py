@@ -156,13 +156,11 @@ class PoseEstimate:
 
     @property
     def position_std_m(self) -> float:
-        return float(np.sqrt(np.trace(self.covariance[3:, 3:]))) if self.covariance is not None else float("nan")
+        return float("nan") if self.covariance is None else float(stds_of(self.covariance)[1])
 
     @property
     def rotation_std_deg(self) -> float:
-        if self.covariance is None:
-            return float("nan")
-        return float(np.degrees(np.sqrt(np.trace(self.covariance[:3, :3]))))
+        return float("nan") if self.covariance is None else float(stds_of(self.covariance)[0])
 
     @property
     def inlier_ratio(self) -> float:
@@ -270,6 +268,20 @@ class ScaledLocalizer:
 def _stretched(poses: Floats, factor: float) -> Floats:
     """Return poses (..., 4, 4) with their translations times a factor."""
     return geometry.make_pose(poses[..., :3, :3], factor * poses[..., :3, 3])
+
+
+def stds_of(covariances: Floats) -> tuple[Floats, Floats]:
+    """Return the standard deviations (...) of rotations, degrees, and places, meters, as lengths, of (..., 6, 6)."""
+    rotation, position = (np.trace(covariances[..., s, s], axis1=-2, axis2=-1) for s in (slice(3), slice(3, 6)))
+    return np.degrees(np.sqrt(rotation)), np.sqrt(position)
+
+
+def carried_over(covariance: Floats, a_from_b: Floats) -> Floats:
+    """Return the covariance (6, 6) of a pose as a motion in a's frame, from that in b's; b is mounted on a."""
+    R, (x, y, z) = a_from_b[:3, :3], a_from_b[:3, 3]
+    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    adjoint = np.block([[R, np.zeros((3, 3))], [across @ R, R]])
+    return np.asarray(adjoint @ covariance @ adjoint.T)
 
 
 def rank(status: str) -> int:

@@ -13,7 +13,7 @@ from toolkit import geometry
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import ImageError
 from toolkit.geometry import Floats, Ints
-from toolkit.localizers.base import PoseEstimate, RoughPose
+from toolkit.localizers.base import PoseEstimate, RoughPose, carried_over
 from toolkit.localizers.bundle import Observations
 from toolkit.localizers.gravity import measured_gravity
 from toolkit.localizers.map import Map
@@ -236,8 +236,8 @@ class SequenceLocalizer:
         step = geometry.invert(way.odom_from_rig[0]) @ way.odom_from_rig[-1]
         turn, shift = way.drift(self._drift, np.array([0]), np.array([len(way) - 1]))
         shift = np.hypot(shift, self.settings.scale_std * np.linalg.norm(step[:3, 3]))
-        moved = _adjoint(geometry.invert(step))
-        covariance = moved @ placed.covariances[-1] @ moved.T + np.diag(np.repeat([turn[0], shift[0]], 3) ** 2)
+        covariance = carried_over(placed.covariances[-1], geometry.invert(step))
+        covariance += np.diag(np.repeat([turn[0], shift[0]], 3) ** 2)
         status = FAR if status == "ok" and not is_sure(covariance[None])[0] else status
         return self._estimate(placed.world_from_rig[-1] @ step, covariance, status)
 
@@ -249,10 +249,3 @@ class SequenceLocalizer:
             covariance=covariance,
             found_by="sequence",
         )
-
-
-def _adjoint(a_from_b: Floats) -> Floats:
-    """Return the matrix (6, 6) that takes small motions, rotation then translation, from b's frame to a's."""
-    rotation, (x, y, z) = a_from_b[:3, :3], a_from_b[:3, 3]
-    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.block([[rotation, np.zeros((3, 3))], [across @ rotation, rotation]])

@@ -11,7 +11,7 @@ import numpy as np
 
 from toolkit import geometry
 from toolkit.geometry import Floats, Ints
-from toolkit.localizers.base import PoseEstimate, RoughPose, agree
+from toolkit.localizers.base import PoseEstimate, RoughPose, agree, stds_of
 from toolkit.localizers.bundle import Observations, Observe, adjusted
 from toolkit.localizers.gravity import Gravity
 from toolkit.localizers.odometry import UNKNOWN_COVARIANCE, Odometry, PosedQueries, place, vote_weights
@@ -68,7 +68,9 @@ def localize_piece(
     doubted = [int(frame) for frame in np.setdiff1d(asked, sure) if np.isfinite(first.world_from_rig[frame]).all()]
     answers: dict[int, PoseEstimate] = {}
     if again is not None and doubted:
-        found = again([(frame, _rough(first, frame)) for frame in doubted])
+        stds = zip(*(each.tolist() for each in stds_of(first.covariances[doubted])), strict=True)
+        rough = [RoughPose(pose, *std) for pose, std in zip(first.world_from_rig[doubted], stds, strict=True)]
+        found = again(list(zip(doubted, rough, strict=True)))
         answers = dict(zip(doubted, found, strict=True))
     every = with_answers(queries, answers)
     second = first if every is queries else _placed(odometry, every, asked, settings, gravity)
@@ -128,15 +130,6 @@ def _laid(odometry: Odometry, agreeing: PosedQueries) -> Floats:
     laid = (candidates[:, :3] @ moved[:, :, 3].T).transpose(0, 2, 1)
     off_m = np.linalg.norm(laid - poses[:, :3, 3], axis=2)
     return np.asarray(candidates[int(np.argmin(np.median(off_m, axis=1)))])
-
-
-def _rough(placed: PlacedPiece, frame: int) -> RoughPose:
-    covariance = placed.covariances[frame]
-    return RoughPose(
-        placed.world_from_rig[frame],
-        float(np.degrees(np.sqrt(np.trace(covariance[:3, :3])))),
-        float(np.sqrt(np.trace(covariance[3:, 3:]))),
-    )
 
 
 def with_answers(queries: PosedQueries, answers: Mapping[int, PoseEstimate]) -> PosedQueries:
