@@ -36,7 +36,7 @@ from toolkit.features.matching import MATCHERS, MutualMatcher, unit_descriptors
 from toolkit.features.stores import extract_session
 from toolkit.files import SceneFiles, image_name, map_record_path, read_map_record, read_references, sidecar_path
 from toolkit.localize import COLUMNS, Map, localize_image, localize_pairs
-from toolkit.localizers import create_localizer
+from toolkit.localizers import create_localizer, predictors
 from toolkit.localizers import map as maps
 from toolkit.localizers.base import PoseEstimate, Query, RoughPose, View
 from toolkit.localizers.correspondences import LocalizedQueries
@@ -513,7 +513,7 @@ def test_a_network_is_asked_once_about_a_query_that_escalates(
         return ByContent.predict(predictor, groups)
 
     monkeypatch.setattr(predictor, "predict", predict)
-    monkeypatch.setattr(maps, "create_predictor", lambda *_, **__: predictor)
+    monkeypatch.setattr(predictors, "NetworkPredictor", lambda *_, **__: predictor)
     settings = ESCALATES | {"method": "hybrid", "predictor": {"num_references": 3}}
     table = run_stage(small_capture, run, query_device="ios", **settings)
     assert sum(asked) == table["queries"].item() == table["escalated"].item()
@@ -1006,7 +1006,7 @@ def test_pictures_get_the_pose_of_the_run_byte_for_byte(
 ) -> None:
     add_other_kind(monkeypatch)
     predictor = ByContent(Capture.open(small_capture), run.maps)
-    monkeypatch.setattr(maps, "create_predictor", lambda *_, **__: predictor)
+    monkeypatch.setattr(predictors, "NetworkPredictor", lambda *_, **__: predictor)
     settings = {"features": ["sift"], "seed": 3, "pnp": {"min_inliers": 11}, "predictor": {"num_references": 3}}
     settings |= method
     run_stage(small_capture, run, query_device=device, **settings)

@@ -70,16 +70,13 @@ def test_megaloc(device: None) -> None:
     np.testing.assert_allclose(there.embed(there.stack(images)), here.embed(images), atol=1e-6)
 
 
-@pytest.mark.parametrize("needs_depth", [False, True])
-def test_vggt(device: None, needs_depth: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_vggt(device: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(VGGT, "from_checkpoint", lambda _, heads, compute_dtype: tiny(heads, compute_dtype))
     checkpoint = tmp_path / "model.pt"
     checkpoint.write_bytes(b"stands for weights")
     photographs = Photographs(tmp_path)
     groups = [photographs.group(*sizes) for sizes in ([WIDE] * 3, [HIGHER, WIDE])]
-    here, there = (
-        NetworkPredictor(checkpoint, name, "float32", needs_depth=needs_depth) for name in ("cpu", "pretend")
-    )
+    here, there = (NetworkPredictor(checkpoint, name, "float32") for name in ("cpu", "pretend"))
     expected = here.predict(groups)
     for _ in range(2):  # the second time from what is kept
         for found, other in zip(there.predict(groups, groups), expected, strict=True):
@@ -88,7 +85,7 @@ def test_vggt(device: None, needs_depth: bool, tmp_path: Path, monkeypatch: pyte
     assert all(isinstance(kept, PretendTensor) for kept in there._cache._kept.values())
     # Where memory is short, the CPU holds what is kept.
     monkeypatch.setattr(predictors, "free_bytes", lambda _: 2 << 30)
-    poor = NetworkPredictor(checkpoint, "pretend", "float32", needs_depth=needs_depth)
+    poor = NetworkPredictor(checkpoint, "pretend", "float32")
     for found, other in zip(poor.predict(groups), expected, strict=True):
         assert_same(found, other)
     assert not any(isinstance(kept, PretendTensor) for kept in poor._cache._kept.values())

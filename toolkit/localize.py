@@ -64,7 +64,6 @@ from toolkit.localizers.map import (
     create_localizer,
     create_methods,
     label,
-    open_predictor,
     session_fingerprint,
     update_attributes,
 )
@@ -72,6 +71,7 @@ from toolkit.localizers.mapping import map_settings
 from toolkit.localizers.misfit import LEAST_SIZE, SIGNIFICANCE
 from toolkit.localizers.picture import localize_image
 from toolkit.localizers.prediction import Predictor
+from toolkit.localizers.predictors import open_predictor
 from toolkit.manifest import LocalizeSettings
 from toolkit.runs.pairs import PairRows
 from toolkit.show.metrics import camera_messages

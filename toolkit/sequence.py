@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,7 @@ from toolkit.files import (
     write_sidecar,
 )
 from toolkit.geometry import Floats, Ints, pose_error
-from toolkit.localizers.base import PoseEstimate, RoughPose
+from toolkit.localizers.base import PoseEstimate, RoughPose, stds_of
 from toolkit.localizers.bundle import Observations
 from toolkit.localizers.correspondences import LocalizedQueries
 from toolkit.localizers.frames import LocalizedFrames, SequenceLocalizer, localize_sequence
@@ -185,11 +185,19 @@ class _Piece:
     device_ids: NDArray[np.object_]
     """(N,)."""
     motion: Odometry
+    query: Ints
+    """(N,) which query each frame is, -1 where it is none."""
+    posed: PosedQueries
+    """Those that have a pose."""
 
-    def cut(self, queries: PosedQueries, settings: SequenceSettings) -> Iterator["_Piece"]:
-        """Yield the parts between losses of tracking that the queries tell."""
-        for part in cut(self.motion, queries, settings):
-            yield _Piece(self.recording, self.device_ids[part], self.motion.part(part))
+    @property
+    def asked(self) -> Ints:
+        """(A,) frames of all queries."""
+        return np.flatnonzero(self.query >= 0)
+
+    def part(self, rows: slice) -> "_Piece":
+        own, posed = self.device_ids[rows], self.posed.part(rows)
+        return _Piece(self.recording, own, self.motion.part(rows), self.query[rows], posed)
 
 
 @dataclass(frozen=True)
@@ -221,9 +229,8 @@ class _Answers:
         found = trajectory.lookup(rows["timestamp"], rows["device_id"])
         return cls(rows[["timestamp", "device_id"]], status, weights, found, covariances)
 
-    def posed(self, timestamps: Ints, device_ids: Any) -> PosedQueries:
-        """Return those that have a pose, of the frames (N,) of a piece of odometry."""
-        rows = self.of(timestamps, device_ids)
+    def posed(self, rows: Ints) -> PosedQueries:
+        """Return those that have a pose, of the frames of a piece of odometry; rows (N,) are as `of` returns them."""
         frames = np.flatnonzero(rows >= 0)
         frames = frames[np.isfinite(self.poses[rows[frames]]).all(axis=(1, 2))]
         rows = rows[frames]
@@ -255,11 +262,11 @@ class _Relocalizer:
             )
         return Map.open(self._run, self._scene, self._device)
 
-    def __call__(self, queries: pd.DataFrame, near: Sequence[RoughPose]) -> list[PoseEstimate]:
-        """Return an estimate of each query, given by `timestamp` and `device_id`."""
+    def __call__(self, keys: pd.DataFrame, todo: Sequence[tuple[int, RoughPose]]) -> list[PoseEstimate]:
+        """Return an estimate of some frames, of which `keys` has `timestamp` and `device_id`, each near a pose."""
         session, place = self._session, self._place
         _ = place.localizer, place.embedders  # opened before threads ask for them
-        rows_of_each = session.rows_of_keyframes(queries)
+        rows_of_each = session.rows_of_keyframes(keys.iloc[[frame for frame, _ in todo]])
 
         def localize(number: int) -> PoseEstimate:
             rows = rows_of_each[number]
@@ -268,12 +275,12 @@ class _Relocalizer:
             paths = [session.image_path(int(row)) for row in rows]
             try:
                 poses = session.rig_from_cam(rows)
-                return localize_image(place, paths, cameras, poses, turns, near[number])
+                return localize_image(place, paths, cameras, poses, turns, todo[number][1])
             except Exception as error:  # one bad query never ends a run
                 return PoseEstimate(f"failed: {reason_of(error, f'localizing {paths[0]} again')}")
 
         with threadpool_limits(1, "blas"):
-            return list(prefetch(localize, range(len(queries)), default_workers()))
+            return list(prefetch(localize, range(len(todo)), default_workers()))
 
 
 def _frames(
@@ -288,50 +295,30 @@ def _frames(
     tables, poses, covariances = list[pd.DataFrame](), list[Floats](), list[Floats]()
     steps, online = [pd.DataFrame(columns=list(STEP_COLUMNS))], list[pd.DataFrame]()
     with_odometry = np.zeros(len(answers.keys), bool)
-    pieces = list(_pieces(session, answers.keys, settings))
-    queries_of_each = [answers.posed(piece.motion.timestamps, piece.device_ids) for piece in pieces]
-    _warn_of_truth(session, pieces, queries_of_each)
+    pieces = list(_pieces(session, answers, settings))
+    _warn_of_truth(session, pieces)
     if not settings.online:
         # Before the drift is measured and pieces are cut, of which the future tells.
-        for piece, queries in zip(pieces, queries_of_each, strict=True):
-            asked = np.flatnonzero(answers.of(piece.motion.timestamps, piece.device_ids) >= 0)
-            online += _step_rows(piece, asked, _online_steps(piece.motion, queries, asked, settings))
-        motions = [piece.motion for piece in pieces]
-        settings = with_measured_drift(zip(motions, queries_of_each, strict=True), settings)
-        pieces = [part for piece, own in zip(pieces, queries_of_each, strict=True) for part in piece.cut(own, settings)]
-        queries_of_each = [answers.posed(piece.motion.timestamps, piece.device_ids) for piece in pieces]
-    motions = [piece.motion for piece in pieces]
-    gravity = measured_gravity(list(zip(motions, queries_of_each, strict=True)), map_up, settings)
+        for piece in pieces:
+            online += _step_rows(piece, _online_steps(piece, settings))
+        settings = with_measured_drift([(piece.motion, piece.posed) for piece in pieces], settings)
+        pieces = [piece.part(rows) for piece in pieces for rows in cut(piece.motion, piece.posed, settings)]
+    gravity = measured_gravity([(piece.motion, piece.posed) for piece in pieces], map_up, settings)
     numbers = Counter[str]()
-    for piece, queries in zip(pieces, queries_of_each, strict=True):
-        motion, frames = piece.motion, queries.frames
-        asked = answers.of(motion.timestamps, piece.device_ids)
-        with_odometry[asked[asked >= 0]] = True
+    for piece in pieces:
+        motion, queries, frames = piece.motion, piece.posed, piece.posed.frames
+        with_odometry[piece.query[piece.asked]] = True
         keys = pd.DataFrame({"timestamp": motion.timestamps, "device_id": piece.device_ids})
-        again = None
-        if relocalizer is not None:
-
-            def again(
-                todo: Sequence[tuple[int, RoughPose]], keys: pd.DataFrame = keys, ask: _Relocalizer = relocalizer
-            ) -> list[PoseEstimate]:
-                return ask(keys.iloc[[frame for frame, _ in todo]], [pose for _, pose in todo])
-
-        observe = None
-        if shown is not None:
-
-            def observe(
-                frame: int, again: PoseEstimate | None, keys: pd.DataFrame = keys, shown: LocalizedQueries = shown
-            ) -> Observations | None:
-                return _observations(session, shown, keys.iloc[[frame]], again)
-
-        done = localize_piece(motion, queries, np.flatnonzero(asked >= 0), settings, again, gravity, observe)
+        again = None if relocalizer is None else partial(relocalizer, keys)
+        observe = None if shown is None else partial(_observations, session, shown, keys)
+        done = localize_piece(motion, queries, piece.asked, settings, again, gravity, observe)
         placed = done.placed
-        steps += _step_rows(piece, np.flatnonzero(asked >= 0), done.steps)
+        steps += _step_rows(piece, done.steps)
         table = pd.DataFrame(dict.fromkeys(COLUMNS), index=range(len(motion)))
         table[list(keys)] = keys
         table["recording"], table["piece"], table["status"] = piece.recording, numbers[piece.recording], placed.status
         numbers[piece.recording] += 1
-        table["single_status"] = np.append(answers.status, "")[asked]
+        table["single_status"] = np.append(answers.status, "")[piece.query]
         table.loc[list(done.again), "again_status"] = [estimate.status for estimate in done.again.values()]
         turned, moved = pose_error(placed.world_from_rig[frames], queries.world_from_rig)
         for name, values in (("moved_m", moved.round(6)), ("turned_deg", turned.round(6))):
@@ -350,9 +337,8 @@ def _frames(
     asked_for = (frames_table["status"] != "").to_numpy()
     frames_table, every, known = frames_table[asked_for], every[asked_for], known[asked_for]
     posed = np.isfinite(every).all(axis=(1, 2))
-    stds = np.sqrt(np.trace(known[:, 3:, 3:], axis1=1, axis2=2)), np.sqrt(np.trace(known[:, :3, :3], axis1=1, axis2=2))
-    frames_table["position_std_m"] = np.where(posed, stds[0], np.nan).round(6)
-    frames_table["rotation_std_deg"] = np.where(posed, np.degrees(stds[1]), np.nan).round(6)
+    for name, stds in zip(("rotation_std_deg", "position_std_m"), stds_of(known), strict=True):
+        frames_table[name] = np.where(posed, stds, np.nan).round(6)
     kept = frames_table[posed]
     times = kept["timestamp"].to_numpy(np.int64)
     trajectory = Trajectory.from_poses(times, kept["device_id"].to_list(), every[posed], known[posed])
@@ -360,9 +346,10 @@ def _frames(
 
 
 def _observations(
-    session: Session, shown: LocalizedQueries, query: pd.DataFrame, again: PoseEstimate | None
+    session: Session, shown: LocalizedQueries, keys: pd.DataFrame, frame: int, again: PoseEstimate | None
 ) -> Observations | None:
-    """Return what a query shows: what its first pose rests on, or that which was found again."""
+    """Return what a frame shows: what its query's first pose rests on, or that which was found again."""
+    query = keys.iloc[[frame]]
     key = int(query["timestamp"].iloc[0]), str(query["device_id"].iloc[0])
     if again is not None:
         [rows], found = session.rows_of_keyframes(query), again.correspondences
@@ -378,21 +365,19 @@ def _observations(
     return Observations.of(found, cameras, session.rig_from_cam(rows))
 
 
-def _step_rows(piece: _Piece, asked: Ints, steps: Mapping[str, Floats]) -> Iterator[pd.DataFrame]:
-    """Yield tables with `STEP_COLUMNS` of the poses (A, 4, 4) of some frames (A,) after each step."""
+def _step_rows(piece: _Piece, steps: Mapping[str, Floats]) -> Iterator[pd.DataFrame]:
+    """Yield tables with `STEP_COLUMNS` of the poses (A, 4, 4) of the frames that are asked for after each step."""
     for name, poses in steps.items():
         posed = np.isfinite(poses).all(axis=(1, 2))
-        rows = asked[posed]
+        rows = piece.asked[posed]
         table = pd.DataFrame({"step": name, "timestamp": piece.motion.timestamps[rows]})
         table["device_id"] = piece.device_ids[rows]
         table[list(POSE_NAMES)] = geometry.qt_from_pose(poses[posed]).round(9)
         yield table
 
 
-def _online_steps(
-    motion: Odometry, queries: PosedQueries, asked: Ints, settings: SequenceSettings
-) -> dict[str, Floats]:
-    """Return poses (A, 4, 4) of frames from single queries of the past alone, by the window's name.
+def _online_steps(piece: _Piece, settings: SequenceSettings) -> dict[str, Floats]:
+    """Return poses (A, 4, 4) of the frames that are asked for, from single queries of the past, by the window's name.
 
     What was localized again near a predicted pose does not count: other queries, of the future too, predicted it.
     """
@@ -402,15 +387,15 @@ def _online_steps(
     for length_s in (*settings.windows_s, None):
         past = settings.model_copy(update={"online": True, "length_s": length_s})
         name = "online" if length_s is None else f"online {length_s:g} s"
-        steps[name] = place_online(motion, queries, asked, past).world_from_rig[asked]
+        steps[name] = place_online(piece.motion, piece.posed, piece.asked, past).world_from_rig[piece.asked]
     return steps
 
 
-def _warn_of_truth(session: Session, pieces: Sequence[_Piece], queries_of_each: Sequence[PosedQueries]) -> None:
+def _warn_of_truth(session: Session, pieces: Sequence[_Piece]) -> None:
     """Warn if odometry has the places in the map that the queries have: then it is none."""
     within = list[bool]()
-    for piece, queries in zip(pieces, queries_of_each, strict=True):
-        sure = queries.choose(queries.trusted)
+    for piece in pieces:
+        sure = piece.posed.choose(piece.posed.trusted)
         turned_deg, moved_m = pose_error(piece.motion.odom_from_rig[sure.frames], sure.world_from_rig)
         within += ((turned_deg < 5.0) & (moved_m < 0.5)).tolist()
     if len(within) >= 3 and np.mean(within) > 0.5:
@@ -421,9 +406,9 @@ def _warn_of_truth(session: Session, pieces: Sequence[_Piece], queries_of_each: 
         )  # fmt: skip
 
 
-def _pieces(session: Session, queries: pd.DataFrame, settings: SequenceSettings) -> Iterator[_Piece]:
+def _pieces(session: Session, answers: _Answers, settings: SequenceSettings) -> Iterator[_Piece]:
     """Yield the pieces of each recording's odometry, in the order of time, with poses of queries between two of it."""
-    odometry = session.odometry
+    odometry, queries = session.odometry, answers.keys
     assert odometry is not None
     poses = odometry.world_from_device
     known = odometry.index.find(queries["timestamp"].to_numpy(), as_strings(queries["device_id"])) >= 0
@@ -436,4 +421,6 @@ def _pieces(session: Session, queries: pd.DataFrame, settings: SequenceSettings)
             piece, devices = whole.part(part), odometry.device_ids[rows[part]]
             between, found = piece.at(times[asked])
             piece, order = piece.joined(times[asked[between]], found)
-            yield _Piece(recording, np.append(devices, ids[asked[between]])[order], piece)
+            devices = np.append(devices, ids[asked[between]])[order]
+            query = answers.of(piece.timestamps, devices)
+            yield _Piece(recording, devices, piece, query, answers.posed(query))

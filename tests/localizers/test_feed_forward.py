@@ -28,7 +28,6 @@ from toolkit.localizers.feed_forward import (
     _other_focal,
 )
 from toolkit.localizers.prediction import Prediction
-from toolkit.localizers.predictors import create_predictor
 from toolkit.localizers.simulated import SimulatedPredictor
 from toolkit.show.visualize_prediction import draw_prediction
 
@@ -380,9 +379,6 @@ def test_the_network_is_never_replaced_by_the_simulation(
 def test_wrong_parameters_are_refused(run: SceneFiles, small_capture: Path, wrong: dict, message: str) -> None:
     with pytest.raises(ManifestError, match=message):
         run_stage(small_capture, run, **wrong)
-    known = "vggt, vggt-omega, da3-base, da3-small, simulated"
-    with pytest.raises(ManifestError, match=f"Unknown predictor 'magic'. Known: {known}"):
-        create_predictor("magic")
 
 
 @pytest.mark.parametrize(

@@ -12,10 +12,11 @@ from toolkit import geometry
 from toolkit.errors import ImageError
 from toolkit.localizers import frames
 from toolkit.localizers.base import PoseEstimate, RoughPose
-from toolkit.localizers.frames import LocalizedFrames, SequenceLocalizer, localize_sequence, queries_of
+from toolkit.localizers.frames import LocalizedFrames, SequenceLocalizer, localize_sequence
 from toolkit.localizers.map import Map
 from toolkit.localizers.odometry import Odometry
 from toolkit.localizers.pose_graph import place_piece
+from toolkit.localizers.recording import queries_of
 from toolkit.manifest import SequenceSettings
 
 pytest.importorskip("gtsam")

@@ -5,6 +5,7 @@ import threading
 import weakref
 from collections.abc import Callable
 from dataclasses import replace
+from inspect import signature
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,7 +30,7 @@ from toolkit.localizers.base import View
 from toolkit.localizers.network import NetworkPredictor, TokenCache
 from toolkit.localizers.placed import PlacedView, shown_size
 from toolkit.localizers.prediction import Prediction
-from toolkit.localizers.predictors import create_predictor
+from toolkit.localizers.predictors import open_predictor
 from toolkit.manifest import LocalizeSettings
 from toolkit.manifest.settings import CONDITIONED
 from toolkit.models.da3 import DepthAnything3
@@ -54,7 +55,7 @@ def make(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Make:
     monkeypatch.setattr(VGGT, "from_checkpoint", lambda _, heads, compute_dtype: tiny(heads, compute_dtype))
     checkpoint = tmp_path / "model.pt"
     checkpoint.write_bytes(b"stands for weights")
-    defaults: dict[str, Any] = {"needs_depth": False, "dtype_compute": "float32"}
+    defaults: dict[str, Any] = {"dtype_compute": "float32"}
     return lambda **options: NetworkPredictor(checkpoint, "cpu", **(defaults | options))
 
 
@@ -114,7 +115,7 @@ def record_shapes(predictor: NetworkPredictor, monkeypatch: pytest.MonkeyPatch) 
 
 def test_a_prediction_is_what_the_network_says(make: Make, photographs: Photographs) -> None:
     group = photographs.group(WIDE, WIDE, HIGHER)
-    [found] = make(needs_depth=True).predict([group])
+    [found] = make().predict([group])
     loaded = load_images([view.image for view in group], "crop")
     assert loaded.images.shape == (3, 3, 126, 518)
     output = tiny(("camera", "depth"))(loaded.images)
@@ -178,7 +179,7 @@ Create = Callable[..., NetworkPredictor]
 
 @pytest.fixture
 def create(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Create:
-    """Return a function that creates the predictor of that name with a small network; options as `create_predictor`."""
+    """Return a function that creates the predictor of that name with a small network; options as its settings."""
 
     def make_predictor(name: str, **options: Any) -> NetworkPredictor:
         small = ROWS[name].tiny
@@ -189,8 +190,9 @@ def create(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Create:
             monkeypatch.setattr(ARCHITECTURES[name], "_channels", small().channels)
         checkpoint = tmp_path / "weights.pt"
         checkpoint.write_bytes(b"stands for weights")
-        options = {"compute_device": "cpu", "dtype_compute": "float32"} | options
-        predictor = create_predictor(name, checkpoint=checkpoint, **options)
+        asked = {"name": name, "checkpoint": str(checkpoint), **options}
+        settings = {"predictor": asked, "compute_device": "cpu", "dtype_compute": "float32"}
+        predictor = open_predictor(LocalizeSettings.of(settings), None, tmp_path)  # type: ignore[arg-type]
         assert isinstance(predictor, NetworkPredictor)
         return predictor
 
@@ -235,11 +237,9 @@ def of_the_map(group: list[View]) -> list[View]:
     return [group[0], *(replace(view, world_from_cam=pose) for view, pose in zip(group[1:], poses[1:], strict=True))]
 
 
-@pytest.mark.parametrize("needs_depth", [True, False])
-def test_every_other_reference_is_told(create: Create, photographs: Photographs, needs_depth: bool) -> None:
+def test_every_other_reference_is_told(create: Create, photographs: Photographs) -> None:
     """A group of two shapes, of which one cannot be read and one of fewer references, which is told nothing."""
     predictor, plain = create("da3-base", conditioned=True), create("da3-base")
-    predictor.needs_depth = needs_depth
     group = of_the_map(photographs.group(*[WIDE] * 6, HIGHER, WIDE, WIDE))
     few = of_the_map(photographs.group(*[WIDE] * 6))
     group[3].image.unlink()
@@ -319,16 +319,14 @@ def test_what_does_not_fit_is_not_told(
 
 
 def test_who_takes_cameras(create: Create) -> None:
-    assert tuple(name for name, row in ARCHITECTURES.items() if row.takes_cameras) == CONDITIONED
+    takes = [name for name, row in ROWS.items() if "extrinsics" in signature(row.network.forward).parameters]
+    assert tuple(takes) == CONDITIONED
     for name in CONDITIONED:
-        settings = LocalizeSettings.of({"predictor": {"name": name, "conditioned": True}})
-        predictor, plain = create(name, conditioned=settings.predictor.conditioned), create(name)
+        predictor, plain = create(name, conditioned=True), create(name)
         assert predictor.settings == plain.settings | {"conditioned": True}
     for name in ("vggt", "vggt-omega", "simulated"):
         with pytest.raises(ManifestError, match=f"{name} cannot be told cameras; expected .* da3-base, da3-small"):
             LocalizeSettings.of({"predictor": {"name": name, "conditioned": True}})
-    with pytest.raises(ManifestError, match="VGGT-Omega cannot be told cameras"):
-        create("vggt-omega", conditioned=True)
 
 
 def test_nothing_of_a_portrait_photograph_is_cut(
@@ -380,13 +378,13 @@ def test_a_blob_is_where_the_map_says(
 
 def test_groups_do_not_change_each_other(make: Make, photographs: Photographs, monkeypatch: pytest.MonkeyPatch) -> None:
     groups = [photographs.group(*sizes) for sizes in ([WIDE] * 3, [HIGHER] * 2, [WIDE] * 3, [WIDE] * 2, [WIDE] * 3)]
-    predictor = make(needs_depth=True, batch_size=2)
+    predictor = make(batch_size=2)
     shapes = record_shapes(predictor, monkeypatch)
     together = predictor.predict([*groups, []])
     assert sorted(shapes) == [(1, 2), (1, 2), (1, 3), (2, 3)]
     for found, group in zip(together, groups, strict=False):
         assert len(found.model_from_cams) == len(group)
-        assert_same(found, make(needs_depth=True).predict([group])[0])
+        assert_same(found, make().predict([group])[0])
     assert together[-1].model_from_cams.shape == (0, 4, 4)
 
 
@@ -489,8 +487,8 @@ def test_smaller_batches_where_memory_is_short(
     predictor = make(batch_size=5)
     expected = predictor.predict(groups)
     shapes = record_shapes(predictor, monkeypatch)
-    two = estimate_bytes(VGGT_ROW, 2, 3, (112, 518), channels=32, depth=False)
-    monkeypatch.setattr(network, "free_bytes", lambda _: 1.3 * two)
+    two = estimate_bytes(VGGT_ROW, 2, 3, (112, 518), channels=32)
+    monkeypatch.setattr(network, "free_bytes", lambda _: 1.251 * two)
     for found, other in zip(predictor.predict(groups), expected, strict=True):
         assert_same(found, other)
     assert shapes == [(2, 3), (2, 3), (1, 3)]
@@ -500,7 +498,7 @@ def test_fewer_views_where_memory_is_shorter(
     make: Make, photographs: Photographs, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     group = photographs.group(*[WIDE] * 5)
-    predictor = make(needs_depth=True)
+    predictor = make()
     [expected] = predictor.predict([group[:3]])
     three = estimate_bytes(VGGT_ROW, 1, 3, (112, 518), channels=32)
     monkeypatch.setattr(network, "free_bytes", lambda _: 1.26 * three)
@@ -569,13 +567,11 @@ def test_memory_for_not_even_two_views(make: Make, photographs: Photographs, mon
 
 
 def test_estimates_are_as_measured() -> None:
-    """Followed allocations: 6 views of 294 x 518, cameras alone 196 MB; 2 views, with depth 279 MB. Others likewise."""
-    assert 196e6 < estimate_bytes(VGGT_ROW, 1, 6, (294, 518), depth=False) < 1.1 * 196e6
+    """Followed allocations: 2 views of 294 x 518, 279 MB. Others likewise."""
     assert 279e6 < estimate_bytes(VGGT_ROW, 1, 2, (294, 518)) < 1.2 * 279e6
-    for name, channels, cameras_mb, depth_mb in (("da3-base", 768, 184.8, 193.1), ("da3-small", 384, 95.0, 122.4)):
+    for name, channels, measured_mb in (("da3-base", 768, 193.1), ("da3-small", 384, 122.4)):
         row = ARCHITECTURES[name]
-        assert 1 < estimate_bytes(row, 1, 6, (378, 504), channels, depth=False) / 1e6 / cameras_mb < 1.1
-        assert 1 < estimate_bytes(row, 1, 2, (378, 504), channels) / 1e6 / depth_mb < 1.2
+        assert 1 < estimate_bytes(row, 1, 2, (378, 504), channels) / 1e6 / measured_mb < 1.2
     three, six, other = (estimate_bytes(VGGT_ROW, *shape, (140, 140)) for shape in ((1, 3), (2, 3), (3, 2)))
     assert other == six > three
     assert estimate_bytes(VGGT_ROW, 1, 11, (518, 518), on_cpu=False) > estimate_bytes(VGGT_ROW, 1, 11, (518, 518))
@@ -587,8 +583,8 @@ def test_estimates_are_as_measured() -> None:
 @pytest.mark.slow
 def test_compiled_blocks_give_the_same(make: Make, photographs: Photographs) -> None:
     groups = [photographs.group(*sizes) for sizes in ([WIDE] * 3, [WIDE] * 4, [HIGHER, WIDE])]
-    expected = make(needs_depth=True).predict(groups)
-    for found, other in zip(make(needs_depth=True, compile=True).predict(groups), expected, strict=True):
+    expected = make().predict(groups)
+    for found, other in zip(make(compile=True).predict(groups), expected, strict=True):
         assert_same(found, other)
 
 
@@ -611,11 +607,11 @@ def test_a_reference_that_cannot_be_read_is_left_out(
     make: Make, photographs: Photographs, caplog: pytest.LogCaptureFixture
 ) -> None:
     groups = [photographs.group(*[WIDE] * 4) for _ in range(3)]
-    predictor = make(needs_depth=True, batch_size=3)
+    predictor = make(batch_size=3)
     whole = predictor.predict(groups)
     bad = groups[1][2]
     bad.image.write_bytes(b"not an image")
-    fresh = make(needs_depth=True, batch_size=3)
+    fresh = make(batch_size=3)
     found = fresh.predict(groups)
     assert_same(found[0], whole[0])
     assert_same(found[2], whole[2])
@@ -728,7 +724,7 @@ def test_a_rolled_camera_is_shown_upright_and_answered_as_it_is(
     params = [size[0], size[0], width / 2, height / 2]
     camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params)
     rolled = View("rolled", path, camera, in_map=True, turns=turns)
-    expected, found = make(needs_depth=True).predict([[query, upright], [query, rolled]])
+    expected, found = make().predict([[query, upright], [query, rolled]])
     np.testing.assert_allclose(found.model_from_cams[0], expected.model_from_cams[0], atol=1e-6)
     model_from_turned = found.model_from_cams[1] @ invert(turned_from_cam(turns))
     np.testing.assert_allclose(model_from_turned, expected.model_from_cams[1], atol=1e-6)

@@ -25,8 +25,8 @@ from toolkit.models.vggt import (
     load_images,
     unproject_depth,
 )
-from toolkit.models.vggt.aggregator import SPECIAL, rope_of_view
-from toolkit.models.vit import rotate_
+from toolkit.models.vggt.aggregator import SPECIAL
+from toolkit.models.vit import places_of_view, rope_of_places, rotate_
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 H, W = 42, 56
@@ -158,10 +158,14 @@ def test_patch_tokens_may_come_from_a_cache(model: VGGT, images: torch.Tensor) -
 
 def test_dense_heads_in_any_portions(model: VGGT, images: torch.Tensor) -> None:
     layers = model.aggregator(model.encode(images.flatten(0, 1)).unflatten(0, (2, 3)), 3, 4, model.dense_layers)
-    values, confidence = dense_output(model.point_head, layers, model.dense_layers, (H, W), 1)
-    for frames in (4, 6, 100):
-        again = dense_output(model.point_head, layers, model.dense_layers, (H, W), frames)
-        torch.testing.assert_close(again, (values, confidence), atol=1e-5, rtol=1e-4)
+    values, confidence = dense_output(model.point_head, layers, model.dense_layers, (H, W))  # a frame at a time
+    flat = [(within.flatten(0, 1), among.flatten(0, 1)) for within, among in map(layers.get, model.dense_layers)]
+    for frames in (4, 6):
+        parts = [[(a[part], b[part]) for a, b in flat] for part in (slice(frames), slice(frames, None))]
+        again = torch.cat([model.point_head(part, (H, W)) for part in parts if len(part[0][0])])
+        again = again.permute(0, 2, 3, 1).unflatten(0, (2, 3))
+        torch.testing.assert_close(again[..., :-1], values, atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(1 + again[..., -1].exp(), confidence, atol=1e-5, rtol=1e-4)
 
 
 def test_bfloat16_stays_in_the_trunk(model: VGGT, images: torch.Tensor) -> None:
@@ -222,14 +226,14 @@ def test_tokens_keep_their_places_among_views(model: VGGT) -> None:
     trunk = model.aggregator
     patches = torch.randn(1, 2, 12, 32, generator=torch.Generator().manual_seed(0))
     within, among = trunk(patches, 3, 4, {0})[0]
-    cosine, sine = rope_of_view(3, 4, 16, torch.device("cpu"))
+    cosine, sine = rope_of_places(places_of_view(3, 4, SPECIAL, torch.device("cpu")), 16)
     expected = trunk.global_blocks[0](within.flatten(1, 2), (torch.cat([cosine] * 2), torch.cat([sine] * 2)))
     torch.testing.assert_close(among.flatten(1, 2), expected)
     assert not torch.allclose(trunk.global_blocks[0](within.flatten(1, 2)), expected, atol=1e-3)
 
 
 def test_rope_turns_by_place() -> None:
-    cosine, sine = rope_of_view(3, 4, 16, torch.device("cpu"))
+    cosine, sine = rope_of_places(places_of_view(3, 4, SPECIAL, torch.device("cpu")), 16)
     assert cosine.shape == sine.shape == (SPECIAL + 12, 16)
     x = torch.randn(2, 3, SPECIAL + 12, 16, generator=torch.Generator().manual_seed(0))
     turned = rotate_(x.clone(), (cosine, sine))

@@ -1,9 +1,11 @@
 """What the scheduling of `NetworkPredictor` has to know of a network, and the networks that there are."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,9 +19,8 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-    from toolkit.models.views import Views
-
 Size = tuple[int, int]
+HEADS = ("camera", "depth")
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class Memory:
     trunk: int
     """For each number of the tokens (views x tokens x channels) during a block."""
     kept: int
-    """For each number of the tokens, with depth: what its head reads of the layers."""
+    """For each number of the tokens: what the depth head reads of the layers."""
     dense_pixel: int
     """For each pixel of a frame in the depth head."""
     dense: int
@@ -55,42 +56,61 @@ class Memory:
     """For each pixel of the result."""
 
 
-class Architecture(Protocol):
+class Architecture(ABC):
     """A network that tells cameras, and depth, of the views of one scene."""
 
     name: str
     """The predictor's."""
     title: str
     """For messages."""
+    package: str
+    """In `toolkit.models`, which imports torch: it is imported where it is needed."""
+    network: str
+    """Its class in the package."""
     weights: WeightsSource
     patch: int
     """Side of a patch, pixels."""
     special_tokens: int
     """Tokens of a view beside its patches."""
-    takes_cameras: bool
-    """Whether it can be told the cameras of some views."""
     memory: Memory
 
+    @abstractmethod
     def lay_out(self, sizes: Sequence[Size]) -> Layout:
         """Return how photographs of these (width, height) are shown to the network."""
 
-    def load(self, checkpoint: Path, heads: tuple[str, ...], dtype: "torch.dtype") -> Any:
+    def load(self, checkpoint: Path, dtype: "torch.dtype") -> Any:
         """Return the network, on the CPU: `encode(images)`, and `(images, heads, tokens)` -> the outputs of its heads;
         where it takes cameras also `(images, heads, tokens, extrinsics, intrinsics)`, see `DepthAnything3`.
 
         Raises:
             WeightsError: the file is not of this network.
         """
+        return getattr(self._imported, self.network).from_checkpoint(checkpoint, heads=HEADS, compute_dtype=dtype)
 
     def read(self, image: Path | NDArray[np.uint8], layout: Layout) -> "tuple[Tensor, Size]":
         """Return the network's image (3, H, W) of a photograph, and the photograph's (width, height).
 
+        One that is smaller than the images of its group gets a white border, of one that is larger the middle is shown.
+
         Raises:
             ImageError: the file is missing or cannot be decoded.
         """
+        import torch.nn.functional as F
+
+        loaded = self._imported.load_images([image], layout.mode)
+        width, height = loaded.sizes[0].tolist()
+        down, right = (all_ - own for all_, own in zip(layout.size, loaded.images.shape[2:], strict=True))
+        top, left = int(down / 2), int(right / 2)
+        return F.pad(loaded.images[0], (left, right - left, top, down - top), value=1.0), (width, height)
 
     def cameras(self, encoding: ArrayLike, size: Size) -> tuple[Floats, Floats]:
         """Return `cam_from_model` (..., 3, 4) and K (..., 3, 3), pixels of the network's images (H, W)."""
+        cameras: tuple[Floats, Floats] = self._imported.cameras_from_pose_encoding(encoding, size)
+        return cameras
+
+    @property
+    def _imported(self) -> Any:
+        return import_module(f"toolkit.models.{self.package}")
 
 
 def estimate_bytes(
@@ -99,7 +119,6 @@ def estimate_bytes(
     views: int,
     size: Size,
     channels: int = 1024,
-    depth: bool = True,
     on_cpu: bool = True,
 ) -> int:
     """Return the memory that a network needs, beside its weights, for so many groups of views at once.
@@ -108,21 +127,17 @@ def estimate_bytes(
         groups, views: how many groups, of how many views each.
         size: (H, W) of the network's images.
         channels: of a token.
-        depth: whether the depth head runs.
         on_cpu: where the depth head takes one frame at a time.
     """
     (height, width), memory, frames = size, architecture.memory, groups * views
     patches = (height // architecture.patch) * (width // architecture.patch)
     numbers = frames * (architecture.special_tokens + patches) * channels
-    trunk = memory.trunk * numbers
-    if not depth:
-        return trunk
     together = 1 if on_cpu else min(frames, memory.dense_frames)
     dense = memory.dense_pixel * height * width * together + memory.dense
-    return memory.kept * numbers + max(trunk, dense) + memory.result_pixel * frames * height * width
+    return memory.kept * numbers + max(memory.trunk * numbers, dense) + memory.result_pixel * frames * height * width
 
 
-class VggtArchitecture:
+class VggtArchitecture(Architecture):
     """VGGT-1B. Photographs go in whole.
 
     The official "crop" would cut a portrait photograph of a phone to its middle 75 % (3:4) or 56 % (9:16); "pad" keeps
@@ -131,11 +146,11 @@ class VggtArchitecture:
     """
 
     name = "vggt"
-    title = "VGGT"
+    title = network = "VGGT"
+    package = "vggt"
     weights = weights.VGGT
     patch = 14
     special_tokens = 5
-    takes_cameras = False
     memory = Memory(trunk=42, kept=32, dense_pixel=1500, dense=32 << 20, dense_frames=8, result_pixel=24)
     _side = 518
 
@@ -150,32 +165,17 @@ class VggtArchitecture:
         scale = resized / np.array(sizes, np.float64).reshape(-1, 2)
         return Layout("pad" if portrait else "crop", (height, self._side), scale, offset.astype(np.float64))
 
-    def load(self, checkpoint: Path, heads: tuple[str, ...], dtype: "torch.dtype") -> Any:
-        from toolkit.models.vggt import VGGT
 
-        return VGGT.from_checkpoint(checkpoint, heads=heads, compute_dtype=dtype)
-
-    def read(self, image: Path | NDArray[np.uint8], layout: Layout) -> "tuple[Tensor, Size]":
-        from toolkit.models.vggt import load_images
-
-        return _padded(load_images([image], layout.mode), layout)
-
-    def cameras(self, encoding: ArrayLike, size: Size) -> tuple[Floats, Floats]:
-        from toolkit.models.vggt import cameras_from_pose_encoding
-
-        return cameras_from_pose_encoding(encoding, size)
-
-
-class OmegaArchitecture:
+class OmegaArchitecture(Architecture):
     """VGGT-Omega, 1B-512. Photographs are shown with about as many pixels of any shape; of one with sides of more than
     2 to 1 the middle is shown, as by the official loader."""
 
     name = "vggt-omega"
     title = "VGGT-Omega"
+    package, network = "omega", "VGGTOmega"
     weights = weights.VGGT_OMEGA
     patch = 16
     special_tokens = 17
-    takes_cameras = False
     memory = Memory(trunk=42, kept=32, dense_pixel=630, dense=0, dense_frames=8, result_pixel=24)
 
     def lay_out(self, sizes: Sequence[Size]) -> Layout:
@@ -190,28 +190,13 @@ class OmegaArchitecture:
         offset = (np.array([width, height]) - resized) // 2 - scale * ((given - cropped) // 2)
         return Layout("balanced", (int(height), int(width)), scale, offset)
 
-    def load(self, checkpoint: Path, heads: tuple[str, ...], dtype: "torch.dtype") -> Any:
-        from toolkit.models.omega import VGGTOmega
 
-        return VGGTOmega.from_checkpoint(checkpoint, heads=heads, compute_dtype=dtype)
-
-    def read(self, image: Path | NDArray[np.uint8], layout: Layout) -> "tuple[Tensor, Size]":
-        from toolkit.models.omega import load_images
-
-        return _padded(load_images([image], layout.mode), layout)
-
-    def cameras(self, encoding: ArrayLike, size: Size) -> tuple[Floats, Floats]:
-        from toolkit.models.omega import cameras_from_pose_encoding
-
-        return cameras_from_pose_encoding(encoding, size)
-
-
-class Da3Architecture:
+class Da3Architecture(Architecture):
     """Depth Anything 3. Of photographs of several shapes the middle is shown, as by the official loader."""
 
+    package, network = "da3", "DepthAnything3"
     patch = 14
     special_tokens = 1
-    takes_cameras = True
 
     def __init__(self, name: str, channels: int, memory: Memory) -> None:
         self.name = name
@@ -228,40 +213,14 @@ class Da3Architecture:
         scale = resized / np.array(sizes, np.float64).reshape(-1, 2)
         return Layout(MODES[0], (int(height), int(width)), scale, -((resized - [width, height]) // 2))
 
-    def load(self, checkpoint: Path, heads: tuple[str, ...], dtype: "torch.dtype") -> Any:
-        from toolkit.models.da3 import DepthAnything3
-
-        network = DepthAnything3.from_checkpoint(checkpoint, heads=heads, compute_dtype=dtype)
+    def load(self, checkpoint: Path, dtype: "torch.dtype") -> Any:
+        network = super().load(checkpoint, dtype)
         if network.channels != self._channels:
             raise WeightsError(
                 f"{checkpoint}: these are weights with {network.channels} channels, not {self.title}, which has "
                 f"{self._channels}. Correct `{self.weights.setting}`, or the predictor's name."
             )
         return network
-
-    def read(self, image: Path | NDArray[np.uint8], layout: Layout) -> "tuple[Tensor, Size]":
-        from toolkit.models.da3 import load_images
-
-        loaded = load_images([image], layout.mode)
-        rows, columns = layout.size
-        top, left = (loaded.images.shape[2] - rows) // 2, (loaded.images.shape[3] - columns) // 2
-        width, height = loaded.sizes[0].tolist()
-        return loaded.images[0, :, top : top + rows, left : left + columns], (width, height)
-
-    def cameras(self, encoding: ArrayLike, size: Size) -> tuple[Floats, Floats]:
-        from toolkit.models.da3 import cameras_from_pose_encoding
-
-        return cameras_from_pose_encoding(encoding, size)
-
-
-def _padded(loaded: "Views", layout: Layout) -> "tuple[Tensor, Size]":
-    """Return one image with a white border up to the size of its group, and the photograph's (width, height)."""
-    import torch.nn.functional as F
-
-    width, height = loaded.sizes[0].tolist()
-    down, right = (all_ - own for all_, own in zip(layout.size, loaded.images.shape[2:], strict=True))
-    border = (right // 2, right - right // 2, down // 2, down - down // 2)
-    return F.pad(loaded.images[0], border, value=1.0), (width, height)
 
 
 _DA3_BASE = Memory(trunk=44, kept=32, dense_pixel=750, dense=0, dense_frames=8, result_pixel=24)

@@ -60,10 +60,7 @@ class Query:
 
     def scaled(self, factor: float) -> "Query":
         """Return the query with the lengths of its rig times a factor."""
-        if factor == 1.0:
-            return self
-        poses = geometry.make_pose(self.rig_from_cams[:, :3, :3], factor * self.rig_from_cams[:, :3, 3])
-        return replace(self, rig_from_cams=poses)
+        return replace(self, rig_from_cams=_stretched(self.rig_from_cams, factor))
 
     def part(self, images: Sequence[int]) -> "Query":
         """Return the query with some of its images alone."""
@@ -148,31 +145,22 @@ class PoseEstimate:
 
     def scaled(self, factor: float) -> "PoseEstimate":
         """Return the estimate with all lengths times a factor."""
-        if factor == 1.0:
-            return self
-        pose, covariance, used = self.world_from_rig, self.covariance, self.correspondences
-        if pose is not None:
-            pose = geometry.make_pose(pose[:3, :3], factor * pose[:3, 3])
-        if covariance is not None:
-            stretch = np.repeat([1.0, factor], 3)
-            covariance = covariance * np.outer(stretch, stretch)
-        used = replace(used, points=factor * used.points)
-        rivals = tuple(
-            rival._replace(world_from_rig=geometry.make_pose(of[:3, :3], factor * of[:3, 3]))
-            for rival in self.rivals
-            for of in [rival.world_from_rig]
+        pose, covariance, stretch = self.world_from_rig, self.covariance, np.repeat([1.0, factor], 3)
+        return replace(
+            self,
+            world_from_rig=None if pose is None else _stretched(pose, factor),
+            covariance=None if covariance is None else covariance * np.outer(stretch, stretch),
+            correspondences=replace(self.correspondences, points=factor * self.correspondences.points),
+            rivals=tuple(Rival(_stretched(rival.world_from_rig, factor), rival.support) for rival in self.rivals),
         )
-        return replace(self, world_from_rig=pose, covariance=covariance, correspondences=used, rivals=rivals)
 
     @property
     def position_std_m(self) -> float:
-        return float(np.sqrt(np.trace(self.covariance[3:, 3:]))) if self.covariance is not None else float("nan")
+        return float("nan") if self.covariance is None else float(stds_of(self.covariance)[1])
 
     @property
     def rotation_std_deg(self) -> float:
-        if self.covariance is None:
-            return float("nan")
-        return float(np.degrees(np.sqrt(np.trace(self.covariance[:3, :3]))))
+        return float("nan") if self.covariance is None else float(stds_of(self.covariance)[0])
 
     @property
     def inlier_ratio(self) -> float:
@@ -212,8 +200,7 @@ class Prior:
 
     def scaled(self, factor: float) -> "Prior":
         """Return the prior with all lengths times a factor."""
-        pose = self.world_from_rig
-        return replace(self, world_from_rig=geometry.make_pose(pose[:3, :3], factor * pose[:3, 3]))
+        return replace(self, world_from_rig=_stretched(self.world_from_rig, factor))
 
 
 class Localizer(Protocol):
@@ -261,14 +248,7 @@ class ScaledLocalizer:
             length: see `Survey.length`.
         """
         self.inner, self._length = inner, length
-
-    @property
-    def image_names(self) -> list[str]:
-        return self.inner.image_names
-
-    @property
-    def batch_size(self) -> int:
-        return self.inner.batch_size
+        self.image_names, self.batch_size = inner.image_names, inner.batch_size
 
     def predict(self, queries: Sequence[Asked], following: Sequence[Asked] = ()) -> list[Any]:
         """Return what a network says of each query, in lengths of the inner localizer; see `Localizer`."""
@@ -283,6 +263,25 @@ class ScaledLocalizer:
         """Return one pose for the cameras of a rig, or for a single camera; see `Localizer`."""
         near = [prior.scaled(1 / self._length) for prior in priors]
         return self.inner.localize(query.scaled(1 / self._length), references, prediction, near).scaled(self._length)
+
+
+def _stretched(poses: Floats, factor: float) -> Floats:
+    """Return poses (..., 4, 4) with their translations times a factor."""
+    return geometry.make_pose(poses[..., :3, :3], factor * poses[..., :3, 3])
+
+
+def stds_of(covariances: Floats) -> tuple[Floats, Floats]:
+    """Return the standard deviations (...) of rotations, degrees, and places, meters, as lengths, of (..., 6, 6)."""
+    rotation, position = (np.trace(covariances[..., s, s], axis1=-2, axis2=-1) for s in (slice(3), slice(3, 6)))
+    return np.degrees(np.sqrt(rotation)), np.sqrt(position)
+
+
+def carried_over(covariance: Floats, a_from_b: Floats) -> Floats:
+    """Return the covariance (6, 6) of a pose as a motion in a's frame, from that in b's; b is mounted on a."""
+    R, (x, y, z) = a_from_b[:3, :3], a_from_b[:3, 3]
+    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    adjoint = np.block([[R, np.zeros((3, 3))], [across @ R, R]])
+    return np.asarray(adjoint @ covariance @ adjoint.T)
 
 
 def rank(status: str) -> int:

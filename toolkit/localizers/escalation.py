@@ -43,14 +43,7 @@ class EscalatingLocalizer:
             sure_position_std_m: see `PnpSettings`.
         """
         self.first, self.second, self._further, self._limit_m = first, second, further, sure_position_std_m
-
-    @property
-    def image_names(self) -> list[str]:
-        return self.first.image_names
-
-    @property
-    def batch_size(self) -> int:
-        return self.first.batch_size
+        self.image_names, self.batch_size = first.image_names, first.batch_size
 
     def predict(self, queries: Sequence[Asked], following: Sequence[Asked] = ()) -> list[Any]:
         """Return what the first's network says of each query; see `Localizer`."""

@@ -14,7 +14,7 @@ from toolkit.capture.upright import Turns
 from toolkit.errors import first_line, reason_of
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.alignment import Alignment, align_to_map, is_trustworthy, query_pose
-from toolkit.localizers.base import CAMERA, Asked, PoseEstimate, Prior, Query, References, View
+from toolkit.localizers.base import CAMERA, Asked, PoseEstimate, Prior, Query, References, View, carried_over
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.pose_mean import robust_mean_pose
 from toolkit.localizers.prediction import Prediction, Predictor
@@ -97,14 +97,7 @@ class FeedForwardLocalizer:
         self._turns = np.zeros(len(session.images), np.int64) if turns is None else turns.of(session)
         self._next: tuple[Sequence[Asked], _Groups] = (), ([], {})
         """The queries of the next call."""
-
-    @property
-    def image_names(self) -> list[str]:
-        return self.map.image_names
-
-    @property
-    def batch_size(self) -> int:
-        return self.settings.batch_size
+        self.image_names, self.batch_size = local_map.image_names, self.settings.batch_size
 
     def localize(
         self,
@@ -270,7 +263,7 @@ def _combine(query: Query, cameras: tuple[CameraAnswer, ...]) -> PoseEstimate:
     if known:
         poses = np.stack([_pose(cameras[index]) for index in known]) @ geometry.invert(query.rig_from_cams[known])
         covariances = np.stack([
-            _moved(_covariance(cameras[index]), query.rig_from_cams[index]) for index in known
+            carried_over(_covariance(cameras[index]), query.rig_from_cams[index]) for index in known
         ])  # fmt: skip
         mean = robust_mean_pose(poses, covariances)
         pose, covariance = mean.world_from_cam, mean.covariance
@@ -339,11 +332,3 @@ def _pose(answer: CameraAnswer) -> Floats:
 def _covariance(answer: CameraAnswer) -> Floats:
     assert answer.covariance is not None
     return answer.covariance
-
-
-def _moved(covariance: Floats, rig_from_cam: Floats) -> Floats:
-    """Return the covariance (6, 6) of a rig's pose from that of a camera on it: the adjoint carries it over."""
-    R, (x, y, z) = rig_from_cam[:3, :3], rig_from_cam[:3, 3]
-    adjoint = np.kron(np.eye(2), R)
-    adjoint[3:, :3] = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ R
-    return np.asarray(adjoint @ covariance @ adjoint.T)

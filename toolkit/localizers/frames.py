@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,21 +13,14 @@ from toolkit import geometry
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import ImageError
 from toolkit.geometry import Floats, Ints
-from toolkit.localizers.base import PoseEstimate, RoughPose
+from toolkit.localizers.base import PoseEstimate, RoughPose, carried_over
 from toolkit.localizers.bundle import Observations
 from toolkit.localizers.gravity import measured_gravity
 from toolkit.localizers.map import Map
-from toolkit.localizers.odometry import (
-    UNKNOWN_COVARIANCE,
-    Odometry,
-    PosedQueries,
-    cut,
-    vote_weights,
-    with_measured_drift,
-)
+from toolkit.localizers.odometry import Odometry, cut, with_measured_drift
 from toolkit.localizers.picture import Picture, check_camera, localize_image
 from toolkit.localizers.pose_graph import FAR, PlacedPiece, is_sure
-from toolkit.localizers.recording import localize_piece
+from toolkit.localizers.recording import localize_piece, queries_of
 from toolkit.manifest import SequenceSettings
 
 Pictures = Picture | Sequence[Picture] | None
@@ -52,24 +46,21 @@ class LocalizedFrames:
     """What it says near its predicted pose, where it was in doubt."""
 
 
-class _Pictures:
-    """Localizes what frames show, alone or near a pose."""
-
-    def __init__(self, place: Map, rig_from_cams: NDArray[np.float64] | None, turns: Sequence[int] | None) -> None:
-        self._place, self._rig, self._turns = place, rig_from_cams, turns
-
-    def up(self) -> Floats:
-        """Return the direction (3,) that is about up in the map."""
-        return up_of_cameras(self._place.session.world_from_cam())
-
-    def localize(self, picture: Pictures, cameras: Cameras, near: RoughPose | None = None) -> PoseEstimate:
-        """Return an estimate; one picture that cannot be read does not end a recording."""
-        for camera in cameras if isinstance(cameras, list | tuple) else [cameras]:
-            check_camera(camera)
-        try:
-            return localize_image(self._place, picture, cameras, self._rig, self._turns, near=near)
-        except ImageError as error:
-            return PoseEstimate(f"failed: {error}")
+def _localize(
+    place: Map,
+    rig_from_cams: NDArray[np.float64] | None,
+    turns: Sequence[int] | None,
+    picture: Pictures,
+    cameras: Cameras,
+    near: RoughPose | None = None,
+) -> PoseEstimate:
+    """Localize what a frame shows, alone or near a pose; one picture that cannot be read does not end a recording."""
+    for camera in cameras if isinstance(cameras, list | tuple) else [cameras]:
+        check_camera(camera)
+    try:
+        return localize_image(place, picture, cameras, rig_from_cams, turns, near=near)
+    except ImageError as error:
+        return PoseEstimate(f"failed: {error}")
 
 
 def localize_sequence(
@@ -106,36 +97,26 @@ def localize_sequence(
     of_each = list(given) if isinstance(several, list | tuple) else [given] * len(images)
     if len(of_each) != len(images):
         raise ValueError(f"Found {len(of_each)} cameras and {len(images)} images: expected one for all, or for each.")
-    pictures = _Pictures(place, rig_from_cams, turns)
-    single = {
-        frame: pictures.localize(image, of_each[frame]) for frame, image in enumerate(images) if image is not None
-    }
+    localize = partial(_localize, place, rig_from_cams, turns)
+    single = {frame: localize(image, of_each[frame]) for frame, image in enumerate(images) if image is not None}
     piece, again = np.zeros(len(odometry), int), dict[int, PoseEstimate]()
     parts = list[PlacedPiece]()
-    pieces = odometry.split(settings)
-
-    def queries_within(rows: slice) -> PosedQueries:
-        own = {frame - rows.start: each for frame, each in single.items() if rows.start <= frame < rows.stop}
-        return queries_of(own)
-
-    queries_of_each = [queries_within(rows) for rows in pieces]
+    pieces, queries = odometry.split(settings), queries_of(single)
     if not settings.online:
-        motions = [odometry.part(rows) for rows in pieces]
-        settings = with_measured_drift(zip(motions, queries_of_each, strict=True), settings)
+        settings = with_measured_drift([(odometry.part(rows), queries.part(rows)) for rows in pieces], settings)
         pieces = [
             slice(rows.start + part.start, rows.start + part.stop)
-            for rows, queries in zip(pieces, queries_of_each, strict=True)
-            for part in cut(odometry.part(rows), queries, settings)
+            for rows in pieces
+            for part in cut(odometry.part(rows), queries.part(rows), settings)
         ]
-        queries_of_each = [queries_within(rows) for rows in pieces]
-    motions = [odometry.part(rows) for rows in pieces]
-    gravity = measured_gravity(list(zip(motions, queries_of_each, strict=True)), pictures.up, settings)
-    for number, (rows, queries) in enumerate(zip(pieces, queries_of_each, strict=True)):
+    tracks = [(odometry.part(rows), queries.part(rows)) for rows in pieces]
+    gravity = measured_gravity(tracks, lambda: up_of_cameras(place.session.world_from_cam()), settings)
+    for number, rows in enumerate(pieces):
         piece[rows] = number
         asked = np.array([frame for frame in single if rows.start <= frame < rows.stop], np.int64)
 
         def localize_again(todo: Sequence[tuple[int, RoughPose]], start: int = rows.start) -> list[PoseEstimate]:
-            return [pictures.localize(images[start + frame], of_each[start + frame], near) for frame, near in todo]
+            return [localize(images[start + frame], of_each[start + frame], near) for frame, near in todo]
 
         def observe(frame: int, again: PoseEstimate | None, start: int = rows.start) -> Observations:
             estimate, each = again or single[start + frame], of_each[start + frame]
@@ -143,15 +124,8 @@ def localize_sequence(
             cameras = each if isinstance(each, list | tuple) else [each]
             return Observations.of(estimate.correspondences, cameras, rig)
 
-        done = localize_piece(
-            odometry.part(rows),
-            queries,
-            asked - rows.start,
-            settings,
-            localize_again if settings.relocalize else None,
-            gravity,
-            observe,
-        )
+        ask = localize_again if settings.relocalize else None
+        done = localize_piece(*tracks[number], asked - rows.start, settings, ask, gravity, observe)
         again |= {rows.start + frame: estimate for frame, estimate in done.again.items()}
         parts.append(done.placed)
     return LocalizedFrames(
@@ -180,7 +154,7 @@ class SequenceLocalizer:
     ) -> None:
         """See `localize_sequence`; `settings.length_s` is the window."""
         self.settings = self._drift = SequenceSettings.of({"online": True}, settings)
-        self._pictures = _Pictures(place, rig_from_cams, turns)
+        self._localize = partial(_localize, place, rig_from_cams, turns)
         self._timestamps, self._poses = list[int](), list[Floats]()
         self._queries = queries_of({})
         """Of the piece, with those found again."""
@@ -211,7 +185,7 @@ class SequenceLocalizer:
             raise ValueError(f"timestamp: found {timestamp} after {self._timestamps[-1]}, expected a later one.")
         self._timestamps.append(int(timestamp))
         self._poses.append(pose)
-        latest = Odometry(np.array(self._timestamps[-4:], np.int64), np.stack(self._poses[-4:]))
+        latest = self._since(-4)
         if latest.split(self.settings)[-1].start == len(latest) - 1:  # tracking was lost: a new piece
             del self._timestamps[:-1], self._poses[:-1]
             self._queries, self._solved = queries_of({}), None
@@ -219,29 +193,28 @@ class SequenceLocalizer:
             self.single = None
             return self._led_on()
         given: Any = cameras
-        self.single = self._pictures.localize(image, given)
+        self.single = self._localize(image, given)
         self._queries = self._queries.joined(queries_of({len(self._poses) - 1: self.single}))
         return self._solve(image, given)
 
-    @property
-    def _window(self) -> Odometry:
-        return Odometry(np.array(self._timestamps, np.int64), np.stack(self._poses))
+    def _since(self, start: int) -> Odometry:
+        return Odometry(np.array(self._timestamps[start:], np.int64), np.stack(self._poses[start:]))
 
     def _forget(self, start: int) -> None:
         """Leave out the frames before one."""
         del self._timestamps[:start], self._poses[:start]
-        self._queries = self._queries.choose(self._queries.frames >= start).shifted(-start)
+        self._queries = self._queries.part(slice(start, start + len(self._poses)))
 
     def _solve(self, image: Pictures, cameras: Cameras) -> PoseEstimate:
         if self.settings.length_s is not None:
             self._forget(int(np.searchsorted(self._timestamps, self._timestamps[-1] - self.settings.length_s * 1e6)))
-        self._drift = with_measured_drift([(self._window, self._queries)], self.settings)
-        self._forget(cut(self._window, self._queries, self._drift)[-1].start)
-        window = self._window
+        self._drift = with_measured_drift([(self._since(0), self._queries)], self.settings)
+        self._forget(cut(self._since(0), self._queries, self._drift)[-1].start)
+        window = self._since(0)
         offline = self._drift.model_copy(update={"online": False, "length_s": None})
 
         def localize_again(todo: Sequence[tuple[int, RoughPose]]) -> list[PoseEstimate]:
-            return [self._pictures.localize(image, cameras, near) for _, near in todo]
+            return [self._localize(image, cameras, near) for _, near in todo]
 
         again = localize_again if self.settings.relocalize else None
         done = localize_piece(window, self._queries, np.array([len(window) - 1]), offline, again)
@@ -259,12 +232,12 @@ class SequenceLocalizer:
         status = str(placed.status[-1])
         if not np.isfinite(placed.world_from_rig[-1]).all():
             return PoseEstimate(status, found_by="sequence")
-        way = Odometry(np.array(self._timestamps[last:], np.int64), np.stack(self._poses[last:])).scaled(placed.scale)
+        way = self._since(last).scaled(placed.scale)
         step = geometry.invert(way.odom_from_rig[0]) @ way.odom_from_rig[-1]
         turn, shift = way.drift(self._drift, np.array([0]), np.array([len(way) - 1]))
         shift = np.hypot(shift, self.settings.scale_std * np.linalg.norm(step[:3, 3]))
-        moved = _adjoint(geometry.invert(step))
-        covariance = moved @ placed.covariances[-1] @ moved.T + np.diag(np.repeat([turn[0], shift[0]], 3) ** 2)
+        covariance = carried_over(placed.covariances[-1], geometry.invert(step))
+        covariance += np.diag(np.repeat([turn[0], shift[0]], 3) ** 2)
         status = FAR if status == "ok" and not is_sure(covariance[None])[0] else status
         return self._estimate(placed.world_from_rig[-1] @ step, covariance, status)
 
@@ -276,29 +249,3 @@ class SequenceLocalizer:
             covariance=covariance,
             found_by="sequence",
         )
-
-
-def queries_of(estimates: dict[int, PoseEstimate]) -> PosedQueries:
-    """Return the estimates that have a pose, given by their frames, as a pose graph takes them."""
-    posed = {frame: each for frame, each in sorted(estimates.items()) if each.world_from_rig is not None}
-    trusted = np.array([each.status == "ok" for each in posed.values()], bool)
-    return PosedQueries(
-        np.array(list(posed), np.int64),
-        np.array([each.world_from_rig for each in posed.values()]).reshape(-1, 4, 4),
-        np.array(
-            [UNKNOWN_COVARIANCE if each.covariance is None else each.covariance for each in posed.values()]
-        ).reshape(-1, 6, 6),
-        vote_weights(
-            trusted,
-            np.array([each.p_correct for each in posed.values()]),
-            np.array([each.rival_support for each in posed.values()]),
-        ),
-        trusted,
-    )
-
-
-def _adjoint(a_from_b: Floats) -> Floats:
-    """Return the matrix (6, 6) that takes small motions, rotation then translation, from b's frame to a's."""
-    rotation, (x, y, z) = a_from_b[:3, :3], a_from_b[:3, 3]
-    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.block([[rotation, np.zeros((3, 3))], [across @ rotation, rotation]])

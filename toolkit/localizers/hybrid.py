@@ -20,14 +20,7 @@ class HybridLocalizer:
         self.pnp = pnp
         self.feed_forward = feed_forward
         self.lifter = DepthLifter(pnp, feed_forward)
-
-    @property
-    def image_names(self) -> list[str]:
-        return self.pnp.image_names
-
-    @property
-    def batch_size(self) -> int:
-        return self.feed_forward.batch_size
+        self.image_names, self.batch_size = pnp.image_names, feed_forward.batch_size
 
     def predict(self, queries: Sequence[Asked], following: Sequence[Asked] = ()) -> list[Predicted]:
         """Return what the network says of each query; see `Localizer`."""

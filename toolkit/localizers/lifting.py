@@ -79,9 +79,7 @@ class DepthLifter:
             answer: what `FeedForwardLocalizer` says of the query.
         """
         count = len(self._first.map.image_names)  # further images are those that only other kinds of features have
-        references = [
-            References(part.images[part.images < count], part.scores[part.images < count]) for part in references
-        ]
+        references = [part.take(part.images < count) for part in references]
         query = replace(
             query,
             features=[kinds if isinstance(kinds, str) else kinds[:1] for kinds in query.features],
@@ -137,24 +135,18 @@ class DepthLifter:
             return None
         seen = [local_map.observations(image)[1] for image in images]
         triangulated = np.unique(np.concatenate(seen))
-        there = np.sort(local_map.observations_of(triangulated))
-        place = np.searchsorted(triangulated, local_map.obs_point[there])
-        new = np.column_stack([np.concatenate(obs), len(triangulated) + np.arange(sum(map(len, points)))])
-        old = np.column_stack([local_map.obs_image[there], local_map.obs_keypoint[there], place])
-        rows = np.concatenate([old, new])
+        part, image_of = local_map.part(triangulated), np.concatenate(source)
+        new = np.column_stack([np.concatenate(obs), len(triangulated) + np.arange(len(image_of))])
+        rows = np.concatenate([np.column_stack([part.obs_image, part.obs_keypoint, part.obs_point]), new])
         rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
-        together = np.concatenate([local_map.points[triangulated], *points])
-        image_of = np.concatenate(source)
-        part = LocalMap(
-            image_names=local_map.image_names,
-            cameras=local_map.cameras,
-            world_from_cams=local_map.world_from_cams,
-            points=together,
-            colors=np.full((len(together), 3), 128, np.uint8),
+        part = replace(
+            part,
+            points=np.concatenate([part.points, *points]),
+            colors=np.concatenate([part.colors, np.full((len(image_of), 3), 128, np.uint8)]),
             obs_image=rows[:, 0],
             obs_keypoint=rows[:, 1],
             obs_point=rows[:, 2],
-            noise_px=np.concatenate([local_map.noise_px[triangulated], np.zeros(len(image_of), np.float32)]),
+            noise_px=np.concatenate([part.noise_px, np.zeros(len(image_of), np.float32)]),
         )
         return LiftedMap(part, triangulated, np.concatenate([np.full(len(triangulated), -1), image_of]), depths)
 

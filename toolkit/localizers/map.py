@@ -21,7 +21,7 @@ from toolkit.embedders import Embedder, Vectors, create_embedder, embedding_fold
 from toolkit.embedders.index import JoinedIndex, VectorIndex, load_index
 from toolkit.embedders.search import search
 from toolkit.errors import ArtifactError, ToolkitError
-from toolkit.features.features import KINDS, LocalFeatures, extract_turned
+from toolkit.features.features import KINDS, extract_turned
 from toolkit.features.groups import HDF5_ERRORS
 from toolkit.features.matching import AnyMethod, DeferredMethod, LocalMethod, create_local_methods, weights_files
 from toolkit.features.stores import FeatureStore, OnDemandFeatures, as_stored, extract_session
@@ -48,7 +48,7 @@ from toolkit.localizers.nearest import NearestLocalizer
 from toolkit.localizers.on_demand import OnDemandLocalizer, PosedImages
 from toolkit.localizers.pnp import PnpLocalizer
 from toolkit.localizers.prediction import Predictor
-from toolkit.localizers.predictors import create_predictor
+from toolkit.localizers.predictors import open_predictor
 from toolkit.localizers.survey import NOMINAL_DEPTH, USUAL_DEPTHS_M
 from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings, nearest
 
@@ -493,31 +493,6 @@ def session_fingerprint(session: Session) -> str:
     return fingerprint([file_fingerprint(session.path / name) for name in files if (session.path / name).exists()])
 
 
-def open_predictor(settings: LocalizeSettings, capture: Capture, map_dir: Path) -> Predictor:
-    """Return what predicts cameras; warn of one that looks up the answers.
-
-    Raises:
-        ManifestError: no such device or precision.
-        WeightsError: no weights; says what to do.
-    """
-    name = settings.predictor.name
-    predictor = create_predictor(
-        name,
-        sessions=[*capture.usable("map"), *capture.usable("query")] if name == "simulated" else (),
-        map_dir=map_dir,
-        features=settings.features.kinds[0],
-        checkpoint=settings.predictor.checkpoint,
-        compute_device=settings.compute_device,
-        dtype_compute=settings.dtype_compute,
-        compile=settings.predictor.compile,
-        conditioned=settings.predictor.conditioned,
-        seed=settings.seed,
-    )
-    if predictor.simulated:
-        log.warning("predictor: %s looks up the true poses of the queries. What comes out is no result.", name)
-    return predictor
-
-
 def turns_for(settings: LocalizeSettings, kinds: Sequence[AnyMethod], capture: Capture) -> Turns | None:
     """Return what makes images upright, if a network is to see them so."""
     upright = (settings.predicts and settings.predictor.upright) or any(KINDS[kind.name].upright for kind in kinds)
@@ -537,11 +512,8 @@ def create_localizer(settings: LocalizeSettings, map: Map, predictor: Predictor 
         WeightsError: the network has no weights.
     """
     if settings.method == "nearest":
-        session = map.session
-        rows = session.camera_rows
-        poses = session.world_from_cam(rows)
-        posed = np.isfinite(poses).reshape(-1, 16).all(axis=1)
-        return NearestLocalizer([session.image_name(int(row)) for row in rows[posed]], poses[posed])
+        posed = PosedImages.of_session(map.session)
+        return NearestLocalizer(posed.names, posed.world_from_cams)
     if not map.kinds:
         raise ArtifactError(
             f"The map of {map.device!r} is of a run of the method {map.settings.method!r} and has no points, which the "
@@ -587,15 +559,11 @@ def _on_demand(
     return OnDemandLocalizer(
         PosedImages.of_session(map.session, names, map.length),
         map.in_lengths,
-        [(kind, partial(_features_of, map, kind)) for kind in kinds],
+        [(kind, partial(lambda kind, name: map.on_demand(kind)(name), kind)) for kind in kinds],
         settings.map,
         settings.pnp,
         settings.seed,
     )
-
-
-def _features_of(map: Map, kind: AnyMethod, name: str) -> LocalFeatures:  # noqa: A002
-    return map.on_demand(kind)(name)
 
 
 def create_methods(settings: LocalizeSettings) -> tuple[list[LocalMethod], list[DeferredMethod]]:

@@ -16,11 +16,10 @@ from toolkit.capture.turning import turn_image, turned_from_cam
 from toolkit.errors import ImageError, ManifestError, ToolkitError, first_line
 from toolkit.files import files_fingerprint
 from toolkit.geometry import invert, make_pose
-from toolkit.localizers.architectures import ARCHITECTURES, Architecture, Size, estimate_bytes
+from toolkit.localizers.architectures import ARCHITECTURES, HEADS, Architecture, Size, estimate_bytes
 from toolkit.localizers.base import View
-from toolkit.localizers.placed import PlacedView, shown_size
+from toolkit.localizers.placed import PlacedView, cameras_to_tell, shown_size, told_views
 from toolkit.localizers.prediction import Prediction
-from toolkit.localizers.telling import cameras_to_tell, told_views
 from toolkit.models.compute import PRECISIONS, Fitting, free_bytes, on_device, resolve_device, resolve_precision
 from toolkit.models.weights import resolve_weights
 
@@ -91,7 +90,6 @@ class NetworkPredictor:
         compute_device: str = "auto",
         dtype_compute: str = "auto",
         *,
-        needs_depth: bool = True,
         batch_size: int | None = None,
         cache_bytes: int = CACHE_BYTES,
         architecture: Architecture = ARCHITECTURES["vggt"],
@@ -103,31 +101,25 @@ class NetworkPredictor:
             checkpoint: file with the weights; None: the hub's cache, else a download.
             compute_device, dtype_compute: as `models.compute` takes them, without float16: the trunk's numbers may
                 be larger than it can hold. `auto` is float32 where it would be that. The heads are always float32.
-            needs_depth: whether to predict depth too, for a fifth more time.
             batch_size: groups at a time, at most; None: what is usual for the device.
             cache_bytes: memory for the encodings of map images: of the device where that has plenty, else of the CPU.
             architecture: which network.
             compile: see `PredictorSettings`.
             conditioned: tell it the intrinsics of all views, and the poses of every other reference where there are
-                at least `telling.LEAST_REFERENCES`.
+                at least `placed.LEAST_REFERENCES`. For a network that takes cameras.
 
         Raises:
-            ManifestError: no such device or precision, or the network takes no cameras.
+            ManifestError: no such precision.
             WeightsError: no weights.
         """
         expected = [name for name in PRECISIONS if name != "float16"]
         if dtype_compute not in expected:
             title = architecture.title
             raise ManifestError(f"dtype_compute is {dtype_compute!r}; {title} expects one of {', '.join(expected)}.")
-        if conditioned and not architecture.takes_cameras:
-            raise ManifestError(
-                f"conditioned is true, but {architecture.title} cannot be told cameras; set it to false."
-            )
         self._architecture, self.name = architecture, architecture.name
         self.conditioned = conditioned
         self.checkpoint = resolve_weights(architecture.weights, checkpoint)
         self.compute_device, self.dtype_compute = compute_device, dtype_compute
-        self.needs_depth = needs_depth
         self._batch_size = batch_size
         self._compile = compile
         self._cache = TokenCache(cache_bytes)
@@ -140,7 +132,7 @@ class NetworkPredictor:
         """What the predictions depend on besides the views. A device changes rounding only, a type more."""
         weights = files_fingerprint([self.checkpoint])
         precision = str(self._dtype).removeprefix("torch.")
-        settings = {"name": self.name, "weights": weights, "dtype_compute": precision, "depth": self.needs_depth}
+        settings = {"name": self.name, "weights": weights, "dtype_compute": precision, "depth": True}
         return settings | ({"conditioned": True} if self.conditioned else {})
 
     @cached_property
@@ -155,14 +147,8 @@ class NetworkPredictor:
         return torch.float32 if dtype == torch.float16 else dtype
 
     @cached_property
-    def _heads(self) -> tuple[str, ...]:
-        return ("camera", "depth") if self.needs_depth else ("camera",)
-
-    @cached_property
     def _model(self) -> Any:
-        return _load_network(
-            self._architecture, self.checkpoint, self._heads, self._dtype, self._device, self._compile
-        )
+        return _load_network(self._architecture, self.checkpoint, self._dtype, self._device, self._compile)
 
     @cached_property
     def _kept_on(self) -> "torch.device":
@@ -219,8 +205,7 @@ class NetworkPredictor:
         """Return how many groups to run at a time, and how many views of each, by the memory that is free."""
         channels = self._model.channels
         on_cpu = self._device.type == "cpu"
-        about = partial(estimate_bytes, self._architecture)
-        estimate = partial(about, size=size, channels=channels, depth=self.needs_depth, on_cpu=on_cpu)
+        estimate = partial(estimate_bytes, self._architecture, size=size, channels=channels, on_cpu=on_cpu)
         growing = 0 if self._kept_on.type == "cpu" else self._cache.max_bytes - self._cache.bytes
         free = int(_MEMORY_SHARE * free_bytes(self._device)) - growing
         batch = self._batch_size or _GROUPS_AT_A_TIME.get(self._device.type, _GROUPS_AT_A_TIME_ELSEWHERE)
@@ -375,7 +360,7 @@ class NetworkPredictor:
         return told_views(views) if self.conditioned else np.zeros(len(views), bool)
 
     def _forward(self, tokens: "Tensor", groups: Sequence[Sequence[PlacedView]]) -> "Tensor":
-        """Return (B, S, 9 + numbers of the depth head), on the CPU, of tokens (B, S, P, C); fewer views if need be."""
+        """Return (B, S, 9 + 2 H W), on the CPU, of tokens (B, S, P, C); fewer views if need be."""
         import torch
 
         size = groups[0][0].size
@@ -407,18 +392,16 @@ class NetworkPredictor:
 
         def run(tokens: "Tensor", *cameras: "Tensor") -> "Tensor":
             images = torch.empty(*tokens.shape[:2], 3, *size, device="meta")
-            output = self._model(images, self._heads, tokens.float(), *cameras)
-            flat = [output["pose_enc"]]
-            if self.needs_depth:
-                flat += [output["depth"].flatten(2), output["depth_conf"].flatten(2)]
-            return torch.cat(flat, dim=-1).cpu()
+            output = self._model(images, HEADS, tokens.float(), *cameras)
+            dense = [output[name].flatten(2) for name in ("depth", "depth_conf")]
+            return torch.cat([output["pose_enc"], *dense], dim=-1).cpu()
 
         return run
 
     def _prediction(
         self, group: list[PlacedView], seen: Sequence[int], numbers: NDArray[np.float32], told: NDArray[np.bool_]
     ) -> Prediction:
-        """Return the prediction of a group, of numbers (seen views, 9 + numbers of the depth head)."""
+        """Return the prediction of a group, of numbers (seen views, 9 + 2 H W)."""
         poses, intrinsics = np.full((len(group), 4, 4), np.nan), np.full((len(group), 3, 3), np.nan)
         size = group[0].size
         for index, encoding in zip(seen, numbers[:, :9].astype(np.float64), strict=True):
@@ -429,8 +412,6 @@ class NetworkPredictor:
                 intrinsics[index] = group[index].intrinsics(K)
         map_from_image = np.stack([placed.map_from_image for placed in group])
         conditioned = np.isin(np.arange(len(group)), np.array(seen)[told]) if told.any() else None
-        if not self.needs_depth:
-            return Prediction(poses, None, None, map_from_image, intrinsics, conditioned)
         depth = [placed.turned_back(np.full(size, np.nan, np.float32)) for placed in group]
         confidence = [placed.turned_back(np.zeros(size, np.float32)) for placed in group]
         maps = numbers[:, 9:].reshape(len(seen), 2, *size)
@@ -448,7 +429,6 @@ _loaded: dict[tuple[Any, ...], Any] = {}
 def _load_network(
     architecture: Architecture,
     checkpoint: Path,
-    heads: tuple[str, ...],
     dtype: "torch.dtype",
     device: "torch.device",
     compiled: bool,
@@ -458,10 +438,10 @@ def _load_network(
     The last network is kept until another is asked for: a notebook that looks into one query after a run makes a
     predictor anew, and the weights are gigabytes.
     """
-    key = (checkpoint.resolve(), files_fingerprint([checkpoint]), architecture.name, heads, dtype, device, compiled)
+    key = (checkpoint.resolve(), files_fingerprint([checkpoint]), architecture.name, dtype, device, compiled)
     if key not in _loaded:
         _loaded.clear()  # before the load: the memory may hold one network, and not two
-        network = on_device(architecture.load(checkpoint, heads, dtype), device, architecture.title)
+        network = on_device(architecture.load(checkpoint, dtype), device, architecture.title)
         if compiled:
             _compile(network, architecture, device)
         _loaded[key] = network

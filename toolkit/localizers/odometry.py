@@ -181,9 +181,10 @@ class PosedQueries:
     def choose(self, rows: Ints | NDArray[np.bool_]) -> "PosedQueries":
         return PosedQueries(*(values[rows] for values in vars(self).values()))
 
-    def shifted(self, frames: int) -> "PosedQueries":
-        """Return them with so much added to the indices of their frames."""
-        return replace(self, frames=self.frames + frames)
+    def part(self, frames: slice) -> "PosedQueries":
+        """Return those of some consecutive poses of the odometry; see `Odometry.part`."""
+        within = self.choose((self.frames >= frames.start) & (self.frames < frames.stop))
+        return replace(within, frames=within.frames - frames.start)
 
     def joined(self, other: "PosedQueries") -> "PosedQueries":
         """Return both, by frame."""

@@ -86,10 +86,7 @@ class OnDemandLocalizer:
         self._map_settings, self._settings = map_settings or MapSettings(), settings or PnpSettings()
         self._seed = seed
         self._network = Lock()
-
-    @property
-    def image_names(self) -> list[str]:
-        return self.posed.names
+        self.image_names = posed.names
 
     def predict(self, queries: Sequence[Asked], following: Sequence[Asked] = ()) -> list[None]:
         """Return nothing for each query: no network is asked for cameras."""

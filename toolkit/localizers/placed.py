@@ -1,5 +1,6 @@
-"""A view in the image that a network is shown, and the way back."""
+"""A view in the image that a network is shown, and the way back; and which cameras it is told of a group."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +11,9 @@ from toolkit.capture.turning import turn_image, turn_points, turned_from_cam
 from toolkit.geometry import Floats, invert
 from toolkit.localizers.architectures import Layout, Size
 from toolkit.localizers.base import View
+
+LEAST_REFERENCES = 6
+"""With fewer no camera is told: less than three would be left to align and confirm by."""
 
 
 def shown_size(view: View) -> Size:
@@ -90,3 +94,20 @@ class PlacedView:
         outside = np.ones(self.size, bool)
         outside[top:bottom, left:right] = False
         return outside
+
+
+def told_views(group: Sequence[PlacedView]) -> NDArray[np.bool_]:
+    """Return which views (S,) of a group, the query first, are told: every other reference, from the best on."""
+    known = [number for number, placed in enumerate(group) if number and placed.view.world_from_cam is not None]
+    told = np.zeros(len(group), bool)
+    if len(known) >= LEAST_REFERENCES:
+        told[known[::2]] = True
+    return told
+
+
+def cameras_to_tell(group: Sequence[PlacedView]) -> tuple[Floats, Floats]:
+    """Return poses (S, 4, 4) of the network's images from the world, NaN where not told, and K (S, 3, 3) of all."""
+    poses = np.full((len(group), 4, 4), np.nan)
+    for number in np.flatnonzero(told_views(group)).tolist():
+        poses[number] = group[number].shown_from_world
+    return poses, np.stack([placed.shown_intrinsics for placed in group])

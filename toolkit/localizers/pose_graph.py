@@ -72,19 +72,15 @@ def place_online(odometry: Odometry, queries: PosedQueries, asked: Ints, setting
     )  # fmt: skip
     for frame in asked.tolist():
         start = int(np.searchsorted(odometry.timestamps, odometry.timestamps[frame] - length_us))
-        within = (queries.frames >= start) & (queries.frames <= frame)
-        past = Odometry(odometry.timestamps[start : frame + 1], odometry.odom_from_rig[start : frame + 1])
-        chosen = queries.choose(within)
-        chosen = chosen.shifted(-start)
+        within = slice(start, frame + 1)
+        past, chosen = odometry.part(within), queries.part(within)
         drifting = with_measured_drift([(past, chosen)], settings)
-        start = cut(past, chosen, drifting)[-1].start  # what is after a loss of tracking that the queries tell
-        past, within[within] = past.part(slice(start, None)), chosen.frames >= start
-        chosen = chosen.choose(chosen.frames >= start).shifted(-start)
+        last = cut(past, chosen, drifting)[-1]  # what is after a loss of tracking that the queries tell
+        past, chosen = past.part(last), chosen.part(last)
         placed = place_piece(past, chosen, drifting)
         every.world_from_rig[frame], every.covariances[frame] = placed.world_from_rig[-1], placed.covariances[-1]
         every.status[frame] = placed.status[-1]
-        own = queries.frames[within] == frame
-        every.used[np.flatnonzero(within)[own]] = placed.used[own]
+        every.used[queries.frames == frame] = placed.used[chosen.frames == len(past) - 1]
         every = replace(every, scale=placed.scale)
     return every
 

@@ -32,7 +32,6 @@ class Prediction:
     conditioned: NDArray[np.bool_] | None = None
     """(S,) views whose poses the network was told. Those agree with the map by construction and confirm nothing: only
     the others are aligned to it. None: it was told none."""
-    simulated: bool = False
     reason: str = ""
     """Why there are no cameras, where that is known."""
 

@@ -11,10 +11,10 @@ import numpy as np
 
 from toolkit import geometry
 from toolkit.geometry import Floats, Ints
-from toolkit.localizers.base import PoseEstimate, RoughPose, agree
+from toolkit.localizers.base import PoseEstimate, RoughPose, agree, stds_of
 from toolkit.localizers.bundle import Observations, Observe, adjusted
 from toolkit.localizers.gravity import Gravity
-from toolkit.localizers.odometry import Odometry, PosedQueries, place
+from toolkit.localizers.odometry import UNKNOWN_COVARIANCE, Odometry, PosedQueries, place, vote_weights
 from toolkit.localizers.pose_graph import PlacedPiece, place_online, place_piece
 from toolkit.manifest import SequenceSettings
 
@@ -68,7 +68,9 @@ def localize_piece(
     doubted = [int(frame) for frame in np.setdiff1d(asked, sure) if np.isfinite(first.world_from_rig[frame]).all()]
     answers: dict[int, PoseEstimate] = {}
     if again is not None and doubted:
-        found = again([(frame, _rough(first, frame)) for frame in doubted])
+        stds = zip(*(each.tolist() for each in stds_of(first.covariances[doubted])), strict=True)
+        rough = [RoughPose(pose, *std) for pose, std in zip(first.world_from_rig[doubted], stds, strict=True)]
+        found = again(list(zip(doubted, rough, strict=True)))
         answers = dict(zip(doubted, found, strict=True))
     every = with_answers(queries, answers)
     second = first if every is queries else _placed(odometry, every, asked, settings, gravity)
@@ -130,15 +132,6 @@ def _laid(odometry: Odometry, agreeing: PosedQueries) -> Floats:
     return np.asarray(candidates[int(np.argmin(np.median(off_m, axis=1)))])
 
 
-def _rough(placed: PlacedPiece, frame: int) -> RoughPose:
-    covariance = placed.covariances[frame]
-    return RoughPose(
-        placed.world_from_rig[frame],
-        float(np.degrees(np.sqrt(np.trace(covariance[:3, :3])))),
-        float(np.sqrt(np.trace(covariance[3:, 3:]))),
-    )
-
-
 def with_answers(queries: PosedQueries, answers: Mapping[int, PoseEstimate]) -> PosedQueries:
     """Return single poses with those that were found near a predicted pose.
 
@@ -146,7 +139,7 @@ def with_answers(queries: PosedQueries, answers: Mapping[int, PoseEstimate]) -> 
     odometry is: it was sought where the others had put it.
     """
     poses, covariances = queries.world_from_rig.copy(), queries.covariances.copy()
-    added: list[tuple[int, PoseEstimate]] = []
+    added: dict[int, PoseEstimate] = {}
     for frame, estimate in answers.items():
         if estimate.world_from_rig is None or estimate.covariance is None:
             continue
@@ -154,15 +147,28 @@ def with_answers(queries: PosedQueries, answers: Mapping[int, PoseEstimate]) -> 
         if same:
             poses[same[0]], covariances[same[0]] = estimate.world_from_rig, estimate.covariance
         else:
-            added.append((frame, estimate))
+            added[frame] = estimate
     if not answers:
         return queries
     voters = replace(queries, world_from_rig=poses, covariances=covariances)
-    others = PosedQueries(
-        np.array([frame for frame, _ in added], np.int64),
-        np.array([estimate.world_from_rig for _, estimate in added]).reshape(-1, 4, 4),
-        np.array([estimate.covariance for _, estimate in added]).reshape(-1, 6, 6),
-        np.zeros(len(added)),
-        np.zeros(len(added), bool),
-    )
+    others = replace(queries_of(added), weights=np.zeros(len(added)), trusted=np.zeros(len(added), bool))
     return voters.joined(others)
+
+
+def queries_of(estimates: Mapping[int, PoseEstimate]) -> PosedQueries:
+    """Return the estimates that have a pose, given by their frames, as a pose graph takes them."""
+    posed = {frame: each for frame, each in sorted(estimates.items()) if each.world_from_rig is not None}
+    trusted = np.array([each.status == "ok" for each in posed.values()], bool)
+    return PosedQueries(
+        np.array(list(posed), np.int64),
+        np.array([each.world_from_rig for each in posed.values()]).reshape(-1, 4, 4),
+        np.array(
+            [UNKNOWN_COVARIANCE if each.covariance is None else each.covariance for each in posed.values()]
+        ).reshape(-1, 6, 6),
+        vote_weights(
+            trusted,
+            np.array([each.p_correct for each in posed.values()]),
+            np.array([each.rival_support for each in posed.values()]),
+        ),
+        trusted,
+    )

@@ -18,7 +18,6 @@ WIDE_BASELINE = 0.25  # of the depth; wider adds nothing
 NEAR_DUPLICATE = 0.03  # of the depth
 LEAST_SIMILARITY = 0.25  # what the worst candidate's score counts, of the best one's
 ALL_SHARED = 50  # points that two images share from which on they count as seeing the same
-ADJACENT_DEG = 60.0  # angle between optical axes up to which two cameras without common points may see one place
 _LAST = 1e-3  # factor for what comes last: a near-duplicate, or an image that shares no view
 
 
@@ -26,7 +25,7 @@ def select_references(
     scores: ArrayLike,
     world_from_cams: ArrayLike,
     k: int,
-    cameras: Sequence[pycolmap.Camera] | None = None,
+    cameras: Sequence[pycolmap.Camera],
     shared_points: ArrayLike | None = None,
     depth_m: float = 5.0,
 ) -> Ints:
@@ -40,8 +39,7 @@ def select_references(
         scores: (N,) similarities, higher is better.
         world_from_cams: (N, 4, 4) map poses.
         k: how many.
-        cameras: N, for what they see of points laid at half, once and twice the depth; None: views overlap as far as
-            their axes agree and their places are near.
+        cameras: N, for what they see of points laid at half, once and twice the depth.
         shared_points: (N, N) triangulated points that two images both see, where known: overlapping frusta do not
             tell of a wall between.
         depth_m: typical depth of the scene, meters.
@@ -60,7 +58,7 @@ def select_references(
     similarity = LEAST_SIMILARITY + (1 - LEAST_SIMILARITY) * (score - score.min()) / (spread if spread > 0 else 1.0)
     if spread == 0:
         similarity[:] = 1.0
-    shared = _shared_view(poses, None if cameras is None else [cameras[int(index)] for index in usable], depth_m)
+    shared = _shared_view(poses, [cameras[int(index)] for index in usable], depth_m)
     if shared_points is not None:
         counts = np.asarray(shared_points, np.float64)[np.ix_(usable, usable)]
         shared = (shared + np.minimum(counts / ALL_SHARED, 1.0)) / 2
@@ -79,13 +77,8 @@ def select_references(
     return usable[chosen]
 
 
-def _shared_view(world_from_cams: Floats, cameras: Sequence[pycolmap.Camera] | None, depth_m: float) -> Floats:
+def _shared_view(world_from_cams: Floats, cameras: Sequence[pycolmap.Camera], depth_m: float) -> Floats:
     """Return the share (N, N) of what one camera sees that the other sees too, the mean of both directions."""
-    if cameras is None:
-        axes, centers = world_from_cams[:, :3, 2], world_from_cams[:, :3, 3]
-        angle_deg = np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1)))
-        apart = np.linalg.norm(centers[:, None] - centers[None], axis=-1) / depth_m
-        return np.asarray(np.clip(1 - angle_deg / ADJACENT_DEG, 0, 1) * np.clip(1.5 - apart / 2, 0, 1))
     bounds = np.stack([view_bounds(camera) for camera in cameras])
     steps = np.linspace(0.1, 0.9, 5)
     x = bounds[:, :1] + steps * (bounds[:, 1:2] - bounds[:, :1])

@@ -130,9 +130,7 @@ class SimulatedPredictor:
         map_from_image = np.zeros((len(group), 4))
         map_from_image[:, :2] = grid / sizes
         depth = np.stack([self._depth(view, group, names, grid) * scale for view in group]).astype(np.float32)
-        return Prediction(
-            model, None if np.isnan(depth).all() else depth, map_from_image=map_from_image, simulated=True
-        )
+        return Prediction(model, None if np.isnan(depth).all() else depth, map_from_image=map_from_image)
 
     def _noisy(self, world_from_cam: Floats, names: list[str], view: View, group: Floats) -> Floats:
         rng = self._random(names, view.name)

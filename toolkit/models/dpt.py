@@ -6,6 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+FRAMES_AT_A_TIME = 8
+"""Of the dense heads, on a GPU."""
 _EPS = 1e-5
 
 LayerTokens = tuple[Tensor, Tensor]
@@ -108,7 +110,7 @@ class DenseHead(nn.Module):
 
 
 def dense_output(
-    head: DenseHead, layers: Mapping[int, LayerTokens], read: Sequence[int], size: tuple[int, int], frames: int
+    head: DenseHead, layers: Mapping[int, LayerTokens], read: Sequence[int], size: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
     """Return the values (B, S, H, W, out - 1) before activation, and the confidence (B, S, H, W), above 1.
 
@@ -116,11 +118,13 @@ def dense_output(
         layers: tokens (B, S, T, C) by layer.
         read: the four layers that the head reads.
         size: (H, W) of the images.
-        frames: number of frames to compute at a time. A frame's maps take many times the memory of its tokens.
     """
     B, S = layers[read[0]][0].shape[:2]
     flat = [(layers[layer][0].flatten(0, 1), layers[layer][1].flatten(0, 1)) for layer in read]
-    result = torch.empty(B * S, *size, head.out, device=flat[0][0].device)
+    device = flat[0][0].device
+    result = torch.empty(B * S, *size, head.out, device=device)
+    # A frame's maps take many times the memory of its tokens; on a CPU, one frame keeps all cores busy.
+    frames = 1 if device.type == "cpu" else FRAMES_AT_A_TIME
     for start in range(0, B * S, frames):
         part = slice(start, start + frames)
         result[part] = head([(within[part], among[part]) for within, among in flat], size).permute(0, 2, 3, 1)

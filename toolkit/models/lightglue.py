@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from toolkit.models.compute import has_onednn, linear
+from toolkit.models.vit import Rope, rotate_
 
 DIM = 256
 """Channels of a feature inside of the network."""
@@ -20,9 +21,6 @@ _HEADS = 4
 _LAYERS = 9
 # Rows of the attention matrix at a time, per thread of the CPU: they shall stay in its cache.
 _ROWS = 128
-
-Rope = tuple[Tensor, Tensor]
-"""Cosines and signed sines of a rotary position embedding, each (B, N, 1, DIM / heads): see `_rotate`."""
 
 # Names in the checkpoints of the package `transformers`, and those of the first files of the authors.
 _NAMES = {
@@ -68,14 +66,8 @@ def official_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _rotate(x: Tensor, rope: Rope) -> Tensor:
-    """Rotate each pair of channels of queries or keys (B, N, heads, D) by its own angle; returns the type of `x`.
-
-    The first half of the channels holds the first of each pair, whose sines are negative.
-    """
-    cosine, sine = rope
-    first, second = x.chunk(2, dim=-1)
-    swapped = torch.cat([second, first], dim=-1)
-    return torch.addcmul(x * cosine, swapped, sine).to(x.dtype)
+    """Return queries or keys (B, N, heads, D), each pair of channels rotated by its own angle, see `rotate_`."""
+    return rotate_(x.float(), rope, groups=1).to(x.dtype)
 
 
 def _attend(queries: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None) -> Tensor:
@@ -279,6 +271,7 @@ class LightGlue(nn.Module):
         return partners.where(mutual, -1), best.exp()
 
     def _rope(self, keypoints: Tensor) -> Rope:
+        """Return the position embedding (B, N, 1, DIM / heads) of features, see `rotate_`."""
         angles = F.linear(keypoints, self.posenc.Wr.weight)[:, :, None]
         cosine, sine = angles.cos(), angles.sin()
         return torch.cat([cosine, cosine], dim=-1), torch.cat([-sine, sine], dim=-1)

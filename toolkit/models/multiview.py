@@ -10,9 +10,6 @@ from torch import Tensor, nn
 from toolkit.models.vit import Block
 from toolkit.models.weights import checkpoint_tensors, load_checkpoint
 
-FRAMES_AT_A_TIME = 8
-"""Of the dense heads, on a GPU; on a CPU, one frame keeps all cores busy."""
-
 
 class MultiView(nn.Module):
     """A network for several views of a scene, with a patch encoder that sees each view by itself.

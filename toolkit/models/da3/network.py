@@ -15,7 +15,7 @@ from toolkit.models.da3.backbone import Backbone, choose_reference
 from toolkit.models.da3.cameras import cameras_from_pose_encoding, normalized_poses, pose_encoding
 from toolkit.models.da3.heads import CameraEncoder, CameraHead
 from toolkit.models.dpt import dense_output
-from toolkit.models.multiview import FRAMES_AT_A_TIME, MultiView
+from toolkit.models.multiview import MultiView
 from toolkit.models.vggt.heads import DenseHead
 from toolkit.models.vit import PATCH, set_matrix_type
 
@@ -158,8 +158,7 @@ class DepthAnything3(MultiView):
             output["pose_enc"] = self.cam_dec(camera.float())
             output["extrinsics"], output["intrinsics"] = _cameras(output["pose_enc"], size)
         if "depth" in heads:
-            frames = 1 if tokens.device.type == "cpu" else FRAMES_AT_A_TIME
-            values, confidence = dense_output(self.head, layers, self.dense_layers, size, frames)
+            values, confidence = dense_output(self.head, layers, self.dense_layers, size)
             output["depth"], output["depth_conf"] = values[..., 0].exp(), confidence
         return output
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from toolkit.models.dpt import dense_output
-from toolkit.models.multiview import FRAMES_AT_A_TIME, MultiView
+from toolkit.models.multiview import MultiView
 from toolkit.models.omega.aggregator import PATCH, SPECIAL, Aggregator
 from toolkit.models.omega.heads import CameraHead, DenseHead
 from toolkit.models.vit import set_matrix_type
@@ -98,7 +98,6 @@ class VGGTOmega(MultiView):
         if "camera" in heads:
             output["pose_enc"] = self.camera_head(special)
         if "depth" in heads:
-            frames = 1 if special.device.type == "cpu" else FRAMES_AT_A_TIME
-            values, confidence = dense_output(self.dense_head, layers, self.dense_layers, size, frames)
+            values, confidence = dense_output(self.dense_head, layers, self.dense_layers, size)
             output["depth"], output["depth_conf"] = values.exp(), confidence
         return output

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from toolkit.models.dpt import LayerTokens
-from toolkit.models.vit import Block, Dinov2, Rope, normalized, places_of_view, rope_of_places
+from toolkit.models.vit import Block, Dinov2, normalized, places_of_view, rope_of_places
 
 REGISTERS = 4
 SPECIAL = 1 + REGISTERS
@@ -30,11 +30,6 @@ class PatchEncoder(Dinov2):
 
     def _resize(self, trained: Tensor, rows: int, columns: int) -> Tensor:
         return F.interpolate(trained, (rows, columns), mode="bicubic", antialias=True)
-
-
-def rope_of_view(rows: int, columns: int, head_dim: int, device: torch.device) -> Rope:
-    """Return the rotary position embedding of one view's tokens, cosines and signed sines (T, head_dim)."""
-    return rope_of_places(places_of_view(rows, columns, SPECIAL, device), head_dim)
 
 
 class Aggregator(nn.Module):
@@ -71,7 +66,7 @@ class Aggregator(nn.Module):
         special = torch.cat([special[:, :1], special[:, 1:].expand(-1, S - 1, -1, -1)], dim=1)
         tokens = torch.cat([special.expand(B, -1, -1, -1), patch_tokens.to(special.dtype)], dim=2)
         T = SPECIAL + P
-        rope = rope_of_view(rows, columns, self.head_dim, tokens.device)
+        rope = rope_of_places(places_of_view(rows, columns, SPECIAL, tokens.device), self.head_dim)
         rope_of_views = (rope[0].repeat(S, 1), rope[1].repeat(S, 1))
         kept = {}
         for layer in range(max(layers) + 1):

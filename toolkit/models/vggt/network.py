@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from toolkit.models.dpt import dense_output
-from toolkit.models.multiview import FRAMES_AT_A_TIME, MultiView
+from toolkit.models.multiview import MultiView
 from toolkit.models.vggt.aggregator import Aggregator
 from toolkit.models.vggt.heads import CameraHead, DenseHead
 from toolkit.models.vit import PATCH, set_matrix_type
@@ -99,16 +99,15 @@ class VGGT(MultiView):
         cameras_only = heads == ("camera",)
         read = {last} if cameras_only else {*self.dense_layers, *([last] if "camera" in heads else [])}
         layers = self.aggregator(patch_tokens, rows, columns, read, cameras_only)
-        frames = 1 if patch_tokens.device.type == "cpu" else FRAMES_AT_A_TIME
         output: dict[str, Any] = {}
         if "camera" in heads:
             output["pose_enc_list"] = self.camera_head(layers[last])
             output["pose_enc"] = output["pose_enc_list"][-1]
         if "depth" in heads:
-            values, confidence = dense_output(self.depth_head, layers, self.dense_layers, size, frames)
+            values, confidence = dense_output(self.depth_head, layers, self.dense_layers, size)
             output["depth"], output["depth_conf"] = values.exp(), confidence
         if "point" in heads:
-            values, confidence = dense_output(self.point_head, layers, self.dense_layers, size, frames)
+            values, confidence = dense_output(self.point_head, layers, self.dense_layers, size)
             output["world_points"] = values.sign() * values.abs().expm1()
             output["world_points_conf"] = confidence
         return output
