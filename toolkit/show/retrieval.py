@@ -22,7 +22,7 @@ from toolkit.show.figures import BLUE, GRAY, GREEN, MAP, ORANGE, TRUE, new_figur
 from toolkit.show.localized import load_maps, map_files
 from toolkit.show.metrics import is_posed
 from toolkit.show.overlap import LEAST_OVERLAP, overlap_in_view, seen_by
-from toolkit.show.top_view import ground_axes
+from toolkit.show.top_view import draw_dots, ground_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -283,9 +283,9 @@ def _draw_from_above(axis: "Axes", one: RetrievedQuery) -> None:
     good, retrieved = _parts(one)
     # Of a map of several places, the one that matters.
     held = places[good | retrieved] if (good | retrieved).any() else places
-    _dots(axis, places[~good], s=9, c="0.6" if one.is_known else MAP, lw=0)
-    _dots(axis, places[good], s=16, c=GREEN, lw=0)
-    _dots(axis, places[retrieved], s=55, facecolors="none", edgecolors=BLUE, lw=1.2)
+    draw_dots(axis, places[~good], s=9, c="0.6" if one.is_known else MAP, lw=0)
+    draw_dots(axis, places[good], s=16, c=GREEN, lw=0)
+    draw_dots(axis, places[retrieved], s=55, facecolors="none", edgecolors=BLUE, lw=1.2)
     true = one.session.world_from_cam([one.row], ground_truth=True)
     if is_posed(true)[0]:
         at = (true[:, :3, 3] @ axes.T)[0]
@@ -301,7 +301,3 @@ def _draw_from_above(axis: "Axes", one: RetrievedQuery) -> None:
     axis.set(xlabel=labels[0], ylabel=labels[1])
     elsewhere = f"; {outside} map images are elsewhere" if outside else ""
     axis.set_title(f"where they stood, from above{elsewhere}", fontsize=9)
-
-
-def _dots(axis: "Axes", xy: Floats, **style: Any) -> None:
-    axis.scatter(xy[:, 0], xy[:, 1], **style)

@@ -1,9 +1,14 @@
 """Seeing a map from above: which way is right and up in the picture, and which places lie apart."""
 
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from toolkit.geometry import Floats, Ints
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 def ground_axes(up: ArrayLike, unit: str | None = "m") -> tuple[Floats, list[str]]:
@@ -51,3 +56,16 @@ def places_of(positions: Floats, gap_ratio: float = 5.0, share: float = 0.12) ->
     labels = fcluster(tree, gap, "distance")[cKDTree(spots).query(positions)[1]]
     _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
     return np.argsort(np.argsort(first))[inverse]
+
+
+def draw_headings(axis: "Axes", positions: Floats, poses: Floats, axes: Floats, length: float, **style: Any) -> None:
+    """Draw a line in the direction that each camera (N, 4, 4) looks, from its place (N, 2) in the picture."""
+    from matplotlib.collections import LineCollection
+
+    ends = positions + length * poses[:, :3, 2] @ axes.T
+    axis.add_collection(LineCollection(list(np.stack([positions, ends], axis=1)), **style))
+
+
+def draw_dots(axis: "Axes", xy: Floats, **style: Any) -> None:
+    """Draw places, (N, 2) or one, (2,); `style` goes to matplotlib's `scatter`."""
+    axis.scatter(*np.reshape(xy, (-1, 2)).T, **style)
