@@ -38,7 +38,6 @@ def record_localizations(
     localizations: Localizations,
     details: Iterable[tuple[int, QueryDetails]] = (),
     up: ArrayLike | None = None,
-    image_size: int = 480,
     ways: Mapping[str, Sequence[Floats]] | None = None,
 ) -> Path:
     """Write a recording of queries in a map, and return its path.
@@ -54,10 +53,11 @@ def record_localizations(
         colors: (P, 3) RGB or None.
         details: number and details of those that can be chosen; taken one at a time.
         up: direction (3,) that is up; None: estimated from the map's cameras.
-        image_size: longer side of the images, pixels.
         ways: of the queries' recordings, the places (n, 3) of each piece: `odometry`, laid in the map as a whole, and
             `frames`, as the sequence stage has found them.
     """
+    import rerun as rr
+
     started = time.perf_counter()
     poses = map_poses[is_posed(map_poses)]
     up = np.asarray(up_of_cameras(poses) if up is None else up, np.float64)
@@ -68,8 +68,11 @@ def record_localizations(
         viewer.log_points(stream, points, colors)
         _log_map_cameras(stream, poses, size)
         _log_overview(stream, localizations)
-        _log_ways(stream, ways or {})
-        writer = _ChosenWriter(stream, localizations, image_size, 2 * size)
+        for way, color in (("odometry", ORANGE), ("frames", SKY)):
+            if ways and ways.get(way):
+                lines = rr.LineStrips3D(ways[way], colors=viewer.rgb(color))
+                stream.log(f"world/recording/{way}", lines, static=True)
+        writer = _ChosenWriter(stream, localizations, 2 * size)
         for number, chosen in details:
             writer.write(number, chosen)
             count += 1
@@ -141,23 +144,11 @@ def _log_overview(stream: "rr.RecordingStream", queries: Localizations) -> None:
     stream.log("legend", rr.EncodedImage(contents=legend, media_type="image/png"), static=True)
 
 
-def _log_ways(stream: "rr.RecordingStream", ways: Mapping[str, Sequence[Floats]]) -> None:
-    """Log the ways of recordings as lines."""
-    import rerun as rr
-
-    for name, color in (("odometry", ORANGE), ("frames", SKY)):
-        if ways.get(name):
-            stream.log(f"world/recording/{name}", rr.LineStrips3D(ways[name], colors=viewer.rgb(color)), static=True)
-
-
 class _ChosenWriter:
     """Logs one query after the other, each in place of the one before."""
 
-    def __init__(
-        self, stream: "rr.RecordingStream", queries: Localizations, image_size: int, camera_depth_m: float
-    ) -> None:
-        self._stream, self._queries = stream, queries
-        self._image_size, self._depth_m = image_size, camera_depth_m
+    def __init__(self, stream: "rr.RecordingStream", queries: Localizations, camera_depth_m: float) -> None:
+        self._stream, self._queries, self._depth_m = stream, queries, camera_depth_m
         self._sizes: dict[str, tuple[int, int]] = {}
         """Width and height of the pictures last logged, by entity."""
 
@@ -214,7 +205,7 @@ class _ChosenWriter:
             # A camera of any kind, too small to be seen.
             stream.log(path, rr.Pinhole(focal_length=1, width=1, height=1, image_plane_distance=viewer.HIDDEN_M))
         else:
-            data, shown = viewer.small_jpeg(read_for_display(image.path), self._image_size)
+            data, shown = viewer.small_jpeg(read_for_display(image.path), viewer.IMAGE_SIZE)
             self._sizes[path] = shown
             located = bool(is_posed(image.world_from_cam))
             if located:

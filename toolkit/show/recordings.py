@@ -78,10 +78,8 @@ def record_session(
     out: str | Path | None = None,
     map_dir: str | Path | None = None,
     queries: str = "keyframes_pruned_subsampled",
-    image_size: int = 480,
-    quality: int = 75,
+    image_size: int = viewer.IMAGE_SIZE,
     world_up: ArrayLike | None = None,
-    workers: int | None = None,
     progress: bool = True,
 ) -> SessionRecording:
     """Record a session for the rerun viewer; memory does not grow with its length.
@@ -113,14 +111,14 @@ def record_session(
             points of the map that `queries_pose` is named after. With `queries_pose`, of the maps that it was found
             with; else of all of the session.
         image_size: longer side of the images shown, pixels; depth maps have half of it.
-        quality: of JPEG, 1 to 100.
         world_up: direction (3,) that is up; None: estimated from the cameras.
-        workers: threads that read and shrink; None: the cores at hand.
 
     Raises:
         CaptureError: unknown session, subsession or keyframe list.
         ArtifactError: `vis_retrieve_queries` without the h5 of `queries_pose`, or for another session.
     """
+    import rerun as rr
+
     started = time.perf_counter()
     if every < 1:
         raise CaptureError(f"every={every}: expected 1 (every frame) or more.")
@@ -136,7 +134,8 @@ def record_session(
     settings = {
         "images": session.files_fingerprint, "subsession": subsession,
         "session": files_fingerprint([*sorted(session.path.glob("*.txt")), *sorted(session.path.glob("proc/*.txt"))]),
-        "keyframes": queries if keyframes_only else "", "every": every, "image_size": image_size, "quality": quality,
+        "keyframes": queries if keyframes_only else "", "every": every,
+        "image_size": image_size, "quality": viewer.JPEG_QUALITY,
         "queries_pose": "" if poses is None else file_fingerprint(poses), "retrieve": vis_retrieve_queries,
         "points": files_fingerprint(list(maps)),
         "world_up": None if world_up is None else np.asarray(world_up, float).tolist(),
@@ -157,7 +156,11 @@ def record_session(
             points, colors = sure_points(local_map)
             viewer.log_points(stream, points, colors)
             counts["points"] = len(points)
-        _log_trajectories(stream, plan, session.device)
+        color = viewer.rgb(color_of(session.device))
+        for name, tracks in plan.tracks.items():
+            # A line a subsession: recordings joined would draw paths nobody went.
+            lines = rr.LineStrips3D([track for track in tracks if len(track) > 1], colors=color)
+            stream.log(f"world/{viewer.entity(name)}/trajectory", lines, static=True)
         if localized is not None:
             _log_queries(stream, localized, session)
             counts["queries"] = len(localized.poses)
@@ -165,9 +168,9 @@ def record_session(
         writer.announce(plan.frames)
 
         def load(number: int) -> list[_Shot]:
-            return [_load(shot, image_size, quality) for shot in plan.shots(number)]
+            return [_load(shot, image_size) for shot in plan.shots(number)]
 
-        loaded = prefetch(load, range(len(plan.frames)), workers or default_workers())
+        loaded = prefetch(load, range(len(plan.frames)), default_workers())
         bar = tqdm(loaded, total=len(plan.frames), desc=session.id, unit="frame", disable=not progress)
         for frame, shots in zip(plan.frames, bar, strict=True):
             counts.update(writer.write(frame, shots))
@@ -367,7 +370,7 @@ def _names(table: pd.DataFrame, column: str, frame: list[str], kind: str) -> pd.
     return pd.Series(names, index=table.index, dtype=object)
 
 
-def _load(shot: _Shot, image_size: int, quality: int) -> _Shot:
+def _load(shot: _Shot, image_size: int) -> _Shot:
     """Read a picture or depth map and make it small; in a thread."""
     if shot.is_depth:
         try:
@@ -387,7 +390,7 @@ def _load(shot: _Shot, image_size: int, quality: int) -> _Shot:
     except ImageError:
         blank = cv2.resize(read_for_display(shot.path), (shot.camera.width, shot.camera.height))
         image, readable = np.asarray(blank, np.uint8), False
-    data, size = viewer.small_jpeg(image, image_size, quality)
+    data, size = viewer.small_jpeg(image, image_size)
     return replace(shot, data=data, size=size, readable=readable)
 
 
@@ -497,16 +500,6 @@ def _session_layout(plan: _Plan, poses: Floats, up: Floats) -> Any:
     panel = rrb.TimePanel(state="collapsed", timeline=FRAME, play_state="paused")
     layout = rrb.Horizontal(scene, rrb.Tabs(*views), column_shares=[2, 1]) if views else rrb.Horizontal(scene)
     return rrb.Blueprint(layout, panel, collapse_panels=True)
-
-
-def _log_trajectories(stream: "rr.RecordingStream", plan: _Plan, device: str) -> None:
-    """Log the way of each device, a line a subsession: recordings joined would draw paths nobody went."""
-    import rerun as rr
-
-    color = viewer.rgb(color_of(device))
-    for name, tracks in plan.tracks.items():
-        lines = rr.LineStrips3D([track for track in tracks if len(track) > 1], colors=color)
-        stream.log(f"world/{viewer.entity(name)}/trajectory", lines, static=True)
 
 
 @dataclass(frozen=True)

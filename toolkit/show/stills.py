@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 Window = tuple[tuple[float, float], tuple[float, float]]
 """Limits of x and y, meters."""
 
+MAX_PLACES, MAX_POINTS = 6, 60_000
+"""Of the map from above: panels, those with the most map images, and points in all, a regular choice."""
 MOST_LETTERS = 60
 """Of an image's name on the sheet of the worst: more would run into the picture beside."""
 
@@ -52,8 +54,6 @@ def draw_scene(
     true: Floats,
     up: ArrayLike | None = None,
     title: str = "Queries in the map, seen from above",
-    max_places: int = 6,
-    max_points: int = 60_000,
     map_tracks: Sequence[Floats] = (),
     query_tracks: Sequence[Floats] = (),
     unit: tuple[str, float] = ("m", 1.0),
@@ -67,8 +67,6 @@ def draw_scene(
         estimated: world_from_cam (Q, 4, 4) of the queries, NaN where there is no pose.
         true: the same, true; NaN where it is not known.
         up: direction (3,) that is up; None: estimated from the map's cameras.
-        max_places: panels at most; the places with the most map images.
-        max_points: points drawn at most in all, a regular choice.
         map_tracks: ways of the map's devices, (n, 3) each, drawn as lines.
         query_tracks: true ways of the query devices.
         unit: what lengths are shown in, see `metrics.length_unit`.
@@ -78,7 +76,7 @@ def draw_scene(
     axes, labels = ground_axes(up_of_cameras(map_poses) if up is None else up, unit[0])
     points, map_poses, estimated, true = points / unit[1], *(_in(unit, poses) for poses in (map_poses, estimated, true))
     map_tracks, query_tracks = ([track / unit[1] for track in tracks] for tracks in (map_tracks, query_tracks))
-    step = len(points) // max_points + 1
+    step = len(points) // MAX_POINTS + 1
     cloud, shades = points[::step] @ axes.T, None if colors is None else colors[::step]
     cameras, estimated_xy, true_xy = (poses[:, :3, 3] @ axes.T for poses in (map_poses, estimated, true))
 
@@ -87,7 +85,7 @@ def draw_scene(
     query_place = _nearest(anchors, cameras, place)
     point_place = _nearest(cloud, cameras, place)
     counts = np.bincount(place, minlength=1)
-    shown = np.sort(np.argsort(-counts, kind="stable")[:max_places])
+    shown = np.sort(np.argsort(-counts, kind="stable")[:MAX_PLACES])
     windows = [_window(cloud[point_place == p], cameras[place == p], anchors[query_place == p]) for p in shown]
 
     columns = min(len(shown), 3)
