@@ -6,6 +6,7 @@ Everything is read from what the runs have left; no query is localized again.
 import math
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -276,9 +277,8 @@ def _names(folders: Sequence[Path]) -> list[str]:
 
 def _hits(queries: pd.DataFrame, runs: int, thresholds: Sequence[str]) -> NDArray[np.bool_]:
     """Return whether each query is within each threshold in each run, (Q, R, T)."""
-    limits = [parse_threshold(name) for name in thresholds]
     errors = [[queries[f"{name}_{i}"].to_numpy(float) for name in _ERRORS] for i in range(runs)]
-    hits = [[is_below(rotation, translation, limit) for limit in limits] for rotation, translation in errors]
+    hits = [[is_below(turned, moved, parse_threshold(name)) for name in thresholds] for turned, moved in errors]
     return np.asarray(np.moveaxis(np.array(hits, bool), 2, 0))
 
 
@@ -436,17 +436,13 @@ def draw_change(comparison: Comparison, row: int) -> "list[tuple[str, Figure]]":
             capture = Capture.open(_capture_of(record, change["scene"], comparison.folders[i]))
             devices = change["map_device"], change["query_device"]
             pair = LocalizedPair.open(capture, *devices, files.poses_dir, files.maps)
-            try:
-                same = (pair.table["timestamp"] == change["timestamp"]) & (
-                    pair.table["device_id"] == change["device_id"]
-                )
+            with closing(pair.queries):
+                same = (pair.table[["timestamp", "device_id"]] == change[["timestamp", "device_id"]]).all(axis=1)
                 if not same.any():
                     raise ArtifactError(f"{files.poses_dir / pair.name}.csv: no row of query {change['timestamp']}.")
                 k = int(np.flatnonzero(same)[0])
                 title = f"{comparison.names[i]}: {pair.table['status'].iloc[k]}"
                 drawn.append((title, draw_localization(pair.details(k), title=title, unit=pair.unit)))
-            finally:
-                pair.queries.close()
     return drawn
 
 
@@ -471,13 +467,22 @@ def write_comparison(comparison: Comparison, path: str | Path | None = None, pic
         if len(stem) > 100:
             stem = f"{comparison.names[0].replace('/', '-')}_and_{len(comparison.names) - 1}_more"
         path = comparison.folders[0].resolve().parent / f"compare_{stem}.html"
-    names, messages = comparison.names, list(comparison.messages)
+    names, messages, looks = comparison.names, list(comparison.messages), list[tuple[str, list[Picture]]]()
     with tempfile.TemporaryDirectory() as folder:
         album = _Album(Path(folder), PICTURE_BUDGET, [])
-        save_figure(draw_differences(comparison), Path(folder) / "differences.png")
+
+        def picture(drawn: "Figure", title: str, caption: str = "") -> Picture:
+            path = save_figure(drawn, Path(folder) / "picture.png")
+            return replace(album.picture(path, title, caption), path="")  # the file does not stay
+
         caption = "Right of the line a run is better than the first; an interval that crosses it may be chance."
-        figure = replace(album.picture(Path(folder) / "differences.png", "Differences", caption), path="")
-        looks = _looks(comparison, pictures, album, messages)
+        figure = picture(draw_differences(comparison), "Differences", caption)
+        for title, drawn in draw_changes(comparison, pictures):
+            shown = [picture(of_run, name) for name, of_run in drawn]
+            if not drawn:
+                messages.append(title)
+            elif all(one.data for one in shown):
+                looks.append((title, shown))
     page = page_template("comparison.html.j2").render(
         run={"name": f"{names[1] if len(names) == 2 else f'{len(names) - 1} runs'} against {names[0]}"},
         folders=list(zip(names, map(str, comparison.folders), comparison.records, strict=True)),
@@ -517,23 +522,6 @@ def draw_changes(
                 yield f"{query} in the {change['map_device']} map: {what}", draw_change(comparison, row)
             except (ToolkitError, OSError) as error:
                 yield f"No picture of {query}: {error}", []
-
-
-def _looks(comparison: Comparison, most: int, album: _Album, messages: list[str]) -> list[tuple[str, list[Picture]]]:
-    """Return pictures of queries won and lost."""
-    looks = []
-    for number_, (title, drawn) in enumerate(draw_changes(comparison, most)):
-        if not drawn:
-            messages.append(title)
-            continue
-        shown = []
-        for run, (name, figure) in enumerate(drawn):
-            file = album.run_dir / f"{number_}_{run}.png"
-            save_figure(figure, file)
-            shown.append(replace(album.picture(file, name), path=""))
-        if all(picture.data for picture in shown):
-            looks.append((title, shown))
-    return looks
 
 
 def _name(change: "pd.Series[Any] | Mapping[str, Any]") -> str:

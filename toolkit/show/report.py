@@ -279,9 +279,6 @@ def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> dict[str, An
     if unit != "m":
         depth = f"a tenth of the median depth that a map shows{': ' if lengths else ''}{', '.join(lengths)}"
         remarks.append(f"The unit of the poses is not known: {unit} is {depth}.")
-    medians = ("median_rotation_deg", "Median rotation error [°]", 1.0), (
-        "median_translation_m", f"Median translation error [{small}]", factor
-    )  # fmt: skip
     verdict, headlines = _verdict(recall, errors, statuses, thresholds)
     matrices, note = _retrieval(retrieval, headlines, unit)
     stills = sorted(files.visualization.glob("*.png"), key=_natural)
@@ -301,9 +298,11 @@ def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> dict[str, An
             _matrix(recall, column, f"Recall at {_threshold(column)} [%]", percent, lambda v: 0.9 * v)
             for column in thresholds
         ],
-        "medians": [
-            _matrix(recall, column, title, lambda v, f=factor: number(v * f))
-            for column, title, factor in (medians if thresholds else ())
+        "medians": thresholds and [
+            _matrix(recall, "median_rotation_deg", "Median rotation error [°]", number),
+            _matrix(
+                recall, "median_translation_m", f"Median translation error [{small}]", lambda v: number(v * factor)
+            ),
         ],
         "pairs": _pairs(recall, thresholds) if len(recall) else None,
         "losses": _losses(losses),
