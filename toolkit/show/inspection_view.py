@@ -345,8 +345,8 @@ def _draw_near(axis: "Axes", named: Named) -> None:
         _draw_place(axis, (pose[:3, 3] - origin) / unit @ axes.T * factor, name, color, 30)
     half *= factor
     axis.set(xlim=(-half, half), ylim=(-half, half), aspect="equal")
-    axis.set_xlabel(f"{_axis_name(labels[0])}, from the pose [{small}]")
-    axis.set_ylabel(f"{_axis_name(labels[1])}, from the pose [{small}]")
+    right, up = (f"{label.partition(' [')[0]}, from the pose [{small}]" for label in labels)
+    axis.set(xlabel=right, ylabel=up)
     missing = "" if ellipses else ": the method states no uncertainty"
     axis.set_title(f"the pose, enlarged{missing}", fontsize=9)
     axis.grid(alpha=0.25)
@@ -356,10 +356,6 @@ def _draw_near(axis: "Axes", named: Named) -> None:
 def _digits(value: float) -> str:
     """Return a number with two digits that count: an error of a fraction of a millimeter is not 0.000 m."""
     return np.format_float_positional(value, 2, fractional=False, trim="-") if value < 0.1 else number(value)
-
-
-def _axis_name(label: str) -> str:
-    return label.partition(" [")[0]
 
 
 def _draw_table(axis: "Axes", ones: Sequence[Answer]) -> None:

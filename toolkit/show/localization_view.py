@@ -201,7 +201,7 @@ class _ChosenWriter:
             # Of the last one's size: the viewer takes pictures of an entity for frames of a film.
             width, height = self._sizes.get(path, (4, 3))
             blank = np.full((height, width, 3), 60, np.uint8)
-            stream.log(f"{path}/image", viewer.jpeg_of(viewer.small_jpeg(blank, max(blank.shape))[0]))
+            data, _ = viewer.small_jpeg(blank, max(blank.shape))
             # A camera of any kind, too small to be seen.
             stream.log(path, rr.Pinhole(focal_length=1, width=1, height=1, image_plane_distance=viewer.HIDDEN_M))
         else:
@@ -212,13 +212,13 @@ class _ChosenWriter:
                 stream.log(path, viewer.transform_of(image.world_from_cam))
             depth_m = self._depth_m if located else viewer.HIDDEN_M
             stream.log(path, viewer.pinhole_of(image.camera, shown, depth_m, color))
-            stream.log(f"{path}/image", viewer.jpeg_of(data))
             scale = np.array(shown) / [image.camera.width, image.camera.height]
             measured, inlier = image.pixels * scale, image.inlier
             if located and residuals and inlier.any():
                 pixels, visible = project(image.points[inlier], image.camera, image.world_from_cam)
                 predicted = pixels[visible] * scale
                 lines = np.stack([measured[inlier][visible], predicted], axis=1)
+        stream.log(f"{path}/image", rr.EncodedImage(contents=data, media_type="image/jpeg"))
         for name, marks, shade, radius in (
             ("reprojected", predicted, viewer.rgb(GREEN), 2.5),
             ("measured", measured[inlier], WHITE, 1.5),

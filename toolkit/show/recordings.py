@@ -433,7 +433,7 @@ class _FrameWriter:
                 self._stream.log(f"{path}/depth", depth)
                 counts["depth_maps"] += 1
             else:
-                self._stream.log(f"{path}/image", viewer.jpeg_of(shot.data))
+                self._stream.log(f"{path}/image", rr.EncodedImage(contents=shot.data, media_type="image/jpeg"))
                 counts["images"] += 1
                 counts["unposed"] += not frame.posed
         # What this device showed before and does not now would hang on at its old place.

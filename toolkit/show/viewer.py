@@ -114,13 +114,6 @@ def transform_of(parent_from_child: ArrayLike) -> "rr.Transform3D":
     return rr.Transform3D(translation=pose[:3, 3], quaternion=rr.Quaternion(xyzw=[x, y, z, w]))
 
 
-def jpeg_of(data: bytes) -> "rr.EncodedImage":
-    """Return a JPEG as the viewer takes it."""
-    import rerun as rr
-
-    return rr.EncodedImage(contents=data, media_type="image/jpeg")
-
-
 def world_axes(up: Floats) -> Any:
     """Return the viewer's coordinates for the world axis that is nearest to `up`."""
     import rerun as rr
