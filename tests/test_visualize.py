@@ -10,6 +10,7 @@ from toolkit import visualize
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError, CaptureError
 from toolkit.localizers.correspondences import LocalizedQuery
+from toolkit.show.figures import new_figure
 from toolkit.visualize import visualize_scene
 
 QUICK = {"session_recordings": False, "matched_queries": 2}
@@ -19,8 +20,15 @@ QUICK = {"session_recordings": False, "matched_queries": 2}
 def drawn(monkeypatch):
     """What the stage gives to draw: the samples, the worst, and the details in recordings."""
     given = {"samples": [], "worst": [], "recorded": [], "clouds": []}
-    monkeypatch.setattr(visualize, "draw_localization", lambda query, *_: given["samples"].append(query))
-    monkeypatch.setattr(visualize, "draw_worst", lambda queries, *_: given["worst"].extend(queries))
+
+    def draw(kind, queries):
+        given[kind].extend(queries)
+        figure = new_figure(1, 1)
+        figure.subplots()
+        return figure
+
+    monkeypatch.setattr(visualize, "draw_localization", lambda query, *_: draw("samples", [query]))
+    monkeypatch.setattr(visualize, "draw_worst", lambda queries, *_: draw("worst", queries))
 
     def record(out, name, poses, points, colors, queries, details, **_):
         given["clouds"].append(points)

@@ -280,9 +280,8 @@ def _query_tables(poses_dir: str | Path, scene: str, map_devices: Sequence[str],
     """Return the readable tables of a query device's pairs."""
     tables = []
     for map_ in map_devices:
-        path = Path(poses_dir) / f"{pair_name(scene, map_, query)}.csv"
         with suppress(ArtifactError):  # `_read_results` says so
-            tables += [read_query_table(path, ["status"])] if path.is_file() else []
+            tables.append(read_query_table(Path(poses_dir) / f"{pair_name(scene, map_, query)}.csv", ["status"]))
     return tables
 
 

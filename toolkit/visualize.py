@@ -22,7 +22,7 @@ from toolkit.show.localized import LocalizedPair, support_of, sure_points
 from toolkit.show.metrics import is_posed, worst_first
 from toolkit.show.recordings import record_session, session_tracks
 from toolkit.show.sequences import SequencePair, draw_sequence
-from toolkit.show.stills import WorstQuery, draw_localization, draw_scene_png, draw_worst
+from toolkit.show.stills import WorstQuery, draw_localization, draw_scene, draw_worst
 
 WORST = 10
 """Queries of the sheet of the worst, over all pairs."""
@@ -129,21 +129,22 @@ def _draw_pair(
     """Draw and record a pair; return its worst queries, rows of `Localizations.ranked` with their details."""
     m, q = pair.map_session.device, pair.query_session.device
     shown, cloud, map_poses = pair.localizations, sure_points(pair.local_map), pair.map_session.world_from_cam()
-    still, recording = out / f"{pair.name}.png", out / f"{pair.name}.rrd"
     details_of = lru_cache(2 * WORST)(pair.details)  # the worst are drawn and recorded
-    draw_scene_png(
-        *(*cloud, map_poses, shown.estimated, shown.true, still),
+    figure = draw_scene(
+        *(*cloud, map_poses, shown.estimated, shown.true),
         up=settings.world_up,
         title=f"{q} queries in the {m} map, seen from above",
         map_tracks=session_tracks(pair.map_session),
         query_tracks=session_tracks(pair.query_session),
         unit=pair.unit,
     )
+    save_figure(figure, out / f"{pair.name}.png", figure.get_suptitle())
     order = shown.worst_first().tolist()
     chosen = np.unique(np.linspace(0, len(order) - 1, min(settings.samples, len(order))).round().astype(int))
     for number, k in enumerate((order[place] for place in chosen), start=1):
         title = f"{q} query in the {m} map: {pair.table['status'].iloc[k]}"
-        draw_localization(details_of(k), out / f"localization_{pair.name}_{number}.png", title, pair.unit)
+        figure = draw_localization(details_of(k), title, pair.unit)
+        save_figure(figure, out / f"localization_{pair.name}_{number}.png", figure.get_suptitle())
     ways: dict[str, list[Floats]] = {}
     if sequences is None:
         (out / f"{pair.name}_sequence.png").unlink(missing_ok=True)
@@ -153,6 +154,7 @@ def _draw_pair(
         ways = {"odometry": sequences.laid_odometry(pair.query_session), "frames": sequences.ways()}
     if settings.recordings:
         details = ((k, details_of(k)) for k in sorted(order[: settings.matched_queries]))
+        recording = out / f"{pair.name}.rrd"
         record_localizations(recording, pair.name, map_poses, *cloud, shown, details, up=settings.world_up, ways=ways)
     candidates = order[:WORST]
     rows = shown.ranked.iloc[candidates]
@@ -176,4 +178,5 @@ def _draw_worst(path: Path, scene: str, candidates: pd.DataFrame) -> None:
             about.append(support_of(row))
         errors = row["rotation_error_deg"], row["translation_error_m"]
         shown.append(WorstQuery(row["pair"], ", ".join(about), row["details"], *errors, row["unit"]))
-    draw_worst(shown, path, f"{scene}: the {len(shown)} worst queries of all pairs")
+    title = f"{scene}: the {len(shown)} worst queries of all pairs"
+    save_figure(draw_worst(shown, title), path, title)

@@ -29,6 +29,7 @@ from toolkit.localizers.feed_forward import (
 )
 from toolkit.localizers.prediction import Prediction
 from toolkit.localizers.simulated import SimulatedPredictor
+from toolkit.show.figures import save_figure
 from toolkit.show.visualize_prediction import draw_prediction
 
 Floats = NDArray[np.float64]
@@ -488,8 +489,8 @@ def test_a_prediction_is_drawn_and_labeled(world: World, tmp_path: Path) -> None
     queries, _ = world.queries("spot")
     localizer = world.localizer(world.predictor(wrong_references=0.3, seed=2))
     (answer,) = answers_of(localizer, queries[:1])
-    figure = draw_prediction(localizer, queries[0][0], answer, out=tmp_path / "prediction.png")
-    assert (tmp_path / "prediction.png").stat().st_size > 20_000
+    figure = draw_prediction(localizer, queries[0][0], answer)
+    assert save_figure(figure, tmp_path / "prediction.png").stat().st_size > 20_000
     assert figure.get_suptitle().startswith("SIMULATED, no result")
     failed = FeedForwardAnswer(PoseEstimate("failed: no references"), ())
     assert "failed: no references" in draw_prediction(localizer, queries[0][0], failed).get_suptitle()

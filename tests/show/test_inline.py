@@ -9,7 +9,7 @@ from toolkit.errors import ArtifactError
 from toolkit.notebook import TEXT_BARS
 from toolkit.show.figures import new_figure
 from toolkit.show.inline import ASSETS, show_recording
-from toolkit.show.recordings import open_recording
+from toolkit.show.viewer import open_recording
 
 
 @pytest.fixture

@@ -265,7 +265,8 @@ def test_pictures_and_intrinsics_change_size_together():
     assert small_jpeg(np.zeros((60, 101), np.uint8), 500)[1] == (101, 60)
 
 
-def test_a_localization_view_holds_the_queries(capture, tmp_path):
+def test_a_localization_view_holds_the_queries(capture, tmp_path, monkeypatch):
+    monkeypatch.setattr("toolkit.show.viewer.IMAGE_SIZE", 64)
     rng = np.random.default_rng(0)
     session = Capture.open(capture)["hl_map"]
     camera, file = session.camera("morning/lf"), session.image_path(0)
@@ -289,9 +290,7 @@ def test_a_localization_view_holds_the_queries(capture, tmp_path):
     reference = ShownImage("r.jpg", file, camera, map_poses[0], pixels[:2], placed[:2], np.arange(2), inlier[:2])
     lost = ShownImage("c.jpg", file, camera, np.full((4, 4), np.nan))
     details = [(1, QueryDetails([shown], [reference])), (2, QueryDetails([lost], [reference]))]
-    path = record_localizations(
-        tmp_path / "v.rrd", "view", map_poses, points, None, queries, iter(details), image_size=64
-    )
+    path = record_localizations(tmp_path / "v.rrd", "view", map_poses, points, None, queries, iter(details))
     found = read_back(path)
     (centers,) = [row[2] for row in logged(found["/world/queries/estimated"], "Points3D:positions")]
     np.testing.assert_allclose(centers, estimated[[0, 1, 3], :3, 3])

@@ -89,12 +89,8 @@ class Answer:
     def matches(self) -> pd.DataFrame:
         """Counts of the correspondences: a row a kind (`sift/guided`), columns inliers and rejected."""
         found = self.correspondences
-        kinds = sorted(set(found.found_by.tolist()))
-        counts = [
-            (int(found.inlier[found.found_by == kind].sum()), int((~found.inlier[found.found_by == kind]).sum()))
-            for kind in kinds
-        ]
-        return pd.DataFrame(counts, pd.Index(kinds, name="found by"), ["inliers", "rejected"], dtype=int)
+        counts = pd.DataFrame({"inliers": found.inlier, "rejected": ~found.inlier}, dtype=int)
+        return counts.groupby(pd.Index(found.found_by.astype(object), name="found by")).sum()
 
     @cached_property
     def references(self) -> pd.DataFrame:

@@ -25,9 +25,10 @@ class Queries(Protocol[T_co]):
         """Return one by its number or name."""
 
 
-def shown_name(name: str) -> str:
-    """Return an image's name without its session; of an imported image, that of the user's file."""
-    return own_name(name.rpartition("/raw_data/")[2])
+def shown_name(name: str, most: int = 1000) -> str:
+    """Return an image's name without its session, or what the user calls it; of more than `most` letters the last."""
+    name = own_name(name.rpartition("/raw_data/")[2])
+    return name if len(name) <= most else f"…{name[1 - most :]}"
 
 
 def find_query(query: object, images: Mapping[str, int], count: int) -> int:

@@ -6,6 +6,7 @@ Everything is read from what the runs have left; no query is localized again.
 import math
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -30,7 +31,7 @@ from toolkit.show.report import (
     Picture,
     Table,
     _Album,
-    _length,
+    _off_by,
     _seconds,
     _threshold,
     page_template,
@@ -98,7 +99,7 @@ class Comparison:
         lines.append("time and peak memory; what a run has reused, or taken over from another, costs it none")
         for i, name in enumerate(self.names):
             spent = self.resources.iloc[-1]
-            lines.append(f"  {name:<{width}}  {_time(spent[f'seconds_{i}'])}, {_memory(spent[f'memory_mb_{i}'])}")
+            lines.append(f"  {name:<{width}}  {_seconds(spent[f'seconds_{i}'])}, {_memory(spent[f'memory_mb_{i}'])}")
         for row in self.settings.to_dict("records"):
             lines.append(f"{row['key']}: " + " | ".join(row[f"run_{i}"] for i in range(len(self.names))))
         return "\n".join([*lines, *(f"Note: {message}" for message in self.messages)])
@@ -106,15 +107,22 @@ class Comparison:
     def summary(self) -> dict[str, Any]:
         """Return the same for scripts: plain values, with every pair and every query won and lost."""
         changes = self.changes.assign(run=[self.names[i] for i in self.changes["run"]])
-        tables = {"recall": self.recall.assign(run=[self.names[i] for i in self.recall["run"]]), "changes": changes}
+        recall = self.recall.assign(run=[self.names[i] for i in self.recall["run"]])
+        tables = {"recall": recall, "changes": changes, "resources": self.resources}
         known = {name: table.replace(np.inf, np.nan) for name, table in tables.items()}  # JSON has no infinity
         plain = {name: table.astype(object).where(table.notna(), None) for name, table in known.items()}
         return {
             "runs": dict(zip(self.names, map(str, self.folders), strict=True)),
             "queries": len(self.queries),
-            **{name: table.to_dict("records") for name, table in plain.items()},
-            "settings": _by_run(self.settings, "key", {"run": ""}, self.names),
-            "resources": _by_run(self.resources, "stage", {"seconds": "s", "memory_mb": "mb"}, self.names),
+            **{name: plain[name].to_dict("records") for name in ("recall", "changes")},
+            "settings": self.settings.set_index("key").set_axis(self.names, axis="columns").to_dict("index"),
+            "resources": {
+                row["stage"]: {
+                    name: {what: row[f"{what}_{i}"] for what in ("seconds", "memory_mb")}
+                    for i, name in enumerate(self.names)
+                }
+                for row in plain["resources"].to_dict("records")
+            },
             "messages": list(self.messages),
         }
 
@@ -269,9 +277,8 @@ def _names(folders: Sequence[Path]) -> list[str]:
 
 def _hits(queries: pd.DataFrame, runs: int, thresholds: Sequence[str]) -> NDArray[np.bool_]:
     """Return whether each query is within each threshold in each run, (Q, R, T)."""
-    limits = [parse_threshold(name) for name in thresholds]
     errors = [[queries[f"{name}_{i}"].to_numpy(float) for name in _ERRORS] for i in range(runs)]
-    hits = [[is_below(rotation, translation, limit) for limit in limits] for rotation, translation in errors]
+    hits = [[is_below(turned, moved, parse_threshold(name)) for name in thresholds] for turned, moved in errors]
     return np.asarray(np.moveaxis(np.array(hits, bool), 2, 0))
 
 
@@ -356,19 +363,6 @@ def _measured(row: Mapping[str, Any], name: str) -> float:
     return float(value) if isinstance(value, int | float) and math.isfinite(value) else 0.0
 
 
-def _by_run(
-    table: pd.DataFrame, key: str, columns: Mapping[str, str], names: Sequence[str]
-) -> dict[str, dict[str, Any]]:
-    """Return a table with columns `<name>_<i>` as key -> run -> value, or -> name -> value where there are several."""
-    found: dict[str, dict[str, Any]] = {}
-    for row in table.to_dict("records"):
-        for i, run in enumerate(names):
-            values = {name: row[f"{name}_{i}"] for name in columns}
-            plain = {name: None if isinstance(v, float) and math.isnan(v) else v for name, v in values.items()}
-            found.setdefault(str(row[key]), {})[run] = plain if len(columns) > 1 else next(iter(plain.values()))
-    return found
-
-
 # Showing
 
 
@@ -442,17 +436,13 @@ def draw_change(comparison: Comparison, row: int) -> "list[tuple[str, Figure]]":
             capture = Capture.open(_capture_of(record, change["scene"], comparison.folders[i]))
             devices = change["map_device"], change["query_device"]
             pair = LocalizedPair.open(capture, *devices, files.poses_dir, files.maps)
-            try:
-                same = (pair.table["timestamp"] == change["timestamp"]) & (
-                    pair.table["device_id"] == change["device_id"]
-                )
+            with closing(pair.queries):
+                same = (pair.table[["timestamp", "device_id"]] == change[["timestamp", "device_id"]]).all(axis=1)
                 if not same.any():
                     raise ArtifactError(f"{files.poses_dir / pair.name}.csv: no row of query {change['timestamp']}.")
                 k = int(np.flatnonzero(same)[0])
                 title = f"{comparison.names[i]}: {pair.table['status'].iloc[k]}"
                 drawn.append((title, draw_localization(pair.details(k), title=title, unit=pair.unit)))
-            finally:
-                pair.queries.close()
     return drawn
 
 
@@ -477,13 +467,22 @@ def write_comparison(comparison: Comparison, path: str | Path | None = None, pic
         if len(stem) > 100:
             stem = f"{comparison.names[0].replace('/', '-')}_and_{len(comparison.names) - 1}_more"
         path = comparison.folders[0].resolve().parent / f"compare_{stem}.html"
-    names, messages = comparison.names, list(comparison.messages)
+    names, messages, looks = comparison.names, list(comparison.messages), list[tuple[str, list[Picture]]]()
     with tempfile.TemporaryDirectory() as folder:
         album = _Album(Path(folder), PICTURE_BUDGET, [])
-        save_figure(draw_differences(comparison), Path(folder) / "differences.png")
+
+        def picture(drawn: "Figure", title: str, caption: str = "") -> Picture:
+            path = save_figure(drawn, Path(folder) / "picture.png")
+            return replace(album.picture(path, title, caption), path="")  # the file does not stay
+
         caption = "Right of the line a run is better than the first; an interval that crosses it may be chance."
-        figure = replace(album.picture(Path(folder) / "differences.png", "Differences", caption), path="")
-        looks = _looks(comparison, pictures, album, messages)
+        figure = picture(draw_differences(comparison), "Differences", caption)
+        for title, drawn in draw_changes(comparison, pictures):
+            shown = [picture(of_run, name) for name, of_run in drawn]
+            if not drawn:
+                messages.append(title)
+            elif all(one.data for one in shown):
+                looks.append((title, shown))
     page = page_template("comparison.html.j2").render(
         run={"name": f"{names[1] if len(names) == 2 else f'{len(names) - 1} runs'} against {names[0]}"},
         folders=list(zip(names, map(str, comparison.folders), comparison.records, strict=True)),
@@ -525,23 +524,6 @@ def draw_changes(
                 yield f"No picture of {query}: {error}", []
 
 
-def _looks(comparison: Comparison, most: int, album: _Album, messages: list[str]) -> list[tuple[str, list[Picture]]]:
-    """Return pictures of queries won and lost."""
-    looks = []
-    for number_, (title, drawn) in enumerate(draw_changes(comparison, most)):
-        if not drawn:
-            messages.append(title)
-            continue
-        shown = []
-        for run, (name, figure) in enumerate(drawn):
-            file = album.run_dir / f"{number_}_{run}.png"
-            save_figure(figure, file)
-            shown.append(replace(album.picture(file, name), path=""))
-        if all(picture.data for picture in shown):
-            looks.append((title, shown))
-    return looks
-
-
 def _name(change: "pd.Series[Any] | Mapping[str, Any]") -> str:
     """Return what a query is called: its image's name, of a long one that of the file; or its timestamp."""
     image = change.get("image")
@@ -581,13 +563,13 @@ def _recall_table(comparison: Comparison, threshold: str) -> Table:
     for pair, group in chosen.groupby(_PAIR, sort=False):
         by_run = group.to_dict("records")
         several = chosen["scene"].nunique() > 2 and pair[0] != ALL
-        cells = [Cell(f"{pair[0]} {pair[1]}" if several else pair[1]), Cell(pair[2]), Cell(str(by_run[0]["queries"]))]
+        cells = [f"{pair[0]} {pair[1]}" if several else pair[1], pair[2], by_run[0]["queries"]]
         recalls = [Cell(_interval(row, "recall"), 0.9 * row["recall"]) for row in by_run]
-        changes = [[Cell(text) for text in (_interval(r, "difference"), str(r["won"]), str(r["lost"]))] for r in by_run]
-        changes[0] = [Cell("")] * 3  # to itself
+        changes = [[_interval(row, "difference"), row["won"], row["lost"]] for row in by_run]
+        changes[0] = [""] * 3  # to itself
         if below:
             named = zip(comparison.names, recalls, changes, strict=True)
-            rows += [[*cells, Cell(name), recall, *change] for name, recall, change in named]
+            rows += [[*cells, name, recall, *change] for name, recall, change in named]
         else:
             rows.append([*cells, *recalls, *changes[1]])
     caption = f"Recall at {_threshold(threshold)} in %, and the differences in percentage points"
@@ -605,8 +587,8 @@ def _changes_table(comparison: Comparison) -> Table | None:
         i = row["run"]
         texts = [comparison.names[i]] if several else []
         texts += [row["change"], _limits(comparison, row["at"]), f"{row['query_device']} in {row['map_device']} map"]
-        texts += [_off_by(row[f"{_ERRORS[0]}_{j}"], row[f"{_ERRORS[1]}_{j}"], unit) for j in (0, i)]
-        rows.append([Cell(text) for text in (*texts, row[f"status_{i}"].replace("_", " "), _name(row))])
+        texts += [_off_by(row, after=f"_{j}", unit=unit) for j in (0, i)]
+        rows.append([*texts, row[f"status_{i}"].replace("_", " "), _name(row)])
     rest = f"; {MOST_ROWS} of them, all with --json" if len(table) > MOST_ROWS else ""
     counts = table["change"].value_counts()
     caption = f"Queries within a threshold in one run only: {counts.get('won', 0)} won, {counts.get('lost', 0)} lost"
@@ -622,12 +604,11 @@ def _resources_table(comparison: Comparison) -> Table:
         columns += [f"{name}: time", "peak memory"]
     longest = comparison.resources.filter(like="seconds_").iloc[:-1].max(axis=None)
     for row in comparison.resources.to_dict("records"):
-        cells = [Cell(row["stage"])]
+        cells = [row["stage"]]
         for i in range(len(comparison.names)):
             seconds = row[f"seconds_{i}"]
             bar = seconds / longest if row["stage"] != ALL and seconds > 0 else None
-            cells += [Cell(_time(seconds), bar=bar)]
-            cells += [Cell(_memory(row[f"memory_mb_{i}"]))]
+            cells += [Cell(_seconds(seconds), bar=bar), _memory(row[f"memory_mb_{i}"])]
         rows.append(cells)
     return Table("Time and peak memory of every stage, start-up of its notebook included", columns, rows)
 
@@ -635,12 +616,7 @@ def _resources_table(comparison: Comparison) -> Table:
 def _settings_table(comparison: Comparison) -> Table | None:
     if comparison.settings.empty:
         return None
-    rows = [[Cell(str(value)) for value in row] for row in comparison.settings.to_numpy()]
-    return Table("Settings that differ", ["setting", *comparison.names], rows)
-
-
-def _off_by(rotation_deg: float, translation: float, unit: str) -> str:
-    return f"{number(rotation_deg)}°, {_length(translation, unit)}" if math.isfinite(rotation_deg) else "no pose"
+    return Table("Settings that differ", ["setting", *comparison.names], comparison.settings.to_numpy().tolist())
 
 
 def _signed(share: float) -> str:
@@ -654,10 +630,6 @@ def _bounds(row: Mapping[str, Any], name: str) -> str:
 
 def _interval(row: Mapping[str, Any], name: str) -> str:
     return f"{(_signed if name == 'difference' else percent)(row[name])} [{_bounds(row, name)}]"
-
-
-def _time(seconds: float) -> str:
-    return _seconds(None if math.isnan(seconds) else seconds)
 
 
 def _memory(megabytes: float) -> str:

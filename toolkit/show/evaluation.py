@@ -169,13 +169,11 @@ def draw_error_curves(errors: pd.DataFrame, thresholds: Sequence[Threshold] = TH
     queries, maps = in_order(errors["query_device"]), in_order(errors["map_device"])
     figure = new_figure(3.6 * len(queries) + 0.8, 6.0)
     axes = figure.subplots(2, len(queries), squeeze=False, sharey=True, sharex="row")
-    quantities = [
-        ("translation_error_m", f"translation error [{unit}]", 1), ("rotation_error_deg", "rotation error [°]", 0)
-    ]  # fmt: skip
-    for row, (column, label, part) in enumerate(quantities):
+    labels = {"translation_error_m": f"translation error [{unit}]", "rotation_error_deg": "rotation error [°]"}
+    for row, (column, label) in enumerate(labels.items()):
         finite = errors[column].to_numpy(float)
         finite = np.maximum(finite[np.isfinite(finite)], 1e-4)
-        marks = sorted({t[part] for t in thresholds})
+        marks = sorted({threshold[1 - row] for threshold in thresholds})
         low, high = min([*finite, *marks]), max([*finite, *marks])
         for axis, query in zip(axes[row], queries, strict=True):
             for map_ in maps:
@@ -188,11 +186,8 @@ def draw_error_curves(errors: pd.DataFrame, thresholds: Sequence[Threshold] = TH
                           color=color_of(map_), label=f"{map_} map")  # fmt: skip
             for mark in marks:
                 axis.axvline(mark, color="0.45", lw=0.9, ls=":", label="thresholds" if mark == marks[0] else None)
-            axis.set_xscale("log")
-            axis.set_xlim(low / 1.5, high * 1.5)
+            axis.set(xscale="log", xlim=(low / 1.5, high * 1.5), ylim=(0, 102), xlabel=label)
             plain_log(axis, "x")
-            axis.set_ylim(0, 102)
-            axis.set_xlabel(label)
             axis.grid(alpha=0.25)
             if row == 0:
                 axis.set_title(f"{query} queries", fontsize=10)
@@ -227,10 +222,8 @@ def draw_reliability(errors: pd.DataFrame, unit: str = "m") -> "Figure":
         axis.annotate(
             str(count), (x, 100 * share), offset, textcoords="offset points", ha=side, fontsize=8, color="0.3"
         )
-    axis.set_xlim(-3, 103)
-    axis.set_ylim(-3, 103)
-    axis.set_xlabel("stated probability of being right [%]")
-    axis.set_ylabel("poses that are right [%]")
+    axis.set(xlim=(-3, 103), ylim=(-3, 103))
+    axis.set(xlabel="stated probability of being right [%]", ylabel="poses that are right [%]")
     axis.legend(frameon=False, fontsize=8, loc="upper left")
     axis.grid(alpha=0.25)
     figure.suptitle(f"How far stated probabilities hold (right: {_limit(WRONG, unit)})")
@@ -263,8 +256,7 @@ def draw_deviations(errors: pd.DataFrame, unit: str = "m") -> "Figure":
         axis.plot(*middles.T, color="0.15", lw=1.5, marker="o", ms=3, label="median of a tenth of the poses")
     axis.set(xscale="log", yscale="log", xlim=(low, high), ylim=(low, high))
     plain_log(axis, "xy")
-    axis.set_xlabel(f"stated standard deviation of the position [{unit}]")
-    axis.set_ylabel(f"error of the position [{unit}]")
+    axis.set(xlabel=f"stated standard deviation of the position [{unit}]", ylabel=f"error of the position [{unit}]")
     axis.grid(alpha=0.25)
     axis.legend(frameon=False, fontsize=8, loc="upper left")
     figure.suptitle("How far stated deviations hold")
@@ -296,13 +288,11 @@ def draw_losses(losses: pd.DataFrame) -> "Figure":
             left += share
         for y, value in enumerate(left):
             axis.text(value + 0.012 * widest, y, f"{value:.0f}", va="center", fontsize=8, color="0.3")
-        axis.set_xlim(0, widest)
+        axis.set(xlim=(0, widest), xlabel="queries [%]")
         axis.set_title(f"missed @ {_limit(parse_threshold(threshold), unit_of(threshold))}", fontsize=10)
-        axis.set_xlabel("queries [%]")
         axis.grid(axis="x", alpha=0.25)
     axes[0].set_yticks(range(len(pairs)), [f"{q} in {m} map" for m, q in pairs])
     axes[0].invert_yaxis()
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=9)
     figure.suptitle("Where accuracy was lost")
     return figure

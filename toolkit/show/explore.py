@@ -157,8 +157,7 @@ def draw_similarity(embeddings: str | Path, limit: int = 300) -> "Figure":
     products = [row @ column.T for row, column in zip(rows, columns, strict=True)]
     values = products[0] if len(products) == 1 else fuse(products)
     image = plot.imshow(values, aspect="auto", interpolation="nearest", cmap="viridis")
-    plot.set_xlabel(f"images of {map_}")
-    plot.set_ylabel(f"images of {query}")
+    plot.set(xlabel=f"images of {map_}", ylabel=f"images of {query}")
     figure.colorbar(image, label="cosine similarity" if len(products) == 1 else "fused similarity")
     return figure
 

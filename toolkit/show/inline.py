@@ -10,7 +10,7 @@ from typing import Any
 from toolkit.errors import ArtifactError
 from toolkit.runs.kernel import TEXT_BARS
 from toolkit.show.pictures import as_jpeg
-from toolkit.show.recordings import open_command
+from toolkit.show.viewer import open_command
 
 ASSETS = "RERUN_NOTEBOOK_ASSET"
 """Variable of the viewer's package: where the page gets the viewer from. Read when the package is imported."""

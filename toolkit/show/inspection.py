@@ -175,11 +175,9 @@ class InspectedPair:
         """
         if query == WORST and len(self):
             return self.worst_first()[0]
-        session = self.localized.query_session
-        of_images = {
-            session.image_name(int(row)): number for number, rows in enumerate(self.localized.rows) for row in rows
-        }
-        return find_query(query, of_images, len(self))
+        names = self.localized.query_session.image_names
+        images = {names[row]: number for number, rows in enumerate(self.localized.rows) for row in rows}
+        return find_query(query, images, len(self))
 
     def look(self, query: int | str = 0) -> Inspection:
         """Return a query as the stage left it.
@@ -202,9 +200,8 @@ class InspectedPair:
             self.settings, float(row.get("seconds", np.nan)), self._true(number), self._retrieved(number), of=self,
         )  # fmt: skip
 
-    def localize(self, query: int | str, changes: Mapping[str, Any]) -> Inspection:
+    def localize(self, number: int, changes: Mapping[str, Any]) -> Inspection:
         """Localize a query again; see `Inspection.again`."""
-        number = self.number_of(query)
         settings = self._again.settings(changes)
         estimate, localized, seconds = self._again.localize(self.localized.rows[number], settings)
         method = label(settings, "" if estimate.world_from_rig is None else estimate.found_by)

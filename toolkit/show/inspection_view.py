@@ -21,7 +21,7 @@ from toolkit.show.choice import shown_name
 from toolkit.show.figures import BLUE, ESTIMATED, GRAY, GREEN, MAP, ORANGE, SKY, TRUE, new_figure, number, styled
 from toolkit.show.localized import ShownImage, sure_points
 from toolkit.show.metrics import is_posed
-from toolkit.show.top_view import ground_axes, places_of
+from toolkit.show.top_view import draw_dots, draw_headings, ground_axes, places_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -89,7 +89,7 @@ def draw_inspection(one: Answer) -> "Figure":
     _draw_from_above(from_above, [(one, "estimated", ESTIMATED)])
     _draw_near(near, [(one, "estimated", ESTIMATED)])
     _draw_table(table, [one])
-    name = _short(shown_name(one.name), 110)
+    name = shown_name(one.name, 110)
     figure.suptitle(f"{one.headline}\n{name}\n{textwrap.fill(one.reason, 130)}", fontsize=10)
     return figure
 
@@ -276,36 +276,34 @@ def _draw_from_above(axis: "Axes", named: Named) -> None:
             low = np.minimum(low, np.percentile(cloud[near], 2, axis=0))
             high = np.maximum(high, np.percentile(cloud[near], 98, axis=0))
     rivals = [(rival.world_from_rig @ _rig_from_first(one), rival.support) for rival in named[-1][0].rivals or ()]
-    every = [*(pose for pose, _, _, _ in shown), *(pose for pose, _ in rivals)]
+    every = [*(pose for pose, _, _ in shown), *(pose for pose, _ in rivals)]
     answers = flat(np.array(every).reshape(-1, 4, 4)[:, :3, 3])
     reached = answers[((answers > low - span) & (answers < high + span)).all(1)]
     low, high = _bounds([low[None], high[None], reached])
     middle, half = (low + high) / 2, 0.55 * max(float((high - low).max()), 1.0)
     outside = []
-    _dots(axis, cloud, s=1, c="0.75", lw=0, rasterized=True)
-    _dots(axis, np.zeros((0, 2)), s=9, c="0.75", lw=0, label="map points")  # large enough for a legend
-    _dots(axis, cameras[here], s=7, c=MAP, lw=0, label="map cameras")
+    draw_dots(axis, cloud, s=1, c="0.75", lw=0, rasterized=True)
+    axis.scatter([], [], s=9, c="0.75", lw=0, label="map points")  # large enough for a legend
+    draw_dots(axis, cameras[here], s=7, c=MAP, lw=0, label="map cameras")
     length = 0.16 * half
     if len(seen):
-        _headings(axis, flat(seen[:, :3, 3]), seen, axes, length, ORANGE)
-        _dots(axis, flat(seen[:, :3, 3]), s=16, c=ORANGE, lw=0, label="references")
+        draw_headings(axis, flat(seen[:, :3, 3]), seen, axes, length, colors=ORANGE, linewidths=1.2)
+        draw_dots(axis, flat(seen[:, :3, 3]), s=16, c=ORANGE, lw=0, label="references")
     for pose, support in rivals:
         at = flat(pose[:3, 3])
         if (np.abs(at - middle) > half).any():
             outside.append(f"rival ({support:.0%})")
             continue
-        _headings(axis, at[None], pose[None], axes, length, BLUE)
+        draw_headings(axis, at[None], pose[None], axes, length, colors=BLUE, linewidths=1.2)
         name = f"rival, {support:.0%} of the support"
-        _dots(axis, at, s=40, marker="D", facecolors="white", edgecolors=BLUE, label=name)
-    for pose, name, color, marker in shown:
+        draw_dots(axis, at, s=40, marker="D", facecolors="white", edgecolors=BLUE, label=name)
+    for pose, name, color in shown:
         at = flat(pose[:3, 3])
         if (np.abs(at - middle) > half).any():
             outside.append(name)
             continue
-        _headings(axis, at[None], pose[None], axes, 1.5 * length, color)
-        hollow = marker == "o" and color == TRUE
-        _dots(axis, at, s=70 if hollow else 34, marker=marker, facecolors="none" if hollow else color,
-              edgecolors=color, lw=1.3, zorder=5, label=name)  # fmt: skip
+        draw_headings(axis, at[None], pose[None], axes, 1.5 * length, colors=color, linewidths=1.2)
+        _draw_place(axis, at, name, color, 34)
     axis.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), aspect="equal")
     axis.set(xlabel=labels[0], ylabel=labels[1])
     far = f"\noutside the picture: {', '.join(outside)}" if outside else ""
@@ -327,7 +325,7 @@ def _draw_near(axis: "Axes", named: Named) -> None:
     unit_name, unit = first.pair.unit
     origin = _first_camera(first)[:3, 3]
     reach, ellipses = [], []
-    for pose, _, _, _ in _cameras_of(named):
+    for pose, _, _ in _cameras_of(named):
         reach.append(float(np.abs((pose[:3, 3] - origin) / unit @ axes.T).max()))
     for one, name, color in posed:
         if one.covariance is None:
@@ -343,15 +341,12 @@ def _draw_near(axis: "Axes", named: Named) -> None:
         at = (_first_camera(one)[:3, 3] - origin) / unit @ axes.T * factor
         axis.add_patch(Ellipse((float(at[0]), float(at[1])), factor * sizes[1], factor * sizes[0], angle=angle,
                                facecolor=color, alpha=0.2, label=f"95 % region, {name}"))  # fmt: skip
-    for pose, name, color, marker in _cameras_of(named):
-        at = (pose[:3, 3] - origin) / unit @ axes.T * factor
-        hollow = color == TRUE
-        _dots(axis, at, s=70 if hollow else 30, marker=marker, facecolors="none" if hollow else color,
-              edgecolors=color, lw=1.3, zorder=5, label=name)  # fmt: skip
+    for pose, name, color in _cameras_of(named):
+        _draw_place(axis, (pose[:3, 3] - origin) / unit @ axes.T * factor, name, color, 30)
     half *= factor
     axis.set(xlim=(-half, half), ylim=(-half, half), aspect="equal")
-    axis.set_xlabel(f"{_axis_name(labels[0])}, from the pose [{small}]")
-    axis.set_ylabel(f"{_axis_name(labels[1])}, from the pose [{small}]")
+    right, up = (f"{label.partition(' [')[0]}, from the pose [{small}]" for label in labels)
+    axis.set(xlabel=right, ylabel=up)
     missing = "" if ellipses else ": the method states no uncertainty"
     axis.set_title(f"the pose, enlarged{missing}", fontsize=9)
     axis.grid(alpha=0.25)
@@ -361,10 +356,6 @@ def _draw_near(axis: "Axes", named: Named) -> None:
 def _digits(value: float) -> str:
     """Return a number with two digits that count: an error of a fraction of a millimeter is not 0.000 m."""
     return np.format_float_positional(value, 2, fractional=False, trim="-") if value < 0.1 else number(value)
-
-
-def _axis_name(label: str) -> str:
-    return label.partition(" [")[0]
 
 
 def _draw_table(axis: "Axes", ones: Sequence[Answer]) -> None:
@@ -413,13 +404,13 @@ def _first_camera(one: Answer) -> Floats:
     return np.asarray(one.pose @ _rig_from_first(one))
 
 
-def _cameras_of(named: Named) -> list[tuple[Floats, str, str, str]]:
-    """Return world_from_cam, name, color and marker of answers that have a pose, and of the truth if it is known."""
+def _cameras_of(named: Named) -> list[tuple[Floats, str, str]]:
+    """Return world_from_cam, name and color of answers that have a pose, and of the truth if it is known."""
     # Of a rig, the image that the first answer shows stands for all.
     rig_from_cam = _rig_from_first(named[0][0])
-    shown = [(one.pose @ rig_from_cam, name, color, "o") for one, name, color in named if one.pose is not None]
+    shown = [(one.pose @ rig_from_cam, name, color) for one, name, color in named if one.pose is not None]
     true = named[0][0].true_pose
-    return [*shown, *([] if true is None else [(true @ rig_from_cam, "true", TRUE, "o")])]
+    return [*shown, *([] if true is None else [(true @ rig_from_cam, "true", TRUE)])]
 
 
 def _position_covariance(one: Answer) -> Floats:
@@ -435,15 +426,10 @@ def _position_covariance(one: Answer) -> Floats:
     return np.asarray(moves @ one.covariance @ moves.T)
 
 
-def _headings(axis: "Axes", positions: Floats, poses: Floats, axes: Floats, length: float, color: str) -> None:
-    """Draw a line in the direction that each camera looks."""
-    ends = positions + length * poses[:, :3, 2] @ axes.T
-    axis.add_collection(LineCollection(list(np.stack([positions, ends], axis=1)), colors=color, linewidths=1.2))
-
-
-def _dots(axis: "Axes", xy: Floats, **style: Any) -> None:
-    x, y = np.reshape(xy, (-1, 2)).T
-    axis.scatter(x, y, **style)
+def _draw_place(axis: "Axes", at: Floats, name: str, color: str, size: float) -> None:
+    """Draw where a camera stands; the truth is a ring, in which an answer is seen."""
+    style: dict[str, Any] = {"s": 70, "facecolors": "none"} if color == TRUE else {"s": size, "facecolors": color}
+    draw_dots(axis, at, edgecolors=color, lw=1.3, zorder=5, label=name, **style)
 
 
 def _bounds(parts: Sequence[Floats]) -> tuple[Floats, Floats]:
@@ -454,7 +440,3 @@ def _bounds(parts: Sequence[Floats]) -> tuple[Floats, Floats]:
 
 def _camera_name(image: ShownImage) -> str:
     return Path(image.name).parent.name
-
-
-def _short(name: str, longest: int) -> str:
-    return name if len(name) <= longest else f"…{name[-longest + 1 :]}"

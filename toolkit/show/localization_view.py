@@ -12,22 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from toolkit.capture.images import read_for_display
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.geometry import Floats, project
+from toolkit.show import viewer
 from toolkit.show.figures import ESTIMATED, GREEN, MAP, ORANGE, SKY, TRUE, draw_error_legend, error_colors
 from toolkit.show.localized import REFERENCES, Localizations, QueryDetails, ShownImage, support_of
 from toolkit.show.metrics import is_posed
-from toolkit.show.viewer import (
-    HIDDEN_M,
-    camera_depth_m,
-    jpeg_of,
-    log_points,
-    open_recording,
-    pinhole_of,
-    rgb,
-    scene_view,
-    small_jpeg,
-    transform_of,
-    world_axes,
-)
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -50,7 +38,6 @@ def record_localizations(
     localizations: Localizations,
     details: Iterable[tuple[int, QueryDetails]] = (),
     up: ArrayLike | None = None,
-    image_size: int = 480,
     ways: Mapping[str, Sequence[Floats]] | None = None,
 ) -> Path:
     """Write a recording of queries in a map, and return its path.
@@ -66,22 +53,26 @@ def record_localizations(
         colors: (P, 3) RGB or None.
         details: number and details of those that can be chosen; taken one at a time.
         up: direction (3,) that is up; None: estimated from the map's cameras.
-        image_size: longer side of the images, pixels.
         ways: of the queries' recordings, the places (n, 3) of each piece: `odometry`, laid in the map as a whole, and
             `frames`, as the sequence stage has found them.
     """
+    import rerun as rr
+
     started = time.perf_counter()
     poses = map_poses[is_posed(map_poses)]
     up = np.asarray(up_of_cameras(poses) if up is None else up, np.float64)
-    size = camera_depth_m(poses[:, :3, 3])
+    size = viewer.camera_depth_m(poses[:, :3, 3])
     count = 0
-    with open_recording(out, name, _layout(name, poses, up)) as stream:
-        stream.log("world", world_axes(up), static=True)
-        log_points(stream, points, colors)
+    with viewer.open_recording(out, name, _layout(name, poses, up)) as stream:
+        stream.log("world", viewer.world_axes(up), static=True)
+        viewer.log_points(stream, points, colors)
         _log_map_cameras(stream, poses, size)
         _log_overview(stream, localizations)
-        _log_ways(stream, ways or {})
-        writer = _ChosenWriter(stream, localizations, image_size, 2 * size)
+        for way, color in (("odometry", ORANGE), ("frames", SKY)):
+            if ways and ways.get(way):
+                lines = rr.LineStrips3D(ways[way], colors=viewer.rgb(color))
+                stream.log(f"world/recording/{way}", lines, static=True)
+        writer = _ChosenWriter(stream, localizations, 2 * size)
         for number, chosen in details:
             writer.write(number, chosen)
             count += 1
@@ -94,7 +85,7 @@ def _layout(name: str, poses: Floats, up: Floats) -> Any:
     """Return the viewer's layout: the scene, and beside it the chosen query, its references, and a page about it."""
     import rerun.blueprint as rrb
 
-    scene = scene_view(poses, up, name)
+    scene = viewer.scene_view(poses, up, name)
     # The pictures' marks belong on the pictures; on the image planes in the scene they would hide it.
     hidden = [f"- /world/chosen/camera_{k}/marks/**" for k in range(MAX_CAMERAS)]
     hidden += [f"- /world/references/{rank}/marks/**" for rank in range(1, REFERENCES + 1)]
@@ -126,7 +117,7 @@ def _log_map_cameras(stream: "rr.RecordingStream", poses: Floats, size: float) -
     corners = size * np.array([[0, 0, 0], [-0.4, -0.3, 1], [0.4, -0.3, 1], [0.4, 0.3, 1], [-0.4, 0.3, 1.0]])
     outline = corners[[0, 1, 2, 0, 3, 4, 0, 1, 4, 3, 2]]
     lines = np.einsum("nij,kj->nki", poses[:, :3, :3], outline) + poses[:, None, :3, 3]
-    stream.log("world/map_cameras", rr.LineStrips3D(lines.astype(np.float32), colors=rgb(MAP)), static=True)
+    stream.log("world/map_cameras", rr.LineStrips3D(lines.astype(np.float32), colors=viewer.rgb(MAP)), static=True)
 
 
 def _log_overview(stream: "rr.RecordingStream", queries: Localizations) -> None:
@@ -141,35 +132,23 @@ def _log_overview(stream: "rr.RecordingStream", queries: Localizations) -> None:
         style = {"colors": color, "radii": rr.Radius.ui_points(radius), "show_labels": False}
         stream.log(path, rr.Points3D(centers[rows], labels=labels[rows].tolist(), **style), static=True)
 
-    dots("world/queries/true", has_truth, queries.true[:, :3, 3], rgb(TRUE), 3)
+    dots("world/queries/true", has_truth, queries.true[:, :3, 3], viewer.rgb(TRUE), 3)
     dots("world/queries/estimated", located, queries.estimated[:, :3, 3], colors[located], 5)
     both = located & has_truth
     lines = np.stack([queries.estimated[both, :3, 3], queries.true[both, :3, 3]], axis=1)
     stream.log("world/queries/error", rr.LineStrips3D(lines.astype(np.float32), colors=colors[both]), static=True)
     if len(queries.nearest_reference):
         lost = ~located & np.isfinite(queries.nearest_reference).all(1)
-        dots("world/queries/failed", lost, queries.nearest_reference, rgb(ESTIMATED), 9)
+        dots("world/queries/failed", lost, queries.nearest_reference, viewer.rgb(ESTIMATED), 9)
     legend = draw_error_legend(queries.unit[0])
     stream.log("legend", rr.EncodedImage(contents=legend, media_type="image/png"), static=True)
-
-
-def _log_ways(stream: "rr.RecordingStream", ways: Mapping[str, Sequence[Floats]]) -> None:
-    """Log the ways of recordings as lines."""
-    import rerun as rr
-
-    for name, color in (("odometry", ORANGE), ("frames", SKY)):
-        if ways.get(name):
-            stream.log(f"world/recording/{name}", rr.LineStrips3D(ways[name], colors=rgb(color)), static=True)
 
 
 class _ChosenWriter:
     """Logs one query after the other, each in place of the one before."""
 
-    def __init__(
-        self, stream: "rr.RecordingStream", queries: Localizations, image_size: int, camera_depth_m: float
-    ) -> None:
-        self._stream, self._queries = stream, queries
-        self._image_size, self._depth_m = image_size, camera_depth_m
+    def __init__(self, stream: "rr.RecordingStream", queries: Localizations, camera_depth_m: float) -> None:
+        self._stream, self._queries, self._depth_m = stream, queries, camera_depth_m
         self._sizes: dict[str, tuple[int, int]] = {}
         """Width and height of the pictures last logged, by entity."""
 
@@ -189,17 +168,17 @@ class _ChosenWriter:
             camera, true = query.cameras[0].camera, query.cameras[0].world_from_cam_true
             has_truth = bool(is_posed(true))
             if has_truth:
-                self._stream.log("world/truth/camera_0", transform_of(true))
+                self._stream.log("world/truth/camera_0", viewer.transform_of(true))
             shown = (camera.width, camera.height)
-            pinhole = pinhole_of(camera, shown, self._depth_m if has_truth else HIDDEN_M, TRUE)
+            pinhole = viewer.pinhole_of(camera, shown, self._depth_m if has_truth else viewer.HIDDEN_M, TRUE)
             self._stream.log("world/truth/camera_0", pinhole)
         points = np.concatenate([np.zeros((0, 3)), *(image.points[image.inlier] for image in query.cameras)])
-        dots = rr.Points3D(points, colors=rgb(GREEN), radii=rr.Radius.ui_points(3))
+        dots = rr.Points3D(points, colors=viewer.rgb(GREEN), radii=rr.Radius.ui_points(3))
         self._stream.log("world/chosen_points", dots)
         center = self._queries.estimated[number, :3, 3]
         lines = [np.stack([center, image.world_from_cam[:3, 3]]) for image in query.references]
         located = bool(is_posed(self._queries.estimated[number]))
-        self._stream.log("world/lines", rr.LineStrips3D(lines if located else [], colors=rgb(ORANGE)))
+        self._stream.log("world/lines", rr.LineStrips3D(lines if located else [], colors=viewer.rgb(ORANGE)))
         text = [f"**query {number}: {describe(self._queries, number)}**", ""]
         text += [f"- {image.name}" for image in query.cameras]
         if query.has_matches:
@@ -222,27 +201,28 @@ class _ChosenWriter:
             # Of the last one's size: the viewer takes pictures of an entity for frames of a film.
             width, height = self._sizes.get(path, (4, 3))
             blank = np.full((height, width, 3), 60, np.uint8)
-            stream.log(f"{path}/image", jpeg_of(small_jpeg(blank, max(blank.shape))[0]))
+            data, _ = viewer.small_jpeg(blank, max(blank.shape))
             # A camera of any kind, too small to be seen.
-            stream.log(path, rr.Pinhole(focal_length=1, width=1, height=1, image_plane_distance=HIDDEN_M))
+            stream.log(path, rr.Pinhole(focal_length=1, width=1, height=1, image_plane_distance=viewer.HIDDEN_M))
         else:
-            data, shown = small_jpeg(read_for_display(image.path), self._image_size)
+            data, shown = viewer.small_jpeg(read_for_display(image.path), viewer.IMAGE_SIZE)
             self._sizes[path] = shown
             located = bool(is_posed(image.world_from_cam))
             if located:
-                stream.log(path, transform_of(image.world_from_cam))
-            stream.log(path, pinhole_of(image.camera, shown, self._depth_m if located else HIDDEN_M, color))
-            stream.log(f"{path}/image", jpeg_of(data))
+                stream.log(path, viewer.transform_of(image.world_from_cam))
+            depth_m = self._depth_m if located else viewer.HIDDEN_M
+            stream.log(path, viewer.pinhole_of(image.camera, shown, depth_m, color))
             scale = np.array(shown) / [image.camera.width, image.camera.height]
             measured, inlier = image.pixels * scale, image.inlier
             if located and residuals and inlier.any():
                 pixels, visible = project(image.points[inlier], image.camera, image.world_from_cam)
                 predicted = pixels[visible] * scale
                 lines = np.stack([measured[inlier][visible], predicted], axis=1)
+        stream.log(f"{path}/image", rr.EncodedImage(contents=data, media_type="image/jpeg"))
         for name, marks, shade, radius in (
-            ("reprojected", predicted, rgb(GREEN), 2.5),
+            ("reprojected", predicted, viewer.rgb(GREEN), 2.5),
             ("measured", measured[inlier], WHITE, 1.5),
-            ("rejected", measured[~inlier], rgb(ORANGE), 1.5),
+            ("rejected", measured[~inlier], viewer.rgb(ORANGE), 1.5),
         ):
             dots = rr.Points2D(marks, colors=shade, radii=rr.Radius.ui_points(radius))
             stream.log(f"{path}/marks/{name}", dots)

@@ -21,26 +21,10 @@ from toolkit.errors import ArtifactError, CaptureError, ImageError
 from toolkit.files import file_fingerprint, files_fingerprint, write_sidecar
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.correspondences import LocalizedQueries, LocalizedQuery
+from toolkit.show import viewer
 from toolkit.show.figures import ORANGE
 from toolkit.show.localized import load_maps, map_files, sure_points
 from toolkit.show.metrics import is_posed
-from toolkit.show.viewer import (
-    HIDDEN_M,
-    camera_depth_m,
-    entity,
-    jpeg_of,
-    log_points,
-    open_command,
-    open_recording,
-    pinhole_of,
-    rgb,
-    scene_view,
-    shown_intrinsics,
-    small_jpeg,
-    spawn_viewer,
-    transform_of,
-    world_axes,
-)
 
 if TYPE_CHECKING:
     import pycolmap
@@ -78,7 +62,7 @@ class SessionRecording:
     @property
     def command(self) -> str:
         """The command that opens it."""
-        return open_command(self.path)
+        return viewer.open_command(self.path)
 
 
 def record_session(
@@ -94,10 +78,8 @@ def record_session(
     out: str | Path | None = None,
     map_dir: str | Path | None = None,
     queries: str = "keyframes_pruned_subsampled",
-    image_size: int = 480,
-    quality: int = 75,
+    image_size: int = viewer.IMAGE_SIZE,
     world_up: ArrayLike | None = None,
-    workers: int | None = None,
     progress: bool = True,
 ) -> SessionRecording:
     """Record a session for the rerun viewer; memory does not grow with its length.
@@ -129,14 +111,14 @@ def record_session(
             points of the map that `queries_pose` is named after. With `queries_pose`, of the maps that it was found
             with; else of all of the session.
         image_size: longer side of the images shown, pixels; depth maps have half of it.
-        quality: of JPEG, 1 to 100.
         world_up: direction (3,) that is up; None: estimated from the cameras.
-        workers: threads that read and shrink; None: the cores at hand.
 
     Raises:
         CaptureError: unknown session, subsession or keyframe list.
         ArtifactError: `vis_retrieve_queries` without the h5 of `queries_pose`, or for another session.
     """
+    import rerun as rr
+
     started = time.perf_counter()
     if every < 1:
         raise CaptureError(f"every={every}: expected 1 (every frame) or more.")
@@ -152,7 +134,8 @@ def record_session(
     settings = {
         "images": session.files_fingerprint, "subsession": subsession,
         "session": files_fingerprint([*sorted(session.path.glob("*.txt")), *sorted(session.path.glob("proc/*.txt"))]),
-        "keyframes": queries if keyframes_only else "", "every": every, "image_size": image_size, "quality": quality,
+        "keyframes": queries if keyframes_only else "", "every": every,
+        "image_size": image_size, "quality": viewer.JPEG_QUALITY,
         "queries_pose": "" if poses is None else file_fingerprint(poses), "retrieve": vis_retrieve_queries,
         "points": files_fingerprint(list(maps)),
         "world_up": None if world_up is None else np.asarray(world_up, float).tolist(),
@@ -167,23 +150,27 @@ def record_session(
     if map_dir is not None and local_map is None:
         messages.append(f"{map_dir}: holds no map for this recording, so no points are shown.")
     counts = Counter(frames=len(plan.frames))
-    with open_recording(path, f"{capture.name}_{session.id}", _session_layout(plan, placed, up)) as stream:
-        stream.log("world", world_axes(up), static=True)
+    with viewer.open_recording(path, f"{capture.name}_{session.id}", _session_layout(plan, placed, up)) as stream:
+        stream.log("world", viewer.world_axes(up), static=True)
         if local_map is not None:
             points, colors = sure_points(local_map)
-            log_points(stream, points, colors)
+            viewer.log_points(stream, points, colors)
             counts["points"] = len(points)
-        _log_trajectories(stream, plan, session.device)
+        color = viewer.rgb(color_of(session.device))
+        for name, tracks in plan.tracks.items():
+            # A line a subsession: recordings joined would draw paths nobody went.
+            lines = rr.LineStrips3D([track for track in tracks if len(track) > 1], colors=color)
+            stream.log(f"world/{viewer.entity(name)}/trajectory", lines, static=True)
         if localized is not None:
             _log_queries(stream, localized, session)
             counts["queries"] = len(localized.poses)
-        writer = _FrameWriter(stream, camera_depth_m(placed[:, :3, 3]), color_of(session.device))
+        writer = _FrameWriter(stream, viewer.camera_depth_m(placed[:, :3, 3]), color_of(session.device))
         writer.announce(plan.frames)
 
         def load(number: int) -> list[_Shot]:
-            return [_load(shot, image_size, quality) for shot in plan.shots(number)]
+            return [_load(shot, image_size) for shot in plan.shots(number)]
 
-        loaded = prefetch(load, range(len(plan.frames)), workers or default_workers())
+        loaded = prefetch(load, range(len(plan.frames)), default_workers())
         bar = tqdm(loaded, total=len(plan.frames), desc=session.id, unit="frame", disable=not progress)
         for frame, shots in zip(plan.frames, bar, strict=True):
             counts.update(writer.write(frame, shots))
@@ -196,7 +183,7 @@ def record_session(
     logger.info("%s: %d frames, %d images in %.0f s, %.1f MB", path, recording.frames, recording.images, seconds,
                 size_bytes / 1e6)  # fmt: skip
     if spawn:
-        spawn_viewer(path)
+        viewer.spawn_viewer(path)
     return recording
 
 
@@ -244,7 +231,7 @@ class _Frame:
     def entity(self) -> str:
         """Path of the device, or of the subsession for a camera without one."""
         parts = ["world" if self.posed else "unposed", self.subsession, *([self.device] if self.device else [])]
-        return entity(*parts)
+        return viewer.entity(*parts)
 
 
 @dataclass
@@ -383,7 +370,7 @@ def _names(table: pd.DataFrame, column: str, frame: list[str], kind: str) -> pd.
     return pd.Series(names, index=table.index, dtype=object)
 
 
-def _load(shot: _Shot, image_size: int, quality: int) -> _Shot:
+def _load(shot: _Shot, image_size: int) -> _Shot:
     """Read a picture or depth map and make it small; in a thread."""
     if shot.is_depth:
         try:
@@ -403,7 +390,7 @@ def _load(shot: _Shot, image_size: int, quality: int) -> _Shot:
     except ImageError:
         blank = cv2.resize(read_for_display(shot.path), (shot.camera.width, shot.camera.height))
         image, readable = np.asarray(blank, np.uint8), False
-    data, size = small_jpeg(image, image_size, quality)
+    data, size = viewer.small_jpeg(image, image_size)
     return replace(shot, data=data, size=size, readable=readable)
 
 
@@ -427,26 +414,26 @@ class _FrameWriter:
         self._now = frame
         self._set_time(frame.index, frame.timestamp)
         if frame.posed and frame.device:
-            self._stream.log(frame.entity, transform_of(frame.world_from_device))
+            self._stream.log(frame.entity, viewer.transform_of(frame.world_from_device))
         shown: dict[str, _Shot] = {}
         counts: Counter[str] = Counter()
         for shot in shots:
             counts["unreadable"] += not shot.readable
             if not shot.data:
                 continue
-            path = f"{frame.entity}/{entity(shot.slot)}"
+            path = f"{frame.entity}/{viewer.entity(shot.slot)}"
             shown[path] = shot
             if frame.posed:
                 pose = shot.parent_from_sensor
-                self._log_changed(path, "pose", pose, lambda pose=pose: transform_of(pose))
-            numbers = [*shown_intrinsics(shot.camera, shot.size).ravel(), *shot.size]
+                self._log_changed(path, "pose", pose, lambda pose=pose: viewer.transform_of(pose))
+            numbers = [*viewer.shown_intrinsics(shot.camera, shot.size).ravel(), *shot.size]
             self._log_changed(path, "pinhole", numbers, lambda s=shot: self._pinhole(s, self._size))
             if shot.is_depth:
                 depth = rr.EncodedDepthImage(shot.data, media_type="image/png", meter=DEPTH_SCALE)
                 self._stream.log(f"{path}/depth", depth)
                 counts["depth_maps"] += 1
             else:
-                self._stream.log(f"{path}/image", jpeg_of(shot.data))
+                self._stream.log(f"{path}/image", rr.EncodedImage(contents=shot.data, media_type="image/jpeg"))
                 counts["images"] += 1
                 counts["unposed"] += not frame.posed
         # What this device showed before and does not now would hang on at its old place.
@@ -465,9 +452,9 @@ class _FrameWriter:
         begin: dict[str, int] = {}
         for frame in frames:
             for slot in frame.slots if frame.posed else ():
-                begin.setdefault(f"{frame.entity}/{entity(slot)}", frame.index)
+                begin.setdefault(f"{frame.entity}/{viewer.entity(slot)}", frame.index)
         for path in [path for path, index in begin.items() if index > frames[0].index]:
-            self._stream.log(path, rr.Pinhole(focal_length=1, width=1, height=1, image_plane_distance=HIDDEN_M))
+            self._stream.log(path, rr.Pinhole(focal_length=1, width=1, height=1, image_plane_distance=viewer.HIDDEN_M))
 
     def finish(self) -> None:
         """End a subsession: the instant after its last frame shows none of its cameras."""
@@ -483,11 +470,11 @@ class _FrameWriter:
         self._stream.set_time(CAPTURE_TIME, duration=np.timedelta64(timestamp, "us"))
 
     def _pinhole(self, shot: _Shot, depth_m: float) -> "rr.Pinhole":
-        return pinhole_of(shot.camera, shot.size, depth_m, self._color)
+        return viewer.pinhole_of(shot.camera, shot.size, depth_m, self._color)
 
     def _hide(self, cameras: dict[str, _Shot]) -> None:
         for path, shot in cameras.items():
-            self._stream.log(path, self._pinhole(shot, HIDDEN_M))
+            self._stream.log(path, self._pinhole(shot, viewer.HIDDEN_M))
             self._last.pop((path, "pinhole"), None)
 
     def _log_changed(self, path: str, kind: str, numbers: ArrayLike, make: Any) -> None:
@@ -504,25 +491,15 @@ def _session_layout(plan: _Plan, poses: Floats, up: Floats) -> Any:
     tabs: dict[str, dict[str, str]] = {}
     for frame in plan.frames:
         for slot in frame.slots:
-            tabs.setdefault(frame.subsession, {})[f"{frame.entity}/{entity(slot)}"] = slot
+            tabs.setdefault(frame.subsession, {})[f"{frame.entity}/{viewer.entity(slot)}"] = slot
     views = [
         rrb.Grid(*[rrb.Spatial2DView(origin=path, name=slot) for path, slot in cameras.items()], name=name)
         for name, cameras in list(tabs.items())[:MAX_TABS]
     ]
-    scene = scene_view(poses, up, plan.session.id)
+    scene = viewer.scene_view(poses, up, plan.session.id)
     panel = rrb.TimePanel(state="collapsed", timeline=FRAME, play_state="paused")
     layout = rrb.Horizontal(scene, rrb.Tabs(*views), column_shares=[2, 1]) if views else rrb.Horizontal(scene)
     return rrb.Blueprint(layout, panel, collapse_panels=True)
-
-
-def _log_trajectories(stream: "rr.RecordingStream", plan: _Plan, device: str) -> None:
-    """Log the way of each device, a line a subsession: recordings joined would draw paths nobody went."""
-    import rerun as rr
-
-    color = rgb(color_of(device))
-    for name, tracks in plan.tracks.items():
-        lines = rr.LineStrips3D([track for track in tracks if len(track) > 1], colors=color)
-        stream.log(f"world/{entity(name)}/trajectory", lines, static=True)
 
 
 @dataclass(frozen=True)
@@ -576,8 +553,8 @@ def _log_queries(stream: "rr.RecordingStream", queries: _QueryPoses, session: Se
     poses = queries.poses
     if session.split == "map":
         labels = [f"{time} {device}" for time, device in zip(poses.timestamps, poses.device_ids, strict=True)]
-        dots = rr.Points3D(poses.world_from_device[:, :3, 3], colors=rgb(color_of(queries.query_device)),
+        dots = rr.Points3D(poses.world_from_device[:, :3, 3], colors=viewer.rgb(color_of(queries.query_device)),
                            radii=rr.Radius.ui_points(4), labels=labels, show_labels=False)  # fmt: skip
         stream.log("world/queries/poses", dots, static=True)
     if queries.lines:
-        stream.log("world/queries/references", rr.LineStrips3D(queries.lines, colors=rgb(ORANGE)), static=True)
+        stream.log("world/queries/references", rr.LineStrips3D(queries.lines, colors=viewer.rgb(ORANGE)), static=True)

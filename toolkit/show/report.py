@@ -5,7 +5,7 @@ import glob
 import json
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ from urllib.parse import quote
 import pandas as pd
 
 from toolkit.errors import ArtifactError
-from toolkit.files import SceneFiles, of_sequence, read_map_record, sidecar_path, write_text
+from toolkit.files import SceneFiles, of_sequence, read_json, read_map_record, sidecar_path, write_text
 from toolkit.show.figures import number, percent
 from toolkit.show.metrics import (
     REASONS,
@@ -110,11 +110,14 @@ class Matrix:
 
 @dataclass
 class Table:
-    """A plain table."""
+    """A plain table; what is no cell in its rows is the text of one."""
 
     caption: str
     columns: list[str]
-    rows: list[list[Cell]]
+    rows: list[list[Any]]
+
+    def __post_init__(self) -> None:
+        self.rows = [[cell if isinstance(cell, Cell) else Cell(str(cell)) for cell in row] for row in self.rows]
 
 
 def write_report(run_dir: str | Path) -> Path:
@@ -227,13 +230,13 @@ def _stages(run: dict[str, Any], run_dir: Path) -> Table:
         notebook = run_dir / str(row.get("notebook") or "")
         name = " ".join(str(part) for part in (row.get("stage", ""), row.get("part")) if part)
         rows.append([
-            Cell(str(row.get("scene") or "")),
+            row.get("scene") or "",
             Cell(name, link=_link(run_dir, notebook) if notebook.is_file() else ""),
-            Cell(str(row.get("status", ""))),
+            row.get("status", ""),
             Cell(_seconds(seconds), bar=float(seconds) / longest if seconds and longest else None),
-            Cell(_seconds(work)),
+            _seconds(work),
             Cell(f"{memory:.0f} MB" if memory else "–", bar=float(memory) / largest if memory else None),
-            Cell(counts),
+            counts,
         ])  # fmt: skip
     caption = "Time and peak memory of every stage; a name leads to its executed notebook"
     return Table(caption, ["scene", "stage", "status", "time", "of it work", "peak memory", "counts"], rows)
@@ -248,7 +251,7 @@ def _not_done(run: dict[str, Any]) -> Table | None:
             found.setdefault(key, []).append(str(row.get("stage", "")))
     if not found:
         return None
-    rows = [[*map(Cell, key), Cell(", ".join(dict.fromkeys(stages)))] for key, stages in found.items()]
+    rows = [[*key, ", ".join(dict.fromkeys(stages))] for key, stages in found.items()]
     return Table("Left out, and why", ["scene", "what", "reason", "stages"], rows)
 
 
@@ -264,7 +267,8 @@ def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> dict[str, An
     )
     thresholds = [column for column in recall.columns if column.startswith("recall@")]
     statuses = _read_statuses(files, messages)
-    messages += _messages(files.evaluation / "recall.csv") if len(recall) else []
+    if len(recall):
+        messages += read_json(sidecar_path(files.evaluation / "recall.csv")).get("settings", {}).get("messages", [])
     unit = unit_of(*thresholds)
     small, factor = small_unit(unit)
     remarks, lengths = list[str](), list[str]()
@@ -275,9 +279,6 @@ def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> dict[str, An
     if unit != "m":
         depth = f"a tenth of the median depth that a map shows{': ' if lengths else ''}{', '.join(lengths)}"
         remarks.append(f"The unit of the poses is not known: {unit} is {depth}.")
-    medians = ("median_rotation_deg", "Median rotation error [°]", 1.0), (
-        "median_translation_m", f"Median translation error [{small}]", factor
-    )  # fmt: skip
     verdict, headlines = _verdict(recall, errors, statuses, thresholds)
     matrices, note = _retrieval(retrieval, headlines, unit)
     stills = sorted(files.visualization.glob("*.png"), key=_natural)
@@ -297,9 +298,11 @@ def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> dict[str, An
             _matrix(recall, column, f"Recall at {_threshold(column)} [%]", percent, lambda v: 0.9 * v)
             for column in thresholds
         ],
-        "medians": [
-            _matrix(recall, column, title, lambda v, f=factor: number(v * f))
-            for column, title, factor in (medians if thresholds else ())
+        "medians": thresholds and [
+            _matrix(recall, "median_rotation_deg", "Median rotation error [°]", number),
+            _matrix(
+                recall, "median_translation_m", f"Median translation error [{small}]", lambda v: number(v * factor)
+            ),
         ],
         "pairs": _pairs(recall, thresholds) if len(recall) else None,
         "losses": _losses(losses),
@@ -352,14 +355,6 @@ def _pairs_of(files: SceneFiles) -> dict[tuple[str, str], Path]:
         if devices and not of_sequence(path.stem):
             pairs[devices[1], devices[2]] = path.with_suffix("")
     return pairs
-
-
-def _messages(table: Path) -> list[str]:
-    try:
-        settings = json.loads(sidecar_path(table).read_text(encoding="utf-8"))["settings"]
-    except (OSError, ValueError, KeyError):
-        return []
-    return list(settings.get("messages", []))
 
 
 def _verdict(
@@ -431,12 +426,9 @@ def _pairs(recall: pd.DataFrame, thresholds: list[str]) -> Table:
     small, factor = small_unit(unit_of(*thresholds))
     columns["median_translation_m"] = f"median [{small}]", lambda length: number(factor * length)
     columns["ok_wrong"] = "ok but wrong", lambda share: _share(share).text
-    columns["state"] = "note", lambda state: "" if state == "evaluated" else str(state)
+    columns["state"] = "note", lambda state: "" if state == "evaluated" else state
     shown = {name: column for name, column in columns.items() if name in recall}
-    rows = []
-    for row in recall.to_dict("records"):
-        texts = [write(row[name]) for name, (_, write) in shown.items()]
-        rows.append([text if isinstance(text, Cell) else Cell(text) for text in texts])
+    rows = [[write(row[name]) for name, (_, write) in shown.items()] for row in recall.to_dict("records")]
     titles = [title for title, _ in shown.values()]
     return Table("Counts of queries, recall and median errors of every pair", titles, rows)
 
@@ -447,12 +439,11 @@ def _steps(sequences: pd.DataFrame, thresholds: list[str]) -> Table:
     rows = []
     for step, pairs in sequences.groupby("step", sort=False):
         shares = [_share(float(pairs[name].mean())) for name in thresholds]
-        medians = [float(pairs[f"median_{name}"].median()) for name in ("rotation_deg", "translation_m")]
-        cells = [Cell(str(step)), Cell(str(int(pairs["queries"].sum()))), *shares]
-        cells += [Cell(number(medians[0])), Cell(number(factor * medians[1]))]
-        rows.append(cells + [Cell(str(int(pairs[name].sum()))) for name in ("rescued", "broken")])
+        turned, moved = (float(pairs[f"median_{name}"].median()) for name in ("rotation_deg", "translation_m"))
+        queries, rescued, broken = (int(pairs[name].sum()) for name in ("queries", *CHANGES))
+        rows.append([step, queries, *shares, number(turned), number(factor * moved), rescued, broken])
     titles = ["step", "queries", *(f"recall {_threshold(name)}" for name in thresholds)]
-    titles += ["median [°]", f"median [{small}]", "rescued", "broken"]
+    titles += ["median [°]", f"median [{small}]", *CHANGES]
     caption = "Queries after each step of the sequence stage: mean recall and median error of the pairs"
     return Table(caption, titles, rows)
 
@@ -461,14 +452,9 @@ def _changes(changes: pd.DataFrame, unit: str) -> Table:
     """List queries that a sequence has broken, and rescued."""
     rows = []
     for row in changes.sort_values("change", kind="stable")[:WORST].to_dict("records"):
-        errors = [
-            f"{number(row[f'{of}rotation_error_deg'])}°, {_length(row[f'{of}translation_error_m'], unit)}"
-            if math.isfinite(row[f"{of}rotation_error_deg"])
-            else "no pose"
-            for of in ("single_", "")
-        ]
-        texts = [f"{row['query_device']} in {row['map_device']} map", row["change"], *errors]
-        rows.append([Cell(text) for text in (*texts, str(row["device_id"]), str(row["timestamp"]))])
+        errors = [_off_by(row, of, unit=unit) for of in ("single_", "")]
+        query = f"{row['query_device']} in {row['map_device']} map"
+        rows.append([query, row["change"], *errors, row["device_id"], row["timestamp"]])
     counts = changes["change"].value_counts()
     caption = ", ".join(f"{counts.get(name, 0)} {name}" for name in CHANGES)
     caption = f"Queries within the last threshold by their sequence alone, or by their single pose alone: {caption}"
@@ -486,8 +472,8 @@ def _losses(losses: pd.DataFrame) -> Table | None:
             queries = part["queries"].sum()
             shares = [part[reason].sum() / queries for reason in REASONS]
             label = _threshold(str(threshold)) if name == parts[0][0] else ""
-            cells = [Cell(label), Cell(name), Cell(f"{queries:.0f}"), Cell(f"{part['missed'].sum():.0f}")]
-            rows.append(cells + [Cell(f"{percent(share)} %", 1.2 * share) for share in shares])
+            cells = [Cell(f"{percent(share)} %", 1.2 * share) for share in shares]
+            rows.append([label, name, f"{queries:.0f}", f"{part['missed'].sum():.0f}", *cells])
     caption = "Queries missed at each threshold, and the share of all queries that each reason costs"
     return Table(caption, ["threshold", "map", "queries", "missed", *REASONS], rows)
 
@@ -506,9 +492,9 @@ def _failures(statuses: pd.DataFrame) -> Table | None:
     for reason, group in groups[:MOST_REASONS]:
         pairs = group.groupby(["query_device", "map_device"]).size().sort_values(ascending=False)
         where = ", ".join(f"{q} in {m} map {count}" for (q, m), count in pairs.items())
-        rows.append([Cell(str(reason)), Cell(str(len(group))), Cell(where)])
+        rows.append([reason, len(group), where])
     if rest := sum(len(group) for _, group in groups[MOST_REASONS:]):
-        rows.append([Cell("other reasons"), Cell(str(rest)), Cell("")])
+        rows.append(["other reasons", rest, ""])
     return Table("Queries without a pose, by reason", ["reason", "queries", "where"], rows)
 
 
@@ -532,15 +518,12 @@ def _worst(queries: pd.DataFrame, thresholds: list[str]) -> Table | None:
     rows = []
     for row in worst.to_dict("records"):
         texts = [f"{row['query_device']} in {row['map_device']} map"]
-        if has_truth:
-            rotation_deg, translation_m = row["rotation_error_deg"], row["translation_error_m"]
-            located = math.isfinite(rotation_deg)
-            texts += [f"{number(rotation_deg)}°, {_length(translation_m, unit)}" if located else "no pose", _why(row)]
+        texts += [_off_by(row, unit=unit), _why(row)] if has_truth else []
         inliers = "–" if pd.isna(row["num_inliers"]) else f"{row['num_inliers']:.0f}"
         texts += [str(row["status"]).replace("_", " "), inliers]
         texts += [row["reason"] if isinstance(row["reason"], str) else "–"] if reasons else []
-        texts += [_shown_names(row["image"])] if named else [str(row["device_id"]), str(row["timestamp"])]
-        rows.append([Cell(text) for text in texts])
+        texts += [_shown_names(row["image"])] if named else [row["device_id"], row["timestamp"]]
+        rows.append(texts)
     return Table(caption, columns, rows)
 
 
@@ -582,9 +565,8 @@ def _files(files: SceneFiles) -> Table | None:
             "references": files.retrieval(map_device, query_device),
             "recording": files.visualization / f"{stem.name}.rrd",
         }
-        rows.append([Cell(map_device), Cell(query_device)])
-        for name, path in paths.items():
-            rows[-1].append(Cell(name, link=_link(files.run, path)) if path.is_file() else Cell("–"))
+        links = [Cell(name, link=_link(files.run, path)) if path.is_file() else "–" for name, path in paths.items()]
+        rows.append([map_device, query_device, *links])
     caption = "Files of each pair: poses (device to world), a status row for each query, references of each image"
     return Table(caption, ["map", "query", "poses", "statuses", "references", "recording"], rows) if rows else None
 
@@ -616,8 +598,14 @@ def _length(length: float, unit: str) -> str:
     return f"{number(length)} {unit}" if length < math.inf else "∞"
 
 
+def _off_by(row: Mapping[Any, Any], before: str = "", after: str = "", *, unit: str) -> str:
+    """Return the errors of a query, in columns of such names."""
+    angle, length = (row[f"{before}{name}{after}"] for name in ("rotation_error_deg", "translation_error_m"))
+    return f"{number(angle)}°, {_length(length, unit)}" if math.isfinite(angle) else "no pose"
+
+
 def _seconds(seconds: float | None) -> str:
-    if seconds is None:
+    if seconds is None or math.isnan(seconds):
         return "–"
     if seconds < 120:
         return f"{seconds:.1f} s"

@@ -22,7 +22,7 @@ from toolkit.show.figures import BLUE, GRAY, GREEN, MAP, ORANGE, TRUE, new_figur
 from toolkit.show.localized import load_maps, map_files
 from toolkit.show.metrics import is_posed
 from toolkit.show.overlap import LEAST_OVERLAP, overlap_in_view, seen_by
-from toolkit.show.top_view import ground_axes
+from toolkit.show.top_view import draw_dots, ground_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -109,17 +109,6 @@ class RetrievedPair:
         self.names = [image_name(line["path"]) for line in self.lines]
         """Of the query images."""
 
-    def number_of(self, query: int | str) -> int:
-        """Return the number of a query image.
-
-        Args:
-            query: its number, or its name or the end of it.
-
-        Raises:
-            ArtifactError: there is none, or several; names the nearest.
-        """
-        return find_query(query, {name: number for number, name in enumerate(self.names)}, len(self.names))
-
     def look(self, query: int | str = 0) -> RetrievedQuery:
         """Return what was retrieved for a query image.
 
@@ -129,12 +118,12 @@ class RetrievedPair:
         cannot be known, and is NaN. Similarities are computed from the stored descriptors.
 
         Args:
-            query: see `number_of`.
+            query: its number, or its name or the end of it.
 
         Raises:
-            ArtifactError: no such query, or its descriptors are missing.
+            ArtifactError: no such query, or several (the nearest is named), or its descriptors are missing.
         """
-        number = self.number_of(query)
+        number = find_query(query, {name: number for number, name in enumerate(self.names)}, len(self.names))
         line = self.lines[number]
         if self.names[number] not in self.session.row_of_name:
             raise ArtifactError(f"{self.names[number]}: the references have this query image, the capture does not.")
@@ -144,14 +133,9 @@ class RetrievedPair:
         images, similarity = self._similarities(row, [rank for rank in ranked if rank >= 0])
         overlap = self._overlaps(row, images)
         of_row = dict(zip(images.tolist(), overlap.tolist(), strict=True))
-        references = pd.DataFrame(
-            {
-                "rank": np.arange(1, len(names) + 1),
-                "score": [float(hit.get("score", np.nan)) for hit in line["topk"]],
-                "name": names,
-                "overlap": [of_row.get(row, np.nan) for row in ranked],
-            }
-        )
+        scores = [float(hit.get("score", np.nan)) for hit in line["topk"]]
+        references = pd.DataFrame({"rank": np.arange(1, len(names) + 1), "score": scores, "name": names})
+        references["overlap"] = [of_row.get(rank, np.nan) for rank in ranked]
         points = "view" if self.local_map is None else "map"
         return RetrievedQuery(
             self.session, self.map_session, number, row, references, images, similarity, overlap, points
@@ -191,12 +175,9 @@ class RetrievedPair:
         if not is_posed(pose):
             return np.full(len(images), np.nan)
         camera = self.session.camera(str(self.session.images["sensor_id"].iloc[row]))
-        shares = []
+        shares, sensors = [], self.map_session.images["sensor_id"]
         for image, of_map in zip(images.tolist(), self.map_session.world_from_cam(images), strict=True):
-            sensor = str(self.map_session.images["sensor_id"].iloc[image])
-            reference: dict[str, Any] = {
-                "path": self.map_session.image_name(image), "sensor_id": sensor, "Tws": of_map,
-            }  # fmt: skip
+            reference = {"path": self.map_session.image_name(image), "sensor_id": sensors.iloc[image], "Tws": of_map}
             seen = seen_by(reference, self.map_session, self.local_map)
             shares.append(overlap_in_view(seen, of_map[:3, 3], pose, camera))
         return np.array(shares)
@@ -283,9 +264,9 @@ def _draw_from_above(axis: "Axes", one: RetrievedQuery) -> None:
     good, retrieved = _parts(one)
     # Of a map of several places, the one that matters.
     held = places[good | retrieved] if (good | retrieved).any() else places
-    _dots(axis, places[~good], s=9, c="0.6" if one.is_known else MAP, lw=0)
-    _dots(axis, places[good], s=16, c=GREEN, lw=0)
-    _dots(axis, places[retrieved], s=55, facecolors="none", edgecolors=BLUE, lw=1.2)
+    draw_dots(axis, places[~good], s=9, c="0.6" if one.is_known else MAP, lw=0)
+    draw_dots(axis, places[good], s=16, c=GREEN, lw=0)
+    draw_dots(axis, places[retrieved], s=55, facecolors="none", edgecolors=BLUE, lw=1.2)
     true = one.session.world_from_cam([one.row], ground_truth=True)
     if is_posed(true)[0]:
         at = (true[:, :3, 3] @ axes.T)[0]
@@ -301,7 +282,3 @@ def _draw_from_above(axis: "Axes", one: RetrievedQuery) -> None:
     axis.set(xlabel=labels[0], ylabel=labels[1])
     elsewhere = f"; {outside} map images are elsewhere" if outside else ""
     axis.set_title(f"where they stood, from above{elsewhere}", fontsize=9)
-
-
-def _dots(axis: "Axes", xy: Floats, **style: Any) -> None:
-    axis.scatter(xy[:, 0], xy[:, 1], **style)

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,10 +12,10 @@ from toolkit.capture.images import read_for_display
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.geometry import Floats, Ints, make_pose, pose_error, project
 from toolkit.show.choice import shown_name
-from toolkit.show.figures import ESTIMATED, GREEN, MAP, TRUE, error_bar, error_colors, new_figure, save_figure, styled
+from toolkit.show.figures import ESTIMATED, GREEN, MAP, TRUE, error_bar, error_colors, new_figure, styled
 from toolkit.show.localized import QueryDetails
 from toolkit.show.metrics import is_posed
-from toolkit.show.top_view import ground_axes, places_of
+from toolkit.show.top_view import draw_dots, draw_headings, ground_axes, places_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,6 +24,8 @@ if TYPE_CHECKING:
 Window = tuple[tuple[float, float], tuple[float, float]]
 """Limits of x and y, meters."""
 
+MAX_PLACES, MAX_POINTS = 6, 60_000
+"""Of the map from above: panels, those with the most map images, and points in all, a regular choice."""
 MOST_LETTERS = 60
 """Of an image's name on the sheet of the worst: more would run into the picture beside."""
 
@@ -45,17 +46,14 @@ class WorstQuery:
 
 
 @styled
-def draw_scene_png(
+def draw_scene(
     points: Floats,
     colors: NDArray[np.uint8] | None,
     map_poses: ArrayLike,
     estimated: Floats,
     true: Floats,
-    out: str | Path | None = None,
     up: ArrayLike | None = None,
     title: str = "Queries in the map, seen from above",
-    max_places: int = 6,
-    max_points: int = 60_000,
     map_tracks: Sequence[Floats] = (),
     query_tracks: Sequence[Floats] = (),
     unit: tuple[str, float] = ("m", 1.0),
@@ -68,10 +66,7 @@ def draw_scene_png(
         map_poses: world_from_cam (N, 4, 4) of the map; NaN rows are passed over.
         estimated: world_from_cam (Q, 4, 4) of the queries, NaN where there is no pose.
         true: the same, true; NaN where it is not known.
-        out: PNG to write; None: no file.
         up: direction (3,) that is up; None: estimated from the map's cameras.
-        max_places: panels at most; the places with the most map images.
-        max_points: points drawn at most in all, a regular choice.
         map_tracks: ways of the map's devices, (n, 3) each, drawn as lines.
         query_tracks: true ways of the query devices.
         unit: what lengths are shown in, see `metrics.length_unit`.
@@ -81,7 +76,7 @@ def draw_scene_png(
     axes, labels = ground_axes(up_of_cameras(map_poses) if up is None else up, unit[0])
     points, map_poses, estimated, true = points / unit[1], *(_in(unit, poses) for poses in (map_poses, estimated, true))
     map_tracks, query_tracks = ([track / unit[1] for track in tracks] for tracks in (map_tracks, query_tracks))
-    step = len(points) // max_points + 1
+    step = len(points) // MAX_POINTS + 1
     cloud, shades = points[::step] @ axes.T, None if colors is None else colors[::step]
     cameras, estimated_xy, true_xy = (poses[:, :3, 3] @ axes.T for poses in (map_poses, estimated, true))
 
@@ -90,7 +85,7 @@ def draw_scene_png(
     query_place = _nearest(anchors, cameras, place)
     point_place = _nearest(cloud, cameras, place)
     counts = np.bincount(place, minlength=1)
-    shown = np.sort(np.argsort(-counts, kind="stable")[:max_places])
+    shown = np.sort(np.argsort(-counts, kind="stable")[:MAX_PLACES])
     windows = [_window(cloud[point_place == p], cameras[place == p], anchors[query_place == p]) for p in shown]
 
     columns = min(len(shown), 3)
@@ -105,14 +100,15 @@ def draw_scene_png(
         near, here, mine = point_place == p, place == p, query_place == p
         # Thin points on white are muted: bright ones would not be seen.
         tint = "#9A9A9A" if shades is None else np.clip(shades[near] / 255 * 0.75 + 0.2, 0, 0.75)
-        _dots(axis, cloud[near], s=1.2, c=tint, lw=0, rasterized=True)
+        draw_dots(axis, cloud[near], s=1.2, c=tint, lw=0, rasterized=True)
         for tracks, color, label in ((map_tracks, MAP, "way of the map's devices"), (query_tracks, TRUE, "true way")):
             for number, track in enumerate(tracks):
                 axis.plot(*(track @ axes.T).T, color=color, lw=0.7, alpha=0.5, zorder=2,
                           label=None if number else label)  # fmt: skip
-        _draw_headings(axis, cameras[here], map_poses[here], axes, window, colors=MAP, alpha=0.7)
-        _dots(axis, cameras[here], s=9, color=MAP, lw=0, zorder=3, label="map cameras" if here.any() else None)
-        _draw_queries(axis, estimated[mine], true[mine], axes, window)
+        length = 0.035 * np.ptp(window, axis=1).max()
+        draw_headings(axis, cameras[here], map_poses[here], axes, length, colors=MAP, alpha=0.7, linewidths=1.0)
+        draw_dots(axis, cameras[here], s=9, color=MAP, lw=0, zorder=3, label="map cameras" if here.any() else None)
+        _draw_queries(axis, estimated[mine], true[mine], axes, length)
         axis.set(xlim=window[0], ylim=window[1], aspect="equal", xlabel=labels[0])
         axis.spines[["top", "right"]].set_visible(False)
         axis.grid(alpha=0.2)
@@ -134,15 +130,11 @@ def draw_scene_png(
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5, frameon=False,
                   fontsize=9)  # fmt: skip
     figure.suptitle(title)
-    if out is not None:
-        save_figure(figure, out, title)
     return figure
 
 
 @styled
-def draw_localization(
-    query: QueryDetails, out: str | Path | None = None, title: str = "", unit: tuple[str, float] = ("m", 1.0)
-) -> "Figure":
+def draw_localization(query: QueryDetails, title: str = "", unit: tuple[str, float] = ("m", 1.0)) -> "Figure":
     """Draw the first image of a query beside its references, with what its pose rests on; return the figure.
 
     Green dots are inliers' points as the pose projects them, a white line leads from each to where it was measured;
@@ -151,7 +143,6 @@ def draw_localization(
 
     Args:
         query: what was localized; its first image is drawn.
-        out: PNG to write; None: no file.
         title: of the figure; the errors are added to it where the true pose is known.
         unit: what lengths are shown in, see `metrics.length_unit`.
     """
@@ -169,7 +160,7 @@ def draw_localization(
     axis = figure.add_subplot(grid[:, 0])
     axis.imshow(pictures[0])
     located, good = bool(is_posed(shown.world_from_cam)), shown.inlier
-    _dots(axis, _on(shown.pixels[~good]), s=7, c=ESTIMATED, alpha=0.5 if located else 1, lw=0)
+    draw_dots(axis, _on(shown.pixels[~good]), s=7, c=ESTIMATED, alpha=0.5 if located else 1, lw=0)
     if not located:
         caption = "query: not localized" + (f", {len(good)} matches" if len(good) else "")
     elif query.has_matches:
@@ -177,7 +168,7 @@ def draw_localization(
         inside = good & visible & (projected >= 0).all(1) & (projected < [width, height]).all(1)
         lines = np.stack([_on(shown.pixels[inside]), _on(projected[inside])], axis=1)
         axis.add_collection(LineCollection(list(lines), colors="white", linewidths=0.8))
-        _dots(axis, _on(projected[inside]), s=11, c=GREEN, edgecolors="white", lw=0.35)
+        draw_dots(axis, _on(projected[inside]), s=11, c=GREEN, edgecolors="white", lw=0.35)
         caption = f"query: {shown.num_inliers} of {len(good)} map points agree"
     else:
         caption = "query: no matches, the pose rests on the references"
@@ -187,29 +178,20 @@ def draw_localization(
         panel = figure.add_subplot(grid[k // columns, 1 + k % columns])
         panel.imshow(picture)
         panel.set_title(text, fontsize=8)
-        _dots(panel, _on(image.pixels[~image.inlier]), s=3, c=ESTIMATED, alpha=0.5, lw=0)
-        _dots(panel, _on(image.pixels[image.inlier]), s=5, c=GREEN, lw=0)
+        draw_dots(panel, _on(image.pixels[~image.inlier]), s=3, c=ESTIMATED, alpha=0.5, lw=0)
+        draw_dots(panel, _on(image.pixels[image.inlier]), s=5, c=GREEN, lw=0)
         _frame(panel, "0.6" if agrees else ESTIMATED, picture.shape[1], picture.shape[0])
     if located and is_posed(shown.world_from_cam_true):
         rotation, distance = pose_error(shown.world_from_cam, shown.world_from_cam_true)
         off = f"{float(rotation):.2g}°, {_length(float(distance) / unit[1], unit[0])}"
         title = f"{title}{' · ' if title else ''}off by {off}"
     figure.suptitle(title)
-    if out is not None:
-        save_figure(figure, out, title)
     return figure
 
 
 @styled
-def draw_worst(
-    queries: Sequence[WorstQuery], out: str | Path | None = None, title: str = "The worst queries"
-) -> "Figure":
-    """Draw the worst queries, each beside its best reference with their common matches joined; return the figure.
-
-    Args:
-        queries: the worst first.
-        out: PNG to write; None: no file.
-    """
+def draw_worst(queries: Sequence[WorstQuery], title: str = "The worst queries") -> "Figure":
+    """Draw queries, the worst first, each beside its best reference with their common matches joined."""
     columns = 2 if len(queries) > 1 else 1
     rows = max(1, -(-len(queries) // columns))
     figure = new_figure(6.0 * columns, 2.75 * rows + 0.8)
@@ -222,13 +204,10 @@ def draw_worst(
         _draw_side_by_side(axis, query.details)
         known = np.isfinite(query.translation_m)
         off = f"off by {query.rotation_deg:.2g}°, {_length(query.translation_m, query.unit)}; " if known else ""
-        name = shown_name(query.details.cameras[0].name)
-        name = name if len(name) <= MOST_LETTERS else f"…{name[1 - MOST_LETTERS :]}"
+        name = shown_name(query.details.cameras[0].name, MOST_LETTERS)
         axis.set_title(f"{rank}. {query.pair}: {off}{query.reason}\n{name}", fontsize=8, loc="left", wrap=True)
     legend = "left: query, right: its best reference; lines: inliers (green) and rejected matches (orange) of both"
     figure.suptitle(f"{title}\n({legend})")
-    if out is not None:
-        save_figure(figure, out, title)
     return figure
 
 
@@ -250,7 +229,7 @@ def _draw_side_by_side(axis: "Axes", query: QueryDetails) -> None:
             joined = lines[image.inlier[i] == agrees]
             step = len(joined) // 80 + 1  # more lines than this hide the pictures
             axis.add_collection(LineCollection(list(joined[::step]), colors=color, linewidths=0.5, alpha=0.8))
-            _dots(axis, joined.reshape(-1, 2), s=4, c=color, lw=0)
+            draw_dots(axis, joined.reshape(-1, 2), s=4, c=color, lw=0)
         if not image.inlier[i].any():
             text = "no common inliers" if query.has_matches else f"no matches; {caption}"
             axis.text(end / 2, height * 0.96, text, ha="center", color="white", fontsize=8,
@@ -275,10 +254,6 @@ def _length(length: float, unit: str) -> str:
 def _in(unit: tuple[str, float], poses: Floats) -> Floats:
     """Return poses with lengths in a unit."""
     return make_pose(poses[..., :3, :3], poses[..., :3, 3] / unit[1])
-
-
-def _dots(axis: "Axes", xy: Floats, **style: Any) -> None:
-    axis.scatter(xy[:, 0], xy[:, 1], **style)
 
 
 def _nearest(positions: Floats, cameras: Floats, place: Ints) -> Ints:
@@ -307,14 +282,7 @@ def _window(cloud: Floats, cameras: Floats, queries: Floats) -> Window:
     return (float(x0), float(x1)), (float(y0), float(y1))
 
 
-def _draw_headings(axis: "Axes", positions: Floats, poses: Floats, axes: Floats, window: Window, **style: Any) -> None:
-    """Draw a line in the direction that each camera looks."""
-    length = 0.035 * max(np.ptp(window[0]), np.ptp(window[1]))
-    heads = positions + length * poses[:, :3, 2] @ axes.T
-    axis.add_collection(LineCollection(list(np.stack([positions, heads], axis=1)), linewidths=1.0, **style))
-
-
-def _draw_queries(axis: "Axes", estimated: Floats, true: Floats, axes: Floats, window: Window) -> None:
+def _draw_queries(axis: "Axes", estimated: Floats, true: Floats, axes: Floats, length: float) -> None:
     has_estimate, has_truth = is_posed(estimated), is_posed(true)
     both, lost = has_estimate & has_truth, has_truth & ~has_estimate
     estimated_xy, true_xy = estimated[:, :3, 3] @ axes.T, true[:, :3, 3] @ axes.T
@@ -322,7 +290,8 @@ def _draw_queries(axis: "Axes", estimated: Floats, true: Floats, axes: Floats, w
     lines = np.stack([estimated_xy[both], true_xy[both]], axis=1)
     axis.add_collection(LineCollection(list(lines), colors=list(colors[both]), linewidths=1.6, zorder=4))
     mine = colors[has_estimate]
-    _draw_headings(axis, estimated_xy[has_estimate], estimated[has_estimate], axes, window, colors=list(mine), zorder=4)
+    style: dict[str, Any] = {"colors": list(mine), "zorder": 4, "linewidths": 1.0}
+    draw_headings(axis, estimated_xy[has_estimate], estimated[has_estimate], axes, length, **style)
     for chosen, places, label, style in (
         (both, true_xy, "query, true", {"s": 52, "facecolors": "none", "edgecolors": TRUE, "lw": 1.2, "zorder": 5}),
         (lost, true_xy, "query without a pose, where it truly was",
@@ -331,4 +300,4 @@ def _draw_queries(axis: "Axes", estimated: Floats, true: Floats, axes: Floats, w
          {"s": 16, "c": mine, "lw": 0, "zorder": 5}),
     ):  # fmt: skip
         if chosen.any():
-            _dots(axis, places[chosen], label=label, **style)
+            draw_dots(axis, places[chosen], label=label, **style)

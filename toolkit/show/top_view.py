@@ -1,9 +1,14 @@
 """Seeing a map from above: which way is right and up in the picture, and which places lie apart."""
 
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from toolkit.geometry import Floats, Ints
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 def ground_axes(up: ArrayLike, unit: str | None = "m") -> tuple[Floats, list[str]]:
@@ -29,11 +34,10 @@ def ground_axes(up: ArrayLike, unit: str | None = "m") -> tuple[Floats, list[str
     return axes, labels
 
 
-def places_of(positions: Floats, gap_ratio: float = 5.0, share: float = 0.12) -> Ints:
+def places_of(positions: Floats) -> Ints:
     """Return the number of the place, (N,) counted from 0 in order of appearance, of positions (N, 2 or 3).
 
-    Places are apart by more than `share` of the whole extent and by more than `gap_ratio` times the usual
-    step between neighbors.
+    Places are apart by more than 12 % of the whole extent and by more than five times the usual step to a neighbor.
     """
     from scipy.cluster.hierarchy import fcluster, linkage
     from scipy.spatial import cKDTree
@@ -47,7 +51,20 @@ def places_of(positions: Floats, gap_ratio: float = 5.0, share: float = 0.12) ->
     if len(spots) < 2:
         return np.zeros(len(positions), np.int64)
     tree = linkage(spots, "single")
-    gap = max(gap_ratio * float(np.median(tree[:, 2])), share * extent)
+    gap = max(5.0 * float(np.median(tree[:, 2])), 0.12 * extent)
     labels = fcluster(tree, gap, "distance")[cKDTree(spots).query(positions)[1]]
     _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
     return np.argsort(np.argsort(first))[inverse]
+
+
+def draw_headings(axis: "Axes", positions: Floats, poses: Floats, axes: Floats, length: float, **style: Any) -> None:
+    """Draw a line in the direction that each camera (N, 4, 4) looks, from its place (N, 2) in the picture."""
+    from matplotlib.collections import LineCollection
+
+    ends = positions + length * poses[:, :3, 2] @ axes.T
+    axis.add_collection(LineCollection(list(np.stack([positions, ends], axis=1)), **style))
+
+
+def draw_dots(axis: "Axes", xy: Floats, **style: Any) -> None:
+    """Draw places, (N, 2) or one, (2,); `style` goes to matplotlib's `scatter`."""
+    axis.scatter(*np.reshape(xy, (-1, 2)).T, **style)

@@ -24,6 +24,8 @@ Image = NDArray[np.uint8]
 
 APPLICATION = "visual-localization"
 POINT_COLOR = GRAY
+IMAGE_SIZE, JPEG_QUALITY = 480, 75
+"""Longer side of the images shown, pixels, and how well they are kept, 1 to 100."""
 HIDDEN_M = 1e-3
 """Depth of a camera that is not there now: too small to be seen."""
 
@@ -71,13 +73,13 @@ def entity(*parts: str) -> str:
     return "/".join(rr.escape_entity_path_part(part) for part in parts)
 
 
-def small_jpeg(image: Image, size: int, quality: int = 75) -> tuple[bytes, tuple[int, int]]:
+def small_jpeg(image: Image, size: int) -> tuple[bytes, tuple[int, int]]:
     """Return an image, (H, W, 3) RGB or (H, W), reduced to `size` pixels on its longer side, as JPEG; and (w, h)."""
     scale = min(1.0, size / max(image.shape[:2]))
     width, height = (max(1, round(scale * side)) for side in image.shape[1::-1])
     small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA) if scale < 1 else image
     bgr = np.ascontiguousarray(small[..., ::-1]) if small.ndim == 3 else small
-    _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return data.tobytes(), (width, height)
 
 
@@ -110,13 +112,6 @@ def transform_of(parent_from_child: ArrayLike) -> "rr.Transform3D":
     pose = np.asarray(parent_from_child, np.float64)
     w, x, y, z = rotation_to_quaternion(pose[:3, :3])
     return rr.Transform3D(translation=pose[:3, 3], quaternion=rr.Quaternion(xyzw=[x, y, z, w]))
-
-
-def jpeg_of(data: bytes) -> "rr.EncodedImage":
-    """Return a JPEG as the viewer takes it."""
-    import rerun as rr
-
-    return rr.EncodedImage(contents=data, media_type="image/jpeg")
 
 
 def world_axes(up: Floats) -> Any:

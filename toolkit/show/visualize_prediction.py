@@ -12,7 +12,7 @@ from toolkit.capture.world_up import up_of_cameras
 from toolkit.geometry import Floats
 from toolkit.localizers.base import Query, View
 from toolkit.localizers.feed_forward import CameraAnswer, FeedForwardAnswer, FeedForwardLocalizer
-from toolkit.show.figures import BLUE, GRAY, GREEN, VERMILLION, new_figure, save_figure, styled
+from toolkit.show.figures import BLUE, GRAY, GREEN, VERMILLION, new_figure, styled
 from toolkit.show.top_view import ground_axes
 
 if TYPE_CHECKING:
@@ -27,7 +27,6 @@ def draw_prediction(
     answer: FeedForwardAnswer,
     camera: int | None = None,
     up: ArrayLike | None = None,
-    out: str | Path | None = None,
 ) -> "Figure":
     """Draw one query image with its references, and where its network's cameras lie in the map; return the figure.
 
@@ -35,7 +34,6 @@ def draw_prediction(
         query, answer: of one query device.
         camera: which of its images; None: the first with the most consistent references.
         up: direction (3,) that is up; None: estimated from the map's cameras.
-        out: PNG to write; None: no file.
     """
     if camera is None:
         counts = [0 if part.alignment is None else part.alignment.num_inliers for part in answer.cameras]
@@ -66,8 +64,6 @@ def draw_prediction(
     more = "" if part.reason in about else f"; {part.reason}"  # a failed query's status says it
     reasons = textwrap.fill(about + more, 150)
     figure.suptitle(f"{title}\n{reasons}", fontsize=10, fontweight="bold" if simulated else None)
-    if out is not None:
-        save_figure(figure, out, title)
     return figure
 
 
