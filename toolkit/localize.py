@@ -22,14 +22,7 @@ from toolkit.capture.tables import read_query_table
 from toolkit.errors import INTERNAL, ToolkitError, reason_of
 from toolkit.features.features import KINDS
 from toolkit.features.groups import GroupWriter, heals
-from toolkit.features.matching import (
-    AnyMethod,
-    DeferredMethod,
-    LocalMethod,
-    MutualMatcher,
-    resolve_auto,
-    weights_files,
-)
+from toolkit.features.matching import AnyMethod, MutualMatcher, resolve_auto, weights_files
 from toolkit.features.stores import FeatureStore, MatchStore, extract_session, match_sessions
 from toolkit.files import (
     Remade,
@@ -71,7 +64,6 @@ from toolkit.localizers.map import (
 from toolkit.localizers.mapping import map_settings
 from toolkit.localizers.misfit import LEAST_SIZE, SIGNIFICANCE
 from toolkit.localizers.picture import localize_image
-from toolkit.localizers.prediction import Predictor
 from toolkit.manifest import LocalizeSettings
 from toolkit.runs.pairs import PairRows
 from toolkit.show.metrics import camera_messages
@@ -222,51 +214,6 @@ class _Pair:
     def session(self) -> Session:
         return self.capture[f"{self.query_device}_query"]
 
-    def record(
-        self,
-        settings: LocalizeSettings,
-        kinds: Sequence[LocalMethod],
-        escalation: Sequence[DeferredMethod],
-        predictor: Predictor | None,
-    ) -> dict[str, Any]:
-        """Return what the poses depend on."""
-        map_session, keyframes = self.capture[f"{self.map_device}_map"], self.session.keyframes(self.queries)
-        if not self.retrieval.exists():
-            read_references(self.retrieval)  # says what is missing
-        record: dict[str, Any] = {
-            "method": settings.method,
-            "pnp": settings.pnp.model_dump() | {"seed": settings.seed},
-            "misfit": [SIGNIFICANCE, LEAST_SIZE],
-            "map": settings.map and map_settings(settings.map, settings.seed),
-            "features": [kind.extractor.settings for kind in kinds],
-            "matchers": [kind.matcher.settings for kind in kinds],
-            "unit": settings.unit,
-            "retrieval": file_fingerprint(self.retrieval),
-            "map_session": session_fingerprint(map_session),
-            "query_session": session_fingerprint(self.session),
-            "images": [map_session.files_fingerprint, self.session.files_fingerprint],
-            "keyframes": fingerprint([keyframes["timestamp"].astype(str).tolist(), keyframes["device_id"].tolist()]),
-        }
-        if escalation:
-            record["escalation"] = {
-                "features": settings.features.model_dump(exclude={"checkpoint"}),
-                "matcher": settings.matcher.model_dump(exclude={"checkpoint"}),
-                "weights": [file_fingerprint(path) for path in weights_files(settings)],
-            }
-        if predictor is not None or any(
-            KINDS[name].upright for name in (*settings.features.kinds, *settings.features.escalation)
-        ):
-            record["world_up"] = settings.world_up
-        if predictor is not None:
-            record |= {
-                "predictor": {"name": predictor.name} | predictor.settings,
-                "references": settings.predictor.model_dump(
-                    exclude={"name", "checkpoint", "batch_size", "compile", "conditioned"}
-                ),
-                "depths": map_session.depths_fingerprint,
-            }
-        return record
-
 
 class _Folders(NamedTuple):
     """As `localize_pairs` is given them."""
@@ -308,7 +255,43 @@ class _Stage(Remade):
 
     def record(self, pair: "_Pair") -> dict[str, Any]:
         """Return what the poses of a pair depend on."""
-        return pair.record(self.settings, self.kinds, self.escalation, self.predictor)
+        map_session, keyframes = self.capture[f"{pair.map_device}_map"], pair.session.keyframes(pair.queries)
+        settings, predictor = self.settings, self.predictor
+        if not pair.retrieval.exists():
+            read_references(pair.retrieval)  # says what is missing
+        record: dict[str, Any] = {
+            "method": settings.method,
+            "pnp": settings.pnp.model_dump() | {"seed": settings.seed},
+            "misfit": [SIGNIFICANCE, LEAST_SIZE],
+            "map": settings.map and map_settings(settings.map, settings.seed),
+            "features": [kind.extractor.settings for kind in self.kinds],
+            "matchers": [kind.matcher.settings for kind in self.kinds],
+            "unit": settings.unit,
+            "retrieval": file_fingerprint(pair.retrieval),
+            "map_session": session_fingerprint(map_session),
+            "query_session": session_fingerprint(pair.session),
+            "images": [map_session.files_fingerprint, pair.session.files_fingerprint],
+            "keyframes": fingerprint([keyframes["timestamp"].astype(str).tolist(), keyframes["device_id"].tolist()]),
+        }
+        if self.escalation:
+            record["escalation"] = {
+                "features": settings.features.model_dump(exclude={"checkpoint"}),
+                "matcher": settings.matcher.model_dump(exclude={"checkpoint"}),
+                "weights": [file_fingerprint(path) for path in weights_files(settings)],
+            }
+        if predictor is not None or any(
+            KINDS[name].upright for name in (*settings.features.kinds, *settings.features.escalation)
+        ):
+            record["world_up"] = settings.world_up
+        if predictor is not None:
+            record |= {
+                "predictor": {"name": predictor.name} | predictor.settings,
+                "references": settings.predictor.model_dump(
+                    exclude={"name", "checkpoint", "batch_size", "compile", "conditioned"}
+                ),
+                "depths": map_session.depths_fingerprint,
+            }
+        return record
 
     def _open_map(self, device: str) -> tuple[Map, Localizer]:
         folders = self.folders
@@ -336,8 +319,8 @@ class _Stage(Remade):
 
 _Task = tuple[int, Query, list[References], Any, float]
 """A query's number, the query, its references, what a network says of it, and the seconds that took."""
-_Row = tuple[int, dict[str, Any]]
-"""A query's number and its line of the table."""
+_Done = tuple[str, int, dict[str, Any]]
+"""A query's group, its number, and its line of the table."""
 
 
 class _PairRun:
@@ -400,7 +383,6 @@ class _PairRun:
         """Localize the queries that a killed run has not; returns a row for each, in the list's order."""
         path = self.pair.file("h5")
         groups = [query_group(*key) for key in self.keys]
-        again: dict[str, dict[str, Any]] = {}  # rows of queries that are not recorded as done
         with GroupWriter(path, record, about) as writer:
             if not self.stage.skip_existing:
                 writer.discard()
@@ -408,13 +390,13 @@ class _PairRun:
             numbers = {group: number for number, group in enumerate(groups)}  # a list may name a query twice
             # Queries with a fault of the toolkit in them are left to do, and done again.
             todo = writer.spread(
-                _localize_share, self.not_localized(writer, list(numbers.values())),
-                (self.stage.of_worker, *self.devices), self.not_localized, self._label, "query", self.first.batch_size,
+                _localize_share, _not_localized(writer, list(numbers.items())), (self.stage.of_worker, *self.devices),
+                self._label, "query", self.first.batch_size, _not_localized,
             )  # fmt: skip
-            again |= self.localize_into(writer, todo)
+            again = self.localize_into(writer, todo)  # rows of queries that are not recorded as done
             if isinstance(self.localizer, EscalatingLocalizer):
                 rows = writer.notes()
-                done = {number: rows[group] for group, number in numbers.items() if group in rows}
+                done = [(group, number, rows[group]) for group, number in numbers.items() if group in rows]
                 again |= self._escalate(writer, done)
             # From here until the new poses are there, a kill must not leave poses of one run with a file of another.
             for poses in (self.pair.file("txt"), sidecar_path(self.pair.file("txt"))):
@@ -423,24 +405,6 @@ class _PairRun:
             rows = writer.notes() | again
         images = self.pair.session.own_names(self.rows)
         return [rows[group] | {"image": image} for group, image in zip(groups, images, strict=True)]
-
-    def share(self, name: str) -> GroupWriter:
-        """Return a file that takes a share of the queries."""
-        return GroupWriter(self.pair.file("h5"), self.stage.record(self.pair), share=name)
-
-    def not_localized(self, writer: GroupWriter, numbers: Sequence[int]) -> list[int]:
-        """Return those of some queries that a file has no row of."""
-        rows = writer.notes()
-        return [number for number in numbers if query_group(*self.keys[number]) not in rows]
-
-    def not_escalated(self, writer: GroupWriter, rows: Sequence[_Row]) -> list[_Row]:
-        """Return those of some queries that a file has no row of that tells of an escalation."""
-        after = writer.notes()
-        return [
-            (number, row)
-            for number, row in rows
-            if not after.get(query_group(*self.keys[number]), {}).get("first_status")
-        ]
 
     @property
     def devices(self) -> tuple[str, str]:
@@ -451,15 +415,15 @@ class _PairRun:
     def _label(self) -> str:
         return f"localize {self.pair.query_device} in {self.pair.map_device}"
 
-    def localize_into(self, writer: GroupWriter, numbers: Sequence[int]) -> dict[str, dict[str, Any]]:
-        """Localize queries and add them to a file.
+    def localize_into(self, writer: GroupWriter, todo: Sequence[tuple[str, int]]) -> dict[str, dict[str, Any]]:
+        """Localize queries, given by group and number, and add them to a file.
 
         Returns:
             The rows of queries that have a fault of the toolkit in them, by group: they are not recorded as done.
         """
         again: dict[str, dict[str, Any]] = {}
-        tasks = self._predicted(self.first, numbers)
-        for number, row, localized in self._localized(self.first.localize, tasks, len(numbers)):
+        tasks = self._predicted(self.first, [number for _, number in todo])
+        for number, row, localized in self._localized(self.first.localize, tasks, len(todo)):
             self._add(writer, query_group(*self.keys[number]), row, localized, again)
         return again
 
@@ -476,16 +440,16 @@ class _PairRun:
             again[group] = row
         writer.add(group, arrays=localized.arrays(), note=None if group in again else row)
 
-    def _escalate(self, writer: GroupWriter, rows: Mapping[int, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-        """Ask with further features where the rows, by number of the query, tell that its pose is not sure.
+    def _escalate(self, writer: GroupWriter, done: Sequence[_Done]) -> dict[str, dict[str, Any]]:
+        """Ask with further features where the rows of queries tell that a pose is not sure.
 
         Returns:
             As `localize_into`.
         """
         limit = self.place.sure_position_std
         todo = [
-            (number, row)
-            for number, row in rows.items()
+            (group, number, row)
+            for group, number, row in done
             if not (row.get("first_status") or row["misfit"] or is_sure(row["status"], row["position_std_m"], limit))
             and can_gain(*self.query(number))
         ]
@@ -495,19 +459,19 @@ class _PairRun:
         self.add_escalation(todo)
         shared = (time.perf_counter() - started) / len(todo)
         others = self.stage.of_worker, *self.devices, shared
-        todo = writer.spread(_escalate_share, todo, others, self.not_escalated, self._label, "query")
+        todo = writer.spread(_escalate_share, todo, others, self._label, "query", left=_not_escalated)
         return self.escalate_into(writer, todo, shared)
 
-    def add_escalation(self, rows: Sequence[_Row]) -> None:
+    def add_escalation(self, done: Sequence[_Done]) -> None:
         """Extract and match the further kinds of features of queries."""
         for kind in self.place.escalation:
-            self._add_kind(kind, [number for number, _ in rows])
+            self._add_kind(kind, [number for _, number, _ in done])
 
-    def escalate_into(self, writer: GroupWriter, rows: Sequence[_Row], shared: float) -> dict[str, dict[str, Any]]:
+    def escalate_into(self, writer: GroupWriter, done: Sequence[_Done], shared: float) -> dict[str, dict[str, Any]]:
         """Localize queries with further features, which were extracted, and add those to a file that this helps.
 
         Args:
-            rows: those without these features.
+            done: those without these features.
             shared: seconds that their extraction took for each.
 
         Returns:
@@ -515,10 +479,10 @@ class _PairRun:
         """
         assert isinstance(self.localizer, EscalatingLocalizer)
         again: dict[str, dict[str, Any]] = {}
-        first = dict(rows)
+        first = {number: (group, row) for group, number, row in done}
         tasks = ((number, *self.query(number), None, shared) for number in first)
-        for number, row, localized in self._localized(self.localizer.escalate, tasks, len(rows)):
-            before, group = first[number], query_group(*self.keys[number])
+        for number, row, localized in self._localized(self.localizer.escalate, tasks, len(done)):
+            group, before = first[number]
             both = {
                 "first_status": before["status"],
                 "first_seconds": before["seconds"],
@@ -567,20 +531,30 @@ class _PairRun:
         return number, row, localized
 
 
-def _localize_share(share: str, numbers: Sequence[int], stage: _Stage, map_device: str, query_device: str) -> None:
-    run = stage.run(map_device, query_device)
-    with run.share(share) as writer:
-        run.localize_into(writer, run.not_localized(writer, numbers))
+def _localize_share(
+    writer: GroupWriter, todo: Sequence[tuple[str, int]], stage: _Stage, map_device: str, query_device: str
+) -> None:
+    stage.run(map_device, query_device).localize_into(writer, todo)
+
+
+def _not_localized(writer: GroupWriter, todo: Sequence[tuple[str, int]]) -> list[tuple[str, int]]:
+    """Return those of some queries that a file has no row of."""
+    rows = writer.notes()
+    return [item for item in todo if item[0] not in rows]
 
 
 def _escalate_share(
-    share: str, rows: Sequence[_Row], stage: _Stage, map_device: str, query_device: str, shared: float
+    writer: GroupWriter, done: Sequence[_Done], stage: _Stage, map_device: str, query_device: str, shared: float
 ) -> None:
     run = stage.run(map_device, query_device)
-    with run.share(share) as writer:
-        rest = run.not_escalated(writer, rows)
-        run.add_escalation(rest)
-        run.escalate_into(writer, rest, shared)
+    run.add_escalation(done)
+    run.escalate_into(writer, done, shared)
+
+
+def _not_escalated(writer: GroupWriter, done: Sequence[_Done]) -> list[_Done]:
+    """Return those of some queries that a file has no row of that tells of an escalation."""
+    rows = writer.notes()
+    return [item for item in done if not rows.get(item[0], {}).get("first_status")]
 
 
 def _is_internal(row: Mapping[str, Any]) -> bool:
