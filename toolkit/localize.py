@@ -138,12 +138,12 @@ def localize_pairs(
     devices = product(capture.devices_with("map", map_device), capture.devices_with("query", query_device))
     with threadpool_limits(1, "blas"):  # queries are the parallel dimension, and sums stay in one order
         for mapped, queried in devices:
-            pair = stage.pair(mapped, queried)
+            pair = _Pair(stage, mapped, queried)
             with table.row(mapped, queried) as row:
                 table.check_upstream()
                 started = time.perf_counter()
                 record = stage.record(pair)
-                about = attributes(settings, stage.kinds, capture, mapped, pair.retrieval_dir)
+                about = attributes(settings, stage.kinds, capture, mapped, folders.retrieval)
                 maps = [folders.map / name for name in json.loads(about[MAPS])]
                 skipped = skip_existing and pair.is_current(record, maps)
                 unfinished = False
@@ -182,23 +182,21 @@ def localize_pairs(
 class _Pair:
     """One map device x query device: where its files are, and which queries are asked."""
 
-    capture: Capture
+    stage: "_Stage"
     map_device: str
     query_device: str
-    retrieval_dir: Path
-    out_dir: Path
-    queries: str
 
     @property
     def retrieval(self) -> Path:
-        return self.retrieval_dir / f"{pair_name(self.capture.name, self.map_device, self.query_device)}.jsonl"
+        name = pair_name(self.stage.capture.name, self.map_device, self.query_device)
+        return self.stage.folders.retrieval / f"{name}.jsonl"
 
     @property
     def about_map(self) -> Path:
-        return map_record_path(self.out_dir, self.capture.name, self.map_device)
+        return map_record_path(self.stage.folders.out, self.stage.capture.name, self.map_device)
 
     def file(self, suffix: str) -> Path:
-        return self.out_dir / f"{self.retrieval.stem}.{suffix}"
+        return self.stage.folders.out / f"{self.retrieval.stem}.{suffix}"
 
     def is_current(self, record: dict[str, Any], maps: Sequence[Path]) -> bool:
         """Tell whether the pair is done; its maps are part of what there is to see of it."""
@@ -212,7 +210,11 @@ class _Pair:
 
     @property
     def session(self) -> Session:
-        return self.capture[f"{self.query_device}_query"]
+        return self.stage.capture[f"{self.query_device}_query"]
+
+    @property
+    def keyframes(self) -> pd.DataFrame:
+        return self.session.keyframes(self.stage.queries)
 
 
 class _Folders(NamedTuple):
@@ -249,13 +251,9 @@ class _Stage(Remade):
             require_same(made_by, self.networks)
         self.open_map = lru_cache(maxsize=1)(self._open_map)
 
-    def pair(self, map_device: str, query_device: str) -> "_Pair":
-        folders = self.folders
-        return _Pair(self.capture, map_device, query_device, folders.retrieval, folders.out, self.queries)
-
-    def record(self, pair: "_Pair") -> dict[str, Any]:
+    def record(self, pair: _Pair) -> dict[str, Any]:
         """Return what the poses of a pair depend on."""
-        map_session, keyframes = self.capture[f"{pair.map_device}_map"], pair.session.keyframes(pair.queries)
+        map_session, keyframes = self.capture[f"{pair.map_device}_map"], pair.keyframes
         settings, predictor = self.settings, self.predictor
         if not pair.retrieval.exists():
             read_references(pair.retrieval)  # says what is missing
@@ -303,7 +301,7 @@ class _Stage(Remade):
 
     def run(self, map_device: str, query_device: str) -> "_PairRun":
         """Return the queries of a pair on their way."""
-        return _PairRun(self.pair(map_device, query_device), *self.open_map(map_device), self)
+        return _PairRun(_Pair(self, map_device, query_device), *self.open_map(map_device))
 
     @property
     def networks(self) -> dict[str, Any]:
@@ -326,11 +324,11 @@ _Done = tuple[str, int, dict[str, Any]]
 class _PairRun:
     """The queries of a pair on their way through a localizer."""
 
-    def __init__(self, pair: _Pair, place: Map, localizer: Localizer, stage: _Stage) -> None:
-        self.pair, self.place, self.localizer, self.stage = pair, place, localizer, stage
+    def __init__(self, pair: _Pair, place: Map, localizer: Localizer) -> None:
+        self.pair, self.place, self.localizer, self.stage = pair, place, localizer, pair.stage
         self.first = localizer.first if isinstance(localizer, EscalatingLocalizer) else localizer
         """Of queries that are not escalated."""
-        keyframes = pair.session.keyframes(pair.queries)
+        keyframes = pair.keyframes
         self.keys = list(zip(keyframes["timestamp"].tolist(), keyframes["device_id"].tolist(), strict=True))
         self.rows = pair.session.rows_of_keyframes(keyframes)
         """Of each query, the rows of its images."""
