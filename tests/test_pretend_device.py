@@ -20,7 +20,7 @@ from tests.models.test_megaloc import tiny_megaloc
 from tests.models.test_vggt import tiny
 from tests.pretend import DEVICE, PretendTensor, pretending, resolved
 from toolkit.embedders import megaloc, search
-from toolkit.features import aliked, lightglue, network
+from toolkit.features import lightglue, network
 from toolkit.features.aliked import AlikedExtractor
 from toolkit.features.lightglue import LightGlueMatcher
 from toolkit.features.network import NetworkExtractor
@@ -36,7 +36,7 @@ __all__ = ["state"]  # a fixture
 @pytest.fixture
 def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Lets `pretend` stand for a device; any other name is resolved as ever."""
-    for module in (megaloc, search, aliked, lightglue, network, predictors):
+    for module in (megaloc, search, lightglue, network, predictors):
         resolve = module.resolve_device
         monkeypatch.setattr(
             module, "resolve_device", lambda name, resolve=resolve: resolved() if name == "pretend" else resolve(name)

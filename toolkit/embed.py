@@ -181,7 +181,7 @@ def _embed_with_one(
             with GroupWriter(matrix_path, made_by) as batches:
                 if not skip_existing:
                     batches.discard()
-                failed = _embed(embedder, part, batches, made_by, settings, store_of)
+                failed = _embed(embedder, part, batches, settings, store_of)
                 embedded = len(part.rows) - len(failed)
                 tables = _write_tables(folder, capture.name, part, failed)
                 write_matrix(matrix_path, batches, embedded, embedder.dim, settings.dtype)
@@ -329,53 +329,30 @@ def _embed(
     embedder: Embedder,
     part: _Subsession,
     batches: GroupWriter,
-    made_by: Mapping[str, Any],
     settings: EmbedSettings,
     store_of: Callable[[str], FeatureStore],
 ) -> dict[int, str]:
     """Add the vectors of the readable images, in order; return why the others (by row) have none."""
-    size, store = settings.batch_size, store_of(part.session.id) if embedder.inputs == "features" else None
-    label, todo = f"embed {part.session.id}/{part.name}", _left(batches, range(-(-len(part.rows) // size)))
-    others = batches.path, made_by, embedder, part, settings, store
-    todo = batches.spread(_embed_share, todo, others, _left, label, "batch")
-    rest = sum(len(part.rows[number * size : (number + 1) * size]) for number in todo)
-    with tqdm(total=len(part.rows), initial=len(part.rows) - rest, desc=label, unit="image") as bar:
-        _embed_into(batches, todo, embedder, part, settings, store, bar.update)
+    store = store_of(part.session.id) if embedder.inputs == "features" else None
+    count, label = -(-len(part.rows) // settings.batch_size), f"embed {part.session.id}/{part.name}"
+    todo = batches.left([(f"{number:08d}", "", number) for number in range(count)])
+    others = embedder, part, settings, store, label
+    _embed_into(batches, batches.spread(_embed_into, todo, others, label, "batch"), *others)
     return {row: reason for note in batches.notes().values() for row, reason in note["failed"]}
-
-
-def _embed_share(
-    share: str,
-    numbers: Sequence[int],
-    path: Path,
-    made_by: Mapping[str, Any],
-    embedder: Embedder,
-    part: _Subsession,
-    settings: EmbedSettings,
-    store: FeatureStore | None,
-) -> None:
-    with GroupWriter(path, made_by, share=share) as batches:
-        _embed_into(batches, _left(batches, numbers), embedder, part, settings, store, lambda _: None)
-
-
-def _left(batches: GroupWriter, numbers: Sequence[int]) -> list[int]:
-    """Return the numbers of batches that are still to do."""
-    done = batches.notes()
-    return [number for number in numbers if f"{number:08d}" not in done]
 
 
 def _embed_into(
     batches: GroupWriter,
-    numbers: Sequence[int],
+    todo: Sequence[tuple[str, str, int]],
     embedder: Embedder,
     part: _Subsession,
     settings: EmbedSettings,
     store: FeatureStore | None,
-    done: Callable[[int], object],
+    label: str,
 ) -> None:
-    """Add the vectors of batches, by number, and why images in them have none; `done` is told of how many images."""
+    """Add the vectors of batches, by group and number, and why images in them have none."""
     size = settings.batch_size
-    slices = [slice(number * size, (number + 1) * size) for number in numbers]
+    slices = [slice(number * size, (number + 1) * size) for *_, number in todo]
     chosen = np.concatenate([np.zeros(0, np.int64), *(np.arange(len(part.rows))[rows] for rows in slices)])
     inputs = _inputs(embedder, replace(part, rows=part.rows[chosen], turns=part.turns[chosen]), size, store)
 
@@ -386,14 +363,17 @@ def _embed_into(
 
     # The next batch is copied to the device while one is embedded.
     of_batches = (list(islice(inputs, len(part.rows[rows]))) for rows in slices)
-    for number, (batch, unreadable) in zip(numbers, prefetch(stack, of_batches, workers=1, ahead=0), strict=True):
-        vectors = embedder.embed(batch)
-        if vectors.shape != (len(batch), embedder.dim):
-            raise ValueError(f"{embedder.name} gave {vectors.shape}; expected {(len(batch), embedder.dim)}.")
-        if settings.normalize:
-            vectors = unit(vectors)
-        batches.add(f"{number:08d}", arrays={VECTORS: vectors}, note={"failed": list(unreadable.items())})
-        done(len(batch) + len(unreadable))
+    with tqdm(total=len(part.rows), initial=len(part.rows) - len(chosen), desc=label, unit="image") as bar:
+        for (group, *_), (batch, unreadable) in zip(
+            todo, prefetch(stack, of_batches, workers=1, ahead=0), strict=True
+        ):
+            vectors = embedder.embed(batch)
+            if vectors.shape != (len(batch), embedder.dim):
+                raise ValueError(f"{embedder.name} gave {vectors.shape}; expected {(len(batch), embedder.dim)}.")
+            if settings.normalize:
+                vectors = unit(vectors)
+            batches.add(group, arrays={VECTORS: vectors}, note={"failed": list(unreadable.items())})
+            bar.update(len(batch) + len(unreadable))
 
 
 def write_matrix(path: Path, batches: GroupWriter, rows: int, dim: int, dtype: str) -> None:

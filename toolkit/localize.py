@@ -22,14 +22,7 @@ from toolkit.capture.tables import read_query_table
 from toolkit.errors import INTERNAL, ToolkitError, reason_of
 from toolkit.features.features import KINDS
 from toolkit.features.groups import GroupWriter, heals
-from toolkit.features.matching import (
-    AnyMethod,
-    DeferredMethod,
-    LocalMethod,
-    MutualMatcher,
-    resolve_auto,
-    weights_files,
-)
+from toolkit.features.matching import AnyMethod, MutualMatcher, resolve_auto, weights_files
 from toolkit.features.stores import FeatureStore, MatchStore, extract_session, match_sessions
 from toolkit.files import (
     Remade,
@@ -70,7 +63,6 @@ from toolkit.localizers.map import (
 from toolkit.localizers.mapping import map_settings
 from toolkit.localizers.misfit import LEAST_SIZE, SIGNIFICANCE
 from toolkit.localizers.picture import localize_image
-from toolkit.localizers.prediction import Predictor
 from toolkit.localizers.predictors import open_predictor
 from toolkit.manifest import LocalizeSettings
 from toolkit.runs.pairs import PairRows
@@ -146,12 +138,12 @@ def localize_pairs(
     devices = product(capture.devices_with("map", map_device), capture.devices_with("query", query_device))
     with threadpool_limits(1, "blas"):  # queries are the parallel dimension, and sums stay in one order
         for mapped, queried in devices:
-            pair = stage.pair(mapped, queried)
+            pair = _Pair(stage, mapped, queried)
             with table.row(mapped, queried) as row:
                 table.check_upstream()
                 started = time.perf_counter()
                 record = stage.record(pair)
-                about = attributes(settings, stage.kinds, capture, mapped, pair.retrieval_dir)
+                about = attributes(settings, stage.kinds, capture, mapped, folders.retrieval)
                 maps = [folders.map / name for name in json.loads(about[MAPS])]
                 skipped = skip_existing and pair.is_current(record, maps)
                 unfinished = False
@@ -190,23 +182,21 @@ def localize_pairs(
 class _Pair:
     """One map device x query device: where its files are, and which queries are asked."""
 
-    capture: Capture
+    stage: "_Stage"
     map_device: str
     query_device: str
-    retrieval_dir: Path
-    out_dir: Path
-    queries: str
 
     @property
     def retrieval(self) -> Path:
-        return self.retrieval_dir / f"{pair_name(self.capture.name, self.map_device, self.query_device)}.jsonl"
+        name = pair_name(self.stage.capture.name, self.map_device, self.query_device)
+        return self.stage.folders.retrieval / f"{name}.jsonl"
 
     @property
     def about_map(self) -> Path:
-        return map_record_path(self.out_dir, self.capture.name, self.map_device)
+        return map_record_path(self.stage.folders.out, self.stage.capture.name, self.map_device)
 
     def file(self, suffix: str) -> Path:
-        return self.out_dir / f"{self.retrieval.stem}.{suffix}"
+        return self.stage.folders.out / f"{self.retrieval.stem}.{suffix}"
 
     def is_current(self, record: dict[str, Any], maps: Sequence[Path]) -> bool:
         """Tell whether the pair is done; its maps are part of what there is to see of it."""
@@ -220,52 +210,11 @@ class _Pair:
 
     @property
     def session(self) -> Session:
-        return self.capture[f"{self.query_device}_query"]
+        return self.stage.capture[f"{self.query_device}_query"]
 
-    def record(
-        self,
-        settings: LocalizeSettings,
-        kinds: Sequence[LocalMethod],
-        escalation: Sequence[DeferredMethod],
-        predictor: Predictor | None,
-    ) -> dict[str, Any]:
-        """Return what the poses depend on."""
-        map_session, keyframes = self.capture[f"{self.map_device}_map"], self.session.keyframes(self.queries)
-        if not self.retrieval.exists():
-            read_references(self.retrieval)  # says what is missing
-        record: dict[str, Any] = {
-            "method": settings.method,
-            "pnp": settings.pnp.model_dump() | {"seed": settings.seed},
-            "misfit": [SIGNIFICANCE, LEAST_SIZE],
-            "map": settings.map and map_settings(settings.map, settings.seed),
-            "features": [kind.extractor.settings for kind in kinds],
-            "matchers": [kind.matcher.settings for kind in kinds],
-            "unit": settings.unit,
-            "retrieval": file_fingerprint(self.retrieval),
-            "map_session": session_fingerprint(map_session),
-            "query_session": session_fingerprint(self.session),
-            "images": [map_session.files_fingerprint, self.session.files_fingerprint],
-            "keyframes": fingerprint([keyframes["timestamp"].astype(str).tolist(), keyframes["device_id"].tolist()]),
-        }
-        if escalation:
-            record["escalation"] = {
-                "features": settings.features.model_dump(exclude={"checkpoint"}),
-                "matcher": settings.matcher.model_dump(exclude={"checkpoint"}),
-                "weights": [file_fingerprint(path) for path in weights_files(settings)],
-            }
-        if predictor is not None or any(
-            KINDS[name].upright for name in (*settings.features.kinds, *settings.features.escalation)
-        ):
-            record["world_up"] = settings.world_up
-        if predictor is not None:
-            record |= {
-                "predictor": {"name": predictor.name} | predictor.settings,
-                "references": settings.predictor.model_dump(
-                    exclude={"name", "checkpoint", "batch_size", "compile", "conditioned"}
-                ),
-                "depths": map_session.depths_fingerprint,
-            }
-        return record
+    @property
+    def keyframes(self) -> pd.DataFrame:
+        return self.session.keyframes(self.stage.queries)
 
 
 class _Folders(NamedTuple):
@@ -302,13 +251,45 @@ class _Stage(Remade):
             require_same(made_by, self.networks)
         self.open_map = lru_cache(maxsize=1)(self._open_map)
 
-    def pair(self, map_device: str, query_device: str) -> "_Pair":
-        folders = self.folders
-        return _Pair(self.capture, map_device, query_device, folders.retrieval, folders.out, self.queries)
-
-    def record(self, pair: "_Pair") -> dict[str, Any]:
+    def record(self, pair: _Pair) -> dict[str, Any]:
         """Return what the poses of a pair depend on."""
-        return pair.record(self.settings, self.kinds, self.escalation, self.predictor)
+        map_session, keyframes = self.capture[f"{pair.map_device}_map"], pair.keyframes
+        settings, predictor = self.settings, self.predictor
+        if not pair.retrieval.exists():
+            read_references(pair.retrieval)  # says what is missing
+        record: dict[str, Any] = {
+            "method": settings.method,
+            "pnp": settings.pnp.model_dump() | {"seed": settings.seed},
+            "misfit": [SIGNIFICANCE, LEAST_SIZE],
+            "map": settings.map and map_settings(settings.map, settings.seed),
+            "features": [kind.extractor.settings for kind in self.kinds],
+            "matchers": [kind.matcher.settings for kind in self.kinds],
+            "unit": settings.unit,
+            "retrieval": file_fingerprint(pair.retrieval),
+            "map_session": session_fingerprint(map_session),
+            "query_session": session_fingerprint(pair.session),
+            "images": [map_session.files_fingerprint, pair.session.files_fingerprint],
+            "keyframes": fingerprint([keyframes["timestamp"].astype(str).tolist(), keyframes["device_id"].tolist()]),
+        }
+        if self.escalation:
+            record["escalation"] = {
+                "features": settings.features.model_dump(exclude={"checkpoint"}),
+                "matcher": settings.matcher.model_dump(exclude={"checkpoint"}),
+                "weights": [file_fingerprint(path) for path in weights_files(settings)],
+            }
+        if predictor is not None or any(
+            KINDS[name].upright for name in (*settings.features.kinds, *settings.features.escalation)
+        ):
+            record["world_up"] = settings.world_up
+        if predictor is not None:
+            record |= {
+                "predictor": {"name": predictor.name} | predictor.settings,
+                "references": settings.predictor.model_dump(
+                    exclude={"name", "checkpoint", "batch_size", "compile", "conditioned"}
+                ),
+                "depths": map_session.depths_fingerprint,
+            }
+        return record
 
     def _open_map(self, device: str) -> tuple[Map, Localizer]:
         folders = self.folders
@@ -320,7 +301,7 @@ class _Stage(Remade):
 
     def run(self, map_device: str, query_device: str) -> "_PairRun":
         """Return the queries of a pair on their way."""
-        return _PairRun(self.pair(map_device, query_device), *self.open_map(map_device), self)
+        return _PairRun(_Pair(self, map_device, query_device), *self.open_map(map_device))
 
     @property
     def networks(self) -> dict[str, Any]:
@@ -336,18 +317,18 @@ class _Stage(Remade):
 
 _Task = tuple[int, Query, list[References], Any, float]
 """A query's number, the query, its references, what a network says of it, and the seconds that took."""
-_Row = tuple[int, dict[str, Any]]
-"""A query's number and its line of the table."""
+_Done = tuple[str, int, dict[str, Any]]
+"""A query's group, its number, and its line of the table."""
 
 
 class _PairRun:
     """The queries of a pair on their way through a localizer."""
 
-    def __init__(self, pair: _Pair, place: Map, localizer: Localizer, stage: _Stage) -> None:
-        self.pair, self.place, self.localizer, self.stage = pair, place, localizer, stage
+    def __init__(self, pair: _Pair, place: Map, localizer: Localizer) -> None:
+        self.pair, self.place, self.localizer, self.stage = pair, place, localizer, pair.stage
         self.first = localizer.first if isinstance(localizer, EscalatingLocalizer) else localizer
         """Of queries that are not escalated."""
-        keyframes = pair.session.keyframes(pair.queries)
+        keyframes = pair.keyframes
         self.keys = list(zip(keyframes["timestamp"].tolist(), keyframes["device_id"].tolist(), strict=True))
         self.rows = pair.session.rows_of_keyframes(keyframes)
         """Of each query, the rows of its images."""
@@ -400,7 +381,6 @@ class _PairRun:
         """Localize the queries that a killed run has not; returns a row for each, in the list's order."""
         path = self.pair.file("h5")
         groups = [query_group(*key) for key in self.keys]
-        again: dict[str, dict[str, Any]] = {}  # rows of queries that are not recorded as done
         with GroupWriter(path, record, about) as writer:
             if not self.stage.skip_existing:
                 writer.discard()
@@ -408,13 +388,13 @@ class _PairRun:
             numbers = {group: number for number, group in enumerate(groups)}  # a list may name a query twice
             # Queries with a fault of the toolkit in them are left to do, and done again.
             todo = writer.spread(
-                _localize_share, self.not_localized(writer, list(numbers.values())),
-                (self.stage.of_worker, *self.devices), self.not_localized, self._label, "query", self.first.batch_size,
+                _localize_share, _not_localized(writer, list(numbers.items())), (self.stage.of_worker, *self.devices),
+                self._label, "query", self.first.batch_size, _not_localized,
             )  # fmt: skip
-            again |= self.localize_into(writer, todo)
+            again = self.localize_into(writer, todo)  # rows of queries that are not recorded as done
             if isinstance(self.localizer, EscalatingLocalizer):
                 rows = writer.notes()
-                done = {number: rows[group] for group, number in numbers.items() if group in rows}
+                done = [(group, number, rows[group]) for group, number in numbers.items() if group in rows]
                 again |= self._escalate(writer, done)
             # From here until the new poses are there, a kill must not leave poses of one run with a file of another.
             for poses in (self.pair.file("txt"), sidecar_path(self.pair.file("txt"))):
@@ -423,24 +403,6 @@ class _PairRun:
             rows = writer.notes() | again
         images = self.pair.session.own_names(self.rows)
         return [rows[group] | {"image": image} for group, image in zip(groups, images, strict=True)]
-
-    def share(self, name: str) -> GroupWriter:
-        """Return a file that takes a share of the queries."""
-        return GroupWriter(self.pair.file("h5"), self.stage.record(self.pair), share=name)
-
-    def not_localized(self, writer: GroupWriter, numbers: Sequence[int]) -> list[int]:
-        """Return those of some queries that a file has no row of."""
-        rows = writer.notes()
-        return [number for number in numbers if query_group(*self.keys[number]) not in rows]
-
-    def not_escalated(self, writer: GroupWriter, rows: Sequence[_Row]) -> list[_Row]:
-        """Return those of some queries that a file has no row of that tells of an escalation."""
-        after = writer.notes()
-        return [
-            (number, row)
-            for number, row in rows
-            if not after.get(query_group(*self.keys[number]), {}).get("first_status")
-        ]
 
     @property
     def devices(self) -> tuple[str, str]:
@@ -451,15 +413,15 @@ class _PairRun:
     def _label(self) -> str:
         return f"localize {self.pair.query_device} in {self.pair.map_device}"
 
-    def localize_into(self, writer: GroupWriter, numbers: Sequence[int]) -> dict[str, dict[str, Any]]:
-        """Localize queries and add them to a file.
+    def localize_into(self, writer: GroupWriter, todo: Sequence[tuple[str, int]]) -> dict[str, dict[str, Any]]:
+        """Localize queries, given by group and number, and add them to a file.
 
         Returns:
             The rows of queries that have a fault of the toolkit in them, by group: they are not recorded as done.
         """
         again: dict[str, dict[str, Any]] = {}
-        tasks = self._predicted(self.first, numbers)
-        for number, row, localized in self._localized(self.first.localize, tasks, len(numbers)):
+        tasks = self._predicted(self.first, [number for _, number in todo])
+        for number, row, localized in self._localized(self.first.localize, tasks, len(todo)):
             self._add(writer, query_group(*self.keys[number]), row, localized, again)
         return again
 
@@ -476,16 +438,16 @@ class _PairRun:
             again[group] = row
         writer.add(group, arrays=localized.arrays(), note=None if group in again else row)
 
-    def _escalate(self, writer: GroupWriter, rows: Mapping[int, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-        """Ask with further features where the rows, by number of the query, tell that its pose is not sure.
+    def _escalate(self, writer: GroupWriter, done: Sequence[_Done]) -> dict[str, dict[str, Any]]:
+        """Ask with further features where the rows of queries tell that a pose is not sure.
 
         Returns:
             As `localize_into`.
         """
         limit = self.place.sure_position_std
         todo = [
-            (number, row)
-            for number, row in rows.items()
+            (group, number, row)
+            for group, number, row in done
             if not (row.get("first_status") or row["misfit"] or is_sure(row["status"], row["position_std_m"], limit))
             and can_gain(*self.query(number))
         ]
@@ -495,19 +457,19 @@ class _PairRun:
         self.add_escalation(todo)
         shared = (time.perf_counter() - started) / len(todo)
         others = self.stage.of_worker, *self.devices, shared
-        todo = writer.spread(_escalate_share, todo, others, self.not_escalated, self._label, "query")
+        todo = writer.spread(_escalate_share, todo, others, self._label, "query", left=_not_escalated)
         return self.escalate_into(writer, todo, shared)
 
-    def add_escalation(self, rows: Sequence[_Row]) -> None:
+    def add_escalation(self, done: Sequence[_Done]) -> None:
         """Extract and match the further kinds of features of queries."""
         for kind in self.place.escalation:
-            self._add_kind(kind, [number for number, _ in rows])
+            self._add_kind(kind, [number for _, number, _ in done])
 
-    def escalate_into(self, writer: GroupWriter, rows: Sequence[_Row], shared: float) -> dict[str, dict[str, Any]]:
+    def escalate_into(self, writer: GroupWriter, done: Sequence[_Done], shared: float) -> dict[str, dict[str, Any]]:
         """Localize queries with further features, which were extracted, and add those to a file that this helps.
 
         Args:
-            rows: those without these features.
+            done: those without these features.
             shared: seconds that their extraction took for each.
 
         Returns:
@@ -515,10 +477,10 @@ class _PairRun:
         """
         assert isinstance(self.localizer, EscalatingLocalizer)
         again: dict[str, dict[str, Any]] = {}
-        first = dict(rows)
+        first = {number: (group, row) for group, number, row in done}
         tasks = ((number, *self.query(number), None, shared) for number in first)
-        for number, row, localized in self._localized(self.localizer.escalate, tasks, len(rows)):
-            before, group = first[number], query_group(*self.keys[number])
+        for number, row, localized in self._localized(self.localizer.escalate, tasks, len(done)):
+            group, before = first[number]
             both = {
                 "first_status": before["status"],
                 "first_seconds": before["seconds"],
@@ -567,20 +529,30 @@ class _PairRun:
         return number, row, localized
 
 
-def _localize_share(share: str, numbers: Sequence[int], stage: _Stage, map_device: str, query_device: str) -> None:
-    run = stage.run(map_device, query_device)
-    with run.share(share) as writer:
-        run.localize_into(writer, run.not_localized(writer, numbers))
+def _localize_share(
+    writer: GroupWriter, todo: Sequence[tuple[str, int]], stage: _Stage, map_device: str, query_device: str
+) -> None:
+    stage.run(map_device, query_device).localize_into(writer, todo)
+
+
+def _not_localized(writer: GroupWriter, todo: Sequence[tuple[str, int]]) -> list[tuple[str, int]]:
+    """Return those of some queries that a file has no row of."""
+    rows = writer.notes()
+    return [item for item in todo if item[0] not in rows]
 
 
 def _escalate_share(
-    share: str, rows: Sequence[_Row], stage: _Stage, map_device: str, query_device: str, shared: float
+    writer: GroupWriter, done: Sequence[_Done], stage: _Stage, map_device: str, query_device: str, shared: float
 ) -> None:
     run = stage.run(map_device, query_device)
-    with run.share(share) as writer:
-        rest = run.not_escalated(writer, rows)
-        run.add_escalation(rest)
-        run.escalate_into(writer, rest, shared)
+    run.add_escalation(done)
+    run.escalate_into(writer, done, shared)
+
+
+def _not_escalated(writer: GroupWriter, done: Sequence[_Done]) -> list[_Done]:
+    """Return those of some queries that a file has no row of that tells of an escalation."""
+    rows = writer.notes()
+    return [item for item in done if not rows.get(item[0], {}).get("first_status")]
 
 
 def _is_internal(row: Mapping[str, Any]) -> bool:

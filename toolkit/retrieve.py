@@ -5,7 +5,7 @@ import logging
 import time
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -121,18 +121,8 @@ def retrieve_pairs(
                 if not skipped:
                     _require_same_dimension(query, database)
                     todo[queried] = replace(query, masks=masks), path, record
-                row |= {
-                    "keyframes": query.keyframes,
-                    "keyframes_missing": query.keyframes_missing,
-                    "query_images": len(query.rows),
-                    "images_missing": query.images_missing,
-                    "database": len(database.rows),
-                    "unposed": database.unposed,
-                    **without,
-                    "seconds": 0.0,
-                    "skipped": skipped,
-                    "path": str(path),
-                }
+                row |= query.counts | database.counts | without
+                row |= {"seconds": 0.0, "skipped": skipped, "path": str(path)}
         if not todo:
             continue
         found: dict[str, Found] = {}
@@ -163,10 +153,8 @@ class _Images:
     rows: Ints
     vectors: Vectors
     table: pd.DataFrame
-    keyframes: int = 0
-    keyframes_missing: int = 0
-    images_missing: int = 0
-    unposed: int = 0
+    counts: dict[str, int] = field(default_factory=dict)
+    """Columns of a pair's row."""
     masks: Masks | None = None
 
     def take(self, chosen: Ints) -> "_Images":
@@ -194,7 +182,8 @@ def _load_database(session: Session, embeddings: Path, normalize: bool) -> _Imag
         raise CaptureError(f"No embedded image of {session.id} has a pose ({session.path / 'trajectories.txt'}).")
     if not posed.all():
         log.warning("%s: %d of %d images have no pose and are left out", session.id, np.sum(~posed), posed.size)
-    return replace(images.take(np.flatnonzero(posed)), unposed=int(np.sum(~posed)))
+    counts = {"database": int(posed.sum()), "unposed": int(np.sum(~posed))}
+    return replace(images.take(np.flatnonzero(posed)), counts=counts)
 
 
 def _load_queries(session: Session, embeddings: Path, queries: str, normalize: bool) -> _Images:
@@ -212,10 +201,8 @@ def _load_queries(session: Session, embeddings: Path, queries: str, normalize: b
         )  # fmt: skip
     rows = np.unique(np.concatenate([np.zeros(0, np.int64), *rows_of_each]))
     chosen = position[rows][position[rows] >= 0]
-    lost = len(rows) - len(chosen)
-    return replace(
-        images.take(chosen), keyframes=len(keyframes), keyframes_missing=len(missing), images_missing=lost
-    )
+    counts = {"keyframes": len(keyframes), "keyframes_missing": len(missing), "query_images": len(chosen)}
+    return replace(images.take(chosen), counts=counts | {"images_missing": len(rows) - len(chosen)})
 
 
 def _require_same_dimension(query: _Images, database: _Images) -> None:

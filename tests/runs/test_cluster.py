@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from tests.other_kind import add_other_kind
 from toolkit.capture import Capture
 from toolkit.capture.names import ALLOW_OUTSIDE
 from toolkit.embed import embed_sessions
@@ -75,31 +76,32 @@ def here(monkeypatch: pytest.MonkeyPatch) -> Here:
 # -------------------------------------------------------------------------------------------------------- shares
 
 
-def write_share(share: str, items: Sequence[int], path: Path, fail_at: int | None = None) -> None:
-    with GroupWriter(path, {"by": 1}, share=share) as writer:
-        for item in items:
-            if f"{item}" in writer.index.groups:
-                continue
-            if item == fail_at:
-                raise ImageError("no more")
-            writer.add(f"{item}", f"from {item}", {"value": np.array([item])}, note=item)
+def items_of(numbers: Sequence[int]) -> list[tuple[str, str, int]]:
+    return [(f"{number}", f"from {number}", number) for number in numbers]
 
 
-def unwritten(writer: GroupWriter, items: Sequence[int]) -> list[int]:
-    return [item for item in items if writer.index.source_of(f"{item}") != f"from {item}"]
+def write(writer: GroupWriter, items: Sequence[tuple[str, str, int]], fail_at: int | None = None) -> None:
+    for name, source, number in items:
+        if number == fail_at:
+            raise ImageError("no more")
+        writer.add(name, source, {"value": np.array([number])}, note=number)
+
+
+def do_share(share: str, numbers: Sequence[int], path: Path, fail_at: int | None = None) -> None:
+    groups._do_share((path, {"by": 1}, {}, share), items_of(numbers), GroupWriter.left, write, (fail_at,))
 
 
 def test_a_writer_takes_what_others_made(tmp_path: Path, here: Here) -> None:
     path = tmp_path / "file.h5"
     with GroupWriter(path, {"by": 1}) as writer:
         writer.add("0", "old", {"value": np.array([-1])}, note=-1)
-        assert writer.spread(write_share, range(20), (path,), unwritten, "write", "group") == []
+        assert writer.spread(write, items_of(range(20)), (), "write", "group") == []
         assert writer.notes() == {str(item): item for item in range(20)}
         assert {name: int(arrays["value"][0]) for name, arrays in writer.read()} == writer.notes()
         writer.annotate("3", "annotated")
     with GroupWriter(path, {"by": 1}) as writer:  # what comes last counts, in the next run too
         assert writer.notes()["3"] == "annotated"
-        writer.spread(write_share, [3], (path,), unwritten, "write", "group")
+        writer.spread(write, items_of([3]), (), "write", "group")
         assert writer.notes()["3"] == 3
         writer.finish()
     assert [path.name for path in sorted(tmp_path.iterdir())] == ["file.h5", "file.h5.meta.json"]
@@ -107,11 +109,11 @@ def test_a_writer_takes_what_others_made(tmp_path: Path, here: Here) -> None:
 
 def test_a_share_goes_on_where_it_was_and_leaves_others_alone(tmp_path: Path) -> None:
     path = tmp_path / "file.h5"
-    write_share("00000-00001-", range(5), path)
+    do_share("00000-00001-", range(5), path)
     with pytest.raises(ImageError):
-        write_share("00000-00000-", range(5, 10), path, fail_at=8)
+        do_share("00000-00000-", range(5, 10), path, fail_at=8)
     parts = {part.name: part.stat().st_mtime_ns for part in (tmp_path / ".file.h5.parts").iterdir()}
-    write_share("00000-00000-", range(5, 10), path, fail_at=7)  # which is there
+    do_share("00000-00000-", range(5, 10), path, fail_at=7)  # which is there
     now = {part.name: part.stat().st_mtime_ns for part in (tmp_path / ".file.h5.parts").iterdir()}
     assert now.items() > parts.items()
     with GroupWriter(path, {"by": 1}) as writer:
@@ -183,7 +185,13 @@ def test_features_and_maps_are_those_of_one_process(small_capture: Path, tmp_pat
 
 
 @pytest.mark.slow
-def test_poses_are_those_of_one_process(small_capture: Path, small_features: Path, tmp_path: Path, here: Here) -> None:
+@pytest.mark.parametrize("escalation", [[], ["other"]])
+def test_poses_are_those_of_one_process(
+    small_capture: Path, small_features: Path, tmp_path: Path, here: Here, monkeypatch: pytest.MonkeyPatch,
+    escalation: list[str],
+) -> None:  # fmt: skip
+    add_other_kind(monkeypatch)
+    settings = {"features": {"kinds": ["sift"], "escalation": escalation}, "pnp": {"ok_probability": 1.0}}
     files = SceneFiles(tmp_path / "run", small_capture.name)
     shutil.copytree(small_features, files.features)
     sessions = small_capture / "sessions"
@@ -196,9 +204,10 @@ def test_poses_are_those_of_one_process(small_capture: Path, small_features: Pat
             if name == "alone":
                 for module in ("toolkit.features.groups", "toolkit.localizers.mapping"):
                     patch.setattr(f"{module}.current_cluster", lambda: None)
-            localize_pairs(sessions, files.retrieval_dir, place.poses_dir, files.features, place.maps, map_device="ios")
+            folders = files.retrieval_dir, place.poses_dir, files.features, place.maps
+            localize_pairs(sessions, *folders, settings, map_device="ios")
         found[name] = {path.name: path.read_bytes() for path in sorted(place.poses_dir.glob("*.txt"))}
-    assert "localize" in here.labels
+    assert here.labels.count("localize") == 3 * (1 + len(escalation))
     assert len(found["alone"]) == 3
     assert found["cluster"] == found["alone"]
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from toolkit.features.network import NetworkExtractor
 from toolkit.manifest import AlikedSettings
 from toolkit.models.aliked import Aliked, find_keypoints
-from toolkit.models.compute import in_single_threads, resolve_device
+from toolkit.models.compute import in_single_threads
 from toolkit.models.weights import ALIKED, given_or_resolved
 
 
@@ -19,32 +19,10 @@ class AlikedExtractor(NetworkExtractor):
     color = True
     name = "aliked"
     title = "ALIKED"
+    defaults = AlikedSettings()
 
-    def __init__(
-        self,
-        checkpoint: str | Path | Mapping[str, Tensor] | None = None,
-        device: str = "auto",
-        dtype: str = "auto",
-        batch_size: int | None = None,
-        settings: AlikedSettings | None = None,
-    ) -> None:
-        """
-        Args:
-            checkpoint: the official file of the model in `settings`, or its tensors by name; None: from an installed
-                package or a cache, else downloaded.
-            device: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
-            dtype: of the encoder: `float32`, `bfloat16`, `float16`; `auto`: float32 on a CPU, where others gain little,
-                else the fastest on the device. Positions, scores and descriptors are always float32.
-            batch_size: most images at a time; None: as suits the device.
-
-        Raises:
-            WeightsError: no weights, or other ones.
-            ManifestError: no such device, precision or setting.
-            ToolkitError: no such device on this machine.
-        """
-        on_cpu = resolve_device(device).type == "cpu"
-        batch_size = batch_size or (torch.get_num_threads() if on_cpu else None)
-        super().__init__(checkpoint, device, dtype, batch_size, settings or AlikedSettings())
+    def _batch_on_cpu(self) -> int:
+        return torch.get_num_threads()
 
     def _load(self, checkpoint: str | Path | Mapping[str, Tensor] | None) -> Aliked:
         model = self._values.model

@@ -12,7 +12,7 @@ import logging
 import math
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, field
 from functools import wraps
@@ -195,7 +195,8 @@ def group_checksum(name: str, arrays: Mapping[str, Any]) -> int:
 
 P = ParamSpec("P")
 Result = TypeVar("Result")
-Item = TypeVar("Item")
+Item = TypeVar("Item", bound=tuple[Any, ...])
+"""What is to be done for a group: its name, what it is made from, and more."""
 
 
 def heals(stage: Callable[P, Result]) -> Callable[P, Result]:
@@ -313,34 +314,43 @@ class GroupWriter:
                 self._parts[part] = index
         self._index_all()
 
+    def left(self, items: Iterable[Item]) -> list[Item]:
+        """Return those of some items that are neither there nor known to fail."""
+        return [item for item in items if self.index.source_of(item[0]) != item[1]]
+
     def spread(
         self,
-        function: Callable[..., None],
+        function: Callable[..., object],
         items: Sequence[Item],
         others: tuple[Any, ...],
-        left: Callable[["GroupWriter", Sequence[Item]], list[Item]],
         label: str,
         unit: str,
         multiple: int = 1,
+        left: Callable[["GroupWriter", Sequence[Item]], list[Item]] | None = None,
     ) -> list[Item]:
         """Have work done by the workers of the cluster, if there is one, and take what they made.
 
         Args:
-            function: does a share; called with its name for a writer, its items, and the `others`.
+            function: does a share; called with a writer of its own, the items that this lacks, and the `others`.
             items: the work; a share has a `multiple` of them.
-            left: returns those of some items that the groups of a writer do not hold.
             label, unit: of the bar.
+            left: returns those of some items that a writer does not hold; None: `GroupWriter.left`.
 
         Returns:
             The items that are left to do here.
         """
+        left = left or GroupWriter.left
         cluster = current_cluster() if items else None
         if cluster is None:
             return list(items)
         self._close_part()
         generation, shares = self._next_number(), cluster.cut(items, multiple)
-        tasks = [(f"{generation:05d}-{number:05d}-", share, *others) for number, share in enumerate(shares)]
-        cluster.run(function, tasks, [len(share) for share in shares], label, unit)
+        own = self.path, self._made_by, self._attributes
+        tasks = [
+            ((*own, f"{generation:05d}-{number:05d}-"), share, left, function, others)
+            for number, share in enumerate(shares)
+        ]
+        cluster.run(_do_share, tasks, [len(share) for share in shares], label, unit)
         self._find_parts()
         return left(self, items)
 
@@ -548,6 +558,18 @@ class GroupWriter:
             self._parts[path] = index
             self.index.update(index)
             self._part_closed = time.monotonic()
+
+
+def _do_share(
+    made_with: tuple[Any, ...],
+    items: Sequence[Item],
+    left: Callable[[GroupWriter, Sequence[Item]], list[Item]],
+    function: Callable[..., object],
+    others: tuple[Any, ...],
+) -> None:
+    """Do a share of `GroupWriter.spread`, whose writer is made with these arguments."""
+    with GroupWriter(*made_with) as writer:
+        function(writer, left(writer, items), *others)
 
 
 def _is_whole(file: h5py.File, name: str) -> bool:

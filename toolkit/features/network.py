@@ -17,9 +17,7 @@ from toolkit.manifest import AlikedSettings, SuperPointSettings
 from toolkit.models.compute import Fitting, on_device, precision_of_matches, resolve_device
 from toolkit.models.weights import weights_digest
 
-# Few images keep a CPU busy; more at once take more memory and no less time.
-_BATCH = {"cpu": 2}
-_BATCH_ELSEWHERE = 16
+_BATCH = 16
 
 
 class NetworkExtractor(Remade):
@@ -34,19 +32,35 @@ class NetworkExtractor(Remade):
     """Key of the kind of features."""
     title: ClassVar[str]
     """Name of the network, for messages."""
+    defaults: ClassVar[AlikedSettings | SuperPointSettings]
 
     def __init__(
         self,
-        checkpoint: str | Path | Mapping[str, Tensor] | None,
-        device: str,
-        dtype: str,
-        batch_size: int | None,
-        settings: AlikedSettings | SuperPointSettings,
+        checkpoint: str | Path | Mapping[str, Tensor] | None = None,
+        device: str = "auto",
+        dtype: str = "auto",
+        batch_size: int | None = None,
+        settings: AlikedSettings | SuperPointSettings | None = None,
     ) -> None:
-        self._values: Any = settings
+        """
+        Args:
+            checkpoint: the official file of the network, or its tensors by name; None: from an installed package or a
+                cache, else downloaded.
+            device: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
+            dtype: of the encoder: `float32`, `bfloat16`, `float16`; `auto`: float32 on a CPU, else the fastest on the
+                device. What follows is always float32: positions, scores and descriptors.
+            batch_size: most images at a time; None: as suits the device.
+            settings: None: the `defaults`.
+
+        Raises:
+            WeightsError: no weights, or other ones.
+            ManifestError: no such device, precision or setting.
+            ToolkitError: a package is missing, or the device.
+        """
+        self._values: Any = settings or self.defaults
         self._device = resolve_device(device)
         self._dtype = precision_of_matches(dtype, self._device)
-        self.batch_size = batch_size or _BATCH.get(self._device.type, _BATCH_ELSEWHERE)
+        self.batch_size = batch_size or (self._batch_on_cpu() if self._device.type == "cpu" else _BATCH)
         model = self._load(checkpoint)
         self._weights = weights_digest(model)
         self._model: Any = on_device(model, self._device, self.title)
@@ -56,6 +70,9 @@ class NetworkExtractor(Remade):
     def settings(self) -> dict[str, Any]:
         precision = str(self._dtype).removeprefix("torch.")
         return {"name": self.name, "weights": self._weights, "dtype_compute": precision, **self._values.model_dump()}
+
+    def _batch_on_cpu(self) -> int:
+        return 2  # few images keep it busy; more at once take more memory and no less time
 
     def _load(self, checkpoint: str | Path | Mapping[str, Tensor] | None) -> nn.Module:
         """Return the network with its weights, on the CPU."""

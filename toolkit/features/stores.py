@@ -13,11 +13,11 @@ first image the index of the second image's feature or -1, and `matching_scores0
 import logging
 import threading
 from collections import Counter
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
-from itertools import islice, tee
+from itertools import islice
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import cv2
 import h5py
@@ -50,11 +50,10 @@ _BYTES = np.zeros(1 << 16, np.uint8)
 _BYTES[_HALVES.view(np.uint16)] = np.arange(256)
 
 
-_Todo = tuple[str, str, int]
-"""An image whose features are to be extracted: name, what they are made from, row of the session."""
+_Todo = tuple[str, str, int, int]
+"""An image whose features are to be extracted: name, what they are made from, row of the session, quarter turns."""
 _ToMatch = tuple[str, str, str, str]
-"""A pair to match: names, group of the file, what the matches are made from."""
-_Pair = TypeVar("_Pair", bound=tuple[Any, Any, str, str])
+"""A pair to match: group of the file, what the matches are made from, names."""
 
 
 def features_path(out: str | Path, session_id: str, settings: Mapping[str, Any]) -> Path:
@@ -261,12 +260,10 @@ def extract_session(
     made_from = {name: _made_from(session, row, int(turns[row])) for name, row in row_of.items()}
     path, label = features_path(out, session.id, extractor.settings), f"{extractor.settings['name']} {session.id}"
     with GroupWriter(path, extractor.settings, {PIXEL_CENTER: 0.0}) as writer:
-        todo = [(name, source, row_of[name]) for name, source in made_from.items()]
-        todo = _left(writer, todo) if skip_existing else todo
-        others = path, session, extractor, {row: int(turns[row]) for _, _, row in todo if turns[row]}
-        todo = writer.spread(_extract_share, todo, others, _left, label, "image")
-        bar = tqdm(todo, desc=label, unit="image", disable=not progress or not todo)
-        _extract_into(writer, bar, session, extractor, turns, workers)
+        todo = [(name, source, row_of[name], int(turns[row_of[name]])) for name, source in made_from.items()]
+        todo = writer.left(todo) if skip_existing else todo
+        todo = writer.spread(_extract_into, todo, (session, extractor), label, "image")
+        _extract_into(writer, todo, session, extractor, workers, label if progress and todo else "")
         writer.finish()
         index = writer.index
     failed = {name: index.failed[name][1] for name in made_from if name in index.failed}
@@ -274,30 +271,21 @@ def extract_session(
     return FeatureStore(path, readable, failed, extractor.settings)
 
 
-def _extract_share(
-    share: str, todo: Sequence[_Todo], path: Path, session: Session, extractor: Extractor, turned: Mapping[int, int]
-) -> None:
-    """Extract a share of a session's features; `turned` has the turns of rows with some."""
-    turns = np.zeros(len(session.images), np.int64)
-    turns[list(turned)] = list(turned.values())
-    with GroupWriter(path, extractor.settings, {PIXEL_CENTER: 0.0}, share) as writer:
-        _extract_into(writer, _left(writer, todo), session, extractor, turns, default_workers())
-
-
-def _left(writer: GroupWriter, todo: Sequence[_Todo]) -> list[_Todo]:
-    return [item for item in todo if writer.index.source_of(item[0]) != item[1]]
-
-
 def _extract_into(
-    writer: GroupWriter, todo: Iterable[_Todo], session: Session, extractor: Extractor, turns: Ints, workers: int
+    writer: GroupWriter,
+    todo: Sequence[_Todo],
+    session: Session,
+    extractor: Extractor,
+    workers: int = 0,
+    label: str = "",
 ) -> None:
-    """Add the features of images to a file, or why they have none."""
-    todo, rows = tee(todo)
+    """Add the features of images to a file, or why they have none; the bar has a `label`."""
     cv2_threads = cv2.getNumThreads()
     cv2.setNumThreads(1)  # the images are the parallel dimension
     try:
-        results = _extract(session, [row for _, _, row in rows], extractor, turns, workers)
-        for (name, source, _), features in zip(todo, results, strict=True):
+        results = _extract(session, [item[2:] for item in todo], extractor, workers or default_workers())
+        bar = tqdm(todo, desc=label, unit="image", disable=not label)
+        for (name, source, *_), features in zip(bar, results, strict=True):
             if isinstance(features, str):
                 writer.fail(name, source, features)
             else:
@@ -341,7 +329,7 @@ class OnDemandFeatures:
 
     def _extract_one(self, name: str) -> LocalFeatures:
         row = self._session.row_of_name[name]
-        features = next(_extract(self._session, [row], self._extractor, self._turns, workers=1))
+        features = next(_extract(self._session, [(row, int(self._turns[row]))], self._extractor, workers=1))
         if isinstance(features, str):
             log.warning("%s", features)
             camera = self._session.camera(self._session.images["sensor_id"].iloc[row])
@@ -357,9 +345,9 @@ def _made_from(session: Session, row: int, turns: int) -> str:
 
 
 def _extract(
-    session: Session, rows: list[int], extractor: Extractor, turns: Ints, workers: int
+    session: Session, images: list[tuple[int, int]], extractor: Extractor, workers: int
 ) -> Iterator[LocalFeatures | str]:
-    """Yield the features of each image, or why it has none."""
+    """Yield the features of each image, given by row and turns, or why it has none."""
     sensors = session.images["sensor_id"].to_numpy()
 
     def read(row: int) -> NDArray[np.uint8] | str:
@@ -375,18 +363,20 @@ def _extract(
             )
         return image
 
-    def read_and_extract(row: int) -> LocalFeatures | str:
+    def read_and_extract(asked: tuple[int, int]) -> LocalFeatures | str:
+        row, turns = asked
         image = read(row)
-        return image if isinstance(image, str) else extract_turned(extractor, [image], [int(turns[row])])[0]
+        return image if isinstance(image, str) else extract_turned(extractor, [image], [turns])[0]
 
     if extractor.threaded:
-        yield from prefetch(read_and_extract, rows, workers)
+        yield from prefetch(read_and_extract, images, workers)
         return
-    images = zip(rows, prefetch(read, rows, workers, ahead=2 * extractor.batch_size), strict=True)
-    while batch := list(islice(images, extractor.batch_size)):
-        readable = [(image, int(turns[row])) for row, image in batch if not isinstance(image, str)]
+    found = prefetch(read, (row for row, _ in images), workers, ahead=2 * extractor.batch_size)
+    turned = zip(found, (turns for _, turns in images), strict=True)
+    while batch := list(islice(turned, extractor.batch_size)):
+        readable = [(image, turns) for image, turns in batch if not isinstance(image, str)]
         features = iter(extract_turned(extractor, *zip(*readable, strict=True)) if readable else [])
-        for _, image in batch:
+        for image, _ in batch:
             yield image if isinstance(image, str) else next(features)
 
 
@@ -479,38 +469,15 @@ def match_sessions(
     with GroupWriter(path, made_by) as writer:
         readable = [(name0, name1) for name0, name1 in pairs if name0 in stores[0] and name1 in stores[1]]
         todo = [
-            (name0, name1, group, stores[0].made_from[name0] + stores[1].made_from[name1])
+            (group, stores[0].made_from[name0] + stores[1].made_from[name1], name0, name1)
             for (name0, name1), group in group_names(readable, writer.index.groups).items()
         ]
-        todo = unmatched(writer, todo) if skip_existing else todo
-        label = f"{matcher.settings['name']} {' '.join(sessions)}"
-        others = path, made_by, stores, matcher
-        todo = writer.spread(_match_share, todo, others, unmatched, label, "pair", matcher.batch_size)
-        with tqdm(total=len(todo), desc=label, unit="pair", disable=not todo) as bar:
-            _match_into(writer, todo, stores, matcher, bar.update)
+        todo = writer.left(todo) if skip_existing else todo
+        others = stores, matcher, f"{matcher.settings['name']} {' '.join(sessions)}"
+        todo = writer.spread(_match_into, todo, others, others[-1], "pair", matcher.batch_size)
+        _match_into(writer, todo, *others)
         writer.finish()
     return MatchStore(path)
-
-
-def _match_share(
-    share: str,
-    todo: Sequence[_ToMatch],
-    path: Path,
-    made_by: Mapping[str, Any],
-    stores: tuple[FeatureStore, FeatureStore],
-    matcher: Matcher,
-) -> None:
-    with GroupWriter(path, made_by, share=share) as writer:
-        _match_into(writer, unmatched(writer, todo), stores, matcher, lambda _: None)
-
-
-def unmatched(writer: GroupWriter, todo: Sequence[_Pair]) -> list[_Pair]:
-    """Return the pairs whose matches, made from the same, a file does not have.
-
-    Args:
-        todo: pairs of images, by name or index, each with its group and what its matches are made from.
-    """
-    return [pair for pair in todo if writer.index.groups.get(pair[2]) != pair[3]]
 
 
 def _match_into(
@@ -518,17 +485,20 @@ def _match_into(
     todo: Sequence[_ToMatch],
     stores: tuple[FeatureStore, FeatureStore],
     matcher: Matcher,
-    done: Callable[[int], object],
+    label: str,
 ) -> None:
-    """Add the matches of pairs to a file; `done` is told of how many."""
-    for start in range(0, len(todo), matcher.batch_size):
-        batch = todo[start : start + matcher.batch_size]
-        # One object for each image: the matcher computes once what depends on one image alone.
-        loaded = [{name: store[name] for name in {pair[side] for pair in batch}} for side, store in enumerate(stores)]
-        features = [(loaded[0][name0], loaded[1][name1]) for name0, name1, *_ in batch]
-        for pair, both, matches in zip(batch, features, matcher.match(features), strict=True):
-            write_matches(writer, *pair[2:], (len(both[0]), len(both[1])), matches)
-        done(len(batch))
+    """Add the matches of pairs to a file."""
+    with tqdm(total=len(todo), desc=label, unit="pair", disable=not todo) as bar:
+        for start in range(0, len(todo), matcher.batch_size):
+            batch = todo[start : start + matcher.batch_size]
+            # One object for each image: the matcher computes once what depends on one image alone.
+            first, second = (
+                {name: store[name] for name in {pair[side] for pair in batch}} for side, store in enumerate(stores, 2)
+            )
+            features = [(first[name0], second[name1]) for _, _, name0, name1 in batch]
+            for pair, both, matches in zip(batch, features, matcher.match(features), strict=True):
+                write_matches(writer, *pair[:2], (len(both[0]), len(both[1])), matches)
+            bar.update(len(batch))
 
 
 def group_names(pairs: Iterable[tuple[str, str]], existing: Container[str] = ()) -> dict[tuple[str, str], str]:

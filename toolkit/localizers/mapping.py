@@ -22,7 +22,7 @@ from toolkit.errors import ArtifactError, ImageError
 from toolkit.features.features import LocalFeatures, feature_kind
 from toolkit.features.groups import GroupWriter
 from toolkit.features.matching import PairMatches, match_along_epipolar_lines, unit_descriptors
-from toolkit.features.stores import FeatureStore, MatchStore, group_names, matches_path, unmatched, write_matches
+from toolkit.features.stores import FeatureStore, MatchStore, group_names, matches_path, write_matches
 from toolkit.files import Remade, fingerprint, is_current, temporary_folder, write_sidecar
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.local_map import LocalMap
@@ -32,8 +32,8 @@ from toolkit.localizers.triangulation import triangulate
 from toolkit.manifest import MapSettings
 from toolkit.runs.cluster import current_cluster
 
-_ToMatch = tuple[int, int, str, str]
-"""A pair to match: images, group of the file, what the matches are made from."""
+_ToMatch = tuple[str, str, int, int]
+"""A pair to match: group of the file, what the matches are made from, images."""
 DEPTHS = (2.0, 4.0, 8.0, 16.0)
 """Depths at which views are compared, "meters"."""
 _MAP_FORMAT = 4
@@ -197,9 +197,8 @@ def build_map(
     return LocalMap.load(path)
 
 
-def _match_share(share: str, todo: Sequence[_ToMatch], plan: "MapPlan", number: int) -> None:
-    with plan._matches(number, share) as writer:
-        plan.match_into(writer, unmatched(writer, todo), default_workers(), label="")
+def _match_share(writer: GroupWriter, todo: Sequence[_ToMatch], plan: "MapPlan") -> None:
+    plan.match_into(writer, todo, default_workers(), label="")
 
 
 class MapPlan(Remade):
@@ -288,17 +287,14 @@ class MapPlan(Remade):
     def match(self, number: int, skip_existing: bool = True, workers: int = 1) -> None:
         """Match the pairs of a tile along epipolar lines, but for those whose matches are there."""
         pairs, names, made_from = self.pairs_of[number].tolist(), self.names, self._made_from
-        with self._matches(number) as writer:
+        with GroupWriter(self._matches_path(number), self._matches_made_by(number)) as writer:
             groups = group_names([(names[i], names[j]) for i, j in pairs], writer.index.groups)
-            todo = [(i, j, groups[names[i], names[j]], made_from[i] + made_from[j]) for i, j in pairs]
-            todo = unmatched(writer, todo) if skip_existing else todo
+            todo = [(groups[names[i], names[j]], made_from[i] + made_from[j], i, j) for i, j in pairs]
+            todo = writer.left(todo) if skip_existing else todo
             label = f"match {self.session.id}" + (f" {number + 1}/{len(self.tiles)}" if len(self.tiles) > 1 else "")
-            todo = writer.spread(_match_share, todo, (self.of_worker, number), unmatched, label, "pair")
+            todo = writer.spread(_match_share, todo, (self.of_worker,), label, "pair")
             self.match_into(writer, todo, workers, label if todo else "")
             writer.finish()
-
-    def _matches(self, number: int, share: str | None = None) -> GroupWriter:
-        return GroupWriter(self._matches_path(number), self._matches_made_by(number), share=share)
 
     def match_into(self, writer: GroupWriter, todo: Sequence[_ToMatch], workers: int, label: str) -> None:
         """Add the matches of pairs to a file."""
@@ -310,7 +306,7 @@ class MapPlan(Remade):
             return found
 
         found = match_pairs(
-            np.array([pair[:2] for pair in todo], np.int64).reshape(-1, 2),
+            np.array([pair[2:] for pair in todo], np.int64).reshape(-1, 2),
             load,
             self.cameras,
             self.world_from_cams,
@@ -320,7 +316,7 @@ class MapPlan(Remade):
             workers,
         )
         bar = tqdm(found, total=len(todo), desc=label, unit="pair", disable=not label)
-        for (i, j, group, source), matches in zip(todo, bar, strict=True):
+        for (group, source, i, j), matches in zip(todo, bar, strict=True):
             write_matches(writer, group, source, (counts[i], counts[j]), matches)
 
     def tile_path(self, number: int) -> Path:
