@@ -184,6 +184,14 @@ def test_a_layer_in_any_precision() -> None:
         torch.testing.assert_close(found.float(), x @ weight.T + bias, atol=2e-2, rtol=2e-2)
 
 
+def test_a_layer_in_bfloat16_on_a_processor_that_onednn_has_no_product_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", lambda: False)
+    monkeypatch.setattr(torch.ops.mkldnn, "_linear_pointwise", MagicMock(side_effect=RuntimeError("no primitive")))
+    x, weight = torch.rand(3, 5).bfloat16(), torch.rand(4, 5).bfloat16()
+    with torch.inference_mode():
+        torch.testing.assert_close(linear(x, weight), x @ weight.T)
+
+
 def test_other_errors_are_not_taken_for_it() -> None:
     def run(_: torch.Tensor) -> torch.Tensor:
         raise RuntimeError("shapes do not fit")

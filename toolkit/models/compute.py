@@ -111,14 +111,16 @@ def has_onednn(x: "torch.Tensor") -> bool:
     """Tell whether `linear` uses oneDNN for this tensor."""
     import torch
 
-    return (
-        x.device.type == "cpu"
-        and x.dtype != torch.float16  # few processors have products for it
-        and not torch.is_grad_enabled()
-        and torch.backends.mkldnn.is_available()
-        and platform.machine().lower() in ("x86_64", "amd64")
-        and hasattr(torch.ops.mkldnn, "_linear_pointwise")
-    )
+    if (
+        x.device.type != "cpu"
+        or torch.is_grad_enabled()
+        or not torch.backends.mkldnn.is_available()
+        or platform.machine().lower() not in ("x86_64", "amd64")
+        or not hasattr(torch.ops.mkldnn, "_linear_pointwise")
+    ):
+        return False
+    # Few processors have products of float16; without AVX-512 there are none of bfloat16.
+    return x.dtype == torch.float32 or (x.dtype == torch.bfloat16 and torch.ops.mkldnn._is_mkldnn_bf16_supported())
 
 
 def linear(x: "torch.Tensor", weight: "torch.Tensor", bias: "torch.Tensor | None" = None) -> "torch.Tensor":
