@@ -6,6 +6,7 @@ import os
 import shutil
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -336,9 +337,8 @@ def test_a_rendering_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pyte
     assert not list(tmp_path.iterdir())
 
 
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A capture of two bare rooms that look alike, by a phone: recordings of 60 s, a loss, a gap, and radio."""
+def render_bare(out: Path, *given: int, **more: Any) -> Path:
+    """Render rooms by a phone, quickly: there is one wall in each."""
 
     def bare_room(seed: int, index: int, look: int | None = None) -> Scene:
         scene = build_room(seed, index, look)
@@ -349,10 +349,14 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(capture_writing, "build_room", bare_room)
         patch.setattr(capture_writing, "DEVICES", {"ios": halved(DEVICES["ios"])})
-        return render_capture(
-            tmp_path_factory.mktemp("recorded") / "LONG", 2, 8, seed=1, progress=False,
-            alike=True, seconds=60, losses=1, gaps=1, radio=True,
-        )  # fmt: skip
+        return render_capture(out, *given, progress=False, **more)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two rooms that look alike: recordings of 60 s, a loss, a gap, and radio."""
+    out = tmp_path_factory.mktemp("recorded") / "LONG"
+    return render_bare(out, 2, 8, seed=1, alike=True, seconds=60, losses=1, gaps=1, radio=True)
 
 
 def test_a_recording_has_odometry_between_its_pictures_with_a_loss_and_a_gap(recorded: Path) -> None:
@@ -445,6 +449,11 @@ def test_scans_of_wifi_have_what_the_format_asks_for() -> None:
         assert len(address) == 17
         assert frequency_khz in (2_412_000, 2_437_000, 5_180_000, 5_260_000)
         assert -92 < dbm < -20
+
+
+def test_a_short_recording_with_losses_has_a_map_of_few_images(tmp_path: Path) -> None:
+    capture = render_bare(tmp_path / "SHORT", 2, 4, seed=5, alike=True, seconds=40, losses=3, gaps=1)
+    assert not check_capture(capture).problems
 
 
 def test_refusals(tmp_path: Path) -> None:

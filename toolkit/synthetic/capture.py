@@ -262,11 +262,12 @@ def _write_session(path: Path, world: World, table: Tables, rooms: list[Scene]) 
             table.sensors[sensor_id] = (sensor_id, f"{kind} sensor", {"bt": "bluetooth"}.get(kind, kind))
             rng, emitters = named_rng(world.seed, kind, recording), emitters_of(world.seed, rooms, kind)
             scanned.setdefault(kind, []).extend(scans(rng, times[rows], measured[rows], emitters, rooms, sensor_id))
-        rng, device = named_rng(world.seed, "odometry", recording), world.devices[name]
-        parts = PICTURE_S * RATE_HZ if long else 1.0
-        kept[rows], measured[rows] = tracked(
-            rng, times[rows], measured[rows], device.drift, parts, world.losses, world.gaps
-        )
+        if split == "query":  # a map of few images would have pieces without any
+            rng, device = named_rng(world.seed, "odometry", recording), world.devices[name]
+            parts = PICTURE_S * RATE_HZ if long else 1.0
+            kept[rows], measured[rows] = tracked(
+                rng, times[rows], measured[rows], device.drift, parts, world.losses, world.gaps
+            )
     odometry = Trajectory.from_poses(times[kept], np.array(ids, object)[kept].tolist(), measured[kept])
     frames = pd.DataFrame(pictured, columns=["timestamp", "device_id"])
     pruned = frames[np.arange(len(frames)) % 6 != 5]
