@@ -8,6 +8,7 @@ import pytest
 from tests.localized import instants, some_correspondences, write_pair, write_queries
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError
+from toolkit.files import write_sidecar
 from toolkit.geometry import make_pose
 from toolkit.localizers.correspondences import LocalizedQuery
 from toolkit.localizers.local_map import LocalMap
@@ -149,6 +150,18 @@ def test_poses_without_their_correspondences_are_an_error(capture, tmp_path):
     stem = write_pair(capture, tmp_path, "ios", "ios", [LocalizedQuery()])
     stem.with_name(f"{stem.name}.h5").unlink()
     with pytest.raises(ArtifactError, match=r"\.h5"):
+        LocalizedPair.open(capture, "ios", "ios", tmp_path, None)
+
+
+@pytest.mark.parametrize("suffix", ["txt", "csv"])
+def test_files_of_a_run_that_were_cut_off_are_an_error(capture, tmp_path, suffix):
+    stem = write_pair(capture, tmp_path, "ios", "ios", [LocalizedQuery(), LocalizedQuery()])
+    poses, table = (stem.with_name(f"{stem.name}.{end}") for end in ("txt", "csv"))
+    write_sidecar(poses, {}, [table])
+    assert len(LocalizedPair.open(capture, "ios", "ios", tmp_path, None).table) == 2
+    torn = stem.with_name(f"{stem.name}.{suffix}")
+    torn.write_text("".join(torn.read_text().splitlines(True)[:-1]))
+    with pytest.raises(ArtifactError, match=rf"\.{suffix} is damaged"):
         LocalizedPair.open(capture, "ios", "ios", tmp_path, None)
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.tables import read_query_table
 from toolkit.errors import ArtifactError
-from toolkit.files import map_record_path, pair_name, read_map_record
+from toolkit.files import map_record_path, pair_name, read_map_record, require_whole
 from toolkit.geometry import Floats, Ints, invert
 from toolkit.localizers.correspondences import Correspondences, LocalizedQueries, LocalizedQuery
 from toolkit.localizers.local_map import LocalMap
@@ -206,11 +206,14 @@ class LocalizedPair:
         """
         name = pair_name(capture.name, map_device, query_device)
         session, stem = capture[f"{query_device}_query"], Path(poses_dir) / name
-        table = read_query_table(Path(f"{stem}.csv"), ["status"])
+        file, listed = Path(f"{stem}.txt"), Path(f"{stem}.csv")
+        require_whole(file)  # a query whose line is cut off would pass for one without a pose
+        require_whole(listed, of=file)
+        table = read_query_table(listed, ["status"])
         rows = session.rows_of_keyframes(table)
         has_image = np.array([len(images) > 0 for images in rows], bool)
         table, rows = table[has_image].reset_index(drop=True), [images for images in rows if len(images)]
-        poses = Trajectory.read(Path(f"{stem}.txt")).lookup(table["timestamp"].to_numpy(), table["device_id"])
+        poses = Trajectory.read(file).lookup(table["timestamp"].to_numpy(), table["device_id"])
         local_map = load_maps(map_files(map_dir, f"{map_device}_map", stem))
         queries = LocalizedQueries(Path(f"{stem}.h5"))
         unit = length_unit(read_map_record(map_record_path(poses_dir, capture.name, map_device)))
