@@ -12,6 +12,7 @@ import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
@@ -278,22 +279,54 @@ RUN_FILES = ("notebooks", "report.html", "run.json", "run.log", "submission.csv"
 """What lies in a run folder beside its scenes, none of which can have such a name."""
 
 
+@dataclass(frozen=True)
 class SceneFiles:
-    """Where the files of one scene lie in a run folder, `<output_root>/<manifest name>`."""
+    """Where the files of one scene lie in a run folder."""
 
-    def __init__(self, run: Path, scene: str) -> None:
-        """`scene` is the name of the capture's folder."""
-        self.run, self.scene = run, scene
-        self.root = Path(run) / scene
-        self.embeddings = self.root / "embeddings"
-        self.features = self.root / "features"
-        self.maps = self.root / "map"
-        self.index = self.root / "index"
-        self.retrieval_dir = self.root / "retrieval"
-        self.reranked_dir = self.root / "reranked"
-        self.poses_dir = self.root / "poses"
-        self.evaluation = self.root / "evaluation"
-        self.visualization = self.root / "visualization"
+    run: Path
+    """The run folder, `<output_root>/<manifest name>`."""
+    scene: str
+    """Name of the capture's folder."""
+
+    @property
+    def root(self) -> Path:
+        return Path(self.run) / self.scene
+
+    @property
+    def embeddings(self) -> Path:
+        return self.root / "embeddings"
+
+    @property
+    def features(self) -> Path:
+        return self.root / "features"
+
+    @property
+    def maps(self) -> Path:
+        return self.root / "map"
+
+    @property
+    def index(self) -> Path:
+        return self.root / "index"
+
+    @property
+    def retrieval_dir(self) -> Path:
+        return self.root / "retrieval"
+
+    @property
+    def reranked_dir(self) -> Path:
+        return self.root / "reranked"
+
+    @property
+    def poses_dir(self) -> Path:
+        return self.root / "poses"
+
+    @property
+    def evaluation(self) -> Path:
+        return self.root / "evaluation"
+
+    @property
+    def visualization(self) -> Path:
+        return self.root / "visualization"
 
     def retrieval(self, map_device: str, query_device: str) -> Path:
         return self.retrieval_dir / f"{pair_name(self.scene, map_device, query_device)}.jsonl"
