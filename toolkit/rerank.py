@@ -14,14 +14,12 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pandas as pd
-from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
-from toolkit.capture.images import default_workers, prefetch
+from toolkit.capture.images import default_workers, one_thread, prefetch
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.errors import INTERNAL, ArtifactError, reason_of
 from toolkit.features.features import KINDS
@@ -92,29 +90,22 @@ def rerank_pairs(
     turns = upright_turns(capture, settings.world_up) if KINDS[method.name].upright else None
     workers = workers or default_workers()
     table = PairRows(capture.name, Path(out_dir), Path(retrieval_dir))
-    cv2_threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # queries are the parallel dimension, and sums stay in one order
-    try:
-        with threadpool_limits(1, "blas"):
-            for devices in product(
-                capture.devices_with("map", map_device), capture.devices_with("query", query_device)
-            ):
-                with table.row(*devices) as row:
-                    table.check_upstream()
-                    started = time.perf_counter()
-                    sessions = capture[f"{devices[0]}_map"], capture[f"{devices[1]}_query"]
-                    name = f"{pair_name(capture.name, *devices)}.jsonl"
-                    pair = _Pair(*sessions, Path(retrieval_dir) / name, Path(out_dir) / name, method, settings)
-                    skipped = skip_existing and is_current(pair.path, pair.record)
-                    if skipped:
-                        sweep(pair.path)
-                    else:
-                        pair.rerank(Path(features_dir), workers, skip_existing, turns)
-                    row |= _counts(read_references(pair.path))
-                    row |= {"seconds": round(time.perf_counter() - started, 2), "skipped": skipped}
-                    row["path"] = str(pair.path)
-    finally:
-        cv2.setNumThreads(cv2_threads)
+    with one_thread():  # queries are the parallel dimension
+        for devices in product(capture.devices_with("map", map_device), capture.devices_with("query", query_device)):
+            with table.row(*devices) as row:
+                table.check_upstream()
+                started = time.perf_counter()
+                sessions = capture[f"{devices[0]}_map"], capture[f"{devices[1]}_query"]
+                name = f"{pair_name(capture.name, *devices)}.jsonl"
+                pair = _Pair(*sessions, Path(retrieval_dir) / name, Path(out_dir) / name, method, settings)
+                skipped = skip_existing and is_current(pair.path, pair.record)
+                if skipped:
+                    sweep(pair.path)
+                else:
+                    pair.rerank(Path(features_dir), workers, skip_existing, turns)
+                row |= _counts(read_references(pair.path))
+                row |= {"seconds": round(time.perf_counter() - started, 2), "skipped": skipped}
+                row["path"] = str(pair.path)
     frame = table.frame()
     write_text(Path(out_dir) / "settings.json", settings.model_dump_json(indent=1) + "\n")
     return frame
