@@ -81,7 +81,7 @@ def localize_session(
 ) -> Iterator[list[dict[str, Any]]]:
     """Yield for each query of a session a row by degradation and choice of references."""
     from toolkit.capture.images import prefetch, read_image
-    from toolkit.features.features import SiftExtractor
+    from toolkit.features.sift import SiftExtractor
     from toolkit.geometry import pose_error
     from toolkit.localizers.base import Query, References, View
     from toolkit.localizers.confidence import EVIDENCE

@@ -4,7 +4,8 @@ from typing import Any
 
 import pytest
 
-from toolkit.features.features import KINDS, FeatureKind, SiftExtractor
+from toolkit.features.features import KINDS, FeatureKind
+from toolkit.features.sift import SiftExtractor
 
 OTHER = FeatureKind(
     "tests.other_kind:OtherExtractor", ("mutual",), 0.85, -1.0,

@@ -31,8 +31,9 @@ from toolkit.embedders import EMBEDDERS
 from toolkit.errors import ArtifactError, CaptureError, ImageError, ManifestError, ToolkitError
 from toolkit.evaluate import evaluate_scene
 from toolkit.features import groups
-from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor, SiftSettings
+from toolkit.features.features import KINDS, LocalFeatures
 from toolkit.features.matching import MATCHERS, MutualMatcher, unit_descriptors
+from toolkit.features.sift import SiftExtractor, SiftSettings
 from toolkit.features.stores import extract_session
 from toolkit.files import SceneFiles, image_name, map_record_path, read_map_record, read_references, sidecar_path
 from toolkit.localize import COLUMNS, Map, localize_image, localize_pairs

@@ -18,9 +18,10 @@ from toolkit.embed import embed_sessions
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError
 from toolkit.evaluate import overlap_in_view, overlap_table
 from toolkit.features import verification
-from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor
+from toolkit.features.features import KINDS, LocalFeatures
 from toolkit.features.groups import GroupWriter
 from toolkit.features.matching import LocalMethod, MutualMatcher
+from toolkit.features.sift import SiftExtractor
 from toolkit.features.verification import is_meaningful, verified_matches
 from toolkit.files import SceneFiles, read_references, sidecar_path
 from toolkit.geometry import invert, make_pose, transform

@@ -22,8 +22,9 @@ from toolkit.capture.turning import turn_image
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import WEIGHTS, Embedder, create_embedder, resolve_model
 from toolkit.errors import CaptureError, ImageError, ManifestError, ToolkitError
-from toolkit.features.features import LocalFeatures, SiftExtractor
+from toolkit.features.features import LocalFeatures
 from toolkit.features.groups import GroupWriter, heals, sweep
+from toolkit.features.sift import SiftExtractor
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import (
     file_fingerprint,

@@ -15,16 +15,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tests.features.test_features import assert_same, textured
 from tests.features.test_matching import features_of, random_units
+from tests.features.test_sift import assert_same, textured
 from toolkit.capture import Session, write_session
 from toolkit.capture.images import read_image
 from toolkit.errors import ArtifactError
 from toolkit.features import groups, stores
 from toolkit.features.features import (
     LocalFeatures,
-    SiftExtractor,
-    SiftSettings,
 )
 from toolkit.features.groups import GroupWriter
 from toolkit.features.matching import (
@@ -32,6 +30,7 @@ from toolkit.features.matching import (
     PairMatches,
     unit_descriptors,
 )
+from toolkit.features.sift import SiftExtractor, SiftSettings
 from toolkit.features.stores import (
     FeatureStore,
     MatchStore,
@@ -275,21 +274,21 @@ def test_a_stopped_run_keeps_what_it_finished(
 KILLED = """
 import os, signal, sys
 import numpy as np
-from toolkit.features import features, groups, stores
+from toolkit.features import groups, sift, stores
 from toolkit.capture import Session
 
 folder, out = sys.argv[1:]
 groups.PART_GROUPS = 2
-class Killed(features.SiftExtractor):
+class Killed(sift.SiftExtractor):
     count = 0
     def extract(self, images):
         self.count += 1
         if self.count == 4:  # two images are in a whole part, the third in one that is being written
             os.kill(os.getpid(), signal.SIGKILL)
         return super().extract(images)
-sift = Killed(features.SiftSettings(min_long_side=0, max_keypoints=200))
+killed = Killed(sift.SiftSettings(min_long_side=0, max_keypoints=200))
 stores.prefetch = lambda function, items, workers: map(function, items)  # the one before has been written
-stores.extract_session(Session.open(folder), out, sift, progress=False)
+stores.extract_session(Session.open(folder), out, killed, progress=False)
 """
 
 

@@ -106,7 +106,7 @@ def test_a_prediction_finds_what_descriptors_alone_do_not(world: World, hybrid: 
     query, references = asked_of(world, "ios", 0)
     true, near = world.queries("ios")[1][0], references[0].images[:4]
     features = hybrid.pnp.matcher.mapped[0].features
-    strict = PnpLocalizer([MappedFeatures(world.map, features, matcher=MutualMatcher(ratio=0.0))])
+    strict = PnpLocalizer([MappedFeatures(world.map, features, matcher=MutualMatcher(min_score=2.0))])
     alone = strict.localize(query, references)
     assert alone.status.startswith("failed")
     prediction = prediction_near(true, near)

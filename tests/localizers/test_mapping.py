@@ -15,7 +15,7 @@ from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory, write_session
 from toolkit.capture.cameras import in_view, rays_of, view_bounds
 from toolkit.errors import ArtifactError
-from toolkit.features.features import SiftExtractor, SiftSettings
+from toolkit.features.sift import SiftExtractor, SiftSettings
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import sidecar_path
 from toolkit.localizers import mapping

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from toolkit import geometry
 from toolkit.capture import Capture, Trajectory
-from toolkit.features.features import KINDS, SiftExtractor
+from toolkit.features.features import KINDS
+from toolkit.features.sift import SiftExtractor
 from toolkit.features.stores import FeatureStore
 from toolkit.geometry import Floats
 from toolkit.localizers.local_map import Consistency, LocalMap

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tests.localizers.test_mapping import PINHOLE, assert_equal, looking_at
 from toolkit import geometry
 from toolkit.capture import Capture, Session
-from toolkit.features.features import SiftExtractor, SiftSettings
+from toolkit.features.sift import SiftExtractor, SiftSettings
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import sweep_partials, temporary_folder
 from toolkit.localizers import local_map as local_maps

@@ -25,7 +25,7 @@ from toolkit.capture.names import ALLOW_OUTSIDE
 from toolkit.embed import embed_sessions
 from toolkit.errors import DamagedError, ImageError, ManifestError, ToolkitError
 from toolkit.features import groups
-from toolkit.features.features import SiftExtractor
+from toolkit.features.sift import SiftExtractor
 from toolkit.features.groups import GroupWriter
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import Remade, SceneFiles

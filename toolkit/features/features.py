@@ -1,20 +1,17 @@
-"""Local features of images: what they are, their kinds, and SIFT. `stores` keeps them in files."""
+"""Local features of images: what they are, and their kinds. `stores` keeps them in files."""
 
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pkgutil import resolve_name
 from typing import Any, Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from toolkit.capture.turning import turn_image, turn_points
 from toolkit.errors import ManifestError
-from toolkit.files import Remade
 from toolkit.geometry import Ints
-from toolkit.manifest import AUTO, FeaturesSettings, SiftSettings, checkpoint_of, nearest
+from toolkit.manifest import AUTO, FeaturesSettings, checkpoint_of, nearest
 
 DESCRIPTOR_SCALE = 512.0
 """RootSIFT vectors have length 1; times this they fill the range of a byte, as COLMAP stores them."""
@@ -109,7 +106,7 @@ KINDS: dict[str, FeatureKind] = {
     # RootSIFT has no negative entries: unrelated patches already score about 0.5, so the ratio test decides. The less
     # the geometry restricts the candidates, the higher is the least score.
     "sift": FeatureKind(
-        "toolkit.features.features:SiftExtractor", ("mutual",), 0.85, -1.0, epipolar_min_score=0.6,
+        "toolkit.features.sift:SiftExtractor", ("mutual",), 0.85, -1.0, epipolar_min_score=0.6,
         guided_min_score=0.75, scale_octaves=1.0, upright=False,
     ),
     # Scores of unrelated patches scatter about 0, and look-alikes are common: the usual test is a distance below 0.7
@@ -166,72 +163,3 @@ def extract_turned(
     """Return the features of images as they are stored, extracted after counter-clockwise quarter turns."""
     upright = extractor.extract([turn_image(image, turn) for image, turn in zip(images, turns, strict=True)])
     return [features.turned(-turn) if turn else features for features, turn in zip(upright, turns, strict=True)]
-
-
-def stretch_contrast(gray: NDArray[np.uint8], max_gain: float = 8.0) -> NDArray[np.uint8]:
-    """Return the image with its 1st to 99th percentile spread over the whole range, by a gain of at most `max_gain`.
-
-    A SIFT descriptor does not change with gain, but a dark image has no keypoint above a fixed contrast.
-    """
-    low, high = np.percentile(gray[::4, ::4], (1.0, 99.0))
-    gain = min(255.0 / max(high - low, 1.0), max_gain)
-    table = np.clip((np.arange(256) - low) * gain, 0, 255).astype(np.uint8)
-    return np.asarray(cv2.LUT(gray, table), np.uint8)
-
-
-class SiftExtractor(Remade):
-    """Extracts RootSIFT features; one instance may be used by several threads."""
-
-    color = False
-    batch_size = 1
-    threaded = True
-
-    def __init__(self, settings: SiftSettings | None = None):
-        self._settings = settings or SiftSettings()
-        self._local = threading.local()
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        return {"name": "sift", **self._settings.model_dump()}
-
-    def extract(self, images: Sequence[NDArray[np.uint8]]) -> list[LocalFeatures]:
-        """Return the features of images, (H, W) gray or (H, W, 3) RGB, uint8."""
-        return [self._extract(image) for image in images]
-
-    def _extract(self, image: NDArray[np.uint8]) -> LocalFeatures:
-        settings = self._settings
-        gray = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
-        height, width = gray.shape
-        long_side = max(height, width)
-        target = float(np.clip(long_side, settings.min_long_side, settings.max_long_side))
-        size = (max(1, round(width * target / long_side)), max(1, round(height * target / long_side)))
-        image = stretch_contrast(gray)
-        if size != (width, height):
-            interpolation = cv2.INTER_AREA if size[0] < width else cv2.INTER_CUBIC
-            image = np.asarray(cv2.resize(image, size, interpolation=interpolation), np.uint8)
-        keypoints, descriptors = self._sift().detectAndCompute(image, None)
-        if descriptors is None or not len(keypoints):
-            return LocalFeatures.none((width, height))
-        scale = np.array([width / size[0], height / size[1]])
-        responses = np.array([keypoint.response for keypoint in keypoints], np.float32)
-        order = np.argsort(-responses, kind="stable")[: settings.max_keypoints]
-        keypoints, descriptors = [keypoints[index] for index in order], descriptors[order]
-        xy = np.array([keypoint.pt for keypoint in keypoints])
-        # OpenCV puts the center of the top-left pixel at 0.
-        xy = (xy + 0.5) * scale
-        sigma = np.array([keypoint.size for keypoint in keypoints]) / 2 * scale.mean()
-        root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6))
-        quantized = np.clip(np.round(root * DESCRIPTOR_SCALE), 0, 255).astype(np.uint8)
-        return LocalFeatures(
-            xy.astype(np.float32), sigma.astype(np.float32), responses[order], quantized, (width, height)
-        )
-
-    def _sift(self) -> Any:
-        # OpenCV's detector keeps buffers between calls, so each thread has its own.
-        if not hasattr(self._local, "sift"):
-            self._local.sift = cv2.SIFT.create(
-                nfeatures=self._settings.max_keypoints,
-                contrastThreshold=self._settings.contrast_threshold,
-                enable_precise_upscale=True,
-            )
-        return self._local.sift

@@ -26,11 +26,12 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from toolkit.capture import Session
-from toolkit.capture.images import default_workers, prefetch, read_image
+from toolkit.capture.images import default_workers, one_thread, prefetch, read_image
 from toolkit.errors import ArtifactError, DamagedError, ImageError, first_line
-from toolkit.features.features import DESCRIPTOR_SCALE, KINDS, Extractor, LocalFeatures, SiftExtractor, extract_turned
+from toolkit.features.features import DESCRIPTOR_SCALE, KINDS, Extractor, LocalFeatures, extract_turned
 from toolkit.features.groups import HDF5_ERRORS, GroupWriter, group_names_of, has_group, read_group
 from toolkit.features.matching import Matcher, PairMatches
+from toolkit.features.sift import SiftExtractor
 from toolkit.files import files_fingerprint, fingerprint, read_sidecar
 from toolkit.geometry import Ints
 
@@ -280,9 +281,7 @@ def _extract_into(
     label: str = "",
 ) -> None:
     """Add the features of images to a file, or why they have none; the bar has a `label`."""
-    cv2_threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # the images are the parallel dimension
-    try:
+    with one_thread():  # the images are the parallel dimension
         results = _extract(session, [item[2:] for item in todo], extractor, workers or default_workers())
         bar = tqdm(todo, desc=label, unit="image", disable=not label)
         for (name, source, *_), features in zip(bar, results, strict=True):
@@ -292,8 +291,6 @@ def _extract_into(
                 quantized = features.descriptors.dtype == np.uint8
                 attributes = {"descriptors": {SCALE: DESCRIPTOR_SCALE}} if quantized else {}
                 writer.add(name, source, _to_arrays(features), attributes)
-    finally:
-        cv2.setNumThreads(cv2_threads)
 
 
 class OnDemandFeatures:

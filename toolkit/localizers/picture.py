@@ -15,8 +15,9 @@ from toolkit.capture.cameras import camera_text, parse_camera
 from toolkit.capture.images import pixels_of, stored_size
 from toolkit.capture.turning import turn_image
 from toolkit.errors import ArtifactError, ImageError
-from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor, extract_turned
+from toolkit.features.features import KINDS, LocalFeatures, extract_turned
 from toolkit.features.matching import AnyMethod
+from toolkit.features.sift import SiftExtractor
 from toolkit.features.stores import as_stored
 from toolkit.localizers.base import PoseEstimate, Prior, Query, RoughPose, View
 from toolkit.localizers.map import Map
@@ -27,6 +28,7 @@ Picture = Any
 """A file (str, Path), or pixels: see `pixels_from`."""
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")  # sums stay in one order, as in a run
 def localize_image(
     place: Map,
     image: Picture | Sequence[Picture],
@@ -107,12 +109,11 @@ def localize_image(
     readers = [picture.read for picture in pixels]
     references = place.retrieve(described, readers, cameras, quarter_turns, about)
     query = Query(views, poses, features)
-    with threadpool_limits(1, "blas"):  # sums stay in one order, as in a run
-        if near is None:
-            return place.judged(place.localizer.localize(query, references))
-        images = np.unique(np.concatenate([part.images for part in references]))
-        prior = Prior.about(near.world_from_rig, images, near.rotation_std_deg, near.position_std_m, "near")
-        return place.judged(place.localizer.localize(query, references, None, [prior]))
+    if near is None:
+        return place.judged(place.localizer.localize(query, references))
+    images = np.unique(np.concatenate([part.images for part in references]))
+    prior = Prior.about(near.world_from_rig, images, near.rotation_std_deg, near.position_std_m, "near")
+    return place.judged(place.localizer.localize(query, references, None, [prior]))
 
 
 def pixels_from(image: Any) -> NDArray[np.uint8]:

@@ -1,0 +1,18 @@
+"""Kinds of local features, by name."""
+
+import pytest
+
+from toolkit.errors import ManifestError
+from toolkit.features.features import create_extractor
+from toolkit.features.sift import SiftExtractor
+from toolkit.manifest import FeaturesSettings, SiftSettings
+
+
+def test_extractors_by_name() -> None:
+    sift = create_extractor("sift", FeaturesSettings.of({"sift": {"max_keypoints": 200, "min_long_side": 0}}))
+    assert sift.settings == SiftExtractor(SiftSettings(min_long_side=0, max_keypoints=200)).settings
+    assert next(iter(sift.settings)) == "name"
+    with pytest.raises(ManifestError, match=r"'sift.keypoints'.*max_keypoints"):
+        FeaturesSettings.of({"sift": {"keypoints": 5}})
+    with pytest.raises(ManifestError, match="Unknown local features 'surf'"):
+        create_extractor("surf", FeaturesSettings())
