@@ -166,16 +166,16 @@ def _extrema(levels: Floats, contrast: float) -> Ints:
         cv2.absdiff(below, above, dst=difference)
     _, height, width = differences.shape
     size, flat = height * width, differences.reshape(-1)
-    # The interpolated peak is higher than the pixel: half of the contrast is enough here.
-    least = 0.5 * contrast / _INTERVALS
+    # The interpolated peak is higher than the pixel, by little.
+    least = 0.8 * contrast / _INTERVALS
     other_levels = np.array(
         [level * size + y * width + x for level in (-1, 1) for y in (-1, 0, 1) for x in (-1, 0, 1) if x or y]
     )
-    extrema = []
+    extrema, limit = [], np.empty((height, width), np.float32)
     rows = slice(_BORDER, height - _BORDER)
     for level in range(1, _INTERVALS + 1):
-        limit = cv2.dilate(differences[level], _NEIGHBORS)
-        np.maximum(limit, least, out=limit)
+        cv2.dilate(differences[level], _NEIGHBORS, dst=limit)
+        cv2.max(limit, least, dst=limit)
         at = np.flatnonzero(differences[level, rows] >= limit[rows]) + _BORDER * width
         x = at % width
         at = at[(x >= _BORDER) & (x < width - _BORDER)] + level * size
@@ -267,16 +267,17 @@ class _Grid(NamedTuple):
         # Plus a half, so that the conversion rounds.
         x = self.x * cos - self.y * sin + (keypoints.x + np.float32(0.5))
         y = self.x * sin + self.y * cos + (keypoints.y + np.float32(0.5))
-        beyond = (x < 1) | (x >= width - 1) | (y < 1) | (y >= height - 1)
-        at = np.clip(y, 1, height - 2, out=y).astype(np.int64)
-        at *= width
-        at += np.clip(x, 1, width - 2, out=x).astype(np.int64)
+        column, row = x.astype(np.int32), y.astype(np.int32)
+        inside = (column >= 1) & (column < width - 1) & (row >= 1) & (row < height - 1)
+        row *= width
+        row += column
+        at = np.where(inside, row, width + 1).astype(np.int64)
         flat = level.reshape(-1)
         dx, dy = flat.take(at + 1), flat.take(at + width)
         dx -= flat.take(at - 1)
         dy -= flat.take(at - width)
         magnitude, direction = cv2.cartToPolar(dx, dy)
-        magnitude[beyond] = 0
+        magnitude *= inside
         return magnitude, direction
 
 
@@ -287,7 +288,7 @@ _WINDOW_WEIGHTS = np.exp(-(_WINDOW.x**2 + _WINDOW.y**2) / (2 * _WINDOW_SIGMA**2)
 def _parts(pyramid: Sequence[Floats], keypoints: _Keypoints) -> Iterator[tuple[Ints, Floats]]:
     """Yield the indices of some keypoints of one level, and the level, until all had their turn."""
     group = keypoints.octave * (_INTERVALS + 1) + keypoints.level
-    order = np.argsort(group, kind="stable")
+    order = np.lexsort((keypoints.y, group))  # from top to bottom: pixels that are used together are in the cache
     for of_level in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
         level = pyramid[keypoints.octave[of_level[0]]][keypoints.level[of_level[0]]]
         for start in range(0, len(of_level), _AT_ONCE):
