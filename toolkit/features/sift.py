@@ -175,7 +175,7 @@ def _extrema(levels: Floats, contrast: float) -> Ints:
     rows = slice(_BORDER, height - _BORDER)
     for level in range(1, _INTERVALS + 1):
         cv2.dilate(differences[level], _NEIGHBORS, dst=limit)
-        cv2.max(limit, least, dst=limit)
+        np.maximum(limit, least, out=limit)
         at = np.flatnonzero(differences[level, rows] >= limit[rows]) + _BORDER * width
         x = at % width
         at = at[(x >= _BORDER) & (x < width - _BORDER)] + level * size
