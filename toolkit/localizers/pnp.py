@@ -251,8 +251,9 @@ class PnpLocalizer:
     def _independent(self, inliers: Matches) -> int:
         """Return how many of the matches are independent evidence."""
         # A point matched in several ways, or several points on one keypoint, are one piece of it.
-        keypoints = np.column_stack([inliers.camera, inliers.pixels])
-        return min(len(np.unique(inliers.point)), len(np.unique(keypoints, axis=0)))
+        places = inliers.pixels.astype(np.float32).view(np.uint64)[:, 0]  # x and y as one number: exact, and soon sorted
+        keypoints = sum(len(np.unique(places[inliers.camera == camera])) for camera in np.unique(inliers.camera))
+        return min(len(np.unique(inliers.point)), keypoints)
 
     def _inliers(self, query: RigQuery, rig_from_world: Floats, matches: Matches) -> NDArray[np.bool_]:
         errors = query.errors_deg(rig_from_world, matches, self.map.points)

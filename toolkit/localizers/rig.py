@@ -183,11 +183,13 @@ class RigQuery:
     def projected(self, rig_from_world: Floats, matches: Matches, points: Floats) -> Floats:
         """Return where a pose puts the points of matches in their images (K, 2), pixels; inf behind a camera."""
         pixels = np.full((len(matches), 2), np.inf)
-        for index in np.unique(matches.camera):
-            part = matches.camera == index
+        for index, camera in enumerate(self.cameras):
+            part = np.flatnonzero(matches.camera == index)
+            if not len(part):
+                continue
             cam_from_world = geometry.invert(self.rig_from_cams[index]) @ rig_from_world
             in_cam = geometry.transform(cam_from_world, points[matches.point[part]])
-            projected = np.asarray(self.cameras[index].img_from_cam(in_cam))
+            projected = np.asarray(camera.img_from_cam(in_cam))
             seen = (in_cam[:, 2] > 1e-3) & np.isfinite(projected).all(axis=1)
             pixels[part] = np.where(seen[:, None], projected, np.inf)
         return pixels

@@ -179,7 +179,7 @@ def refine_points(
     good = in_front & ((error**2).sum(1) < settings.max_reprojection_error_px**2)
     kept = observations[good]
     # Keypoints of one image at one place (two orientations) are one view.
-    views = np.unique(kept[:, [0, 2]], axis=0)[:, 1]
+    views = np.unique(kept[:, 0] * count + kept[:, 2]) % count
     seen = np.bincount(views, minlength=count) >= 2
     seen &= np.isfinite(points).all(axis=1)
     new_index = np.cumsum(seen) - 1
