@@ -23,10 +23,9 @@ from toolkit.localizers.misfit import find_misfit
 from toolkit.localizers.rig import Matches, RigQuery, least_squares_covariance
 from toolkit.manifest import PnpSettings
 
-FIRST_REFERENCES = 4
-"""References of an image that are matched first."""
-ENOUGH_INLIERS = 100
-"""Independent inliers with which the pose found with these needs no other to start from."""
+FIRST_REFERENCES = {2: 200, 4: 100}
+"""How many references of an image are matched first, and the independent inliers with which the pose that these give is
+the one to start from. With fewer inliers, the next number of references is tried, and at last all."""
 VIEWS = 4
 """References of an estimate whose keypoints are kept with its correspondences, those that see the most of them."""
 
@@ -179,24 +178,26 @@ class PnpLocalizer:
         """Return matches by descriptors, those among which a pose is sought, and the pose that the most agree with.
 
         The best references have most of the right matches, the further ones mostly wrong ones, which slow RANSAC down.
-        So its pose is sought with the best, and again with all if it has few inliers. Where hardly anything else is in
-        the matches of the best, further references are matched only if they show another place, which may be a rival.
+        So a pose is sought with the best few, and with more if it has few inliers. If most matches of the best are
+        inliers, further references are matched only if they show another place, which may be a rival.
         """
         settings, known = self.settings, KnownMatches()
         start: Floats | None = None
-        if any(len(part.images) > FIRST_REFERENCES for part in references):
-            best = [part.take(np.arange(len(part.images)) < FIRST_REFERENCES) for part in references]
+        for count, enough in FIRST_REFERENCES.items():
+            if all(len(part.images) <= count for part in references):
+                break
+            best = [part.take(np.arange(len(part.images)) < count) for part in references]
             among = self.matcher.by_descriptors(query, best, network_matches, known)
             start = self._ransac(query, among, settings.ransac_max_error_deg)
             inliers = among[np.zeros(len(among), bool) if start is None else self._inliers(query, start, among)]
-            if self._independent(inliers) < ENOUGH_INLIERS:
+            if self._independent(inliers) < enough:
                 start = None
             elif len(inliers) > settings.clear_inlier_ratio * len(among):
                 same = self.map.images_seeing(np.unique(inliers.point)) >= settings.min_inliers
                 references = [
-                    part.take((np.arange(len(part.images)) < FIRST_REFERENCES) | ~same[part.images])
-                    for part in references
+                    part.take((np.arange(len(part.images)) < count) | ~same[part.images]) for part in references
                 ]
+                break
         matches = self.matcher.by_descriptors(query, references, network_matches, known)
         if start is not None:
             return matches, among, start
