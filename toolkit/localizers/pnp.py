@@ -252,7 +252,7 @@ class PnpLocalizer:
     def _independent(self, inliers: Matches) -> int:
         """Return how many of the matches are independent evidence."""
         # A point matched in several ways, or several points on one keypoint, are one piece of it.
-        places = inliers.pixels.astype(np.float32).view(np.uint64)[:, 0]  # x and y as one number: exact, and soon sorted
+        places = inliers.pixels.astype(np.float32).view(np.uint64)[:, 0]  # x and y as one number
         keypoints = sum(len(np.unique(places[inliers.camera == camera])) for camera in np.unique(inliers.camera))
         return min(len(np.unique(inliers.point)), keypoints)
 
