@@ -236,7 +236,7 @@ def damage(kind: str, run: Path) -> None:
     ("kind", "said"),
     [
         ("no run", r"No run at .*b: run\.json is missing"),
-        ("torn record", r"run\.json is not whole JSON"),
+        ("torn record", r"run\.json is not valid JSON"),
         ("odd record", r"run\.json: 'stages' is not as a run writes it"),
         ("not evaluated", r"b: not evaluated .*errors\.csv is missing.*python -m toolkit run"),
         ("torn table", r"errors\.csv.*Run the stage"),
