@@ -87,7 +87,7 @@ def test_it_shows_what_the_stage_stored(files: SceneFiles, pair: InspectedPair) 
     shown = text_of(one.figure)
     assert one.status in shown
     assert f"\n{one.name.partition('/raw_data/')[2]}\n" in shown
-    assert "true error of position [m]\n0\n" not in shown
+    assert "true position error [m]\n0\n" not in shown
     assert "0.000\n" not in shown
     assert f"{row['num_inliers']}" in shown
     assert picture_of(one).width > 800
@@ -113,7 +113,7 @@ def test_unchanged_settings_give_the_same_pose_and_others_are_shown_beside(pair:
     first = one.references[one.references["rank"] == 1]  # one of each camera of the rig
     assert nearest.after.localized.references == [first["name"][first["score"].idxmax()]]
     alone = text_of(nearest.after.figure)
-    assert "true error of position" in alone
+    assert "true position error" in alone
     assert not any(text in alone for text in ("inliers", "matches by descriptors", "image covered")), "it has none"
     with pytest.raises(ManifestError, match=r"max_keypoints|features: found other settings"):
         one.again({"features": {"max_keypoints": 500}})
