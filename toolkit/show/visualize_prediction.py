@@ -1,4 +1,4 @@
-"""Show what a network said of one query: references, aligned cameras, depth, and what was left out."""
+"""Draw a network's prediction for one query: references, aligned cameras and depth."""
 
 import textwrap
 from pathlib import Path
@@ -28,12 +28,12 @@ def draw_prediction(
     camera: int | None = None,
     up: ArrayLike | None = None,
 ) -> "Figure":
-    """Draw one query image with its references, and where its network's cameras lie in the map; return the figure.
+    """Draw one query image with its references, and the predicted cameras in the map; return the figure.
 
     Args:
-        query, answer: of one query device.
-        camera: which of its images; None: the first with the most consistent references.
-        up: direction (3,) that is up; None: estimated from the map's cameras.
+        query, answer: a query device and its answer.
+        camera: number of its image to draw; None: the first with the most consistent references.
+        up: up direction (3,); None: estimated from the map's cameras.
     """
     if camera is None:
         counts = [0 if part.alignment is None else part.alignment.num_inliers for part in answer.cameras]
@@ -60,10 +60,10 @@ def draw_prediction(
     title = f"{'SIMULATED, no result: ' if simulated else ''}{localizer.predictor.name} on {views[0].name}"
     estimate = answer.estimate
     scale = f"scale known to {estimate.scale_std:.1%}" if np.isfinite(estimate.scale_std) else "scale unknown"
-    about = f"{estimate.status}; {scale}" if estimate.world_from_rig is not None else estimate.status
-    more = "" if part.reason in about else f"; {part.reason}"  # a failed query's status says it
-    reasons = textwrap.fill(about + more, 150)
-    figure.suptitle(f"{title}\n{reasons}", fontsize=10, fontweight="bold" if simulated else None)
+    status = f"{estimate.status}; {scale}" if estimate.world_from_rig is not None else estimate.status
+    reason = "" if part.reason in status else f"; {part.reason}"  # the status of a failed query contains it
+    text = textwrap.fill(status + reason, 150)
+    figure.suptitle(f"{title}\n{text}", fontsize=10, fontweight="bold" if simulated else None)
     return figure
 
 
@@ -85,7 +85,7 @@ def _draw_view(
         return
     low, high = np.nanpercentile(values, (5, 95))
     extent = None
-    if prediction.map_from_image is not None:  # in pixels of the photograph
+    if prediction.map_from_image is not None:  # draw in pixels of the photograph
         scale_x, scale_y, offset_x, offset_y = prediction.map_from_image[number]
         height, width = values.shape
         left, right = -offset_x / scale_x, (width - offset_x) / scale_x
@@ -100,43 +100,43 @@ def _draw_from_above(
     local_map, alignment = localizer.map, part.alignment
     axes, labels = ground_axes(up_of_cameras(local_map.world_from_cams) if up is None else up)
     places = local_map.world_from_cams[part.references]
-    marked = [places]
+    drawn = [places]
     if alignment is not None and part.prediction is not None and np.isfinite(alignment.rotation_std_deg):
         finite = np.isfinite(part.prediction.model_from_cams[1:]).all(axis=(1, 2))
         aligned = alignment.world_from_model.apply_to_pose(part.prediction.model_from_cams[1:])
-        marked.append(aligned[kept])
+        drawn.append(aligned[kept])
         for agreed, color, label in ((True, GREEN, "consistent"), (False, VERMILLION, "left out")):
             shown = (kept == agreed) & finite
             _draw_cameras(axis, aligned[shown], axes, color, f"predicted, {label}", "o")
             for start, end in zip(places[shown, :3, 3] @ axes.T, aligned[shown, :3, 3] @ axes.T, strict=True):
                 axis.plot(*zip(start, end, strict=True), c=color, lw=0.8)
     if part.world_from_cam is not None:
-        marked.append(part.world_from_cam[None])
+        drawn.append(part.world_from_cam[None])
         _draw_cameras(axis, part.world_from_cam[None], axes, "black", "query", "*")
     _draw_cameras(axis, places, axes, BLUE, "reference in the map", "s")
     _draw_cameras(axis, local_map.world_from_cams, axes, GRAY, "map", ".")
-    centers = np.concatenate(marked)[:, :3, 3] @ axes.T
+    centers = np.concatenate(drawn)[:, :3, 3] @ axes.T
     if not len(centers):
         centers = local_map.world_from_cams[:, :3, 3] @ axes.T
-    # A window about what is of interest: a camera left out may be far away.
+    # The window ignores cameras that were left out: they may be far away.
     middle, half = (centers.min(axis=0) + centers.max(axis=0)) / 2, np.ptp(centers, axis=0).max() * 0.75 + 1.0
     cloud = local_map.points @ axes.T
     near = (np.abs(cloud - middle) < half).all(axis=1)
     axis.scatter(cloud[near, 0], cloud[near, 1], s=1, c="#BBBBBB", lw=0, zorder=0, rasterized=True)
     axis.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), aspect="equal")
     axis.set(xlabel=labels[0], ylabel=labels[1])
-    axis.set_title("cameras from above; a line joins a reference's two places", fontsize=9)
+    axis.set_title("cameras from above; lines join true and predicted references", fontsize=9)
     axis.grid(alpha=0.2)
     axis.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=3, frameon=False)
 
 
 def _draw_cameras(axis: "Axes", poses: Floats, axes: Floats, color: str, label: str, marker: str) -> None:
-    """Draw places (N, 4, 4) from above, with a stroke where they look."""
+    """Draw cameras (N, 4, 4) from above, with their viewing directions."""
     if not len(poses):
         return
     places, looks = poses[:, :3, 3] @ axes.T, poses[:, :3, 2] @ axes.T
     size, layer = (14, 1) if marker == "." else (90 if marker == "*" else 60 if marker == "s" else 28, 3)
-    face = "none" if marker == "s" else color  # what lies below stays visible
+    face = "none" if marker == "s" else color  # a hollow square does not hide a marker below
     x, y = places.T
     axis.scatter(x, y, s=size, facecolors=face, edgecolors=color, marker=marker, label=label, zorder=layer)
     axis.quiver(x, y, *looks.T, color=color, width=0.003, scale=18, headwidth=3, zorder=layer)
