@@ -27,15 +27,15 @@ from toolkit.show.localized import LocalizedPair
 from toolkit.show.metrics import is_below, parse_threshold, unit_of
 from toolkit.show.report import (
     PICTURE_BUDGET,
+    Album,
     Cell,
     Picture,
     Table,
-    _Album,
-    _off_by,
-    _seconds,
-    _threshold,
+    off_by,
     page_template,
     read_run,
+    seconds_text,
+    threshold_text,
 )
 from toolkit.show.stills import draw_localization
 
@@ -90,16 +90,17 @@ class Comparison:
         width = max(map(len, self.names))
         lines = [f"{len(self.queries)} queries in {self.queries.groupby(_PAIR).ngroups} pairs, recall in % [95 %]"]
         for threshold, group in rows.groupby("threshold", sort=False):
-            lines.append(f"at {_threshold(str(threshold))}")
+            lines.append(f"at {threshold_text(str(threshold))}")
             for row in group.to_dict("records"):
                 line = f"  {self.names[row['run']]:<{width}}  {_interval(row, 'recall')}"
                 if row["run"]:
                     line += f"   {_interval(row, 'difference')}   {row['won']} won, {row['lost']} lost"
                 lines.append(line)
         lines.append("time and peak memory; reused results, also those of another run, count as none")
+        total = self.resources.iloc[-1]
         for i, name in enumerate(self.names):
-            total = self.resources.iloc[-1]
-            lines.append(f"  {name:<{width}}  {_seconds(total[f'seconds_{i}'])}, {_memory(total[f'memory_mb_{i}'])}")
+            seconds, memory = seconds_text(total[f"seconds_{i}"]), _memory(total[f"memory_mb_{i}"])
+            lines.append(f"  {name:<{width}}  {seconds}, {memory}")
         for row in self.settings.to_dict("records"):
             lines.append(f"{row['key']}: " + " | ".join(row[f"run_{i}"] for i in range(len(self.names))))
         return "\n".join([*lines, *(f"Note: {message}" for message in self.messages)])
@@ -279,7 +280,7 @@ def _names(folders: Sequence[Path]) -> list[str]:
 def _hits(queries: pd.DataFrame, runs: int, thresholds: Sequence[str]) -> NDArray[np.bool_]:
     """Return whether each query is within each threshold in each run, (Q, R, T)."""
     errors = [[queries[f"{name}_{i}"].to_numpy(float) for name in _ERRORS] for i in range(runs)]
-    hits = [[is_below(*of_run, parse_threshold(name)) for name in thresholds] for of_run in errors]
+    hits = [[is_below(degrees, meters, parse_threshold(name)) for name in thresholds] for degrees, meters in errors]
     return np.asarray(np.moveaxis(np.array(hits, bool), 2, 0))
 
 
@@ -317,7 +318,7 @@ def _recall(
 
 
 def _changes(queries: pd.DataFrame, hits: NDArray[np.bool_], thresholds: Sequence[str]) -> pd.DataFrame:
-    """List for each run the queries lost, then those won; those that changed at most thresholds first."""
+    """List for each run the queries lost, then those won; those that changed at the most thresholds first."""
     parts = []
     for run in range(1, hits.shape[1]):
         for change, changed in (("lost", hits[:, 0] & ~hits[:, run]), ("won", ~hits[:, 0] & hits[:, run])):
@@ -390,7 +391,7 @@ def draw_differences(comparison: Comparison) -> "Figure":
             panel.hlines(y, low, high, color=color, lw=2)
             panel.plot(middle, y, "o", color=color, ms=5, label=comparison.names[run])
         panel.axvline(0, color="0.4", lw=0.8)
-        panel.set(title=f"at {_threshold(threshold)}", xlabel="difference of recall [percentage points]")
+        panel.set(title=f"at {threshold_text(threshold)}", xlabel="difference of recall [percentage points]")
         panel.set_yticks(range(len(pairs)), labels)
     panels[0].invert_yaxis()
     lowest, highest = panels[0].get_xlim()
@@ -403,7 +404,7 @@ def draw_differences(comparison: Comparison) -> "Figure":
 
 def readable(comparison: Comparison) -> dict[str, pd.DataFrame]:
     """Return the tables of the page as text: `recall`, `changes`, `resources` and `settings`; some may be empty."""
-    recall = {_threshold(name): _frame(_recall_table(comparison, name)) for name in comparison.thresholds}
+    recall = {threshold_text(name): _frame(_recall_table(comparison, name)) for name in comparison.thresholds}
     makers = {"changes": _changes_table, "resources": _resources_table, "settings": _settings_table}
     tables = {name: _frame(make(comparison)) for name, make in makers.items()}
     return {"recall": pd.concat(recall, names=["at"]), **tables}
@@ -470,7 +471,7 @@ def write_comparison(comparison: Comparison, path: str | Path | None = None, pic
         path = comparison.folders[0].resolve().parent / f"compare_{stem}.html"
     names, messages, looks = comparison.names, list(comparison.messages), list[tuple[str, list[Picture]]]()
     with tempfile.TemporaryDirectory() as folder:
-        album = _Album(Path(folder), PICTURE_BUDGET, [])
+        album = Album(Path(folder), PICTURE_BUDGET, [])
 
         def picture(drawn: "Figure", title: str, caption: str = "") -> Picture:
             path = save_figure(drawn, Path(folder) / "picture.png")
@@ -540,7 +541,7 @@ def _spread(rows: Sequence[int], most: int) -> list[int]:
 def _limits(comparison: Comparison, at: str) -> str:
     names = at.split("; ")
     every = len(names) == len(comparison.thresholds) > 1
-    return "every threshold" if every else "; ".join(map(_threshold, names))
+    return "every threshold" if every else "; ".join(map(threshold_text, names))
 
 
 def _tiles(comparison: Comparison) -> list[tuple[str, str]]:
@@ -548,7 +549,7 @@ def _tiles(comparison: Comparison) -> list[tuple[str, str]]:
     tiles = []
     shown = comparison.thresholds if len(comparison.names) == 2 else comparison.thresholds[:1]
     for row in rows[rows["threshold"].isin(shown)].to_dict("records"):
-        where = f"{comparison.names[row['run']]} at {_threshold(row['threshold'])}"
+        where = f"{comparison.names[row['run']]} at {threshold_text(row['threshold'])}"
         text = f"points of recall [{_bounds(row, 'difference')}], {row['won']} won and {row['lost']} lost: {where}"
         tiles.append((_signed(row["difference"]), text))
     return tiles
@@ -573,7 +574,7 @@ def _recall_table(comparison: Comparison, threshold: str) -> Table:
             rows += [[*cells, name, recall, *change] for name, recall, change in named]
         else:
             rows.append([*cells, *recalls, *changes[1]])
-    caption = f"Recall at {_threshold(threshold)} in %, and its differences in percentage points"
+    caption = f"Recall at {threshold_text(threshold)} in %, and its differences in percentage points"
     return Table(caption, columns, rows)
 
 
@@ -588,7 +589,7 @@ def _changes_table(comparison: Comparison) -> Table | None:
         i = row["run"]
         texts = [comparison.names[i]] if several else []
         texts += [row["change"], _limits(comparison, row["at"]), f"{row['query_device']} in {row['map_device']} map"]
-        texts += [_off_by(row, after=f"_{j}", unit=unit) for j in (0, i)]
+        texts += [off_by(row, after=f"_{j}", unit=unit) for j in (0, i)]
         rows.append([*texts, row[f"status_{i}"].replace("_", " "), _name(row)])
     rest = f"; {MOST_ROWS} of them, all with --json" if len(table) > MOST_ROWS else ""
     counts = table["change"].value_counts()
@@ -609,7 +610,7 @@ def _resources_table(comparison: Comparison) -> Table:
         for i in range(len(comparison.names)):
             seconds = row[f"seconds_{i}"]
             bar = seconds / longest if row["stage"] != ALL and seconds > 0 else None
-            cells += [Cell(_seconds(seconds), bar=bar), _memory(row[f"memory_mb_{i}"])]
+            cells += [Cell(seconds_text(seconds), bar=bar), _memory(row[f"memory_mb_{i}"])]
         rows.append(cells)
     return Table("Time and peak memory of every stage, including the start-up of its notebook", columns, rows)
 

@@ -2,7 +2,7 @@
 
 import io
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache, partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
     from matplotlib.colors import Colormap, LogNorm
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure, SubFigure
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -69,6 +69,14 @@ def plain_log(axes: "Axes", sides: str) -> None:
         axis.set_major_locator(LogLocator(subs=(1.0,) if high > 100 * low else (1.0, 2.0, 5.0)))
         axis.set_major_formatter(FuncFormatter(lambda value, _: np.format_float_positional(value, 6, trim="-")))
         axis.set_minor_formatter(NullFormatter())
+
+
+def shared_legend(figure: "Figure | SubFigure", axes: Iterable["Axes"], **style: Any) -> None:
+    """Draw one legend below a figure with the labels of several axes; `style` is passed to `Figure.legend`."""
+    handles: dict[str, Any] = {}
+    for axis in axes:
+        handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", **style)
 
 
 def save_figure(figure: "Figure", path: str | Path, caption: str = "") -> Path:

@@ -133,7 +133,7 @@ def write_report(run_dir: str | Path) -> Path:
     scenes = []
     for name in map(str, run["scenes"]):
         # Every scene gets an equal share, or the first scenes would leave no room for the last.
-        album = _Album(run_dir, PICTURE_BUDGET // len(run["scenes"]), left_out)
+        album = Album(run_dir, PICTURE_BUDGET // len(run["scenes"]), left_out)
         scenes.append(_scene(SceneFiles(run_dir, name), str(run["inputs"].get(name, "")), album))
     page = page_template("report.html.j2").render(
         run=run,
@@ -200,8 +200,8 @@ def _summary(run: dict[str, Any]) -> list[tuple[str, str]]:
     parts = [("started", str(run["created"]).replace("T", " ").replace("+00:00", " UTC"))]
     if run["total_seconds"] is not None:
         work = run["work_seconds"]
-        detail = f" ({_seconds(work)} of work besides the notebooks' start-up)" if work is not None else ""
-        parts.append(("time", _seconds(run["total_seconds"]) + detail))
+        detail = f" ({seconds_text(work)} of work besides the notebooks' start-up)" if work is not None else ""
+        parts.append(("time", seconds_text(run["total_seconds"]) + detail))
     if run["peak_memory_mb"]:
         parts.append(("peak memory", f"{run['peak_memory_mb'] / 1000:.2f} GB"))
     # The page lists Python's version with the other versions.
@@ -229,8 +229,8 @@ def _stages(run: dict[str, Any], run_dir: Path) -> Table:
             row.get("scene") or "",
             Cell(name, link=_link(run_dir, notebook) if notebook.is_file() else ""),
             row.get("status", ""),
-            Cell(_seconds(seconds), bar=float(seconds) / longest if seconds and longest else None),
-            _seconds(work),
+            Cell(seconds_text(seconds), bar=float(seconds) / longest if seconds and longest else None),
+            seconds_text(work),
             Cell(f"{memory:.0f} MB" if memory else "–", bar=float(memory) / largest if memory else None),
             counts,
         ])  # fmt: skip
@@ -254,7 +254,7 @@ def _not_done(run: dict[str, Any]) -> Table | None:
 # A scene
 
 
-def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> dict[str, Any]:
+def _scene(files: SceneFiles, fingerprint: str, album: "Album") -> dict[str, Any]:
     """Return the template variables of one scene."""
     messages: list[str] = []
     tables = ("recall", "errors", "losses", "retrieval", "sequence", "changes")
@@ -291,7 +291,7 @@ def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> dict[str, An
         "messages": messages,
         "remarks": remarks,
         "recall": [
-            _matrix(recall, column, f"Recall at {_threshold(column)} [%]", percent, lambda v: 0.9 * v)
+            _matrix(recall, column, f"Recall at {threshold_text(column)} [%]", percent, lambda v: 0.9 * v)
             for column in thresholds
         ],
         "medians": thresholds and [
@@ -368,14 +368,14 @@ def _verdict(
     if not len(done):
         return verdict, headlines
     for column in thresholds:
-        headlines.append((f"{percent(done[column].mean())} %", f"mean recall at {_threshold(column)}"))
+        headlines.append((f"{percent(done[column].mean())} %", f"mean recall at {threshold_text(column)}"))
     if len(errors):
         rotation_deg, translation_m = errors[["rotation_error_deg", "translation_error_m"]].median()
         length = _length(translation_m, unit_of(thresholds[0]))
         headlines.append((length, f"median position error; rotation {number(rotation_deg)}°"))
     strict = thresholds[0]
     weakest = done.loc[done[strict].idxmin()]
-    share, limit = percent(weakest[strict]), _threshold(strict)
+    share, limit = percent(weakest[strict]), threshold_text(strict)
     if weakest[strict] == done[strict].max():
         verdict.append(f"Every pair has {share} % at {limit}.")
     else:
@@ -417,7 +417,7 @@ def _pairs(recall: pd.DataFrame, thresholds: list[str]) -> Table:
     columns: dict[str, tuple[str, Any]] = {"map_device": ("map", str), "query_device": ("query", str)}
     for name in ("queries", "localized", "ok", "low_confidence", "failed"):
         columns[name] = name.replace("_", " "), lambda count: "–" if pd.isna(count) else f"{count:.0f}"
-    columns |= {name: (f"recall {_threshold(name)}", _share) for name in thresholds}
+    columns |= {name: (f"recall {threshold_text(name)}", _share) for name in thresholds}
     columns["median_rotation_deg"] = "median [°]", number
     small, factor = small_unit(unit_of(*thresholds))
     columns["median_translation_m"] = f"median [{small}]", lambda length: number(factor * length)
@@ -438,7 +438,7 @@ def _steps(sequences: pd.DataFrame, thresholds: list[str]) -> Table:
         turned, moved = (float(pairs[f"median_{name}"].median()) for name in ("rotation_deg", "translation_m"))
         queries, rescued, broken = (int(pairs[name].sum()) for name in ("queries", *CHANGES))
         rows.append([step, queries, *shares, number(turned), number(factor * moved), rescued, broken])
-    titles = ["step", "queries", *(f"recall {_threshold(name)}" for name in thresholds)]
+    titles = ["step", "queries", *(f"recall {threshold_text(name)}" for name in thresholds)]
     titles += ["median [°]", f"median [{small}]", *CHANGES]
     caption = "Queries after each step of the sequence stage: mean recall and median error of the pairs"
     return Table(caption, titles, rows)
@@ -448,7 +448,7 @@ def _changes(changes: pd.DataFrame, unit: str) -> Table:
     """List queries that the sequence stage broke or rescued."""
     rows = []
     for row in changes.sort_values("change", kind="stable")[:WORST].to_dict("records"):
-        errors = [_off_by(row, of, unit=unit) for of in ("single_", "")]
+        errors = [off_by(row, of, unit=unit) for of in ("single_", "")]
         query = f"{row['query_device']} in {row['map_device']} map"
         rows.append([query, row["change"], *errors, row["device_id"], row["timestamp"]])
     counts = changes["change"].value_counts()
@@ -467,7 +467,7 @@ def _losses(losses: pd.DataFrame) -> Table | None:
         for name, part in [*parts, ("all", group)]:
             queries = part["queries"].sum()
             shares = [part[reason].sum() / queries for reason in REASONS]
-            label = _threshold(str(threshold)) if name == parts[0][0] else ""
+            label = threshold_text(str(threshold)) if name == parts[0][0] else ""
             cells = [Cell(f"{percent(share)} %", 1.2 * share) for share in shares]
             rows.append([label, name, f"{queries:.0f}", f"{part['missed'].sum():.0f}", *cells])
     caption = "Queries missed at each threshold, and the share of all queries lost for each reason"
@@ -515,7 +515,7 @@ def _worst(queries: pd.DataFrame, thresholds: list[str]) -> Table | None:
     rows = []
     for row in worst.to_dict("records"):
         texts = [f"{row['query_device']} in {row['map_device']} map"]
-        texts += [_off_by(row, unit=unit), _why(row)] if has_truth else []
+        texts += [off_by(row, unit=unit), _why(row)] if has_truth else []
         inliers = "–" if pd.isna(row["num_inliers"]) else f"{row['num_inliers']:.0f}"
         texts += [str(row["status"]).replace("_", " "), inliers]
         texts += [row["reason"] if isinstance(row["reason"], str) else "–"] if has_reasons else []
@@ -533,7 +533,7 @@ def _shown_names(images: str) -> str:
 def _why(row: dict[str, Any]) -> str:
     """Return the reason of the loss at the widest threshold that a query misses."""
     losses = {name: reason for name, reason in row.items() if name.startswith("loss@")}
-    missed = [f"{reason} at {_threshold(name)}" for name, reason in losses.items() if reason in REASONS]
+    missed = [f"{reason} at {threshold_text(name)}" for name, reason in losses.items() if reason in REASONS]
     return missed[-1] if missed else "within every threshold" if losses else ""
 
 
@@ -595,13 +595,13 @@ def _length(length: float, unit: str) -> str:
     return f"{number(length)} {unit}" if length < math.inf else "∞"
 
 
-def _off_by(row: Mapping[Any, Any], before: str = "", after: str = "", *, unit: str) -> str:
+def off_by(row: Mapping[Any, Any], before: str = "", after: str = "", *, unit: str) -> str:
     """Return the errors of a query as text; `before` and `after` complete the names of their columns."""
     angle, length = (row[f"{before}{name}{after}"] for name in ("rotation_error_deg", "translation_error_m"))
     return f"{number(angle)}°, {_length(length, unit)}" if math.isfinite(angle) else "no pose"
 
 
-def _seconds(seconds: float | None) -> str:
+def seconds_text(seconds: float | None) -> str:
     if seconds is None or math.isnan(seconds):
         return "–"
     if seconds < 120:
@@ -609,12 +609,12 @@ def _seconds(seconds: float | None) -> str:
     return f"{int(seconds) // 60} min {int(seconds) % 60} s"
 
 
-def _threshold(name: str) -> str:
+def threshold_text(name: str) -> str:
     degrees, meters = parse_threshold(name)
     return f"{degrees:g}°, {meters:g}\N{NO-BREAK SPACE}{unit_of(name)}"
 
 
-class _Album:
+class Album:
     """Turns picture files into data URLs until `room` bytes are used up."""
 
     def __init__(self, run_dir: Path, room: int, left_out: list[str]) -> None:

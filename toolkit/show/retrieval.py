@@ -18,7 +18,7 @@ from toolkit.errors import ArtifactError
 from toolkit.files import image_name, read_references
 from toolkit.geometry import Floats, Ints
 from toolkit.show.choice import find_query, shown_name
-from toolkit.show.figures import BLUE, GRAY, GREEN, MAP, ORANGE, TRUE, new_figure, shown, styled
+from toolkit.show.figures import BLUE, GRAY, GREEN, MAP, ORANGE, TRUE, new_figure, shared_legend, shown, styled
 from toolkit.show.localized import load_maps, map_files
 from toolkit.show.metrics import is_posed
 from toolkit.show.overlap import LEAST_OVERLAP, overlap_in_view, seen_by
@@ -205,10 +205,7 @@ def draw_retrieved(query: RetrievedQuery) -> "Figure":
     along, above = below.subplots(1, 2, width_ratios=[1.6, 1.0])
     _draw_along(along, query)
     _draw_from_above(above, query)
-    handles: dict[str, Any] = {}
-    for axis in (along, above):
-        handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
-    below.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4)
+    shared_legend(below, (along, above), ncols=4)
     points = "the map points" if query.points == "map" else "points laid into the views"
     title = f"query image {query.number}: {shown_name(query.name)}"
     if query.is_known:

@@ -16,7 +16,7 @@ from toolkit.capture.tables import POSE_NAMES, as_strings, read_query_table
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.files import pair_name
 from toolkit.geometry import Floats
-from toolkit.show.figures import GREEN, ORANGE, SKY, VERMILLION, new_figure, percent, styled
+from toolkit.show.figures import GREEN, ORANGE, SKY, VERMILLION, new_figure, percent, shared_legend, styled
 from toolkit.show.metrics import (
     WRONG,
     Threshold,
@@ -204,8 +204,7 @@ def draw_sequence(
         plot.set_xlabel(labels[0])
         plot.set_aspect("equal", adjustable="datalim")
     plots[0].set_ylabel(labels[1])
-    handles = {name: handle for plot in plots for handle, name in zip(*plot.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles.keys(), fontsize=8, loc="outside lower center", ncols=4)
+    shared_legend(figure, plots, ncols=4, fontsize=8)
     figure.suptitle(f"{query_device} recordings in the {map_device} map, from above")
     return figure
 

@@ -12,7 +12,7 @@ from toolkit.capture.images import read_for_display
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.geometry import Floats, Ints, make_pose, pose_error, project
 from toolkit.show.choice import shown_name
-from toolkit.show.figures import ESTIMATED, GREEN, MAP, TRUE, error_bar, error_colors, new_figure, styled
+from toolkit.show.figures import ESTIMATED, GREEN, MAP, TRUE, error_bar, error_colors, new_figure, shared_legend, styled
 from toolkit.show.localized import QueryDetails
 from toolkit.show.metrics import is_posed
 from toolkit.show.top_view import draw_dots, draw_headings, ground_axes, places_of
@@ -124,11 +124,7 @@ def draw_scene(
         panels[row * columns].set_ylabel(labels[1])
     if (is_posed(estimated) & is_posed(true)).any():
         error_bar(figure, unit[0], ax=list(panels[: len(shown)]), shrink=0.8)
-    handles: dict[str, Any] = {}
-    for axis in panels:
-        handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5, frameon=False,
-                  fontsize=9)  # fmt: skip
+    shared_legend(figure, panels, ncols=5, frameon=False, fontsize=9)
     figure.suptitle(title)
     return figure
 
