@@ -412,11 +412,11 @@ def _retrieval_recall(
     limits: tuple[float, float],
     length: float,
 ) -> tuple[dict[str, Any], NDArray[np.bool_] | None]:
-    """Return a pair's row of the table `retrieval`, and whether each query has a good reference.
+    """Return a pair's row of the table `retrieval`, and whether each query has a good reference (None if unreadable).
 
     Args:
-        limits: largest distance and angle (degrees) of a good reference from the query.
-        length: the unit of the distance, in the unit of the poses.
+        limits: largest distance and angle (degrees) between a query and a good reference.
+        length: unit of the distance, in the unit of the poses.
     """
     if not path.is_file():
         return {"state": "no retrieval file", "queries": len(keys)}, None
@@ -447,11 +447,7 @@ def _retrieval_recall(
 
 
 def _is_near(a: Floats, b: Floats, limits: tuple[float, float]) -> NDArray[np.bool_]:
-    """Return whether cameras a and b, world_from_cam (..., 4, 4), are within a distance and an angle; False for NaN.
-
-    Args:
-        limits: distance in the unit of the poses, and angle between the viewing directions, degrees.
-    """
+    """Return whether cameras a and b, world_from_cam (..., 4, 4), are within (distance, degrees); False for NaN."""
     distance = np.linalg.norm(a[..., :3, 3] - b[..., :3, 3], axis=-1)
     cosine = np.sum(a[..., :3, 2] * b[..., :3, 2], axis=-1)
     return (distance <= limits[0]) & (cosine >= np.cos(np.radians(limits[1])))
@@ -501,21 +497,21 @@ def overlap_table(
     capture = Capture.from_sessions_root(sessions_root)
     load = lru_cache(maxsize=1)(load_maps)
     rows = []
-    for map_ in capture.devices_with("map", map_device):
-        for query in capture.devices_with("query", query_device):
-            if references and (pairs is None or [map_, query] in map(list, pairs)):
-                name = pair_name(capture.name, map_, query)
-                poses = None if poses_dir is None else Path(poses_dir) / name
-                row: dict[str, Any] = {"map_device": map_, "query_device": query, "state": "evaluated"}
-                rows.append(row)
-                try:
-                    sessions = capture[f"{query}_query"], capture[f"{map_}_map"]
-                except CaptureError as error:
-                    row["state"] = f"{LEFT_OUT}{error}"
-                    continue
-                local_map = load(map_files(map_dir, f"{map_}_map", poses))
-                for column, folder in references.items():
-                    row |= _overlap(Path(folder) / f"{name}.jsonl", column, *sessions, local_map)
+    for map_, query in product(capture.devices_with("map", map_device), capture.devices_with("query", query_device)):
+        if not references or not (pairs is None or [map_, query] in map(list, pairs)):
+            continue
+        name = pair_name(capture.name, map_, query)
+        poses = None if poses_dir is None else Path(poses_dir) / name
+        row: dict[str, Any] = {"map_device": map_, "query_device": query, "state": "evaluated"}
+        rows.append(row)
+        try:
+            sessions = capture[f"{query}_query"], capture[f"{map_}_map"]
+        except CaptureError as error:
+            row["state"] = f"{LEFT_OUT}{error}"
+            continue
+        local_map = load(map_files(map_dir, f"{map_}_map", poses))
+        for column, folder in references.items():
+            row |= _overlap(Path(folder) / f"{name}.jsonl", column, *sessions, local_map)
     return _table(pd.DataFrame(rows), "images", "points")
 
 

@@ -88,9 +88,9 @@ class Answer:
     @cached_property
     def matches(self) -> pd.DataFrame:
         """Counts of the correspondences: one row per kind (`sift/guided`), columns inliers and rejected."""
-        found = self.correspondences
-        counts = pd.DataFrame({"inliers": found.inlier, "rejected": ~found.inlier}, dtype=int)
-        return counts.groupby(pd.Index(found.found_by.astype(object), name="found by")).sum()
+        matches = self.correspondences
+        counts = pd.DataFrame({"inliers": matches.inlier, "rejected": ~matches.inlier}, dtype=int)
+        return counts.groupby(pd.Index(matches.found_by.astype(object), name="found by")).sum()
 
     @cached_property
     def references(self) -> pd.DataFrame:
@@ -100,14 +100,15 @@ class Answer:
         the pose was computed from it); rejected (whether it contradicts the used references); inliers (inliers that it
         observes; missing if its views were not stored).
         """
-        retrieved, found, used = self.retrieved, self.correspondences, self.localized.references
+        retrieved, matches, used = self.retrieved, self.correspondences, self.localized.references
         names = list(dict.fromkeys([*used, *self.localized.rejected, *retrieved]))
-        kept = set(found.view_reference.tolist())
+        kept = set(matches.view_reference.tolist())
         rows = []
         for name in names:
             rank, score = retrieved.get(name, (None, np.nan))
             number = used.index(name) if name in used else -1
-            inliers = int(found.inlier[found.view_of[found.view_reference == number]].sum()) if number in kept else None
+            seen = matches.view_of[matches.view_reference == number]
+            inliers = int(matches.inlier[seen].sum()) if number in kept else None
             rows.append((name, rank, score, name in used, name in self.localized.rejected, inliers))
         table = pd.DataFrame(rows, columns=["name", "rank", "score", "used", "rejected", "inliers"])
         return table.astype({"rank": "Int64", "inliers": "Int64"})

@@ -149,8 +149,8 @@ def compare_runs(run_dirs: Sequence[str | Path], seed: int = SEED, resamples: in
     """
     folders = [] if isinstance(run_dirs, str) else list(map(Path, run_dirs))
     if len(folders) < 2:
-        found = run_dirs if isinstance(run_dirs, str) else [str(folder) for folder in folders]
-        raise ArtifactError(f"compare: found {found!r}, expected a list of two or more run folders.")
+        given = run_dirs if isinstance(run_dirs, str) else [str(folder) for folder in folders]
+        raise ArtifactError(f"compare: found {given!r}, expected a list of two or more run folders.")
     records = [read_run(folder / "run.json") for folder in folders]
     tables = [_read_errors(folder, record) for folder, record in zip(folders, records, strict=True)]
     names, messages = _names(folders), list[str]()
@@ -158,8 +158,10 @@ def compare_runs(run_dirs: Sequence[str | Path], seed: int = SEED, resamples: in
     units = [unit_of(*names_of) for names_of in limits]
     for folder, record, unit, limit in zip(folders, records, units, limits, strict=True):
         if unit != units[0]:
-            found = f"{folder}: found errors in {unit}, expected {units[0]} as in {folders[0]}"
-            raise ArtifactError(f"{found}. Set the same `unit` for both, and run them again.")
+            raise ArtifactError(
+                f"{folder}: found errors in {unit}, expected {units[0]} as in {folders[0]}. Set the same `unit` for "
+                "both, and run them again."
+            )
         if record["status"] not in ("done", ""):
             messages.append(f"{folder.name} is {record['status']}: {record['error'] or 'it has not ended'}")
         if limit != limits[0]:
@@ -352,9 +354,9 @@ def _resources(stages: Sequence[Sequence[Mapping[str, Any]]]) -> pd.DataFrame:
     for name in (*names, ALL):
         line: dict[str, Any] = {"stage": name}
         for i, rows in enumerate(stages):
-            mine = [row for row in rows if name in (ALL, row.get("stage"))]
-            line[f"seconds_{i}"] = sum(_measured(row, "seconds") for row in mine) if mine else math.nan
-            line[f"memory_mb_{i}"] = max((_measured(row, "peak_memory_mb") for row in mine), default=math.nan)
+            stage_rows = [row for row in rows if name in (ALL, row.get("stage"))]
+            line[f"seconds_{i}"] = sum(_measured(row, "seconds") for row in stage_rows) if stage_rows else math.nan
+            line[f"memory_mb_{i}"] = max((_measured(row, "peak_memory_mb") for row in stage_rows), default=math.nan)
         table.append(line)
     return pd.DataFrame(table)
 
@@ -540,8 +542,9 @@ def _spread(rows: Sequence[int], most: int) -> list[int]:
 
 def _limits(comparison: Comparison, at: str) -> str:
     names = at.split("; ")
-    every = len(names) == len(comparison.thresholds) > 1
-    return "every threshold" if every else "; ".join(map(threshold_text, names))
+    if len(names) == len(comparison.thresholds) > 1:
+        return "every threshold"
+    return "; ".join(map(threshold_text, names))
 
 
 def _tiles(comparison: Comparison) -> list[tuple[str, str]]:

@@ -210,11 +210,11 @@ def draw_reliability(errors: pd.DataFrame, unit: str = "m") -> "Figure":
     figure = new_figure(5.2, 4.6)
     axis = figure.subplots()
     axis.plot([0, 100], [0, 100], color="0.6", lw=1, ls=":", label="as stated")
-    for number_of_bin in np.unique(bin_of):
-        mine = bin_of == number_of_bin
-        count, share = int(mine.sum()), float(right[mine].mean())
+    for k in np.unique(bin_of):
+        in_bin = bin_of == k
+        count, share = int(in_bin.sum()), float(right[in_bin].mean())
         low, high = wilson_interval(share, count)
-        x = 100 * stated[mine].mean()
+        x = 100 * stated[in_bin].mean()
         axis.errorbar(
             x, 100 * share, [[100 * max(share - low, 0)], [100 * max(high - share, 0)]], fmt="o", color=SKY, capsize=3
         )

@@ -261,8 +261,7 @@ class _Plan:
         trajectory = session.ground_truth if session.split == "query" else session.trajectory
         if localized is not None and session.split == "query":
             trajectory = localized.poses
-        groups = table.groupby(["index", "device_slot"], sort=False)
-        first = table.loc[groups.head(1).index]
+        first = table.drop_duplicates(["index", "device_slot"])
         poses = np.full((len(first), 4, 4), np.nan)
         if trajectory is not None:
             poses = trajectory.lookup(first["timestamp"].to_numpy(), first["device_id"].to_numpy(str))
@@ -272,16 +271,13 @@ class _Plan:
             shown = pd.MultiIndex.from_frame(first[["timestamp", "device_id"]].astype(object)).isin(listed)
         kept = np.unique(first["index"].to_numpy()[shown])[::every]
         shown &= np.isin(first["index"], kept)
-        rows_of = groups.indices
-        names = ["index", "timestamp", "subsession", "device_slot", "device_id"]
+        rows_of = table.groupby(["index", "device_slot"], sort=False).indices
         image_rows, slots = table["row"].to_numpy(), table["slot"].to_numpy()
+        columns = first.loc[shown, ["index", "timestamp", "subsession", "device_slot", "device_id"]]
         frames = []
-        for k, values in enumerate(first[names].itertuples(index=False, name=None)):
-            if shown[k]:
-                index, timestamp, name, device, device_id = values
-                own = rows_of[index, device]
-                frames.append(_Frame(index, timestamp, name, device, device_id, poses[k], image_rows[own],
-                                     tuple(slots[own])))  # fmt: skip
+        for values, pose in zip(columns.itertuples(index=False, name=None), poses[shown], strict=True):
+            rows = rows_of[values[0], values[3]]
+            frames.append(_Frame(*values, pose, image_rows[rows], tuple(slots[rows])))
         rows = np.array([frame.rows[0] for frame in frames], np.int64)
         cameras = poses[shown] @ session.rig_from_cam(rows) if len(rows) else np.zeros((0, 4, 4))
         depths: dict[tuple[int, str], list[int]] = {}
@@ -317,10 +313,9 @@ def session_tracks(session: Session) -> list[Floats]:
 
     A rig's track is that of its first camera. Maps have the poses of the trajectory, queries those of the ground truth.
     """
-    table = _slots(session)
-    first = table.loc[table.groupby(["index", "device_slot"], sort=False).head(1).index]
-    rows = first["row"].to_numpy()
-    return [t for ts in _tracks(first, session.world_from_cam(rows, session.split == "query")).values() for t in ts]
+    first = _slots(session).drop_duplicates(["index", "device_slot"])
+    poses = session.world_from_cam(first["row"].to_numpy(), session.split == "query")
+    return [track for tracks in _tracks(first, poses).values() for track in tracks]
 
 
 def _tracks(frames: pd.DataFrame, poses: Floats) -> dict[str, list[Floats]]:

@@ -242,8 +242,8 @@ def _not_done(run: dict[str, Any]) -> Table | None:
     """List the items that stages left out, and why."""
     stages_of: dict[tuple[str, str, str], list[str]] = {}
     for row in run["stages"]:
-        for one in row.get("left_out") or ():
-            key = str(row.get("scene") or ""), str(one.get("what", "")), str(one.get("reason", ""))
+        for item in row.get("left_out") or ():
+            key = str(row.get("scene") or ""), str(item.get("what", "")), str(item.get("reason", ""))
             stages_of.setdefault(key, []).append(str(row.get("stage", "")))
     if not stages_of:
         return None
@@ -453,7 +453,7 @@ def _changes(changes: pd.DataFrame, unit: str) -> Table:
         rows.append([query, row["change"], *errors, row["device_id"], row["timestamp"]])
     counts = changes["change"].value_counts()
     caption = ", ".join(f"{counts.get(name, 0)} {name}" for name in CHANGES)
-    caption = f"Queries within the last threshold only with their sequence, or only without it: {caption}"
+    caption = f"Queries within the last threshold only with or only without their sequence: {caption}"
     return Table(caption, ["query", "change", "single", "sequence", "device", "timestamp [µs]"], rows)
 
 
@@ -463,13 +463,13 @@ def _losses(losses: pd.DataFrame) -> Table | None:
         return None
     rows = []
     for threshold, group in losses.dropna(subset=["threshold"]).groupby("threshold", sort=False):
-        parts = [(str(m), part) for m, part in group.groupby("map_device", sort=False)]
-        for name, part in [*parts, ("all", group)]:
-            queries = part["queries"].sum()
-            shares = [part[reason].sum() / queries for reason in REASONS]
-            label = threshold_text(str(threshold)) if name == parts[0][0] else ""
+        maps = [(str(map_), of_map) for map_, of_map in group.groupby("map_device", sort=False)]
+        for name, pairs in [*maps, ("all", group)]:
+            queries = pairs["queries"].sum()
+            shares = [pairs[reason].sum() / queries for reason in REASONS]
+            label = threshold_text(str(threshold)) if name == maps[0][0] else ""
             cells = [Cell(f"{percent(share)} %", 1.2 * share) for share in shares]
-            rows.append([label, name, f"{queries:.0f}", f"{part['missed'].sum():.0f}", *cells])
+            rows.append([label, name, f"{queries:.0f}", f"{pairs['missed'].sum():.0f}", *cells])
     caption = "Queries missed at each threshold, and the share of all queries lost for each reason"
     return Table(caption, ["threshold", "map", "queries", "missed", *REASONS], rows)
 

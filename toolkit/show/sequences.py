@@ -176,9 +176,9 @@ def draw_sequence(
     plots = figure.subplots(1, count, squeeze=False)[0]
     shown = np.concatenate([centers, *after])
     for number, plot in enumerate(plots):
-        here = shown[place == number]
+        in_panel = shown[place == number]
         plot.scatter(*centers[place[: len(centers)] == number].T, s=12, c="0.78", label=f"map, {map_device}")
-        low, high = (here.min(axis=0), here.max(axis=0)) if len(here) else (np.zeros(2), np.ones(2))
+        low, high = (in_panel.min(axis=0), in_panel.max(axis=0)) if len(in_panel) else (np.zeros(2), np.ones(2))
         low, high = low - 3 / unit[1], high + 3 / unit[1]
 
         def inside(points: Floats, low: Floats = low, high: Floats = high) -> NDArray[np.bool_]:

@@ -97,26 +97,29 @@ def draw_scene(
     for axis in panels[len(shown) :]:
         axis.set_visible(False)
     for axis, p, window in zip(panels, shown, windows, strict=False):
-        near, here, mine = point_place == p, place == p, query_place == p
+        points_here, cameras_here, here = point_place == p, place == p, query_place == p
+        queries, centers = estimated[here], estimated_xy[here]
         # Darker colors: small bright points would vanish on white.
-        tint = "#9A9A9A" if shades is None else np.clip(shades[near] / 255 * 0.75 + 0.2, 0, 0.75)
-        draw_dots(axis, cloud[near], s=1.2, c=tint, lw=0, rasterized=True)
+        tint = "#9A9A9A" if shades is None else np.clip(shades[points_here] / 255 * 0.75 + 0.2, 0, 0.75)
+        draw_dots(axis, cloud[points_here], s=1.2, c=tint, lw=0, rasterized=True)
         for tracks, color, label in ((map_tracks, MAP, "map tracks"), (query_tracks, TRUE, "true query tracks")):
             for number, track in enumerate(tracks):
                 axis.plot(*(track @ axes.T).T, color=color, lw=0.7, alpha=0.5, zorder=2,
                           label=None if number else label)  # fmt: skip
         length = 0.035 * np.ptp(window, axis=1).max()
-        draw_headings(axis, cameras[here], map_poses[here], axes, length, colors=MAP, alpha=0.7, linewidths=1.0)
-        draw_dots(axis, cameras[here], s=9, color=MAP, lw=0, zorder=3, label="map cameras" if here.any() else None)
-        _draw_queries(axis, estimated[mine], true[mine], axes, length)
+        style: dict[str, Any] = {"colors": MAP, "alpha": 0.7, "linewidths": 1.0}
+        draw_headings(axis, cameras[cameras_here], map_poses[cameras_here], axes, length, **style)
+        label = "map cameras" if cameras_here.any() else None
+        draw_dots(axis, cameras[cameras_here], s=9, color=MAP, lw=0, zorder=3, label=label)
+        _draw_queries(axis, queries, true[here], axes, length)
         axis.set(xlim=window[0], ylim=window[1], aspect="equal", xlabel=labels[0])
         axis.spines[["top", "right"]].set_visible(False)
         axis.grid(alpha=0.2)
         name = f"place {int(p) + 1}: " if len(counts) > 1 else ""
         low, high = np.array(window).T
-        outside = int(((estimated_xy[mine] < low) | (estimated_xy[mine] > high)).any(1).sum())
+        outside = int(((centers < low) | (centers > high)).any(1).sum())
         far = f", {outside} estimated outside the picture" if outside else ""
-        axis.set_title(f"{name}{is_posed(estimated[mine]).sum()} of {mine.sum()} queries have a pose{far}", fontsize=9)
+        axis.set_title(f"{name}{is_posed(queries).sum()} of {len(queries)} queries have a pose{far}", fontsize=9)
         if len(shown) < len(counts) and axis is panels[len(shown) - 1]:
             axis.annotate(f"{len(counts) - len(shown)} smaller places not shown", (1, -0.2), fontsize=8,
                           xycoords="axes fraction", ha="right")  # fmt: skip
