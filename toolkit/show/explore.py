@@ -180,7 +180,7 @@ def draw_reranked(
 ) -> "Figure":
     """Draw query images, each with its first references before and (to the right) after reranking; return the figure.
 
-    Queries whose first reference came from the lowest retrieval ranks are drawn.
+    The queries drawn are those whose new first reference had the worst retrieval rank.
 
     Args:
         jsonl: the reranked references of a pair, `<scene>_map_<M>_query_<Q>.jsonl`.
