@@ -142,9 +142,7 @@ def test_a_failed_query_says_why_and_is_drawn(small_capture: Path, tmp_path: Pat
     one = pair.look(0)
     assert one.pose is None
     assert one.error is None
-    assert one.reason == (
-        "No pose: too few inliers (4 within 0.45 deg) among 9 matches; at least 12 are required."
-    )
+    assert one.reason == "No pose: too few inliers (4 within 0.45 deg) among 9 matches; at least 12 are required."
     assert "no pose" in text_of(one.figure)
     assert picture_of(one).width > 800
     assert pair.look(1).reason == "No pose: the retrieval has no references for this query."

@@ -276,8 +276,11 @@ class _Plan:
         columns = first.loc[shown, ["index", "timestamp", "subsession", "device_slot", "device_id"]]
         frames = []
         for values, pose in zip(columns.itertuples(index=False, name=None), poses[shown], strict=True):
-            rows = rows_of[values[0], values[3]]
-            frames.append(_Frame(*values, pose, image_rows[rows], tuple(slots[rows])))
+            index, timestamp, name, device, device_id = values
+            rows = rows_of[index, device]
+            frames.append(
+                _Frame(index, timestamp, name, device, device_id, pose, image_rows[rows], tuple(slots[rows]))
+            )
         rows = np.array([frame.rows[0] for frame in frames], np.int64)
         cameras = poses[shown] @ session.rig_from_cam(rows) if len(rows) else np.zeros((0, 4, 4))
         depths: dict[tuple[int, str], list[int]] = {}

@@ -109,8 +109,8 @@ def draw_scene(
         length = 0.035 * np.ptp(window, axis=1).max()
         style: dict[str, Any] = {"colors": MAP, "alpha": 0.7, "linewidths": 1.0}
         draw_headings(axis, cameras[cameras_here], map_poses[cameras_here], axes, length, **style)
-        label = "map cameras" if cameras_here.any() else None
-        draw_dots(axis, cameras[cameras_here], s=9, color=MAP, lw=0, zorder=3, label=label)
+        style = {"s": 9, "color": MAP, "lw": 0, "zorder": 3, "label": "map cameras" if cameras_here.any() else None}
+        draw_dots(axis, cameras[cameras_here], **style)
         _draw_queries(axis, queries, true[here], axes, length)
         axis.set(xlim=window[0], ylim=window[1], aspect="equal", xlabel=labels[0])
         axis.spines[["top", "right"]].set_visible(False)
