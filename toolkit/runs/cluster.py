@@ -122,7 +122,7 @@ class Cluster:
             self._client.wait_for_workers(1, timeout=_WAIT_S)
         except TimeoutError:
             raise ToolkitError(
-                f"{label}: no worker is left, and none came within {_WAIT_S} s. Finished work is kept."
+                f"{label}: no worker is left, and none came for {_WAIT_S} s. What was done is kept."
             ) from None
 
 
