@@ -587,8 +587,8 @@ def _run_job(
     line.end(f"{summary}{summary and '; '}{work:.1f} s + {seconds - work:.1f} s start-up, {memory:.0f} MB")
     for one in row.get("left_out", ()):
         say(f"  left out: {one['what']}: {one['reason']}")
-    warnings = [one for one in warnings_of_kernels(job.files.run / LOG, logged) if one not in record.told]
-    record.told.update(warnings)
+    warnings = [one for one in warnings_of_kernels(job.files.run / LOG, logged) if one not in record.shown]
+    record.shown.update(warnings)
     for one in warnings[:MOST_WARNINGS]:
         say(f"  warning: {one}")
     if len(warnings) > MOST_WARNINGS:

@@ -104,7 +104,7 @@ def read_group(file: h5py.File, name: str) -> dict[str, NDArray[Any]]:
         raise DamagedError(
             Path(file.filename),
             f"{file.filename} is damaged at {name} ({first_line(error)}). If a run made it, run its stage again with "
-            "--force, which rebuilds damaged groups.",
+            "--force: each damaged group is made again.",
         ) from None
     return arrays
 

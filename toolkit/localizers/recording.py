@@ -66,8 +66,8 @@ def localize_piece(
     """
     first = _placed(odometry, queries, query_frames, settings, gravity)
     sure = queries.frames[first.used & queries.trusted]
-    predicted = np.isfinite(first.world_from_rig).all(axis=(1, 2))
-    doubtful = [frame for frame in np.setdiff1d(query_frames, sure).tolist() if predicted[frame]]
+    predicted = query_frames[np.isfinite(first.world_from_rig[query_frames]).all(axis=(1, 2))]
+    doubtful = np.setdiff1d(predicted, sure).tolist()
     relocalized: dict[int, PoseEstimate] = {}
     if again is not None and doubtful:
         stds = zip(*(each.tolist() for each in stds_of(first.covariances[doubtful])), strict=True)

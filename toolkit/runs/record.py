@@ -41,7 +41,7 @@ class RunLog:
     error: str | None = None
     exit_code: int | None = None
     rows: list[dict[str, Any]] = field(default_factory=list)
-    told: set[str] = field(default_factory=set)
+    shown: set[str] = field(default_factory=set)
     """Warnings that the terminal has already shown."""
     started: float = field(default_factory=time.perf_counter)
     created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
