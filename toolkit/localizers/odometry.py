@@ -217,7 +217,7 @@ def floored(covariances: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Placement:
-    """A placement of odometry in the map: a set of single poses that the odometry between them makes consistent."""
+    """A placement of odometry in the map: single poses that agree with each other, given the odometry between them."""
 
     seed: int
     """The query that all members agree with."""

@@ -28,7 +28,7 @@ from toolkit.localizers.odometry import (
 from toolkit.manifest import SequenceSettings
 
 MISSING = (
-    "The stage `sequence` needs GTSAM, which is not installed here. To add it, where the toolkit was installed from: "
+    "The stage `sequence` needs GTSAM, which is not installed. To install it, run in the clone of the toolkit: "
     "pip install -e '.[sequence]'"
 )
 _CHI2_999 = 22.46

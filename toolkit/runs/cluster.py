@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 ADDRESS = "TOOLKIT_CLUSTER"
 """Environment variable with the address of the scheduler whose workers the stages use."""
 MISSING = (
-    "--cluster needs Dask, which is not installed here. To add it, where the toolkit was installed from: "
+    "--cluster needs Dask, which is not installed. To install it, run in the clone of the toolkit: "
     "pip install -e '.[cluster]'"
 )
 SHARES_A_WORKER = 4
