@@ -218,12 +218,7 @@ def notebook_parameters(path: Path) -> dict[str, Any]:
 
 
 def check_parameters(path: Path, parameters: Iterable[str], where: str = "") -> None:
-    """Refuse parameters that the notebook `path` does not have; papermill would only warn.
-
-    Args:
-        path: the notebook.
-        parameters: names.
-        where: prefix of the name in the message.
+    """Refuse parameters that the notebook `path` does not have; papermill would only warn. Messages begin with `where`.
 
     Raises:
         ManifestError: a parameter is unknown; the message names the nearest known one.
@@ -445,7 +440,6 @@ def execute(
     """Execute the notebook `path` in a fresh kernel and write the executed copy to `output`.
 
     Args:
-        path: the notebook.
         output: path of the executed copy, which is also written if a cell fails.
         parameters: values that replace those of the parameters cell.
         progress: shows what the kernel writes to stderr.

@@ -177,9 +177,8 @@ def sweep(
     demo capture is rendered once for all runs. If a run fails, the next ones still run.
 
     Args:
-        manifest_path: YAML file, see `toolkit.manifest`.
         sweeps: `key=a,b,c` each, see `runs.sweep.swept_runs`; several keys give all combinations of their values.
-        overrides, say, options: as for `run`.
+        manifest_path, overrides, say, options: as for `run`.
 
     Returns:
         The folders of the runs that succeeded, and the errors of the runs that failed.
@@ -364,10 +363,9 @@ def _not_tolerated(
 
 
 def tree_fingerprint(folder: Path, of: Callable[[str], bool] | None = None, content: bool = False) -> str:
-    """Return a fingerprint, 16 hex digits, of the files below a folder.
+    """Return a fingerprint, 16 hex digits, of the files below a folder; links are followed.
 
     Args:
-        folder: links in it are followed.
         of: selects files by their path below the folder; None: all files.
         content: hash the content of each file beside its path and size, instead of the time of its last change. This
             also detects damage, and takes about a second for some gigabytes that are in the page cache.

@@ -281,7 +281,6 @@ class GroupWriter:
         """Open a file to add groups.
 
         Args:
-            path: the file; it need not exist.
             made_by: settings, JSON. Groups made with other settings are dropped.
             attributes: attributes of the HDF5 file, for other readers.
             share: prefix of the names of the parts to write, for a writer that does a share of the work. It does not
@@ -299,15 +298,12 @@ class GroupWriter:
         self._share = share
         self._whole: Index | None = None
         if share is None:
-            self._hold()
+            self._wait_for_others()
+            self._whole = read_index(path, made_by)
+            if self._whole is None and path.exists() and not _is_of_another(path, made_by):
+                log.warning("%s is torn, or of another version of the toolkit: what it held is made again.", path)
         self._find_parts()
         self._part_closed = time.monotonic()
-
-    def _hold(self) -> None:
-        self._wait_for_others()
-        self._whole = read_index(self.path, self._made_by)
-        if self._whole is None and self.path.exists() and not _is_of_another(self.path, self._made_by):
-            log.warning("%s is torn, or of another version of the toolkit: what it held is made again.", self.path)
 
     def _find_parts(self) -> None:
         self._parts = {}
@@ -339,7 +335,6 @@ class GroupWriter:
         Args:
             function: does a share of the work; called as `function(writer, items, *arguments)` with a writer for the
                 share and the items that are not done yet.
-            items: the work.
             arguments: further arguments of `function`.
             label, unit: of the progress bar.
             multiple: shares have a multiple of this number of items.
@@ -390,9 +385,7 @@ class GroupWriter:
         """Write a group, which replaces one of the same name.
 
         Args:
-            name: name of the group.
             made_from: fingerprint of its sources, besides the settings `made_by` of the file.
-            arrays: arrays by name.
             attributes: attributes of arrays, by the array's name.
             note: any JSON about the group; `notes` returns it.
         """

@@ -171,7 +171,6 @@ class FeatureStore(Mapping[str, LocalFeatures]):
 
         Args:
             out: folder of all features.
-            session_id: name of the session.
             settings: settings of the extractor; None: SIFT.
 
         Raises:
@@ -242,17 +241,14 @@ def extract_session(
 ) -> FeatureStore:
     """Extract the local features of a session's images, or reuse earlier ones.
 
-    After a kill, the next call continues and loses at most one part of `GroupWriter`. Memory does not grow with the
-    session.
+    A killed run loses at most one part of `GroupWriter`. Memory does not grow with the session.
 
     Args:
         session: the session; only its camera images are read.
         out: folder of all features; this session's file is `features_path`.
         extractor: the extractor; None: SIFT.
         rows: rows of `session.images` to extract; None: all.
-        workers: number of threads.
         skip_existing: reuse the features of unchanged images.
-        progress: show a progress bar.
         turns: quarter turns that make each image of the session upright, see `capture.upright`; None: images stay as
             they are. Ignored for kinds of features that do not need upright images.
 
@@ -389,8 +385,6 @@ def matches_path(out: str | Path, session0: str, session1: str, made_by: Mapping
     """Return the file of the matches of two sessions.
 
     Args:
-        out: folder of all matches.
-        session0, session1: names of the sessions.
         made_by: settings, `features` (a list with those of each session) and `matcher`.
     """
     features, matcher = made_by["features"][0].get("name", "features"), made_by["matcher"]["name"]
@@ -440,15 +434,7 @@ class MatchStore:
 def write_matches(
     writer: GroupWriter, group: str, made_from: str, counts: tuple[int, int], matches: PairMatches
 ) -> None:
-    """Add the matches of two images to a file.
-
-    Args:
-        writer: the file.
-        group: name of the group, see `group_names`.
-        made_from: fingerprint of the features of both images.
-        counts: number of features of each image.
-        matches: the matches.
-    """
+    """Add the matches of two images to a file, as a group of `group_names`; `counts` are the images' features."""
     # 16 bits as in hloc; few networks find more features.
     matches0 = np.full(counts[0], -1, np.int16 if max(counts) <= np.iinfo(np.int16).max else np.int32)
     scores = np.zeros(counts[0], np.float16)
@@ -470,9 +456,7 @@ def match_sessions(
     Args:
         stores: features of the first and of the second session.
         pairs: names of the two images, the first session's first.
-        matcher: the matcher.
         out: folder of all matches, see `matches_path`.
-        sessions: names of the two sessions.
         skip_existing: reuse the matches of unchanged features.
 
     Returns:
@@ -522,7 +506,6 @@ def group_names(pairs: Iterable[tuple[str, str]], existing: Container[str] = ())
     readers of hloc's layout do not find.
 
     Args:
-        pairs: names of the two images.
         existing: groups in the file; an existing unique name is kept.
     """
     shared = {pair: _shared_group(*pair) for pair in pairs}

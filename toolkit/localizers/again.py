@@ -26,12 +26,7 @@ class LocalizeAgain:
     """Localizes queries of one pair like the localize stage, without writing; the map stays open."""
 
     def __init__(self, map_: Map, session: Session, retrieval: Path) -> None:
-        """
-        Args:
-            map_: the open map.
-            session: the query session.
-            retrieval: file with the pair's references, `<pair>.jsonl`.
-        """
+        """Take an open map, a query session, and the file with the pair's references, `<pair>.jsonl`."""
         self.map, self.session, self.retrieval = map_, session, retrieval
         self._localizer = lru_cache(maxsize=8)(self._create)
 

@@ -59,9 +59,6 @@ class PlacedPiece:
 def place_online(odometry: Odometry, queries: PosedQueries, frames: Ints, settings: SequenceSettings) -> PlacedPiece:
     """Return the poses of some frames of a piece, each only from the last `settings.length_s` seconds before it.
 
-    Args:
-        frames: indices of the frames.
-
     Raises:
         ManifestError: GTSAM is not installed.
     """

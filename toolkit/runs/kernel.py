@@ -29,14 +29,7 @@ _ARGUMENTS = [
 
 
 def kernel_error(error: Exception, ended_by: int | None, memory_mb: float, output: Path) -> StageError:
-    """Return the error for a kernel that did not start, or that died.
-
-    Args:
-        error: raised by the client.
-        ended_by: exit status of the kernel, negative for a signal; None: it has not died.
-        memory_mb: peak memory of the stage.
-        output: the executed notebook.
-    """
+    """Return the error for a kernel that died, or did not start; `ended_by` as of `RunningKernel`."""
     if ended_by == -9:
         text = (
             f"Out of memory, most likely: the system killed the notebook's kernel (signal 9; {memory_mb:.0f} MB were "
