@@ -45,7 +45,7 @@ def test_keys_of_one_last_part_are_told_apart() -> None:
         (["=1,2"], "expected key=value,value"),
         (["retrieve.topk=[1"], "expected key=value,value"),
         (["retrieve.topk=1", "retrieve.topk=2"], "twice"),
-        (["embed.model=[a b],a b"], "one folder"),
+        (["embed.model=[a b],a b"], "the same folder name"),
         ([f"seed={','.join(map(str, range(101)))}"], "found 101 runs"),
     ],
 )
