@@ -108,8 +108,8 @@ def require_space(folder: Path, needed_bytes: int, alternative: str) -> None:
     if needed_bytes * _SPACE_FACTOR > free_bytes:
         needed = size_text(int(needed_bytes * _SPACE_FACTOR))
         raise DownloadError(
-            f"{folder}: about {needed} are needed on this disk, {size_text(free_bytes)} are free. Free some space, set "
-            f"CAPTURES (or `captures` in the manifest) to a folder on another disk, or {alternative}."
+            f"{folder}: about {needed} are needed on this disk and {size_text(free_bytes)} are free. Free some space, "
+            f"set CAPTURES (or `captures` in the manifest) to a folder on another disk, or {alternative}."
         )
 
 
