@@ -137,7 +137,7 @@ def test_images_of_a_model_that_cannot_be_used_are_rows(model: Path, tmp_path: P
     assert status["phone/1.jpg"] == "no such file"
     assert status["phone/2.jpg"].startswith("cannot be read as an image")
     assert status["rig/3.jpg"].startswith("the image is stored as 32 x 24 pixels, its camera has 64 x 48; use")
-    assert status["rig/4.jpg"].endswith("turn the pixels and remove the EXIF orientation")
+    assert status["rig/4.jpg"].endswith("rotate the pixels and remove the EXIF orientation")
     assert status["rig/5.jpg"] == "imported"
     session = report.session
     assert len((session / "proc" / "import.csv").read_text().splitlines()) == 6
@@ -243,7 +243,7 @@ def test_a_folder_becomes_queries_without_ground_truth(folder: Path, tmp_path: P
     assert session.images["path"].tolist() == [f"import/images/{name}" for name in ("a/10.png", "a/2.jpg", "b/1.jpg")]
     assert session.images["timestamp"].tolist() == [1_000_000, 2_000_000, 3_000_000]
     assert session.subsessions == ["import"]
-    assert "intrinsics of 3 images: the camera that was given" in report.text()
+    assert "intrinsics of 3 images: the given camera" in report.text()
     assert session.image_path(0).is_symlink()
 
 
