@@ -127,9 +127,7 @@ def run(
 @app.command()
 def compare(
     runs: Annotated[list[Path], typer.Argument(help="Two or more run folders, compared with the first.")],
-    out: Annotated[
-        Path | None, typer.Option(help="HTML file; default: compare_<names>.html beside the first run.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="HTML file, else compare_<names>.html beside the first run.")] = None,
     pictures: Annotated[int, typer.Option(min=0, help="Number of queries won or lost to draw, per run.")] = 4,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the resampling for the intervals.")] = 0,
     as_json: Json = False,
@@ -170,8 +168,7 @@ def check(
 
     report = check_capture(capture, deep)
     if as_json:
-        problems = [asdict(problem) for problem in report.problems]
-        _print_json({"capture": str(capture), "ok": report.ok, "problems": problems})
+        _print_json({"capture": str(capture), "ok": report.ok, "problems": [asdict(row) for row in report.problems]})
     else:
         print(report.text())
     if not report.ok:
@@ -229,9 +226,7 @@ def submit(
 
 @app.command()
 def download(
-    manifest: Annotated[
-        Path, typer.Argument(help="Manifest with a section `dataset`, e.g. data_manifests/crocodl-hydro.yaml.")
-    ],
+    manifest: Annotated[Path, typer.Argument(help="Manifest with `dataset`, as data_manifests/crocodl-hydro.yaml.")],
     sessions: Annotated[
         str, typer.Option(metavar="NAME,...", help="Only these sessions of the manifest, e.g. ios_map,hl_query.")
     ] = "",
@@ -257,9 +252,7 @@ def demo_data(
     frames: Annotated[int, typer.Option(min=2, help="Frames per room and map session.")] = 12,
     seed: Annotated[int, typer.Option(min=0, help="Random seed; another seed gives other rooms.")] = 0,
     alike: Annotated[bool, typer.Option("--alike", help="The last room looks exactly like the first.")] = False,
-    seconds: Annotated[
-        int, typer.Option(min=0, help="Seconds per query recording, with odometry between images; 0: no fixed length.")
-    ] = 0,
+    seconds: Annotated[int, typer.Option(min=0, help="Length of a query recording; adds odometry between images.")] = 0,
     losses: Annotated[int, typer.Option(min=0, help="Tracking losses per query recording.")] = 0,
     gaps: Annotated[int, typer.Option(min=0, help="Gaps of 4 s in the odometry of a query recording.")] = 0,
     radio: Annotated[bool, typer.Option("--radio", help="Add scans of WiFi and Bluetooth.")] = False,
@@ -309,8 +302,7 @@ def import_images(
         Path | None, typer.Option(help="CSV like the table, with ground-truth poses of the queries, for evaluation.")
     ] = None,
     camera: Annotated[
-        str | None,
-        typer.Option(metavar="'MODEL, W, H, ...'", help="Intrinsics of all images; default: guess from EXIF."),
+        str | None, typer.Option(metavar="'MODEL, W, H, ...'", help="Intrinsics of all images; else guessed from EXIF.")
     ] = None,
     cameras: Annotated[Path | None, typer.Option(help="COLMAP's cameras.txt.")] = None,
     placing: Placing = "link",
@@ -333,9 +325,7 @@ def import_transforms(
     hold_out: Annotated[
         int, typer.Option(metavar="N", help="Every Nth image becomes a query with ground truth; 0: none.")
     ] = 0,
-    unit: Annotated[
-        float | None, typer.Option(metavar="METERS", help="Meters per unit of the poses; default: unknown.")
-    ] = None,
+    unit: Annotated[float | None, typer.Option(metavar="METERS", help="Meters per unit of the poses if known.")] = None,
     axes: Axes = "opengl",
     placing: Placing = "link",
 ) -> None:
@@ -428,15 +418,14 @@ def record(
     """Record a session for the rerun viewer: images on a timeline, cameras, depth and points."""
     from toolkit.show.recordings import record_session
 
-    recording = record_session(
+    rrd = record_session(
         scene, split, device, subsession, keyframes_only, every, spawn, vis_retrieve_queries, queries_pose,
         out=out, map_dir=map_dir,
     )  # fmt: skip
-    for message in recording.messages:
+    for message in rrd.messages:
         print("Note:", message)
-    size_mb = recording.bytes / 1e6
-    print(f"{recording.frames} frames, {recording.images} images, {size_mb:.1f} MB in {recording.seconds:.0f} s")
-    print(f"Open it: {recording.command}")
+    print(f"{rrd.frames} frames, {rrd.images} images, {rrd.bytes / 1e6:.1f} MB in {rrd.seconds:.0f} s")
+    print(f"Open it: {rrd.command}")
 
 
 def _sweep(

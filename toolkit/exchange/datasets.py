@@ -31,14 +31,11 @@ def arrange(sessions: str | Path, names: Mapping[str, str]) -> list[str]:
     """Rename the sessions of a data set. Split a session by device if several new names refer to it.
 
     A session is split by its subsessions, whose names begin with `<device>_`. `queries.txt` is copied to
-    `proc/keyframes_original.txt`. Images are moved, not copied.
+    `proc/keyframes_original.txt`. Images are moved, not copied. Return notes on what was left out.
 
     Args:
         sessions: folder of the sessions; changed in place. Sessions that are not in `names` stay as they are.
         names: for each new name, `<device>_<map or query>`, the session's name in the data set.
-
-    Returns:
-        One note for each kind of content that was left out.
 
     Raises:
         CaptureError: a session to split has no subsession of a device, or an invalid subsession name.
@@ -89,8 +86,8 @@ def _split(old: Path, new: list[Path]) -> list[str]:
     if unclaimed:
         notes.append(f"{old.name}: {len(unclaimed)} subsessions of other devices, such as {min(unclaimed)}")
     if other_files:
-        count, example = len(other_files), other_files[0].name
-        notes.append(f"{old.name}: {count} files that cannot be split by device, such as {example}")
+        example = other_files[0].name
+        notes.append(f"{old.name}: {len(other_files)} files that cannot be split by device, such as {example}")
     return notes
 
 

@@ -113,11 +113,7 @@ class Draft:
             self.poses[name] = world_from_cam
 
     def write(self) -> ImportReport:
-        """Write the session, without the images that cannot be used.
-
-        Raises:
-            CaptureError: no image can be used.
-        """
+        """Write the session without the images that cannot be used; raise CaptureError if none is left."""
         problems = {image.name: self._problem(image) for image in self.images}
         self.rows += [{"image": name, "status": problem} for name, problem in problems.items() if problem]
         self.images = [image for image in self.images if not problems[image.name]]
@@ -213,12 +209,7 @@ class Draft:
 
 
 def start(capture: str | Path, device: str, split: str, folder: Path, placing: str) -> Draft:
-    """Return the draft of a new session.
-
-    Raises:
-        CaptureError: the session exists already.
-        ManifestError: an unknown split or placing, or a device that cannot be part of a name.
-    """
+    """Return the draft of a new session. Raise CaptureError if it exists, ManifestError for an invalid argument."""
     if split not in SPLITS:
         raise ManifestError(f"split: unknown {split!r}. {nearest(split, SPLITS)}")
     if placing not in PLACING:

@@ -45,12 +45,7 @@ Keypoints = Mapping[str, NDArray[np.floating]]
 
 
 def export_colmap(
-    run: str | Path,
-    scene: str,
-    device: str,
-    out: str | Path,
-    capture: str | Path | None = None,
-    names: str = "own",
+    run: str | Path, scene: str, device: str, out: str | Path, capture: str | Path | None = None, names: str = "own"
 ) -> pycolmap.Reconstruction:
     """Write the triangulated map that a run localized with as a binary COLMAP model.
 
@@ -102,11 +97,7 @@ def _features_of(files: SceneFiles, session_id: str, map_file: Path) -> FeatureS
 
 
 def _pooled(maps: Sequence[LocalMap], stores: Sequence[FeatureStore]) -> tuple[LocalMap, Keypoints]:
-    """Merge the maps of several kinds of features. In each image, concatenate the keypoints of all kinds.
-
-    Returns:
-        The merged map, whose observations index the concatenated keypoints (n, 2) of each image.
-    """
+    """Merge the maps of several kinds of features; in each image, concatenate the keypoints (n, 2) of all kinds."""
     keypoints: dict[str, NDArray[np.floating]] = {}
     shifted = []
     for local_map, store in zip(maps, stores, strict=True):

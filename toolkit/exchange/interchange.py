@@ -160,14 +160,9 @@ def import_images(
 
 
 def import_once(
-    images: str | Path | None,
-    capture: str | Path,
-    device: str,
-    split: str,
-    unit_m: float | None = 1.0,
-    **options: Any,
+    images: str | Path | None, capture: str | Path, device: str, split: str, unit_m: float | None = 1.0, **options: Any
 ) -> str:
-    """Import images unless the session was imported before from the same input; return a message for the user.
+    """Import images, unless the session was imported before from the same input. Return a message for the user.
 
     Args:
         unit_m: meters per unit of the poses; None: unknown.
@@ -278,34 +273,26 @@ def _camera(params: str, where: str) -> pycolmap.Camera:
 
 
 def _camera_of(
-    row: Mapping[Any, Any],
-    listed: Mapping[str, pycolmap.Camera],
-    shared: pycolmap.Camera | None,
-    path: Path,
-    where: str,
+    row: Mapping[Any, Any], by_id: Mapping[str, pycolmap.Camera], shared: pycolmap.Camera | None, path: Path, where: str
 ) -> tuple[pycolmap.Camera, str]:
     """Return the camera of an image and its origin: the table, cameras.txt, the camera shared by all images, or EXIF.
 
-    Args:
-        row: the image's row of the table.
-        listed: cameras of cameras.txt by id.
-        path: the image, whose EXIF header is the last resort.
-        where: file and line of the row, for messages.
+    `where` names file and line of the image's row, for messages.
     """
     if "model" in row:
         text = ", ".join([row["model"], row["width"], row["height"], *str(row["params"]).split()])
         return _camera(text, where), "the table's"
     if "camera_id" in row:
-        if row["camera_id"] not in listed:
-            ids = ", ".join(listed) or "none: give cameras.txt"
+        if row["camera_id"] not in by_id:
+            ids = ", ".join(by_id) or "none: give cameras.txt"
             raise CaptureError(f"{where}: camera_id {row['camera_id']!r} is not in cameras.txt (it has: {ids}).")
-        return listed[row["camera_id"]], "those of cameras.txt"
-    if len(listed) > 1:
+        return by_id[row["camera_id"]], "those of cameras.txt"
+    if len(by_id) > 1:
         raise CaptureError(
-            f"cameras.txt has {len(listed)} cameras; give a table with the columns image, camera_id to assign them."
+            f"cameras.txt has {len(by_id)} cameras; give a table with the columns image, camera_id to assign them."
         )
-    if listed:
-        return next(iter(listed.values())), "the camera of cameras.txt"
+    if by_id:
+        return next(iter(by_id.values())), "the camera of cameras.txt"
     return (shared, "the given camera") if shared is not None else exif_camera(path)
 
 

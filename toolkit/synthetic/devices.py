@@ -104,11 +104,8 @@ BODY_FROM_LEVEL_CAM = make_pose(looking(0, 0, 0), (0, 0, 0))
 def _walk(rng: Rng, scene: Scene, device: Device, radius: float, angles: Floats) -> Floats:
     """Return poses world_from_body (N, 4, 4) on an ellipse around the room's center, looking across the center.
 
-    The body sways by a sum of slow sine waves of the angle, so the walk is smooth for any number of frames.
-
-    Args:
-        radius: radius of the ellipse as a fraction of the room's sides.
-        angles: (N,) viewing directions, radians.
+    `angles` (N,) are the viewing directions, radians; `radius` is a fraction of the room's sides. The body sways by a
+    sum of slow sine waves of the angle, so the walk is smooth for any number of frames.
     """
 
     def wave(amplitude: float) -> Floats:

@@ -13,11 +13,7 @@ MODELS = 2  # textures per such material and size in whole meters
 
 
 def _blocked(scene: Scene, start: Image, way: Image) -> NDArray[np.bool_]:
-    """Return which of N segments start + t * way, t in (0, 1), intersect a box of the scene (slab test).
-
-    Args:
-        start, way: (N, 3) in the world, meters.
-    """
+    """Return which segments start + t * way, t in (0, 1), (N, 3) each, intersect a box of the scene (slab test)."""
     hit = np.zeros(len(start), bool)
     if not len(start):
         return hit

@@ -14,12 +14,9 @@ from toolkit.geometry import Floats, Ints, invert, make_pose, quaternion_to_rota
 from toolkit.synthetic.scene import Scene, named_rng
 from toolkit.synthetic.textures import Rng
 
-RATE_HZ = 5.0
-"""Rate of odometry."""
-PICTURE_S = 1.4
-"""Time between two images of a recording without a given length."""
-GAP_S = 4.0
-"""Length of a gap in odometry."""
+RATE_HZ = 5.0  # of odometry
+PICTURE_S = 1.4  # between two images of a recording without a given length
+GAP_S = 4.0  # length of a gap in odometry
 
 
 def every_frame(times: Ints, world_from_rig: Floats, start: int, seconds: float) -> tuple[Ints, Floats]:
@@ -109,23 +106,17 @@ class Emitter:
     """A WiFi access point or a Bluetooth beacon."""
 
     id: str
-    position: Floats
-    """(3,) in the world, meters."""
-    dbm: float
-    """Signal strength received at 1 m."""
-    frequency_khz: int = 0
-    """Frequency of WiFi; 0 for Bluetooth."""
+    position: Floats  # (3,) in the world, meters
+    dbm: float  # signal strength at 1 m
+    frequency_khz: int = 0  # of WiFi; 0 for Bluetooth
 
 
-WIFI_S, BLUETOOTH_S = 4.0, 1.0
-"""Time between two scans."""
-SCAN_US = 600_000
-"""Duration of a WiFi scan."""
+WIFI_S, BLUETOOTH_S = 4.0, 1.0  # between two scans
+SCAN_US = 600_000  # duration of a WiFi scan
 PATH_LOSS, WALL_DB, FADING_DB, FAINTEST_DBM = 2.5, 6.9, 3.0, -92.0
 """Path-loss exponent (log-distance model: T. S. Rappaport, Wireless Communications, 2002), loss per wall (COST 231
 multi-wall model), standard deviation of a reading, and the level below which nothing is received."""
-RADIOS = {"ios": ("bt",), "hl": ("wifi", "bt"), "spot": ("wifi", "bt")}
-"""Radios by device. iOS does not let an app scan WiFi."""
+RADIOS = {"ios": ("bt",), "hl": ("wifi", "bt"), "spot": ("wifi", "bt")}  # iOS does not let an app scan WiFi
 
 
 def emitters_of(seed: int, rooms: Sequence[Scene], kind: str) -> list[Emitter]:

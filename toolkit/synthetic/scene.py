@@ -86,16 +86,13 @@ class Scene:
         side: Material | None = None, top: Material | None = None, ppm: float = 350.0, lit: bool = True,
         back: bool = True,
     ) -> None:  # fmt: skip
-        """Add a box of `size` (width, depth, height) with its base at height z; its front faces +y rotated by yaw.
-
-        `back`: whether the back side is visible.
-        """
+        """Add a box of `size` (width, depth, height) with its base at height z; its front faces +y rotated by yaw."""
         x, y, yaw = place
         half = np.array(size) / 2
         center = np.array([x, y, z + half[2]])
         axis_x, axis_y = np.array([np.cos(yaw), np.sin(yaw), 0]), np.array([-np.sin(yaw), np.cos(yaw), 0])
         sides = [(axis_y, half[1], half[0], front)]
-        if back:
+        if back:  # the back side is visible
             sides.append((-axis_y, half[1], half[0], side or front))
         sides += [(normal, half[0], half[1], side or front) for normal in (axis_x, -axis_x)]
         for normal, reach, half_width, material in sides:
@@ -139,12 +136,7 @@ def _clutter(scene: Scene, rng: Rng, place: Place, z: float, wide: float, deep: 
 
 
 def _furnish(scene: Scene, rng: Rng, wall: int, along: float, room: float, kind: str) -> float:
-    """Put one piece of furniture against a wall, starting at `along`; return its width, or 0 if it does not fit.
-
-    Args:
-        along: meters from the middle of the wall.
-        room: free length of the wall from there, meters.
-    """
+    """Put a thing against a wall from `along` on; return its width, or 0 if it is wider than `room` (all in meters)."""
     tall = scene.size[2]
     width = {
         "shelf": rng.uniform(0.9, 1.6), "cabinet": rng.uniform(0.8, 1.4), "posters": rng.uniform(0.6, 0.9),

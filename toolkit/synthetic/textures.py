@@ -166,8 +166,7 @@ def _chip(rng: Rng, image: Image, ppm: float) -> None:
 
 def poster(rng: Rng, h: int, w: int, ppm: float) -> Image:
     """A printed sheet: title, picture, paragraphs, border."""
-    image = np.empty((h, w, 3), np.uint8)
-    image[:] = random_color(rng, (0.05, 0.7), (0.5, 1.0))
+    image = np.full((h, w, 3), random_color(rng, (0.05, 0.7), (0.5, 1.0)), np.uint8)
     ink = random_color(rng, (0.2, 1.0), (0.05, 0.35))
     top, bottom = int(h * rng.uniform(0.14, 0.25)), int(h * rng.uniform(0.6, 0.8))
     picture = image[top:bottom, int(w * 0.06) : int(w * 0.94)]
@@ -213,8 +212,7 @@ def wood(rng: Rng, h: int, w: int, ppm: float, color: Any = (60, 100, 145)) -> I
 def books(rng: Rng, h: int, w: int, ppm: float) -> Image:
     """The front of a shelf: boards, uprights, and rows of books with titles on their spines."""
     board = _f((45, 75, 110)) * rng.uniform(0.6, 1.4)
-    image = np.empty((h, w, 3), np.uint8)
-    image[:] = board * 0.25
+    image = np.full((h, w, 3), board * 0.25, np.uint8)
     thick, rows = max(2, int(0.03 * ppm)), max(1, round(h / ppm / 0.34))
     for r in range(rows):
         bottom, room = int((r + 1) * h / rows) - thick, h / rows - thick
