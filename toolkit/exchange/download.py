@@ -226,7 +226,7 @@ class _CaptureDownload:
         for file in self.files if in_full else ():
             self.say(f"    {size_text(file.size):>9}  {file.path}")
 
-    # What has been fetched before
+    # Files fetched before
 
     def _read_done(self) -> dict[str, dict[str, Any]]:
         done: dict[str, dict[str, Any]] = {}

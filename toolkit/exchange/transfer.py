@@ -165,7 +165,7 @@ class Transfer:
                             raise DownloadError("The download was stopped.")
                         out.write(chunk)
                         self._advance(len(chunk))
-        except requests.RequestException as error:  # a subclass of OSError
+        except requests.RequestException as error:  # an OSError too, but not one of the disk
             raise _TryAgainError(f"the connection broke ({first_line(error)})", 0) from error
         now = partial.stat().st_size
         if size is not None and now < size and now <= have:  # without this, a server that sends nothing loops forever

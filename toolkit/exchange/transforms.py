@@ -148,7 +148,7 @@ class _Frame:
         return float(value)
 
     def world_from_named(self) -> Floats:
-        """Return the camera-to-world pose (4, 4) with the file's camera axes and unit."""
+        """Return world_from_camera (4, 4) as stored, with the file's camera axes and unit."""
         rows = self.values.get("transform_matrix")
         expected = "4 rows of 4 finite numbers, world_from_cam, the last row 0 0 0 1"
         try:
