@@ -177,7 +177,7 @@ def check(
 
 @app.command()
 def new(
-    name: Annotated[str, typer.Argument(help="Name of the manifest and of its run: letters, digits, - and _.")],
+    name: Annotated[str, typer.Argument(help="Name of the manifest and its run, runs/<name>: letters, digits, -, _.")],
     capture: Annotated[
         Path | None, typer.Argument(help="Capture folder, with sessions/ in it; default: a placeholder to fill in.")
     ] = None,
