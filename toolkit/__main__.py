@@ -17,30 +17,30 @@ try:
     import typer
 
     from toolkit.errors import IncompleteError, ManifestError, ToolkitError, exit_code, sentence
-except ModuleNotFoundError as missing:  # messages say `python -m toolkit`, whatever python is called
+except ModuleNotFoundError as missing:  # users may run `python -m toolkit` with the wrong Python
     raise SystemExit(
-        f"Error: {sys.executable} has no package {missing.name}. Take the Python that the toolkit is installed for: "
-        ".venv/bin/python -m toolkit, where `make` has installed it."
+        f"Error: {sys.executable} has no package {missing.name}. Use the Python that the toolkit is installed for: "
+        ".venv/bin/python -m toolkit, if `make` installed it."
     ) from None
 
 app = typer.Typer(
-    help="Tell where photographs were taken, in a map of posed photographs.",
+    help="Visual localization: find where images were taken in a map of images with known poses.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
 
 
-import_app = typer.Typer(help="Make a session of your own images.", no_args_is_help=True)
-export_app = typer.Typer(help="Write what other tools read.", no_args_is_help=True)
+import_app = typer.Typer(help="Make a session from your own images.", no_args_is_help=True)
+export_app = typer.Typer(help="Write files for other tools.", no_args_is_help=True)
 app.add_typer(import_app, name="import")
 app.add_typer(export_app, name="export")
 
 USAGE, INTERRUPTED = 2, 130
-"""Exit codes of typer: a wrong option, Ctrl-C."""
+"""Exit codes of typer: a wrong option; Ctrl-C."""
 
-Device = Annotated[str, typer.Option(help="The kind of device: ios, hl, spot or another name.")]
-Placing = Annotated[str, typer.Option("--images", metavar="link|copy", help="Link the images, or copy them.")]
+Device = Annotated[str, typer.Option(help="Device type: ios, hl, spot or another name.")]
+Placing = Annotated[str, typer.Option("--images", metavar="link|copy", help="Link to the images, or copy them.")]
 Run = Annotated[Path, typer.Argument(help="Run folder.")]
 Scene = Annotated[str, typer.Argument(help="Name of the capture.")]
 MapDevice = Annotated[str, typer.Argument(help="Map device.")]
@@ -51,7 +51,7 @@ Axes = Annotated[
     typer.Option(
         "--axes",
         metavar="opencv|opengl",
-        help="Camera axes of the poses: x right, y down, z forward; or x right, y up, z backward.",
+        help="Camera axes of the poses. opencv: x right, y down, z forward; opengl: x right, y up, z backward.",
     ),
 ]
 Names = Annotated[
@@ -59,20 +59,20 @@ Names = Annotated[
     typer.Option(
         "--names",
         metavar="own|capture",
-        help="Call imported images as you do, or as the run's HDF5 files do; others have one name.",
+        help="Name imported images as in your folder (own), or as in the capture and the run's HDF5 files (capture).",
     ),
 ]
 Capture = Annotated[Path | None, typer.Option(help="Capture folder, if it has moved since the run.")]
 Json = Annotated[
-    bool, typer.Option("--json", help="Print a summary as JSON, and nothing else, to stdout; the rest to stderr.")
+    bool, typer.Option("--json", help="Print only a summary as JSON to stdout, everything else to stderr.")
 ]
 
 
 @app.command()
 def run(
-    manifest: Annotated[Path, typer.Argument(help="What to run, for example data_manifests/demo.yaml.")],
-    only: Annotated[str | None, typer.Option(metavar="STAGE", help="Run this stage alone.")] = None,
-    force: Annotated[bool, typer.Option("--force", help="Run stages that are up to date as well.")] = False,
+    manifest: Annotated[Path, typer.Argument(help="Manifest, for example data_manifests/demo.yaml.")],
+    only: Annotated[str | None, typer.Option(metavar="STAGE", help="Run only this stage.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Also run stages that are up to date.")] = False,
     overrides: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Replace a setting, e.g. localize.method=nearest."),
@@ -81,8 +81,8 @@ def run(
         str | None,
         typer.Option(
             metavar="local[:N]|tcp://HOST:PORT|slurm:FILE",
-            help="Have the work done by Dask workers: N on this machine, those of a scheduler, or those that a "
-            "cluster's queue starts (see docs/scaling.md).",
+            help="Run on Dask workers: N on this machine, those of a scheduler, or workers started by a cluster's "
+            "queue (see docs/scaling.md).",
         ),
     ] = None,
     sweeps: Annotated[
@@ -90,15 +90,15 @@ def run(
         typer.Option(
             "--sweep",
             metavar="KEY=A,B,C",
-            help="Run once with each value, in a folder each, and compare; of several, all combinations.",
+            help="Run once per value, each in its own folder, and compare. Repeat it to run all combinations.",
         ),
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Run the notebooks of a manifest, resuming what is done, and write a report.
+    """Run the notebooks of a manifest, skip what is up to date, and write a report.
 
-    Exit codes: 0 done; 1 something to mend, as the message says; 2 done, but more images, queries or pairs failed than
-    the manifest tolerates (`tolerate_failed`); 3 a bug; 130 or 143 interrupted.
+    Exit codes: 0 done; 1 an error that you can fix, as the message says; 2 done, but more images, queries or pairs
+    failed than the manifest tolerates (`tolerate_failed`); 3 a bug; 130 or 143 interrupted.
     """
     from toolkit import pipeline
     from toolkit.runs.record import summary
@@ -113,32 +113,32 @@ def run(
     except BaseException as error:
         if as_json:
             status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
-            how = {"status": status, "exit_code": exit_code(error), "error": sentence(error)}
-            _print_json(_summary_of_stopped(manifest, overrides or ()) | how)
+            outcome = {"status": status, "exit_code": exit_code(error), "error": sentence(error)}
+            _print_json(_summary_of_stopped(manifest, overrides or ()) | outcome)
         raise
     tell(f"Report: {run_dir / 'report.html'}")
-    done = summary(run_dir)
+    result = summary(run_dir)
     if as_json:
-        _print_json(done)
-    if done["exit_code"] != 0:
-        raise IncompleteError(done["error"])
+        _print_json(result)
+    if result["exit_code"] != 0:
+        raise IncompleteError(result["error"])
 
 
 @app.command()
 def compare(
-    runs: Annotated[list[Path], typer.Argument(help="Run folders, two or more; the first is compared with.")],
-    out: Annotated[Path | None, typer.Option(help="HTML file; else compare_<names>.html beside the first run.")] = None,
-    pictures: Annotated[int, typer.Option(min=0, help="Queries won or lost that are drawn, of each run.")] = 4,
-    seed: Annotated[int, typer.Option(min=0, help="Of the resamples that intervals are made from.")] = 0,
+    runs: Annotated[list[Path], typer.Argument(help="Two or more run folders, compared with the first.")],
+    out: Annotated[Path | None, typer.Option(help="HTML file, else compare_<names>.html beside the first run.")] = None,
+    pictures: Annotated[int, typer.Option(min=0, help="Number of queries won or lost to draw, per run.")] = 4,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the resampling for the intervals.")] = 0,
     as_json: Json = False,
 ) -> None:
-    """Compare runs: recall with intervals, queries won and lost, time, memory, settings; and write a page."""
+    """Compare runs and write a page: recall with intervals, queries won and lost, time, memory, settings."""
     _compare(runs, print, as_json, out, pictures, seed)
 
 
 @app.command()
 def settings(stage: Annotated[str, typer.Argument(help="Only this stage, e.g. localize.")] = "") -> None:
-    """Show all settings of a manifest, with meanings and defaults, as YAML that a manifest can hold."""
+    """Show all settings of a manifest with their meanings and defaults, as YAML to copy into a manifest."""
     from toolkit.manifest import STAGES, Manifest, describe, nearest
 
     if stage and stage not in STAGES:
@@ -151,7 +151,7 @@ def settings(stage: Annotated[str, typer.Argument(help="Only this stage, e.g. lo
 
 @app.command()
 def report(run_dir: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, for example runs/demo.")]) -> None:
-    """Write the report of a run anew, from what lies in its folder."""
+    """Write the report of a run again from its folder."""
     from toolkit.show.report import write_report
 
     print(f"Report: {write_report(run_dir)}")
@@ -160,15 +160,15 @@ def report(run_dir: Annotated[Path, typer.Argument(metavar="RUN", help="Run fold
 @app.command()
 def check(
     capture: Annotated[Path, typer.Argument(help="Capture folder, with sessions/ in it.")],
-    deep: Annotated[bool, typer.Option("--deep", help="Decode every image, not its header alone.")] = False,
+    deep: Annotated[bool, typer.Option("--deep", help="Decode the images completely, not only their headers.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Show what a capture holds and every inconsistency, with file and line."""
+    """Show the content of a capture and all its inconsistencies, with file and line."""
     from toolkit.capture.check import check_capture
 
     report = check_capture(capture, deep)
     if as_json:
-        _print_json({"capture": str(capture), "ok": report.ok, "problems": [asdict(one) for one in report.problems]})
+        _print_json({"capture": str(capture), "ok": report.ok, "problems": [asdict(row) for row in report.problems]})
     else:
         print(report.text())
     if not report.ok:
@@ -177,13 +177,13 @@ def check(
 
 @app.command()
 def new(
-    name: Annotated[str, typer.Argument(help="Of the manifest: letters, digits, - and _; the run is runs/<name>.")],
+    name: Annotated[str, typer.Argument(help="Name of the manifest and its run, runs/<name>: letters, digits, -, _.")],
     capture: Annotated[
-        Path | None, typer.Argument(help="Capture folder, with sessions/ in it; else to be filled in.")
+        Path | None, typer.Argument(help="Capture folder, with sessions/ in it; default: a placeholder to fill in.")
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder of the manifest.")] = Path("data_manifests"),
 ) -> None:
-    """Write a manifest for a capture, with comments and with what `check` has found in it."""
+    """Write a manifest for a capture, with explanations and the findings of `check`."""
     from toolkit.exchange.new_manifest import new_manifest
 
     path = new_manifest(name, capture, out)
@@ -192,32 +192,32 @@ def new(
 
 @app.command()
 def submit(
-    runs: Annotated[list[Path], typer.Argument(help="Run folders; scenes may be spread over several.")],
+    runs: Annotated[list[Path], typer.Argument(help="Run folders; scenes may be distributed over several.")],
     description: Annotated[
-        str, typer.Option(metavar="TEXT|FILE", help="What this is: method, thresholds, link to the code.")
+        str, typer.Option(metavar="TEXT|FILE", help="Description: method, thresholds, link to the code.")
     ] = "",
-    out: Annotated[Path | None, typer.Option(help="Zip file; else RUN/submission.zip.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Zip file; default: RUN/submission.zip.")] = None,
     failed: Annotated[
         str,
         typer.Option(
             metavar="nearest|leave-out",
-            help="What stands for a query without a pose. `nearest`: the pose of its best retrieved reference. It is "
-            "the default because recall counts a query without a pose as a miss, so that a rough pose can only gain, "
-            "and because every query asked is then answered. The description says how many, and submission.csv "
-            "which. `leave-out`: nothing; then the zip holds only what was localized.",
+            help="What to write for a query without a pose. `nearest`: the pose of its best retrieved reference. This "
+            "is the default: recall counts a missing pose as a miss, so a rough pose cannot reduce it, and the "
+            "submission is complete. The description gives the number of such queries, and submission.csv lists them. "
+            "`leave-out`: nothing; the zip then has only localized queries.",
         ),
     ] = "nearest",
-    queries: Annotated[str | None, typer.Option(help="Keyframe list to answer; else the challenge's.")] = None,
+    queries: Annotated[str | None, typer.Option(help="List of the query keyframes; default: the challenge's.")] = None,
     scene: Annotated[list[str] | None, typer.Option(help="Only this scene; repeat for more.")] = None,
     capture: Annotated[list[Path] | None, typer.Option(help="Capture folder, if it has moved since the run.")] = None,
-    sequence: Annotated[bool, typer.Option("--sequence", help="Take the poses of the stage `sequence`.")] = False,
+    sequence: Annotated[bool, typer.Option("--sequence", help="Use the poses of the stage `sequence`.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would be in the zip, write nothing.")] = False,
 ) -> None:
-    """Check the poses of runs and write the zip file that the challenge takes; missing pairs are listed."""
+    """Check the poses of runs and write the zip file for the challenge; list missing pairs."""
     from toolkit.exchange.submission import collect
 
     if not description.strip() and not dry_run:
-        raise ManifestError("--description is missing: a text, or a file. The challenge wants to know what was done.")
+        raise ManifestError("--description is missing: give a text or a file. The challenge requires a description.")
     submission = collect(runs, description, out, failed, queries, scene or (), capture or (), sequence)
     print(submission.text())
     if not dry_run:
@@ -226,17 +226,17 @@ def submit(
 
 @app.command()
 def download(
-    manifest: Annotated[Path, typer.Argument(help="A manifest with `dataset`: data_manifests/crocodl-hydro.yaml.")],
+    manifest: Annotated[Path, typer.Argument(help="Manifest with `dataset`, as data_manifests/crocodl-hydro.yaml.")],
     sessions: Annotated[
-        str, typer.Option(metavar="NAME,...", help="Only these of the manifest's sessions, e.g. ios_map,hl_query.")
+        str, typer.Option(metavar="NAME,...", help="Only these sessions of the manifest, e.g. ios_map,hl_query.")
     ] = "",
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List files and sizes; fetch nothing.")] = False,
-    keep_archives: Annotated[bool, typer.Option("--keep-archives", help="Keep what was unpacked.")] = False,
+    keep_archives: Annotated[bool, typer.Option("--keep-archives", help="Keep archives after unpacking.")] = False,
     overrides: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Replace a setting, as for `run`.")
     ] = None,
 ) -> None:
-    """Fetch the captures of a manifest, unpack and check them; goes on where it was stopped."""
+    """Download, unpack and check the captures of a manifest; resume a stopped download."""
     from toolkit.exchange.download import download
 
     names = [name.strip() for name in sessions.split(",") if name.strip()]
@@ -248,14 +248,14 @@ def download(
 @app.command()
 def demo_data(
     out: Annotated[Path, typer.Option(help="Capture folder to write.")],
-    rooms: Annotated[int, typer.Option(min=1, help="Rooms to render.")] = 2,
-    frames: Annotated[int, typer.Option(min=2, help="Frames a room and map session.")] = 12,
-    seed: Annotated[int, typer.Option(min=0, help="Another seed, another place.")] = 0,
-    alike: Annotated[bool, typer.Option("--alike", help="The last room looks exactly as the first.")] = False,
-    seconds: Annotated[int, typer.Option(min=0, help="Of a query recording, with odometry between pictures.")] = 0,
-    losses: Annotated[int, typer.Option(min=0, help="Losses of tracking a query recording.")] = 0,
-    gaps: Annotated[int, typer.Option(min=0, help="Times of 4 s without odometry a query recording.")] = 0,
-    radio: Annotated[bool, typer.Option("--radio", help="Scans of WiFi and Bluetooth.")] = False,
+    rooms: Annotated[int, typer.Option(min=1, help="Number of rooms.")] = 2,
+    frames: Annotated[int, typer.Option(min=2, help="Frames per room and map session.")] = 12,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed; another seed gives other rooms.")] = 0,
+    alike: Annotated[bool, typer.Option("--alike", help="The last room looks exactly like the first.")] = False,
+    seconds: Annotated[int, typer.Option(min=0, help="Length of a query recording; adds odometry between images.")] = 0,
+    losses: Annotated[int, typer.Option(min=0, help="Tracking losses per query recording.")] = 0,
+    gaps: Annotated[int, typer.Option(min=0, help="Gaps of 4 s in the odometry of a query recording.")] = 0,
+    radio: Annotated[bool, typer.Option("--radio", help="Add scans of WiFi and Bluetooth.")] = False,
 ) -> None:
     """Render a capture with exact ground truth, for demos, tests and benchmarks."""
     from toolkit.synthetic import render_capture
@@ -275,7 +275,7 @@ def import_colmap(
     split: Annotated[str, typer.Option(metavar="map|query", help="Poses of queries become ground truth.")] = "map",
     placing: Placing = "link",
 ) -> None:
-    """Make a session of a COLMAP model: cameras, poses, rigs."""
+    """Make a session from a COLMAP model: cameras, poses, rigs."""
     from toolkit.exchange import interchange
 
     print(interchange.import_colmap(model, images, capture, device, split, placing).text())
@@ -297,9 +297,9 @@ def import_images(
         str, typer.Option(metavar="world_from_cam|cam_from_world", help="Direction of the table's poses.")
     ] = "world_from_cam",
     axes: Axes = "opencv",
-    unit: Annotated[float, typer.Option(metavar="METERS", help="Meters in a unit of the poses, e.g. 0.01.")] = 1.0,
+    unit: Annotated[float, typer.Option(metavar="METERS", help="Meters per unit of the poses, e.g. 0.01.")] = 1.0,
     truth: Annotated[
-        Path | None, typer.Option(help="CSV as the table, with the true poses of queries, to evaluate against.")
+        Path | None, typer.Option(help="CSV like the table, with ground-truth poses of the queries, for evaluation.")
     ] = None,
     camera: Annotated[
         str | None, typer.Option(metavar="'MODEL, W, H, ...'", help="Intrinsics of all images; else guessed from EXIF.")
@@ -307,7 +307,7 @@ def import_images(
     cameras: Annotated[Path | None, typer.Option(help="COLMAP's cameras.txt.")] = None,
     placing: Placing = "link",
 ) -> None:
-    """Make a session of a folder of images: a map with poses, or queries."""
+    """Make a session from a folder of images: a map with poses, or queries."""
     from toolkit.exchange import interchange
 
     report = interchange.import_images(
@@ -318,20 +318,18 @@ def import_images(
 
 @import_app.command("transforms")
 def import_transforms(
-    transforms: Annotated[Path, typer.Argument(help="File of nerfstudio or instant-ngp, beside the images.")],
+    transforms: Annotated[Path, typer.Argument(help="transforms.json of nerfstudio or instant-ngp, near its images.")],
     capture: Annotated[Path, typer.Argument(help="Capture folder; the session is sessions/<device>_<split>.")],
     device: Device = "ios",
     split: Annotated[str, typer.Option(metavar="map|query", help="Poses of queries become ground truth.")] = "map",
     hold_out: Annotated[
         int, typer.Option(metavar="N", help="Every Nth image becomes a query with ground truth; 0: none.")
     ] = 0,
-    unit: Annotated[
-        float | None, typer.Option(metavar="METERS", help="Meters in a unit of the poses; else it is not known.")
-    ] = None,
+    unit: Annotated[float | None, typer.Option(metavar="METERS", help="Meters per unit of the poses if known.")] = None,
     axes: Axes = "opengl",
     placing: Placing = "link",
 ) -> None:
-    """Make a session of a transforms.json: cameras with distortion, poses."""
+    """Make a session from a transforms.json: cameras with distortion, poses."""
     from toolkit.exchange.transforms import import_transforms
 
     for report in import_transforms(transforms, capture, device, split, placing, axes, unit, hold_out):
@@ -342,7 +340,7 @@ def import_transforms(
 def export_colmap(
     run: Run,
     scene: Scene,
-    device: Annotated[str, typer.Argument(help="Whose map, e.g. ios.")],
+    device: Annotated[str, typer.Argument(help="Map device, e.g. ios.")],
     out: Annotated[Path, typer.Argument(help="New folder for the model.")],
     capture: Capture = None,
     names: Names = "own",
@@ -360,10 +358,10 @@ def export_pairs(
     map_device: MapDevice,
     query_device: QueryDevice,
     out: TextFile,
-    topk: Annotated[int | None, typer.Option(min=1, help="References a query; else all.")] = None,
+    topk: Annotated[int | None, typer.Option(min=1, help="References per query; default: all.")] = None,
     names: Names = "own",
 ) -> None:
-    """Write the retrieval of a pair as hloc reads it: `query reference` a line."""
+    """Write the retrieval of a pair in hloc's format: `query reference` per line."""
     from toolkit.exchange import export
 
     print(f"{out}: {export.export_pairs(run, scene, map_device, query_device, out, topk, names)} pairs")
@@ -379,7 +377,7 @@ def export_poses(
     capture: Capture = None,
     names: Names = "own",
 ) -> None:
-    """Write the poses of a pair's queries as hloc does: `name qw qx qy qz tx ty tz` a line, cam_from_world."""
+    """Write the poses of a pair's queries in hloc's format: `name qw qx qy qz tx ty tz` per line, cam_from_world."""
     from toolkit.exchange import export
 
     print(f"{out}: {export.export_poses(run, scene, map_device, query_device, out, capture, names)} poses")
@@ -395,7 +393,7 @@ def export_intrinsics(
     capture: Capture = None,
     names: Names = "own",
 ) -> None:
-    """Write the cameras of a pair's queries as hloc reads them: `name MODEL width height parameters` a line."""
+    """Write the cameras of a pair's queries in hloc's format: `name MODEL width height parameters` per line."""
     from toolkit.exchange import export
 
     print(f"{out}: {export.export_intrinsics(run, scene, map_device, query_device, out, capture, names)} images")
@@ -406,52 +404,53 @@ def record(
     scene: Annotated[Path, typer.Argument(help="Capture folder, with sessions/ in it.")],
     device: Annotated[str, typer.Option(help="ios, hl or spot.")],
     split: Annotated[str, typer.Option(help="map or query.")] = "map",
-    subsession: Annotated[str, typer.Option(help="One recording of the session, or all.")] = "all",
-    keyframes_only: Annotated[bool, typer.Option("--keyframes-only", help="Only the frames asked as queries.")] = False,
-    every: Annotated[int, typer.Option(min=1, help="Every so many frames.")] = 1,
+    subsession: Annotated[str, typer.Option(help="One subsession, or all.")] = "all",
+    keyframes_only: Annotated[bool, typer.Option("--keyframes-only", help="Only the query keyframes.")] = False,
+    every: Annotated[int, typer.Option(min=1, help="Record only every Nth frame.")] = 1,
     spawn: Annotated[bool, typer.Option("--spawn", help="Open the viewer when done.")] = False,
     vis_retrieve_queries: Annotated[
-        bool, typer.Option("--vis-retrieve-queries", help="Join queries with the references they were localized by.")
+        bool, typer.Option("--vis-retrieve-queries", help="Connect queries with the references that localized them.")
     ] = False,
-    queries_pose: Annotated[Path | None, typer.Option(help="Trajectories file with poses of queries.")] = None,
-    map_dir: Annotated[Path | None, typer.Option(help="Folder of triangulated maps, for points.")] = None,
+    queries_pose: Annotated[Path | None, typer.Option(help="Trajectories file with the poses of queries.")] = None,
+    map_dir: Annotated[Path | None, typer.Option(help="Folder of triangulated maps, to show their points.")] = None,
     out: Annotated[Path | None, typer.Option(help="File to write, .rrd.")] = None,
 ) -> None:
     """Record a session for the rerun viewer: images on a timeline, cameras, depth and points."""
     from toolkit.show.recordings import record_session
 
-    done = record_session(
+    rrd = record_session(
         scene, split, device, subsession, keyframes_only, every, spawn, vis_retrieve_queries, queries_pose,
         out=out, map_dir=map_dir,
     )  # fmt: skip
-    for message in done.messages:
+    for message in rrd.messages:
         print("Note:", message)
-    print(f"{done.frames} frames, {done.images} images, {done.bytes / 1e6:.1f} MB in {done.seconds:.0f} s")
-    print(f"Open it: {done.command}")
+    print(f"{rrd.frames} frames, {rrd.images} images, {rrd.bytes / 1e6:.1f} MB in {rrd.seconds:.0f} s")
+    print(f"Open it: {rrd.command}")
 
 
 def _sweep(
     manifest: Path, sweeps: Sequence[str], overrides: Sequence[str], tell: Callable[..., None], as_json: bool,
     **options: Any,
 ) -> None:  # fmt: skip
-    """Run a manifest with each of some values, and compare the runs that came to their end."""
+    """Run a manifest with each combination of values, and compare the finished runs."""
     from toolkit import pipeline
     from toolkit.runs.record import summary
 
-    folders, failed = pipeline.sweep(manifest, sweeps, overrides, tell, **options)
-    ends = list(map(summary, folders))
-    wrong = [*failed, *(IncompleteError(f"{end['name']}: {end['error']}") for end in ends if end["exit_code"] != 0)]
+    folders, errors = pipeline.sweep(manifest, sweeps, overrides, tell, **options)
+    for result in map(summary, folders):
+        if result["exit_code"] != 0:
+            errors.append(IncompleteError(f"{result['name']}: {result['error']}"))
     if len(folders) > 1:
-        _compare(folders, tell, as_json and not wrong)  # else the error is what stdout holds
-    if wrong:
-        raise wrong[0]
+        _compare(folders, tell, as_json and not errors)  # if there is an error, stdout has its JSON instead
+    if errors:
+        raise errors[0]
 
 
 def _compare(
     runs: list[Path], tell: Callable[..., None], as_json: bool, out: Path | None = None, pictures: int = 4,
     seed: int = 0,
 ) -> None:  # fmt: skip
-    """Tell of a comparison, and write its page."""
+    """Compare runs, print the result, and write its page."""
     from toolkit.show.comparison import compare_runs, write_comparison
 
     comparison = compare_runs(runs, seed)
@@ -464,7 +463,7 @@ def _compare(
 
 
 def _summary_of_stopped(manifest: Path, overrides: Sequence[str]) -> dict[str, Any]:
-    """Return the summary of a run that this process has begun; nothing if it did not get so far."""
+    """Return the summary of the run that this process started; empty if it had not started."""
     from toolkit.files import read_json
     from toolkit.manifest import load_manifest
     from toolkit.runs.record import RECORD, summary
@@ -482,9 +481,9 @@ def _print_json(content: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    """Run the command line; an error is a sentence, with a traceback only where the toolkit itself is at fault."""
+    """Run the command line. Print an error as one sentence, with a traceback only if it is a bug of the toolkit."""
 
-    import pycolmap  # noqa: F401 - when it is imported, it takes SIGTERM for itself: so before it is taken below
+    import pycolmap  # noqa: F401 - its import installs a SIGTERM handler, which must not replace the one below
 
     received: list[int] = []
 
@@ -492,17 +491,17 @@ def main() -> None:
         received.append(number)
         raise KeyboardInterrupt(number)
 
-    for name in ("SIGTERM", "SIGHUP"):  # as Ctrl-C, unless they are ignored, as `nohup` wants it
+    for name in ("SIGTERM", "SIGHUP"):  # act like Ctrl-C, unless they are ignored, e.g. under `nohup`
         if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) == signal.SIG_DFL:
             signal.signal(getattr(signal, name), stop)
     try:
         app(prog_name="python -m toolkit")
-    except SystemExit as end:  # typer has told what there is to tell
+    except SystemExit as end:  # typer has printed the message
         if end.code != INTERRUPTED:
             raise SystemExit(1 if end.code == USAGE else end.code) from None
         error: BaseException = KeyboardInterrupt(*received)
-    except Exception as other:
-        error = other
+    except Exception as caught:
+        error = caught
     if exit_code(error) == 3 and not isinstance(error, ToolkitError):
         traceback.print_exception(error)
     print(f"{'' if isinstance(error, KeyboardInterrupt) else 'Error: '}{sentence(error)}", file=sys.stderr)

@@ -337,7 +337,7 @@ def test_what_fails_of_one_capture_does_not_end_the_others(hub: FakeHub, manifes
     )
     hub.datasets["Someone/OTHER"] = {name: body for name, body in published().items() if "ios_map" in name}
     message = failure(manifest)
-    assert "OTHER: all of dataset Someone/OTHER" in message
+    assert "OTHER: all requested files of dataset Someone/OTHER" in message
     assert "there is no session ios_query in it; found ios_map." in message
     assert found(manifest.parent) == capture_files()
 
@@ -629,14 +629,14 @@ def test_an_archive_of_the_hub_that_leads_out(hub: FakeHub, manifest: Path) -> N
     hub.datasets[REPO]["ios_query.zip"] = zipped(session("ios_query") | {"../../../evil": b"1"})
     message = failure(manifest)
     assert "1 of 6 files failed" in message
-    assert "leads out of the folder" in message
+    assert "outside the target folder" in message
     assert not any("ios_query" in path or "evil" in path for path in found(manifest.parent))
     assert not list(manifest.parent.rglob("evil"))
 
 
 def test_a_listing_that_leads_out(hub: FakeHub, manifest: Path) -> None:
     hub.datasets[REPO]["ios_map/../../../../evil.txt"] = b"1"
-    assert "leads out of the folder" in failure(manifest)
+    assert "outside the target folder" in failure(manifest)
     assert hub.paths == []
 
 
@@ -644,7 +644,7 @@ def test_a_damaged_archive_elsewhere_is_fetched_again(hub: FakeHub, manifest: Pa
     right = zipped({f"sessions/{path}": body for path, body in capture_files().items()})
     hub.plain["/PLACE.zip"] = right[:-30] + bytes(30)
     options = [f"dataset.sources.PLACE={{hub: null, urls: ['{hub.url}/PLACE.zip']}}"]
-    assert "not a whole zip archive" in failure(manifest, overrides=options)
+    assert "incomplete or damaged zip archive" in failure(manifest, overrides=options)
     hub.plain["/PLACE.zip"] = right
     download(manifest, overrides=options)
     assert found(manifest.parent) == capture_files()

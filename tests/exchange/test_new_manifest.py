@@ -56,7 +56,7 @@ def test_without_a_capture_there_is_a_place_for_one(tmp_path: Path) -> None:
     path = new_manifest("place", folder=tmp_path)
     assert yaml.safe_load(path.read_text()) == yaml.safe_load(TEMPLATE.read_text())
     assert "cp " not in path.read_text()
-    with pytest.raises(ManifestError, match=r"no name of a run"):
+    with pytest.raises(ManifestError, match=r"not a run name"):
         new_manifest("../place", folder=tmp_path)
     with pytest.raises(CaptureError, match="nowhere"):
         new_manifest("other", tmp_path / "nowhere", tmp_path)

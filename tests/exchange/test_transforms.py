@@ -168,13 +168,13 @@ def test_images_that_cannot_be_used_are_rows(tmp_path: Path) -> None:
     status = import_transforms(file, tmp_path / "PLACE")[0].images.set_index("image")["status"]
     assert status["images/0.jpg"] == "imported"
     assert status["images/1.jpg"] == status["x" * 300] == "no such file"
-    assert status["images/2.jpg"] == "the image is stored as 64 x 48 pixels, its camera is of 65 x 48"
+    assert status["images/2.jpg"] == "the image is stored as 64 x 48 pixels, its camera has 65 x 48"
     assert status["../outside.jpg"] == "not a path inside the folder of images"
 
 
 def test_images_of_another_size_or_place_say_what_to_do(tmp_path: Path) -> None:
     file = write(tmp_path, fl_x=25.0, w=SIZE[0] // 2, h=SIZE[1] // 2)
-    with pytest.raises(CaptureError, match=r"is of 32 x 24; take images of the camera's size, or its .* times 2"):
+    with pytest.raises(CaptureError, match=r"has 32 x 24; use images of the camera's size, or .* intrinsics by 2"):
         import_transforms(file, tmp_path / "PLACE")
     (tmp_path / "images").rename(tmp_path / "pictures")
     with pytest.raises(CaptureError, match=r"First: images/0.jpg: no such file. Names are paths in this folder: corr"):

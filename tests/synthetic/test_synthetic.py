@@ -410,7 +410,7 @@ def test_radio_fades_with_distance_and_walls_and_tells_rooms(recorded: Path) -> 
     rng, room = np.random.default_rng(0), build_room(0, 0)
     beacon = Emitter("b", room.origin + np.array([0.0, 0.0, 1.5]), -59.0)
     away = np.array([0.5, 1.0, 2.0, 5.0])
-    places = beacon.place + np.stack([away, 0 * away, 0 * away], axis=1)
+    places = beacon.position + np.stack([away, 0 * away, 0 * away], axis=1)
     levels = np.nanmean([received(rng, [beacon], places, [room])[:, 0] for _ in range(400)], axis=0)
     expected = -59 - 25 * np.log10(away) - [0, 0, 0, 6.9]  # the last is outside
     np.testing.assert_allclose(levels, expected, atol=0.6)

@@ -1,1 +1,1 @@
-"""Captures and images in, models, pairs and submissions out."""
+"""Import captures and images; export models, pairs, poses and submissions."""

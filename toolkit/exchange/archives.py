@@ -1,4 +1,4 @@
-"""Unpack zip archives from elsewhere: only below their folder, only files, only what the disk has room for."""
+"""Unpack untrusted zip archives: regular files only, nothing outside the target folder, no more than the disk holds."""
 
 import re
 import shutil
@@ -10,30 +10,30 @@ from pathlib import Path, PurePosixPath
 
 from toolkit.errors import DownloadError, first_line
 
-_SPARE = 1.02  # of the disk: folders and file systems need some for themselves
+_SPACE_FACTOR = 1.02  # folders and file systems take some space themselves
 
 
 class FileError(DownloadError):
-    """Something is wrong with one file; the others can go on."""
+    """One file failed; the download of other files can continue."""
 
 
-def unpack(archive: Path, target: Path, place: Callable[[list[str]], str | None], name: str = "") -> int:
-    """Unpack a zip archive into a new folder, and return how many files it has written.
+def unpack(archive: Path, target: Path, target_path: Callable[[list[str]], str | None], name: str = "") -> int:
+    """Unpack a zip archive into a new folder and return the number of files written.
 
     Args:
-        place: returns the path in the folder (with `/`) for the parts of a member's path, or None to leave it out.
-        name: of the archive, for messages and the progress bar; its file name when not given.
+        target_path: maps the parts of a member's path to its path below `target` (with `/`), or to None to skip it.
+        name: archive name in messages and the progress bar; default: its file name.
 
     Raises:
-        DownloadError: a member's path leads out of the folder; a member is not a file, is encrypted, or is there twice;
-            the archive is damaged; or the disk has no room for it. Nothing outside of `target` was written.
+        DownloadError: a member's path leaves the folder; a member is no regular file, is encrypted, or occurs twice;
+            the archive is damaged; or the disk is too small. Nothing is written outside `target`.
     """
     from tqdm.auto import tqdm
 
     name = name or archive.name
     try:
         with zipfile.ZipFile(archive) as zipped:
-            members = _members(zipped, place, name)
+            members = _members(zipped, target_path, name)
             size = sum(member.file_size for member in members.values())
             target.mkdir(parents=True)
             require_space(target, size, "unpack fewer sessions (--sessions)")
@@ -41,14 +41,14 @@ def unpack(archive: Path, target: Path, place: Callable[[list[str]], str | None]
                 for path, member in members.items():
                     file = target / path
                     file.parent.mkdir(parents=True, exist_ok=True)
-                    # Reading stops at the size that the archive states, and compares the checksum.
+                    # zipfile stops at the size stated in the archive and verifies the checksum.
                     with zipped.open(member) as source, open(file, "xb") as out:
-                        while piece := source.read(1 << 20):
-                            bar.update(out.write(piece))
+                        while chunk := source.read(1 << 20):
+                            bar.update(out.write(chunk))
     except (zipfile.BadZipFile, zlib.error, EOFError) as error:
         raise FileError(
-            f"{name}: not a whole zip archive: {first_line(error)}. Nothing of it was used. Run the same command "
-            "again; if this comes back, the archive is damaged where it is published."
+            f"{name}: incomplete or damaged zip archive: {first_line(error)}. Nothing of it was used. Run the same "
+            "command again; if the error persists, the published archive is damaged."
         ) from error
     except (NotImplementedError, RuntimeError) as error:
         raise FileError(
@@ -56,66 +56,68 @@ def unpack(archive: Path, target: Path, place: Callable[[list[str]], str | None]
         ) from error
     except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
         raise FileError(
-            f"{name}: holds a file and a folder of one name, {error.filename}. Nothing of it was used."
+            f"{name}: contains a file and a folder with the same name, {error.filename}. Nothing of it was used."
         ) from error
     return len(members)
 
 
 def _members(
-    zipped: zipfile.ZipFile, place: Callable[[list[str]], str | None], name: str
+    zipped: zipfile.ZipFile, target_path: Callable[[list[str]], str | None], name: str
 ) -> dict[str, zipfile.ZipInfo]:
-    """Return the members to unpack by their paths in the folder; refuse what a capture has no use for."""
+    """Return the members to unpack by target path. Raise FileError for links, encrypted files and duplicates."""
     members: dict[str, zipfile.ZipInfo] = {}
     for member in zipped.infolist():
-        parts = safe_parts(member.filename, name)  # also of what is left out: such an archive is not to be trusted
-        if member.is_dir() or (path := place(parts)) is None:
+        parts = safe_parts(member.filename, name)  # skipped members too: one unsafe path makes the archive suspect
+        if member.is_dir() or (path := target_path(parts)) is None:
             continue
         mode = member.external_attr >> 16
         if stat.S_IFMT(mode) not in (0, stat.S_IFREG, stat.S_IFDIR):
             raise FileError(
-                f"{name}: holds {member.filename!r}, which is a link or no file at all. Nothing of it was used: "
-                "the data may have been tampered with. Tell those who publish them."
+                f"{name}: contains {member.filename!r}, which is a link or a special file. Nothing of it was used: "
+                "the data may have been tampered with. Tell the publishers."
             )
         if member.flag_bits & 1:
             raise FileError(f"{name}: {member.filename!r} is encrypted. Unpack it yourself with its password.")
         if path in members:
-            raise FileError(f"{name}: holds {path} twice. Nothing of it was used. Tell those who publish it.")
+            raise FileError(f"{name}: contains {path} twice. Nothing of it was used. Tell the publishers.")
         members[path] = member
     return members
 
 
 def top_folders(archive: Path) -> list[str]:
-    """Return the first folders in an archive, three levels deep, for messages."""
+    """Return up to 20 folders of an archive, at most three levels deep, for error messages."""
     with zipfile.ZipFile(archive) as zipped:
-        tops = {"/".join(name.split("/")[:3]) for name in zipped.namelist()}
-    return sorted(tops)[:20]
+        return sorted({"/".join(name.split("/")[:3]) for name in zipped.namelist()})[:20]
 
 
 def safe_parts(name: str, where: str | Path) -> list[str]:
-    """Return the folders and the name of a path from outside, or refuse one that leads out of its folder."""
+    """Split an untrusted relative path into its parts. Raise FileError if it leaves its folder."""
     path = name.replace("\\", "/")
     parts = [part for part in path.split("/") if part not in ("", ".")]
     if not parts or path.startswith("/") or ".." in parts or re.match("[A-Za-z]:", path) or "\0" in path:
         raise FileError(
-            f"{where}: holds {name!r}, a path that leads out of the folder it belongs in. Nothing of it was used: "
-            "the data may have been tampered with. Tell those who publish them."
+            f"{where}: contains {name!r}, a path outside the target folder. Nothing of it was used: the data may have "
+            "been tampered with. Tell the publishers."
         )
     return parts
 
 
-def require_space(place: Path, needed: int, otherwise: str) -> None:
-    """Raise DownloadError if `needed` bytes do not fit on the disk of a folder; `otherwise` is another way out."""
-    free = shutil.disk_usage(place).free
-    if needed * _SPARE > free:
+def require_space(folder: Path, needed_bytes: int, alternative: str) -> None:
+    """Raise DownloadError if `needed_bytes` do not fit on the disk of `folder`; the message suggests `alternative`."""
+    free_bytes = shutil.disk_usage(folder).free
+    if needed_bytes * _SPACE_FACTOR > free_bytes:
+        needed = size_text(int(needed_bytes * _SPACE_FACTOR))
         raise DownloadError(
-            f"{place}: about {size_text(int(needed * _SPARE))} are needed on this disk and {size_text(free)} are free. "
-            f"Free some, set CAPTURES (or `captures` in the manifest) to a folder on another disk, or {otherwise}."
+            f"{folder}: about {needed} are needed on this disk and {size_text(free_bytes)} are free. Free some space, "
+            f"set CAPTURES (or `captures` in the manifest) to a folder on another disk, or {alternative}."
         )
 
 
-def size_text(count: int | None) -> str:
-    """Return a number of bytes as people read it; `?` for None."""
+def size_text(count_bytes: int | None) -> str:
+    """Return a size such as `1.2 GB`; `?` for None."""
+    if count_bytes is None:
+        return "?"
     for unit, scale in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if count is not None and count >= scale:
-            return f"{count / scale:.1f} {unit}"
-    return "?" if count is None else f"{count} B"
+        if count_bytes >= scale:
+            return f"{count_bytes / scale:.1f} {unit}"
+    return f"{count_bytes} B"

@@ -1,7 +1,7 @@
-"""Rename and split the sessions of other data sets as the capture format has them.
+"""Rename and split the sessions of other data sets to match the capture format.
 
-LaMAR (Sarlin, Dusmanu et al., ECCV 2022) has one session `map` of phones and headsets together, and lists its queries
-in `queries.txt`; here a session is of one device, and lists of queries are `proc/keyframes_*.txt`.
+In LaMAR (Sarlin, Dusmanu et al., ECCV 2022) one session `map` holds phones and headsets, and `queries.txt` lists the
+queries. Here each session has one device, and `proc/keyframes_*.txt` list the queries.
 """
 
 import shutil
@@ -11,7 +11,7 @@ from pathlib import Path
 from toolkit.capture.names import require_name
 from toolkit.errors import CaptureError
 
-# Files of a session, with the column whose values begin with the subsession: `<subsession>/<sensor>`.
+# For each file of a session, the column whose values are `<subsession>/<sensor>` or `<subsession>`.
 _KEY_COLUMNS = {
     "sensors.txt": 0,
     "rigs.txt": 0,
@@ -28,18 +28,17 @@ _KEY_COLUMNS = {
 
 
 def arrange(sessions: str | Path, names: Mapping[str, str]) -> list[str]:
-    """Rename the sessions of a data set, and split by device a session that several names stand for.
+    """Rename the sessions of a data set. Split a session by device if several new names refer to it.
 
-    A session is split by its subsessions, whose names begin with `<device>_`. A list `queries.txt` becomes
-    `proc/keyframes_original.txt`. Images are moved, not copied. Return what was left
-    out, in words.
+    A session is split by its subsessions, whose names begin with `<device>_`. `queries.txt` is copied to
+    `proc/keyframes_original.txt`. Images are moved, not copied. Return notes on what was left out.
 
     Args:
-        sessions: folder of the sessions; changed in place. A session that `names` does not have stays as it is.
+        sessions: folder of the sessions; changed in place. Sessions that are not in `names` stay as they are.
         names: for each new name, `<device>_<map or query>`, the session's name in the data set.
 
     Raises:
-        CaptureError: a session to split has no subsession of a device, or one whose name leads out of it.
+        CaptureError: a session to split has no subsession of a device, or an invalid subsession name.
     """
     sessions = Path(sessions)
     notes = []
@@ -60,7 +59,7 @@ def arrange(sessions: str | Path, names: Mapping[str, str]) -> list[str]:
 
 
 def _split(old: Path, new: list[Path]) -> list[str]:
-    """Split a session into one of each device; return what was left out."""
+    """Split a session into one per device; return notes on what was left out."""
     unclaimed = subsessions = set(_subsessions(old))
     for name in subsessions:
         require_name(name, "subsession", old / "proc" / "subsessions.txt")
@@ -69,8 +68,8 @@ def _split(old: Path, new: list[Path]) -> list[str]:
         own = {name for name in subsessions if name.startswith(f"{device}_")}
         if not own:
             raise CaptureError(
-                f"{old.name}: has no subsession of device {device!r}, whose names begin with {device}_; found "
-                f"{', '.join(sorted(subsessions)[:3]) or 'none'}. Take {session.name} out of dataset.sessions."
+                f"{old.name}: expected subsessions of device {device!r}, named {device}_...; found "
+                f"{', '.join(sorted(subsessions)[:3]) or 'none'}. Remove {session.name} from dataset.sessions."
             )
         unclaimed = unclaimed - own
         for file, column in _KEY_COLUMNS.items():
@@ -80,27 +79,28 @@ def _split(old: Path, new: list[Path]) -> list[str]:
             if (old / "raw_data" / name).is_dir():
                 (session / "raw_data").mkdir(parents=True, exist_ok=True)
                 (old / "raw_data" / name).rename(session / "raw_data" / name)
-    split = {old / file for file in _KEY_COLUMNS}
-    others = [path for path in old.rglob("*") if path.is_file() and path not in split]
+    split_files = {old / file for file in _KEY_COLUMNS}
+    other_files = [path for path in old.rglob("*") if path.is_file() and path not in split_files]
     shutil.rmtree(old)
     notes = []
     if unclaimed:
         notes.append(f"{old.name}: {len(unclaimed)} subsessions of other devices, such as {min(unclaimed)}")
-    if others:
-        notes.append(f"{old.name}: {len(others)} files that cannot be split by device, such as {others[0].name}")
+    if other_files:
+        example = other_files[0].name
+        notes.append(f"{old.name}: {len(other_files)} files that cannot be split by device, such as {example}")
     return notes
 
 
 def _subsessions(session: Path) -> list[str]:
-    listed = session / "proc" / "subsessions.txt"
-    if listed.is_file():
-        lines = listed.read_text(encoding="utf-8").splitlines()
+    list_file = session / "proc" / "subsessions.txt"
+    if list_file.is_file():
+        lines = list_file.read_text(encoding="utf-8").splitlines()
         return [line.strip() for line in lines if line.strip() and not line.startswith("#")]
     return sorted(path.name for path in (session / "raw_data").glob("*") if path.is_dir())
 
 
 def _copy_rows(source: Path, target: Path, column: int, subsessions: set[str]) -> None:
-    """Copy the comments, and the rows whose key begins with one of the subsessions."""
+    """Copy the comments and the rows of the given subsessions."""
     target.parent.mkdir(parents=True, exist_ok=True)
     with open(source, encoding="utf-8") as lines, open(target, "w", encoding="utf-8") as out:
         for line in lines:

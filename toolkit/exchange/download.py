@@ -1,12 +1,12 @@
-"""Fetch the captures of a manifest: list, download, unpack, lay out as the capture format wants, check.
+"""Download the captures of a manifest: list, fetch, unpack, arrange in the capture format, check.
 
-What is under way is kept in `<capture>/.download/`, so that the same command goes on after a failure or a kill:
+`<capture>/.download/` keeps the state, so the same command resumes after a failure or a kill:
 
-    unfinished       the sessions whose download has begun and not ended, one a line
-    done.jsonl       what has been fetched, unpacked and verified, one JSON object a line
-    partial/         files that are being fetched; the name says which version of which file
-    archives/        whole archives that wait to be unpacked
-    unpacked/        an archive that is being unpacked
+    unfinished       sessions whose download has started and not finished, one per line
+    done.jsonl       files that were fetched, verified and unpacked, one JSON object per line
+    partial/         files being fetched, named by a fingerprint of path and version
+    archives/        complete archives waiting to be unpacked
+    unpacked/        an archive being unpacked
 """
 
 import errno
@@ -39,7 +39,7 @@ Say = Callable[..., None]
 
 STATE = ".download"
 _UNFINISHED = "unfinished"
-_WORKERS = 8  # of small files, whose time is mostly waiting; archives come one by one
+_WORKERS = 8  # threads for small files, which mostly wait for the network; archives are fetched one by one
 
 
 def download(
@@ -50,29 +50,29 @@ def download(
     overrides: Iterable[str] = (),
     say: Say = print,
 ) -> "list[CheckReport]":
-    """Fetch the captures of a manifest into their folders, and check them. What is there already is not fetched again.
+    """Download the captures of a manifest into their folders and check them. Files already there are not fetched again.
 
     Args:
         manifest_path: YAML file with `captures` and a section `dataset`, see `toolkit.manifest`.
-        sessions: only these of the manifest's sessions.
-        keep_archives: keep archives in `<capture>/.download/archives` after they are unpacked.
+        sessions: download only these sessions of the manifest; default: all.
+        keep_archives: keep archives in `<capture>/.download/archives` after unpacking.
         dry_run: list what would be fetched, and write nothing.
         overrides: `key=value` or `section.key=value`, in place of the manifest's values.
         say: called with each line of the report, like `print`.
 
     Returns:
-        For each capture, the report of the check; nothing on a dry run.
+        The check report of each capture; empty on a dry run.
 
     Raises:
         ManifestError: the manifest does not say where its captures are, or has no such session.
-        DownloadError: something cannot be fetched, unpacked or stored. The same command goes on where it was.
+        DownloadError: something cannot be fetched, unpacked or stored. The same command resumes the download.
     """
     manifest = load_manifest(manifest_path, overrides)
     dataset = manifest.dataset
     if dataset is None:
         raise ManifestError(
-            f"{manifest_path}: has no section `dataset`, so where to download from is not known. "
-            "data_manifests/crocodl-hydro.yaml is one that has."
+            f"{manifest_path}: has no section `dataset`, which says where to download from. See "
+            "data_manifests/crocodl-hydro.yaml for an example."
         )
     for name in sessions:
         if name not in dataset.session_names:
@@ -82,7 +82,7 @@ def download(
     if without := [name for name in folders if name not in dataset.sources]:
         if len(without) == len(folders):
             raise ManifestError(
-                f"{manifest_path}: dataset.sources has no {without[0]!r}, which is the name of a folder in `captures`. "
+                f"{manifest_path}: dataset.sources has no entry for {without[0]!r}, a folder in `captures`. "
                 f"{nearest(without[0], dataset.sources)}"
             )
         say(f"{', '.join(without)}: not in dataset.sources, so nothing is fetched for it.")
@@ -102,7 +102,7 @@ def download(
         try:
             capture.run()
             reports.append(capture.check())
-        except DownloadError as error:  # of one capture; the others can go on
+        except DownloadError as error:  # the other captures continue
             failures.append(str(error))
     if failures:
         raise DownloadError("\n".join(failures))
@@ -110,20 +110,20 @@ def download(
 
 
 def is_unfinished(capture: Path) -> bool:
-    """Tell whether a download into this capture's folder has begun and not ended."""
+    """Return whether a download into this capture's folder has started and not finished."""
     return (capture / STATE / _UNFINISHED).exists()
 
 
 @dataclass
 class _CaptureDownload:
-    """The download of one capture: the files of its source, those that are here already, and the steps between."""
+    """The download of one capture: the files of its source, the state on disk, and the steps."""
 
     folder: Path
     """The capture's folder."""
     dataset: DatasetSettings
     source: Source
     names: dict[str, str]
-    """For each session that is wanted, its name in the source."""
+    """For each requested session, its name in the source."""
     keep_archives: bool
     say: Say
 
@@ -138,16 +138,16 @@ class _CaptureDownload:
         self.done = self._read_done()
         self.bar: Any = None
 
-    # What there is to fetch
+    # List the files of the source
 
     def list_files(self) -> None:
-        """Ask the source for its files, and choose those of the wanted sessions."""
+        """List the files of the source, and select those of the requested sessions."""
         for file in self._list_hub(self.source.hub) if self.source.hub else self._list_urls():
             (self.files if self.source.urls or self._wants(file.path) else self.left_out).append(file)
         if not self.files:
             listed = {_session_of(file.path, ()) or file.path.partition("/")[0] for file in self.left_out}
             raise DownloadError(
-                f"{self.folder.name}: {self.origin} has no file for {', '.join(self.names.values())}. Found there: "
+                f"{self.folder.name}: {self.origin} has no file for {', '.join(self.names.values())}. It has "
                 f"{', '.join(sorted(listed)[:20]) or 'nothing'}. Correct `dataset.sessions` or `dataset.into`."
             )
 
@@ -167,7 +167,7 @@ class _CaptureDownload:
                     files.append(RemoteFile(path, url, entry.size, version))
         except DownloadError:
             raise
-        except Exception as error:  # of the library, and of its HTTP client, which differs with its version
+        except Exception as error:  # the library's own, or its HTTP client's, which depends on its version
             refused = status_of(error) in (401, 403, 404)
             raise DownloadError(
                 f"{self.folder.name}: {self.origin} (revision {revision}) cannot be listed: "
@@ -190,27 +190,27 @@ class _CaptureDownload:
 
     @property
     def _access(self) -> str:
-        """What to do if the server refuses access."""
+        """What the user can do if the server refuses access."""
         if self.source.hub:
             return (
-                f"Look at {self.page} in a browser: accept the terms if it has some, make a token (Settings, Access "
-                "Tokens), and set HF_TOKEN to it or log in with `hf auth login`. If there is no such page, look for "
-                f"the data set's present name at {self.dataset.page} and set "
+                f"Open {self.page} in a browser: accept the terms if it asks for that, create a token (Settings, "
+                "Access Tokens), and set HF_TOKEN to it or log in with `hf auth login`. If there is no such page, look "
+                f"up the data set's current name at {self.dataset.page} and set "
                 f"`dataset.sources.{self.folder.name}.hub`."
             )
         return (
-            f"See {self.dataset.page} for how to get access and for the present addresses; set them as "
+            f"See {self.dataset.page} for how to get access and for the current addresses; set them as "
             f"`dataset.sources.{self.folder.name}.urls`."
         )
 
     def _wants(self, path: str) -> bool:
-        """Tell whether the download needs the file with this path in the capture."""
+        """Return whether to download the file with this path in the capture."""
         return _session_of(path, self.names.values()) in self.names.values() or any(
             fnmatch.fnmatchcase(path, pattern) for pattern in self.dataset.include
         )
 
     def describe(self, in_full: bool) -> None:
-        """Say what is fetched, from where, and under which license; `in_full` lists each file."""
+        """Print what is fetched, from where, and under which license; `in_full` lists each file."""
         self.say(f"{self.folder.name}: {self.origin}\n  to        {self.folder}\n  license   {self.dataset.license}")
         if self.dataset.citation:
             self.say(f"  cite      {self.dataset.citation}")
@@ -226,7 +226,7 @@ class _CaptureDownload:
         for file in self.files if in_full else ():
             self.say(f"    {size_text(file.size):>9}  {file.path}")
 
-    # What has been fetched before
+    # Files fetched before
 
     def _read_done(self) -> dict[str, dict[str, Any]]:
         done: dict[str, dict[str, Any]] = {}
@@ -238,17 +238,17 @@ class _CaptureDownload:
             try:
                 row = json.loads(line)
             except ValueError:
-                continue  # a kill tore this line: its file counts as not done, and is looked at again
+                continue  # a kill cut this line off: its file counts as not done and is checked again
             done[row["path"]] = row
         return done
 
-    def _mark_done(self, file: RemoteFile, **more: Any) -> None:
-        row = self.done[file.path] = {"path": file.path, "version": file.version, **more}
+    def _mark_done(self, file: RemoteFile, **columns: Any) -> None:
+        row = self.done[file.path] = {"path": file.path, "version": file.version, **columns}
         with self.lock, open(self.state / "done.jsonl", "a", encoding="utf-8") as stream:
-            stream.write("\n" + json.dumps(row))  # the break comes first: a kill may have torn the line above
+            stream.write("\n" + json.dumps(row))  # newline first: a kill may have cut off the previous line
 
     def is_done(self, file: RemoteFile) -> bool:
-        """Tell whether a file has been fetched before, and is still there; of an archive, what was unpacked from it."""
+        """Return whether this version of a file, or what an archive was unpacked to, is in place already."""
         row = self.done.get(file.path, {})
         if row.get("version") != file.version:
             return False
@@ -258,25 +258,25 @@ class _CaptureDownload:
         return _file_size(self.folder / file.path) == file.size
 
     def count_fetched(self, file: RemoteFile) -> int:
-        """Return how many bytes of a file that is not done are here."""
+        """Return how many bytes of an unfinished file are on disk."""
         return _file_size(self._archive(file)) or _file_size(self._partial(file)) or 0
 
     def _sessions_in(self, archive: RemoteFile) -> list[str]:
-        """Return the wanted sessions, by their names in the capture, that an archive may hold."""
+        """Return the requested sessions, by their names in the capture, that an archive may contain."""
         session = _session_of(archive.path, self.names.values())
         return sorted(name for name, name_in_source in self.names.items() if session in (None, name_in_source))
 
     def _partial(self, file: RemoteFile) -> Path:
-        # Another version has another name, so that no file is put together from two versions.
+        # The name depends on the version, so a file is never assembled from two versions.
         return self.state / "partial" / fingerprint([file.path, file.version])
 
     def _archive(self, file: RemoteFile) -> Path:
         return self.state / "archives" / f"{PurePosixPath(file.path).stem}-{self._partial(file).name}.zip"
 
-    # Fetching
+    # Fetch the files
 
     def run(self) -> None:
-        """Fetch, unpack and lay out everything."""
+        """Fetch, unpack and arrange all files of the capture."""
         from filelock import FileLock, Timeout
 
         try:
@@ -289,9 +289,9 @@ class _CaptureDownload:
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
                 text = f"the disk is full ({size_text(shutil.disk_usage(self.folder).free)} free). Free some space"
             else:
-                text = f"{first_line(error)}. See to it that you can write there, or choose another folder (`captures`)"
+                text = f"{first_line(error)}. Make the folder writable, or choose another folder (`captures`)"
             raise DownloadError(
-                f"{error.filename or self.folder}: {text}; then run the same command: it goes on where it was."
+                f"{error.filename or self.folder}: {text}; then run the same command: it resumes the download."
             ) from error
 
     def _run(self) -> None:
@@ -315,8 +315,8 @@ class _CaptureDownload:
         if failures:
             first = "\n  ".join(map(str, failures[:5])) + ("\n  ..." if len(failures) > 5 else "")
             raise DownloadError(
-                f"{self.folder.name}: {len(failures)} of {len(self.files)} files failed; the others are there. The "
-                f"same command tries these again.\n  {first}"
+                f"{self.folder.name}: {len(failures)} of {len(self.files)} files failed; the others are there. Run the "
+                f"same command to try these again.\n  {first}"
             )
         shutil.rmtree(self.state / "unpacked", ignore_errors=True)
         self._set_unfinished(False)
@@ -324,20 +324,20 @@ class _CaptureDownload:
             shutil.rmtree(self.state / "partial", ignore_errors=True)
 
     def _set_unfinished(self, unfinished: bool) -> None:
-        """Add the wanted sessions to those that are unfinished, or remove them; the file goes with the last one."""
-        mark = self.state / _UNFINISHED
-        names = set(mark.read_text(encoding="utf-8").split()) if mark.exists() else set()
+        """Add the requested sessions to the list of unfinished ones, or remove them. Delete the list once empty."""
+        list_file = self.state / _UNFINISHED
+        names = set(list_file.read_text(encoding="utf-8").split()) if list_file.exists() else set()
         if names := names | self.names.keys() if unfinished else names - self.names.keys():
-            write_text(mark, "\n".join(sorted(names)))
+            write_text(list_file, "\n".join(sorted(names)))
         else:
-            mark.unlink()
+            list_file.unlink()
 
     def _advance(self, count: int) -> None:
         with self.lock:
             self.bar.update(count)
 
     def _fetch_loose(self, transfer: Transfer, files: list[RemoteFile]) -> list[FileError]:
-        """Fetch the files that are no archives, several at a time; return what failed for single files."""
+        """Fetch files that are not archives, several at a time; return the errors of single files."""
         failures = []
         pool = ThreadPoolExecutor(_WORKERS)
         try:
@@ -346,7 +346,7 @@ class _CaptureDownload:
                     task.result()
                 except FileError as error:
                     failures.append(error)
-        except BaseException:  # of one file for all, or Ctrl-C: end the others
+        except BaseException:  # an error that affects all files, or Ctrl-C: stop the other threads
             transfer.stop.set()
             raise
         finally:
@@ -355,86 +355,86 @@ class _CaptureDownload:
 
     def _fetch_one(self, transfer: Transfer, file: RemoteFile) -> None:
         target = self.folder / file.path
-        if _file_size(target) == file.size and file.matches(target):  # fetched by other means
+        if _file_size(target) == file.size and file.matches(target):  # fetched by another tool
             self._advance(file.size or 0)
         else:
             transfer.fetch(file, self._partial(file), target)
         self._mark_done(file)
 
     def _fetch_archive(self, transfer: Transfer, file: RemoteFile) -> None:
-        """Fetch an archive, unpack it aside, and move what is wanted into place; unpack it anew after a kill."""
+        """Fetch an archive, unpack it to a temporary folder, and move the requested files into the capture."""
         archive = self._archive(file)
         if not archive.exists():
             transfer.fetch(file, self._partial(file), archive)
-        aside = self.state / "unpacked" / archive.stem
-        shutil.rmtree(aside, ignore_errors=True)
-        above = file.path.split("/")[:-1]
+        unpacked = self.state / "unpacked" / archive.stem
+        shutil.rmtree(unpacked, ignore_errors=True)  # left by a kill
+        parent = file.path.split("/")[:-1]
 
-        def place(parts: list[str]) -> str | None:
-            if not above and "sessions" in parts[:2]:
-                parts = parts[parts.index("sessions") :]  # a folder of the capture's name may stand above
-            path = "/".join([*above, *parts])
+        def target_path(parts: list[str]) -> str | None:
+            if not parent and "sessions" in parts[:2]:
+                parts = parts[parts.index("sessions") :]  # without the capture's own folder, if the archive has it
+            path = "/".join([*parent, *parts])
             return path if self._wants(path) else None
 
         try:
             try:
-                count = unpack(archive, aside, place, file.path)
+                count = unpack(archive, unpacked, target_path, file.path)
             except FileError:
-                # With a checksum it is what was published, and fetching it again would bring the same.
+                # If the checksum is known, the published archive itself is damaged: fetching it again is useless.
                 if not file.version.startswith(("sha256:", "git:")):
                     archive.unlink()
                 raise
             if count == 0:
                 raise FileError(
-                    f"{file.path}: holds nothing of {', '.join(self.names.values())}. It has: "
+                    f"{file.path}: contains nothing of {', '.join(self.names.values())}. It has: "
                     f"{', '.join(top_folders(archive))}. Correct `dataset.sessions`."
                 )
             if isinstance(self.dataset.sessions, dict):
-                for note in arrange(aside / "sessions", self.dataset.sessions):
+                for note in arrange(unpacked / "sessions", self.dataset.sessions):
                     self.say(f"{self.folder.name}: left out of {note}")
-                for name in self.dataset.sessions.keys() - self.names.keys():  # of a session that several share
-                    shutil.rmtree(aside / "sessions" / name, ignore_errors=True)
-            folders = _move_into(aside, self.folder)
+                for name in self.dataset.sessions.keys() - self.names.keys():  # split off but not requested
+                    shutil.rmtree(unpacked / "sessions" / name, ignore_errors=True)
+            folders = _move_into(unpacked, self.folder)
         finally:
-            shutil.rmtree(aside, ignore_errors=True)
+            shutil.rmtree(unpacked, ignore_errors=True)
         self._mark_done(file, sessions=self._sessions_in(file), folders=folders)
         if not self.keep_archives:
             archive.unlink()
 
     def check(self) -> "CheckReport":
-        """Check the capture, report the result, and raise if a wanted session is not in it."""
+        """Check the capture, print the result, and raise DownloadError if a requested session is missing."""
         from toolkit.capture.check import check_capture
 
         report = check_capture(self.folder)
         self.say("\n" + report.text(most=20))
         if missing := [name for name in self.names if name not in report.tables]:
             raise DownloadError(
-                f"{self.folder}: all of {self.origin} that was asked for is here, but there is no session "
+                f"{self.folder}: all requested files of {self.origin} are here, but there is no session "
                 f"{', '.join(missing)} in it; found {', '.join(report.tables)}. If the data are published without, "
-                "take them out of `dataset.sessions`, or name the others with --sessions."
+                "remove them from `dataset.sessions`, or name the sessions to download with --sessions."
             )
         return report
 
 
 def _require_space_for(captures: list[_CaptureDownload]) -> None:
-    """Refuse, before anything is fetched, what the disks cannot hold: archives take space packed and unpacked."""
-    needed: Counter[int] = Counter()
-    places: dict[int, Path] = {}
+    """Check before the download that the disks have room. An archive takes space packed and unpacked."""
+    needed_bytes: Counter[int] = Counter()  # by disk
+    folders: dict[int, Path] = {}
     for capture in captures:
-        place = next(parent for parent in (capture.folder, *capture.folder.parents) if parent.exists())
-        disk = place.stat().st_dev
-        places.setdefault(disk, place)
+        folder = next(parent for parent in (capture.folder, *capture.folder.parents) if parent.exists())
+        disk = folder.stat().st_dev
+        folders.setdefault(disk, folder)
         missing = [file for file in capture.files if not capture.is_done(file)]
         packed = [file.size or 0 for file in missing if file.is_archive]
-        # Photographs hardly shrink in an archive. The true size is compared with the disk before it is unpacked.
-        needed[disk] += sum(packed) if capture.keep_archives else max(packed, default=0)
-        needed[disk] += sum((file.size or 0) - capture.count_fetched(file) for file in missing)
-    for disk, count in needed.items():
-        require_space(places[disk], count, "fetch fewer sessions at once (--sessions)")
+        # Images hardly shrink in an archive, so its size estimates the unpacked size. `unpack` checks the exact one.
+        needed_bytes[disk] += sum(packed) if capture.keep_archives else max(packed, default=0)
+        needed_bytes[disk] += sum((file.size or 0) - capture.count_fetched(file) for file in missing)
+    for disk, count in needed_bytes.items():
+        require_space(folders[disk], count, "fetch fewer sessions at once (--sessions)")
 
 
 def _session_of(path: str, sessions: Iterable[str]) -> str | None:
-    """Return the session in whose folder a file lies, or whose name an archive in `sessions/` begins with."""
+    """Return the session folder that a file lies in, or the session that an archive in `sessions/` is named after."""
     parts = path.split("/")
     if parts[0] != "sessions" or len(parts) < 2:
         return None
@@ -445,13 +445,13 @@ def _session_of(path: str, sessions: Iterable[str]) -> str | None:
 
 
 def _move_into(source: Path, target: Path) -> list[str]:
-    """Move all files below one folder to their places below another; return the folders, two levels deep."""
+    """Move all files from one folder to the same paths below another; return their folders, two levels deep."""
     folders = set()
     for path in [path for path in source.rglob("*") if path.is_file()]:
-        place = target / path.relative_to(source)
-        folders.add("/".join(path.relative_to(source).parts[:-1][:2]))
-        place.parent.mkdir(parents=True, exist_ok=True)
-        path.replace(place)
+        relative = path.relative_to(source)
+        folders.add("/".join(relative.parts[:-1][:2]))
+        (target / relative).parent.mkdir(parents=True, exist_ok=True)
+        path.replace(target / relative)
     return sorted(folders)
 
 

@@ -1,8 +1,8 @@
-"""Sessions that are put together from images of the user's own: what every import shares.
+"""Assemble a session from a user's own images. All imports share this module.
 
-Images are linked or copied to `raw_data/import/images/`, under their names. The status of each image is a row of
-`proc/import.csv`; `proc/import.json` has the unit of the poses: `m`, or null where it is not known. Images stay as they
-are stored, and intrinsics belong to the stored pixels, whether or not EXIF asks to turn the image.
+Images are linked or copied to `raw_data/import/images/` under their names. `proc/import.csv` has a row with the status
+of each image; `proc/import.json` has the unit of the poses: `m`, or null if unknown. Images are not rotated: intrinsics
+belong to the stored pixels, whatever orientation EXIF states.
 """
 
 import json
@@ -34,26 +34,26 @@ PLACING = ("link", "copy")
 IMPORT_RECORD = "proc/import.json"
 NOT_INSIDE = "not a path inside the folder of images"
 AXES = {"opencv": np.eye(4), "opengl": np.diag([1.0, -1.0, -1.0, 1.0])}
-"""Conventions of camera axes, as named_from_cam: `opencv` has x right, y down, z forward, as the toolkit has them;
-`opengl` x right, y up, z backward."""
+"""named_from_cam (4, 4) for each named convention of camera axes: `opencv`, the toolkit's own, has x right, y down, z
+forward; `opengl` has x right, y up, z backward."""
 
 
 @dataclass
 class ImportReport:
-    """What an import made."""
+    """The result of an import."""
 
     session: Path
     images: pd.DataFrame
-    """One row an image: image, status (`imported` or why not), path, timestamp, sensor_id, device_id, camera."""
+    """One row per image: image, status (`imported` or why not), path, timestamp, sensor_id, device_id, camera."""
     notes: list[str] = field(default_factory=list)
-    """What was guessed, made up, or deserves a look."""
+    """Guesses, made-up values, and anything the user should look at."""
 
     def text(self) -> str:
-        """Return what was made, as text."""
-        done = self.images["status"] == "imported"
-        cameras = self.images[done]["sensor_id"].nunique()
-        lines = [f"{self.session}: {done.sum()} of {len(self.images)} images, {cameras} cameras", *self.notes]
-        left_out = self.images[~done]
+        """Return the report as text."""
+        imported = self.images["status"] == "imported"
+        cameras = self.images[imported]["sensor_id"].nunique()
+        lines = [f"{self.session}: {imported.sum()} of {len(self.images)} images, {cameras} cameras", *self.notes]
+        left_out = self.images[~imported]
         lines += [f"left out: {row.image}: {row.status}" for row in left_out.head(10).itertuples()]
         if len(left_out) > 10:
             lines.append(f"... and {len(left_out) - 10} more, see proc/import.csv")
@@ -62,21 +62,21 @@ class ImportReport:
 
 @dataclass
 class DraftImage:
-    """An image that is to become part of a session."""
+    """An image to be imported."""
 
     name: str
     camera: pycolmap.Camera
     sensor: str
     frame: str
-    """Images of one frame were taken at one time."""
+    """Images with the same frame were taken at the same time."""
     rig: str | None = None
     time_us: int | None = None
     turned: bool = False
-    """Whether EXIF asks to turn the image."""
+    """Whether the EXIF orientation says to rotate the image."""
 
     @property
     def path(self) -> str:
-        """Relative to raw_data."""
+        """Path relative to raw_data."""
         return f"{IMPORTED}{self.name}"
 
     @property
@@ -86,34 +86,34 @@ class DraftImage:
 
 @dataclass
 class Draft:
-    """A session that is being put together."""
+    """A session being assembled."""
 
     session: Path
     folder: Path
-    """Of the images."""
+    """Folder of the images."""
     placing: str
     images: list[DraftImage] = field(default_factory=list)
     rows: list[dict[str, Any]] = field(default_factory=list)
-    """Of `proc/import.csv`."""
+    """Rows of `proc/import.csv`."""
     poses: dict[str, Floats] = field(default_factory=dict)
-    """world_from_device, (4, 4), by frame; a frame of queries may have none."""
+    """world_from_device (4, 4) by frame; query frames may have none."""
     rigs: list[tuple[str, str, Floats]] = field(default_factory=list)
-    """Rig, sensor, rig_from_sensor."""
+    """Rig, sensor, rig_from_sensor (4, 4)."""
     unit: str | None = "m"
-    """Of the poses; None: not known."""
+    """Unit of the poses; None: unknown."""
     notes: list[str] = field(default_factory=list)
     sensors: dict[str, str] = field(default_factory=dict)
-    """Sensor by the text of its camera, of images that are in no rig."""
+    """Sensor id by `camera_text`, for images that are not in a rig."""
 
     def add(self, name: str, camera: pycolmap.Camera, world_from_cam: Floats | None) -> None:
-        """Add an image of a camera in no rig; images with equal intrinsics are of one camera."""
+        """Add an image that is not in a rig. Images with equal intrinsics share a camera."""
         sensor = self.sensors.setdefault(camera_text(camera), f"{SUBSESSION}/cam_{len(self.sensors) + 1}")
         self.images.append(DraftImage(name, camera, sensor, name))
         if world_from_cam is not None:
             self.poses[name] = world_from_cam
 
     def write(self) -> ImportReport:
-        """Leave out the images that cannot be used, and write the session of the others."""
+        """Write the session without the images that cannot be used; raise CaptureError if none is left."""
         problems = {image.name: self._problem(image) for image in self.images}
         self.rows += [{"image": name, "status": problem} for name, problem in problems.items() if problem]
         self.images = [image for image in self.images if not problems[image.name]]
@@ -123,7 +123,7 @@ class Draft:
                 why += " Names are paths in this folder: correct them in the list, or put the list beside the images."
             raise CaptureError(f"{self.folder}: none of {len(self.rows)} images can be imported.{why}")
         if turned := sum(image.turned for image in self.images):
-            self.notes.append(f"{turned} images have an EXIF tag that asks for turning: the pixels are used as stored")
+            self.notes.append(f"{turned} images have an EXIF orientation, which is ignored: pixels are used as stored")
         times = self._choose_times()
         self.rows += [
             {"image": image.name, "status": "imported", "path": image.path, "timestamp": times[image.frame],
@@ -132,23 +132,23 @@ class Draft:
         ]  # fmt: skip
         columns = ["image", "status", "path", "timestamp", "sensor_id", "device_id", "camera"]
         table = pd.DataFrame(self.rows, columns=columns).astype({"timestamp": "Int64"})
-        with write_folder(self.session) as part:
+        with write_folder(self.session) as session:
             for image in self.images:
-                source, target = self.folder / image.name, part / RAW_DATA / image.path
+                source, target = self.folder / image.name, session / RAW_DATA / image.path
                 target.parent.mkdir(parents=True, exist_ok=True)
                 if self.placing == "copy":
                     shutil.copyfile(source, target)
                 else:
-                    target.symlink_to(os.path.abspath(source))  # noqa: PTH100 - a link in the source stays one
-            self._write_tables(part, times)
-            table.to_csv(part / "proc" / "import.csv", index=False)
-            (part / IMPORT_RECORD).write_text(json.dumps({"unit": self.unit}) + "\n", encoding="utf-8")
+                    target.symlink_to(os.path.abspath(source))  # noqa: PTH100 - must not resolve links in the source
+            self._write_tables(session, times)
+            table.to_csv(session / "proc" / "import.csv", index=False)
+            (session / IMPORT_RECORD).write_text(json.dumps({"unit": self.unit}) + "\n", encoding="utf-8")
             if self.placing == "link":
-                note_linked_here(part)
+                note_linked_here(session)
         return ImportReport(self.session, table, self.notes)
 
     def _write_tables(self, session: Path, times: Mapping[str, int]) -> None:
-        """Write the text files of the capture format, `times` being those of frames."""
+        """Write the text files of the capture format; `times` are the timestamps of the frames, microseconds."""
         frame_of = {(times[image.frame], image.device): image.frame for image in self.images}
         keys = pd.DataFrame(sorted(frame_of), columns=["timestamp", "device_id"])
         trajectory = None
@@ -165,12 +165,12 @@ class Draft:
             trajectory if is_map else None,
             sorted((times[image.frame], image.sensor, image.path) for image in self.images),
             subsessions=[SUBSESSION],
-            keyframes=None if is_map else {"pruned_subsampled": keys},  # the list that is localized by default
+            keyframes=None if is_map else {"pruned_subsampled": keys},  # the list localized by default
             ground_truth=None if is_map else trajectory,
         )
 
     def _problem(self, image: DraftImage) -> str:
-        """Set what an image's header says; return why the image cannot be used, or nothing."""
+        """Return why an image cannot be used, or an empty text. Set its time and orientation from its EXIF header."""
         name = PurePosixPath(image.name)
         if "," in image.name:
             return "the capture format cannot hold the comma in its name"
@@ -187,34 +187,35 @@ class Draft:
         if size == (camera.width, camera.height):
             return ""
         stored = f"{size[0]} x {size[1]}"
-        problem = f"the image is stored as {stored} pixels, its camera is of {camera.width} x {camera.height}"
+        problem = f"the image is stored as {stored} pixels, its camera has {camera.width} x {camera.height}"
         sides = (*size, camera.width, camera.height)
-        if abs(size[0] * camera.height - size[1] * camera.width) <= max(sides) / 2:  # sides are rounded to pixels
-            problem += f"; take images of the camera's size, or its intrinsics times {size[0] / camera.width:.6g}"
+        if abs(size[0] * camera.height - size[1] * camera.width) <= max(sides) / 2:  # equal ratio up to rounding
+            factor = size[0] / camera.width
+            problem += f"; use images of the camera's size, or multiply its intrinsics by {factor:.6g}"
         if orientation > 4 and size == (camera.height, camera.width):
-            problem += "; the camera is of the turned image: turn the pixels and remove the EXIF orientation"
+            problem += "; the camera fits the rotated image: rotate the pixels and remove the EXIF orientation"
         return problem
 
     def _choose_times(self) -> dict[str, int]:
-        """Return the time of each frame, microseconds: from EXIF if that tells the frames apart."""
+        """Return the timestamp of each frame, microseconds: from EXIF if all frames have different times there."""
         frames = list(dict.fromkeys(image.frame for image in self.images))
         taken = {image.frame: image.time_us for image in reversed(self.images) if image.time_us is not None}
         if len(taken) == len(frames) == len(set(taken.values())):
-            self.notes.append("timestamps: of the camera's clock, from EXIF")
+            self.notes.append("timestamps: camera clock, from EXIF")
             return taken
         why = "some images have no time" if len(taken) < len(frames) else "some images have the same time"
-        self.notes.append(f"timestamps: made up, a second apart in the order of the images ({why} in EXIF)")
+        self.notes.append(f"timestamps: made up, one second apart in the order of the images ({why} in EXIF)")
         return {frame: (number + 1) * 10**6 for number, frame in enumerate(frames)}
 
 
 def start(capture: str | Path, device: str, split: str, folder: Path, placing: str) -> Draft:
-    """Return the draft of a new session, or refuse one that cannot be made."""
+    """Return the draft of a new session. Raise CaptureError if it exists, ManifestError for an invalid argument."""
     if split not in SPLITS:
         raise ManifestError(f"split: unknown {split!r}. {nearest(split, SPLITS)}")
     if placing not in PLACING:
         raise ManifestError(f"images: unknown choice {placing!r}. {nearest(placing, PLACING)}")
-    if not re.fullmatch(r"[a-z0-9-]+", device):  # as `extra_devices` of a manifest has it
-        raise ManifestError(f"device: found {device!r}, expected small letters, digits and '-', such as ios or drone.")
+    if not re.fullmatch(r"[a-z0-9-]+", device):  # the rule for `extra_devices` in a manifest
+        raise ManifestError(f"device: found {device!r}, expected lower-case letters, digits and '-', such as drone.")
     session = Path(capture) / "sessions" / f"{device}_{split}"
     if session.exists():
         raise CaptureError(f"{session} exists already. Import into another capture or device, or remove it first.")
@@ -222,12 +223,12 @@ def start(capture: str | Path, device: str, split: str, folder: Path, placing: s
 
 
 def list_images(folder: Path) -> pd.DataFrame:
-    """Return the images in and below a folder, a table [image, line] without lines, in order of their names.
+    """Return the images in and below a folder, sorted by name, as a table [image, line] with line 0.
 
-    A folder in it may be a link to another disk.
+    Links to folders elsewhere are followed.
 
     Raises:
-        CaptureError: there are none.
+        CaptureError: there is no image.
     """
     paths = sorted(path for path in _files_below(folder) if path.suffix.lower() in IMAGE_SUFFIXES)
     if not paths:
@@ -236,35 +237,32 @@ def list_images(folder: Path) -> pd.DataFrame:
 
 
 def _files_below(folder: Path) -> Iterator[Path]:
-    """Yield the files in and below a folder, also in folders that it links to elsewhere, each of these once."""
-    known = [folder.resolve()]
+    """Yield the files in and below a folder. Links to folders elsewhere are followed, each target once."""
+    visited = [folder.resolve()]
     for root, folders, names in os.walk(folder, followlinks=True):
         for link in [name for name in folders if Path(root, name).is_symlink()]:
             target = Path(root, link).resolve()
-            if any(target.is_relative_to(one) or one.is_relative_to(target) for one in known):
+            if any(target.is_relative_to(path) or path.is_relative_to(target) for path in visited):
                 folders.remove(link)
             else:
-                known.append(target)
+                visited.append(target)
         yield from (Path(root, name) for name in names)
 
 
 def posed_camera(world_from_named: Floats, axes: str, unit_m: float) -> Floats:
-    """Return world_from_cam, (4, 4), meters, of a pose whose camera axes are those of `AXES[axes]`.
+    """Return world_from_cam (4, 4) in meters and with the toolkit's camera axes.
 
     Args:
-        unit_m: meters in the unit of the pose.
+        world_from_named: pose (4, 4) of a camera with the axes `AXES[axes]`.
+        unit_m: length of the pose's unit, meters.
     """
     world_from_cam = world_from_named @ AXES[axes]
     return make_pose(world_from_cam[:3, :3], unit_m * world_from_cam[:3, 3])
 
 
 def require_convention(axes: str, unit_m: float) -> None:
-    """Refuse unknown camera axes, and a unit that is no length.
-
-    Raises:
-        ManifestError: naming what was found, and what is known.
-    """
+    """Raise ManifestError for unknown camera axes or a unit that is not a positive length."""
     if axes not in AXES:
         raise ManifestError(f"axes: unknown {axes!r}. {nearest(axes, AXES)}")
     if not (np.isfinite(unit_m) and unit_m > 0):
-        raise ManifestError(f"unit: found {unit_m:g}, expected the meters in a unit of the poses, such as 0.01.")
+        raise ManifestError(f"unit: found {unit_m:g}, expected the meters per unit of the poses, such as 0.01.")

@@ -1,11 +1,11 @@
-"""What other tools read: the map as a COLMAP model; retrieval, poses and intrinsics as hloc's lists; a table of poses.
+"""Export for other tools: a COLMAP model of the map; retrieval, poses and intrinsics as hloc lists; a table of poses.
 
-Images have the names that the user knows them by (`files.own_name`): imported ones their path in the folder that they
-were imported from, others theirs relative to the capture's folder `sessions`. With `names="capture"` all are relative
-to that folder, as in the HDF5 files of local features and matches. Another choice of names is a ManifestError.
+`names="own"` gives images the names that the user knows (`files.own_name`): an imported image has its path in the
+folder it was imported from, other images have their path relative to the capture's folder `sessions`. With
+`names="capture"` all paths are relative to `sessions`, as in the HDF5 files of local features and matches.
 
-A run says where its captures are; `capture` is the place of one that has moved. If it is in neither, or there is
-another than was asked for, that is a ManifestError, too.
+The run records where its captures are; `capture` is the new folder of one that has moved. All exports raise
+ManifestError for an unknown choice of names, a capture that is in neither place, or a capture with another name.
 """
 
 from collections.abc import Mapping, Sequence
@@ -45,72 +45,66 @@ Keypoints = Mapping[str, NDArray[np.floating]]
 
 
 def export_colmap(
-    run: str | Path,
-    scene: str,
-    device: str,
-    out: str | Path,
-    capture: str | Path | None = None,
-    names: str = "own",
+    run: str | Path, scene: str, device: str, out: str | Path, capture: str | Path | None = None, names: str = "own"
 ) -> pycolmap.Reconstruction:
-    """Write the triangulated map that a run localized with as a COLMAP model, binary.
+    """Write the triangulated map that a run localized with as a binary COLMAP model.
 
-    All keypoints are written, also those that see no point, in COLMAP's pixels, which are ours: the center of the
-    top-left pixel is (0.5, 0.5). Where the run has used several kinds of features, the keypoints and points of one kind
-    follow those of the kind before. A rig's frame is that of its first camera, as COLMAP wants it; rigs with the same
-    cameras at the same places are one rig.
+    All keypoints are written, including those without a point. Pixel coordinates are the same in COLMAP and here: the
+    center of the top-left pixel is (0.5, 0.5). If the run used several kinds of features, their keypoints and points
+    are concatenated. The rig frame is the frame of its first camera, as COLMAP requires; rigs with the same cameras at
+    the same poses are merged into one.
 
     Raises:
         ArtifactError: the run has not localized in such a map.
-        ManifestError: there are files in the folder `out`.
+        ManifestError: the folder `out` contains files.
     """
     _require_names(names)
     files, session_id, out = SceneFiles(Path(run), scene), f"{device}_map", Path(out)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise ManifestError(f"{out}: there are files already. Give an empty or new folder.")
+        raise ManifestError(f"{out}: contains files already. Give an empty or new folder.")
     session = _session(run, scene, session_id, capture)
     paths = _maps_of(files, device)
     stores = [_features_of(files, session_id, path) for path in paths]
     local_map, keypoints = _pooled([LocalMap.load(path) for path in paths], stores)
     model = colmap_model(local_map, session, keypoints, names)
-    with write_folder(out) as part:
-        model.write_binary(str(part))
+    with write_folder(out) as folder:
+        model.write_binary(str(folder))
     return model
 
 
 def _maps_of(files: SceneFiles, device: str) -> list[Path]:
-    """Return the files of the triangulated maps that a run has localized with, one a kind of features."""
+    """Return the files of the triangulated maps that a run localized with, one per kind of features."""
     for path in sorted(files.poses_dir.glob(f"{pair_name(files.scene, device, '*')}.h5")):
         with closing(LocalizedQueries(path)) as queries:
             if queries.maps:
                 return [files.maps / name for name in queries.maps]
     raise ArtifactError(
-        f"{files.poses_dir}: no query has been localized in a triangulated map of {device}. Run the localize stage "
-        "with a method that uses one (python -m toolkit run MANIFEST --only localize)."
+        f"{files.poses_dir}: no query was localized in a triangulated map of {device}. Run the localize stage with a "
+        "method that uses one (python -m toolkit run MANIFEST --only localize)."
     )
 
 
 def _features_of(files: SceneFiles, session_id: str, map_file: Path) -> FeatureStore:
     """Open the local features that a map was triangulated from."""
-    kind = map_file.stem.removeprefix(session_id).removeprefix("-") or "sift"  # as `mapping.map_path` names maps
-    found = sorted((files.features / session_id).glob(f"{kind}-*.h5"))
-    if len(found) != 1:
+    kind = map_file.stem.removeprefix(session_id).removeprefix("-") or "sift"  # the naming of `mapping.map_path`
+    stores = sorted((files.features / session_id).glob(f"{kind}-*.h5"))
+    if len(stores) != 1:
         raise ArtifactError(
-            f"{files.features / session_id}: {len(found)} files of {kind} features, expected the one that {map_file} "
+            f"{files.features / session_id}: {len(stores)} files of {kind} features, expected the one that {map_file} "
             "was triangulated from. Delete this folder and run the localize stage again."
         )
-    return FeatureStore.open(found[0])
+    return FeatureStore.open(stores[0])
 
 
 def _pooled(maps: Sequence[LocalMap], stores: Sequence[FeatureStore]) -> tuple[LocalMap, Keypoints]:
-    """Return one map of several, and the keypoints that its observations count through: in each image those of one kind
-    of features after those of the kind before."""
+    """Merge the maps of several kinds of features; in each image, concatenate the keypoints (n, 2) of all kinds."""
     keypoints: dict[str, NDArray[np.floating]] = {}
     shifted = []
     for local_map, store in zip(maps, stores, strict=True):
-        before = [keypoints.get(name, np.zeros((0, 2))) for name in local_map.image_names]
-        starts = np.array([len(xy) for xy in before], np.int64)
+        previous = [keypoints.get(name, np.zeros((0, 2))) for name in local_map.image_names]
+        starts = np.array([len(xy) for xy in previous], np.int64)
         shifted.append(replace(local_map, obs_keypoint=local_map.obs_keypoint + starts[local_map.obs_image]))
-        for name, xy in zip(local_map.image_names, before, strict=True):
+        for name, xy in zip(local_map.image_names, previous, strict=True):
             keypoints[name] = np.concatenate([xy, store[name].keypoints])
     return LocalMap.pooled(shifted), keypoints
 
@@ -118,24 +112,24 @@ def _pooled(maps: Sequence[LocalMap], stores: Sequence[FeatureStore]) -> tuple[L
 def colmap_model(
     local_map: LocalMap, session: Session, keypoints: Keypoints, names: str = "own"
 ) -> pycolmap.Reconstruction:
-    """Return a map as a COLMAP model; its observations count through the keypoints (n, 2) of each image.
+    """Return a map as a COLMAP model; the map's observations index the keypoints (n, 2) of each image.
 
     Raises:
-        ArtifactError: the session does not list an image of the map.
+        ArtifactError: an image of the map is not in the session.
     """
     row_of = session.row_of_name
-    unknown = [name for name in local_map.image_names if name not in row_of]
-    if unknown:
-        raise ArtifactError(f"{session.path}: image {unknown[0]} of the map is not in it. Run the map's stages again.")
+    missing = [name for name in local_map.image_names if name not in row_of]
+    if missing:
+        raise ArtifactError(f"{session.path}: image {missing[0]} of the map is not in it. Run the map's stages again.")
     rows = np.array([row_of[name] for name in local_map.image_names], np.int64)
     sensors = session.images["sensor_id"].to_numpy(str)[rows]
     model = pycolmap.Reconstruction()
-    rigs: dict[object, tuple[int, list[int]]] = {}  # ids of each rig and of its cameras
-    # The images of each device at each time, cameras in order of their ids.
+    rigs: dict[object, tuple[int, list[int]]] = {}  # id of each rig and ids of its cameras
+    # A frame is all images of a device at a timestamp, in order of camera ids.
     images = session.images.iloc[rows][["timestamp", "sensor_id"]].assign(device=session.device_ids[rows])
     by_frame = images.reset_index(drop=True).sort_values("sensor_id", kind="stable").groupby(["timestamp", "device"])
     for frame_id, members in enumerate((group.index.tolist() for _, group in by_frame), start=1):
-        # Rig ids are often made anew for each frame; the cameras and their places say which rig it is.
+        # Captures often have a new rig id for each frame, so a rig is identified by its cameras and their poses.
         rig_from_cams = session.rig_from_cam(rows[members])
         first_from_cams = invert(rig_from_cams[0]) @ rig_from_cams
         key = (tuple(sensors[members]), tuple(np.round(first_from_cams, 12).ravel()))
@@ -172,7 +166,7 @@ def _add_rig(
     rig.rig_id = model.num_rigs() + 1
     for camera, first_from_cam in zip(cameras, first_from_cams, strict=True):
         camera = pycolmap.Camera(camera.todict())
-        camera.camera_id = model.num_cameras() + 1  # a new camera, for COLMAP lets one be in one rig only
+        camera.camera_id = model.num_cameras() + 1  # a copy, because in COLMAP a camera belongs to one rig
         model.add_camera(camera)
         if camera_ids:
             rig.add_sensor(camera.sensor_id, _rigid(invert(first_from_cam)))
@@ -190,17 +184,17 @@ def _rigid(pose: Floats) -> pycolmap.Rigid3d:
 def export_table(session: Session, out: str | Path, ground_truth: bool = False) -> Path:
     """Write the cameras and poses of a session's images as the table that `interchange.import_images` reads.
 
-    Image names are relative to the session's `raw_data`, poses are world_from_cam. Without any pose the table has
-    cameras only; an image without a pose is left out where others have one.
+    Image names are relative to the session's `raw_data`, poses are world_from_cam. If some images have poses, the
+    others are left out. If none has, the table has cameras only.
 
     Args:
-        ground_truth: write the poses of `session.ground_truth`; else those of a map session's `session.trajectory`,
-            and none for queries.
+        ground_truth: write the poses of `session.ground_truth`. Otherwise, map sessions have the poses of
+            `session.trajectory` and query sessions have none.
     """
     rows = session.camera_rows
     poses = session.world_from_cam(rows, ground_truth)
     if session.split == "query" and not ground_truth:
-        poses[:] = np.nan  # odometry says nothing of the place in the map
+        poses[:] = np.nan  # odometry is not in the map's frame
     posed = np.isfinite(poses).all((1, 2))
     if posed.any():
         rows, poses = rows[posed], poses[posed]
@@ -225,28 +219,28 @@ def export_pairs(
     topk: int | None = None,
     names: str = "own",
 ) -> int:
-    """Write the retrieval of a pair as hloc reads it, `query reference` a line, and return the number of lines.
+    """Write the retrieval of a pair in hloc's format, `query reference` per line, and return the number of lines.
 
     Args:
-        topk: so many references a query; None: all that were retrieved.
+        topk: number of references per query; None: all retrieved ones.
 
     Raises:
-        ArtifactError: the run has no such retrieval, a line of it is malformed, a name has a space in it, or a query
-            and a reference have one name.
+        ArtifactError: the run has no such retrieval, a line of it is malformed, a name contains a space, or a query
+            and a reference have the same name.
     """
     _require_names(names)
     path = SceneFiles(Path(run), scene).retrieval(map_device, query_device)
     pairs = []
     for row in read_references(path, "path"):
         paths = [str(entry["path"]) for entry in (row, *row["topk"][:topk])]
-        strange = [name for name in paths if "/sessions/" not in name]
-        if strange:
-            raise ArtifactError(f"{path}: expected images as SCENE/sessions/..., found {strange[0]!r}. Retrieve again.")
+        invalid = [name for name in paths if "/sessions/" not in name]
+        if invalid:
+            raise ArtifactError(f"{path}: expected images as SCENE/sessions/..., found {invalid[0]!r}. Retrieve again.")
         query, *references = (_listed(image_name(name), names, path) for name in paths)
         pairs += [(query, reference) for reference in references]
-    if twice := {query for query, _ in pairs} & {reference for _, reference in pairs}:
+    if shared := {query for query, _ in pairs} & {reference for _, reference in pairs}:
         raise ArtifactError(
-            f"{path}: {min(twice)!r} is the name of a query and of a reference, which hloc cannot tell apart. Use "
+            f"{path}: {min(shared)!r} is the name of a query and of a reference, which hloc cannot tell apart. Use "
             "--names capture."
         )
     write_text(out, "".join(f"{query} {reference}\n" for query, reference in pairs))
@@ -262,16 +256,16 @@ def export_poses(
     capture: str | Path | None = None,
     names: str = "own",
 ) -> int:
-    """Write the poses of a pair's queries as hloc does, a line `name qw qx qy qz tx ty tz` for each image.
+    """Write the poses of a pair's queries in hloc's format, `name qw qx qy qz tx ty tz` for each image.
 
-    Poses are cam_from_world, in the unit of the capture; a rig has a line for each of its cameras. Queries without a
-    pose have no line. hloc itself writes the last part of a name alone. Return the number of lines.
+    Poses are cam_from_world in the unit of the capture; a rig has one line per camera. Queries without a pose are left
+    out. Names are complete paths, whereas hloc writes file names only. Return the number of lines.
 
     Raises:
-        ArtifactError: the run has no such poses, or a name has a space in it.
+        ArtifactError: the run has no such poses, or a name contains a space.
     """
     _require_names(names)
-    path = _whole(SceneFiles(Path(run), scene).poses_txt(map_device, query_device))
+    path = _require_poses(SceneFiles(Path(run), scene).poses_txt(map_device, query_device))
     session, poses = _session(run, scene, f"{query_device}_query", capture), Trajectory.read(path)
     lines = []
     keys = pd.DataFrame({"timestamp": poses.timestamps, "device_id": poses.device_ids})
@@ -292,12 +286,12 @@ def export_intrinsics(
     capture: str | Path | None = None,
     names: str = "own",
 ) -> int:
-    """Write the cameras of a pair's queries as hloc reads them, `name MODEL width height parameters` for each image.
+    """Write the cameras of a pair's queries in hloc's format, `name MODEL width height parameters` for each image.
 
-    Returns and raises what `export_poses` does; queries without a pose are there as well.
+    Queries without a pose are included. Returns and errors are those of `export_poses`.
     """
     _require_names(names)
-    path = _whole(SceneFiles(Path(run), scene).poses_csv(map_device, query_device))
+    path = _require_poses(SceneFiles(Path(run), scene).poses_csv(map_device, query_device))
     session = _session(run, scene, f"{query_device}_query", capture)
     lines = []
     for rows in session.rows_of_keyframes(read_query_table(path, [])):
@@ -314,20 +308,20 @@ def _require_names(names: str) -> None:
 
 
 def _exported(name: str, names: str) -> str:
-    """Return what an image, by its name in the capture, is called in what is exported."""
+    """Return the exported name of an image, given its name in the capture."""
     return own_name(name) if names == "own" else name
 
 
 def _listed(name: str, names: str, path: Path) -> str:
-    """Return what an image is called in a list of hloc's, which are separated by spaces."""
+    """Return the exported name of an image. Raise ArtifactError if it contains the separator of hloc's lists."""
     name = _exported(name, names)
     if len(name.split()) != 1:
         raise ArtifactError(f"{path}: hloc's lists cannot hold the space in {name!r}. Rename the image.")
     return name
 
 
-def _whole(path: Path) -> Path:
-    """Return the path of a result of the localize stage, or refuse one that is missing or damaged."""
+def _require_poses(path: Path) -> Path:
+    """Return the path of a result of the localize stage. Raise ArtifactError if it is missing or damaged."""
     if not path.is_file():
         raise ArtifactError(
             f"No poses: {path} is missing. Run the localize stage first "

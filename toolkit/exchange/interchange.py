@@ -1,9 +1,9 @@
-"""Bring your own: COLMAP models and folders of images become sessions of a capture (see `drafts`).
+"""Import COLMAP models and folders of images as sessions of a capture (see `drafts`).
 
-The table of a folder of images is a CSV file with a header. Column `image` is the path in the folder; `qw qx qy qz tx
-ty tz` are the image's pose; `camera_id` names a camera of a `cameras.txt` in COLMAP's format, or `model width height
-params` (params separated by spaces) are the camera itself. Columns may stand in any order; an unknown one is refused.
-hloc's list of queries, `name MODEL width height parameters` a line, is read as such a table.
+A folder of images may have a table, a CSV file with a header. Column `image` is the path in the folder; `qw qx qy qz tx
+ty tz` are the pose; `camera_id` names a camera in a COLMAP `cameras.txt`, or `model width height params` (params
+separated by spaces) give the camera directly. The order of columns is free; unknown columns are an error. A query list
+of hloc, `name MODEL width height parameters` per line, is accepted in place of the table.
 """
 
 import json
@@ -39,7 +39,7 @@ from toolkit.manifest import nearest
 
 POSE_DIRECTIONS = ("world_from_cam", "cam_from_world")
 PROBE_S = 60
-"""How long COLMAP may take to read a model, besides 10 s a megabyte; at damaged files it may take for ever."""
+"""Time limit for reading a COLMAP model, seconds, plus 10 s per megabyte; on damaged files COLMAP may never return."""
 _CAMERA_COLUMNS = ("model", "width", "height", "params")
 
 
@@ -51,18 +51,18 @@ def import_colmap(
     split: str = "map",
     placing: str = "link",
 ) -> ImportReport:
-    """Make a session of a COLMAP model and its images: cameras, poses, and rigs where a rig has several cameras.
+    """Make a session from a COLMAP model and its images: cameras, poses, and the rigs that have several cameras.
 
-    Camera models are kept as they are, without undistortion: the capture format holds all of COLMAP's. Points and
-    tracks are not kept, for the map is triangulated anew. Images of the folder that are not in the model are left out,
-    and counted in the report.
+    The capture format supports all camera models of COLMAP, so they are kept without undistortion. Points and tracks
+    are dropped, because the toolkit triangulates its own map. Images of the folder that are not in the model are left
+    out and counted in the report.
 
     Args:
         model: folder with cameras, images, points3D (and rigs, frames), as .bin or .txt.
         images: folder that the model's image names are relative to.
-        capture: folder of the capture; made where it does not exist.
+        capture: folder of the capture; created if it does not exist.
         device, split: the session is `<device>_<split>`. Poses of queries become their ground truth.
-        placing: `link` images to where they are, or `copy` them.
+        placing: `link` to the images, or `copy` them.
 
     Raises:
         CaptureError: no model in the folder, the session exists already, or no image is left.
@@ -77,7 +77,7 @@ def import_colmap(
                 rig_from_sensor = np.eye(4) if rig.is_ref_sensor(sensor) else _inverse(rig.sensor_from_rig(sensor))
                 draft.rigs.append((f"{SUBSESSION}/rig_{rig_id}", f"{SUBSESSION}/cam_{sensor.id}", rig_from_sensor))
     for _, image in sorted(reconstruction.images.items()):
-        if not image.has_pose:  # a model in a file has registered images only
+        if not image.has_pose:
             continue
         rig_name = f"{SUBSESSION}/rig_{image.frame.rig_id}" if image.frame.rig_id in rigs else None
         frame, sensor_name = f"{image.frame_id}", f"{SUBSESSION}/cam_{image.camera_id}"
@@ -103,27 +103,29 @@ def import_images(
     unit_m: float = 1.0,
     truth: str | Path | None = None,
 ) -> ImportReport:
-    """Make a session of a folder of images, each camera on its own.
+    """Make a session from a folder of images without rigs.
 
-    Intrinsics are those of the table, else of `cameras`, else `camera`, else a guess from each image's EXIF.
+    Intrinsics come from the table, else from `cameras`, else from `camera`, else they are guessed from each image's
+    EXIF.
 
     Args:
-        images: folder; without a table, all JPEG and PNG files in and below it.
-        capture, device, split, placing: as of `import_colmap`. A map needs poses.
-        table: CSV file, see the head of this module.
+        images: folder; without a table, all JPEG and PNG files in and below it are imported.
+        capture, device, split, placing: as for `import_colmap`. A map needs poses.
+        table: CSV file, see the module's docstring.
         poses_are: direction of the poses in table and truth, `world_from_cam` or `cam_from_world`.
         camera: intrinsics of all images, `MODEL, width, height, parameter, ...`, with COLMAP's models.
-        cameras: COLMAP's cameras.txt; its only camera is of all images, else the table's `camera_id` says which.
-        axes: those of the cameras that the poses are of, see `drafts.AXES`.
-        unit_m: meters in a unit of the poses.
-        truth: CSV file like the table, whose poses become the ground truth of queries; images that it does not name
-            are queries without one.
+        cameras: COLMAP's cameras.txt. A single camera applies to all images; of several, the table's `camera_id`
+            selects one.
+        axes: camera axes of the poses, see `drafts.AXES`.
+        unit_m: meters per unit of the poses.
+        truth: CSV file like the table; its poses become the ground truth of queries. Images not in it are queries
+            without ground truth.
 
     Raises:
         CaptureError: a malformed table or camera (names file and line), an image without intrinsics, a map without
             poses, truth that names no image, the session exists already, or no image is left.
-        ManifestError: an unknown split, placing, direction or axes, a unit that is no length, truth of a map or beside
-            poses in the table, or a device that cannot be part of a name.
+        ManifestError: an unknown split, placing, direction or axes, a unit that is not a positive length, truth for a
+            map or together with poses in the table, or a device that cannot be part of a name.
     """
     if poses_are not in POSE_DIRECTIONS:
         raise ManifestError(f"poses_are: unknown {poses_are!r}. {nearest(poses_are, POSE_DIRECTIONS)}")
@@ -138,14 +140,14 @@ def import_images(
             "transforms.json or a COLMAP model (`python -m toolkit import --help`)."
         )
     listed_cameras = _read_cameras(Path(cameras)) if cameras is not None else {}
-    given_camera = None if camera is None else _camera(camera, "camera")
+    shared_camera = None if camera is None else _camera(camera, "camera")
     posed = rows if truth is None else _read_truth(Path(truth), rows, split)
     poses = _poses_of(posed, poses_are, axes, unit_m)
     origins = Counter[str]()
     for row in rows.to_dict("records"):
         name, where = str(row["image"]), f"{table}, line {row['line']}"
         try:
-            image_camera, origin = _camera_of(row, listed_cameras, given_camera, folder / name, where)
+            image_camera, origin = _camera_of(row, listed_cameras, shared_camera, folder / name, where)
         except ImageError as error:
             draft.rows.append({"image": name, "status": str(error)})
             continue
@@ -158,36 +160,31 @@ def import_images(
 
 
 def import_once(
-    images: str | Path | None,
-    capture: str | Path,
-    device: str,
-    split: str,
-    unit_m: float | None = 1.0,
-    **options: Any,
+    images: str | Path | None, capture: str | Path, device: str, split: str, unit_m: float | None = 1.0, **options: Any
 ) -> str:
-    """Import images as `import_images` does, unless this was done before from the same input; return what to tell.
+    """Import images, unless the session was imported before from the same input. Return a message for the user.
 
     Args:
-        unit_m: meters in a unit of the poses; None: not known.
-        options: of `import_images`; `table` may be a transforms.json in the folder of images.
+        unit_m: meters per unit of the poses; None: unknown.
+        options: as for `import_images`; `table` may be a transforms.json in the folder of images.
 
     Raises:
-        CaptureError: the session was made from other input, which is named; or what the imports raise.
-        ManifestError: no folder is given, or another than that of the transforms.json; or what the imports raise.
+        CaptureError: the session was imported from other input (the message names it); or as for the imports.
+        ManifestError: no folder is given, or not the folder of the transforms.json; or as for the imports.
     """
     if images is None:
         raise ManifestError(f"{split}_images: found None, expected the folder of your images: other inputs are given.")
     session = Path(capture) / "sessions" / f"{device}_{split}"
-    given: dict[str, Any] = {"images": str(Path(images).resolve()), **options}
-    if unit_m != 1:  # sessions of earlier versions do not say that it is
-        given["unit_m"] = unit_m
+    inputs: dict[str, Any] = {"images": str(Path(images).resolve()), **options}
+    if unit_m != 1:  # sessions of earlier versions do not record it
+        inputs["unit_m"] = unit_m
     for name in ("table", "truth", "cameras"):
-        if given.get(name) is not None:
-            given[f"content of {name}"] = file_fingerprint(given[name])
-            given[name] = str(Path(given[name]).resolve())
-    if given.get("camera") is not None and _has_cameras(table=options.get("table"), cameras=options.get("cameras")):
-        given["camera"] = None  # a camera that is given for other images changes nothing here
-    given["files of images"] = files_fingerprint([Path(images) / name for name in list_images(Path(images))["image"]])
+        if inputs.get(name) is not None:
+            inputs[f"content of {name}"] = file_fingerprint(inputs[name])
+            inputs[name] = str(Path(inputs[name]).resolve())
+    if inputs.get("camera") is not None and _has_cameras(table=options.get("table"), cameras=options.get("cameras")):
+        inputs["camera"] = None  # the table or cameras.txt override it
+    inputs["files of images"] = files_fingerprint([Path(images) / name for name in list_images(Path(images))["image"]])
     record = session / IMPORT_RECORD
     if not session.exists():
         if _is_transforms(options.get("table")):
@@ -196,18 +193,18 @@ def import_once(
             report = import_transforms(options["table"], capture, device, split, unit_m=unit_m)[0]
         else:
             report = import_images(images, capture, device, split, unit_m=unit_m or 1.0, **options)
-        write_text(record, json.dumps(read_json(record) | {"input": given}, indent=1) + "\n")
+        write_text(record, json.dumps(read_json(record) | {"input": inputs}, indent=1) + "\n")
         return report.text()
     before = read_json(record).get("input", {})
-    if differing := [name for name in given if before.get(name) != given[name]]:
-        of = "; ".join(
+    if differing := [name for name in inputs if before.get(name) != inputs[name]]:
+        changes = "; ".join(
             f"{name}: have changed" if name.split()[0] in ("content", "files") and name in before
-            else f"{name}: then {before.get(name)!r}, now {given[name]!r}"
+            else f"{name}: then {before.get(name)!r}, now {inputs[name]!r}"
             for name in differing
         )  # fmt: skip
         raise CaptureError(
-            f"{session} was imported from other input ({of}). Give another folder for the capture, or delete this one "
-            "to import it again."
+            f"{session} was imported from other input ({changes}). Give another folder for the capture, or delete this "
+            "one to import it again."
         )
     return f"{session}: imported before from the same input, kept"
 
@@ -217,11 +214,11 @@ def _is_transforms(table: str | Path | None) -> bool:
 
 
 def _require_own_folder(images: Path, file: Path, split: str, poses_are: str) -> None:
-    """Refuse a transforms.json that is given as the table of another folder than its own, or with other poses."""
+    """Raise ManifestError unless a transforms.json is in the folder of images and its poses are world_from_cam."""
     if images.resolve() != file.resolve().parent:
-        raise ManifestError(f"{split}_images: found {images}, expected the folder of {file}, which its paths begin in.")
+        raise ManifestError(f"{split}_images: found {images}, expected the folder of {file}: its paths start there.")
     if poses_are != POSE_DIRECTIONS[0]:
-        raise ManifestError(f"poses_are: found {poses_are!r}, expected world_from_cam, as {file} has it.")
+        raise ManifestError(f"poses_are: found {poses_are!r}, expected world_from_cam, the direction in {file}.")
 
 
 _PROBE = """
@@ -235,31 +232,31 @@ try:
     model = pycolmap.Reconstruction(sys.argv[1])
     [image.cam_from_world() for image in model.images.values() if image.has_pose]
 except MemoryError:
-    sys.exit("a file is damaged: it asks for more memory than its size can mean")
+    sys.exit("a file is damaged: reading it takes more memory than its size justifies")
 except Exception as error:
     sys.exit(str(error) or type(error).__name__)
 """
 
 
 def _read_model(folder: Path) -> pycolmap.Reconstruction:
-    """Read a model, first in a process of its own: at damaged files COLMAP ends the process, or fills the memory."""
+    """Read a COLMAP model. Try it in a child process first: on damaged files COLMAP may crash or fill the memory."""
     if not folder.is_dir():
         raise CaptureError(f"{folder}: no such folder. Expected one with a COLMAP model.")
     for path in folder.glob("*.bin"):
         if path.stat().st_size < 8:
-            raise CaptureError(f"{path}: no part of a COLMAP model: it is cut short. Export the model again.")
+            raise CaptureError(f"{path}: not a file of a COLMAP model: it is cut short. Export the model again.")
     limit_s = PROBE_S + 1e-5 * sum(path.stat().st_size for path in folder.iterdir())
     try:
-        tried = subprocess.run(
+        probe = subprocess.run(
             [sys.executable, "-c", _PROBE, str(folder)], capture_output=True, timeout=limit_s, check=False
         )
-        said = [line for line in tried.stderr.decode(errors="replace").split("\n") if line.strip(" *")]
-        reason = said[0].strip()[:300] if said else f"COLMAP ended with status {tried.returncode}"
+        lines = [line for line in probe.stderr.decode(errors="replace").split("\n") if line.strip(" *")]
+        reason = lines[0].strip()[:300] if lines else f"COLMAP ended with status {probe.returncode}"
     except subprocess.TimeoutExpired:
-        tried, reason = None, f"COLMAP was not done with it after {limit_s:.0f} s"
-    if tried is None or tried.returncode:
+        probe, reason = None, f"COLMAP did not finish in {limit_s:.0f} s"
+    if probe is None or probe.returncode:
         raise CaptureError(
-            f"{folder}: no COLMAP model can be read here ({reason}). Expected cameras, images, points3D as .bin or "
+            f"{folder}: cannot be read as a COLMAP model ({reason}). Expected cameras, images, points3D as .bin or "
             ".txt."
         )
     return pycolmap.Reconstruction(str(folder))
@@ -276,28 +273,31 @@ def _camera(params: str, where: str) -> pycolmap.Camera:
 
 
 def _camera_of(
-    row: Mapping[Any, Any], listed: Mapping[str, pycolmap.Camera], given: pycolmap.Camera | None, path: Path, where: str
+    row: Mapping[Any, Any], by_id: Mapping[str, pycolmap.Camera], shared: pycolmap.Camera | None, path: Path, where: str
 ) -> tuple[pycolmap.Camera, str]:
-    """Return the camera of an image, and where it is from: its row of the table, a list, the user, or EXIF."""
+    """Return the camera of an image and its origin: the table, cameras.txt, the camera shared by all images, or EXIF.
+
+    `where` names file and line of the image's row, for messages.
+    """
     if "model" in row:
         text = ", ".join([row["model"], row["width"], row["height"], *str(row["params"]).split()])
         return _camera(text, where), "the table's"
     if "camera_id" in row:
-        if row["camera_id"] not in listed:
-            ids = ", ".join(listed) or "none: give cameras.txt"
-            raise CaptureError(f"{where}: camera_id {row['camera_id']!r} is not in cameras.txt (there: {ids}).")
-        return listed[row["camera_id"]], "those of cameras.txt"
-    if len(listed) > 1:
+        if row["camera_id"] not in by_id:
+            ids = ", ".join(by_id) or "none: give cameras.txt"
+            raise CaptureError(f"{where}: camera_id {row['camera_id']!r} is not in cameras.txt (it has: {ids}).")
+        return by_id[row["camera_id"]], "those of cameras.txt"
+    if len(by_id) > 1:
         raise CaptureError(
-            f"cameras.txt has {len(listed)} cameras; give a table with the columns image, camera_id that says which."
+            f"cameras.txt has {len(by_id)} cameras; give a table with the columns image, camera_id to assign them."
         )
-    if listed:
-        return next(iter(listed.values())), "the camera of cameras.txt"
-    return (given, "the camera that was given") if given is not None else exif_camera(path)
+    if by_id:
+        return next(iter(by_id.values())), "the camera of cameras.txt"
+    return (shared, "the given camera") if shared is not None else exif_camera(path)
 
 
 def _has_cameras(table: str | Path | None, cameras: str | Path | None) -> bool:
-    """Return whether these go before a camera that is given for all images, as `_camera_of` has it."""
+    """Return whether the table or cameras.txt give cameras, which override the camera given for all images."""
     if _is_transforms(table):
         return True
     columns = _read_table(Path(table)).columns if table is not None else []
@@ -305,7 +305,7 @@ def _has_cameras(table: str | Path | None, cameras: str | Path | None) -> bool:
 
 
 def _read_cameras(path: Path) -> dict[str, pycolmap.Camera]:
-    """Read COLMAP's cameras.txt: `CAMERA_ID MODEL WIDTH HEIGHT PARAMS...` a line."""
+    """Read COLMAP's cameras.txt: `CAMERA_ID MODEL WIDTH HEIGHT PARAMS...` per line."""
     cameras: dict[str, pycolmap.Camera] = {}
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -324,9 +324,9 @@ def _read_cameras(path: Path) -> dict[str, pycolmap.Camera]:
 
 
 def _read_truth(path: Path, images: pd.DataFrame, split: str) -> pd.DataFrame:
-    """Read the table of true poses of queries, some of the `images`."""
+    """Read the table with the ground truth of some of the query `images`."""
     if split != "query" or "qw" in images:
-        why = "the images of a map" if split != "query" else "images whose table has poses, which are their truth"
+        why = "the images of a map" if split != "query" else "images whose table has poses already"
         raise ManifestError(f"truth: {path} is given for {why}. Give it for queries whose table has no poses.")
     rows = _read_table(path)
     if "qw" not in rows:
@@ -334,14 +334,14 @@ def _read_truth(path: Path, images: pd.DataFrame, split: str) -> pd.DataFrame:
     if not set(rows["image"]) & set(images["image"]):
         names = [repr(next(iter(table["image"]), "")) for table in (rows, images)]
         raise CaptureError(
-            f"{path}: no row is of an image that is imported: found {names[0]} and others, expected {names[1]} and "
-            "others. Images are named by their path in the folder of images."
+            f"{path}: no row is about an imported image: found {names[0]} and others, expected {names[1]} and others. "
+            "Images are named by their path in the folder of images."
         )
     return rows
 
 
 def _poses_of(rows: pd.DataFrame, poses_are: str, axes: str, unit_m: float) -> dict[str, Floats]:
-    """Return world_from_cam, (4, 4), meters, by image, of the rows of a table; none if it has no poses."""
+    """Return world_from_cam (4, 4), meters, by image; empty if the table has no poses."""
     if "qw" not in rows:
         return {}
     poses = pose_from_qt(rows[list(POSE_NAMES)].to_numpy(float))
@@ -350,9 +350,11 @@ def _poses_of(rows: pd.DataFrame, poses_are: str, axes: str, unit_m: float) -> d
 
 
 def _read_table(path: Path) -> pd.DataFrame:
-    """Read the table of a folder of images, all values as text; adds the column `line`."""
+    """Read the table of a folder of images, all values as text, with the additional column `line`."""
     if _is_transforms(path):
-        raise CaptureError(f"{path}: no CSV table. Is it a transforms.json? Then: python -m toolkit import transforms")
+        raise CaptureError(
+            f"{path}: not a CSV table. Import a transforms.json with: python -m toolkit import transforms"
+        )
     try:
         first = next((line for line in path.read_text().splitlines() if line.strip()), "").split()
         if len(first) > 4 and first[1] in pycolmap.CameraModelId.__members__:
@@ -383,16 +385,16 @@ def _read_table(path: Path) -> pd.DataFrame:
             row = rows.iloc[int(np.argmax(wrong))]
             raise CaptureError(
                 f"{path}, line {row['line']}: found the pose {', '.join(row[list(POSE_NAMES)])}; expected seven finite "
-                "numbers, qw qx qy qz of length 1 and meters."
+                "numbers, qw qx qy qz of length 1 and tx ty tz."
             )
     return rows
 
 
 def _read_hloc_list(path: Path) -> pd.DataFrame:
-    """Read hloc's list of queries, `name MODEL width height parameters` a line without a header, as a table."""
+    """Read hloc's query list, `name MODEL width height parameters` per line without a header, as a table."""
     lines = [line.split(maxsplit=4) for line in path.read_text().splitlines()]
     rows = pd.DataFrame([line + [""] * (5 - len(line)) for line in lines], columns=["image", *_CAMERA_COLUMNS])
-    rows.index += -1  # it has no header, and its first line is the first
+    rows.index += -1  # no header: the first row is line 1, not 2 as in `_read_table`
     return rows
 
 

@@ -1,7 +1,7 @@
-"""Make the zip file that a benchmark takes: the poses of finished runs, checked, under the names that it expects.
+"""Collect and check the poses of finished runs, and write the zip file that a benchmark accepts.
 
-Names and contents are those of the benchmarks' own combine scripts: `description.txt`, and for each pair a text file in
-the trajectories format without covariances. Equal runs and options give equal bytes.
+Names and contents follow the benchmarks' own combine scripts: `description.txt`, and for each pair a text file in the
+trajectories format without covariances. Equal runs and options give equal bytes.
 """
 
 import itertools
@@ -33,18 +33,18 @@ Key = tuple[int, str]
 
 @dataclass(frozen=True)
 class Challenge:
-    """What one benchmark wants in its zip file."""
+    """The zip file that one benchmark expects."""
 
     pairs: tuple[tuple[str, str], ...]
-    """Map and query devices."""
+    """Pairs of map and query device."""
     scenes: dict[str, str] = field(default_factory=dict)
-    """The captures, and what each is called in file names."""
+    """For each capture, its name in file names."""
     file: str = "{scene}_map_{map}_query_{query}.txt"
-    """Name of a pair's file."""
+    """Pattern of a pair's file name."""
     queries: str = "keyframes_pruned_subsampled"
-    """The list of query keyframes to answer."""
+    """List of the query keyframes to be localized."""
     devices: dict[str, str] = field(default_factory=dict)
-    """The benchmark's names of devices that have another name here."""
+    """The benchmark's device names that differ from the toolkit's."""
 
     def file_name(self, scene: str, map_device: str, query_device: str) -> str:
         """Return the name of a pair's file in the zip."""
@@ -73,18 +73,18 @@ class Entry:
     map_device: str
     query_device: str
     name: str
-    """In the zip."""
+    """Its name in the zip."""
     state: str = "complete"
-    """`complete`, or why it is not there or not whole."""
+    """`complete`, or why the file is missing or incomplete."""
     poses: Trajectory | None = None
-    """What is written; None: the pair is missing."""
+    """The poses to write; None: the pair is missing."""
     queries: pd.DataFrame = field(default_factory=pd.DataFrame)
-    """One row a query: timestamp, device_id, pose (`ok`, `low_confidence`, `nearest`, `left out`), reason."""
+    """One row per query: timestamp, device_id, pose (`ok`, `low_confidence`, `nearest`, `left out`), reason."""
     not_asked: int = 0
-    """Poses of the run whose query is not in the list; they are not written."""
+    """Number of poses whose query is not in the list; they are not written."""
 
     def counts(self) -> dict[str, int]:
-        """Return what the table says of the pair, by the names of `COUNTS`."""
+        """Return the counts of the pair, with the keys `COUNTS`."""
         poses = Counter(self.queries.get("pose", ()))
         written = 0 if self.poses is None else len(self.poses)
         by_kind = [poses[kind] for kind in ("ok", "low_confidence", FILLED, LEFT_OUT)]
@@ -93,27 +93,27 @@ class Entry:
 
 @dataclass
 class Submission:
-    """What goes into the zip file, checked."""
+    """The checked content of the zip file."""
 
     description: str
     entries: list[Entry]
     sources: dict[str, str]
-    """Fingerprints of the files that it is made from."""
+    """Fingerprint of the source file of each entry, by entry name."""
     failed: str
     path: Path
 
     @property
     def missing(self) -> list[Entry]:
-        """The pairs that have no file."""
+        """The pairs without a file."""
         return [entry for entry in self.entries if entry.poses is None]
 
     def table(self) -> pd.DataFrame:
-        """Return one row a pair: file, counts, state."""
+        """Return one row per pair: file, counts, state."""
         rows = [{"file": entry.name, **entry.counts(), "state": entry.state} for entry in self.entries]
         return pd.DataFrame(rows, columns=["file", *COUNTS, "state"])
 
     def text(self) -> str:
-        """Return the table, its sums and the missing pairs, as text."""
+        """Return the table, its totals and the missing pairs as text."""
         table = self.table()
         total = table[COUNTS].sum()
         sums = (
@@ -125,10 +125,10 @@ class Submission:
         return f"{table.to_string(index=False, justify='left')}\n\n{sums}{missing}"
 
     def write(self) -> Path:
-        """Write the zip file, and beside it a CSV file with the origin of each query's pose.
+        """Write the zip file, and a CSV file beside it with the origin of each query's pose.
 
         Raises:
-            ToolkitError: there is not one pair to write.
+            ToolkitError: no pair has poses.
         """
         with tempfile.TemporaryDirectory() as folder:
             files = {"description.txt": self.description.encode()}
@@ -140,7 +140,7 @@ class Submission:
             raise ToolkitError(f"Nothing to submit: none of the {len(self.entries)} pairs has poses.\n{self.text()}")
         with write_atomic(self.path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
             for name, content in files.items():
-                # A fixed time, system and mode: the same poses give the same bytes.
+                # Time, system and mode are fixed, so the same poses give the same bytes.
                 info = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
                 info.compress_type, info.create_system, info.external_attr = zipfile.ZIP_DEFLATED, 3, 0o644 << 16
                 archive.writestr(info, content)
@@ -162,25 +162,26 @@ def collect(
     captures: Sequence[str | Path] = (),
     sequence: bool = False,
 ) -> Submission:
-    """Gather and check the poses of runs for submission; `.write()` then writes the zip file.
+    """Collect and check the poses of runs for submission; `.write()` then writes the zip file.
 
-    If the runs hold a scene of a challenge, all scenes and pairs of the challenge are expected, and those without poses
-    are listed as missing. Otherwise all scenes of the runs are taken, with the pairs that their captures have.
+    If the runs contain a scene of a challenge, all scenes and pairs of the challenge are expected, and those without
+    poses are listed as missing. Otherwise the submission has all scenes of the runs with the pairs of their captures.
 
     Args:
-        runs: run folders, `<output_root>/<manifest name>`; scenes and pairs may be spread over several.
-        description: a text, or the name of a file that holds it.
+        runs: run folders, `<output_root>/<manifest name>`; scenes and pairs may be distributed over several.
+        description: a text, or the name of a file with the text.
         out: the zip file; None: `submission.zip` in the first run folder.
-        failed: what is written for a query without a pose: `nearest`, the pose of the best retrieved reference, or
+        failed: what to write for a query without a pose: `nearest`, the pose of the best retrieved reference, or
             `leave-out`, nothing.
-        queries: the list of query keyframes to answer, in the query session's `proc/`; None: the challenge's.
-        scenes: only these; none: see above.
+        queries: list of the query keyframes to be localized, in the query session's `proc/`; None: the challenge's.
+        scenes: only these scenes; default: see above.
         captures: folders of captures that have moved since the runs.
-        sequence: take the poses of the stage `sequence`, and not those of single queries.
+        sequence: use the poses of the stage `sequence` instead of those of single queries.
 
     Raises:
         ManifestError: an unknown value, no such run, or a file that cannot be read as a description.
-        ArtifactError: a pair is in two runs, or a poses file has a key twice or a quaternion that is not unit.
+        ArtifactError: two runs have the same pair, or a poses file has a duplicate key or a quaternion that is not of
+            unit length.
         CaptureError: a malformed poses file, or no such keyframe list; names file and line.
     """
     if failed not in FAILED:
@@ -194,19 +195,20 @@ def collect(
         raise ManifestError(f"{', '.join(map(str, folders))}: no poses in it. Run the manifest first.")
     challenge = next((rules for rules in (LAMAR, CROCODL) if present & rules.scenes.keys()), None)
     expected = challenge.scenes if challenge else {}
-    places = Captures(folders, captures, sorted(present.union(scenes, expected)))
+    captures_by_scene = Captures(folders, captures, sorted(present.union(scenes, expected)))
     out = Path(out) if out else folders[0] / "submission.zip"
     submission = Submission(_description(description), [], {}, failed, out)
     for scene in scenes or expected or sorted(present):
         if challenge and scene in expected:
             rules = challenge
-        else:  # of no challenge: every pair that the capture has
-            devices = places[scene].devices_with("map"), places[scene].devices_with("query")
-            rules = Challenge(tuple(itertools.product(*devices)))
+        else:  # not part of a challenge: all pairs of the capture
+            capture = captures_by_scene[scene]
+            rules = Challenge(tuple(itertools.product(capture.devices_with("map"), capture.devices_with("query"))))
         for map_device, query_device in rules.pairs:
             entry = Entry(scene, map_device, query_device, rules.file_name(scene, map_device, query_device))
             submission.entries.append(entry)
-            _fill_entry(entry, folders, places, queries or rules.queries, failed, submission.sources, sequence)
+            keyframes = queries or rules.queries
+            _fill_entry(entry, folders, captures_by_scene, keyframes, failed, submission.sources, sequence)
     total = submission.table()[COUNTS].sum()
     if total["filled"]:
         submission.description += (
@@ -217,42 +219,42 @@ def collect(
 
 
 class Captures(dict[str, Capture]):
-    """The capture of each scene, by name: in the folder that the user gives, else where the runs found it."""
+    """The capture of each scene, opened from the folder given by the user, else from the folder recorded in a run."""
 
     def __init__(self, runs: Iterable[Path], given: Iterable[str | Path], scenes: Sequence[str]) -> None:
         """
         Args:
-            given: capture folders that the user gives; each has the name of one of the `scenes`.
+            given: capture folders given by the user; each must have the name of one of the `scenes`.
 
         Raises:
             ManifestError: a given folder has another name.
         """
-        self._places: dict[str, Path] = {}
+        self._folders: dict[str, Path] = {}
         for run in runs:
             try:
                 rows = json.loads((run / "run.json").read_text(encoding="utf-8"))["stages"]
-                self._places |= {row["scene"]: Path(row["parameters"]["sessions_root"]).parent for row in rows}
+                self._folders |= {row["scene"]: Path(row["parameters"]["sessions_root"]).parent for row in rows}
             except (OSError, ValueError, KeyError, TypeError):
-                continue  # poses of another tool, or stages run by hand: then the captures must be given
+                continue  # poses of another tool, or stages run by hand: the user must give the captures
         for path in map(Path, given):
             if path.resolve().name not in scenes:
-                raise ManifestError(f"{path}: a capture of another name than the scene. Expected {', '.join(scenes)}.")
-            self._places[path.resolve().name] = path.resolve()
+                raise ManifestError(f"{path}: the folder has no scene's name. Expected {', '.join(scenes)}.")
+            self._folders[path.resolve().name] = path.resolve()
 
     def __missing__(self, scene: str) -> Capture:
-        if scene not in self._places:
+        if scene not in self._folders:
             raise ManifestError(f"{scene}: the runs do not say where this capture is. Give it: --capture PATH/{scene}.")
         try:
-            self[scene] = Capture.open(self._places[scene])
+            self[scene] = Capture.open(self._folders[scene])
         except CaptureError as error:
             raise ManifestError(f"{scene}: {error} Give the folder: --capture PATH/{scene}.") from None
         return self[scene]
 
 
 def _description(text: str) -> str:
-    """Return the text, or the content of the file of that name."""
+    """Return the text, or the content of the file with this name."""
     path = Path(text)
-    if os.path.isfile(text):  # noqa: PTH113 - a long text is no file name, and no error
+    if os.path.isfile(text):  # noqa: PTH113 - Path.is_file raises an error for a long text
         try:
             text = path.read_text(encoding="utf-8")
         except UnicodeDecodeError as error:
@@ -266,14 +268,14 @@ def _fill_entry(
     entry: Entry, runs: Sequence[Path], captures: Captures, queries: str, failed: str, sources: dict[str, str],
     sequence: bool,
 ) -> None:  # fmt: skip
-    """Read the poses of a pair from the run that has them, and set what is written for each query of the list."""
+    """Read the poses of a pair from the run that has them, and choose the pose to write for each query of the list."""
     pair = (entry.map_device, entry.query_device)
-    of_runs = [SceneFiles(run, entry.scene) for run in runs]
-    paths = [files.sequence_txt(*pair) if sequence else files.poses_txt(*pair) for files in of_runs]
-    with_poses = [(files, path) for files, path in zip(of_runs, paths, strict=True) if path.is_file()]
+    scenes = [SceneFiles(run, entry.scene) for run in runs]
+    paths = [files.sequence_txt(*pair) if sequence else files.poses_txt(*pair) for files in scenes]
+    with_poses = [(files, path) for files, path in zip(scenes, paths, strict=True) if path.is_file()]
     if not with_poses:
-        what = "poses of the stage `sequence`" if sequence else "poses"
-        entry.state = f"missing: no {what} in " + ", ".join(str(files.poses_dir) for files in of_runs)
+        kind = "poses of the stage `sequence`" if sequence else "poses"
+        entry.state = f"missing: no {kind} in " + ", ".join(str(files.poses_dir) for files in scenes)
         return
     if len(with_poses) > 1:
         both = " and ".join(str(path) for _, path in with_poses)
@@ -307,21 +309,22 @@ def _fill_entry(
 
 
 def _read_poses(path: Path) -> Trajectory:
-    """Read a poses file; refuses one that has a key twice or a quaternion that is not unit."""
+    """Read a poses file. Raise ArtifactError for a duplicate key or a quaternion that is not of unit length."""
     table = read_table(path, COLUMNS["trajectories.txt"])
     poses = Trajectory.from_table(table)
     repeated = poses.index.repeated()
     lengths = np.linalg.norm(poses.qt[:, :4], axis=1)
     wrong = np.flatnonzero(np.abs(lengths - 1) > UNIT_TOLERANCE)
-    for rows, what in ((repeated, "is there twice"), (wrong, "has a quaternion that is not of length 1")):
+    for rows, problem in ((repeated, "occurs twice"), (wrong, "has a quaternion that is not of length 1")):
         if len(rows):
             key = f"(timestamp {poses.timestamps[rows[0]]}, device {poses.device_ids[rows[0]]!r})"
-            raise ArtifactError(f"{table.where(rows[0])}: {key} {what}. Localize this pair again, or correct the line.")
+            where = table.where(rows[0])
+            raise ArtifactError(f"{where}: {key} {problem}. Localize this pair again, or correct the line.")
     return poses
 
 
 def _statuses(path: Path) -> dict[Key, str]:
-    """Return the status of each query in a run's table of a pair; none where the run has no table."""
+    """Return the status of each query in a run's table of a pair; empty if the run has no table."""
     if not path.is_file():
         return {}
     table = read_query_table(path, ["status"])
@@ -329,10 +332,10 @@ def _statuses(path: Path) -> dict[Key, str]:
 
 
 def _nearest_references(path: Path) -> tuple[dict[Key, np.ndarray], str]:
-    """Return for each query a pose that stands in for its own, and what to say of queries that have none.
+    """Return substitute poses for queries that were not localized, and the reason why other queries have none.
 
-    The pose, world_from_device (4, 4), puts the camera whose first reference has the best score of all at the place of
-    that reference.
+    Of all cameras of a query, take the one whose first reference has the best score, and give it the pose of that
+    reference. The substitutes are world_from_device (4, 4).
     """
     if not path.is_file():
         return {}, f"no retrieval to fill it from: {path} is missing"

@@ -1,18 +1,18 @@
-"""Import of transforms.json, in which nerfstudio and instant-ngp keep images, cameras and poses.
+"""Import transforms.json, the format in which nerfstudio and instant-ngp store images, cameras and poses.
 
-What is read, of the file or, first, of each of its `frames`:
+Each entry of `frames` may have these keys; keys it lacks are read from the top level of the file (not `file_path`):
 
-- `file_path`: relative to the folder of the file, with or without extension. `transform_matrix`: world_from_cam, whose
-  camera has the axes of OpenGL: x right, y up, z backward.
-- `fl_x fl_y cx cy` in pixels, `w h`; or, in place of the focal lengths, `camera_angle_x camera_angle_y`, the fields of
-  view in radians: f = (w / 2) / tan(angle / 2). As in COLMAP, whose numbers these are, the center of the top-left pixel
-  is (0.5, 0.5).
-- `k1 k2 k3 p1 p2`: the distortion of OpenCV. For `camera_model` OPENCV_FISHEYE, or `is_fisheye`, `k1 k2 k3 k4` are that
-  of OpenCV's fisheye model (J. Kannala and S. Brandt, "A generic camera model and calibration method for conventional,
-  wide-angle, and fish-eye lenses", PAMI 2006).
+- `file_path`: relative to the folder of the file, with or without extension. `transform_matrix`: world_from_cam with
+  OpenGL camera axes: x right, y up, z backward.
+- `fl_x fl_y cx cy` in pixels, `w h`. Instead of the focal lengths, `camera_angle_x camera_angle_y` may give the fields
+  of view in radians: f = (w / 2) / tan(angle / 2). The center of the top-left pixel is (0.5, 0.5), as in COLMAP, where
+  these numbers come from.
+- `k1 k2 k3 p1 p2`: OpenCV distortion. If `camera_model` is OPENCV_FISHEYE or `is_fisheye` is set, `k1 k2 k3 k4` are the
+  coefficients of OpenCV's fisheye model (J. Kannala and S. Brandt, "A generic camera model and calibration method for
+  conventional, wide-angle, and fish-eye lenses", PAMI 2006).
 
-What is for rendering alone (`aabb_scale`, `scale`, `offset`, masks, depths) is passed over, and so is
-`applied_transform`, which the matrices already have in them.
+Keys for rendering (`aabb_scale`, `scale`, `offset`, masks, depths) are ignored. So is `applied_transform`, because the
+matrices already include it.
 """
 
 import json
@@ -35,7 +35,7 @@ from toolkit.geometry import Floats
 PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 FISHEYE = "OPENCV_FISHEYE"
 TOLERANCE = 1e-3
-"""Of a rotation: by so much its columns may be off from unit length and right angles."""
+"""Largest deviation of R^T R from the identity, per element, that still counts as a rotation."""
 
 
 def import_transforms(
@@ -48,26 +48,27 @@ def import_transforms(
     unit_m: float | None = None,
     hold_out: int = 0,
 ) -> list[ImportReport]:
-    """Make a session, or two, of the frames of a transforms.json; images keep their `file_path` as names.
+    """Make a session, or a map and a query session, from a transforms.json. Images keep their `file_path` as names.
 
     Args:
-        capture, device, split, placing: as of `interchange.import_colmap`.
-        axes: those of the cameras that the matrices are of, see `drafts.AXES`.
-        unit_m: meters in a unit of the poses; None: not known, as after structure from motion. Poses are then kept as
-            they are, and the session says so.
-        hold_out: every so many frames of a map, in order of their names, becomes a query with ground truth instead;
+        capture, device, split, placing: as for `interchange.import_colmap`.
+        axes: camera axes of the matrices, see `drafts.AXES`.
+        unit_m: meters per unit of the poses; None: unknown, as after structure from motion. The poses are then not
+            scaled, and the session records that their unit is unknown.
+        hold_out: every `hold_out`-th frame of a map, in order of names, becomes a query with ground truth instead;
             0: none.
 
     Returns:
-        The reports of the sessions: the map's first.
+        The reports of the sessions, the map first.
 
     Raises:
-        CaptureError: a malformed file (names frame and key), a session exists already, or no image is left of one.
-        ManifestError: an unknown split, placing or axes, a unit that is no length, or frames that cannot be held out.
+        CaptureError: a malformed file (names frame and key), or a session that exists already or has no usable image.
+        ManifestError: an unknown split, placing or axes, a unit that is not a positive length, or an invalid
+            `hold_out`.
     """
     require_convention(axes, 1.0 if unit_m is None else unit_m)
     if hold_out and (hold_out < 2 or split != "map"):
-        raise ManifestError(f"hold-out: found {hold_out} for a {split}, expected 2 or more, of a map.")
+        raise ManifestError(f"hold-out: found {hold_out} for a {split}, expected 2 or more, for a map.")
     path = Path(path)
     splits = (split, "query") if hold_out else (split,)
     drafts = [start(capture, device, name, path.parent, placing) for name in splits]
@@ -76,29 +77,30 @@ def import_transforms(
     for number, entry in enumerate(content["frames"]):
         frame = _Frame(path, number, entry, content)
         if frame.name in frames:
-            raise frame.error("file_path", f"that of frame {frames[frame.name].number} again", "one frame an image")
+            raise frame.error("file_path", f"that of frame {frames[frame.name].number} again", "one frame per image")
         frames[frame.name] = frame
     if hold_out > len(frames):
         raise ManifestError(f"hold-out: found {hold_out}, but there are {len(frames)} frames. Give a smaller number.")
-    for place, name in enumerate(sorted(frames)):
-        draft = drafts[1 if hold_out and place % hold_out == hold_out - 1 else 0]
+    for index, name in enumerate(sorted(frames)):
+        draft = drafts[1 if hold_out and index % hold_out == hold_out - 1 else 0]
         pose = posed_camera(frames[name].world_from_named(), axes, unit_m or 1.0)
         try:
             draft.add(name, frames[name].camera(), pose)
         except ImageError as error:
             draft.rows.append({"image": name, "status": str(error)})
     folders = {PurePosixPath(name).parent for name in frames}
-    beside = [one for folder in folders for one in (path.parent / folder).glob("*")]
-    images = {one.relative_to(path.parent).as_posix() for one in beside if one.suffix.lower() in IMAGE_SUFFIXES}
-    others = images - set(frames)
-    if others:
-        drafts[0].notes.append(f"{len(others)} images beside these are not in {path.name}")
+    files = [file for folder in folders for file in (path.parent / folder).glob("*")]
+    images = {file.relative_to(path.parent).as_posix() for file in files if file.suffix.lower() in IMAGE_SUFFIXES}
+    not_in_file = images - set(frames)
+    if not_in_file:
+        drafts[0].notes.append(f"{len(not_in_file)} images beside these are not in {path.name}")
     for draft in drafts:
         if unit_m is None:
             draft.unit = None
             draft.notes.append(
-                "unit of the poses: not known. Say how many meters it has by --unit METERS (1 where a phone's tracking "
-                "or a scanner gave the poses); else set `unit: null` in the manifest, as `python -m toolkit new` does"
+                "unit of the poses: not known. If you know its length in meters, give --unit METERS (1 if a phone's "
+                "tracking or a scanner gave the poses); else set `unit: null` in the manifest, as `python -m toolkit "
+                "new` does"
             )
     return [draft.write() for draft in drafts]
 
@@ -118,25 +120,25 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 class _Frame:
-    """One image of the file; its own values go before those of the file."""
+    """One image of the file. Its own values override those at the top level."""
 
     def __init__(self, path: Path, number: int, entry: Mapping[str, Any], shared: Mapping[str, Any]) -> None:
         self.path, self.number, self.values = path, number, {**shared, **entry}
-        found = entry.get("file_path")
-        if not isinstance(found, str) or not found.strip() or re.search("[\ud800-\udfff]", found):
-            raise self.error("file_path", repr(found)[:80], "the path of an image, relative to the folder of this file")
-        self.name = self._with_suffix(found.replace("\\", "/"))
+        image = entry.get("file_path")
+        if not isinstance(image, str) or not image.strip() or re.search("[\ud800-\udfff]", image):
+            raise self.error("file_path", repr(image)[:80], "the path of an image, relative to the folder of this file")
+        self.name = self._with_suffix(image.replace("\\", "/"))
 
-    def _with_suffix(self, found: str) -> str:
-        """Return the path of an image relative to the folder of the file, with the extension that may be missing."""
-        name = os.path.normpath(os.path.relpath(found, self.path.parent) if found.startswith("/") else found)
+    def _with_suffix(self, image: str) -> str:
+        """Return an image's path relative to the folder of the file, with its extension added if it is missing."""
+        name = os.path.normpath(os.path.relpath(image, self.path.parent) if image.startswith("/") else image)
         suffixes = ["", *IMAGE_SUFFIXES, *map(str.upper, IMAGE_SUFFIXES)]
-        name = next((name + one for one in suffixes if is_file(self.path.parent / (name + one))), name)
+        name = next((name + suffix for suffix in suffixes if is_file(self.path.parent / (name + suffix))), name)
         return Path(name).as_posix()
 
     def error(self, key: str, found: str, expected: str) -> CaptureError:
-        of = getattr(self, "name", "")
-        frame = f"frame {self.number}" + (f" ({of})" if of else "")
+        image = getattr(self, "name", "")
+        frame = f"frame {self.number}" + (f" ({image})" if image else "")
         return CaptureError(f"{self.path}, {frame}, {key}: found {found}; expected {expected}. Correct it in the file.")
 
     def _number(self, key: str, expected: str, default: float | None = None) -> float:
@@ -146,18 +148,18 @@ class _Frame:
         return float(value)
 
     def world_from_named(self) -> Floats:
-        """Return the pose as it is, (4, 4): of a camera with the file's axes, in its unit."""
-        found = self.values.get("transform_matrix")
+        """Return world_from_camera (4, 4) as stored, with the file's camera axes and unit."""
+        rows = self.values.get("transform_matrix")
         expected = "4 rows of 4 finite numbers, world_from_cam, the last row 0 0 0 1"
         try:
-            matrix = np.array(found, np.float64)
+            matrix = np.array(rows, np.float64)
         except (TypeError, ValueError, OverflowError):
-            raise self.error("transform_matrix", repr(found)[:80], expected) from None
+            raise self.error("transform_matrix", repr(rows)[:80], expected) from None
         if matrix.shape == (3, 4):
             matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
         is_pose = matrix.shape == (4, 4) and np.allclose(matrix[3], [0, 0, 0, 1])
         if not is_pose or not (np.abs(matrix) < FARTHEST_M).all():
-            raise self.error("transform_matrix", repr(found)[:80], expected)
+            raise self.error("transform_matrix", repr(rows)[:80], expected)
         rotation = matrix[:3, :3]
         if np.abs(rotation.T @ rotation - np.eye(3)).max() > TOLERANCE or np.linalg.det(rotation) < 0:
             expected = "a rotation: columns of length 1 at right angles, x cross y = z"
@@ -168,8 +170,8 @@ class _Frame:
         """Return the intrinsics.
 
         Raises:
-            ImageError: they do not say the size of the image, and it cannot be read.
-            CaptureError: they are missing or malformed.
+            ImageError: the file does not state the image size, and the image header cannot be read.
+            CaptureError: the intrinsics are missing or malformed.
         """
         pixels = "pixels, a number"
         size = [self._number(key, pixels) for key in "wh" if key in self.values]
@@ -196,15 +198,15 @@ class _Frame:
         return self._number(f"fl_{axis}", "a focal length in pixels, or camera_angle_x in radians", default)
 
     def _distortion(self) -> tuple[str, list[float]]:
-        """Return the model of COLMAP, and its parameters after the principal point."""
+        """Return the COLMAP camera model and its parameters after the principal point."""
         model = self.values.get("camera_model", FISHEYE if self.values.get("is_fisheye") else "OPENCV")
         if model not in (*PERSPECTIVE, FISHEYE):
-            expected = f"one of {', '.join((*PERSPECTIVE, FISHEYE))}, the models that images are localized with"
+            expected = f"one of {', '.join((*PERSPECTIVE, FISHEYE))}, the supported models"
             raise self.error("camera_model", repr(model)[:80], expected)
         k1, k2, k3, k4, p1, p2 = (self._number(key, "a number", 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
         if model == FISHEYE:
             if p1 or p2:
-                raise self.error("p1, p2", f"{p1:g}, {p2:g}", f"0, 0, which {FISHEYE} does not have")
+                raise self.error("p1, p2", f"{p1:g}, {p2:g}", f"0, 0, because {FISHEYE} has no such coefficients")
             return FISHEYE, [k1, k2, k3, k4]
         if k4:
             raise self.error("k4", f"{k4:g}", f"0 for {model}: COLMAP's models have no term in r^8. Is it {FISHEYE}")

@@ -1,3 +1,3 @@
-"""A rendered capture with exact ground truth, for demos, tests and benchmarks."""
+"""Render captures with exact ground truth, for demos, tests and benchmarks."""
 
 from toolkit.synthetic.capture import render_capture, render_street

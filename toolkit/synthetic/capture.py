@@ -1,8 +1,8 @@
-"""A rendered capture: textured rooms seen by a phone, a headset and a robot, with exact ground truth.
+"""Render a synthetic capture: textured rooms seen by a phone, a headset and a robot, with exact ground truth.
 
-Poses, intrinsics and depths are exact. The world has z up and meters; the rooms stand far apart. All randomness comes
-from the seed and the name of the thing that is drawn, never from the order of work: the bytes do not depend on the
-number of cores.
+Poses, intrinsics and depths are exact. The world frame has z up and is in meters; the rooms are far apart. Each random
+generator is seeded by the seed and the name of the thing it draws, not by the order of work, so the bytes do not depend
+on the number of cores.
 """
 
 import ctypes
@@ -33,46 +33,46 @@ from toolkit.synthetic.textures import Image
 if TYPE_CHECKING:
     import pycolmap
 
-FORMAT = 2  # raise it when the same settings give other bytes
+FORMAT = 2  # increase it when the same settings produce other bytes
 
 
 @dataclass(frozen=True)
 class World:
-    """What is rendered: places along a way, and how often they are photographed."""
+    """Settings of the rendered world. A place is a room, or a block of the street."""
 
-    places: int  # rooms, or blocks of a street
-    frames: int  # a place and map session
-    queries: int  # a place and query session
+    places: int
+    frames: int  # map frames per place
+    queries: int  # query frames per place
     seed: int
     look_alikes: bool = False
-    street: bool = False  # else rooms
+    street: bool = False  # a street instead of rooms
     alike: bool = False
-    seconds: int = 0  # of a query recording; 0: as long as its pictures take
-    losses: int = 0  # of tracking, a query recording
-    gaps: int = 0  # in its odometry
+    seconds: int = 0  # length of a query recording; 0: as long as its images take
+    losses: int = 0  # tracking losses per query recording
+    gaps: int = 0  # gaps in the odometry of a query recording
     radio: bool = False
 
     @property
     def devices(self) -> dict[str, Device]:
-        """Who walks there. In a street a phone with small pictures, for many images in little time."""
+        """The recording devices. A street has only a phone with small images, to render many images fast."""
         return {"ios": halved(DEVICES["ios"])} if self.street else DEVICES
 
     @property
     def hours(self) -> int:
-        """Whole hours that are enough for one subsession."""
+        """Whole hours that are long enough for one subsession."""
         return 1 + int(max(PICTURE_S * self.places * (self.frames + 8), self.seconds) / 3600)
 
     @property
     def stay_s(self) -> float:
-        """Seconds in a room of a recording that is `seconds` long; half as many are the way to the next."""
+        """Seconds spent in each room of a recording of length `seconds`; the walk to the next room takes half of it."""
         return self.seconds / (1.5 * self.places - 0.5)
 
     def look(self, index: int) -> int:
-        """Return which place a place looks like."""
+        """Return the index of the place whose appearance a place has."""
         return 0 if self.alike and index == self.places - 1 else index
 
     def build(self, index: int) -> Scene:
-        """Return a place without its textures."""
+        """Return a place without textures."""
         if not self.street:
             return build_room(self.seed, index, self.look(index))
         block = build_block(self.seed, index)
@@ -80,7 +80,7 @@ class World:
         return block
 
     def walk(self, scene: Scene, index: int, name: str) -> dict[tuple[str, int], Floats]:
-        """Return the poses world_from_body of one device in one place, by split and subsession."""
+        """Return the poses world_from_body (N, 4, 4) of one device in one place, by split and subsession number."""
         if self.street:
             return walk_street(scene, self.seed, {"map": self.frames, "query": self.queries}, name)
         return walks(scene, self.seed, index, self.frames, name)
@@ -88,12 +88,12 @@ class World:
 
 @dataclass
 class Shot:
-    """One picture to take."""
+    """One image to render."""
 
     session: str
     timestamp: int
     sensor_id: str
-    path: str  # below raw_data/
+    path: str  # relative to raw_data/
     depth_path: str | None
     camera: "pycolmap.Camera"
     world_from_cam: Floats
@@ -102,20 +102,20 @@ class Shot:
 
 @dataclass
 class Tables:
-    """The rows of a session's files, as they are collected."""
+    """The rows of a session's text files."""
 
     sensors: dict[str, tuple[Any, ...]] = field(default_factory=dict)
     rigs: list[tuple[int, str, str, Floats]] = field(default_factory=list)
     poses: list[tuple[int, str, Floats]] = field(default_factory=list)
     images: list[tuple[int, str, str]] = field(default_factory=list)
     depths: list[tuple[int, str, str]] = field(default_factory=list)
-    subsessions: dict[str, int] = field(default_factory=dict)  # the start of each, microseconds
+    subsessions: dict[str, int] = field(default_factory=dict)  # start time of each, microseconds
 
     def add_frame(
         self, name: str, device: Device, subsession: str, timestamp: int, zoom: float = 1.0
     ) -> tuple[str, Floats]:
-        """Add the sensors of a frame; return the id of the device that is posed, and body_from_device (4, 4)."""
-        if name == "ios":  # a phone focuses anew for every picture
+        """Add the sensors of a frame; return the id of the camera or rig to be posed, and body_from_device (4, 4)."""
+        if name == "ios":  # a phone refocuses for each image, so each image has its own intrinsics
             (sensor,) = device.sensors
             sensor_id, *_ = _names(name, sensor, subsession, timestamp)
             params = [round(f * zoom, 3) for f in sensor.params[:2]] + list(sensor.params[2:])
@@ -134,20 +134,20 @@ class Tables:
 
 
 def _subsession(name: str, split: str, part: int, hours: int) -> tuple[str, int]:
-    """Return a subsession's name and its first timestamp, microseconds, on the device's clock."""
-    after_s = (2 * part + (split == "query")) * hours * 3600 + {"ios": 0, "hl": 600, "spot": 1200}[name]
-    after_us = after_s * 10**6
-    day = 1714557600 * 10**6 + after_us  # 2024-05-01 10:00 UTC
-    stamp = time.gmtime(day // 10**6)
+    """Return a subsession's name and its start on the device's clock, microseconds."""
+    offset_s = (2 * part + (split == "query")) * hours * 3600 + {"ios": 0, "hl": 600, "spot": 1200}[name]
+    offset_us = offset_s * 10**6
+    start_us = 1714557600 * 10**6 + offset_us  # 2024-05-01 10:00 UTC
+    date = time.gmtime(start_us // 10**6)
     if name == "ios":
-        return time.strftime("ios_%Y-%m-%d_%H.%M.%S_000", stamp), 630_000_000_000 + after_us
+        return time.strftime("ios_%Y-%m-%d_%H.%M.%S_000", date), 630_000_000_000 + offset_us
     if name == "hl":
-        return time.strftime("hl_%Y-%m-%d-%H-%M-%S-417", stamp), 93_000_000_000 + after_us
-    return time.strftime("spot_%Y-%m-%d-%H-%M", stamp), day
+        return time.strftime("hl_%Y-%m-%d-%H-%M-%S-417", date), 93_000_000_000 + offset_us
+    return time.strftime("spot_%Y-%m-%d-%H-%M", date), start_us
 
 
 def _names(name: str, sensor: Sensor, subsession: str, timestamp: int) -> tuple[str, str, str]:
-    """Return the id of a device's sensor, the folder of its pictures and the stem of one's file name."""
+    """Return a sensor's id, the folder of its images and the file stem of the image at a timestamp."""
     if name == "ios":
         return f"{subsession}/cam_phone_{timestamp}", "images/", str(timestamp)
     if name == "hl":
@@ -157,7 +157,7 @@ def _names(name: str, sensor: Sensor, subsession: str, timestamp: int) -> tuple[
 
 
 def _plan_place(world: World, scene: Scene, index: int, tables: dict[str, Tables]) -> Iterator[Shot]:
-    """Add one place's frames to the tables of all sessions, and yield its pictures."""
+    """Add one place's frames to the tables of all sessions, and yield its images."""
     import pycolmap
 
     for name, device in world.devices.items():
@@ -168,11 +168,11 @@ def _plan_place(world: World, scene: Scene, index: int, tables: dict[str, Tables
             rng = named_rng(world.seed, index, "frames", name, split, part)
             for i, world_from_body in enumerate(bodies):
                 if world.seconds and split == "query":
-                    after_s = world.stay_s * (1.5 * index + (i + rng.uniform(0.2, 0.8)) / len(bodies))
-                    timestamp = start + int(1e6 * after_s)
+                    offset_s = world.stay_s * (1.5 * index + (i + rng.uniform(0.2, 0.8)) / len(bodies))
+                    timestamp = start + int(1e6 * offset_s)
                 else:
-                    after_s = 5 + PICTURE_S * (index * (world.frames + 8) + i)
-                    timestamp = start + int(1e6 * after_s + rng.integers(0, 700_000))
+                    offset_s = 5 + PICTURE_S * (index * (world.frames + 8) + i)
+                    timestamp = start + int(1e6 * offset_s + rng.integers(0, 700_000))
                 zoom = float(np.round(rng.normal(1, 0.004), 5))
                 device_id, body_from_device = table.add_frame(name, device, subsession, timestamp, zoom)
                 table.poses.append((timestamp, device_id, world_from_body @ body_from_device))
@@ -191,13 +191,13 @@ def _plan_place(world: World, scene: Scene, index: int, tables: dict[str, Tables
 
 
 def _take(shot: Shot, quads: list[Quad], rays: Rays | None, sessions: Path, seed: int) -> None:
-    """Render one picture as its device sees it, and its depth, into the session's raw_data."""
+    """Render one image with its device's exposure, tint and noise, and its depth, into the session's raw_data."""
     device = shot.device
     picture, depth = render(quads, shot.world_from_cam, rays or Rays.of(shot.camera), device.gray)
     h, w = depth.shape
     y, x = np.ogrid[0:h, 0:w]
     radius2 = ((x - w / 2) ** 2 + (y - h / 2) ** 2).astype(np.float32) / ((w / 2) ** 2 + (h / 2) ** 2)
-    # Exposure follows the scene only half way, as it does in a device that must not flicker.
+    # Exposure compensates for the scene's brightness only in part, like a camera that must not flicker.
     gain = (device.brightness / max(float(picture.mean()), 20.0)) ** 0.7
     picture = np.clip(picture * (gain / 255), 0, None) ** device.gamma * 255
     picture *= (1 - device.vignette * radius2).reshape(h, w, *[1] * (picture.ndim - 2))
@@ -215,20 +215,20 @@ def _take(shot: Shot, quads: list[Quad], rays: Rays | None, sessions: Path, seed
 
 def _save(path: Path, image: Image, options: list[int]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    done, encoded = cv2.imencode(path.suffix, image, options)
-    if not done:
-        raise CaptureError(f"Cannot encode {path} from an array {image.shape} {image.dtype}.")
+    ok, encoded = cv2.imencode(path.suffix, image, options)
+    if not ok:
+        raise CaptureError(f"{path}: cannot encode an image of shape {image.shape} and type {image.dtype}.")
     path.write_bytes(encoded.tobytes())
 
 
 def _poses_between(table: Tables, world: World, name: str) -> list[tuple[int, str, Floats]]:
-    """Return the poses of all frames of `world.seconds` long recordings, which have pictures now and then."""
+    """Return the poses of all frames of recordings of length `world.seconds`. Only some frames have images."""
     poses = []
     for recording, start in table.subsessions.items():
-        own = sorted((row for row in table.poses if row[1].startswith(f"{recording}/")), key=lambda row: row[:2])
-        device_ids = {time: device_id for time, device_id, _ in own}
-        pictures = np.array([row[0] for row in own]), np.stack([row[2] for row in own])
-        for time_us, pose in zip(*every_frame(*pictures, start, world.seconds), strict=True):
+        rows = sorted((row for row in table.poses if row[1].startswith(f"{recording}/")), key=lambda row: row[:2])
+        device_ids = {time: device_id for time, device_id, _ in rows}
+        times, pictured_poses = np.array([row[0] for row in rows]), np.stack([row[2] for row in rows])
+        for time_us, pose in zip(*every_frame(times, pictured_poses, start, world.seconds), strict=True):
             if int(time_us) not in device_ids:
                 device_ids[int(time_us)] = table.add_frame(name, world.devices[name], recording, int(time_us))[0]
             poses.append((int(time_us), device_ids[int(time_us)], pose))
@@ -236,10 +236,10 @@ def _poses_between(table: Tables, world: World, name: str) -> list[tuple[int, st
 
 
 def _write_session(path: Path, world: World, table: Tables, rooms: list[Scene]) -> None:
-    """Write the text files of a session, rows in order of time; queries have odometry.
+    """Write the text files of a session, rows ordered by time. Query sessions get odometry instead of true poses.
 
     Args:
-        rooms: where radio signals are scanned; none: no scans.
+        rooms: all rooms, in which radio signals are scanned; empty: no scans.
     """
     import pandas as pd
 
@@ -262,7 +262,7 @@ def _write_session(path: Path, world: World, table: Tables, rooms: list[Scene]) 
             table.sensors[sensor_id] = (sensor_id, f"{kind} sensor", {"bt": "bluetooth"}.get(kind, kind))
             rng, emitters = named_rng(world.seed, kind, recording), emitters_of(world.seed, rooms, kind)
             scanned.setdefault(kind, []).extend(scans(rng, times[rows], measured[rows], emitters, rooms, sensor_id))
-        if split == "query":  # a map of few images would have pieces without any
+        if split == "query":  # in a map session of few images, some pieces of odometry would contain no image
             rng, device = named_rng(world.seed, "odometry", recording), world.devices[name]
             parts = PICTURE_S * RATE_HZ if long else 1.0
             kept[rows], measured[rows] = tracked(
@@ -303,38 +303,39 @@ def render_capture(
 ) -> Path:
     """Render a capture of `rooms` rooms by a phone, a headset and a robot; return its folder.
 
-    Each device has a map and a query session of two subsessions; each subsession walks through all rooms. A
-    folder that holds this very capture already is left as it is. Time grows with rooms * frames, memory not.
+    Each device has a map and a query session of two subsessions; each subsession walks through all rooms. If the
+    folder contains this capture already, nothing is done. Time grows with rooms * frames, memory does not.
 
     Args:
-        out: the capture's folder; its name is the scene's. Settings are kept in `demo.json` in it.
-        rooms: how many rooms, at least 1.
-        frames: frames (rig poses) a room and map session, at least 2; query sessions have half as many.
-        seed: of everything; the same seed gives the same bytes.
-        look_alikes: whether doors, windows, shelves, cabinets and crates come in few models, the same in all rooms,
-            which are easily taken for one another.
-        alike: whether the last room looks exactly as the first.
-        seconds: length of a query recording, at least 20 a room; it then has odometry also between its pictures, five
-            poses a second. 0: as long as the pictures take, one in 1.4 s, and poses of these alone.
-        losses: how often tracking is lost in a query recording: from there on its odometry is in another frame.
-        gaps: how often such odometry has no poses for 4 s. Both need `seconds`.
-        radio: whether sessions have scans of WiFi (the phone has none) and Bluetooth, of emitters in and about rooms.
+        out: the capture's folder; its name is the scene's name. `demo.json` in it records the settings.
+        rooms: number of rooms, at least 1.
+        frames: frames (rig poses) per room and map session, at least 2; query sessions have half as many.
+        seed: the same seed gives the same bytes.
+        look_alikes: doors, windows, shelves, cabinets and crates come in few models, shared by all rooms, so they are
+            easily confused.
+        alike: the last room looks exactly like the first.
+        seconds: length of a query recording, at least 20 per room. The recording then has odometry between its images
+            too, at 5 Hz. 0: the recording has one image per 1.4 s, and odometry at the images only.
+        losses: number of tracking losses per query recording; after each, odometry continues in another frame.
+            Needs `seconds`.
+        gaps: number of 4 s gaps in the odometry of a query recording. Needs `seconds`.
+        radio: add scans of Bluetooth and WiFi (the phone has no WiFi scans) from emitters in and around the rooms.
 
     Raises:
-        CaptureError: a setting is out of range, or `out` holds something else than a rendered capture.
+        CaptureError: a setting is out of range, or `out` contains something other than a rendered capture.
     """
     if rooms < 1 or frames < 2 or seed < 0:
         raise CaptureError(f"Expected rooms >= 1, frames >= 2, seed >= 0; found {rooms=}, {frames=}, {seed=}.")
     if seconds and (seconds < 20 * rooms or rooms * (frames // 4) < 2):
         raise CaptureError(
-            f"A recording that lasts {seconds=} in {rooms=} of {frames=}: expected seconds >= {20 * rooms}, 20 a room, "
-            "and frames >= 4, or 8 in a single room, for two pictures or more."
+            f"Found {seconds=} for {rooms=} and {frames=}; expected seconds >= {20 * rooms}, 20 per room, and frames "
+            ">= 4, or 8 for a single room, so that a recording has two images or more."
         )
     if (losses or gaps) and not seconds:
-        raise CaptureError(f"{losses=} and {gaps=} are of the odometry between pictures: set seconds, too.")
+        raise CaptureError(f"Found {losses=}, {gaps=}: both concern the odometry between images, so set seconds too.")
     settings = {"format": FORMAT, "rooms": rooms, "frames": frames, "seed": seed}
-    asked = {"look_alikes": look_alikes, "alike": alike, "seconds": seconds, "losses": losses, "gaps": gaps}
-    settings |= {name: int(value) for name, value in {**asked, "radio": radio}.items() if value}
+    options = {"look_alikes": look_alikes, "alike": alike, "seconds": seconds, "losses": losses, "gaps": gaps}
+    settings |= {name: int(value) for name, value in {**options, "radio": radio}.items() if value}
     queries = max(2, frames // 2)
     world = World(rooms, frames, queries, seed, look_alikes, False, alike, seconds, losses, gaps, radio)
     return _render(Path(out), world, settings, progress)
@@ -343,20 +344,21 @@ def render_capture(
 def render_street(
     out: str | Path, blocks: int = 2, frames: int = 50, queries: int = 4, seed: int = 0, progress: bool = True
 ) -> Path:
-    """Render a street seen by a phone with small pictures, for maps of many images; return the capture's folder.
+    """Render a street seen by a phone with small images, for maps of many images; return the capture's folder.
 
-    The street has no end: blocks of 12 m follow each other, each sees the next, and none is like another. What an image
-    shares with others depends on `frames` alone, so a longer street is more of the same. 15 images/s a core.
+    The street consists of different blocks of 12 m; neighboring blocks see each other. The overlap of an image with
+    others depends on `frames` only, so the number of blocks scales the map without changing its density. Speed: 15
+    images/s per core.
 
     Args:
-        out: as `render_capture` has it.
-        blocks: how many, at least 1.
-        frames: map images a block, at least 2; half look at one front, half at the other.
-        queries: query images a block.
-        seed: of everything; the same seed gives the same bytes.
+        out: as for `render_capture`.
+        blocks: number of blocks, at least 1.
+        frames: map images per block, at least 2; half look at one side of the street, half at the other.
+        queries: query images per block.
+        seed: the same seed gives the same bytes.
 
     Raises:
-        CaptureError: a setting is out of range, or `out` holds something else than a rendered capture.
+        CaptureError: a setting is out of range, or `out` contains something other than a rendered capture.
     """
     if blocks < 1 or frames < 2 or queries < 1 or seed < 0:
         raise CaptureError(
@@ -367,70 +369,71 @@ def render_street(
 
 
 def _render(out: Path, world: World, settings: dict[str, int], progress: bool) -> Path:
-    """Render a capture into a hidden folder and move it to `out`, unless it is there already."""
+    """Render a capture into a temporary folder and move it to `out`, unless it is there already."""
     if _is_complete(out, settings):
         return out
     if out.exists() and any(out.iterdir()) and not (out / "demo.json").exists():
         raise CaptureError(
-            f"{out} is not empty and holds no demo.json, so it was not rendered here: choose another folder."
+            f"{out} is not empty and has no demo.json, so it is not a rendered capture. Choose another folder."
         )
     threads = cv2.getNumThreads()
     try:
-        cv2.setNumThreads(1)  # the renderer's pool has a thread a core
-        with write_folder(out) as part:
-            _render_sessions(part, world, progress)
-            count = sum(1 for path in part.rglob("*") if path.is_file())
-            (part / "demo.json").write_text(json.dumps({**settings, "files": count}, indent=1) + "\n")
+        cv2.setNumThreads(1)  # the renderer's pool already has one thread per core
+        with write_folder(out) as folder:
+            _render_sessions(folder, world, progress)
+            count = sum(1 for path in folder.rglob("*") if path.is_file())
+            (folder / "demo.json").write_text(json.dumps({**settings, "files": count}, indent=1) + "\n")
             if out.exists() and not _is_complete(out, settings):
                 shutil.rmtree(out)
     except OSError:
-        if not _is_complete(out, settings):  # else another process was faster
+        if not _is_complete(out, settings):  # otherwise another process finished first
             raise
     finally:
         cv2.setNumThreads(threads)
-        with suppress(AttributeError, OSError, TypeError):  # not glibc, which keeps what threads have freed
+        # glibc keeps memory that threads have freed. Other C libraries have no malloc_trim.
+        with suppress(AttributeError, OSError, TypeError):
             ctypes.CDLL(None).malloc_trim(0)
     return out
 
 
 def _render_sessions(out: Path, world: World, progress: bool) -> None:
-    """Render the pictures of all sessions, place by place, and write the sessions' files."""
+    """Render the images of all sessions, place by place, and write the sessions' files."""
     from tqdm.auto import tqdm
 
     from toolkit.capture.images import default_workers
 
     sessions = out / "sessions"
     tables = {f"{name}_{split}": Tables() for name in world.devices for split in ("map", "query")}
-    pictures = world.places * sum(len(d.sensors) for d in world.devices.values()) * (world.frames + world.queries)
+    images = world.places * sum(len(d.sensors) for d in world.devices.values()) * (world.frames + world.queries)
     rays: dict[tuple[float, ...], Rays] = {}
     scenes: dict[int, Scene] = {}
     with (
-        tqdm(total=pictures, desc="render", unit="image", disable=not progress) as bar,
-        ThreadPoolExecutor(default_workers()) as pool,  # a thread may hold 150 MB
+        tqdm(total=images, desc="render", unit="image", disable=not progress) as bar,
+        ThreadPoolExecutor(default_workers()) as pool,  # a thread may need 150 MB
     ):
         try:
             for index in range(world.places):
-                seen = (index, index - 1, index + 1) if world.street else (index,)
-                around = [i for i in seen if 0 <= i < world.places]
-                for i in around:
+                neighbors = (index, index - 1, index + 1) if world.street else (index,)
+                visible = [i for i in neighbors if 0 <= i < world.places]
+                for i in visible:
                     if i not in scenes:
                         scenes[i] = world.build(i)
                         look = world.look(i)
                         paint_quad = partial(paint, scenes[i], world.seed, look, look_alikes=world.look_alikes)
                         for _ in pool.map(paint_quad, range(len(scenes[i].quads))):
                             pass
-                scenes = {i: scenes[i] for i in around}
+                scenes = {i: scenes[i] for i in visible}
                 scene = scenes[index]
-                # The sky of one place is enough.
-                quads = scene.quads + [quad for i in around[1:] for quad in scenes[i].quads if quad.lit]
-                waiting = []
+                # Only the current place contributes its sky, which is not lit.
+                quads = scene.quads + [quad for i in visible[1:] for quad in scenes[i].quads if quad.lit]
+                tasks = []
                 for shot in _plan_place(world, scene, index, tables):
                     key = tuple(shot.camera.params)
                     if shot.device.rig_from_body is not None and key not in rays:
                         rays[key] = Rays.of(shot.camera)
-                    waiting.append(pool.submit(_take, shot, quads, rays.get(key), sessions, world.seed))
-                for work in waiting:
-                    work.result()
+                    tasks.append(pool.submit(_take, shot, quads, rays.get(key), sessions, world.seed))
+                for task in tasks:
+                    task.result()
                     bar.update()
         except BaseException:
             pool.shutdown(cancel_futures=True)
@@ -441,7 +444,7 @@ def _render_sessions(out: Path, world: World, progress: bool) -> None:
 
 
 def _is_complete(out: Path, settings: dict[str, int]) -> bool:
-    """Tell whether `out` holds the capture of these settings with all its files."""
+    """Return whether `out` contains the complete capture with these settings."""
     try:
         written = json.loads((out / "demo.json").read_text())
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""Who sees the rendered rooms: a phone, a headset and a robot, their cameras and their walks."""
+"""The devices of the rendered capture, a phone, a headset and a robot: their cameras and trajectories."""
 
 from dataclasses import dataclass, replace
 
@@ -11,7 +11,7 @@ from toolkit.synthetic.textures import Rng
 
 @dataclass(frozen=True)
 class Sensor:
-    """One camera of a device: its place and turn in the body frame (x forward, y left, z up)."""
+    """One camera of a device, with its position (meters) and angles in the body frame (x forward, y left, z up)."""
 
     name: str
     model: str
@@ -30,20 +30,20 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Device:
-    """How one kind of device sees the world; `rig_from_body` is None where the camera is the device."""
+    """Cameras, motion and image properties of one kind of device."""
 
     sensors: tuple[Sensor, ...]
     height_m: float
-    sway_deg: float  # of the hand or the gait
+    sway_deg: float  # amplitude of the rotation by hand or gait
     gray: bool
-    brightness: float  # the mean that its exposure aims at
+    brightness: float  # target mean of the exposure control, gray levels
     gamma: float
     tint: tuple[float, float, float]  # BGR
     vignette: float
-    noise: float
+    noise: float  # standard deviation, gray levels
     quality: int  # JPEG
-    rig_from_body: tuple[float, ...] | None = None  # qw qx qy qz tx ty tz
-    drift: float = 1.0  # of its odometry, in units of what `odometry_of` says
+    rig_from_body: tuple[float, ...] | None = None  # qw qx qy qz tx ty tz; None: a single camera without a rig
+    drift: float = 1.0  # of the odometry, see `odometry_of`
 
 
 DEVICES = {
@@ -80,7 +80,7 @@ DEVICES = {
 
 
 def halved(device: Device) -> Device:
-    """Return a device whose pinhole cameras take pictures of half the width and height."""
+    """Return a device with pinhole cameras whose images have half the width and height."""
     sensors = (
         replace(sensor, size=(sensor.size[0] // 2, sensor.size[1] // 2), params=tuple(p / 2 for p in sensor.params))
         for sensor in device.sensors
@@ -89,7 +89,7 @@ def halved(device: Device) -> Device:
 
 
 def looking(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Floats:
-    """Return a camera's rotation (3, 3) in a frame with z up: yaw left of x, pitch up, roll clockwise."""
+    """Return the rotation level_from_cam (3, 3), z up: yaw to the left of x, pitch up, roll clockwise."""
     yaw, pitch, roll = np.radians([yaw_deg, pitch_deg, roll_deg])
     forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
     right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
@@ -102,10 +102,10 @@ BODY_FROM_LEVEL_CAM = make_pose(looking(0, 0, 0), (0, 0, 0))
 
 
 def _walk(rng: Rng, scene: Scene, device: Device, radius: float, angles: Floats) -> Floats:
-    """Return poses world_from_body (N, 4, 4) along an ellipse around the room's middle, looking across it.
+    """Return poses world_from_body (N, 4, 4) on an ellipse around the room's center, looking across the center.
 
-    `angles` (N,) are the directions of the look, radians; `radius` is a share of the room's sides. The wobble
-    is a sum of slow waves, so the walk is smooth however many frames it has.
+    `angles` (N,) are the viewing directions, radians; `radius` is a fraction of the room's sides. The body sways by a
+    sum of slow sine waves of the angle, so the walk is smooth for any number of frames.
     """
 
     def wave(amplitude: float) -> Floats:
@@ -123,7 +123,7 @@ def _walk(rng: Rng, scene: Scene, device: Device, radius: float, angles: Floats)
 
 
 def _turn(poses: Floats, degrees: Floats) -> Floats:
-    """Turn poses world_from_body about the world's vertical through their own place."""
+    """Rotate poses world_from_body about the vertical axes through their positions."""
     a = np.radians(degrees)
     spin = np.zeros((len(poses), 3, 3))
     spin[:, 0, 0] = spin[:, 1, 1] = np.cos(a)
@@ -134,11 +134,11 @@ def _turn(poses: Floats, degrees: Floats) -> Floats:
 
 
 def walks(scene: Scene, seed: int, index: int, frames: int, name: str) -> dict[tuple[str, int], Floats]:
-    """Return the poses world_from_body of one device in one room, by split and subsession.
+    """Return the poses world_from_body (N, 4, 4) of one device in one room, by split and subsession number.
 
-    The two map walks follow an outer and an inner ring, the queries the ring between them, turned 10 to 25
-    degrees away from the nearest map pose. From frame to frame the look turns 15 degrees at most, so that
-    neighbors overlap however few there are.
+    The two map walks follow an outer and an inner ring. The queries follow the ring between them, rotated by 10 to 25
+    degrees from the nearest map pose. The viewing direction changes by at most 15 degrees between frames, so neighbors
+    overlap even if there are few frames.
     """
     device, rng = DEVICES[name], named_rng(seed, index, "walk", name)
     start = named_rng(seed, index, "start").uniform(0, 2 * np.pi)
@@ -148,7 +148,7 @@ def walks(scene: Scene, seed: int, index: int, frames: int, name: str) -> dict[t
         phase = rng.uniform(0, 0.3)
         for part, count in enumerate((total - total // 2, total // 2)):
             share = (np.arange(count) + 0.5 * part + phase) / count
-            margin = 0.0 if split == "map" else 0.1  # queries stay where the map has looked
+            margin = 0.0 if split == "map" else 0.1  # queries look only in directions covered by the map
             angles = start + span * (margin + (1 - 2 * margin) * share)
             radius = (0.32, 0.17)[part] if split == "map" else (0.235, 0.255)[part]
             poses[split, part] = _walk(rng, scene, device, radius, angles)
@@ -160,21 +160,22 @@ def walks(scene: Scene, seed: int, index: int, frames: int, name: str) -> dict[t
         for turn in np.arange(-30.0, 31.0, 1.0):
             turned = _turn(query, np.full(len(query), turn))
             angle = rotation_angle_deg(invert(mapped[nearest])[:, :3, :3] @ turned[:, :3, :3])
-            # The least turn that is far enough, to the left on one walk and to the right on the other.
-            price = abs(turn) + 100 * ((angle < 11) | (angle > 24)) + 8 * ((turn > 0) == bool(part))
-            best, cost = np.where(price < cost, turn, best), np.minimum(price, cost)
+            # Prefer the smallest sufficient rotation, to the left on the first walk and to the right on the second.
+            turn_cost = abs(turn) + 100 * ((angle < 11) | (angle > 24)) + 8 * ((turn > 0) == bool(part))
+            best, cost = np.where(turn_cost < cost, turn, best), np.minimum(turn_cost, cost)
         poses["query", part] = _turn(query, best)
     return poses
 
 
 def walk_street(scene: Scene, seed: int, counts: dict[str, int], name: str) -> dict[tuple[str, int], Floats]:
-    """Return the poses world_from_body of one device along one block of a street, by split and subsession.
+    """Return the poses world_from_body (N, 4, 4) of one device along one block, by split and subsession number.
 
-    There on one side of the middle, looking at the front across, and back on the other. Queries walk closer to the
-    middle and look elsewhere. The wobble is that of the whole street: a walk goes on from block to block.
+    The first subsession walks on one side of the middle of the street and looks at the opposite front; the second walks
+    on the other side. Queries walk closer to the middle and in other directions of view. The sway is a function of the
+    position in the street, so a walk is continuous from block to block.
 
     Args:
-        counts: frames of a split, `map` and `query`, both subsessions together.
+        counts: number of frames of each split, `map` and `query`, over both subsessions.
     """
     device, length = DEVICES[name], scene.size[0]
     poses: dict[tuple[str, int], Floats] = {}

@@ -1,4 +1,4 @@
-"""Light and paint of the rendered capture: the textures of a room's rectangles, with its lamps' light baked in."""
+"""Make the textures of a room's rectangles, with the light of its lamps baked in."""
 
 import cv2
 import numpy as np
@@ -7,13 +7,13 @@ from numpy.typing import NDArray
 from toolkit.synthetic.scene import Quad, Scene, named_rng
 from toolkit.synthetic.textures import Image
 
-LEVELS = 6  # of the mip-maps; texture sides are multiples of 2 ** (LEVELS - 1)
-SOLD_OFTEN = ("books", "crate", "door", "drawers", "window")
-MODELS = 2  # of each of these things and each size in whole meters, where a world has look-alikes
+LEVELS = 6  # mip levels; texture sides are multiples of 2 ** (LEVELS - 1)
+SOLD_OFTEN = ("books", "crate", "door", "drawers", "window")  # materials that look alike in a world with look-alikes
+MODELS = 2  # textures per such material and size in whole meters
 
 
 def _blocked(scene: Scene, start: Image, way: Image) -> NDArray[np.bool_]:
-    """Tell which segments start + t * way, t in (0, 1), (N, 3) each, are cut by a box (slab test)."""
+    """Return which segments start + t * way, t in (0, 1), (N, 3) each, intersect a box of the scene (slab test)."""
     hit = np.zeros(len(start), bool)
     if not len(start):
         return hit
@@ -39,13 +39,13 @@ def _blocked(scene: Scene, start: Image, way: Image) -> NDArray[np.bool_]:
 
 
 def _light(scene: Scene, quad: Quad) -> Image:
-    """Return the light on a rectangle, a small float32 picture: lamps with shadows and ambient occlusion."""
+    """Return the light on a rectangle as a coarse float32 image: lamps with shadows, and ambient occlusion."""
     rows, columns = max(2, round(quad.height / 0.15)), max(2, round(quad.width / 0.15))
     t, s = np.mgrid[0:rows, 0:columns] + 0.5
     points = quad.corner + (s.ravel() * quad.width / columns)[:, None] * quad.right
     points = points + (t.ravel() * quad.height / rows)[:, None] * quad.down + 0.02 * quad.normal
     points = points.astype(np.float32)
-    # Directions spread evenly over the hemisphere, denser along the normal as Lambert's law has it.
+    # Cosine-weighted directions over the hemisphere (Lambert's law), on a spiral with the golden angle.
     i = np.arange(14) + 0.5
     radius, angle = np.sqrt(i / 14), i * 2.399963
     local = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - i / 14)], -1)
@@ -73,17 +73,17 @@ def _light(scene: Scene, quad: Quad) -> Image:
 
 
 def paint(scene: Scene, seed: int, index: int, number: int, look_alikes: bool = False) -> None:
-    """Make the texture of rectangle `number` of room `index` and its mip-maps, light baked in."""
+    """Make the texture of rectangle `number` of room `index`, with light baked in, and its mip levels."""
     quad = scene.quads[number]
     multiple = 2 ** (LEVELS - 1)
     h, w = (max(multiple, round(side * quad.ppm / multiple) * multiple) for side in (quad.height, quad.width))
     rng = named_rng(seed, index, "quad", number)
     name = getattr(quad.material, "func", quad.material).__name__
     if look_alikes and name in SOLD_OFTEN:
-        # A model is drawn for whole meters: things of unequal width then begin alike.
-        tall, wide = (round(np.ceil(side) * quad.ppm) + multiple for side in (quad.height, quad.width))
+        # Draw the texture for whole meters and crop it, so that objects of different widths share their left part.
+        full_h, full_w = (round(np.ceil(side) * quad.ppm) + multiple for side in (quad.height, quad.width))
         model = named_rng(seed, "model", name, int(rng.integers(MODELS)))
-        image = quad.material(model, tall, wide, quad.ppm)[:h, :w]
+        image = quad.material(model, full_h, full_w, quad.ppm)[:h, :w]
     else:
         image = quad.material(rng, h, w, quad.ppm)
     if quad.lit:

@@ -1,7 +1,7 @@
-"""The renderer: a picture of textured rectangles, with its exact depth.
+"""Render textured rectangles to an image with exact depth.
 
-A picture is made sample by sample, four a pixel: the ray of each sample through the camera's own model (distortion
-included) meets the planes, the nearest wins, and its texture is read at the mip level of the sample's footprint.
+Each pixel has four samples. The ray of each sample, from the camera model with its distortion, is intersected with the
+rectangles; the nearest one gives the color, read from its texture at the mip level of the sample's footprint.
 """
 
 from dataclasses import dataclass
@@ -20,24 +20,24 @@ if TYPE_CHECKING:
     import pycolmap
 
 NEAR_M = 0.05
-SAMPLES = 2  # a side of a pixel
-OFFSETS = np.array([[-0.125, 0.125], [0.375, 0.625]], np.float32)  # of their mip levels
+SAMPLES = 2  # per pixel and axis
+OFFSETS = np.array([[-0.125, 0.125], [0.375, 0.625]], np.float32)  # added to the mip level of each sample of a pixel
 
 
 @dataclass
 class Rays:
-    """The rays of a camera's samples: x / z and y / z, each (SAMPLES * H, SAMPLES * W) float32."""
+    """The rays of a camera's samples: x / z and y / z, each (SAMPLES * H, SAMPLES * W) float32, camera frame."""
 
     camera: "pycolmap.Camera"
     x: Image
     y: Image
-    planes: Floats  # (5, 4) the view's borders in the camera frame; inside is positive
+    planes: Floats  # (5, 4) planes of the viewing frustum in the camera frame; positive inside
 
     @classmethod
     def of(cls, camera: "pycolmap.Camera") -> "Rays":
-        """Unproject the sample grid; the center of the top-left pixel is (0.5, 0.5)."""
+        """Unproject the sample grid. The center of the top-left pixel is (0.5, 0.5)."""
         u, v = ((np.arange(SAMPLES * n) + 0.5) / SAMPLES for n in (camera.width, camera.height))
-        if camera.model.name == "PINHOLE":  # x depends on u alone, and y on v
+        if camera.model.name == "PINHOLE":  # x depends only on u, y only on v
             x = np.asarray(camera.cam_from_img(np.stack([u, 0 * u], -1)))[:, 0]
             y = np.asarray(camera.cam_from_img(np.stack([0 * v, v], -1)))[:, 1]
             x, y = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
@@ -52,7 +52,7 @@ class Rays:
 
 
 def _visible_area(polygon: Floats, rays: Rays) -> tuple[slice, slice] | None:
-    """Return the rows and columns of samples that may see a polygon (N, 3), camera frame; None if none."""
+    """Return the rows and columns of samples that may see a polygon (N, 3) in the camera frame; None if none may."""
     for plane in rays.planes:
         side = polygon @ plane[:3] + plane[3]
         if (side >= 0).all():
@@ -67,7 +67,7 @@ def _visible_area(polygon: Floats, rays: Rays) -> tuple[slice, slice] | None:
         if not kept:
             return None
         polygon = np.array(kept)
-    # Distortion bends the edges: follow them, not only the corners.
+    # Distortion bends the edges, so project points along them, not only the corners.
     steps = np.linspace(0, 1, 6)[:, None, None]
     outline = (polygon + steps * (np.roll(polygon, -1, 0) - polygon)).reshape(-1, 3)
     pixels = np.asarray(rays.camera.img_from_cam(outline))
@@ -78,39 +78,39 @@ def _visible_area(polygon: Floats, rays: Rays) -> tuple[slice, slice] | None:
 
 
 def _texture(level: Image, x: Image, y: Image) -> Image:
-    """Read texels at N places, continuous coordinates (the first texel's center is 0.5)."""
-    width = 4096  # OpenCV bounds the side of a map
+    """Interpolate a texture at N positions, in texels; the center of the first texel is (0.5, 0.5)."""
+    width = 4096  # OpenCV limits the sides of a map
     rows = -(-len(x) // width)
     maps = np.zeros((2, rows * width), np.float32)
     maps[0, : len(x)], maps[1, : len(x)] = x, y
     maps -= 0.5
-    read = cv2.remap(level, maps[0].reshape(rows, width), maps[1].reshape(rows, width), cv2.INTER_LINEAR,
-                     borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
-    return read.reshape(rows * width, -1)[: len(x)]
+    texels = cv2.remap(level, maps[0].reshape(rows, width), maps[1].reshape(rows, width), cv2.INTER_LINEAR,
+                       borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
+    return texels.reshape(rows * width, -1)[: len(x)]
 
 
 def render(quads: list[Quad], world_from_cam: Floats, rays: Rays, gray: bool) -> tuple[Image, Image]:
-    """Return a picture, (H, W, 3) BGR or (H, W), float32 0..255, and its depth, (H, W) float32 meters.
+    """Render an image, (H, W, 3) BGR or (H, W) if `gray`, float32 0..255, and its depth, (H, W) float32 meters.
 
-    Depth is along the optical axis at pixel centers; 0 on the sky and where a pixel straddles an edge.
+    Depth is measured along the optical axis at pixel centers; it is 0 in the sky and in pixels that cross an edge.
     """
     height, width = rays.x.shape
     R, center = world_from_cam[:3, :3].T, world_from_cam[:3, 3]
     nearest = np.zeros((height, width), np.float32)  # inverse depth
     owner = np.full((height, width), -1, np.int16)
-    seen: dict[int, tuple[tuple[slice, slice], NDArray[np.float32], float]] = {}
+    visible: dict[int, tuple[tuple[slice, slice], NDArray[np.float32], float]] = {}
     corners = np.stack([quad.corners for quad in quads])
     normals = np.stack([quad.normal for quad in quads])
     distances = np.einsum("qi,qi->q", normals, center - corners[:, 0])
     corners = (corners - center) @ R.T
-    beyond: Any = corners @ rays.planes[:, :3].T + rays.planes[:, 3] < 0
-    outside = beyond.all(axis=1).any(axis=1)
+    corner_outside: Any = corners @ rays.planes[:, :3].T + rays.planes[:, 3] < 0
+    outside = corner_outside.all(axis=1).any(axis=1)
     for k in np.flatnonzero((distances > 1e-6) & ~outside).tolist():
         quad, distance = quads[k], float(distances[k])
         area = _visible_area(corners[k], rays)
         if area is None:
             continue
-        # With r = (x, y, 1) the ray, 1 / z = n.r / n.p, and texture coordinates times 1 / z are linear in r.
+        # For the ray r = (x, y, 1), 1 / z = n.r / n.p. Texture coordinates divided by z are linear in r as well.
         p = R @ (quad.corner - center)
         inverse = R @ quad.normal / -distance
         right, down = (R @ axis - (R @ axis @ p) * inverse for axis in (quad.right, quad.down))
@@ -121,12 +121,12 @@ def render(quads: list[Quad], world_from_cam: Floats, rays: Rays, gray: bool) ->
         if inside.any():
             np.copyto(nearest[area], q, where=inside)
             np.copyto(owner[area], np.int16(k), where=inside)
-            seen[k] = area, linear, distance
+            visible[k] = area, linear, distance
     picture = np.zeros((height * width, 1 if gray else 3), np.uint8)
     samples = np.arange(height * width).reshape(height, width)
     offsets = np.tile(OFFSETS, (height // SAMPLES, width // SAMPLES)).ravel()
     focal = SAMPLES * (rays.camera.focal_length_x * rays.camera.focal_length_y) ** 0.5
-    for k, (area, linear, distance) in seen.items():
+    for k, (area, linear, distance) in visible.items():
         quad, index = quads[k], samples[area][owner[area] == k]
         if not len(index):
             continue
@@ -134,24 +134,25 @@ def render(quads: list[Quad], world_from_cam: Floats, rays: Rays, gray: bool) ->
         s, t = ((a * x + (b * y + c)) * z for a, b, c in linear[1:])
         pyramid = quad.gray if gray else quad.color
         th, tw = pyramid[0].shape[:2]
-        # The sample's footprint has the area z^3 / (f^2 * distance). The four samples of a pixel round its
-        # level at four offsets, which blends the levels; the quarter keeps slanted surfaces from flickering.
+        # The footprint of a sample on the surface has the area z^3 / (f^2 * distance). The four samples of a pixel
+        # round the mip level with four offsets, which blends levels. The term with 0.25 blurs slanted surfaces, which
+        # would flicker otherwise.
         scale = tw / quad.width / focal / np.sqrt(distance)
         level = np.log2(scale * z**1.5) + 0.25 * np.log2(np.maximum(z / distance, 1))
         level = np.clip((level + offsets[index]).astype(np.int8), 0, LEVELS - 1)
-        for at in range(LEVELS):
-            chosen = np.flatnonzero(level == at)
-            if not len(chosen):
+        for i in range(LEVELS):
+            rows = np.flatnonzero(level == i)
+            if not len(rows):
                 continue
-            lx, ly = tw / quad.width / 2.0**at, th / quad.height / 2.0**at
-            picture[index[chosen]] = _texture(pyramid[at], s[chosen] * np.float32(lx), t[chosen] * np.float32(ly))
+            lx, ly = tw / quad.width / 2.0**i, th / quad.height / 2.0**i
+            picture[index[rows]] = _texture(pyramid[i], s[rows] * np.float32(lx), t[rows] * np.float32(ly))
     size = (width // SAMPLES, height // SAMPLES)
     picture = picture.reshape(height, width, -1).astype(np.float32)
     return cv2.resize(picture, size, interpolation=cv2.INTER_AREA), _depth(quads, owner, nearest)
 
 
 def _depth(quads: list[Quad], owner: Image, nearest: Image) -> Image:
-    """Return depth at pixel centers (H, W): from the mean inverse depth of the samples, exact on a plane."""
+    """Return depth at pixel centers (H, W), from the mean inverse depth of the samples, which is exact on a plane."""
     low = high = total = nearest[::SAMPLES, ::SAMPLES]
     for i in range(1, SAMPLES**2):
         sample = nearest[i // SAMPLES :: SAMPLES, i % SAMPLES :: SAMPLES]

@@ -1,6 +1,6 @@
-"""The rooms of the rendered capture: what stands where, as textured rectangles. `light.paint` makes the textures.
+"""The rooms and streets of the rendered capture, built from textured rectangles. `light.paint` makes the textures.
 
-All randomness comes from the seed and the name of the thing that is drawn, never from the order of work.
+Each random generator is seeded by the seed and the name of the thing it draws, not by the order of work.
 """
 
 import zlib
@@ -15,17 +15,20 @@ from toolkit.synthetic import textures as tex
 from toolkit.synthetic.textures import Image, Material, Rng
 
 UP = np.array([0.0, 0.0, 1.0])
-Place = tuple[float, float, float]  # where a box stands in its room: x, y (meters), and yaw (radians)
+Place = tuple[float, float, float]  # position and heading of a box in its room: x, y (meters), yaw (radians)
 
 
 def named_rng(*key: int | str) -> Rng:
-    """Return the random generator of the thing named by `key`, whatever was drawn before it."""
+    """Return a random generator that depends on `key` only."""
     return np.random.default_rng([k if isinstance(k, int) else zlib.crc32(k.encode()) for k in key])
 
 
 @dataclass
 class Quad:
-    """A textured rectangle: its texture's top left corner and unit axes, in world meters."""
+    """A textured rectangle, given by the top-left corner of its texture and the texture's unit axes in the world frame.
+
+    Lengths are in meters; `ppm` is the texture's resolution, pixels per meter; `lit` is False for lamps and sky.
+    """
 
     corner: Floats
     right: Floats
@@ -40,7 +43,7 @@ class Quad:
 
     @cached_property
     def normal(self) -> Floats:
-        """The unit normal on the side that is seen."""
+        """The unit normal on the visible side."""
         return np.cross(self.down, self.right)
 
     @cached_property
@@ -52,7 +55,7 @@ class Quad:
 
 @dataclass
 class Scene:
-    """The rectangles of one room, its boxes as obstacles to light, and its lamps."""
+    """The rectangles of one room, its boxes (which block light), and its lamps."""
 
     origin: Floats
     size: tuple[float, float, float]
@@ -63,18 +66,18 @@ class Scene:
 
     @cached_property
     def blocker_bounds(self) -> tuple[Floats, Floats]:
-        """The lowest and the highest corners (N, 3) of upright boxes around the blockers, for a scene that is built."""
+        """Lower and upper corners (N, 3) of axis-aligned bounding boxes of the blockers. Use it on finished scenes."""
         centers = np.array([center for center, _, _ in self.blockers]).reshape(-1, 3)
         halves = np.array([half for _, half, _ in self.blockers]).reshape(-1, 3)
-        across = np.hypot(halves[:, 0], halves[:, 1])  # whatever the yaw
-        reach = np.stack([across, across, halves[:, 2]], -1)
-        return centers - reach, centers + reach
+        radius = np.hypot(halves[:, 0], halves[:, 1])  # bounds x and y for any yaw
+        extent = np.stack([radius, radius, halves[:, 2]], -1)
+        return centers - extent, centers + extent
 
     def plate(
         self, corner: Any, right: Any, down: Any, width: float, height: float, material: Material,
         ppm: float = 300.0, lit: bool = True,
     ) -> None:  # fmt: skip
-        """Add one rectangle, its corner relative to the room's origin."""
+        """Add one rectangle; `corner` is relative to the room's origin."""
         axes = np.asarray(right, float), np.asarray(down, float)
         self.quads.append(Quad(self.origin + np.asarray(corner, float), *axes, width, height, material, ppm, lit))
 
@@ -83,23 +86,20 @@ class Scene:
         side: Material | None = None, top: Material | None = None, ppm: float = 350.0, lit: bool = True,
         back: bool = True,
     ) -> None:  # fmt: skip
-        """Add a box of `size` (width, depth, height) that stands at height z; its front looks along +y turned by yaw.
-
-        `back` says whether its back side can be seen.
-        """
+        """Add a box of `size` (width, depth, height) with its base at height z; its front faces +y rotated by yaw."""
         x, y, yaw = place
         half = np.array(size) / 2
         center = np.array([x, y, z + half[2]])
         axis_x, axis_y = np.array([np.cos(yaw), np.sin(yaw), 0]), np.array([-np.sin(yaw), np.cos(yaw), 0])
         sides = [(axis_y, half[1], half[0], front)]
-        if back:
+        if back:  # the back side is visible
             sides.append((-axis_y, half[1], half[0], side or front))
         sides += [(normal, half[0], half[1], side or front) for normal in (axis_x, -axis_x)]
-        for normal, reach, wide, material in sides:
+        for normal, reach, half_width, material in sides:
             right = np.cross(UP, normal)
-            corner = center + normal * reach - right * wide + UP * half[2]
-            self.plate(corner, right, -UP, 2 * wide, size[2], material, ppm, lit)
-        # The underside only where it can be seen.
+            corner = center + normal * reach - right * half_width + UP * half[2]
+            self.plate(corner, right, -UP, 2 * half_width, size[2], material, ppm, lit)
+        # Top, and the underside if it is visible.
         for sign in (1, -1) if z > 0.1 else (1,):
             corner = center - axis_x * half[0] + sign * (axis_y * half[1] + UP * half[2])
             self.plate(corner, axis_x, -sign * axis_y, size[0], size[1], top or side or front, ppm, lit)
@@ -107,7 +107,7 @@ class Scene:
             self.blockers.append((self.origin + center, half, yaw))
 
     def at_wall(self, wall: int, along: float, depth: float) -> Place:
-        """Return the place of a box of this depth set against a wall, `along` meters from the wall's middle."""
+        """Return the place of a box of this depth against a wall, `along` meters from the middle of the wall."""
         w, d, _ = self.size
         gap = depth / 2 + 0.004
         places: list[Place] = [
@@ -124,19 +124,19 @@ class Scene:
 
 
 def _clutter(scene: Scene, rng: Rng, place: Place, z: float, wide: float, deep: float, count: int) -> None:
-    """Stand small boxes on a surface, side by side."""
+    """Put small boxes side by side on a surface."""
     x, y, yaw = place
     c, s = np.cos(yaw), np.sin(yaw)
     for i in range(count):
         size = rng.uniform([0.1, 0.1, 0.08], [0.26, 0.24, 0.34])
         along, across = (i + 0.5) / count * wide - wide / 2, rng.uniform(-0.2, 0.2) * deep
         material = [tex.poster, tex.crate, tex.books, tex.cloth][int(rng.integers(4))]
-        turned = x + along * c - across * s, y + along * s + across * c, yaw + rng.uniform(-0.5, 0.5)
-        scene.box(turned, z, tuple(size), material, material, tex.poster, 450)
+        box_place = x + along * c - across * s, y + along * s + across * c, yaw + rng.uniform(-0.5, 0.5)
+        scene.box(box_place, z, tuple(size), material, material, tex.poster, 450)
 
 
 def _furnish(scene: Scene, rng: Rng, wall: int, along: float, room: float, kind: str) -> float:
-    """Put one thing against a wall from `along` on; return the width it takes, 0 where it does not fit."""
+    """Put a thing against a wall from `along` on; return its width, or 0 if it is wider than `room` (all in meters)."""
     tall = scene.size[2]
     width = {
         "shelf": rng.uniform(0.9, 1.6), "cabinet": rng.uniform(0.8, 1.4), "posters": rng.uniform(0.6, 0.9),
@@ -201,7 +201,7 @@ OAK = [(75, 120, 165), (62, 104, 150), (85, 135, 180)]
 SLATE = [(95, 95, 90), (110, 108, 100), (85, 88, 90), (125, 120, 112)]
 CHECK = [(205, 215, 220), (60, 65, 85), (190, 205, 215)]
 
-# wall (None: plaster) and floor are cells: height, width, colors, stagger; things stand at the walls
+# Walls (None: plaster) and floors are `tex.cells` with height, width (meters), colors, stagger; things stand at walls.
 KINDS: dict[str, dict[str, Any]] = {
     "library": {
         "wall": None, "floor": (0.14, 1.1, OAK, "random"),
@@ -223,7 +223,7 @@ KINDS: dict[str, dict[str, Any]] = {
 
 
 BLOCK_M = (12.0, 9.0, 5.4)
-STREET_WALLS = (0, 2)  # those along x
+STREET_WALLS = (0, 2)  # the walls along x
 STREET_THINGS = [
     "planter", "bench", "crates", "posters", "door", "painting", "board", "window", "shelf", "cabinet", "posters",
 ]  # fmt: skip
@@ -237,7 +237,7 @@ def _build_wall(scene: Scene, wall: int, material: Material) -> None:
 
 
 def _furnish_wall(scene: Scene, rng: Rng, wall: int, things: list[str]) -> None:
-    """Set things side by side against a wall, and outdoors windows above them."""
+    """Put things side by side against a wall, and outdoors a row of windows above them."""
     length = scene.size[wall % 2]
     along = -length / 2 + 0.5
     for thing in list(rng.permutation(things)) * 3:
@@ -256,9 +256,11 @@ def _build_sky(scene: Scene) -> None:
 
 
 def build_room(seed: int, index: int, look: int | None = None) -> Scene:
-    """Return room `index` of the world of `seed`: geometry and materials; `light.paint` makes its textures.
+    """Return the geometry and materials of a room; `light.paint` makes its textures.
 
-    It is where room `index` is, and looks like room `look`, if that is given.
+    Args:
+        index: number of the room, which determines its position.
+        look: number of the room whose appearance it has; None: its own.
     """
     look = index if look is None else look
     rng = named_rng(seed, look, "room")
@@ -299,7 +301,7 @@ def build_room(seed: int, index: int, look: int | None = None) -> Scene:
 
 
 def build_block(seed: int, index: int) -> Scene:
-    """Return block `index` of the street of `seed`, which goes on along x: two fronts and the ground between them."""
+    """Return block `index` of a street along x: two fronts and the ground between them."""
     rng = named_rng(seed, index, "block")
     w, d, _ = BLOCK_M
     scene = Scene(np.array([w * index, 0.0, 0.0]), BLOCK_M, outdoor=True)
@@ -316,7 +318,7 @@ def build_block(seed: int, index: int) -> Scene:
 
 
 def _furnish_middle(scene: Scene, rng: Rng) -> None:
-    """Furnish the corners, the middle and the air; the ring between them is left free for walking."""
+    """Furnish the corners, the middle, and the space below the ceiling. Leave a ring free for the walks."""
     w, d, h = scene.size
     for sx, sy in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
         x, y, yaw = sx * (w / 2 - 0.42), sy * (d / 2 - 0.42), rng.uniform(0, 6)
@@ -345,7 +347,7 @@ def _furnish_middle(scene: Scene, rng: Rng) -> None:
     rug = 0.3 * w * np.array([c, s, 0]), 0.3 * d * np.array([-s, c, 0])
     corner, material = rug[1] - rug[0] + [0, 0, 0.012], mosaic if scene.outdoor else tex.cloth
     scene.plate(corner, (c, s, 0), (s, -c, 0), 0.6 * w, 0.6 * d, material, 220)
-    for i in range(0 if scene.outdoor else 3):  # things that hang
+    for i in range(0 if scene.outdoor else 3):  # boxes hanging from the ceiling
         angle = yaw + i * 2.1
         x, y, z = 0.24 * w * np.cos(angle), 0.24 * d * np.sin(angle), min(h, 3.4) - rng.uniform(0.7, 0.9)
         scene.box((x, y, angle), z, (0.45, 0.45, 0.3), [tex.cloth, tex.poster, tex.painting][i], ppm=300)

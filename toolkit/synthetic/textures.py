@@ -1,7 +1,7 @@
 """Procedural textures of the rendered capture: walls, floors, furniture, pictures.
 
-A material is a function (random generator, height, width, pixels a meter) -> (height, width, 3) BGR uint8. All are rich
-in corners at several scales, and drawn from the generator alone: the same generator, the same bytes.
+A material is a function (random generator, height, width, pixels per meter) -> (height, width, 3) BGR uint8. All have
+many corners at several scales. The same state of the generator gives the same bytes.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Image = NDArray[Any]
 Rng = np.random.Generator
-Material = Callable[[Rng, int, int, float], Image]  # (random, height, width, pixels a meter) -> BGR uint8
+Material = Callable[[Rng, int, int, float], Image]
 
 
 def _f(value: ArrayLike) -> NDArray[np.float32]:
@@ -27,14 +27,14 @@ def _i(value: ArrayLike) -> NDArray[np.int32]:
 def random_color(
     rng: Rng, saturation: tuple[float, float] = (0.15, 0.75), value: tuple[float, float] = (0.25, 0.95)
 ) -> Any:
-    """Return a BGR color; people prefer warm ones and blues."""
+    """Return a random BGR color; half are warm and a quarter are blue, as in furnished rooms."""
     hues = rng.normal(28, 20), rng.normal(28, 20), rng.normal(212, 18), rng.uniform(0, 360)
     hsv = _f([[[hues[rng.integers(4)] % 360, rng.uniform(*saturation), rng.uniform(*value)]]])
     return tuple(float(c) for c in cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR)[0, 0] * 255)
 
 
 def _noise(rng: Rng, h: int, w: int, cells: tuple[int, ...], stretch: int = 1) -> Image:
-    """Return smooth noise (h, w), about unit deviation, summed over cells of the given sizes in pixels."""
+    """Return smooth noise (h, w) with a standard deviation of about 1, summed over cell sizes in pixels."""
     total = np.zeros((h, w), np.float32)
     for cell in cells:
         rows, columns = h // cell + 3, w // (cell * stretch) + 3
@@ -67,18 +67,18 @@ def _spot(rng: Rng, image: Image) -> list[int]:
 
 
 def _blob(rng: Rng, image: Image, center: list[int], axes: list[float], color: Any) -> None:
-    """Fill an ellipse of the given axes (pixels), turned at random."""
+    """Fill an ellipse with the given axes (pixels) and a random rotation."""
     cv2.ellipse(image, (center, axes, rng.uniform(0, 180)), color, -1, cv2.LINE_AA)
 
 
 def _wander(rng: Rng, image: Image, steps: int, step: float) -> Image:
-    """Return the corners (steps, 2) of a random walk from a random place, in pixels."""
+    """Return the corners (steps, 2) of a random walk from a random pixel, in pixels."""
     h, w = image.shape[:2]
     return _i(np.cumsum(rng.normal(0, step, (steps, 2)), 0) + rng.uniform(0, 1, 2) * [w, h])
 
 
 def _shapes(rng: Rng, image: Image, count: int, low: float, high: float) -> None:
-    """Scatter discs, boxes, triangles, rings and strokes, of sizes low..high pixels."""
+    """Scatter discs, boxes, triangles, rings and strokes of size low..high pixels."""
     h, w = image.shape[:2]
     for _ in range(count):
         size = np.exp(rng.uniform(np.log(low), np.log(high)))
@@ -128,7 +128,7 @@ def cells(
     rng: Rng, h: int, w: int, ppm: float, size: tuple[float, float], colors: Any, stagger: str = "half",
     jitter: float = 0.12, joint: Any = (150, 155, 160), motifs: bool = False,
 ) -> Image:  # fmt: skip
-    """Bricks, tiles or planks: cells of `size` (height, width) meters with joints, each of its own tone."""
+    """Bricks, tiles or planks: cells of `size` (height, width) meters with joints, each with its own tone."""
     ch, cw = max(4, int(size[0] * ppm)), max(4, int(size[1] * ppm))
     y, rows, columns = np.arange(h), h // ch + 1, w // cw + 2
     row = y // ch
@@ -147,15 +147,15 @@ def cells(
         for r in range(rows):
             for c in range(columns):
                 if rng.random() < 0.35:
-                    part = image[r * ch + gap : (r + 1) * ch, c * cw + gap : (c + 1) * cw]
-                    if part.size:
-                        _shapes(rng, part, 3, ch / 6, ch / 2)
+                    cell = image[r * ch + gap : (r + 1) * ch, c * cw + gap : (c + 1) * cw]
+                    if cell.size:
+                        _shapes(rng, cell, 3, ch / 6, ch / 2)
     _chip(rng, image, ppm)
     return _grain(rng, image, 0.02)
 
 
 def _chip(rng: Rng, image: Image, ppm: float) -> None:
-    """Scatter small chips, drips and scratches, as any used surface has them."""
+    """Scatter small chips, drips and scratches, as on a used surface."""
     h, w = image.shape[:2]
     for _ in range(int(h * w / ppm**2 * 14)):
         x, y = _spot(rng, image)
@@ -166,8 +166,7 @@ def _chip(rng: Rng, image: Image, ppm: float) -> None:
 
 def poster(rng: Rng, h: int, w: int, ppm: float) -> Image:
     """A printed sheet: title, picture, paragraphs, border."""
-    image = np.empty((h, w, 3), np.uint8)
-    image[:] = random_color(rng, (0.05, 0.7), (0.5, 1.0))
+    image = np.full((h, w, 3), random_color(rng, (0.05, 0.7), (0.5, 1.0)), np.uint8)
     ink = random_color(rng, (0.2, 1.0), (0.05, 0.35))
     top, bottom = int(h * rng.uniform(0.14, 0.25)), int(h * rng.uniform(0.6, 0.8))
     picture = image[top:bottom, int(w * 0.06) : int(w * 0.94)]
@@ -213,15 +212,14 @@ def wood(rng: Rng, h: int, w: int, ppm: float, color: Any = (60, 100, 145)) -> I
 def books(rng: Rng, h: int, w: int, ppm: float) -> Image:
     """The front of a shelf: boards, uprights, and rows of books with titles on their spines."""
     board = _f((45, 75, 110)) * rng.uniform(0.6, 1.4)
-    image = np.empty((h, w, 3), np.uint8)
-    image[:] = board * 0.25
+    image = np.full((h, w, 3), board * 0.25, np.uint8)
     thick, rows = max(2, int(0.03 * ppm)), max(1, round(h / ppm / 0.34))
     for r in range(rows):
         bottom, room = int((r + 1) * h / rows) - thick, h / rows - thick
         x = float(thick)
         while x < w - thick:
             width = ppm * rng.uniform(0.018, 0.06)
-            if rng.random() < 0.06:  # a gap, or a thing that is no book
+            if rng.random() < 0.06:  # a gap
                 x += ppm * rng.uniform(0.04, 0.14)
                 continue
             top = int(bottom - room * rng.uniform(0.55, 0.95))
@@ -258,15 +256,15 @@ def drawers(rng: Rng, h: int, w: int, ppm: float) -> Image:
 
 
 def _sticker(rng: Rng, image: Image, x: float, y: float, side: float, ppm: float) -> None:
-    part = image[int(y) : int(y + side * rng.uniform(0.5, 1.0)), int(x) : int(x + side)]
-    if min(part.shape[:2]) > 6:
-        part[:] = random_color(rng, (0, 0.5), (0.7, 1.0))
-        _shapes(rng, part, 3, 3, side / 2)
-        _write(rng, part, 2, part.shape[0] * 0.8, max(4, part.shape[0] * 0.3), (20, 20, 30), 1)
+    label = image[int(y) : int(y + side * rng.uniform(0.5, 1.0)), int(x) : int(x + side)]
+    if min(label.shape[:2]) > 6:
+        label[:] = random_color(rng, (0, 0.5), (0.7, 1.0))
+        _shapes(rng, label, 3, 3, side / 2)
+        _write(rng, label, 2, label.shape[0] * 0.8, max(4, label.shape[0] * 0.3), (20, 20, 30), 1)
 
 
 def notes(rng: Rng, h: int, w: int, ppm: float) -> Image:
-    """A cork board with papers, photographs and pins, overlapping."""
+    """A cork board with overlapping papers and photographs."""
     image = _painted((95, 140, 185), 0.18 * _noise(rng, h, w, (2, 4)))
     for _ in range(int(h * w / ppm**2 * 26)):
         side = rng.uniform(0.08, 0.28) * ppm
@@ -274,11 +272,11 @@ def notes(rng: Rng, h: int, w: int, ppm: float) -> Image:
         if rng.random() < 0.4:
             _sticker(rng, image, x, y, side, ppm)
             continue
-        part = image[int(y) : int(y + side), int(x) : int(x + side * 0.75)]
-        if min(part.shape[:2]) > 12:
-            part[:] = random_color(rng, (0, 0.15), (0.8, 1.0))
+        paper = image[int(y) : int(y + side), int(x) : int(x + side * 0.75)]
+        if min(paper.shape[:2]) > 12:
+            paper[:] = random_color(rng, (0, 0.15), (0.8, 1.0))
             for line in np.arange(0.12, 0.95, 0.1):
-                _write(rng, part, 3, line * side + 3, 0.045 * side + 2, (50, 40, 40), 3)
+                _write(rng, paper, 3, line * side + 3, 0.045 * side + 2, (50, 40, 40), 3)
     cv2.rectangle(image, (0, 0), (w, h), (50, 75, 100), max(4, int(0.06 * ppm)))
     return image
 
