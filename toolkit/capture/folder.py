@@ -86,8 +86,8 @@ class Capture:
             return present
         if not present:
             raise CaptureError(
-                f"{self.path}: no {split} session. Expected a folder sessions/<device>_{split}; "
-                f"`python -m toolkit import ... --split {split}` makes one."
+                f"{self.path}: no {split} session. Expected sessions/<device>_{split}, as made by "
+                f"`python -m toolkit import ... --split {split}`."
             )
         if device not in present:
             raise CaptureError(
