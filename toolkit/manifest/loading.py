@@ -62,8 +62,8 @@ def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
     for name, capture in zip(names, manifest.captures, strict=True):
         if name in RUN_FILES:
             raise ManifestError(
-                f"{source}: captures: the results of {capture} and the run's own {name} would have one path. Rename the "
-                "folder, or name a link to it."
+                f"{source}: captures: the results of {capture} and the run's own {name} would have one path. Rename "
+                "the folder, or name a link to it."
             )
     if twice := {name for name in names if names.count(name) > 1}:
         raise ManifestError(
