@@ -49,17 +49,14 @@ def explain(
         elif of_branch and problem["type"] in ("list_type", "dict_type") and isinstance(problem["input"], list | dict):
             continue  # likewise for `list | dict`
         elif problem["type"] == "literal_error" and isinstance(problem["input"], str):
-            line = f"{where}: found {problem['input']!r}. {nearest(problem['input'], _choices(problem))}"
+            choices = re.findall(r"'([^']*)'", problem["ctx"]["expected"])
+            line = f"{where}: found {problem['input']!r}. {nearest(problem['input'], choices)}"
         elif problem["type"] == "missing":
             line = f"{where}: not given. {problem['msg']}."
         else:
             line = f"{where}: found {problem['input']!r}. {_expected(problem, model, keys)}"
         lines.append(line + origin(keys))
     return "\n  ".join([f"{source}:", *dict.fromkeys(lines)])
-
-
-def _choices(problem: Any) -> list[str]:
-    return re.findall(r"'([^']*)'", problem["ctx"]["expected"])
 
 
 def _expected(problem: Any, model: type[BaseModel], keys: list[str]) -> str:

@@ -222,7 +222,7 @@ class MaskSettings(Settings):
     poses_angle_deg: PositiveNumber = 90.0
     """Largest angle between the viewing directions of the rough pose and a map camera, degrees; roll is ignored."""
     gps: bool = False
-    """Search only map images whose GPS fix (gps.txt) is near the query's; map images without a fix may be anywhere."""
+    """Search only map images whose GPS fix (gps.txt) is near the query's; map images without a fix are kept."""
     gps_margin_m: PositiveNumber = 25.0
     """Largest distance between the two fixes, meters, beyond twice the sum of their stated accuracies."""
     radio: bool = False
