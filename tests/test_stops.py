@@ -407,7 +407,7 @@ def test_what_builds_on_a_failed_stage_is_skipped(here: Path) -> None:
         ("rerank", {"matcher": "mutuel"}, "Did you mean 'mutual'"),
         ("embed", {"model": "vald"}, "'vald'. Did you mean 'vlad'. Known: auto, megaloc"),
         ("embed", {"settings": {"model": ["vlad", "megalok"]}}, "Did you mean 'megaloc'"),
-        ("embed", {"compute_device": "cude"}, "found 'cude'. It is: Where a network runs: auto, cpu, cuda"),
+        ("embed", {"compute_device": "cude"}, "found 'cude'. Meaning: Device of the network: auto, cpu, cuda"),
         ("retrieve", {"settings": {"index": "IVF4096,Flot"}}, "retrieve.index: found 'IVF4096,Flot'"),
         ("evaluate", {"pairs": "ios"}, "pairs: found 'ios'"),
         ("evaluate", {"pairs": [["ios"]]}, "pairs"),

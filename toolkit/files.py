@@ -1,4 +1,4 @@
-"""Artifacts on disk: written whole or not at all, each with a record of what it was made from."""
+"""Artifacts on disk: written atomically, each with a record of its settings, inputs and checksums."""
 
 import glob
 import hashlib
@@ -27,20 +27,20 @@ log = logging.getLogger(__name__)
 
 @contextmanager
 def write_atomic(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path` that is moved into place when the block ends without an error.
+    """Yield a temporary path beside `path`, which is moved to `path` if the block ends without an error.
 
-    A killed or failing writer leaves the old file, or none, under the final name.
+    If the writer fails or is killed, the old file, if any, remains under the final name.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Process and machine are in the name: `sweep_partials` then knows what nobody writes any more.
+    # The name contains process and machine, so that `sweep_partials` recognizes abandoned files.
     prefix = f".{path.name}.{process_tag()}-"
     handle, name = tempfile.mkstemp(prefix=prefix, suffix=f".partial{path.suffix}", dir=path.parent)
     os.close(handle)
     temporary = Path(name)
     try:
         yield temporary
-        # mkstemp makes private files; an artifact is as readable as any other file of the user.
+        # mkstemp makes private files; an artifact should have the user's usual permissions.
         umask = os.umask(0)
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
@@ -52,24 +52,24 @@ def write_atomic(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def write_folder(path: str | Path) -> Iterator[Path]:
-    """Yield a hidden folder that is moved to `path`, absent or empty, when the block ends without an error.
+    """Yield a hidden folder, which is moved to `path` (missing or empty) if the block ends without an error.
 
-    What a killed writer of the same folder left is removed.
+    Remains of killed writers of the same folder are removed first.
     """
     path = Path(path)
     for stale in path.parent.glob(f".{glob.escape(path.name)}.*-*"):
         if is_left_over(stale.name):
             shutil.rmtree(stale, ignore_errors=True)
     with temporary_folder(path) as folder:
-        part = folder / path.name
-        part.mkdir()
-        yield part
-        part.replace(path)
+        content = folder / path.name
+        content.mkdir()
+        yield content
+        content.replace(path)
 
 
 @contextmanager
 def temporary_folder(path: str | Path) -> Iterator[Path]:
-    """Yield a hidden folder beside `path`, which is removed when the block ends; `sweep_partials` knows it, too."""
+    """Yield a hidden folder beside `path`, which is removed when the block ends, or else by `sweep_partials`."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(".partial", f".{path.name}.{process_tag()}-", path.parent) as folder:
@@ -77,14 +77,14 @@ def temporary_folder(path: str | Path) -> Iterator[Path]:
 
 
 def process_tag() -> str:
-    """Return `<process>-<machine>`, for the names of what a process removes when it ends: see `is_left_over`."""
+    """Return `<process>-<machine>`, for names of temporary files and folders; see `is_left_over`."""
     return f"{os.getpid()}-{_machine()}"
 
 
 def is_left_over(name: str) -> bool:
-    """Tell whether a temporary file or folder, with `.<process_tag()>-` in its name, is of a killed process.
+    """Tell whether a temporary file or folder, with `.<process_tag()>-` in its name, is from a process that ended.
 
-    Only of this machine: of others it is not known which processes they run.
+    False for those of other machines, whose processes are not known here.
     """
     import psutil
 
@@ -93,7 +93,7 @@ def is_left_over(name: str) -> bool:
 
 
 def sweep_partials(folder: str | Path) -> None:
-    """Remove what killed writers of this machine left at and below a folder; what is still being written stays."""
+    """Remove temporary files and folders below a folder that killed processes of this machine left."""
     for path in Path(folder).rglob(".*.partial*"):
         if is_left_over(path.name):
             with suppress(OSError):
@@ -102,46 +102,46 @@ def sweep_partials(folder: str | Path) -> None:
 
 @cache
 def _machine() -> str:
-    """Return 8 hex digits that tell this machine from others that share its disks."""
+    """Return 8 hex digits that distinguish this machine from others with the same disks."""
     return hashlib.sha256(platform.node().encode()).hexdigest()[:8]
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file in one piece (see `write_atomic`)."""
+    """Write a text file atomically; see `write_atomic`."""
     with write_atomic(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def fingerprint(value: Any) -> str:
-    """Return 16 hex digits that identify a nest of dicts, lists, strings, numbers, None and paths."""
+    """Return 16 hex digits that identify a nested value of dicts, lists, strings, numbers, None and paths."""
     canonical = json.dumps(value, sort_keys=True, separators=(",", ":"), default=_jsonable)
     return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
 
 def file_fingerprint(path: str | Path) -> str:
-    """Return 16 hex digits that identify a file's content by its bytes."""
+    """Return 16 hex digits that identify the content of a file."""
     with open(path, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()[:16]
 
 
 def files_fingerprint(paths: list[Path]) -> str:
-    """Return 16 hex digits that identify many files by name, size and time of change, without reading them."""
+    """Return 16 hex digits that identify files by name, size and modification time, without reading them."""
     rows = []
     for path in paths:
         try:
             stat = path.stat()
             rows.append([path.name, stat.st_size, stat.st_mtime_ns])
-        except OSError:  # missing, or a name, a link or a folder that cannot be followed
+        except OSError:  # missing, or a path that cannot be followed
             rows.append([path.name, None, None])
     return fingerprint(rows)
 
 
 def checksum(path: str | Path) -> str:
-    """Return the XXH3 of a file's content, 32 hex digits; a process reads each state of a file once.
+    """Return the XXH3 hash of a file's content, 32 hex digits, cached until the file changes.
 
-    It tells damage from what was written, at the speed of memory; it is no protection against intent.
+    It detects damage at the speed of memory, but gives no protection against deliberate changes.
     """
-    stat = os.stat(path)  # noqa: PTH116 - the key of a cache, asked for often
+    stat = os.stat(path)  # noqa: PTH116 - faster; called often
     return _checksum(str(path), stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns)
 
 
@@ -152,7 +152,7 @@ def _checksum(path: str, *state: int) -> str:
 
 
 def sidecar_path(path: str | Path) -> Path:
-    """Return where the record of what an artifact was made from is kept: `<name>.meta.json` beside it."""
+    """Return the path of an artifact's record: `<name>.meta.json` beside it."""
     path = Path(path)
     return path.with_name(path.name + ".meta.json")
 
@@ -165,14 +165,14 @@ def write_sidecar(
     checksums: bool = True,
     unfinished: bool = False,
 ) -> None:
-    """Record the settings and inputs that the artifact `path` was made from, and what its content is.
+    """Record the settings and inputs of the artifact `path`, and the checksums of its files.
 
-    Call it after the artifact stands: an artifact without a matching record is made again.
+    Call this after the artifact is written; an artifact without a matching record is made again.
 
     Args:
-        others: further files beside it that are part of the artifact.
-        checksums: False for a file that has checksums of its parts in itself; its size is recorded.
-        unfinished: something of the artifact is to be tried again: it is there to be used, but not reused.
+        others: further files beside it that belong to the artifact.
+        checksums: False for a file that contains checksums of its own; only its size is recorded.
+        unfinished: a part of the artifact failed and must be tried again: this run uses it, later runs do not reuse it.
     """
     files = [Path(path), *map(Path, others)]
     record = {
@@ -186,15 +186,15 @@ def write_sidecar(
 
 
 def read_sidecar(path: str | Path) -> dict[str, Any] | None:
-    """Return the settings that the artifact `path` was made from; None unless it is whole and of this version.
+    """Return the settings of the artifact `path`; None unless it is complete, undamaged and from this version.
 
-    A warning says what of it is damaged or missing.
+    A warning names what is damaged or missing.
     """
     record = _read_record(path)
     settings = record.get("settings")
     if record.get("version") != __version__ or record.get("unfinished") or not isinstance(settings, dict):
         return None
-    if not record.get("files"):  # of a toolkit that kept no checksums
+    if not record.get("files"):  # written by a version without checksums
         return None
     damage = _damage(path, record)
     if not damage and record.get("fingerprint") != fingerprint(settings):
@@ -205,33 +205,33 @@ def read_sidecar(path: str | Path) -> dict[str, Any] | None:
 
 
 def is_current(path: str | Path, settings: dict[str, Any]) -> bool:
-    """Tell whether the artifact `path` is whole and was made by this version from exactly these settings."""
-    wanted = fingerprint(settings)
-    if _read_record(path).get("fingerprint") != wanted:  # before its content is read
+    """Tell whether the artifact `path` is undamaged and was made by this version with exactly these settings."""
+    expected = fingerprint(settings)
+    if _read_record(path).get("fingerprint") != expected:  # fast, without reading the artifact
         return False
-    found = read_sidecar(path)
-    return found is not None and fingerprint(found) == wanted
+    recorded = read_sidecar(path)
+    return recorded is not None and fingerprint(recorded) == expected
 
 
 def require_whole(path: str | Path, of: str | Path | None = None) -> None:
-    """Refuse a file that is not as its record says that it was written; one without a record is another tool's.
+    """Refuse a file that differs from its record. A file without a record is accepted: it is from another tool.
 
     Args:
-        of: the artifact that the file is part of, where that has the record.
+        of: the artifact that the file belongs to, if the record is that of the artifact.
 
     Raises:
-        ArtifactError: what is damaged, and what to do.
+        ArtifactError: the file is damaged or missing.
     """
     artifact = Path(of or path)
     if damage := _damage(artifact, _read_record(artifact), Path(path).name):
         raise ArtifactError(
             f"{damage}. Run the stage that makes it again. If it was changed on purpose, delete "
-            f"{sidecar_path(artifact)}: it is then taken as it is."
+            f"{sidecar_path(artifact)}: it is then used as it is."
         )
 
 
 def any_unfinished(folder: str | Path, part: str = "") -> bool:
-    """Tell whether artifacts below a folder, those that have `part` in their path, hold what is to be tried again."""
+    """Tell whether any artifact below a folder with `part` in its path is recorded as unfinished."""
     records = (path for path in Path(folder).rglob("*.meta.json") if part in path.relative_to(folder).as_posix())
     return any(_read_record(path.with_name(path.name.removesuffix(".meta.json"))).get("unfinished") for path in records)
 
@@ -248,7 +248,7 @@ def _read_record(path: str | Path) -> dict[str, Any]:
 
 
 def _damage(path: str | Path, record: dict[str, Any], only: str | None = None) -> str:
-    """Return what is wrong with the files of an artifact, or with the one named `only`; empty: nothing."""
+    """Return what is wrong with the files of an artifact, or only with the one named `only`; empty if nothing is."""
     try:
         for name, (size, expected) in record.get("files", {}).items():
             file = Path(path).with_name(name)
@@ -272,21 +272,21 @@ def _jsonable(value: Any) -> Any:
         return str(value)
     if hasattr(value, "item"):  # a numpy scalar
         return value.item()
-    raise TypeError(f"Settings must be JSON: {value!r} is a {type(value).__name__}.")
+    raise TypeError(f"Settings must be JSON values: {value!r} is a {type(value).__name__}.")
 
 
 RUN_FILES = ("notebooks", "report.html", "run.json", "run.log", "submission.csv", "submission.zip")
-"""What lies in a run folder beside its scenes, none of which can have such a name."""
+"""Files and folders of a run beside its scenes; no scene can have one of these names."""
 
 
 @dataclass(frozen=True)
 class SceneFiles:
-    """Where the files of one scene lie in a run folder."""
+    """Paths of the files of one scene in a run folder."""
 
     run: Path
-    """The run folder, `<output_root>/<manifest name>`."""
+    """Run folder, `<output_root>/<manifest name>`."""
     scene: str
-    """Name of the capture's folder."""
+    """Name of the capture folder."""
 
     @property
     def root(self) -> Path:
@@ -342,40 +342,40 @@ class SceneFiles:
 
 
 IMPORTED = "import/images/"
-"""Where `import` puts images, relative to a session's `raw_data`."""
+"""Folder of imported images, relative to a session's `raw_data`."""
 
 
 def image_name(path: str) -> str:
-    """Return the name of an image (`<session>/raw_data/<path>`) that outputs give as `<scene>/sessions/<name>`."""
+    """Return the name of an image, `<session>/raw_data/<path>`, from `<scene>/sessions/<name>` in outputs."""
     return path.split("/sessions/", 1)[-1]
 
 
 def own_name(name: str) -> str:
-    """Return what the user calls an image: of an imported one its path in the folder that it was imported from.
+    """Return the user's name of an image: for an imported image, its path in the folder it was imported from.
 
     Args:
-        name: the image's path relative to `raw_data`, or its `image_name`. Of other images, this is what is returned.
+        name: the image's path relative to `raw_data`, or its `image_name`; returned unchanged for other images.
     """
     return re.sub(f"^([^/]+/raw_data/)?{IMPORTED}", "", name)
 
 
 def pair_name(scene: str, map_device: str, query_device: str) -> str:
-    """Return the file stem of a map x query pair, as the challenge names it."""
+    """Return the file stem of a pair of map and query devices, as in the challenge."""
     return f"{scene}_map_{map_device}_query_{query_device}"
 
 
 def of_sequence(name: str) -> bool:
-    """Tell whether a file, by its name, is of the sequence stage, which writes beside the poses of single queries."""
+    """Tell by its name whether a file is from the sequence stage, which writes beside the poses of single queries."""
     return "_sequence" in name.rpartition("_query_")[2]
 
 
 def map_record_path(poses_dir: str | Path, scene: str, map_device: str) -> Path:
-    """Return where the localize stage says what is known of a map."""
+    """Return the path of the localize stage's record of a map."""
     return Path(poses_dir) / f"{scene}_map_{map_device}.json"
 
 
 def read_json(path: str | Path) -> dict[str, Any]:
-    """Return a JSON object, an empty one where the file is missing or holds something else."""
+    """Return the JSON object in a file; an empty one if the file is missing or contains something else."""
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -384,21 +384,21 @@ def read_json(path: str | Path) -> dict[str, Any]:
 
 
 def read_map_record(path: str | Path) -> dict[str, Any]:
-    """Return what the localize stage says of a map; where it says nothing: that its poses are meters."""
+    """Return the localize stage's record of a map; by default, the unit of its poses is meters."""
     return {"unit": "m", "depth": None, "verdict": "unknown", "text": "", "wrong": []} | read_json(path)
 
 
 def read_references(path: str | Path, *needed: str) -> list[dict[str, Any]]:
-    """Return the rows of a file of references, one a query image.
+    """Return the rows of a file of references, one per query image.
 
-    Each has at least `timestamp` (a whole number), `sensor_id`, and `topk`, a list of map images with a `path` each;
-    those that the toolkit writes have the keys that the retrieve stage describes.
+    A row has at least `timestamp` (an integer), `sensor_id`, and `topk`, a list of map images, each with a `path`. Rows
+    written by the toolkit have all keys described in the retrieve stage.
 
     Args:
         needed: further keys that each row must have.
 
     Raises:
-        ArtifactError: the file is missing or damaged, or a line of it is no such row.
+        ArtifactError: the file is missing or damaged, or a line is not such a row.
     """
     rows: list[dict[str, Any]] = []
     keys, number = {"timestamp", "sensor_id", "topk", *needed}, 0
@@ -432,10 +432,11 @@ def _checked(row: Any, keys: set[str]) -> dict[str, Any]:
 
 
 class Remade:
-    """Pickled as the arguments that it was made with; a process that unpickles it makes it once, until it gets another.
+    """Base of objects that are pickled as their constructor arguments and made again where they are unpickled.
 
-    For networks and other things that are costly to make, and of which each worker needs one. What is made again must
-    have the same `settings`, where they are JSON: `auto` may be another precision on another machine.
+    For networks and other objects that are expensive to make and that each worker needs once. A process keeps the last
+    object of each class. If `settings` is a dict, the new object must have the same settings: for example, `auto` may
+    select another precision on another machine.
     """
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Any:
@@ -450,7 +451,7 @@ class Remade:
 
     @classmethod
     def elsewhere(cls, *args: Any, **kwargs: Any) -> Any:
-        """Return what is pickled as if it were made with these arguments, without making it here."""
+        """Return an object to pickle with these arguments, without running its constructor here."""
         return cls.__new__(cls, *args, **kwargs)
 
 
@@ -459,7 +460,7 @@ _last_remade: dict[type, tuple[bytes, Any]] = {}
 
 def _remade(kind: type, made_with: bytes, expected: dict[str, Any] | None = None) -> Any:
     if _last_remade.get(kind, (b"", None))[0] != made_with:
-        _last_remade.pop(kind, None)  # first, as both may not fit in memory
+        _last_remade.pop(kind, None)  # free the old one first, because both may not fit in memory
         args, kwargs = pickle.loads(made_with)
         _last_remade[kind] = made_with, kind(*args, **kwargs)
     made = _last_remade[kind][1]
@@ -468,16 +469,16 @@ def _remade(kind: type, made_with: bytes, expected: dict[str, Any] | None = None
     return made
 
 
-def require_same(asked: Mapping[str, Any], here: Mapping[str, Any]) -> None:
-    """Refuse to compute with other settings than those that results are recorded under.
+def require_same(expected: Mapping[str, Any], here: Mapping[str, Any]) -> None:
+    """Refuse to compute with settings that differ from those in the record of the results.
 
     Raises:
-        ToolkitError: names those that differ.
+        ToolkitError: names the settings that differ.
     """
-    differing = [name for name in {**asked, **here} if asked.get(name) != here.get(name)]
+    differing = [name for name in {**expected, **here} if expected.get(name) != here.get(name)]
     if differing:
-        found = "; ".join(f"{name}: {here.get(name)} here, {asked.get(name)} there" for name in differing)
+        found = "; ".join(f"{name}: {here.get(name)} here, {expected.get(name)} there" for name in differing)
         raise ToolkitError(
-            f"The worker on {platform.node()} would compute otherwise than the process that asks ({found}). "
-            "Set it in the manifest, or use machines of one kind."
+            f"The worker on {platform.node()} has other settings than the main process ({found}). "
+            "Set them in the manifest, or use machines of one kind."
         )

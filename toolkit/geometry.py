@@ -1,6 +1,6 @@
-"""SE(3) and SO(3) on arrays. Poses are `a_from_b`, (..., 4, 4) float64; quaternions are qw qx qy qz.
+"""SE(3) and SO(3) on arrays, batched over leading dimensions.
 
-All functions are batched over leading dimensions.
+Poses are `a_from_b`, (..., 4, 4) float64; quaternions are qw qx qy qz.
 """
 
 from typing import TYPE_CHECKING, TypeVar
@@ -17,17 +17,17 @@ Real = TypeVar("Real", np.float32, np.float64)
 
 
 def unit(vectors: NDArray[Real], shortest: float = 1e-12) -> NDArray[Real]:
-    """Return vectors (..., D) at length 1, in their type; one shorter than `shortest` is divided by that instead."""
+    """Return vectors (..., D) scaled to unit length, in their type; shorter ones than `shortest` are divided by it."""
     lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
     units: NDArray[Real] = vectors / np.maximum(lengths, vectors.dtype.type(shortest))
     return units
 
 
 def quaternion_to_rotation(qwxyz: ArrayLike) -> Floats:
-    """Return the rotation matrices (..., 3, 3) of quaternions (..., 4); they need not be unit.
+    """Return the rotation matrices (..., 3, 3) of quaternions (..., 4) of any length.
 
     Raises:
-        ValueError: a quaternion is zero or not finite.
+        ValueError: wrong shape, or a quaternion is zero or not finite.
     """
     q = np.asarray(qwxyz, np.float64)
     if q.shape[-1:] != (4,):
@@ -47,8 +47,11 @@ def quaternion_to_rotation(qwxyz: ArrayLike) -> Floats:
 def rotation_to_quaternion(rotation: ArrayLike) -> Floats:
     """Return unit quaternions (..., 4), qw >= 0, of rotation matrices (..., 3, 3).
 
-    Each is computed from its largest component (Shepperd 1978), which stays exact at 180 degrees. SciPy's conversions
-    round otherwise, in both directions: with them the last digits of poses in files would change.
+    Each is computed from its largest component (Shepperd 1978), which is exact also at 180 degrees. SciPy's conversions
+    round differently, in both directions, and would change the last digits of poses in files.
+
+    Raises:
+        ValueError: wrong shape.
     """
     R = np.asarray(rotation, np.float64)
     if R.shape[-2:] != (3, 3):
@@ -56,7 +59,7 @@ def rotation_to_quaternion(rotation: ArrayLike) -> Floats:
     m00, m11, m22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     a, b, c = R[..., 2, 1], R[..., 0, 2], R[..., 1, 0]
     d, e, f = R[..., 1, 2], R[..., 2, 0], R[..., 0, 1]
-    # Each row is 4 * q_k * q for one k: any of them is the quaternion up to scale.
+    # Row k is 4 * q_k * q: each row is the quaternion up to scale.
     elements = [
         *(1 + m00 + m11 + m22, a - d, b - e, c - f),
         *(a - d, 1 + m00 - m11 - m22, c + f, b + e),
@@ -70,7 +73,7 @@ def rotation_to_quaternion(rotation: ArrayLike) -> Floats:
 
 
 def pose_from_qt(qt: ArrayLike) -> Floats:
-    """Return poses (..., 4, 4) from rows qw qx qy qz tx ty tz, (..., 7)."""
+    """Return poses (..., 4, 4) of rows qw qx qy qz tx ty tz, (..., 7)."""
     qt = np.asarray(qt, np.float64)
     return make_pose(quaternion_to_rotation(qt[..., :4]), qt[..., 4:7])
 
@@ -82,7 +85,7 @@ def qt_from_pose(pose: ArrayLike) -> Floats:
 
 
 def make_pose(rotation: ArrayLike, translation: ArrayLike) -> Floats:
-    """Return a_from_b, (..., 4, 4), from its rotation (..., 3, 3) and translation (..., 3)."""
+    """Return a_from_b, (..., 4, 4), with a rotation (..., 3, 3) and a translation (..., 3)."""
     rotation, translation = np.asarray(rotation, np.float64), np.asarray(translation, np.float64)
     pose = np.zeros((*np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1]), 4, 4))
     pose[..., :3, :3], pose[..., :3, 3], pose[..., 3, 3] = rotation, translation, 1.0
@@ -90,14 +93,14 @@ def make_pose(rotation: ArrayLike, translation: ArrayLike) -> Floats:
 
 
 def invert(a_from_b: ArrayLike) -> Floats:
-    """Return b_from_a, (..., 4, 4), of rigid poses (..., 4, 4)."""
+    """Return b_from_a, (..., 4, 4), of rigid poses a_from_b, (..., 4, 4)."""
     pose = np.asarray(a_from_b, np.float64)
     Rt = np.swapaxes(pose[..., :3, :3], -1, -2)
     return make_pose(Rt, -(Rt @ pose[..., :3, 3:])[..., 0])
 
 
 def transform(a_from_b: ArrayLike, points_in_b: ArrayLike) -> Floats:
-    """Return points in frame a, (..., N, 3), of points in frame b, (..., N, 3)."""
+    """Return points in frame a, (..., N, 3), given in frame b, (..., N, 3)."""
     pose, points = np.asarray(a_from_b, np.float64), np.asarray(points_in_b, np.float64)
     return points @ np.swapaxes(pose[..., :3, :3], -1, -2) + pose[..., None, :3, 3]
 
@@ -105,7 +108,7 @@ def transform(a_from_b: ArrayLike, points_in_b: ArrayLike) -> Floats:
 def rotation_angle_deg(rotation: ArrayLike) -> Floats:
     """Return the angle, degrees in [0, 180], of rotations (..., 3, 3); NaN for NaN.
 
-    It is atan2 of the skew part and the trace: exact near 0, where arccos of the trace alone is not.
+    Computed by atan2 of the skew part and the trace, which is exact near 0, unlike arccos of the trace.
     """
     R = np.asarray(rotation, np.float64)
     skew = np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1)
@@ -116,7 +119,7 @@ def rotation_angle_deg(rotation: ArrayLike) -> Floats:
 def pose_error(world_from_estimated: ArrayLike, world_from_true: ArrayLike) -> tuple[Floats, Floats]:
     """Return the rotation error, degrees, and the translation error, meters, of poses (..., 4, 4).
 
-    As the LaMAR benchmark defines them: the angle and the length of inverse(estimated) @ true.
+    Defined as in the LaMAR benchmark: rotation angle and translation length of inverse(estimated) @ true.
     """
     estimated_from_true = invert(world_from_estimated) @ np.asarray(world_from_true, np.float64)
     distance_m = np.linalg.norm(estimated_from_true[..., :3, 3], axis=-1)
@@ -124,7 +127,7 @@ def pose_error(world_from_estimated: ArrayLike, world_from_true: ArrayLike) -> t
 
 
 def project(points: Floats, camera: "pycolmap.Camera", world_from_cam: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return the pixels (n, 2) of world points (n, 3), and which are in front of the camera (others NaN)."""
+    """Return the pixels (n, 2) of world points (n, 3), NaN behind the camera, and which are valid, (n,) bool."""
     in_cam = transform(invert(world_from_cam), points)
     front = in_cam[:, 2] > 1e-3
     pixels = np.full((len(points), 2), np.nan)

@@ -106,7 +106,7 @@ def test_scans_and_fixes_are_counted_and_a_sensor_that_is_not_known_is_told_once
             "10, imu, t/10.jpg",
             ":6: warning: image t/10.jpg is in no subsession of proc/subsessions.txt",
         ),
-        ("hl_map/images.txt", "30, imu, s/a/10.jpg", ":6: error: sensor 'imu' of an image is no camera"),
+        ("hl_map/images.txt", "30, imu, s/a/10.jpg", ":6: error: sensor 'imu' of an image is not a camera"),
         ("hl_map/depths.txt", "10, s/a, s/a/10.png", ":1: error: missing file raw_data/s/a/10.png"),
         ("hl_map/depths.txt", "10, render/s/x, s/a/10.jpg", ":1: error: unknown sensor 'render/s/x'"),
         ("hl_map/rigs.txt", f"r, s/x, {QT}", ":6: error: unknown sensor 's/x': not in sensors.txt"),
@@ -234,7 +234,7 @@ def test_poses_that_cannot_be_right_are_found(capture: Path) -> None:
     walk(capture, [0, 0, -0.5])
     assert any("trajectories.txt: warning: cameras move backwards" in line for line in found(capture))
     walk(capture, [0, 0, 0.5], turn=0)
-    assert any("trajectories.txt: warning: all 12 images look exactly one way" in line for line in found(capture))
+    assert any("trajectories.txt: warning: all 12 images have the same rotation" in line for line in found(capture))
 
 
 def test_a_session_without_images_is_noted(capture: Path) -> None:
@@ -246,7 +246,7 @@ def test_queries_without_a_list_are_noted(capture: Path) -> None:
     (capture / "sessions" / "hl_query" / "proc" / "keyframes_pruned_subsampled.txt").unlink()
     (line,) = found(capture)
     assert line.startswith("hl_query/proc/keyframes_pruned_subsampled.txt: warning: no such list")
-    assert "there: pruned." in line
+    assert "found: pruned." in line
 
 
 def test_a_session_that_cannot_be_read_does_not_hide_the_others(capture: Path, tmp_path: Path) -> None:

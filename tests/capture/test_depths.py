@@ -138,8 +138,8 @@ def test_depth_that_cannot_be_placed_is_left_out(tmp_path: Path, settings: dict,
     ("spoil", "reason"),
     [
         (lambda path: path.unlink(), "no such file"),
-        (lambda path: path.write_bytes(b"torn"), "no 16-bit image"),
-        (lambda path: cv2.imwrite(str(path), np.ones((120, 160), np.uint8)), "no 16-bit image"),
+        (lambda path: path.write_bytes(b"torn"), "not a 16-bit image"),
+        (lambda path: cv2.imwrite(str(path), np.ones((120, 160), np.uint8)), "not a 16-bit image"),
         (lambda path: cv2.imwrite(str(path), np.ones((60, 80), np.uint16)), "80 x 60 pixels, expected 160 x 120"),
     ],
 )

@@ -107,10 +107,10 @@ def test_check_says_what_is_not_used_and_what_has_no_row(tmp_path: Path) -> None
     (path / "pointclouds.txt").write_text("1, s/lidar, cloud.ply\n")
     write(tmp_path / "CAB", "drone_map")
     report = check_capture(tmp_path / "CAB")
-    assert "pointclouds.txt is there and is not used" in report.text()
+    assert "pointclouds.txt is not used" in report.text()
     messages = [str(problem) for problem in report.problems if not problem.file]
     assert messages == [
-        "drone_map/: warning: device 'drone' is none of ios, hl, spot; it takes part. Meant? Else rename it"
+        "drone_map/: warning: device 'drone' is none of ios, hl, spot; it is used. Rename it if not intended"
     ]
     with devices.extra_devices([{"key": "drone"}]):
         assert not [problem for problem in check_capture(tmp_path / "CAB").problems if not problem.file]

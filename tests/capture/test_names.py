@@ -137,7 +137,7 @@ def test_names_too_long_for_files_are_refused(tmp_path: Path) -> None:
     name = "ä" * 101  # 202 bytes, of which outputs need 240
     with pytest.raises(CaptureError, match=r"subsessions\.txt: the subsession .* more than 200 bytes"):
         read_all(session_of(tmp_path / "1", proc_subsessions=f"{name}\n"))
-    assert any("too long a name" in line for line in errors_of(tmp_path / "1" / "PLACE" / "sessions" / "ios_map"))
+    assert any("too long for files" in line for line in errors_of(tmp_path / "1" / "PLACE" / "sessions" / "ios_map"))
     with pytest.raises(CaptureError, match=r"images\.txt: the subsession .* more than 200 bytes"):
         read_all(session_of(tmp_path / "2", images=f"1, s/cam, {name}/1.png\n"))
     folder = session_of(tmp_path / "3", images=f"1, s/cam, s/{'x' * 300}.png\n")
@@ -169,7 +169,7 @@ def test_dots_are_no_name_of_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def test_a_scene_does_not_take_the_place_of_a_run_s_own_files(tmp_path: Path) -> None:
     (tmp_path / "m.yaml").write_text("captures: [data/notebooks]\n")
-    with pytest.raises(ManifestError, match=r"captures: .*its own notebooks"):
+    with pytest.raises(ManifestError, match=r"captures: .*run's own notebooks"):
         load_manifest(tmp_path / "m.yaml")
 
 

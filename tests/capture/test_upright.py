@@ -211,7 +211,7 @@ def test_phones_without_a_clear_majority_are_left(write: Write, caplog: pytest.L
         assert turns.of(query).tolist() == [0]
         turns.of(query)
     lines = [line for line in caplog.messages if "ios_query" in line]
-    assert lines == ["Upright: ios_query: not known, left as they are: cam_phone_*."]
+    assert lines == ["Upright: ios_query: unknown, not turned: cam_phone_*."]
 
 
 def test_a_camera_is_known_by_its_name(write: Write) -> None:
@@ -228,7 +228,7 @@ def test_a_device_without_a_map_is_not_turned(write: Write, caplog: pytest.LogCa
     query = write("spot_query", [("q/cam", np.eye(4))], posed=False)
     with caplog.at_level(logging.INFO, "toolkit.capture.upright"):
         assert turns.of(query).tolist() == [0]
-    assert "not known, left as they are: cam." in caplog.text
+    assert "unknown, not turned: cam." in caplog.text
 
 
 def test_an_unknown_camera_follows_from_its_rig(tmp_path: Path) -> None:

@@ -325,7 +325,7 @@ def test_who_takes_cameras(create: Create) -> None:
         predictor, plain = create(name, conditioned=True), create(name)
         assert predictor.settings == plain.settings | {"conditioned": True}
     for name in ("vggt", "vggt-omega", "simulated"):
-        with pytest.raises(ManifestError, match=f"{name} cannot be told cameras; expected .* da3-base, da3-small"):
+        with pytest.raises(ManifestError, match=f"{name} does not accept cameras; expected .* da3-base, da3-small"):
             LocalizeSettings.of({"predictor": {"name": name, "conditioned": True}})
 
 

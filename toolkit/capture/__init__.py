@@ -1,4 +1,4 @@
-"""The capture format of LaMAR and CroCoDL: sessions of images with calibration and poses, read, written and checked."""
+"""Read, write and check captures in the format of LaMAR and CroCoDL: sessions of images with calibration and poses."""
 
 from toolkit.capture.cameras import CAMERA_TYPES, camera_text, parse_camera
 from toolkit.capture.folder import Capture

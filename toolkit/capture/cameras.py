@@ -1,4 +1,4 @@
-"""Cameras: intrinsics in the format of sensors.txt, rays, and the view of a camera."""
+"""Cameras: intrinsics in the format of sensors.txt, viewing rays, and the field of view."""
 
 import numpy as np
 import pycolmap
@@ -6,19 +6,19 @@ from numpy.typing import NDArray
 
 from toolkit.geometry import Floats, unit
 
-CAMERA_TYPES = ("camera", "depth")  # both have intrinsics; only the first takes photographs
-_LARGEST = 2**31 - 1  # pixels of a side; COLMAP refuses larger numbers with errors of its own
+CAMERA_TYPES = ("camera", "depth")  # sensor types with intrinsics; only `camera` takes photographs
+_LARGEST = 2**31 - 1  # largest image side, pixels; COLMAP cannot hold larger numbers
 
 
 def parse_camera(sensor_type: str, params: str) -> pycolmap.Camera:
-    """Return the camera that a line of sensors.txt describes.
+    """Return the camera of a line of sensors.txt.
 
     Args:
         sensor_type: `camera` or `depth`.
         params: the text after the sensor type: `MODEL, width, height, parameter, ...`.
 
     Raises:
-        ValueError: it is not a camera, or its model, size or parameters are not valid.
+        ValueError: the sensor is not a camera, or its model, size or parameters are not valid.
     """
     if sensor_type not in CAMERA_TYPES:
         raise ValueError(f"found type {sensor_type!r}, expected one with intrinsics: {' or '.join(CAMERA_TYPES)}.")
@@ -28,7 +28,7 @@ def parse_camera(sensor_type: str, params: str) -> pycolmap.Camera:
         raise ValueError(f"found camera model {model!r}, expected one of {', '.join(models)}.")
     count = len(pycolmap.Camera.create_from_model_name(0, model, 1.0, 1, 1).params)
     try:
-        # The benchmark writes whole numbers without a point, other tools `960.0`.
+        # The benchmark writes `960`, other tools `960.0`. Python accepts `9_60`, which is refused here.
         numbers = np.array([float(value.replace("_", " ")) for value in values if value], np.float64)
     except ValueError as error:
         raise ValueError(f"found {params!r}, expected numbers after the model ({error}).") from None
@@ -46,30 +46,29 @@ def parse_camera(sensor_type: str, params: str) -> pycolmap.Camera:
     for index, size in zip(camera.principal_point_idxs(), (width, height), strict=False):
         if not -size <= camera.params[index] <= 2 * size:
             raise ValueError(
-                f"found a principal point at {camera.params[index]:g} in {params!r}, more than the size of the image "
-                f"({size:g}) away from it; expected pixels."
+                f"found a principal point at {camera.params[index]:g} in {params!r}, further outside the image than "
+                f"its size ({size:g}); expected pixels."
             )
     return camera
 
 
 def camera_text(camera: pycolmap.Camera) -> str:
-    """Return what `parse_camera` reads: `MODEL, width, height, parameter, ...`, with all digits."""
+    """Return a camera as `MODEL, width, height, parameter, ...`, with all digits; `parse_camera` reads it."""
     params = (repr(float(value)) for value in camera.params)
     return ", ".join([camera.model.name, str(camera.width), str(camera.height), *params])
 
 
 def rays_of(camera: pycolmap.Camera, pixels: NDArray[np.floating]) -> Floats:
-    """Return unit rays (N, 3) in the camera's frame of pixels (N, 2)."""
+    """Return the unit viewing rays (N, 3), in the camera's frame, of pixels (N, 2)."""
     if not len(pixels):
         return np.zeros((0, 3))
-    rays = np.asarray(camera.cam_ray_from_img(np.asarray(pixels, np.float64)))
-    return unit(rays)
+    return unit(np.asarray(camera.cam_ray_from_img(np.asarray(pixels, np.float64))))
 
 
 def projection_jacobian(in_cams: Floats, focals_px: Floats) -> Floats:
     """Return the Jacobians (n, 2, 3), pixels per meter, of the projections (f x/z, f y/z) of points (n, 3).
 
-    The points are in the cameras' frames; the depth z counts as at least 1 mm.
+    Points are in the cameras' frames. Depths z below 1 mm are raised to 1 mm.
     """
     z = np.maximum(in_cams[:, 2], 1e-3)
     scale = focals_px / z
@@ -80,15 +79,19 @@ def projection_jacobian(in_cams: Floats, focals_px: Floats) -> Floats:
 
 
 def view_bounds(camera: pycolmap.Camera) -> Floats:
-    """Return x_min, x_max, y_min, y_max of the view at depth 1."""
+    """Return x_min, x_max, y_min, y_max of the field of view at depth 1."""
     w, h = camera.width, camera.height
     rays = rays_of(camera, np.array([[0, h / 2], [w, h / 2], [w / 2, 0], [w / 2, h]]))
-    rays = rays / np.maximum(rays[:, 2:], 0.2)  # views wider than 157 degrees are cut there
+    rays = rays / np.maximum(rays[:, 2:], 0.2)  # fields of view wider than 157 degrees are clipped
     return np.array([rays[0, 0], rays[1, 0], rays[2, 1], rays[3, 1]])
 
 
 def in_view(points_in_cams: Floats, bounds: Floats) -> NDArray[np.bool_]:
-    """Tell which points (J, P, 3) in the cameras' frames lie in the cameras' views (J, 4)."""
+    """Tell which points (J, P, 3) in the frames of J cameras lie in their fields of view; (J, P) bool.
+
+    Args:
+        bounds: (J, 4), as `view_bounds` returns them.
+    """
     z = points_in_cams[..., 2]
     x, y = points_in_cams[..., 0] / np.maximum(z, 1e-6), points_in_cams[..., 1] / np.maximum(z, 1e-6)
     b = bounds[:, None]

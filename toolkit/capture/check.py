@@ -1,4 +1,4 @@
-"""Look for inconsistencies in a capture and list every one, with file and line."""
+"""Find the inconsistencies of a capture and list each with file and line."""
 
 import os
 from dataclasses import dataclass, field
@@ -22,11 +22,13 @@ from toolkit.geometry import unit
 
 ERROR, WARNING = "error", "warning"
 ASKED = "pruned_subsampled"
-"""The list of keyframes that manifests ask for, unless they say otherwise."""
+"""Keyframe list that manifests localize by default."""
 SAME_PLACE_M = 1e-6
+"""Positions closer than this are the same, meters."""
 WALK = 10
-"""Steps of a camera that say which way it goes."""
-UNIT_TOLERANCE = 1e-3  # of the length of a quaternion; one further off is no rotation, or lost digits
+"""Smallest number of steps between camera positions from which the direction of motion is judged."""
+UNIT_TOLERANCE = 1e-3
+"""Largest deviation of a quaternion's length from 1; beyond, it is not a rotation or has lost digits."""
 
 
 @dataclass(frozen=True)
@@ -37,28 +39,28 @@ class Problem:
     file: str
     """Relative to the session's folder."""
     line: int
-    """From 1; 0 where it is about the whole file."""
+    """Line number from 1; 0 if the problem concerns the whole file."""
     message: str
     severity: str
-    """`error`: data is missing or wrong; `warning`: worth a look."""
+    """`error`: data are missing or wrong; `warning`: data may be wrong."""
 
     def __str__(self) -> str:
-        place = f"{self.session}/{self.file}" + (f":{self.line}" if self.line else "")
-        return f"{place}: {self.severity}: {self.message}"
+        where = f"{self.session}/{self.file}" + (f":{self.line}" if self.line else "")
+        return f"{where}: {self.severity}: {self.message}"
 
 
 @dataclass
 class CheckReport:
-    """What a capture contains and what is wrong with it."""
+    """The contents of a capture and its problems."""
 
     path: Path
     tables: dict[str, pd.DataFrame] = field(default_factory=dict)
-    """For each session, a table [what, count, details] of texts."""
+    """Contents of each session: a table [what, count, details] of texts."""
     problems: list[Problem] = field(default_factory=list)
 
     @property
     def ok(self) -> bool:
-        """Whether there is no error; warnings do not count."""
+        """Whether there are no errors; warnings are allowed."""
         return not self.errors
 
     @property
@@ -66,11 +68,11 @@ class CheckReport:
         return [problem for problem in self.problems if problem.severity == ERROR]
 
     def text(self, most: int | None = None) -> str:
-        """Return the report as text: a table for each session, then the problems, one a line (the first `most`)."""
+        """Return the report as text: a table per session, then at most `most` problems, one per line."""
         parts = [f"Capture {self.path}"]
         for session, table in self.tables.items():
-            wide, narrow = (max(map(len, table[name])) for name in ("what", "count"))
-            rows = (f"  {what:<{wide}}  {count:>{narrow}}  {details}" for what, count, details in table.to_numpy())
+            width, digits = (max(map(len, table[name])) for name in ("what", "count"))
+            rows = (f"  {what:<{width}}  {count:>{digits}}  {details}" for what, count, details in table.to_numpy())
             parts.append("\n".join([session, *map(str.rstrip, rows)]))
         if self.problems:
             lines = [str(problem) for problem in self.problems[:most]]
@@ -83,13 +85,13 @@ class CheckReport:
 
 
 def check_capture(path: str | Path, deep: bool = False) -> CheckReport:
-    """Read every session of a capture and the headers of its images, and list all inconsistencies.
+    """Read all sessions of a capture and the headers of its images, and list all inconsistencies.
 
     Args:
-        deep: decode each image and depth map, too.
+        deep: also decode every image and depth map.
 
     Raises:
-        CaptureError: the folder is not a capture at all.
+        CaptureError: the folder is not a capture.
     """
     capture = Capture.open(path)
     report = CheckReport(capture.path)
@@ -97,7 +99,7 @@ def check_capture(path: str | Path, deep: bool = False) -> CheckReport:
         try:
             checker = _SessionCheck(capture.folder(session_id), deep)
             checker.run()
-        except CaptureError as error:  # of what keeps the whole session from being read
+        except CaptureError as error:  # the session cannot be read at all
             report.problems.append(Problem(session_id, "", 0, str(error), ERROR))
             continue
         report.tables[session_id] = checker.summary()
@@ -114,13 +116,13 @@ class _SessionCheck:
         self.problems: list[Problem] = []
         self.missing: dict[str, int] = {}
         self.sizes: dict[str, tuple[int, int]] = {}
-        """Width and height of the images of each sensor that is a camera."""
+        """Image width and height of each camera and depth sensor."""
         self.sensors = self._rows("sensors.txt")
         self.rig_ids = self.session.rigs["rig_id"] if self.session.rigs is not None else pd.Series([], dtype=object)
         self.cameras = self.sensors[self.sensors["sensor_type"] == "camera"]["sensor_id"]
 
     def _rows(self, file: str) -> pd.DataFrame:
-        """Return the well-formed rows of a file; the index is the line number."""
+        """Return the well-formed rows of a file, indexed by line number."""
         table = self.session.tables[file]
         return table.frame(*table.columns).set_index(pd.Index(table.lines))
 
@@ -132,7 +134,7 @@ class _SessionCheck:
         return any(problem.severity == ERROR for problem in self.problems)
 
     def _add_rows(self, file: str, rows: pd.DataFrame, message: str, severity: str = ERROR) -> None:
-        """Report some rows of a file; `{column}` in the message stands for the row's value."""
+        """Report rows of a file; `{column}` in the message is replaced by the row's value."""
         for line, row in zip(rows.index, rows.to_dict("records"), strict=True):
             self._add(file, line, message.format(**row), severity)
 
@@ -143,10 +145,11 @@ class _SessionCheck:
             expected = f"<{', '.join(known)}>_<map or query>"
             self._add("", 0, f"found session name {session.path.name!r}, expected {expected}", WARNING)
         elif session.device not in [*known, *(device for device, _ in OTHER_SESSIONS.values())]:
-            message = f"device {session.device!r} is none of {', '.join(known)}; it takes part. Meant? Else rename it"
+            message = f"device {session.device!r} is none of {', '.join(known)}; it is used. Rename it if not intended"
             self._add("", 0, message, WARNING)
         if not len(session.images) and not session.tables["images.txt"].problems:
             self._add("images.txt", 0, "lists no image", WARNING)
+        # Reading these adds their files to `session.tables`.
         _ = session.subsessions, session.depths, [session.keyframes(name) for name in session.keyframe_files]
         _ = session.wifi, session.bluetooth, session.gps
         for file in session.tables:
@@ -163,18 +166,18 @@ class _SessionCheck:
         for file in session.keyframe_files.values():
             self._check_keyframes(file, self._rows(file))
         if session.split == "query" and ASKED not in session.keyframe_files:
-            there = ", ".join(session.keyframe_files) or "none"
-            message = f"no such list, the default for queries; there: {there}. Set `queries` in the manifest, or add it"
+            lists = ", ".join(session.keyframe_files) or "none"
+            message = f"no such list, the default for queries; found: {lists}. Set `queries` in the manifest, or add it"
             self._add(f"proc/keyframes_{ASKED}.txt", 0, message, WARNING)
         if SUBSESSIONS in session.tables:
             self._check_subsessions()
         if session.split == "map" and not self._has_errors:
-            self._check_places()
-        order = {file: place for place, file in enumerate(session.tables)}
+            self._check_map_poses()
+        order = {file: rank for rank, file in enumerate(session.tables)}
         self.problems.sort(key=lambda problem: (order.get(problem.file, -1), problem.line))
 
     def _check_rows(self, file: str, rows: pd.DataFrame) -> None:
-        """Check what does not depend on the kind of file: malformed lines, keys, ids and quaternions."""
+        """Report malformed lines, duplicate keys, unknown ids and bad quaternions of any file."""
         for line, message in self.session.tables[file].problems:
             self._add(file, line, message)
         if file not in SIGNALS:
@@ -182,12 +185,12 @@ class _SessionCheck:
             shown = ", ".join(f"{name} {{{name}!r}}" for name in key)
             again, same = rows.duplicated(key), rows.duplicated()
             self._add_rows(file, rows[again & ~same], f"duplicate key ({shown}), with other values")
-            self._add_rows(file, rows[again & same], f"duplicate key ({shown}), a line that counts once", WARNING)
+            self._add_rows(file, rows[again & same], f"duplicate key ({shown}), same values: counts once", WARNING)
         if "sensor_id" in rows:
             unknown, severity = ~rows["sensor_id"].isin(self.sensors["sensor_id"]), ERROR
-            if file == "depths.txt":  # maps that were rendered for a photograph: <prefix>/<sensor id>
+            if file == "depths.txt":  # ids of rendered depth maps: <prefix>/<sensor id of the photograph>
                 unknown &= ~rows["sensor_id"].str.replace("^[^/]*/", "", regex=True).isin(self.sensors["sensor_id"])
-            elif file in (*SIGNALS, "gps.txt"):  # which need nothing else of their sensors
+            elif file in (*SIGNALS, "gps.txt"):  # usable without a line in sensors.txt; one warning per sensor
                 unknown, severity = unknown & ~rows.duplicated("sensor_id"), WARNING
             self._add_rows(file, rows[unknown], "unknown sensor {sensor_id!r}: not in sensors.txt", severity)
         if "device_id" in rows:
@@ -220,8 +223,9 @@ class _SessionCheck:
                 self.sizes[sensor] = verdict
 
     def _check_files(self, file: str, rows: pd.DataFrame) -> None:
-        others = self.sensors[~self.sensors["sensor_type"].isin(CAMERA_TYPES)]["sensor_id"]
-        self._add_rows(file, rows[rows["sensor_id"].isin(others)], "sensor {sensor_id!r} of an image is no camera")
+        non_cameras = self.sensors[~self.sensors["sensor_type"].isin(CAMERA_TYPES)]["sensor_id"]
+        wrong = rows["sensor_id"].isin(non_cameras)
+        self._add_rows(file, rows[wrong], "sensor {sensor_id!r} of an image is not a camera")
         path = rows.columns[2]
         again = rows.duplicated(path) & ~rows.duplicated(key_of(file))
         self._add_rows(file, rows[again], f"{RAW_DATA}/{{{path}}} is listed again, under another key")
@@ -238,7 +242,7 @@ class _SessionCheck:
         self._check_content(file, rows[exist & inside])
 
     def _check_content(self, file: str, rows: pd.DataFrame) -> None:
-        """Open the files of rows; those of photographs have the size of their camera."""
+        """Open the image files of rows, and compare the size of photographs with that of their camera."""
         root, read = self.session.path / RAW_DATA, read_depth if file == "depths.txt" else read_image
         is_photograph = rows["sensor_id"].isin(self.cameras) & (file == "images.txt")
 
@@ -250,9 +254,9 @@ class _SessionCheck:
                     read(root / path)
             except (ImageError, CaptureError) as error:
                 return str(error)
-            expected = self.sizes.get(sensor, size) if photograph else size
-            stored, said = (f"{width} x {height}" for width, height in (size, expected))
-            return "" if size == expected else f"{path} has {stored} pixels, its sensor {sensor!r} {said}"
+            camera_size = self.sizes.get(sensor, size) if photograph else size
+            found, expected = (f"{width} x {height}" for width, height in (size, camera_size))
+            return "" if size == camera_size else f"{path} has {found} pixels, its sensor {sensor!r} {expected}"
 
         items = zip(rows[rows.columns[2]], rows["sensor_id"], is_photograph, strict=True)
         workers = default_workers()
@@ -265,7 +269,7 @@ class _SessionCheck:
         images = KeyIndex(times_of(session.images), session.device_ids)
         without = images.find(times_of(rows), rows["device_id"]) < 0
         takes_images = rows["device_id"].isin(self.rig_ids) | rows["device_id"].isin(self.cameras)
-        if session.split == "map":  # the odometry of queries goes on between images
+        if session.split == "map":  # odometry of queries also has poses between images
             message = "pose without image (timestamp {timestamp}, device {device_id!r})"
             self._add_rows(file, rows[takes_images & without], message, WARNING)
         if session.tables[file].has_extra:
@@ -296,8 +300,8 @@ class _SessionCheck:
             without = session.ground_truth.index.find(times_of(rows), rows["device_id"]) < 0
             self._add_rows(file, rows[known & without], f"keyframe without ground truth {shown}", WARNING)
 
-    def _check_places(self) -> None:
-        """Look for poses of a map that are well written and cannot be right."""
+    def _check_map_poses(self) -> None:
+        """Report implausible map poses: all in one place, all with one rotation, or all cameras moving backwards."""
         session = self.session
         poses, rows = posed_photographs(session)
         order = np.lexsort((times_of(session.images)[rows], session.subsession_of(rows).astype(str)))
@@ -308,18 +312,18 @@ class _SessionCheck:
         if np.ptp(poses[:, :3, 3], axis=0).max() < SAME_PLACE_M:
             self._add(file, 0, f"all {len(poses)} images stand in one place: nothing can be triangulated")
         elif np.ptp(poses[:, :3, :3], axis=0).max() < 1e-9:
-            self._add(file, 0, f"all {len(poses)} images look exactly one way: are rotations lost?", WARNING)
+            self._add(file, 0, f"all {len(poses)} images have the same rotation: were rotations lost?", WARNING)
         steps = np.diff(poses[:, :3, 3], axis=0)
         walked = (np.linalg.norm(steps, axis=1) > SAME_PLACE_M) & (recording[1:] == recording[:-1])
         forward = np.sum(unit(steps[walked]) * poses[1:][walked, :3, 2], axis=1)
         if len(forward) >= WALK and np.median(forward) < -np.cos(np.radians(45)):
-            message = "cameras move backwards: do their z axes point forward, as OpenCV's, or backward, as OpenGL's?"
+            message = "cameras move backwards: z axes must point forward (OpenCV); do they point backward (OpenGL)?"
             self._add(file, 0, message, WARNING)
 
     def _check_subsessions(self) -> None:
         of_image, rows = self.session.subsession_of(), self._rows(SUBSESSIONS)
         long = rows["subsession"].map(lambda name: has_long_part(name, "subsession")).astype(bool)
-        self._add_rows(SUBSESSIONS, rows[long], "subsession {subsession!r} has too long a name for files")
+        self._add_rows(SUBSESSIONS, rows[long], "subsession {subsession!r} has a name too long for files")
         empty = rows[~rows["subsession"].isin(of_image)]
         self._add_rows(SUBSESSIONS, empty, "subsession {subsession!r} has no images", WARNING)
         message = "image {image_path} is in no subsession of proc/subsessions.txt"
@@ -347,7 +351,7 @@ class _SessionCheck:
         for what, trajectory in (("poses", session.trajectory), ("ground truth", session.ground_truth)):
             note = ""
             if what == "poses" and trajectory is not None and session.split != "map":
-                note = "the device's own odometry: never used as ground truth"
+                note = "odometry of the device, not used as ground truth"
             elif what == "ground truth" and trajectory is None and session.split == "query":
                 note = f"no {ALIGNED}: these queries cannot be evaluated"
             elif what == "ground truth" and trajectory is not None and trajectory is session.trajectory:
@@ -373,7 +377,7 @@ class _SessionCheck:
             keys = self._rows(file)
             add(f"keyframes {name}", len(keys), _count(keys["device_id"].nunique(), "device"))
         if (session.path / "pointclouds.txt").exists():
-            add("point clouds", None, "pointclouds.txt is there and is not used")
+            add("point clouds", None, "pointclouds.txt is not used")
         return pd.DataFrame(rows, columns=["what", "count", "details"])
 
     def _camera_models(self) -> list[str]:
@@ -384,7 +388,7 @@ class _SessionCheck:
 
 
 def _exist(root: Path, paths: "pd.Series[str]") -> "pd.Series[bool]":
-    """Tell which paths relative to `root` exist. Each folder is listed once, which is faster than asking per file."""
+    """Tell which paths relative to `root` exist. Listing each folder once is faster than looking up each file."""
     listed: dict[str, set[str]] = {}
 
     def exists(path: str) -> bool:

@@ -1,12 +1,12 @@
 """The depth of photographs, from the depth maps of a capture.
 
-The official tools write `depths.txt` such that a depth map belongs to a photograph in one of three ways:
+In `depths.txt` of the official tools, a depth map belongs to a photograph in one of three ways:
 
-- rendered for it: same timestamp, under the photograph's sensor id or under `<prefix>/<sensor id>`, which is no sensor;
-- measured with it (phones): same timestamp, under its sensor id with `cam` replaced by `depth` in the last part;
-- measured by another sensor of its rig (headsets, robots), which has its own intrinsics, place in the rig and times.
+- rendered for it: same timestamp, and its sensor id or `<prefix>/<sensor id>`, an id that is not in sensors.txt;
+- measured with it (phones): same timestamp, and its sensor id with `cam` replaced by `depth` in the last part;
+- measured by another sensor of its rig (headsets, robots), with its own intrinsics, pose in the rig and timestamps.
 
-In each case the points of the map are transformed to the photograph's camera, and occluded points are left out.
+In each case the points of the depth map are transformed to the photograph's camera, and occluded points are dropped.
 """
 
 import logging
@@ -30,17 +30,16 @@ from toolkit.geometry import Floats, Ints
 
 log = logging.getLogger(__name__)
 
-
 MAX_OFFSET_US = 100_000
-"""Between a photograph and the depth map of another sensor: half the period of the slowest, at 5 Hz."""
+"""Largest time between a photograph and the depth map of another sensor: half the period of the slowest, at 5 Hz."""
 MAX_GAP_US = 1_000_000
-"""Between two poses of a sensor that are interpolated."""
-_MOST_POINTS = 30_000  # of a depth map; a few hundred features need no more
-_HIDDEN = 1.1  # a point deeper than that many times its nearest neighbor is occluded, or on an edge
-_CELL = 1.5  # width of a cell in which the nearest point hides the others, in spacings of the points
+"""Largest time between two poses of a sensor to interpolate between them."""
+_MOST_POINTS = 30_000  # per depth map; enough for a few hundred features
+_HIDDEN = 1.1  # a point deeper than its nearest neighbor by this factor is occluded, or on an edge
+_CELL = 1.5  # width of a cell, in point spacings; only the nearest point of a cell is visible
 _FITTED = 8  # points that a plane is fitted to
-_UNEVEN = 0.05  # relative inverse depth by which one of them may be off the plane
-_KEPT = 32  # photographs whose depth is kept in memory
+_UNEVEN = 0.05  # largest residual of a point to the plane, relative to the inverse depth
+_KEPT = 32  # photographs whose depth is cached
 
 
 @dataclass(frozen=True)
@@ -48,13 +47,13 @@ class SeenDepth:
     """Depth at some pixels of a photograph."""
 
     pixels: Floats
-    """(P, 2) of the photograph, in rows from the top."""
+    """(P, 2) pixels of the photograph, in row order from the top."""
     depth_m: Floats
-    """(P,) along the photograph's optical axis."""
+    """(P,) depth along the photograph's optical axis, meters."""
     cell_px: float = 1.0
-    """Width of the grid's cells; there is at most one point in each."""
+    """Width of the grid cells, pixels; each cell has at most one point."""
     reason: str = ""
-    """What was left out and why; without points, why there are none."""
+    """Which depth maps were left out and why; without points, why there are none."""
 
     def __len__(self) -> int:
         return len(self.depth_m)
@@ -64,10 +63,10 @@ class SeenDepth:
         return KDTree(self.pixels)
 
     def at(self, xy: ArrayLike) -> Floats:
-        """Return depth (N,), meters, at pixels (N, 2), from a plane through the points about each.
+        """Return the depth (N,), meters, at pixels (N, 2), from a plane fitted to the nearest points.
 
-        Inverse depth is linear in the pixels of a plane. NaN where fewer than four points are near, or where the points
-        do not lie on one surface.
+        The fit is linear, because the inverse depth of a plane is linear in the pixels. NaN where fewer than four
+        points are near, or where the points do not lie on one surface.
         """
         xy = np.asarray(xy, np.float64).reshape(-1, 2)
         depth_m = np.full(len(xy), np.nan)
@@ -78,17 +77,18 @@ class SeenDepth:
         inverse = 1 / self.depth_m[near[inside]]
         offset = (self.pixels[near[inside]] - xy[inside, None]) / self.cell_px
         rows = np.concatenate([np.ones((*inverse.shape, 1)), offset], axis=2)
-        normal = np.einsum("nki,nkj->nij", rows, rows) + 1e-6 * np.eye(3)  # if points lie on a line: flat across it
+        # The damping makes depth constant across a line if all points lie on it.
+        normal = np.einsum("nki,nkj->nij", rows, rows) + 1e-6 * np.eye(3)
         plane = np.linalg.solve(normal, np.einsum("nki,nk->ni", rows, inverse)[..., None])
-        off = np.abs((rows @ plane)[..., 0] - inverse).max(axis=1)
+        residual = np.abs((rows @ plane)[..., 0] - inverse).max(axis=1)
         value = plane[:, 0, 0]
-        smooth = (value > 0) & (off <= _UNEVEN * np.abs(value))
+        smooth = (value > 0) & (residual <= _UNEVEN * np.abs(value))
         depth_m[inside[smooth]] = 1 / value[smooth]
         return depth_m
 
 
 def lifted(camera: pycolmap.Camera, pixels: Floats, depth_m: Floats) -> Floats:
-    """Return the points (P, 3) in a camera's frame that project to pixels (P, 2) and have depths (P,)."""
+    """Return the points (P, 3), in the camera's frame, at pixels (P, 2) and depths (P,)."""
     rays = rays_of(camera, pixels)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(rays / rays[:, 2:] * np.asarray(depth_m)[:, None], np.float64)
@@ -96,31 +96,31 @@ def lifted(camera: pycolmap.Camera, pixels: Floats, depth_m: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class _DepthMap:
-    """A depth map of a photograph."""
+    """A depth map that belongs to a photograph."""
 
     path: str
-    """Below raw_data/."""
+    """Path relative to raw_data/."""
     camera: pycolmap.Camera | None
-    """None: the photograph's, resized."""
+    """Camera of the depth map; None: the photograph's camera, possibly resized."""
     cam_from_depth: Floats
-    """(4, 4)"""
+    """(4, 4) pose of the depth sensor in the photograph's camera."""
 
 
 class DepthMaps:
-    """The depth maps of a session, by photograph. Safe to use from several threads."""
+    """The depth maps of a session by photograph. Thread-safe."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
         self._seen = lru_cache(_KEPT)(self._see)
         self._tracks: dict[str, tuple[Ints, Floats]] = {}
         self._lock = Lock()
-        self._told: set[str] = set()
+        self._logged: set[str] = set()
 
     def of(self, row: int) -> SeenDepth:
-        """Return the depth in a photograph, a row of `Session.images`.
+        """Return the depth in a photograph, given as a row of `Session.images`.
 
-        It comes from the map nearest in time of every depth sensor that belongs to the camera, at most `MAX_OFFSET_US`
-        away. A map that cannot be read or does not fit its sensor is left out with a reason, which is logged once.
+        Each depth sensor that belongs to the camera contributes its depth map nearest in time, within `MAX_OFFSET_US`.
+        A depth map that cannot be read or does not fit its sensor is left out; the reason is logged once.
         """
         return self._seen(row)
 
@@ -138,15 +138,15 @@ class DepthMaps:
             points.append(points_of_map)
             spacing = max(spacing, spacing_px)
         with self._lock:
-            new = [reason for reason in reasons if reason not in self._told]
-            self._told.update(new)
+            new = [reason for reason in reasons if reason not in self._logged]
+            self._logged.update(new)
         for reason in new:
             log.warning("left out: %s", reason)
         return _visible(np.concatenate(points), camera, max(1.0, _CELL * spacing), "; ".join(reasons))
 
     @cached_property
     def _rows_of_sensor(self) -> dict[str, Ints]:
-        """Rows of depths.txt of each sensor, in order of time."""
+        """Rows of depths.txt of each sensor, sorted by time."""
         depths = self._session.depths
         if depths is None:
             return {}
@@ -155,12 +155,12 @@ class DepthMaps:
 
     @cached_property
     def _renderings(self) -> dict[str, str]:
-        """Ids `<prefix>/<sensor id>` of depth maps, by sensor id."""
-        ids = [other for other in self._rows_of_sensor if not self._session.has_sensor(other)]
-        return {other.partition("/")[2]: other for other in ids}
+        """Ids `<prefix>/<sensor id>` of rendered depth maps, by sensor id."""
+        ids = [depth_id for depth_id in self._rows_of_sensor if not self._session.has_sensor(depth_id)]
+        return {depth_id.partition("/")[2]: depth_id for depth_id in ids}
 
     @cached_property
-    def _mates(self) -> dict[str, list[str]]:
+    def _rig_depth_sensors(self) -> dict[str, list[str]]:
         """Depth sensors that share a rig with each sensor."""
         rigs = self._session.rigs
         if rigs is None:
@@ -168,38 +168,38 @@ class DepthMaps:
         depth = rigs[rigs["sensor_id"].isin(list(self._rows_of_sensor))]
         pairs = rigs.merge(depth, on="rig_id", suffixes=("", "_depth"))[["sensor_id", "sensor_id_depth"]]
         pairs = pairs[pairs["sensor_id"] != pairs["sensor_id_depth"]].drop_duplicates()
-        return {str(key): [str(i) for i in part] for key, part in pairs.groupby("sensor_id")["sensor_id_depth"]}
+        return {str(key): [str(i) for i in group] for key, group in pairs.groupby("sensor_id")["sensor_id_depth"]}
 
     def _sources(self, row: int, timestamp: int, sensor: str) -> tuple[list[_DepthMap], list[str]]:
-        """Return the depth maps of a photograph, and why others are left out."""
+        """Return the depth maps of a photograph, and the reasons why others are left out."""
         session = self._session
         if session.depths is None:
             return [], []
-        mates = self._mates.get(sensor, [])
+        in_rig = self._rig_depth_sensors.get(sensor, [])
         folder, slash, last = sensor.rpartition("/")
-        named = folder + slash + last.replace("cam", "depth")
-        for other in (sensor, self._renderings.get(sensor, ""), "" if named in mates else named):
-            nearest = self._nearest(other, timestamp, 0)
+        paired = folder + slash + last.replace("cam", "depth")
+        for depth_id in (sensor, self._renderings.get(sensor, ""), "" if paired in in_rig else paired):
+            nearest = self._nearest(depth_id, timestamp, 0)
             if nearest is not None:
-                own = other == sensor or not session.has_sensor(other)
-                return [_DepthMap(nearest[1], None if own else session.camera(other), np.eye(4))], []
+                own = depth_id == sensor or not session.has_sensor(depth_id)
+                return [_DepthMap(nearest[1], None if own else session.camera(depth_id), np.eye(4))], []
         sources, reasons = [], []
         world_from_cam = session.world_from_cam([row])[0]
-        for other in mates:
-            nearest = self._nearest(other, timestamp, MAX_OFFSET_US)
+        for depth_id in in_rig:
+            nearest = self._nearest(depth_id, timestamp, MAX_OFFSET_US)
             if nearest is None:
                 continue
-            world_from_depth = self._pose(other, nearest[0])
+            world_from_depth = self._pose(depth_id, nearest[0])
             if world_from_depth is None or not np.isfinite(world_from_cam).all():
-                why = "its sensor" if world_from_depth is None else "the photograph"
-                reasons.append(f"depth map {nearest[1]}: {why} has no pose at that time or about it")
+                missing = "its sensor" if world_from_depth is None else "the photograph"
+                reasons.append(f"depth map {nearest[1]}: {missing} has no pose at that time or near it")
                 continue
             cam_from_depth = geometry.invert(world_from_cam) @ world_from_depth
-            sources.append(_DepthMap(nearest[1], session.camera(other), cam_from_depth))
+            sources.append(_DepthMap(nearest[1], session.camera(depth_id), cam_from_depth))
         return sources, reasons
 
     def _nearest(self, sensor: str, timestamp: int, tolerance_us: int) -> tuple[int, str] | None:
-        """Return time and path of the depth map of a sensor that is nearest in time."""
+        """Return time and path of a sensor's depth map nearest in time, None beyond the tolerance."""
         rows = self._rows_of_sensor.get(sensor)
         if rows is None or self._session.depths is None:
             return None
@@ -210,7 +210,7 @@ class DepthMaps:
         return int(times[best]), str(self._session.depths["path"].iloc[int(rows[best])])
 
     def _pose(self, sensor: str, timestamp: int) -> Floats | None:
-        """Return world_from_sensor at a time, interpolated between two poses; None without poses near in time."""
+        """Return world_from_sensor at a time, interpolated between two poses; None if they are too far apart."""
         with self._lock:
             if sensor not in self._tracks:
                 self._tracks[sensor] = self._session.poses_of_sensor(sensor)
@@ -221,12 +221,16 @@ class DepthMaps:
         if after in (0, len(times)) or times[after] - times[after - 1] > MAX_GAP_US:
             return None
         share = (timestamp - times[after - 1]) / (times[after] - times[after - 1])
-        turn = Slerp([0, 1], Rotation.from_matrix(poses[after - 1 : after + 1, :3, :3]))(share).as_matrix()
-        place = (1 - share) * poses[after - 1, :3, 3] + share * poses[after, :3, 3]
-        return geometry.make_pose(turn, place)
+        rotation = Slerp([0, 1], Rotation.from_matrix(poses[after - 1 : after + 1, :3, :3]))(share).as_matrix()
+        position = (1 - share) * poses[after - 1, :3, 3] + share * poses[after, :3, 3]
+        return geometry.make_pose(rotation, position)
 
     def _points(self, source: _DepthMap, photograph: pycolmap.Camera) -> tuple[Floats, float]:
-        """Return the points (P, 3) of a depth map in the photograph's camera, and their spacing in its pixels."""
+        """Return the points (P, 3) of a depth map in the photograph's camera, and their spacing in its pixels.
+
+        Raises:
+            CaptureError: the depth map cannot be read, or its size does not fit the camera.
+        """
         path = self._session.path / RAW_DATA / source.path
         depth = read_depth(path)
         height, width = depth.shape
@@ -234,8 +238,8 @@ class DepthMaps:
         resized = source.camera is None and abs(width - height * camera.width / camera.height) <= 1
         if not resized and (width, height) != (camera.width, camera.height):
             raise CaptureError(
-                f"Depth map {path}: found {width} x {height} pixels, expected {camera.width} x {camera.height} as "
-                "sensors.txt says" + (", or that made smaller." if source.camera is None else ".")
+                f"Depth map {path}: found {width} x {height} pixels, expected {camera.width} x {camera.height} as in "
+                "sensors.txt" + (", or a smaller size of that aspect ratio." if source.camera is None else ".")
             )
         step = int(np.ceil(np.sqrt(max(np.count_nonzero(depth) / _MOST_POINTS, 1.0))))
         y, x = np.nonzero(depth[step // 2 :: step, step // 2 :: step])
@@ -248,7 +252,7 @@ class DepthMaps:
 
 
 def _visible(points: Floats, camera: pycolmap.Camera, cell_px: float, reason: str) -> SeenDepth:
-    """Project points (P, 3) in a camera's frame; keep the nearest of each cell unless a neighbor occludes it."""
+    """Project points (P, 3) in a camera's frame; keep the nearest point of each cell unless a neighbor occludes it."""
     if len(points):
         points = points[in_view(points[None], view_bounds(camera)[None])[0]]
     pixels = np.asarray(camera.img_from_cam(points), np.float64).reshape(-1, 2) if len(points) else np.zeros((0, 2))

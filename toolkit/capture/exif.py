@@ -1,4 +1,4 @@
-"""The metadata in the file of a photograph: its size as stored, when it was taken, and a guess of its intrinsics."""
+"""Metadata of an image file: its stored size, the time it was taken, and a guess of its intrinsics."""
 
 import os
 from collections.abc import Mapping
@@ -12,25 +12,25 @@ import pycolmap
 
 from toolkit.errors import ImageError
 
-# Tags that are read, and the millimeters in a unit of FocalPlaneResolutionUnit.
+# Numbers of the EXIF tags, and the length in millimeters of each value of FocalPlaneResolutionUnit.
 ORIENTATION, _EXIF, _TIME, _SUBSECOND = 0x0112, 0x8769, 0x9003, 0x9291
 _FOCAL_MM, _FOCAL_35MM, _WIDTH = 0x920A, 0xA405, 0xA002
 _PLANE_X, _PLANE_UNIT = 0xA20E, 0xA210
-_UNIT_MM = {0.0: 25.4, 2.0: 25.4, 3.0: 10.0, 4.0: 1.0}  # inches where it is not said
+_UNIT_MM = {0.0: 25.4, 2.0: 25.4, 3.0: 10.0, 4.0: 1.0}  # 0, a missing tag, means inches
 NO_FILE = "no such file"
 _FILM_DIAGONAL_MM = float(np.hypot(36, 24))
 
 
 def is_file(path: Path) -> bool:
-    """Tell whether there is a file; also of a name that no file can have, as it is too long."""
-    return os.path.isfile(path)  # noqa: PTH113 - Path.is_file raises then
+    """Tell whether a file exists; False for a name that is too long for a file."""
+    return os.path.isfile(path)  # noqa: PTH113 - Path.is_file raises for too long a name
 
 
 def read_header(path: Path) -> tuple[tuple[int, int], dict[int, Any]]:
-    """Return width and height as stored, and the EXIF tags by number.
+    """Return the stored width and height of an image, and its EXIF tags by number.
 
     Raises:
-        ImageError: no such file, or no image.
+        ImageError: the file is missing or not an image.
     """
     if not is_file(path):
         raise ImageError(NO_FILE)
@@ -43,7 +43,7 @@ def read_header(path: Path) -> tuple[tuple[int, int], dict[int, Any]]:
 
 
 def time_taken(exif: Mapping[int, Any]) -> int | None:
-    """Return the time by the camera's clock, microseconds since 1970, of unknown time zone; None without a tag."""
+    """Return the time on the camera's clock, microseconds since 1970 in an unknown time zone; None without a tag."""
     try:
         taken = datetime.strptime(str(exif[_TIME]), "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
     except (KeyError, ValueError):
@@ -53,7 +53,7 @@ def time_taken(exif: Mapping[int, Any]) -> int | None:
 
 
 def read_number(exif: Mapping[int, Any], tag: int) -> float:
-    """Return the number of a tag; 0 if it is missing, not a number or not finite."""
+    """Return the value of a tag as a number; 0 if it is missing, not a number or not finite."""
     try:
         number = float(exif.get(tag, 0))
     except (TypeError, ValueError, ZeroDivisionError):
@@ -62,13 +62,13 @@ def read_number(exif: Mapping[int, Any], tag: int) -> float:
 
 
 def exif_camera(path: Path) -> tuple[pycolmap.Camera, str]:
-    """Guess the intrinsics of an image from its EXIF tags: no distortion, the principal point in the center.
+    """Guess the intrinsics of an image from its EXIF tags: no distortion, principal point in the image center.
 
-    FocalLengthIn35mmFilm refers to the diagonal of 36 mm x 24 mm film, as in CIPA DC-008. Without that tag the guess is
-    FocalLength times FocalPlaneXResolution, scaled if the image was resized later.
+    FocalLengthIn35mmFilm refers to the diagonal of 36 mm x 24 mm film (CIPA DC-008). Without that tag, the focal length
+    is FocalLength times FocalPlaneXResolution, scaled if the image was resized later.
 
     Returns:
-        A SIMPLE_PINHOLE camera, and a phrase that says which tags it rests on.
+        A SIMPLE_PINHOLE camera, and a phrase that names the tags used.
 
     Raises:
         ImageError: the image cannot be read, or has no focal length in EXIF.
@@ -84,8 +84,8 @@ def exif_camera(path: Path) -> tuple[pycolmap.Camera, str]:
         how = "FocalLength and FocalPlaneXResolution"
     else:
         raise ImageError(
-            "no focal length in EXIF: give the intrinsics by --camera 'MODEL,W,H,...', such as "
-            f"'SIMPLE_PINHOLE,{width},{height},FOCAL_PX,{width / 2:g},{height / 2:g}', by --cameras, or in the table"
+            "no focal length in EXIF: give the intrinsics with --camera 'MODEL,W,H,...', such as "
+            f"'SIMPLE_PINHOLE,{width},{height},FOCAL_PX,{width / 2:g},{height / 2:g}', with --cameras, or in the table"
         )
     params = [float(focal_px), width / 2, height / 2]
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=width, height=height, params=params)

@@ -1,4 +1,4 @@
-"""The folder of a capture: its sessions by name."""
+"""The folder of a capture and its sessions."""
 
 import logging
 from collections.abc import Iterator
@@ -13,13 +13,13 @@ log = logging.getLogger(__name__)
 
 
 class Capture:
-    """A capture folder: its sessions, each read when first asked for."""
+    """A capture folder. A session is read at its first use."""
 
     def __init__(self, path: str | Path) -> None:
         path = Path(path)
-        self.path = path.resolve() if path.name == ".." else path  # the folder is to have a name
+        self.path = path.resolve() if path.name == ".." else path  # the folder's name is the scene's name
         if not self.path.is_dir():
-            raise CaptureError(f"No such capture folder: {self.path}. Expected a folder that holds `sessions/`.")
+            raise CaptureError(f"No such capture folder: {self.path}. Expected a folder that contains `sessions/`.")
         self._root = self.path / "sessions"
         if not self._root.is_dir():
             raise CaptureError(
@@ -38,8 +38,8 @@ class Capture:
         self.session_ids = sorted(self._folders)
         if not self.session_ids:
             raise CaptureError(
-                f"{self._root} holds no session: no folder in it has a sensors.txt or images.txt. "
-                "Expected e.g. ios_map, hl_query."
+                f"{self._root} contains no session: no folder in it has a sensors.txt or images.txt. "
+                "Expected folders such as ios_map and hl_query."
             )
         self._sessions: dict[str, Session] = {}
 
@@ -48,13 +48,13 @@ class Capture:
         """Open a capture folder.
 
         Raises:
-            CaptureError: no such folder, no `sessions/` in it, or nothing in that.
+            CaptureError: the folder is missing, has no `sessions/`, or contains no session.
         """
         return cls(path)
 
     @classmethod
     def from_sessions_root(cls, sessions_root: str | Path) -> "Capture":
-        """Open the capture whose `sessions` folder this is."""
+        """Open the capture of a given `sessions` folder."""
         root = Path(sessions_root).absolute()
         if root.name != "sessions":
             raise CaptureError(f"{root} is not the `sessions` folder of a capture; expected <capture>/sessions.")
@@ -62,32 +62,32 @@ class Capture:
 
     @property
     def name(self) -> str:
-        """Name of the folder; the scene's name in all outputs."""
+        """Name of the folder, which is the name of the scene in all outputs."""
         return self.path.absolute().name
 
     @property
     def devices(self) -> list[str]:
-        """The device keys that have a session."""
+        """Keys of the devices that have a session."""
         sessions = (session_of(folder.name) for folder in self._folders.values())
         return in_order(device for device, split in sessions if split in SPLITS)
 
     def devices_with(self, split: str, device: str = "all") -> list[str]:
-        """Return the devices that have a session of a split: all of them, or a given one.
+        """Return the devices that have a session of a split: all of them, or only the given one.
 
         Args:
             split: `map` or `query`.
             device: a device key, or `all` (also `auto`).
 
         Raises:
-            CaptureError: no device, or not this one, has such a session.
+            CaptureError: no device has such a session, or the given one has none.
         """
         present = [key for key in self.devices if f"{key}_{split}" in self]
         if device in ("all", "auto") and present:
             return present
         if not present:
             raise CaptureError(
-                f"{self.path}: no {split} session. Expected sessions/<device>_{split}, such as "
-                f"`python -m toolkit import ... --split {split}` makes."
+                f"{self.path}: no {split} session. Expected sessions/<device>_{split}, as made by "
+                f"`python -m toolkit import ... --split {split}`."
             )
         if device not in present:
             raise CaptureError(
@@ -101,15 +101,15 @@ class Capture:
         return self._folders[session_id]
 
     def image_path(self, name: str) -> Path:
-        """Return the file of an image by its name, as `Session.image_name` gives it.
+        """Return the file of an image by its name, as from `Session.image_name`.
 
         Raises:
-            CaptureError: no session lists it.
+            CaptureError: no session lists the image.
         """
         session = self[session_id(name.partition("/")[0])]
         row = session.row_of_name.get(name)
         if row is None:
-            raise CaptureError(f"{session.path / 'images.txt'}: has no image {name!r}. Run the stages of it again.")
+            raise CaptureError(f"{session.path / 'images.txt'}: has no image {name!r}. Run its stages again.")
         return session.image_path(row)
 
     def __getitem__(self, session_id: str) -> Session:
@@ -127,7 +127,7 @@ class Capture:
         return self._sessions[session_id]
 
     def usable(self, split: str) -> list[Session]:
-        """Return the sessions of a split that can be read; those that cannot are logged, with the reason."""
+        """Return the readable sessions of a split; log the others with the reason."""
         sessions = []
         for name in (name for name in self.session_ids if session_of(self._folders[name].name)[1] == split):
             try:

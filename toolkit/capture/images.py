@@ -1,4 +1,4 @@
-"""Decode images, with errors that say whether a file is missing or unreadable."""
+"""Read image files, with errors that distinguish missing from unreadable files; also thread counts for such loops."""
 
 import os
 import stat
@@ -23,29 +23,29 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 WORKERS = "TOOLKIT_WORKERS"
-"""Environment variable: the threads that this process may use."""
+"""Environment variable with the number of threads that this process may use."""
 THREAD_BYTES = 1 << 29
-"""Memory for each thread: SIFT of a photograph of 4000 x 3000 pixels takes 460 MB."""
+"""Memory to reserve for each thread, bytes: SIFT of a photograph of 4000 x 3000 pixels takes 460 MB."""
 MOST_BYTES = 1 << 30
-"""Of a file that is read as an image."""
+"""Largest size of an image file, bytes."""
 MOST_PIXELS = 1 << 28
-"""Of an image that is decoded: 268 million, 0.8 GB in color. A file of some kilobytes can hold many more."""
-# Not all by `PIL.Image.open`: its limit of pixels is below what telephones take by now.
+"""Largest number of pixels of a decoded image: 268 million, 0.8 GB in color. A tiny file can declare many more."""
+# JPEG and PNG bypass `PIL.Image.open`, whose limit of pixels is below the resolution of recent phones.
 _HEADER_READERS: dict[bytes, Callable[[Any], PIL.Image.Image]] = {
     b"\xff\xd8": JpegImagePlugin.JpegImageFile,
     b"\x89PNG\r\n\x1a\n": PngImagePlugin.PngImageFile,
     b"": PIL.Image.open,
 }
 _REDUCED = {8: cv2.IMREAD_REDUCED_COLOR_8, 4: cv2.IMREAD_REDUCED_COLOR_4, 2: cv2.IMREAD_REDUCED_COLOR_2}
-_CGROUPS = Path("/sys/fs/cgroup")  # its files are named differently in versions 2 and 1
+_CGROUPS = Path("/sys/fs/cgroup")  # file names differ between versions 2 and 1
 _HEADER_ERRORS = (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError)
 
 
 def read_file(path: str | Path) -> bytes:
-    """Return the content of the file of an image.
+    """Return the content of an image file.
 
     Raises:
-        ImageError: there is none; it is a folder, a pipe or a device; it cannot be read, or is too large.
+        ImageError: the file is missing, cannot be read, is too large, or is a folder, a pipe or a device.
     """
     with _open(path) as stream:
         return stream.read()
@@ -54,17 +54,17 @@ def read_file(path: str | Path) -> bytes:
 @contextmanager
 def _open(path: str | Path) -> Iterator[BinaryIO]:
     try:
-        found = os.stat(path)  # noqa: PTH116 - half the time of a Path's
-        if not stat.S_ISREG(found.st_mode):  # to open a pipe waits for ever, a device has no end
+        status = os.stat(path)  # noqa: PTH116 - twice as fast as Path.stat
+        if not stat.S_ISREG(status.st_mode):  # opening a pipe blocks forever, reading a device never ends
             raise ImageError(f"Image cannot be read: {path} is a folder, a pipe or a device, expected a file")
-        if found.st_size > MOST_BYTES:
-            size = f"{found.st_size:,} bytes, expected {MOST_BYTES:,} at most"
+        if status.st_size > MOST_BYTES:
+            size = f"{status.st_size:,} bytes, expected at most {MOST_BYTES:,}"
             raise ImageError(f"Image cannot be read: {path} has {size}")
         with open(path, "rb") as stream:
             yield stream
     except FileNotFoundError:
         raise ImageError(f"Image not found: {path}") from None
-    except (OSError, ValueError) as error:  # the latter for a name that no file can have
+    except (OSError, ValueError) as error:  # ValueError: the name is not valid for a file
         raise ImageError(f"Image cannot be read: {path} ({error})") from None
 
 
@@ -72,7 +72,7 @@ def stored_size(path: str | Path) -> tuple[int, int]:
     """Return width and height of an image file, from its header.
 
     Raises:
-        ImageError: see `read_file`; or it has no header of an image.
+        ImageError: see `read_file`; or the file has no image header.
     """
     with _open(path) as stream:
         try:
@@ -94,7 +94,7 @@ def decode(path: str | Path, flags: int, least_side: int | None = None) -> NDArr
         least_side: see `read_image`; adds to `flags`.
 
     Raises:
-        ImageError: see `read_file`; or it is no image, is cut short, or has more than `MOST_PIXELS`.
+        ImageError: see `read_file`; or the file is not an image, is truncated, or has more than `MOST_PIXELS` pixels.
     """
     data = read_file(path)
     try:
@@ -102,10 +102,10 @@ def decode(path: str | Path, flags: int, least_side: int | None = None) -> NDArr
     except PIL.Image.DecompressionBombError as error:
         raise ImageError(f"Image cannot be decoded ({error}): {path}") from None
     except _HEADER_ERRORS:
-        width = height = 0  # OpenCV says whether it is an image
+        width = height = 0  # OpenCV decides whether it is an image
     if width * height > MOST_PIXELS:
         raise ImageError(f"Image cannot be decoded ({width} x {height} pixels, more than {MOST_PIXELS:,}): {path}")
-    if least_side is not None and data.startswith(b"\xff\xd8"):  # of other files OpenCV decodes all, then subsamples
+    if least_side is not None and data.startswith(b"\xff\xd8"):  # reducing saves time only for JPEG
         flags |= _reduced(width, height, least_side)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
@@ -117,25 +117,25 @@ def decode(path: str | Path, flags: int, least_side: int | None = None) -> NDArr
 
 
 def _reduced(width: int, height: int, least_side: int) -> int:
-    """Return the flag to decode a JPEG file of a size with, see `read_image`; 0 for as it is stored."""
-    for by, flag in _REDUCED.items():
-        # Of other sizes the last row and column would stand for fewer pixels than the others, and all be moved.
-        if width % by == height % by == 0 and min(width, height) >= by * least_side:
+    """Return the OpenCV flag that decodes a JPEG of this size reduced, see `read_image`; 0 for full size."""
+    for factor, flag in _REDUCED.items():
+        # With a remainder, the last row and column would cover fewer pixels and shift all others.
+        if width % factor == height % factor == 0 and min(width, height) >= factor * least_side:
             return flag
     return 0
 
 
 def read_image(path: str | Path, gray: bool = False, least_side: int | None = None) -> NDArray[np.uint8]:
-    """Return an image as stored, (H, W, 3) RGB uint8, or (H, W) where `gray`.
+    """Return an image as stored, (H, W, 3) RGB uint8, or (H, W) if `gray`.
 
-    EXIF orientation is not applied: a capture's intrinsics belong to the pixels as they are in the file.
+    EXIF orientation is ignored, because a capture's intrinsics refer to the stored pixels.
 
     Args:
-        least_side: a JPEG file in color comes at 1/8, 1/4 or 1/2 of its size where that is a whole number of pixels
-            and leaves the shorter side so many: for who makes it smaller still. None: as stored.
+        least_side: decode a color JPEG at 1/8, 1/4 or 1/2 of its size if both sides stay whole numbers and the shorter
+            one has at least this many pixels. Saves time for callers that reduce the image anyway. None: full size.
 
     Raises:
-        ImageError: the file is missing, or is not an image that can be decoded; see `decode`.
+        ImageError: the file is missing or cannot be decoded; see `decode`.
     """
     flags = cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR
     image = decode(path, flags | cv2.IMREAD_IGNORE_ORIENTATION, None if gray else least_side)
@@ -145,10 +145,13 @@ def read_image(path: str | Path, gray: bool = False, least_side: int | None = No
 def pixels_of(
     image: str | Path | NDArray[np.uint8], gray: bool = False, least_side: int | None = None
 ) -> NDArray[np.uint8]:
-    """Return the pixels of a file, see `read_image`, or those given, (H, W) or (H, W, 3) RGB, in gray or in color.
+    """Return an image in gray, (H, W), or in color, (H, W, 3) RGB.
+
+    Args:
+        image: a file, see `read_image`; or pixels (H, W) or (H, W, 3) RGB uint8.
 
     Raises:
-        ImageError: the file is missing or cannot be decoded, or pixels of another shape or type.
+        ImageError: the file is missing or cannot be decoded, or the pixels have another shape or type.
     """
     if isinstance(image, str | Path):
         return read_image(image, gray, least_side)
@@ -160,7 +163,7 @@ def pixels_of(
 
 
 def read_for_display(path: str | Path) -> NDArray[np.uint8]:
-    """Return an image, (H, W, 3) RGB; a gray image with the text `unreadable` if it cannot be read."""
+    """Return an image, (H, W, 3) RGB; for an unreadable file, a gray one with the text `unreadable`."""
     try:
         return read_image(path)
     except ImageError:
@@ -170,10 +173,10 @@ def read_for_display(path: str | Path) -> NDArray[np.uint8]:
 
 
 def default_workers() -> int:
-    """Return the default number of threads: what `WORKERS` says, else the cores that this process may use.
+    """Return the default number of threads: the value of `WORKERS`, else the number of usable cores.
 
-    These are limited by its affinity, by the quota of its container, and by the memory of the machine or the container,
-    of which each thread should have `THREAD_BYTES`.
+    It is limited by the CPU affinity of the process, the CPU quota of its container, and the memory of the machine and
+    the container, with `THREAD_BYTES` per thread.
     """
     import psutil
 
@@ -189,7 +192,7 @@ def default_workers() -> int:
 
 
 def _of_control_group(*files: str) -> list[list[int]]:
-    """Return the numbers in files of this process's control group; nothing where it has none or they say `max`."""
+    """Return the numbers in files of this process's control group; empty without a group or a limit (`max`)."""
     with suppress(OSError, ValueError):
         return [[int(text) for file in files for text in (_CGROUPS / file).read_text().split()]]
     return []
@@ -211,10 +214,10 @@ def one_thread() -> Iterator[None]:
 
 
 def prefetch(function: Callable[[T], R], items: Iterable[T], workers: int = 2, ahead: int = 4) -> Iterator[R]:
-    """Yield `function(item)` in order while `workers` threads work on the next ones, at most `ahead` of them.
+    """Yield `function(item)` in order, while `workers` threads process up to `ahead` further items.
 
-    Memory stays bounded however long `items` is. Meant for functions that release the interpreter lock (decoding, SIFT,
-    RANSAC). An exception of `function` is raised when its item's turn comes.
+    Memory is bounded for any number of items. Meant for functions that release the interpreter lock (decoding, SIFT,
+    RANSAC). An exception of `function` is raised at its item's turn.
     """
     pool = ThreadPoolExecutor(workers)
     pending: deque[Future[R]] = deque()

@@ -1,9 +1,9 @@
-"""Which images of a map a query can show, by what is known of its place: radio signals, GPS fixes, rough poses.
+"""Masks: which map images a query may retrieve, according to radio signals, GPS fixes or rough poses.
 
-Radio: what a device receives within some seconds is compared with what was received at the map's images, as the LaMAR
-benchmark does (P.-E. Sarlin et al., "LaMAR: Benchmarking Localization and Mapping for Augmented Reality", ECCV 2022).
-There levels are compared in dB, where the query received any; here all strengths by the angle between them, as the
-receivers of different devices differ by several dB.
+Radio: the signals that a device receives within some seconds are compared with those received at the map images, as in
+the LaMAR benchmark (P.-E. Sarlin et al., "LaMAR: Benchmarking Localization and Mapping for Augmented Reality", ECCV
+2022). The benchmark compares levels in dB of the emitters that the query received. Here the angle between the vectors
+of all strengths is compared, because receivers of different devices differ by several dB.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -25,42 +25,42 @@ from toolkit.geometry import Floats, Ints
 Bools = NDArray[np.bool_]
 
 _BLOCK = 1 << 24
-"""Pairs of a query and a map image that are looked at at a time."""
+"""Pairs of a query and a map image that are processed at a time."""
 _FAINTEST_DBM = -100.0
-"""Weaker signals are hardly received; strengths count from here."""
+"""Zero of the scale of strengths: weaker signals are hardly received."""
 _ACCURACIES = 2.0
-"""A fix is within so many accuracies, the radius of 68 %, in 99 % of cases, where errors are normal."""
+"""Radius that contains the true position in 99 % of cases if errors are normal, in stated accuracies (68 % radii)."""
 
 
 @dataclass(frozen=True)
 class Masks:
-    """Which of N rows each of Q queries may find, in N / 8 bytes a distinct mask."""
+    """Which of N map images each of Q queries may retrieve; N / 8 bytes per distinct mask."""
 
     count: int
-    """N."""
+    """N, the number of map images."""
     bits: NDArray[np.uint8]
-    """(M, N / 8) the distinct masks, the first row in the lowest bit."""
+    """(M, N / 8) the distinct masks, the first map image in the lowest bit."""
     which: Ints
-    """(Q,) the mask of each query; -1: it may find all rows."""
+    """(Q,) row in `bits` of each query's mask; -1: all map images are allowed."""
 
     @classmethod
     def of(cls, masks: Iterable[Bools], which: Ints, count: int) -> "Masks":
-        """Make masks of blocks (m, N) of distinct ones; one that leaves no row limits no query."""
+        """Make masks from blocks (m, N) of distinct masks; a mask that allows no map image is ignored."""
         bits = [np.zeros((0, -(-count // 8)), np.uint8)]
         bits += [np.packbits(block, axis=1, bitorder="little") for block in masks]
         stacked = np.concatenate(bits)
-        some = np.append(stacked.any(axis=1), False)  # for -1, which comes last
+        some = np.append(stacked.any(axis=1), False)  # the last entry is for -1
         return cls(count, stacked, np.where(some[which], which, -1))
 
     def __len__(self) -> int:
         return len(self.which)
 
     def choose(self, queries: Ints | slice) -> "Masks":
-        """Return those of some of the queries."""
+        """Return the masks of some of the queries."""
         return replace(self, which=self.which[queries])
 
     def rows(self, start: int, stop: int) -> Bools:
-        """Return what each query may find of some of the rows, (Q, stop - start)."""
+        """Return which of the map images from `start` to `stop` each query may retrieve, (Q, stop - start)."""
         first, last, limited = start // 8, -(-stop // 8), self.which >= 0
         packed = np.full((len(self), last - first), 255, np.uint8)
         packed[limited] = self.bits[self.which[limited], first:last]
@@ -68,24 +68,24 @@ class Masks:
         return unpacked[:, start - 8 * first : stop - 8 * first]
 
     def distinct(self) -> Iterator[tuple[Ints, Bools | None]]:
-        """Yield for each distinct mask the queries that have it, and the mask (N,); None: they may find all rows."""
+        """Yield for each distinct mask the queries that have it, and the mask (N,); None: all map images."""
         order = np.argsort(self.which, kind="stable")
         masks, starts = np.unique(self.which[order], return_index=True)
         for mask, queries in zip(masks, np.split(order, starts[1:]), strict=True):
             yield queries, None if mask < 0 else self.choose(queries[:1]).rows(0, self.count)[0]
 
     @classmethod
-    def stack(cls, parts: Sequence["Masks"]) -> "Masks":
-        """Return several sets of queries, of the same rows, one below the other."""
-        starts = np.cumsum([0, *(len(part.bits) for part in parts)])
-        which = [np.where(part.which < 0, -1, part.which + start) for part, start in zip(parts, starts, strict=False)]
-        return cls(parts[0].count, np.concatenate([part.bits for part in parts]), np.concatenate(which))
+    def stack(cls, sets: Sequence["Masks"]) -> "Masks":
+        """Concatenate the masks of several sets of queries over the same map images."""
+        starts = np.cumsum([0, *(len(masks.bits) for masks in sets)])
+        which = [np.where(masks.which < 0, -1, masks.which + start) for masks, start in zip(sets, starts, strict=False)]
+        return cls(sets[0].count, np.concatenate([masks.bits for masks in sets]), np.concatenate(which))
 
 
 def combine(priors: Sequence[Masks]) -> tuple[Masks, list[int]]:
-    """Return what all priors allow, and for each how many queries it does not limit.
+    """Return the map images that all priors allow, and for each prior the number of queries that it does not limit.
 
-    A prior that has nothing to say about a query, or contradicts those before it there, does not count for it.
+    For each query, a prior without information, or one that contradicts those before it, is ignored.
     """
     combinations, which = np.unique(np.stack([prior.which for prior in priors], axis=1), axis=0, return_inverse=True)
     which = which.reshape(-1)
@@ -97,84 +97,87 @@ def combine(priors: Sequence[Masks]) -> tuple[Masks, list[int]]:
         some = both.any(axis=1)
         bits[counts[some]] = both[some]
         without.append(int(len(which) - np.isin(which, counts[some]).sum()))
-    limited = combinations.max(axis=1) >= 0  # the first prior of a query cannot contradict another
+    limited = combinations.max(axis=1) >= 0  # the first prior of a query has nothing to contradict
     return Masks(priors[0].count, bits, np.where(limited[which], which, -1)), without
 
 
 def near(world_from_cams: Floats, world_from_cam: Floats, distance_m: float, angle_deg: float = 180.0) -> Bools:
-    """Return which of N map cameras could see what a camera at a roughly known pose sees, (N,) bool.
+    """Return which of N map cameras may see the same scene as a camera at a roughly known pose, (N,) bool.
 
-    Roll about the viewing direction does not count: it moves what is seen only within the image.
+    Roll about the viewing direction is ignored, because it only rotates the image.
 
     Args:
-        world_from_cams: (N, 4, 4) of the map, OpenCV axes; one that is NaN is not near.
-        world_from_cam: (4, 4) of the query, in the map's frame.
-        distance_m: most distance between the camera centers, in the unit of the poses.
-        angle_deg: most angle between the viewing directions (z axes).
+        world_from_cams: (N, 4, 4) poses of the map cameras, OpenCV axes; a NaN pose is not near.
+        world_from_cam: (4, 4) pose of the query, in the map's frame.
+        distance_m: largest distance between the camera centers, in the unit of the poses.
+        angle_deg: largest angle between the viewing directions (z axes).
     """
-    found = np.linalg.norm(world_from_cams[:, :3, 3] - world_from_cam[:3, 3], axis=1) <= distance_m
-    forward = world_from_cams[found, :3, 2], world_from_cam[:3, 2]
+    is_near = np.linalg.norm(world_from_cams[:, :3, 3] - world_from_cam[:3, 3], axis=1) <= distance_m
+    forward = world_from_cams[is_near, :3, 2], world_from_cam[:3, 2]
     # atan2 is exact near 0 and 180 degrees, where the arccos of rounded numbers is not.
     sine, cosine = np.linalg.norm(np.cross(*forward), axis=1), forward[0] @ forward[1]
-    found[found] = np.degrees(np.arctan2(sine, cosine)) <= angle_deg
-    return found
+    is_near[is_near] = np.degrees(np.arctan2(sine, cosine)) <= angle_deg
+    return is_near
 
 
 def pose_masks(
     poses: Trajectory,
-    mapped: Session,
+    map_session: Session,
     map_rows: Ints,
-    asked: Session,
-    rows: Ints,
+    query_session: Session,
+    query_rows: Ints,
     distance_m: float,
     angle_deg: float,
 ) -> Masks:
-    """Return the masks of map images that are `near` roughly known poses of query images.
+    """Return masks of the map images that are `near` the roughly known poses of query images.
 
     Args:
-        poses: world_from_device of query devices, the rigs' or else the cameras', in the map's frame.
-        map_rows, rows: of the images of the two sessions, (N,) and (Q,).
+        poses: world_from_device of the query rigs, or else of their cameras, in the map's frame.
+        map_rows, query_rows: rows of the images of the two sessions, (N,) and (Q,).
     """
-    times, sensors = times_of(asked.images)[rows], asked.images["sensor_id"].iloc[rows]
-    world_from_cams = poses.lookup(times, asked.device_ids[rows]) @ asked.rig_from_cam(rows)
+    times, sensors = times_of(query_session.images)[query_rows], query_session.images["sensor_id"].iloc[query_rows]
+    world_from_cams = poses.lookup(times, query_session.device_ids[query_rows]) @ query_session.rig_from_cam(query_rows)
     of_camera = poses.lookup(times, sensors)
     unknown = np.isnan(world_from_cams[:, 0, 0])
     world_from_cams[unknown] = of_camera[unknown]
-    which = np.where(np.isnan(world_from_cams[:, 0, 0]), -1, np.arange(len(rows)))
-    of_map = mapped.world_from_cam(map_rows)
+    which = np.where(np.isnan(world_from_cams[:, 0, 0]), -1, np.arange(len(query_rows)))
+    of_map = map_session.world_from_cam(map_rows)
     masks = (near(of_map, pose, distance_m, angle_deg)[None] for pose in world_from_cams)
     return Masks.of(masks, which, len(map_rows))
 
 
-def gps_masks(mapped: Session, map_rows: Ints, asked: Session, rows: Ints, margin_m: float, window_s: float) -> Masks:
-    """Return the masks of map images whose GPS fix can be where that of a query image is.
+def gps_masks(
+    map_session: Session, map_rows: Ints, query_session: Session, query_rows: Ints, margin_m: float, window_s: float
+) -> Masks:
+    """Return masks of the map images whose GPS fixes are near those of query images.
 
-    Two fixes can be within the margin of each other if their distance is at most that and twice both accuracies. A map
-    image without a fix can be anywhere, if the query is where any other is.
+    Two fixes are near if their distance is at most the margin plus twice both accuracies. A map image without a fix is
+    allowed if the query is near any other map image.
 
     Args:
-        map_rows, rows: of the images of the two sessions, (N,) and (Q,).
-        margin_m: most distance between a query and a map image that shows what it shows.
-        window_s: a fix counts for images so long before and after it.
+        map_rows, query_rows: rows of the images of the two sessions, (N,) and (Q,).
+        margin_m: largest distance between a query and a map image that show the same scene.
+        window_s: largest time difference between an image and its fixes.
     """
-    count, nowhere = len(map_rows), np.full(len(rows), -1)
-    tables = [_fixes(mapped), _fixes(asked)]
-    if any(table.empty for table in tables):
-        return Masks.of([], nowhere, count)
-    origin = tables[0].iloc[0]
-    place, where = _mean_fix(mapped, map_rows, tables[0], origin, window_s)
-    place_asked, which = _mean_fix(asked, rows, tables[1], origin, window_s)
+    count = len(map_rows)
+    map_fixes, query_fixes = _fixes(map_session), _fixes(query_session)
+    if map_fixes.empty or query_fixes.empty:
+        return Masks.of([], np.full(len(query_rows), -1), count)
+    origin = map_fixes.iloc[0]
+    map_means, map_which = _mean_fix(map_session, map_rows, map_fixes, origin, window_s)
+    query_means, which = _mean_fix(query_session, query_rows, query_fixes, origin, window_s)
 
     def blocks() -> Iterator[Bools]:
-        for part in _blocks(place_asked, max(count, len(place))):
-            reach = margin_m + _ACCURACIES * (part[:, None, 2] + place[:, 2])
-            can_be = np.hypot(*np.moveaxis(part[:, None, :2] - place[:, :2], -1, 0)) <= reach
-            yield np.hstack([can_be, can_be.any(axis=1, keepdims=True)])[:, where]  # -1, no fix, takes the last
+        for block in _blocks(query_means, max(count, len(map_means))):
+            reach = margin_m + _ACCURACIES * (block[:, None, 2] + map_means[:, 2])
+            is_near = np.hypot(*np.moveaxis(block[:, None, :2] - map_means[:, :2], -1, 0)) <= reach
+            yield np.hstack([is_near, is_near.any(axis=1, keepdims=True)])[:, map_which]  # -1, no fix, is the last
 
     return Masks.of(blocks(), which, count)
 
 
 def _fixes(session: Session) -> pd.DataFrame:
+    """Return the rows of gps.txt that have a fix."""
     table = session.gps
     if table is None:
         return pd.DataFrame({"timestamp": []})
@@ -184,50 +187,52 @@ def _fixes(session: Session) -> pd.DataFrame:
 def _mean_fix(
     session: Session, rows: Ints, table: pd.DataFrame, origin: "pd.Series[float]", window_s: float
 ) -> tuple[Floats, Ints]:
-    """Return means (S, 3) of fixes, meters east and north of `origin` and accuracy, and that of each image."""
+    """Return mean fixes (S, 3), meters east and north of `origin` and accuracy, and the mean's row for each image."""
     names = ["longitude_deg", "latitude_deg"]
-    away = np.radians((table[names] - origin[names].astype(float) + 180) % 360 - 180).to_numpy()
-    # On the tangent plane of the ellipsoid of WGS 84: its radii of curvature across and along the meridian.
+    offsets = np.radians((table[names] - origin[names].astype(float) + 180) % 360 - 180).to_numpy()
+    # Tangent plane of the WGS 84 ellipsoid, with its radii of curvature across and along the meridian.
     sine = np.sin(np.radians(float(origin["latitude_deg"])))
     across = 6378137.0 / np.sqrt(1 - 0.00669437999014 * sine**2)
     along = across * (1 - 0.00669437999014) / (1 - 0.00669437999014 * sine**2)
-    meters = away * [across * np.sqrt(1 - sine**2), along]
+    meters = offsets * [across * np.sqrt(1 - sine**2), along]
     fixes = np.column_stack([meters, table["horizontal_accuracy_m"]])
     within, which = _within(session, rows, table, window_s)
     return within @ fixes / np.maximum(within.sum(axis=1), 1)[:, None], which
 
 
-def radio_masks(mapped: Session, map_rows: Ints, asked: Session, rows: Ints, least: int, window_s: float) -> Masks:
-    """Return the masks of the map images that received most nearly what a device received at query images.
+def radio_masks(
+    map_session: Session, map_rows: Ints, query_session: Session, query_rows: Ints, least: int, window_s: float
+) -> Masks:
+    """Return masks of the map images with the radio signals most similar to those at query images.
 
-    The likeness is the cosine between the strengths of all emitters, in dB above -100 dBm and 0 where they were not
-    received. Map images without a scan take that of the nearest one that has any.
+    The similarity is the cosine between the vectors of strengths of all emitters, in dB above -100 dBm, 0 for an
+    emitter that was not received. A map image without a scan uses the scan of the nearest map image that has one.
 
     Args:
-        map_rows, rows: of the images of the two sessions, (N,) and (Q,); those of the map have poses.
-        least: so many of the map's images are allowed, if so many received any of the query's emitters; more where
-            they are equal.
-        window_s: a scan counts for images so long before and after it.
+        map_rows, query_rows: rows of the images of the two sessions, (N,) and (Q,); map images have poses.
+        least: number of map images to allow: fewer if fewer received any of the query's emitters, more if some are
+            equally similar.
+        window_s: largest time difference between an image and its scans.
     """
     count = len(map_rows)
-    heard = [_heard(mapped), _heard(asked)]
-    emitters = pc.unique(as_strings(heard[0]["emitter"]))
-    strengths, where = _strengths(mapped, map_rows, heard[0], emitters, window_s)
-    strengths_asked, which = _strengths(asked, rows, heard[1], emitters, window_s)
-    known = where >= 0
+    map_signals, query_signals = _signals(map_session), _signals(query_session)
+    emitters = pc.unique(as_strings(map_signals["emitter"]))
+    map_strengths, map_which = _strengths(map_session, map_rows, map_signals, emitters, window_s)
+    query_strengths, which = _strengths(query_session, query_rows, query_signals, emitters, window_s)
+    known = map_which >= 0
     if not known.any():
-        return Masks.of([], np.full(len(rows), -1), count)
-    centers = mapped.world_from_cam(map_rows)[:, :3, 3]
-    where[~known] = where[known][cKDTree(centers[known]).query(centers[~known])[1]]
-    images = np.bincount(where, minlength=strengths.shape[0])
+        return Masks.of([], np.full(len(query_rows), -1), count)
+    centers = map_session.world_from_cam(map_rows)[:, :3, 3]
+    map_which[~known] = map_which[known][cKDTree(centers[known]).query(centers[~known])[1]]
+    images = np.bincount(map_which, minlength=map_strengths.shape[0])
 
     def blocks() -> Iterator[Bools]:
-        for part in _blocks(strengths_asked, max(count, len(images))):
-            likeness = (part @ strengths.T).toarray()
-            order = np.argsort(-likeness, axis=1)
+        for block in _blocks(query_strengths, max(count, len(images))):
+            similarity = (block @ map_strengths.T).toarray()
+            order = np.argsort(-similarity, axis=1)
             enough = np.argmax(np.cumsum(images[order], axis=1) >= min(least, count), axis=1)[:, None]
-            lowest = np.take_along_axis(likeness, np.take_along_axis(order, enough, axis=1), axis=1)
-            yield ((likeness >= lowest) & (likeness > 0))[:, where]
+            lowest = np.take_along_axis(similarity, np.take_along_axis(order, enough, axis=1), axis=1)
+            yield ((similarity >= lowest) & (similarity > 0))[:, map_which]
 
     return Masks.of(blocks(), which, count)
 
@@ -238,24 +243,24 @@ def _blocks(of_queries: "Floats | csr_array", width: int) -> Iterator["Floats | 
         yield of_queries[start : start + step]
 
 
-def _heard(session: Session) -> pd.DataFrame:
-    """Return all signals of a session, table [timestamp, sensor_id, emitter, rssi_dbm]."""
-    parts = [pd.DataFrame({"timestamp": np.zeros(0, np.int64), "sensor_id": [], "emitter": [], "rssi_dbm": []})]
+def _signals(session: Session) -> pd.DataFrame:
+    """Return all WiFi and Bluetooth signals of a session, table [timestamp, sensor_id, emitter, rssi_dbm]."""
+    tables = [pd.DataFrame({"timestamp": np.zeros(0, np.int64), "sensor_id": [], "emitter": [], "rssi_dbm": []})]
     for table, name in ((session.wifi, "mac_addr"), (session.bluetooth, "id")):
         if table is not None and len(table):
-            emitters = table[name].str.lower()  # as the benchmark does: programs differ in how they write an address
-            parts.append(table.assign(emitter=emitters)[list(parts[0])])
-    return pd.concat(parts[1:] or parts, ignore_index=True)
+            emitters = table[name].str.lower()  # as in the benchmark, because programs write addresses differently
+            tables.append(table.assign(emitter=emitters)[list(tables[0])])
+    return pd.concat(tables[1:] or tables, ignore_index=True)
 
 
 def _strengths(
-    session: Session, rows: Ints, heard: pd.DataFrame, emitters: pa.Array, window_s: float
+    session: Session, rows: Ints, signals: pd.DataFrame, emitters: pa.Array, window_s: float
 ) -> tuple[csr_array, Ints]:
-    """Return mean strengths (S, E) of emitters, rows of length 1, and the row of each image, -1 without a scan."""
-    codes = codes_of(as_strings(heard["emitter"]), emitters)
-    heard, codes = heard[codes >= 0], codes[codes >= 0]
-    strength = np.maximum(heard["rssi_dbm"].to_numpy(np.float64) - _FAINTEST_DBM, 1)
-    within, which = _within(session, rows, heard, window_s)
+    """Return mean strengths (S, E) of emitters, scaled to unit rows, and the row of each image, -1 without a scan."""
+    codes = codes_of(as_strings(signals["emitter"]), emitters)
+    signals, codes = signals[codes >= 0], codes[codes >= 0]
+    strength = np.maximum(signals["rssi_dbm"].to_numpy(np.float64) - _FAINTEST_DBM, 1)
+    within, which = _within(session, rows, signals, window_s)
     sums, times = (
         within @ csr_array((values, codes, np.arange(len(codes) + 1)), (len(codes), len(emitters)))
         for values in (strength, np.ones(len(codes)))
@@ -269,13 +274,13 @@ def _strengths(
 
 
 def _within(session: Session, rows: Ints, table: pd.DataFrame, window_s: float) -> tuple[csr_array, Ints]:
-    """Return which of L lines of a table are of the recordings and times of images.
+    """Return which of L lines of a table belong to an image: those of its recording within the time window.
 
-    A line is of the recording whose name its sensor's id begins with; without such a name it is of all.
+    A line belongs to the recording whose name its sensor id begins with; without such a name, to all recordings.
 
     Returns:
-        A matrix (S, L), with a row for each distinct set of lines, 1 where a line is in it; and the row of each image,
-        -1 without a line.
+        A matrix (S, L) with one row per distinct set of lines, 1 for the lines in it; and the row of each image,
+        -1 without any line.
     """
     names = sorted(session.subsessions, key=len)
     sensors, of_line = as_strings(table["sensor_id"]), np.full(len(table), -1)
@@ -284,21 +289,22 @@ def _within(session: Session, rows: Ints, table: pd.DataFrame, window_s: float) 
     of_image = pd.Index(names, dtype=object).get_indexer(session.subsession_of(rows))
     order = np.lexsort((times_of(table), of_line))
     times, of_line = times_of(table)[order], of_line[order]
-    asked, window = times_of(session.images)[rows], round(window_s * 1e6)
-    spans = np.zeros((len(rows), 2, 2), np.int64)  # of its own recording, and of none
+    image_times, window = times_of(session.images)[rows], round(window_s * 1e6)
+    spans = np.zeros((len(rows), 2, 2), np.int64)  # lines of the image's recording, and lines of no recording
     for number in np.unique(of_image):
         images = np.flatnonzero(of_image == number)
         for span, recording in enumerate((number, -1)):
             first, last = np.searchsorted(of_line, [recording, recording + 1])
-            spans[images, span, 0] = first + np.searchsorted(times[first:last], asked[images] - window)
-            spans[images, span, 1] = first + np.searchsorted(times[first:last], asked[images] + window, side="right")
+            begin, end = image_times[images] - window, image_times[images] + window
+            spans[images, span, 0] = first + np.searchsorted(times[first:last], begin)
+            spans[images, span, 1] = first + np.searchsorted(times[first:last], end, side="right")
     spans[of_image < 0, 0] = 0
     spans[spans[..., 0] == spans[..., 1]] = 0
     distinct, which = np.unique(spans.reshape(-1, 4), axis=0, return_inverse=True)
-    parts = [csr_array((len(distinct), len(table)))]
+    members = []
     for first, last in (distinct[:, :2].T, distinct[:, 2:].T):
         starts = np.concatenate([[0], np.cumsum(last - first)])
         lines = order[np.arange(starts[-1]) + np.repeat(first - starts[:-1], last - first)]
-        parts.append(csr_array((np.ones(len(lines)), lines, starts), parts[0].shape))
-    found, which = parts[1] + parts[2], which.reshape(-1)
-    return found, np.where(distinct.max(axis=1)[which] > 0, which, -1)
+        members.append(csr_array((np.ones(len(lines)), lines, starts), (len(distinct), len(table))))
+    which = which.reshape(-1)
+    return members[0] + members[1], np.where(distinct.max(axis=1)[which] > 0, which, -1)

@@ -1,7 +1,7 @@
-"""What a capture may name and reach: checked once, where it is read, since its names become paths of outputs.
+"""Validate the names and links of a capture once, when it is read, because its names become paths of outputs.
 
-A name is one or more parts separated by `/`. No part is empty or begins with a dot, so no name leads out of its folder
-or hides a file, and there are no control characters. Whatever is read lies, links followed, in the capture or in the
+A name is one or more parts separated by `/`. It has no control characters, and no part is empty or begins with a dot,
+so a name cannot leave its folder or hide a file. All files must lie, after resolving links, in the capture or in the
 session's folder, which may itself be a link to another disk.
 """
 
@@ -20,14 +20,14 @@ import pyarrow.compute as pc
 from toolkit.errors import CaptureError
 
 ALLOW_OUTSIDE = "TOOLKIT_ALLOW_OUTSIDE"
-"""Environment variable, `1` where images may lie outside of the capture."""
+"""Environment variable; `1` allows images outside of the capture."""
 LINKED_HERE = "proc/links.txt"
-"""File of a session that `import` filled with links: the inode of the folder, which an archive cannot know."""
+"""File that `import` writes into a session of links: the inode of the session folder, which an archive cannot forge."""
 LONGEST = {"capture": 100, "session": 40, "subsession": 200}
-"""Bytes of a part: file systems take 255, and names of outputs add theirs."""
+"""Largest number of bytes in a part of a name. File systems allow 255, of which names of outputs need some."""
 HOW_TO_ALLOW = f"allow_outside: true in the manifest (elsewhere {ALLOW_OUTSIDE}=1) permits it"
 
-# C0 and C1 controls, and what breaks or turns a line of Unicode text.
+# C0 and C1 controls, and Unicode characters that break a line or change its direction.
 _CONTROL = r"[\x00-\x1f\x7f-\x{9f}\x{200e}\x{200f}\x{2028}-\x{202e}\x{2066}-\x{2069}]"
 _PART = r"(^|/)(\.|/|$)"
 EXPECTED_NAME = "a name without control characters whose parts between `/` are not empty and do not begin with a dot"
@@ -40,7 +40,7 @@ def outside_allowed() -> bool:
 
 @contextmanager
 def allow_outside(allowed: bool = True) -> Iterator[None]:
-    """Let images lie outside of the capture, in this process and in those that it starts within the context."""
+    """Allow images outside of the capture within the context, in this process and in the processes that it starts."""
     before = os.environ.get(ALLOW_OUTSIDE)
     if allowed:
         os.environ[ALLOW_OUTSIDE] = "1"
@@ -54,55 +54,60 @@ def allow_outside(allowed: bool = True) -> Iterator[None]:
 
 
 def bad_names(names: pa.Array, may_leave: bool = False) -> pa.Array:
-    """Tell which names are refused; those that `may_leave` may be absolute and have parts that begin with a dot."""
+    """Tell which names are refused; with `may_leave`, names may be absolute and have parts that begin with a dot."""
     if _are_plain(names):
         return pa.array(np.zeros(len(names), bool))
     return pc.match_substring_regex(names, f"{_CONTROL}|^$" if may_leave else f"{_CONTROL}|{_PART}")
 
 
 def _are_plain(names: pa.Array) -> bool:
-    """Tell whether all names are surely good, as those of most files are, at a fraction of the time of the pattern."""
+    """Tell whether all names are plain ASCII and certainly valid: a shortcut much faster than the pattern."""
     if not len(names):
         return True
-    places = np.frombuffer(names.buffers()[1], np.int64)[names.offset : names.offset + len(names) + 1]
-    if not np.all(places[1:] > places[:-1]):
+    offsets = np.frombuffer(names.buffers()[1], np.int64)[names.offset : names.offset + len(names) + 1]
+    if not np.all(offsets[1:] > offsets[:-1]):
         return False
-    letters = np.frombuffer(names.buffers()[2], np.uint8)[places[0] : places[-1]]
+    letters = np.frombuffer(names.buffers()[2], np.uint8)[offsets[0] : offsets[-1]]
     if letters.min() < ord(" ") or letters.max() > ord("~"):
         return False
-    slash, starts = letters == ord("/"), places[:-1] - places[0]
-    opens = slash | (letters == ord("."))  # what no part begins with
-    return not (np.any(slash[:-1] & opens[1:]) or np.any(opens[starts]) or np.any(slash[starts - 1]))
+    slash, starts = letters == ord("/"), offsets[:-1] - offsets[0]
+    bad_start = slash | (letters == ord("."))  # no part may begin with these
+    return not (np.any(slash[:-1] & bad_start[1:]) or np.any(bad_start[starts]) or np.any(slash[starts - 1]))
 
 
 def is_bad_name(name: str) -> bool:
-    """Tell whether a name is refused; also one that is not Unicode, which has surrogates."""
+    """Tell whether a name is refused; also if it has surrogates, that is, is not valid Unicode."""
     broken = re.search("[\ud800-\udfff]", name) is not None
     return broken or bool(bad_names(pa.array([name], pa.large_string()))[0].as_py())
 
 
 def has_long_part(name: str, kind: str) -> bool:
-    """Tell whether a part of a name is longer than names of this kind may be."""
+    """Tell whether a part of a name is longer than `LONGEST` allows for this kind."""
     return max(map(len, os.fsencode(name).split(b"/"))) > LONGEST[kind]
 
 
 def require_name(name: str, kind: str, place: str | Path) -> None:
-    """Refuse the name of a capture, session or subsession that outputs cannot be called by.
+    """Refuse the name of a capture, session or subsession if outputs cannot be named after it.
+
+    Args:
+        name: the name.
+        kind: `capture`, `session` or `subsession`.
+        place: file or folder with the name, for the message.
 
     Raises:
-        CaptureError: naming `place`.
+        CaptureError: the name is not valid or is too long.
     """
     if is_bad_name(name) or ("/" in name and kind != "subsession"):
         raise CaptureError(f"{place}: found the {kind} {name!r}, expected {EXPECTED_NAME}. Rename it.")
     if has_long_part(name, kind):
         raise CaptureError(
-            f"{place}: the {kind} {name[:40]!r}... has a name of more than {LONGEST[kind]} bytes, too many for the "
-            "files that are called after it. Rename it."
+            f"{place}: the {kind} {name[:40]!r}... has a name of more than {LONGEST[kind]} bytes, too long for the "
+            "files that are named after it. Rename it."
         )
 
 
 def roots_of(session: Path) -> list[Path]:
-    """Return the folders, links followed, that the files of a session may lie in: its own and its capture's."""
+    """Return the resolved folders in which the files of a session may lie: its own and its capture's."""
     session = session.absolute()
     roots = [session]
     if session.parent.name == "sessions":
@@ -111,46 +116,46 @@ def roots_of(session: Path) -> list[Path]:
 
 
 def leads_out(path: Path, roots: Sequence[Path]) -> Path | None:
-    """Return where a path leads, links followed, if that is in none of the folders; else None."""
+    """Return the target of a path, with links resolved, if it is outside of all `roots`; else None."""
     target = Path(os.path.realpath(path))
     return None if any(target.is_relative_to(root) for root in roots) else target
 
 
 def links_out(folder: Path, paths: "pd.Series[str]", roots: Sequence[Path]) -> dict[int, Path]:
-    """Return the files relative to `folder` that links put out of the `roots`: their places in `paths`, and targets.
+    """Return the files, relative to `folder`, that links lead out of the `roots`: their rows in `paths` and targets.
 
-    Each folder is resolved and listed once, which takes no look at the single files.
+    Each folder is resolved and listed once; only links are looked at one by one.
     """
-    found: dict[int, Path] = {}
+    targets: dict[int, Path] = {}
     folder_of = paths.str.replace(r"[^/]*$", "", regex=True)
-    for part in folder_of.unique():
-        outside = leads_out(folder / part, roots)
+    for subfolder in folder_of.unique():
+        outside = leads_out(folder / subfolder, roots)
         try:
-            with os.scandir(folder / part) as entries:
-                links = {part + entry.name for entry in entries if outside or entry.is_symlink()}
+            with os.scandir(folder / subfolder) as entries:
+                links = {subfolder + entry.name for entry in entries if outside or entry.is_symlink()}
         except OSError:
             continue
         if links:
-            for row in (paths.isin(links) & (folder_of == part)).to_numpy().nonzero()[0].tolist():
+            for row in (paths.isin(links) & (folder_of == subfolder)).to_numpy().nonzero()[0].tolist():
                 if target := leads_out(folder / paths.iloc[row], roots):
-                    found[row] = target
-    return dict(sorted(found.items()))
+                    targets[row] = target
+    return dict(sorted(targets.items()))
 
 
 def is_linked_here(session: Path) -> bool:
-    """Tell whether `import` has made this folder on this disk, with links to images that the user has named.
+    """Tell whether `import` made this session folder on this disk, with links to the user's own images.
 
-    A copy from elsewhere has another inode, whatever it says of itself.
+    A copy from elsewhere has another inode than the one in its file.
     """
     note = session / LINKED_HERE
-    try:  # a pipe would be waited for, a device has no end
-        found = note.lstat()
-        plain = stat.S_ISREG(found.st_mode) and found.st_size < 32
+    try:  # reading a pipe could block, a device never ends
+        status = note.lstat()
+        plain = stat.S_ISREG(status.st_mode) and status.st_size < 32
         return plain and int(note.read_text(encoding="utf-8")) == session.stat().st_ino
     except (OSError, ValueError):
         return False
 
 
 def note_linked_here(session: Path) -> None:
-    """Note in a session's folder that its links are the user's own."""
+    """Record in a session's folder that its links are the user's own."""
     (session / LINKED_HERE).write_text(f"{session.stat().st_ino}\n", encoding="utf-8")

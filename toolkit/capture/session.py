@@ -1,15 +1,16 @@
-"""One session of a capture in the CroCoDL/LaMAR format. `toolkit.capture.check` looks for inconsistencies.
+"""One session of a capture in the CroCoDL/LaMAR format. `toolkit.capture.check` finds inconsistencies.
 
     CAPTURE/sessions/<device>_<map|query>/          (LaMAR: map, query_phone, query_hololens; see capture.devices)
         sensors.txt  rigs.txt  images.txt  depths.txt  trajectories.txt  wifi.txt  bt.txt  gps.txt  raw_data/
         proc/subsessions.txt  proc/keyframes_*.txt  proc/alignment_trajectories.txt      (LaMAR: queries.txt)
 
-`trajectories.txt` and `alignment_trajectories.txt` hold world_from_device, `rigs.txt` holds rig_from_sensor. Lengths
-are meters, timestamps int64 microseconds, quaternions qw qx qy qz. The key of an image is (timestamp, sensor_id), that
-of a device pose and of a keyframe (timestamp, device_id). The device is the rig or, for a sensor in no rig, the sensor.
+`trajectories.txt` and `alignment_trajectories.txt` contain world_from_device, `rigs.txt` contains rig_from_sensor.
+Lengths are in meters, timestamps in int64 microseconds, quaternions are qw qx qy qz. The key of an image is (timestamp,
+sensor_id), the key of a device pose or a keyframe is (timestamp, device_id). The device is the rig or, for a sensor
+without a rig, the sensor itself.
 
-A session may hold 200,000 images, sensors and rigs. So tables stay columns (Arrow strings, NumPy numbers), and no
-Python code loops over rows while a session is read.
+A session may have 200,000 images, sensors and rigs. Tables are therefore kept as columns (Arrow strings, NumPy
+numbers), and no Python code loops over rows while a session is read.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -77,20 +78,20 @@ class Session:
 
     Attributes:
         path: the folder.
-        device: a key of `toolkit.capture.devices`; like `split`, from the folder's name.
-        split: `map` or `query`.
-        id: `<device>_<split>`, the name of all that is made of the session.
+        device: a key of `toolkit.capture.devices`, from the folder's name.
+        split: `map` or `query`, from the folder's name.
+        id: `<device>_<split>`, the name of the session in all outputs.
         images: table [timestamp, sensor_id, path], in the order of images.txt; path is relative to raw_data/.
-        sensors: table [sensor_id, name, sensor_type, params], params as written.
+        sensors: table [sensor_id, name, sensor_type, params]; params is the text in sensors.txt.
         rigs: table [rig_id, sensor_id], or None.
-        trajectory: trajectories.txt, or None. Of a query session it is the device's own odometry, in a frame of its
-            own: good for motion between two times, never a place in the map.
-        ground_truth: poses in the world of the map: proc/alignment_trajectories.txt; of a map session without that
-            file trajectories.txt; else None.
+        trajectory: trajectories.txt, or None. For a query session, this is the odometry of the device in its own
+            frame: it gives the motion between two times, but no position in the map.
+        ground_truth: poses in the world of the map: proc/alignment_trajectories.txt; a map session without that file
+            uses trajectories.txt; else None.
     """
 
     def __init__(self, path: str | Path, strict: bool = True) -> None:
-        """Read a session; with strict=False leave malformed lines out, and keep the tables of files in `tables`."""
+        """Read a session. With strict=False, drop malformed lines and keep the tables of all files in `tables`."""
         self.path = Path(path)
         self.device, self.split = session_of(self.path.name)
         self.id = session_id(self.path.name)
@@ -127,7 +128,7 @@ class Session:
         return cls(path)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the folder: who unpickles it reads it once, and again when its files have changed."""
+        """Pickle only the folder. A process that unpickles it reads the session once, and again if its files change."""
         files = [*sorted(self.path.glob("*.txt")), *sorted((self.path / "proc").rglob("*.txt"))]
         return _reopened, (self.path, files_fingerprint(files))
 
@@ -150,21 +151,21 @@ class Session:
             self.tables[file] = table
             return table
         if file in ("trajectories.txt", ALIGNED):
-            table.repeated(key_of(file))  # a pose that is there twice is found once; its covariance stays in the file
+            table.repeated(key_of(file))  # keeps repeated poses, because covariances are read later by row
             return table
-        if file in ("sensors.txt", *SIGNALS):  # sensors: see `_sensor_rows`
+        if file in ("sensors.txt", *SIGNALS):  # sensors: see `_sensor_rows`; signals may repeat
             return table
         return table.without_repeated(key_of(file))
 
     def _require_different(self, images: TextTable) -> None:
-        """Refuse images of one path: whatever is made of an image goes by its path."""
+        """Refuse two images with one path, because outputs identify an image by its path."""
         if not self._strict:
             return
         for row in np.flatnonzero(images.frame("image_path").duplicated())[:1].tolist():
             path = images.columns["image_path"][row].as_py()
             raise CaptureError(
-                f"{images.where(row)}: found the image {path!r} again, under another timestamp or sensor. Remove one "
-                "of the two lines, or give the other its own file."
+                f"{images.where(row)}: found the image {path!r} again, with another timestamp or sensor. Remove one "
+                "of the two lines, or use two files."
             )
 
     def _trajectory(self, file: str) -> Trajectory | None:
@@ -172,14 +173,14 @@ class Session:
 
     @property
     def odometry(self) -> Trajectory | None:
-        """Of a query session its trajectories.txt, if it has one: world_from_device in a frame that is the device's own
-        and begins anew where tracking was lost. A map session has none: its poses are in the world."""
+        """trajectories.txt of a query session, or None: world_from_device in the device's own frame, which changes when
+        tracking is lost. None for a map session, whose poses are in the world."""
         return self.trajectory if self.split == "query" else None
 
     @cached_property
     def wifi(self) -> pd.DataFrame | None:
         """Signals of access points, table [timestamp, sensor_id, mac_addr, frequency_khz, rssi_dbm]; None without a
-        wifi.txt. A scan is what a sensor received at one time."""
+        wifi.txt. Rows with one timestamp and sensor form a scan."""
         return self._optional("wifi.txt")
 
     @cached_property
@@ -189,8 +190,8 @@ class Session:
 
     @cached_property
     def gps(self) -> pd.DataFrame | None:
-        """Fixes, table [timestamp, sensor_id, latitude_deg, longitude_deg, altitude_m, horizontal_accuracy_m], WGS 84;
-        None without a gps.txt. A negative accuracy says that there is no fix."""
+        """GPS fixes, table [timestamp, sensor_id, latitude_deg, longitude_deg, altitude_m, horizontal_accuracy_m],
+        WGS 84; None without a gps.txt. A negative accuracy means no fix."""
         return self._optional("gps.txt")
 
     def _optional(self, file: str) -> pd.DataFrame | None:
@@ -206,7 +207,7 @@ class Session:
         """Return the file of an image.
 
         Raises:
-            CaptureError: an image of the session is listed under two keys, or links put one outside of the capture.
+            CaptureError: an image of the session is listed twice, or a link leads outside of the capture.
         """
         return self._raw_data / self.images["path"].iloc[row]
 
@@ -220,13 +221,13 @@ class Session:
         return [f"{self.path.name}/{RAW_DATA}/{path}" for path in self.images["path"]]
 
     def own_names(self, rows_of_queries: Iterable[Ints]) -> list[str]:
-        """Return what the user calls the images of queries (`files.own_name`), those of one query joined by `;`."""
+        """Return the user's names of the images of each query (`files.own_name`), joined by `;`."""
         paths = self.images["path"]
         return [";".join(own_name(path) for path in paths.iloc[rows]) for rows in rows_of_queries]
 
     @cached_property
     def row_of_name(self) -> dict[str, int]:
-        """Row of `images` by the image's name."""
+        """Row of `images` by image name."""
         return {name: row for row, name in enumerate(self.image_names)}
 
     @cached_property
@@ -234,7 +235,7 @@ class Session:
         """Table [timestamp, sensor_id, path] of depths.txt, or None.
 
         Raises:
-            CaptureError: a line is malformed, or links put a depth map outside of the capture.
+            CaptureError: a line is malformed, or a link leads outside of the capture.
         """
         if not (self.path / "depths.txt").exists():
             return None
@@ -244,7 +245,7 @@ class Session:
 
     @cached_property
     def _raw_data(self) -> Path:
-        """The folder of the images, after a look at what would cost time where they are not read."""
+        """The folder of the images. Checks their paths first, which sessions without image access need not wait for."""
         self._require_different(self._image_table)
         self._require_no_link_out(self._image_table, "image_path")
         return self.path / RAW_DATA
@@ -257,15 +258,15 @@ class Session:
             )
 
     def links_out(self, paths: "pd.Series[str]") -> dict[int, Path]:
-        """Return which of the paths below raw_data/ links put outside of the capture, and their targets.
+        """Return the paths below raw_data/ that links lead outside of the capture: their rows in `paths` and targets.
 
-        None where that is allowed, and in a session that `import` filled with links here.
+        Empty if links are allowed, or if `import` made the links of this session on this machine.
         """
         return {} if self._links_allowed else links_out(self.path / RAW_DATA, paths, self._roots)
 
     @cached_property
     def camera_rows(self) -> Ints:
-        """Rows of `images` that cameras took, in file order: no depth maps."""
+        """Rows of `images` of sensors of type `camera`, in file order; depth maps are not included."""
         sensors = self.images["sensor_id"]
         for sensor in sensors[~sensors.isin(self.sensors["sensor_id"])][:1]:
             self._sensor_row(sensor)  # raises
@@ -273,7 +274,7 @@ class Session:
 
     @cached_property
     def files_fingerprint(self) -> str:
-        """16 hex digits that identify the image files as they were at first use."""
+        """16 hex digits that identify the image files at first use."""
         return files_fingerprint([self.image_path(row) for row in range(len(self.images))])
 
     @cached_property
@@ -281,7 +282,7 @@ class Session:
         return None if self.depths is None else KeyIndex(times_of(self.depths), self.depths["sensor_id"])
 
     def depth_path(self, timestamp: int, sensor_id: str) -> Path | None:
-        """Return the depth map of a depth sensor at a time, None if there is none."""
+        """Return the depth map of a depth sensor at a time, or None."""
         if self.depths is None or self._depth_index is None:
             return None
         (row,) = self._depth_index.find(np.array([timestamp], np.int64), [sensor_id])
@@ -289,7 +290,7 @@ class Session:
 
     @cached_property
     def depths_fingerprint(self) -> str:
-        """16 hex digits that identify depths.txt and the files of depth maps as they were at first use."""
+        """16 hex digits that identify depths.txt and the depth map files at first use."""
         if self.depths is None:
             return ""
         root = self.path / RAW_DATA
@@ -301,28 +302,28 @@ class Session:
     def _sensor_rows(self) -> dict[str, int]:
         rows = {sensor: row for row, sensor in enumerate(self._sensor_table.columns["sensor_id"].to_pylist())}
         if len(rows) < len(self._sensor_table) and self._strict:
-            self._sensor_table.without_repeated(key_of("sensors.txt"))  # tells, or raises
+            self._sensor_table.without_repeated(key_of("sensors.txt"))  # logs the repeated line, or raises
         return rows
 
     def _sensor_row(self, sensor_id: str) -> int:
         row = self._sensor_rows.get(sensor_id)
         if row is None:
             raise CaptureError(
-                f"Unknown sensor {sensor_id!r} in session {self.id}: no such line in "
-                f"{self._sensor_table.path} (but {len(self.sensors)}, e.g. {list(self._sensor_rows)[:3]}). "
-                "Add it there, or correct the id where it is used."
+                f"Unknown sensor {sensor_id!r} in session {self.id}: it is none of the {len(self.sensors)} sensors in "
+                f"{self._sensor_table.path}, e.g. {list(self._sensor_rows)[:3]}. Add it there, or correct the id where "
+                "it is used."
             )
         return row
 
     def has_sensor(self, sensor_id: str) -> bool:
-        """Tell whether sensors.txt has a sensor."""
+        """Tell whether sensors.txt lists a sensor."""
         return sensor_id in self._sensor_rows
 
     def camera(self, sensor_id: str) -> "pycolmap.Camera":
-        """Return the intrinsics of a `camera` or `depth` sensor: any camera model of COLMAP.
+        """Return the intrinsics of a `camera` or `depth` sensor, with any camera model of COLMAP.
 
         Raises:
-            CaptureError: no such sensor, not a camera, unknown model or wrong parameters; names the line.
+            CaptureError: unknown sensor, not a camera, unknown model or wrong parameters; names the line.
         """
         if sensor_id not in self._cameras:
             row = self._sensor_row(sensor_id)
@@ -337,7 +338,7 @@ class Session:
 
     @cached_property
     def subsessions(self) -> list[str]:
-        """The recordings in the session: proc/subsessions.txt, else the first folders of image paths."""
+        """Names of the recordings of the session: proc/subsessions.txt, else the top folders of the image paths."""
         if (self.path / SUBSESSIONS).exists():
             return self._checked(self._read(SUBSESSIONS).columns["subsession"].to_pylist(), SUBSESSIONS)
         return sorted(set(self._subsession_of_image))
@@ -348,7 +349,7 @@ class Session:
         return list(subsessions)
 
     def subsession_of(self, rows: Rows = None) -> Strings:
-        """Return the subsession of images, (n,) str: the longest that starts path or sensor id, else ""."""
+        """Return the subsession of images, (n,) str: the longest prefix of path or sensor id, "" without any."""
         return self._subsession_of_image[_selection(rows)]
 
     @cached_property
@@ -357,7 +358,7 @@ class Session:
         if not (self.path / SUBSESSIONS).exists():
             parts = pc.split_pattern(columns[1], "/", max_splits=1)
             in_folder = pc.and_(pc.greater(pc.list_value_length(parts), 1), pc.invert(bad_names(columns[1])))
-            first = pc.if_else(in_folder, pc.list_element(parts, 0), self.id)  # a path that leads out has none
+            first = pc.if_else(in_folder, pc.list_element(parts, 0), self.id)  # the id if in no folder
             self._checked(pc.unique(first).to_pylist(), "images.txt")
             return first.to_numpy(zero_copy_only=False)
         subsessions = np.full(len(self.images), "", object)
@@ -368,9 +369,9 @@ class Session:
 
     @property
     def keyframe_files(self) -> dict[str, str]:
-        """File of each keyframe list by its name, relative to the session's folder.
+        """File of each keyframe list, relative to the session's folder, by the name of the list.
 
-        `<name>` for `proc/keyframes_<name>.txt`, and `queries` of LaMAR.
+        The name is `<name>` for `proc/keyframes_<name>.txt`, and `queries` for LaMAR's `queries.txt`.
         """
         names = sorted(path.name for path in (self.path / "proc").glob("keyframes_*.txt"))
         files = {name.removesuffix(".txt").removeprefix("keyframes_"): f"proc/{name}" for name in names}
@@ -380,17 +381,16 @@ class Session:
         """Return a keyframe list, table [timestamp, device_id].
 
         Args:
-            name: a list of `keyframe_files`, with or without the prefix `keyframes_`; or `all`: every device
-                pose of the ground truth, without one every device that took an image.
+            name: a list of `keyframe_files`, with or without the prefix `keyframes_`; or `all`: all device poses of
+                the ground truth or, without it, all devices that took an image.
 
         Raises:
             CaptureError: there is no such list.
         """
         if name == "all":
-            truth = self.ground_truth
             times, ids = times_of(self.images), self._devices[0]
-            if truth is not None:
-                times, ids = truth.timestamps, truth.arrow_ids
+            if self.ground_truth is not None:
+                times, ids = self.ground_truth.timestamps, self.ground_truth.arrow_ids
             keys = pd.DataFrame({"timestamp": times, "device_id": as_pandas(ids)}, copy=False)
             return keys.drop_duplicates(ignore_index=True)
         short, files = name.removesuffix(".txt").removeprefix("keyframes_"), self.keyframe_files
@@ -407,12 +407,12 @@ class Session:
 
     @cached_property
     def device_ids(self) -> Strings:
-        """The posed device of each image, (N,) array of str: its rig at that time, else the sensor itself."""
+        """The device of each image, (N,) array of str: its rig at that time, else the sensor itself."""
         return self._devices[0].to_numpy(zero_copy_only=False)
 
     @cached_property
     def _devices(self) -> tuple[pa.Array, Ints]:
-        """The device of each image, and the row of rigs.txt that holds it there (-1 without a rig)."""
+        """The device of each image, and its row of rigs.txt (-1 without a rig)."""
         return self._find_devices(times_of(self.images), as_strings(self.images["sensor_id"]))
 
     def _find_devices(self, timestamps: Ints, sensors: pa.Array) -> tuple[pa.Array, Ints]:
@@ -424,21 +424,21 @@ class Session:
         return pc.if_else(pa.array(in_rig), rigs, sensors), rig_rows
 
     def devices_of(self, timestamps: ArrayLike, sensor_ids: Any) -> tuple[Strings, Floats]:
-        """Return the posed device of sensors of any type at given times, (n,), and device_from_sensor (n, 4, 4).
+        """Return the devices (n,) of sensors of any type at given times, and device_from_sensor (n, 4, 4).
 
-        The device is the rig at that time, else the sensor itself, with the identity.
+        The device is the rig at that time, else the sensor itself, with an identity pose.
         """
         devices, rig_rows = self._find_devices(np.asarray(timestamps, np.int64), as_strings(sensor_ids))
         return devices.to_numpy(zero_copy_only=False), self._rig_from_sensor(rig_rows)
 
     def _rig_from_sensor(self, rig_rows: Ints) -> Floats:
-        """Return rig_from_sensor, (n, 4, 4), of rows of rigs.txt; the identity for -1."""
+        """Return rig_from_sensor, (n, 4, 4), for rows of rigs.txt; the identity for -1."""
         poses = np.tile(np.eye(4), (len(rig_rows), 1, 1))
         poses[rig_rows >= 0] = pose_from_qt(self._rig_qt[rig_rows[rig_rows >= 0]])
         return poses
 
     def _posed_keys(self) -> Iterator[tuple[Ints, pa.Array]]:
-        """Yield timestamps and device ids of what says which rigs there are at which times: poses, then keyframes."""
+        """Yield timestamps and device ids of poses, then of keyframes: they tell which rigs exist at which time."""
         if self.trajectory is not None:
             yield self.trajectory.timestamps, self.trajectory.arrow_ids
         if self.ground_truth is not None and self.ground_truth is not self.trajectory:
@@ -471,17 +471,17 @@ class Session:
         devices, rig_rows = self._devices
         pose_rows = trajectory.index.find(times_of(self.images)[selection], devices.take(pa.array(selection)))
         posed = np.flatnonzero(pose_rows >= 0)
-        for part in np.split(posed, range(16384, len(posed), 16384)):  # the products need several times the result
-            poses, rigs = pose_from_qt(trajectory.qt[pose_rows[part]]), rig_rows[selection[part]]
+        for block in np.split(posed, range(16384, len(posed), 16384)):  # intermediate arrays are several times larger
+            poses, rigs = pose_from_qt(trajectory.qt[pose_rows[block]]), rig_rows[selection[block]]
             in_rig = rigs >= 0
             poses[in_rig] = poses[in_rig] @ pose_from_qt(self._rig_qt[rigs[in_rig]])
-            world_from_cam[part] = poses
+            world_from_cam[block] = poses
         return world_from_cam
 
     def poses_of_sensor(self, sensor_id: str) -> tuple[Ints, Floats]:
-        """Return the times at which a sensor has a pose, (n,) microseconds ascending, and world_from_sensor, (n, 4, 4).
+        """Return the times of a sensor's poses, (n,) ascending microseconds, and world_from_sensor, (n, 4, 4).
 
-        They are the poses in `trajectory` of the sensor itself and of all rigs that hold it.
+        These are the poses in `trajectory` of the sensor itself and of all rigs that hold it.
         """
         if self.trajectory is None:
             return np.zeros(0, np.int64), np.zeros((0, 4, 4))
@@ -498,17 +498,14 @@ class Session:
 
     @cached_property
     def _image_index(self) -> tuple[KeyIndex, Ints]:
-        """Finds photographs by (timestamp, device_id); the second part has the row in `images` of each."""
-        others = self.sensors["sensor_id"][self.sensors["sensor_type"] != "camera"]
-        photographs = np.flatnonzero(~self.images["sensor_id"].isin(others))
+        """An index of photographs by (timestamp, device_id), and the row of each photograph in `images`."""
+        non_cameras = self.sensors["sensor_id"][self.sensors["sensor_type"] != "camera"]
+        photographs = np.flatnonzero(~self.images["sensor_id"].isin(non_cameras))
         devices = self._devices[0].take(pa.array(photographs))
         return KeyIndex(times_of(self.images)[photographs], devices), photographs
 
     def rows_of_keyframes(self, keyframes: pd.DataFrame) -> list[Ints]:
-        """Return, for each row of a keyframe table, the rows of `images` that the device took then, in file order.
-
-        Photographs only, no depth maps.
-        """
+        """Return, for each row of a keyframe table, the rows in `images` of its photographs, in file order."""
         index, photographs = self._image_index
         return [photographs[rows] for rows in index.find_all(times_of(keyframes), keyframes["device_id"])]
 
@@ -518,7 +515,7 @@ def _records(table: TextTable, column: str) -> pd.DataFrame:
 
 
 def _selection(rows: Rows) -> Any:
-    """Return rows as an index of arrays; None selects all."""
+    """Return rows as an index for arrays; None selects all."""
     if rows is None or isinstance(rows, slice):
         return slice(None) if rows is None else rows
     rows = np.atleast_1d(np.asarray(rows))

@@ -1,9 +1,9 @@
-"""Text tables of the capture format: their columns, a reader at the speed of Arrow, and rows found by key.
+"""Text tables of the capture format: their columns, a fast reader, and an index of rows by key.
 
-The reader takes lines of comma-separated values with `#` comments and blank lines anywhere, spaces around values,
-Windows line ends and a byte-order mark. Columns beyond the expected ones are ignored, or kept as one text. It cuts a
-file into blocks of whole lines; Arrow splits and converts two blocks at a time. So no Python code loops over rows, and
-an error message can name the line.
+The reader accepts comma-separated values with `#` comments and blank lines anywhere, spaces around values, Windows line
+ends and a byte-order mark. Columns beyond the expected ones are ignored or kept as one text. A file is cut into blocks
+of whole lines, and Arrow splits and converts two blocks at a time. No Python code loops over rows, and yet error
+messages name the line.
 """
 
 import errno
@@ -31,11 +31,11 @@ log = logging.getLogger(__name__)
 
 Columns = Sequence[tuple[str, str]]
 
-# Column types: an integer, a finite number, a length of a position, angles, a name, the path of an image, any text.
+# Column types. METERS is a bounded coordinate, ID a valid name, PATH the path of an image, TEXT any text.
 INTEGER, NUMBER, METERS, LATITUDE, LONGITUDE = "integer", "finite number", "meters", "latitude", "longitude"
 ID, PATH, TEXT = "id", "path", "text"
 FARTHEST_M = 1e12
-"""Farther than any place; the squares of numbers near the largest one would not be finite."""
+"""Largest coordinate, meters: beyond any place, and small enough that its square is finite."""
 POSE_NAMES = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
 POSE = tuple((name, NUMBER if name.startswith("q") else METERS) for name in POSE_NAMES)
 ALIGNED = "proc/alignment_trajectories.txt"
@@ -57,10 +57,10 @@ COLUMNS: dict[str, Columns] = {
     "proc/subsessions.txt": (("subsession", ID),),
     "keyframes": (("timestamp", INTEGER), ("device_id", ID)),
 }
-"""The columns of each file of a session: names and types. wifi.txt and bt.txt have more, a name and the times of a
-scan, which are not needed."""
+"""Names and types of the columns of each file of a session. Further columns of wifi.txt and bt.txt (name, times of the
+scan) are not used."""
 SIGNALS = ("wifi.txt", "bt.txt")
-"""Files in which a key may be there again: a scan may receive an emitter several times."""
+"""Files whose keys may repeat, because a scan may receive an emitter several times."""
 
 
 def key_of(file: str) -> list[str]:
@@ -71,7 +71,7 @@ def key_of(file: str) -> list[str]:
 
 @dataclass
 class TextTable:
-    """The well-formed rows of a text file, and where the others are."""
+    """The well-formed rows of a text file, and the problems of its other lines."""
 
     path: Path
     columns: dict[str, pa.Array]
@@ -79,7 +79,7 @@ class TextTable:
     lines: Ints
     """Line number of each row, from 1."""
     problems: list[tuple[int, str]]
-    """Line number (0: the file itself) and fault of each malformed line; such lines are left out."""
+    """Line number (0 for the whole file) and fault of each malformed line; these lines are not in `columns`."""
     has_extra: bool
     """Whether any line has more columns than expected."""
 
@@ -95,21 +95,21 @@ class TextTable:
         return pd.DataFrame({name: as_pandas(self.columns[name]) for name in names}, copy=False)
 
     def where(self, row: int) -> str:
-        """Return file and line of a row, for messages."""
+        """Return the file and line of a row, for messages."""
         return f"{self.path}, line {self.lines[row]}"
 
     def repeated(self, key: list[str]) -> Ints:
-        """Return the rows that repeat the key of an earlier one, ascending.
+        """Return the rows that repeat the key of an earlier row, ascending.
 
         Raises:
-            CaptureError: one of them says something else than the earlier one.
+            CaptureError: a repeated row differs from the earlier one.
         """
         if key[0] == "timestamp" and np.all(np.diff(self.columns["timestamp"].to_numpy()) > 0):
-            return np.zeros(0, np.int64)  # as most are; ids need not be looked at
+            return np.zeros(0, np.int64)  # the usual case: distinct timestamps make distinct keys
         again = np.flatnonzero(self.frame(*key).duplicated())
         if len(again):
-            other = again[~self.frame(*self.columns).duplicated().to_numpy()[again]]
-            for row in other[:1].tolist():
+            different = again[~self.frame(*self.columns).duplicated().to_numpy()[again]]
+            for row in different[:1].tolist():
                 raise CaptureError(
                     f"{self.where(row)}: {self._shown(row, key)} again, with other values than in line "
                     f"{self._first_line(row, key)}. Remove one of the two."
@@ -117,7 +117,7 @@ class TextTable:
         return again
 
     def without_repeated(self, key: list[str]) -> "TextTable":
-        """Return the table without lines that repeat an earlier one, which are told; see `repeated`."""
+        """Return the table without repeated lines, and log them; raises as `repeated` does."""
         again = self.repeated(key)
         if not len(again):
             return self
@@ -142,19 +142,19 @@ def read_table(path: Path, columns: Columns, strict: bool = True, extra: bool = 
 
     Args:
         columns: name and type of each column, as in COLUMNS.
-        strict: raise at a malformed line; else leave it out and list it in `.problems`.
+        strict: raise at a malformed line; else drop it and list it in `.problems`.
         extra: keep the text after the last column, as column `extra`.
 
     Raises:
-        CaptureError: the file is missing, or (strict) a line is malformed. The message gives the line, its text and
-            what was expected there.
+        CaptureError: the file cannot be read, or (strict) is missing or has a malformed line. The message gives the
+            line number, the text found and what was expected.
     """
     try:
         spans = _line_blocks(path)
     except FileNotFoundError:
         message = f"file not found; expected lines of `{_layout(columns)}`"
         if strict:
-            raise CaptureError(f"{path}: {message}. Is this a whole session?") from None
+            raise CaptureError(f"{path}: {message}. Is the session complete?") from None
         empty = {name: pa.array([], _ARROW_TYPES[kind]) for name, kind in [*columns, ("extra", TEXT)]}
         return TextTable(path, empty, np.zeros(0, np.int64), [(0, message)], False)
     except OSError as error:
@@ -170,18 +170,18 @@ def read_table(path: Path, columns: Columns, strict: bool = True, extra: bool = 
         blocks = list(pool.map(parse, spans))
     first = np.cumsum([0, *(block.count for block in blocks)])[:-1]
     problems = [
-        (int(start + line), what) for start, block in zip(first, blocks, strict=True) for line, what in block.problems
+        (int(start + line), fault) for start, block in zip(first, blocks, strict=True) for line, fault in block.problems
     ]
     if strict and problems:
-        line, what = problems[0]
+        line, fault = problems[0]
         more = f" ({len(problems) - 1} more such lines.)" if len(problems) > 1 else ""
         raise CaptureError(
-            f"{path}, line {line}: {what}. Correct or remove the line; "
+            f"{path}, line {line}: {fault}. Correct or remove the line; "
             f"`python -m toolkit check CAPTURE` lists all problems.{more}"
         )
     kinds = dict(columns) | ({"extra": TEXT} if extra else {})
     values = {
-        # Each block gives up a column as it is joined, so that the table is never in memory twice.
+        # A block's column is freed as it is joined, so that the table is never in memory twice.
         name: pa.concat_arrays([pa.array([], _ARROW_TYPES[kind]), *(block.columns.pop(name) for block in blocks)])
         for name, kind in kinds.items()
     }
@@ -191,7 +191,7 @@ def read_table(path: Path, columns: Columns, strict: bool = True, extra: bool = 
 
 @dataclass
 class _Block:
-    """Some lines of a file; line numbers count from 1 in the block."""
+    """Rows of a block of lines; line numbers count from 1 within the block."""
 
     columns: dict[str, pa.Array]
     lines: Ints
@@ -201,13 +201,13 @@ class _Block:
 
 
 _MOST = {METERS: FARTHEST_M, LATITUDE: 90.0, LONGITUDE: 180.0}
-"""Largest size of what is limited."""
+"""Largest absolute value of each bounded column type."""
 _ARROW_TYPES = {
     INTEGER: pa.int64(),
     **dict.fromkeys((NUMBER, *_MOST), pa.float64()),
     **dict.fromkeys((ID, PATH, TEXT), pa.large_string()),
 }
-# Small enough that two in flight cost little memory, large enough to hide the overhead.
+# Small enough that two blocks need little memory, large enough to hide the overhead of a block.
 _BLOCK_BYTES = 1 << 20
 
 
@@ -218,8 +218,8 @@ def _layout(columns: Columns) -> str:
 def _line_blocks(path: Path) -> list[tuple[int, int]]:
     """Cut a file into spans of bytes that end at line ends."""
     borders = [0]
-    if path.exists() and not path.is_file():  # to open a pipe waits for ever, a device has no end
-        raise OSError(errno.EINVAL, "it is no file")
+    if path.exists() and not path.is_file():  # opening a pipe blocks forever, reading a device never ends
+        raise OSError(errno.EINVAL, "not a file")
     with open(path, "rb") as stream:
         size = stream.seek(0, os.SEEK_END)
         while borders[-1] < size:
@@ -230,8 +230,8 @@ def _line_blocks(path: Path) -> list[tuple[int, int]]:
 
 
 def _parse_block(data: bytes, first: bool, columns: Columns, keep_extra: bool) -> _Block:
-    """Split and convert the whole lines of `data`; `first` tells that they start the file."""
-    if first and data.startswith(b"\xef\xbb\xbf"):  # the mark that Windows editors put before UTF-8
+    """Split and convert the lines of `data`; `first`: they are the first lines of the file."""
+    if first and data.startswith(b"\xef\xbb\xbf"):  # byte-order mark, which Windows editors write
         data = data[3:]
     if not data.endswith(b"\n"):
         data += b"\n"
@@ -241,14 +241,13 @@ def _parse_block(data: bytes, first: bool, columns: Columns, keep_extra: bool) -
         for number, line in enumerate(texts, 1):
             if fault := _fault(line):
                 problems.append((number, fault))
-                texts[number - 1] = b"#"
+                texts[number - 1] = b"#"  # a comment, so that the line is skipped below
         data = b"\n".join(texts)
     ends = np.flatnonzero(np.frombuffer(data, np.uint8) == ord("\n"))
     offsets = np.zeros(len(ends) + 1, np.int64)
     offsets[1:] = ends + 1
     text = pa.LargeStringArray.from_buffers(len(ends), pa.py_buffer(offsets), pa.py_buffer(data))
     text = pc.ascii_trim_whitespace(text)
-    # What is reported already was made a comment.
     kept = pc.invert(pc.or_(pc.starts_with(text, "#"), pc.equal(text, "")))
     text, lines = text.filter(kept), np.flatnonzero(kept.to_numpy(zero_copy_only=False)) + 1
 
@@ -257,8 +256,8 @@ def _parse_block(data: bytes, first: bool, columns: Columns, keep_extra: bool) -
     counts = pc.list_value_length(values).to_numpy()
     if np.any(counts < width):
         for row in np.flatnonzero(counts < width):
-            values_there = f"{counts[row]} value{'s' if counts[row] > 1 else ''} in {_shorten(text[row])}"
-            problems.append((int(lines[row]), f"found {values_there}, expected {width}: {_layout(columns)}"))
+            found = f"{counts[row]} value{'s' if counts[row] > 1 else ''} in {_shorten(text[row])}"
+            problems.append((int(lines[row]), f"found {found}, expected {width}: {_layout(columns)}"))
         good = counts >= width
         values, lines, counts = values.filter(pa.array(good)), lines[good], counts[good]
 
@@ -272,16 +271,16 @@ def _parse_block(data: bytes, first: bool, columns: Columns, keep_extra: bool) -
         bad |= wrong
     has_extra = bool(np.any(counts > width))
     if keep_extra:
-        # An extra value lies right after the `width` others of its line.
-        place = np.cumsum(counts) - 1
-        extra = pc.ascii_trim_whitespace(values.flatten().take(pa.array(place)))
+        # The extra text is the last value of its line, after the `width` expected ones.
+        last = np.cumsum(counts) - 1
+        extra = pc.ascii_trim_whitespace(values.flatten().take(pa.array(last)))
         arrays["extra"] = pc.if_else(pa.array(counts > width), extra, "")
     if columns[-len(POSE) :] == POSE:
         q = np.stack([arrays[name].to_numpy() for name, _ in POSE[:4]], axis=1)
         with np.errstate(over="ignore"):
             squared = np.einsum("ij,ij->i", q, q)
-        of_wrong_length = {"a zero quaternion": squared < 1e-12, "a quaternion without end": squared > FARTHEST_M**2}
-        for fault, wrong in of_wrong_length.items():
+        faults = {"a zero quaternion": squared < 1e-12, "a quaternion of huge length": squared > FARTHEST_M**2}
+        for fault, wrong in faults.items():
             rows = np.flatnonzero(wrong & ~bad)
             problems += [(int(lines[row]), f"found {fault}, expected length 1") for row in rows]
             bad |= wrong
@@ -298,12 +297,12 @@ _EXPECTED = {
     LATITUDE: "degrees from -90 to 90",
     LONGITUDE: "degrees from -180 to 180",
     ID: EXPECTED_NAME,
-    PATH: f"{EXPECTED_NAME}, below raw_data/ (if you list files that lie elsewhere yourself, {HOW_TO_ALLOW})",
+    PATH: f"{EXPECTED_NAME}, below raw_data/ (for your own files elsewhere, {HOW_TO_ALLOW})",
 }
 
 
 def convert(column: pa.Array, kind: str) -> tuple[pa.Array, NDArray[np.bool_]]:
-    """Return a column converted to its type, and which values are wrong (0 or empty there)."""
+    """Return a column converted to its type, and which of its values are wrong; such numbers may become 0."""
     if kind == TEXT:
         return column, np.zeros(len(column), bool)
     if kind in (ID, PATH):
@@ -311,7 +310,7 @@ def convert(column: pa.Array, kind: str) -> tuple[pa.Array, NDArray[np.bool_]]:
     wrong = np.zeros(len(column), bool)
     try:
         converted = column.cast(_ARROW_TYPES[kind])
-    except pa.ArrowInvalid:  # find the values one by one; only a block with a malformed line comes here
+    except pa.ArrowInvalid:  # find the malformed values one by one
         scalars = []
         for row, value in enumerate(column):
             try:
@@ -320,7 +319,7 @@ def convert(column: pa.Array, kind: str) -> tuple[pa.Array, NDArray[np.bool_]]:
                 wrong[row] = True
                 scalars.append(0)
         converted = pa.array(scalars, _ARROW_TYPES[kind])
-    if kind == INTEGER:  # Arrow takes 0x10 for 16
+    if kind == INTEGER:  # Arrow reads 0x10 as 16
         for prefix in ("0x", "0X"):
             wrong |= pc.starts_with(column, prefix).to_numpy(zero_copy_only=False)
     elif kind in _MOST:
@@ -331,7 +330,7 @@ def convert(column: pa.Array, kind: str) -> tuple[pa.Array, NDArray[np.bool_]]:
 
 
 def _fault(text: bytes) -> str:
-    """Return why a line cannot be read; empty: it can."""
+    """Return why a line cannot be read; empty if it can."""
     try:
         text.decode()
     except UnicodeDecodeError as error:
@@ -370,13 +369,13 @@ def as_strings(ids: Any) -> pa.Array:
 
 
 def codes_of(ids: pa.Array, vocabulary: pa.Array) -> Ints:
-    """Return the place of each id in a vocabulary, -1 where it is not there."""
+    """Return the position of each id in a vocabulary, -1 if it is missing."""
     codes = pc.fill_null(pc.index_in(ids, value_set=vocabulary), -1)
     return codes.to_numpy(zero_copy_only=False).astype(np.int64)
 
 
 class KeyIndex:
-    """Finds rows of a table by (timestamp, id)."""
+    """Index that finds rows of a table by (timestamp, id)."""
 
     def __init__(self, timestamps: Ints, ids: Any) -> None:
         ids = as_strings(ids)
@@ -395,27 +394,27 @@ class KeyIndex:
         return np.where(known, times * len(self._ids) + codes, -1)
 
     def find(self, timestamps: Ints, ids: Any) -> Ints:
-        """Return the first row of each key, (n,) int64, -1 where there is none."""
+        """Return the first row with each key, (n,) int64, -1 without any."""
         keys = self._keys(timestamps, ids)
         if not len(self._sorted):
             return np.full(len(keys), -1, np.int64)
-        place = np.minimum(np.searchsorted(self._sorted, keys), len(self._sorted) - 1)
-        return np.where((self._sorted[place] == keys) & (keys >= 0), self._order[place], -1)
+        nearest = np.minimum(np.searchsorted(self._sorted, keys), len(self._sorted) - 1)
+        return np.where((self._sorted[nearest] == keys) & (keys >= 0), self._order[nearest], -1)
 
     def find_all(self, timestamps: Ints, ids: Any) -> list[Ints]:
-        """Return all rows of each key, in the table's order."""
+        """Return all rows with each key, in the table's order."""
         keys = self._keys(timestamps, ids)
         starts, ends = np.searchsorted(self._sorted, keys), np.searchsorted(self._sorted, keys, side="right")
         ends = np.where(keys >= 0, ends, starts)
         return [self._order[start:end] for start, end in zip(starts, ends, strict=True)]
 
     def repeated(self) -> Ints:
-        """Return the rows whose key an earlier row has already, ascending."""
+        """Return the rows whose key an earlier row has too, ascending."""
         return np.sort(self._order[1:][self._sorted[1:] == self._sorted[:-1]])
 
 
 def read_query_table(path: Path, columns: Sequence[str]) -> pd.DataFrame:
-    """Read the CSV file of a pair, one row for each query: timestamp int64; device_id and `columns` as text.
+    """Read the CSV file of a pair with one row per query: timestamp as int64, device_id and `columns` as text.
 
     Raises:
         ArtifactError: the file cannot be read, is not such a table, or lacks a column.

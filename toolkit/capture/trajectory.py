@@ -1,4 +1,4 @@
-"""Poses of devices over time: files of trajectories, and poses found by timestamp and device."""
+"""Poses of devices over time: read, write and look up by timestamp and device."""
 
 from functools import cached_property
 from pathlib import Path
@@ -29,8 +29,8 @@ class Trajectory:
 
     Attributes:
         timestamps: (N,) int64 microseconds.
-        qt: (N, 7) float64: qw qx qy qz tx ty tz, as in the file.
-        arrow_ids: N device ids, as an Arrow array.
+        qt: (N, 7) float64, qw qx qy qz tx ty tz, as in the file.
+        arrow_ids: N device ids as an Arrow array.
     """
 
     def __init__(
@@ -41,13 +41,13 @@ class Trajectory:
         covariances: ArrayLike | None = None,
         source: Path | None = None,
     ) -> None:
-        """`covariances` are (N, 6, 6); from the file `source` they are read when they are first needed."""
+        """Make a trajectory. Covariances are given, (N, 6, 6), or read from the file `source` at first use."""
         self.timestamps = np.asarray(timestamps, np.int64)
         self.arrow_ids = as_strings(device_ids)
         self.qt = np.asarray(qt, np.float64).reshape(-1, 7)
         if not len(self.timestamps) == len(self.arrow_ids) == len(self.qt):
             raise ValueError(
-                f"Expected as many timestamps as device ids and poses, got {len(self.timestamps)}, "
+                f"Expected equally many timestamps, device ids and poses, got {len(self.timestamps)}, "
                 f"{len(self.arrow_ids)} and {len(self.qt)}."
             )
         self._covariances = None if covariances is None else np.asarray(covariances, np.float64).reshape(-1, 6, 6)
@@ -57,21 +57,21 @@ class Trajectory:
     def from_poses(
         cls, timestamps: ArrayLike, device_ids: Any, world_from_device: ArrayLike, covariances: ArrayLike | None = None
     ) -> "Trajectory":
-        """Make a trajectory of poses (N, 4, 4)."""
+        """Make a trajectory from poses (N, 4, 4)."""
         return cls(timestamps, device_ids, qt_from_pose(world_from_device), covariances)
 
     @classmethod
     def read(cls, path: str | Path) -> "Trajectory":
-        """Read a trajectories file. Columns after the pose that are not a covariance are ignored.
+        """Read a trajectories file. Columns after the pose are ignored unless they are a covariance.
 
         Raises:
-            CaptureError: no such file, or a malformed line.
+            CaptureError: the file is missing or has a malformed line.
         """
         return cls.from_table(read_table(Path(path), COLUMNS["trajectories.txt"]))
 
     @classmethod
     def from_table(cls, table: TextTable) -> "Trajectory":
-        """Make a trajectory of the rows of a trajectories file."""
+        """Make a trajectory from the table of a trajectories file."""
         return cls(
             table.columns["timestamp"].to_numpy(),
             table.columns["device_id"],
@@ -80,7 +80,7 @@ class Trajectory:
         )
 
     def write(self, path: str | Path) -> None:
-        """Write the file in one piece, with numbers that read back exactly. Covariances that are NaN are left out."""
+        """Write the file atomically, with numbers that read back exactly. NaN covariances are omitted."""
         covariances, values = self.covariances, self.qt.tolist()
         if covariances is not None:
             finite = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
@@ -98,22 +98,22 @@ class Trajectory:
 
     @cached_property
     def device_ids(self) -> NDArray[np.object_]:
-        """(N,) array of str."""
+        """Device ids, (N,) array of str."""
         return self.arrow_ids.to_numpy(zero_copy_only=False)
 
     @property
     def covariances(self) -> Floats | None:
-        """(N, 6, 6), NaN in rows without one; None without any. Read from the file on first use."""
+        """Pose covariances (N, 6, 6), NaN in rows without one; None without any. Read from the file at first use."""
         if self._covariances is None and self._source is not None:
             extra = read_table(self._source, COLUMNS["trajectories.txt"], extra=True).columns["extra"]
             rows = np.flatnonzero(pc.equal(pc.count_substring(extra, ","), 35).to_numpy(zero_copy_only=False))
             if len(rows):
                 self._covariances = np.full((len(self), 6, 6), np.nan)
                 for start in range(0, len(rows), 4096):
-                    part = rows[start : start + 4096]
-                    values = pc.split_pattern(extra.take(pa.array(part)), ",").flatten()
+                    block = rows[start : start + 4096]
+                    values = pc.split_pattern(extra.take(pa.array(block)), ",").flatten()
                     numbers, _ = convert(pc.ascii_trim_whitespace(values), NUMBER)
-                    self._covariances[part] = numbers.to_numpy().reshape(-1, 6, 6)
+                    self._covariances[block] = numbers.to_numpy().reshape(-1, 6, 6)
             self._source = None
         return self._covariances
 
@@ -124,11 +124,11 @@ class Trajectory:
 
     @cached_property
     def index(self) -> KeyIndex:
-        """Finds rows by (timestamp, device_id)."""
+        """Index of the rows by (timestamp, device_id)."""
         return KeyIndex(self.timestamps, self.arrow_ids)
 
     def lookup(self, timestamps: ArrayLike, device_ids: Any) -> Floats:
-        """Return world_from_device, (n, 4, 4), of keys; NaN where there is no pose."""
+        """Return world_from_device, (n, 4, 4), for n keys; NaN for keys without a pose."""
         rows = self.index.find(np.atleast_1d(np.asarray(timestamps, np.int64)), as_strings(device_ids))
         poses = np.full((len(rows), 4, 4), np.nan)
         poses[rows >= 0] = pose_from_qt(self.qt[rows[rows >= 0]])

@@ -1,6 +1,6 @@
-"""Turn images, poses and pixel positions by quarter turns.
+"""Rotate images, poses and pixel positions by quarter turns.
 
-`k` is always a number of COUNTER-CLOCKWISE quarter turns of the image, as in `np.rot90`.
+`k` is always the number of COUNTER-CLOCKWISE quarter turns of the image, as in `np.rot90`.
 """
 
 from typing import Any
@@ -21,7 +21,7 @@ def turn_image(image: NDArray[Any], k: int) -> NDArray[Any]:
 
 
 def turn_points(xy: ArrayLike, width: int, height: int, k: int) -> Floats:
-    """Return pixel positions (N, 2) of an image of this size as they are after k quarter turns, (N, 2).
+    """Return the pixel positions (N, 2) after k quarter turns of an image of this size, (N, 2).
 
     The center of the top-left pixel is (0.5, 0.5), before and after.
     """
@@ -31,13 +31,13 @@ def turn_points(xy: ArrayLike, width: int, height: int, k: int) -> Floats:
 
 
 def turned_from_cam(k: ArrayLike) -> Floats:
-    """Return the pose of the camera in the coordinates of the camera after k quarter turns, (..., 4, 4).
+    """Return turned_from_cam, (..., 4, 4): it maps camera coordinates to those of the camera after k quarter turns.
 
-    A turned image's pose is world_from_cam @ invert(turned_from_cam(k)).
+    The pose of a turned image is world_from_cam @ invert(turned_from_cam(k)).
 
     Args:
         k: quarter turns, any shape.
     """
     quarter = np.eye(4)
-    quarter[:2, :2] = [[0, 1], [-1, 0]]  # what pointed right points up, along -y
+    quarter[:2, :2] = [[0, 1], [-1, 0]]  # right becomes up (-y)
     return np.stack([np.linalg.matrix_power(quarter, turn) for turn in range(4)])[np.asarray(k) % 4]

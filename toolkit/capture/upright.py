@@ -1,8 +1,7 @@
-"""Decide by how many quarter turns the images of each sensor have to be turned so that gravity points down in them.
+"""Find the number of quarter turns that make the images of each sensor upright, with gravity pointing down.
 
-Headset and robot cameras are mounted rotated; people hold phones upright while the sensor lies on its side. Networks
-that learned from upright photographs expect upright ones. The functions of `toolkit.capture.turning` turn images, poses
-and pixel positions.
+Headset and robot cameras are mounted rotated, and phones store portrait photographs in landscape. Networks trained on
+upright photographs expect upright images. `toolkit.capture.turning` rotates images, poses and pixel positions.
 
     turns = quarter_turns([capture["hl_map"], capture["ios_map"]], world_up=None)
     k = turns.of(capture["hl_query"])
@@ -27,21 +26,20 @@ from toolkit.geometry import Floats, Ints, unit
 
 log = logging.getLogger(__name__)
 
-
-CLEAR = 0.15  # the least margin of votes that is a decision; one image's vote is at most 1
-MAJORITY = 2 / 3  # share of the votes that a decision needs where sensors are only alike, not the same
+CLEAR = 0.15  # smallest margin of votes that decides; one image has at most 1 vote
+MAJORITY = 2 / 3  # share of the votes that decides for similar sensors, as opposed to the same sensor
 SHARES = {"sensor": 0.0, "role": MAJORITY, "name": MAJORITY, "device": MAJORITY}
-"""Share of the votes that a decision needs, for each kind of name under which sensors are looked up."""
+"""Share of the votes needed for a decision, for each kind of name by which sensors are looked up."""
 
 
 @dataclass(frozen=True)
 class _TurnsByName:
-    """Quarter turns that map images voted for, by a name that sensors share.
+    """Quarter turns by sensor name, decided by the votes of map images.
 
     Attributes:
         names: (n,) texts.
-        turns: (n,) quarter turns, -1 where the votes are not clear.
-        ups: (n, 3) mean up direction in camera coordinates, unit.
+        turns: (n,) quarter turns, -1 if the votes do not decide.
+        ups: (n, 3) mean up directions in camera coordinates, unit length.
     """
 
     names: pd.Index
@@ -50,9 +48,12 @@ class _TurnsByName:
 
     @classmethod
     def learn(cls, names: pd.Series, up_in_cams: Floats, share: float) -> "_TurnsByName":
-        """Let images vote: (n,) names, None where an image does not vote, and (n, 3) up directions in their cameras.
+        """Decide by the votes of images.
 
-        A decision needs a `share` of all votes of a name.
+        Args:
+            names: (n,) name of each image's sensor; an image with None does not vote.
+            up_in_cams: (n, 3) up direction in each image's camera coordinates.
+            share: share of a name's votes needed for a decision.
         """
         codes, unique = pd.factorize(names, sort=True)
         up_in_cams, codes = up_in_cams[codes >= 0], codes[codes >= 0]
@@ -66,14 +67,14 @@ class _TurnsByName:
         return cls(pd.Index(unique, dtype=object), np.where(clear, votes.argmax(1), -1), unit(ups))
 
     def find(self, names: pd.Series) -> tuple[Ints, Floats]:
-        """Return turns (n,), -1 where unknown, and up directions (n, 3), zero where unknown."""
+        """Return turns (n,), -1 if unknown, and up directions (n, 3), zero if unknown."""
         rows = self.names.get_indexer(names.to_numpy(object)) if len(self.names) else np.full(len(names), -1)
         return np.append(self.turns, -1)[rows], np.vstack([self.ups, np.zeros(3)])[rows]
 
 
 @dataclass
 class Turns:
-    """How many quarter turns bring up to the top of the images of each sensor; see `quarter_turns`."""
+    """The quarter turns that make the images of each sensor upright; see `quarter_turns`."""
 
     world_up: WorldUp | None
     _by_name: dict[str, _TurnsByName]
@@ -82,10 +83,10 @@ class Turns:
     def of(self, session: Session, rows: Rows = None) -> Ints:
         """Return counter-clockwise quarter turns, 0 to 3, for images of a map or query session, (n,) int64.
 
-        A sensor is looked up by its id; by its kind of device and the id after the last `/` (recordings prefix ids); by
-        its kind of device and its name. A camera that is still unknown follows from the known cameras of its rig. If
-        there are none, it is turned as two thirds or more of the map images of its kind of device are; else it is left
-        as it is. What was turned and what is unknown is logged once for each session.
+        A sensor is looked up by its kind of device and, in turn, its id, the part of its id after the last `/`
+        (recordings prefix ids), and its name. If it is not found, its turns follow from the known cameras of its rig;
+        failing that, from two thirds or more of the map images of its kind of device. Otherwise it is not turned. The
+        turns are logged once per session.
 
         Args:
             rows: rows of `session.images`; None means all.
@@ -104,11 +105,11 @@ class Turns:
         return digest.hexdigest()[:16]
 
     def record(self, session: Session | None = None) -> dict[str, Any]:
-        """Return what was learned, for fingerprints; the same maps give the same record.
+        """Return a record of the turns, for fingerprints; the same maps give the same record.
 
         Args:
-            session: limits the record to this session: it then changes only if one of its images is turned
-                differently, whatever else is added to the map.
+            session: limit the record to this session, so that it changes only if the turns of its images change, and
+                not with other additions to the map.
         """
         if session is not None:
             codes, turns = self._turns_of(session)
@@ -130,15 +131,15 @@ class Turns:
         return self._of_sensors[key]
 
     def _look_up(self, session: Session) -> tuple[Ints, Ints]:
-        """Return the sensor of each image, as a number, and the turns of each sensor; log them."""
+        """Return the index of each image's sensor, and the turns of each sensor; log them."""
         codes, ids = pd.factorize(session.images["sensor_id"])
         sensors = pd.Series(np.asarray(ids, object), dtype=object)
         names = sensor_names(session, sensors)
         turns, ups = np.full(len(sensors), -1, np.int64), np.zeros((len(sensors), 3))
         for kind in ("sensor", "role", "name"):
             turns_of_kind, ups_of_kind = self._by_name[kind].find(names[kind])
-            take = (turns < 0) & (turns_of_kind >= 0)
-            turns[take], ups[take] = turns_of_kind[take], ups_of_kind[take]
+            new = (turns < 0) & (turns_of_kind >= 0)
+            turns[new], ups[new] = turns_of_kind[new], ups_of_kind[new]
         if np.any(turns >= 0) and np.any(turns < 0):
             turns = _from_rigs(session, sensors, turns, ups)
         turns = np.where(turns < 0, self._by_name["device"].find(names["device"])[0], turns)
@@ -147,29 +148,29 @@ class Turns:
 
 
 def quarter_turns(maps: Sequence[Session], world_up: WorldUp | ArrayLike | None = None) -> Turns:
-    """Learn how each camera is mounted or held from the poses of a capture's map sessions.
+    """Find how each camera is mounted or held, from the poses of a capture's map sessions.
 
-    Every image votes for the quarter turns that bring up nearest to its top, the more the clearer: an image that looks
-    straight up or down, or is held at 45 degrees, has no say.
+    Each image votes for the quarter turns that bring the up direction closest to its top. The weight of the vote is
+    zero for an image that looks straight up or down, or is rolled by 45 degrees.
 
     Args:
         maps: all map sessions of one capture.
-        world_up: the direction (3,) that is up, of any length; None: `estimate_world_up`.
+        world_up: up direction (3,) of the world, any length; None: `estimate_world_up`.
 
     Returns:
-        The turns. Without any posed image nothing is known and nothing is turned, which is logged as a warning.
+        The turns. Without any posed image, no image is turned, and a warning is logged.
 
     Raises:
         ManifestError: `world_up` is not three finite numbers, or is zero.
     """
     up = world_up if world_up is None or isinstance(world_up, WorldUp) else given_world_up(world_up)
-    parts: list[pd.DataFrame] = []
+    tables = [pd.DataFrame({kind: [] for kind in SHARES}, dtype=object)]
     rotations = [np.zeros((0, 3, 3))]
     for session in maps:
         world_from_cam, rows = posed_photographs(session)
-        parts.append(sensor_names(session, session.images["sensor_id"].iloc[rows]))
+        tables.append(sensor_names(session, session.images["sensor_id"].iloc[rows]))
         rotations.append(world_from_cam[:, :3, :3])
-    names = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame({kind: [] for kind in SHARES}, dtype=object)
+    names = pd.concat(tables[1:] or tables, ignore_index=True)
     up_in_cams = np.zeros((0, 3))
     if not len(names):
         log.warning(
@@ -181,17 +182,16 @@ def quarter_turns(maps: Sequence[Session], world_up: WorldUp | ArrayLike | None 
             up = estimate_world_up(maps)
             log.log(logging.INFO if up.known else logging.WARNING, "Upright: up is %s.", up.reason)
         up_in_cams = np.einsum("nij,i->nj", np.concatenate(rotations), up.direction)
-    tables = {kind: _TurnsByName.learn(names[kind], up_in_cams, share) for kind, share in SHARES.items()}
-    return Turns(up, tables)
+    return Turns(up, {kind: _TurnsByName.learn(names[kind], up_in_cams, share) for kind, share in SHARES.items()})
 
 
 def upright_turns(capture: Capture, world_up: ArrayLike | None = None) -> Turns:
-    """Return the turns learned from all map sessions of a capture; see `quarter_turns`."""
+    """Return the turns according to all map sessions of a capture; see `quarter_turns`."""
     return quarter_turns(capture.usable("map"), world_up)
 
 
 def _from_rigs(session: Session, sensors: pd.Series, turns: Ints, ups: Floats) -> Ints:
-    """Return the turns with those added that follow from the known cameras of the same rig."""
+    """Return the turns, with unknown ones derived from the known cameras of the same rig."""
     if session.rigs is None:
         return turns
     rig, _ = pd.factorize(session.rigs["rig_id"])
@@ -208,10 +208,10 @@ def _from_rigs(session: Session, sensors: pd.Series, turns: Ints, ups: Floats) -
 
 
 def _report(session: Session, roles: pd.Series, turns: Ints) -> None:
-    """Log one line on a session; sensors whose ids differ only in long numbers count as one."""
+    """Log the turns of a session in one line; sensors whose ids differ only in long numbers are merged."""
     short = roles.str.replace(r"^[^/]*/", "", regex=True).str.replace(r"\d{4,}", "*", regex=True)
     table = pd.DataFrame({"sensor": short, "turns": turns})
-    texts = {-1: "not known, left as they are", 0: "upright as they are"}
+    texts = {-1: "unknown, not turned", 0: "upright already"}
     parts = []
     for turn, group in table.groupby("turns"):
         counts = group["sensor"].value_counts().sort_index()

@@ -1,4 +1,4 @@
-"""Estimate which direction is up in the world of a capture, from the poses of its map images."""
+"""Estimate the up direction of a capture's world from the poses of its map images."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,27 +11,27 @@ from toolkit.capture.session import Session
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.geometry import Floats, Ints
 
-MAX_IMAGES = 2000  # of a session
-SIGMA_ROLL = 0.1  # radians; how far from a multiple of 90 degrees cameras are held
-SIGMA_PITCH, SIGMA_PULL = np.radians(40.0), np.radians(25.0)
-ODD = 0.1  # share of images that are held in another way than most of their sensor
-# The share of each quarter turn among the odd images of a sensor; a row for each turn that most of its images need. A
-# phone that mostly lies on its side is rather turned upright.
+MAX_IMAGES = 2000  # images used per session
+SIGMA_ROLL = 0.1  # radians; standard deviation of the roll from the nearest multiple of 90 degrees
+SIGMA_PITCH, SIGMA_PULL = np.radians(40.0), np.radians(25.0)  # standard deviations of pitch: likelihood, refinement
+ODD = 0.1  # share of images with another roll than most images of their sensor
+# Shares of the quarter turns among the odd images of a sensor; one row for each quarter turn that most of its images
+# need. The odd images of a phone that mostly lies on its side are more often upright.
 ODD_PRIOR = np.array([[0.25] * 4, [0.4, 0.2, 0.2, 0.2], [0.25] * 4, [0.4, 0.2, 0.2, 0.2]])
-OUTLIER = 0.005
-SENSOR_PRIOR = np.array([0.0, -1.0, -2.0, -1.0])  # log; upright is likelier than on the side than upside down
-Z_BONUS, Z_NEAR = 1.5, np.radians(10.0)  # log, radians: worlds are mostly made with z along gravity
-WALK_BONUS = 2.0  # log: people walk on the ground, so cameras spread least along up
-DECISIVE = 0.5  # log; the least difference between up and down that is not a guess
+OUTLIER = 0.005  # likelihood of an outlier, an image held in any other way
+SENSOR_PRIOR = np.array([0.0, -1.0, -2.0, -1.0])  # log prior: most likely upright, least likely upside down
+Z_BONUS, Z_NEAR = 1.5, np.radians(10.0)  # log, radians; prior that the world's z axis is vertical
+WALK_BONUS = 2.0  # log; prior that cameras spread least along up, because people walk on the ground
+DECISIVE = 0.5  # log; smallest difference of the scores of up and down that decides between them
 
 
 @dataclass(frozen=True, eq=False)
 class WorldUp:
-    """The direction that is up in the world of a capture.
+    """The up direction of a capture's world.
 
     Attributes:
-        direction: (3,) float64, unit.
-        known: False where its sign is a guess.
+        direction: (3,) float64, unit length.
+        known: False if the sign is a guess.
         reason: how it was determined, for messages.
     """
 
@@ -41,10 +41,10 @@ class WorldUp:
 
 
 def given_world_up(direction: ArrayLike) -> WorldUp:
-    """Return the direction (3,) that a manifest gives, of any length, as a unit vector.
+    """Return the up direction (3,) of a manifest, of any length, as a unit vector.
 
     Raises:
-        ManifestError: not three finite numbers, or all zero.
+        ManifestError: the direction is not three finite numbers, or is zero.
     """
     try:
         up = np.asarray(direction, np.float64)
@@ -53,23 +53,23 @@ def given_world_up(direction: ArrayLike) -> WorldUp:
     length = float(np.linalg.norm(up)) if up.shape == (3,) else 0.0
     if not np.isfinite(length) or length < 1e-9:
         raise ManifestError(
-            f"Found world_up: {direction!r}; expected three finite numbers, not all zero, the direction that is "
-            "up in the captures' world, e.g. [0, 0, 1]. Leave it out to have it estimated."
+            f"Found world_up: {direction!r}; expected three finite numbers, not all zero: the up direction of the "
+            "captures' world, e.g. [0, 0, 1]. Leave it out to have it estimated."
         )
     return WorldUp(up / length, True, "given")
 
 
 def estimate_world_up(sessions: Sequence[Session]) -> WorldUp:
-    """Estimate the direction that is up in a capture from the poses of its map sessions, which share one world.
+    """Estimate the up direction of a capture from the poses of its map sessions, which share one world.
 
-    Cameras are held or mounted near a multiple of 90 degrees of roll, so one axis of each image is level, whatever
-    the pitch. Up is perpendicular to all level axes: it is the eigenvector with the smallest eigenvalue of the sum of
-    their outer products, with less weight for images that are held askew (Huber 1981). Which axis is level is decided
-    for each camera of a device; a share of its images may be held otherwise. Where all cameras look one way, many
-    directions are perpendicular to their level axes. Then weak priors decide: cameras look near the horizon, are
-    rather upright than rolled and are carried along the ground, and the world's z is vertical.
+    Cameras are held or mounted near a multiple of 90 degrees of roll, so one axis of each image is level for any pitch.
+    Up is perpendicular to all level axes: the eigenvector with the smallest eigenvalue of the sum of their outer
+    products, with less weight for tilted images (Huber 1981). Which axis is level is decided for each camera of a
+    device; a share of its images may be held differently. If all cameras look the same way, many directions are
+    perpendicular to their level axes. Weak priors then decide: cameras look near the horizon, are rather upright than
+    rolled and move along the ground, and the world's z axis is vertical.
 
-    Upright cameras tell up from down. Where cameras do not tell, up is +z if z is within 25 degrees of the axis (the
+    Upright cameras distinguish up from down. If the cameras do not, up is +z if z is within 25 degrees of the axis (the
     convention of CroCoDL and LaMAR), else the sign is arbitrary; `known` is False in both cases.
 
     Raises:
@@ -80,8 +80,8 @@ def estimate_world_up(sessions: Sequence[Session]) -> WorldUp:
     if not count:
         names = ", ".join(session.id for session in sessions) or "none"
         raise CaptureError(
-            f"No image of the map sessions ({names}) has a pose, so the direction that is up cannot be "
-            "estimated: expected poses in trajectories.txt. Give `world_up` in the manifest instead."
+            f"No image of the map sessions ({names}) has a pose, so the up direction cannot be estimated: expected "
+            "poses in trajectories.txt. Or set `world_up` in the manifest."
         )
     up, difference = _most_upright(axes, centers, groups)
     known, how = difference >= DECISIVE, "as most of its cameras are held"
@@ -94,9 +94,9 @@ def estimate_world_up(sessions: Sequence[Session]) -> WorldUp:
 
 
 def up_of_cameras(world_from_cams: ArrayLike) -> Floats:
-    """Return the direction (3,) that is up for cameras (N, 4, 4), as `estimate_world_up` does; z without any pose.
+    """Return the up direction (3,) of cameras (N, 4, 4), estimated as in `estimate_world_up`; z without any pose.
 
-    All cameras count as one sensor; poses that are not finite are left out.
+    All cameras are treated as one sensor; poses that are not finite are ignored.
     """
     poses = np.asarray(world_from_cams, np.float64).reshape(-1, 4, 4)
     poses = poses[np.isfinite(poses).all(axis=(1, 2))]
@@ -107,7 +107,7 @@ def up_of_cameras(world_from_cams: ArrayLike) -> Floats:
 
 
 def _most_upright(axes: Floats, centers: Floats, groups: Ints) -> tuple[Floats, float]:
-    """Return the direction (3,) that explains the cameras best, and by how much it beats its opposite (log)."""
+    """Return the up direction (3,) with the highest score, and its lead over the opposite direction (log)."""
     order = np.argsort(groups, kind="stable")
     few = order[_evenly(len(order), 300)]
     likelihood = _UpLikelihood(axes, centers, groups)
@@ -121,17 +121,17 @@ def _most_upright(axes: Floats, centers: Floats, groups: Ints) -> tuple[Floats, 
 
 
 def _posed_cameras(sessions: Sequence[Session]) -> tuple[Floats, Floats, Ints]:
-    """Return axes (n, 3, 3), centers (n, 3) and groups (n,) of up to MAX_IMAGES cameras a session, in the world.
+    """Return axes (n, 3, 3), centers (n, 3) and groups (n,) of up to MAX_IMAGES cameras per session, in the world.
 
-    The columns of the axes are right, down and forward. A group is one camera of a device in all its recordings. The
-    cameras that took only a few of a device's images (a phone may have one sensor id for each image) form one group.
+    The columns of the axes are right, down and forward. A group is one camera of a device in all its recordings. All
+    cameras with few of a device's images form one group, because a phone may have one sensor id per image.
     """
     poses: list[Floats] = []
     roles: list[pd.Series] = []
     for session in sessions:
         world_from_cam, rows = posed_photographs(session)
         role = sensor_names(session, session.images["sensor_id"]).iloc[rows]["role"]
-        # One camera after the other: a stride through a rig's frames could meet the same camera each time.
+        # Sort by camera before sampling: a stride through a rig's frames could always pick the same camera.
         order = np.argsort(pd.factorize(role)[0], kind="stable")
         order = order[_evenly(len(order), MAX_IMAGES)]
         poses.append(world_from_cam[order])
@@ -147,7 +147,7 @@ def _posed_cameras(sessions: Sequence[Session]) -> tuple[Floats, Floats, Ints]:
 
 
 def posed_photographs(session: Session) -> tuple[Floats, Ints]:
-    """Return world_from_cam, (n, 4, 4), of the photographs of a session that have a pose, and their rows."""
+    """Return world_from_cam, (n, 4, 4), of the photographs of a session that have a pose, and their rows (n,)."""
     poses = session.world_from_cam(ground_truth=session.trajectory is None)
     rows = session.camera_rows
     rows = rows[np.isfinite(poses[rows]).all((1, 2))]
@@ -155,12 +155,12 @@ def posed_photographs(session: Session) -> tuple[Floats, Ints]:
 
 
 def _evenly(count: int, most: int) -> Ints:
-    """Return at most `most` of the first `count` numbers, evenly spread."""
+    """Return at most `most` indices, evenly spread from 0 to `count` - 1."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 
 def _candidates(axes: Floats) -> Floats:
-    """Return directions that may be up, (c, 3) unit: axes of images, cross products of two of them, and z."""
+    """Return candidate up directions, (c, 3) unit: image axes, cross products of image axes, z, and their opposites."""
     few = axes[_evenly(len(axes), 40)]
     x, y = few[:, :, 0], few[:, :, 1]
     half = max(1, len(few) // 2)
@@ -172,7 +172,7 @@ def _candidates(axes: Floats) -> Floats:
 
 
 def _distinct(directions: Floats, count: int) -> Floats:
-    """Return the first directions (at most `count`) that are 15 degrees or more from the ones before, and opposites."""
+    """Return the first directions, at most `count`, 15 degrees or more from earlier ones and their opposites."""
     kept = directions[:1]
     for direction in directions[1:]:
         if len(kept) < count and np.abs(kept @ direction).max() < np.cos(np.radians(15.0)):
@@ -181,15 +181,14 @@ def _distinct(directions: Floats, count: int) -> Floats:
 
 
 class _UpLikelihood:
-    """How well a direction that may be up explains the way cameras are held: a log likelihood with weak priors.
+    """Log likelihood, with weak priors, of candidate up directions given the camera rotations.
 
-    An image is held near one of four rolls, mostly that of its group, with any pitch that is not too steep; or it is
-    an outlier. Images of a walk are not independent, so all together count as at most 100; else the noise of a
-    thousand images would outweigh every prior.
+    An image is held near one of four rolls, mostly the one of its group, at a moderate pitch; or it is an outlier.
+    Images of a walk are not independent, so together they count as at most 100; otherwise the noise of a thousand
+    images would outweigh every prior. The arguments are the arrays of `_posed_cameras`.
     """
 
     def __init__(self, axes: Floats, centers: Floats, groups: Ints) -> None:
-        """Take the arrays of `_posed_cameras`."""
         self.axes = axes
         self.member = (groups[:, None] == np.unique(groups)).astype(np.float64)
         offsets = centers - centers.mean(0)
@@ -197,7 +196,11 @@ class _UpLikelihood:
         self.weight = min(1.0, 100 / len(axes))
 
     def _likelihoods(self, ups: Floats) -> tuple[Floats, Floats]:
-        """Return the likelihood of each image to need 0 to 3 quarter turns, (4, n, c), and sines of pitch, (n, c)."""
+        """Return the likelihood that each image needs 0 to 3 quarter turns, (4, n, c), and the sines of pitch, (n, c).
+
+        Args:
+            ups: (c, 3) candidate up directions.
+        """
         right, down, forward = np.moveaxis(np.einsum("nij,ci->jnc", self.axes, ups), 0, 0)
         roll = np.exp(-0.5 * (np.stack([right, down]) / SIGMA_ROLL) ** 2)
         pitch = np.exp(-0.5 * (np.arcsin(np.clip(forward, -1, 1)) / SIGMA_PITCH) ** 2)
@@ -205,22 +208,22 @@ class _UpLikelihood:
         return roll[[0, 1, 0, 1]] * pitch * (tops > 0), forward
 
     def _by_group(self, likely: Floats, forward: Floats) -> Floats:
-        """Return the log likelihood of each group to need 0 to 3 quarter turns, (4, g, c)."""
+        """Return the log likelihood that each group needs 0 to 3 quarter turns, (4, g, c)."""
         mixed = OUTLIER + (1 - ODD) * likely + ODD * np.einsum("kj,jnc->knc", ODD_PRIOR, likely, optimize=True)
         logs = np.einsum("ng,knc->kgc", self.member, np.log(mixed), optimize=True)
-        # How a camera that looks straight up or down is turned says nothing about up.
+        # The roll of a camera that looks straight up or down tells nothing about the up direction.
         clarity = self.member.T @ (1 - np.clip(forward, -1, 1) ** 2) / self.member.sum(0)[:, None]
         return logs * self.weight + SENSOR_PRIOR[:, None, None] * clarity
 
     def scores(self, ups: Floats) -> Floats:
-        """Return the score of directions (c, 3), (c,)."""
+        """Return the scores (c,) of candidate up directions (c, 3)."""
         held = self._by_group(*self._likelihoods(ups)).max(0).sum(0)
         from_z = np.arccos(np.clip(np.abs(ups[:, 2]), 0, 1))
         walk = np.einsum("ci,ij,cj->c", ups, self.spread, ups)
         return held + Z_BONUS * np.exp(-0.5 * (from_z / Z_NEAR) ** 2) - WALK_BONUS * walk
 
     def _scatter(self, up: Floats) -> tuple[Floats, Floats]:
-        """Return the mean outer products (3, 3) of the axes that are level if `up` is up, and of view directions."""
+        """Return the mean outer products (3, 3) of the level axes, given `up`, and of the view directions."""
         likely, forward = self._likelihoods(up[None])
         held = self.member @ np.eye(4)[self._by_group(likely, forward)[..., 0].argmax(0)]
         shares = (held @ ((1 - ODD) * np.eye(4) + ODD * ODD_PRIOR)).T * likely[..., 0]
@@ -232,9 +235,9 @@ class _UpLikelihood:
         return outer[0] + outer[1], outer[2]
 
     def refined(self, up: Floats) -> Floats:
-        """Return the direction (3,) near `up` that level axes agree on, with a weak pull towards level views.
+        """Refine `up`, (3,), by the level axes, with a weak pull towards level view directions.
 
-        Without the pull, cameras that all look one way would leave the angle about their level axes open.
+        Without the pull, cameras that all look the same way do not determine the angle about their level axes.
         """
         pull = max(0.15, min(1.0, 6 / len(self.axes))) * (SIGMA_ROLL / SIGMA_PULL) ** 2
         for _ in range(10):
@@ -243,31 +246,32 @@ class _UpLikelihood:
         return up
 
     def polished(self, up: Floats) -> Floats:
-        """Return `up` refined without the pull, if level axes alone determine it; else `up`.
+        """Refine `up` without the pull if the level axes alone determine it; else return it unchanged.
 
-        The pull bends the result where all cameras look down. Level axes are enough where their second eigenvalue,
-        which comes from different headings, is clearly above the effect of cameras that are held askew.
+        The pull biases the result if all cameras look down. The level axes suffice if their second eigenvalue, due to
+        different headings, is clearly larger than the effect of tilted cameras.
         """
         polished = up
         for _ in range(5):
             level, _ = self._scatter(polished)
-            askew, second, _ = np.linalg.eigvalsh(level) + (SIGMA_ROLL / 2) ** 2
-            if second < 4 * askew:
+            tilt, second, _ = np.linalg.eigvalsh(level) + (SIGMA_ROLL / 2) ** 2
+            if second < 4 * tilt:
                 return up
             polished = _smallest(level, polished)
         return polished
 
 
 def _smallest(scatter: Floats, near: Floats) -> Floats:
-    """Return the eigenvector (3,) of the smallest eigenvalue, in the direction that is nearer to `near`."""
+    """Return the eigenvector (3,) of the smallest eigenvalue, with the sign that is closer to `near`."""
     smallest: Floats = np.linalg.eigh(scatter)[1][:, 0]
     return smallest if smallest @ near >= 0 else -smallest
 
 
 def sensor_names(session: Session, sensors: pd.Series) -> pd.DataFrame:
-    """Return the names under which sensors (n,) can be looked up: columns sensor (id), role, name and device.
+    """Return the names by which sensors (n,) are looked up: columns sensor (id), role, name and device.
 
-    The role is the id after the last `/`, as recordings prefix their ids. All names start with the kind of device.
+    The role is the part of the id after the last `/`, because recordings prefix ids. All names start with the kind of
+    device.
     """
     ids = sensors.reset_index(drop=True).astype(object)
     names = session.sensors.drop_duplicates("sensor_id").set_index("sensor_id")["name"]

@@ -1,4 +1,4 @@
-"""Write the text files of a session; read and write its depth maps."""
+"""Write the text files of a session; read and write depth maps."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -33,22 +33,24 @@ def write_session(
     wifi: Iterable[Sequence[Any]] | None = None,
     bt: Iterable[Sequence[Any]] | None = None,
 ) -> Path:
-    """Write the text files of a session (not the images); what is None is not written. Return the folder.
+    """Write the text files of a session, not its images. Return the folder.
+
+    Arguments that are None are not written.
 
     Args:
-        path: the session's folder; made where it does not exist.
+        path: the session's folder; created if missing.
         sensors: rows (sensor_id, name, sensor_type, parameter, ...).
         rigs: rows (rig_id, sensor_id, rig_from_sensor), the pose as (4, 4) or as qw qx qy qz tx ty tz.
-        trajectory: goes to trajectories.txt: the poses of a map, or the odometry of queries.
+        trajectory: written to trajectories.txt: the poses of a map, or the odometry of queries.
         images, depths: rows (timestamp, sensor_id, path relative to raw_data/).
         keyframes: tables [timestamp, device_id] by name, e.g. `pruned_subsampled`.
-        ground_truth: goes to proc/alignment_trajectories.txt.
+        ground_truth: written to proc/alignment_trajectories.txt.
         wifi: rows (timestamp, sensor_id, MAC address, kHz, dBm, name, start and end of the scan, microseconds).
         bt: rows (timestamp, sensor_id, id, dBm, name), the id as `<guid>:<major>:<minor>`.
 
     Raises:
-        ValueError: a value that the format cannot hold: with a comma, a line break or spaces at an end, or # at the
-            start of a line.
+        ValueError: the format cannot store a value: it contains a comma or a line break, begins or ends with a space,
+            or starts a line with #.
     """
     path = Path(path)
     write_table(path / "sensors.txt", "sensor_id, name, sensor_type, [sensor_params]+", map(_line, sensors))
@@ -70,7 +72,7 @@ def write_session(
     for file, columns, signals in (("wifi.txt", _WIFI, wifi), ("bt.txt", _BLUETOOTH, bt)):
         if signals is not None:
             write_table(path / file, f"timestamp, sensor_id, {columns}", map(_line, signals))
-    # The benchmark writes the files in proc/ without a header, and its evaluation reads them so.
+    # The benchmark's evaluation expects the files in proc/ without a header.
     if subsessions is not None:
         write_table(path / "proc" / "subsessions.txt", None, (_line([name]) for name in subsessions))
     for name, table in (keyframes or {}).items():
@@ -80,7 +82,7 @@ def write_session(
 
 
 def _line(values: Sequence[Any]) -> str:
-    # repr of a float is the shortest text that reads back as the same number
+    # repr of a float is the shortest text that reads back as the same number.
     texts = [repr(float(value)) if isinstance(value, float) else str(value) for value in values]
     for text in texts:
         if any(sign in text for sign in ",\n\r") or text != text.strip(" \t\r\v\f"):
@@ -104,16 +106,18 @@ def read_depth(path: str | Path) -> NDArray[np.float32]:
         depth = decode(path, cv2.IMREAD_UNCHANGED)
     except ImageError as error:
         raise CaptureError(
-            f"Depth map {path}: no such file, or no 16-bit image of one channel ({error}). Expected a 16-bit PNG in "
+            f"Depth map {path}: no such file, or not a 16-bit image of one channel ({error}). Expected a 16-bit PNG in "
             "millimeters."
         ) from None
     if depth.dtype != np.uint16 or depth.ndim != 2:
-        raise CaptureError(f"Depth map {path}: no 16-bit image of one channel. Expected a 16-bit PNG in millimeters.")
+        raise CaptureError(
+            f"Depth map {path}: not a 16-bit image of one channel. Expected a 16-bit PNG in millimeters."
+        )
     return (depth / np.float32(DEPTH_SCALE)).astype(np.float32)
 
 
 def write_depth(path: str | Path, depth_m: ArrayLike) -> None:
-    """Write a depth map (H, W), meters, as a 16-bit PNG in millimeters; beyond 65.5 m becomes unknown."""
+    """Write a depth map (H, W), meters, as a 16-bit PNG in millimeters; depth beyond 65.5 m becomes 0, unknown."""
     import cv2
 
     millimeters = np.round(np.asarray(depth_m, np.float64) * DEPTH_SCALE)

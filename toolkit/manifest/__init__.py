@@ -1,4 +1,4 @@
-"""What to run and with which settings: the manifest, and the tree of settings that all stages share."""
+"""The manifest (what to run) and the tree of settings that all stages share."""
 
 from toolkit.manifest.loading import load_manifest
 from toolkit.manifest.manifest import OPTIONAL, STAGES, DatasetSettings, DemoData, Manifest, Source

@@ -1,4 +1,4 @@
-"""Read a manifest: inheritance, paths and variables, `--set`."""
+"""Read a manifest; resolve inheritance, paths, environment variables and `--set`."""
 
 import itertools
 import os
@@ -17,24 +17,22 @@ from toolkit.manifest.messages import explain
 from toolkit.manifest.settings import expand, merge
 
 PATHS = ("captures", "output_root", "retrieve.mask.poses")
-"""Keys of paths, beside those of checkpoints."""
+"""Keys whose values are paths; the keys of checkpoints are paths too."""
 MOST_VALUES = 100_000
-"""A manifest of more values is no manifest, but aliases of aliases that fill the memory."""
+"""Largest number of values in a manifest: nested YAML aliases can expand to so many that they fill the memory."""
 
 
 def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
-    """Read and check a manifest; its paths are made absolute.
+    """Read and check a manifest and make its paths absolute.
 
-    `inherits: FILE` (or a list of files, relative to the manifest) takes over what those files say: sections are
-    merged key by key, lists and values replaced, and each path counts from the folder of the file that has it.
+    `inherits: FILE` (or a list of files, relative to the manifest) merges the manifest over those files: sections key
+    by key, while lists and values are replaced. A path is relative to the folder of the file that contains it.
 
     Args:
-        overrides: `key=value` or `section.key=value`, as deep as the tree of settings is, the value in YAML; merged
-            over what the file says.
+        overrides: `key=value` or `section.key=value` at any depth, the value in YAML; merged over the file.
 
     Raises:
-        ManifestError: naming the file, the key, what was found, and the nearest known key; also the file that an
-            inherited key is from.
+        ManifestError: names the file (also the inherited one), the key, what was found, and the nearest known key.
     """
     path = Path(path)
     source = str(path)
@@ -49,23 +47,23 @@ def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
     raw.setdefault("output_root", Manifest.model_fields["output_root"].default)  # a path like any other
     folder = path.resolve().parent
     try:
-        Manifest.model_validate(raw)  # before paths are looked at, whose messages are about other things
+        Manifest.model_validate(raw)  # before paths are expanded, so that its errors come first
         raw = _map_paths(raw, lambda text, key: str(_expand(text, folder, f"{source}: {key}")))
         manifest = Manifest.model_validate(raw)
     except ValidationError as error:
 
         def origin(keys: list[str]) -> str:
-            """Say of a key that an inherited file is where it stands."""
-            giver = next((file for file, content in reversed(chain) if _has(content, keys)), path)
-            return "" if giver == path else f" (in {giver}, which it inherits)"
+            """Name the inherited file that sets a key; empty if the manifest itself does."""
+            setter = next((file for file, content in reversed(chain) if _has(content, keys)), path)
+            return "" if setter == path else f" (in {setter}, which it inherits)"
 
         raise ManifestError(explain(error, Manifest, source, origin)) from None
     names = [Path(capture).name for capture in manifest.captures]
     for name, capture in zip(names, manifest.captures, strict=True):
         if name in RUN_FILES:
             raise ManifestError(
-                f"{source}: captures: the results of {capture} would go where a run has its own {name}. Rename the "
-                "folder, or give a link of another name to it."
+                f"{source}: captures: the results of {capture} and the run's own {name} would have one path. Rename "
+                "the folder, or name a link to it."
             )
     if twice := {name for name in names if names.count(name) > 1}:
         raise ManifestError(
@@ -76,13 +74,13 @@ def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
 
 
 Chain = list[tuple[Path, dict[str, Any]]]
-"""The files that make up a manifest, each with what it says itself; a later one wins."""
+"""The files of a manifest and their own contents, inherited files first; a later file wins."""
 
 
 def _read_chain(path: Path, heirs: tuple[Path, ...]) -> Chain:
     if path.resolve() in [heir.resolve() for heir in heirs]:
         circle = " inherits ".join(map(str, (*heirs, path)))
-        raise ManifestError(f"{circle}: a manifest cannot inherit from itself. Take one of these `inherits` out.")
+        raise ManifestError(f"{circle}: a manifest cannot inherit from itself. Remove one of these `inherits`.")
     raw = _read_yaml(path, heirs[-1] if heirs else None)
     bases = raw.pop("inherits", [])
     bases = [bases] if isinstance(bases, str) else bases
@@ -96,7 +94,7 @@ def _read_chain(path: Path, heirs: tuple[Path, ...]) -> Chain:
 
 
 def _map_paths(raw: dict[str, Any], change: Callable[[str, str], str], where: str = "") -> dict[str, Any]:
-    """Return raw values with every path changed; `change` takes the path and its key."""
+    """Return raw values with every path replaced by `change(path, key)`."""
     changed: dict[str, Any] = {}
     for name, value in raw.items():
         key = f"{where}{name}"
@@ -112,39 +110,39 @@ def _map_paths(raw: dict[str, Any], change: Callable[[str, str], str], where: st
 
 
 def _anchor(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Return the values of a base with absolute paths: they count from its own folder, not from its heir's."""
+    """Return the values of an inherited file with its paths made absolute, relative to its own folder."""
 
     def anchor(text: str, key: str) -> str:
         if text.startswith("~") or "$" in os.path.expandvars(text):
-            return text  # expanded, or refused, at the end: an heir may replace it
+            return text  # expanded or refused at the end, because the inheriting file may replace it
         return os.path.normpath(folder / os.path.expandvars(text))
 
     return _map_paths(raw, anchor)
 
 
 def _read_yaml(path: Path, heir: Path | None = None) -> dict[str, Any]:
-    asked = f"{heir}: inherits {path}" if heir else f"{path}"
+    where = f"{heir}: inherits {path}" if heir else f"{path}"
     try:
         raw = _parse_yaml(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         if heir:
-            raise ManifestError(f"{heir}: inherits {path}, and there is no such file. Correct `inherits`.") from None
+            raise ManifestError(f"{where}, and there is no such file. Correct `inherits`.") from None
         raise ManifestError(f"{path}: no such manifest. data_manifests/demo.yaml is an example.") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise ManifestError(f"{asked}: cannot be read as a text file ({error}).") from None
+        raise ManifestError(f"{where}: cannot be read as a text file ({error}).") from None
     except yaml.YAMLError as error:
         text = str(error).replace('"<unicode string>"', str(path))
-        raise ManifestError(f"{asked}: not valid YAML. {text}") from None
+        raise ManifestError(f"{where}: not valid YAML. {text}") from None
     if not isinstance(raw, dict):
         raise ManifestError(f"{path}: found {type(raw).__name__}, expected `key: value` lines.")
     return raw
 
 
 def _parse_yaml(text: str) -> Any:
-    """Return what a YAML text holds.
+    """Return the content of a YAML text.
 
     Raises:
-        yaml.YAMLError: it is not valid, or is far larger than it looks: aliases of aliases, or of what they stand in.
+        yaml.YAMLError: the text is not valid, or its aliases expand to too many values or contain themselves.
     """
     loader = yaml.SafeLoader(text)
     try:
@@ -152,21 +150,21 @@ def _parse_yaml(text: str) -> Any:
         if node is None:
             return None
         if _size(node, {}) > MOST_VALUES:
-            raise yaml.YAMLError(f"Its aliases stand for more than {MOST_VALUES:,} values.")
+            raise yaml.YAMLError(f"Its aliases expand to more than {MOST_VALUES:,} values.")
         return loader.construct_document(node)
     except RecursionError:
-        raise yaml.YAMLError("It is nested too deeply, or an alias stands within what it stands for.") from None
+        raise yaml.YAMLError("It is nested too deeply, or an alias contains itself.") from None
     except (ValueError, LookupError, AttributeError, TypeError) as error:  # 2024-99-99, or !!int of no number
-        raise yaml.YAMLError(f"A value is not of the type that it seems to have ({error}).") from None
+        raise yaml.YAMLError(f"A value does not fit its type ({error}).") from None
 
 
-def _size(node: yaml.Node, known: dict[int, int]) -> int:
-    """Return how many values a node stands for; `known` has it for nodes that were counted, by their id."""
-    if id(node) not in known:
-        parts = node.value if isinstance(node, yaml.CollectionNode) else []
-        children = itertools.chain.from_iterable(part if isinstance(part, tuple) else (part,) for part in parts)
-        known[id(node)] = 1 + sum(_size(child, known) for child in children)
-    return known[id(node)]
+def _size(node: yaml.Node, sizes: dict[int, int]) -> int:
+    """Return the number of values in a node with its aliases expanded; `sizes` caches it by the node's id."""
+    if id(node) not in sizes:
+        entries = node.value if isinstance(node, yaml.CollectionNode) else []
+        children = itertools.chain.from_iterable(entry if isinstance(entry, tuple) else (entry,) for entry in entries)
+        sizes[id(node)] = 1 + sum(_size(child, sizes) for child in children)
+    return sizes[id(node)]
 
 
 def _read_override(override: str) -> dict[str, Any]:
@@ -184,7 +182,7 @@ def _read_override(override: str) -> dict[str, Any]:
 
 
 def _has(content: Any, keys: list[str]) -> bool:
-    """Tell whether a file itself says something under these keys."""
+    """Tell whether the content of a file sets these keys itself."""
     for key in keys:
         if isinstance(content, list):
             return True
@@ -204,7 +202,7 @@ def _expand(text: str, folder: Path, where: str) -> Path:
     try:
         path = Path(expanded).expanduser()
     except RuntimeError:
-        raise ManifestError(f"{where}: {text!r}: there is no such user here. Write the folder itself.") from None
+        raise ManifestError(f"{where}: {text!r} names an unknown user. Write the folder itself.") from None
     if "\0" in expanded:
-        raise ManifestError(f"{where}: {text!r} is no path: it has a zero byte in it.")
+        raise ManifestError(f"{where}: {text!r} is not a path: it contains a zero byte.")
     return Path(os.path.normpath(folder / path))

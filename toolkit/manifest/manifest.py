@@ -26,7 +26,7 @@ from toolkit.manifest.settings import (
 
 STAGES = ("explore", "embed", "retrieve", "rerank", "localize", "sequence", "evaluate", "visualize")
 OPTIONAL = ("rerank", "sequence")
-"""Stages that run only where the manifest has their section."""
+"""Stages that run only if the manifest has their section."""
 
 DevicePair = Annotated[list[str], Field(min_length=2, max_length=2)]
 
@@ -35,87 +35,87 @@ class DemoData(Settings):
     """A rendered capture instead of a recorded one."""
 
     rooms: Positive = 2
-    """Rooms to render."""
+    """Number of rooms to render."""
     frames: Annotated[int, Field(ge=2)] = 12
-    """Frames a room and map session; queries have half."""
+    """Frames per room of each map session; query sessions have half as many."""
     seed: Natural = 0
-    """Another seed, another place."""
+    """Random seed; each seed renders a different place."""
     alike: bool = False
-    """Whether the last room looks exactly as the first."""
+    """Make the last room look exactly like the first."""
     seconds: Natural = 0
-    """Length of a query recording, with odometry also between pictures; 0: as long as its pictures take."""
+    """Length of each query recording in seconds, with odometry also between images; 0: as long as its images take."""
     losses: Natural = 0
-    """Losses of tracking in each query recording; need `seconds`."""
+    """Losses of tracking in each query recording; needs `seconds`."""
     gaps: Natural = 0
-    """Times of 4 s without odometry in each query recording; need `seconds`."""
+    """Gaps of 4 s without odometry in each query recording; needs `seconds`."""
     radio: bool = False
-    """Whether sessions have scans of WiFi and Bluetooth."""
+    """Add scans of WiFi and Bluetooth to the sessions."""
 
 
 class Tolerance(Settings):
-    """What share may fail before a run that came to its end has the exit code 2."""
+    """Shares that may fail. A completed run with more failures ends with exit code 2."""
 
     images: Share = 0.0
-    """Images that cannot be read."""
+    """Share of images that cannot be read."""
     queries: Share = 0.5
-    """Queries without a pose: a hard query is a result; a majority of them, the sign of something wrong."""
+    """Share of queries without a pose. Some hard queries are normal; if most fail, something is wrong."""
     pairs: Share = 0.0
-    """Pairs of devices that had to be left out."""
+    """Share of device pairs that had to be skipped."""
 
 
 class ExtraDevice(Settings):
-    """A further kind of device, or what is different about a known one."""
+    """A further kind of device, or changes to a known one."""
 
     key: Annotated[str, Field(pattern=r"^[a-z0-9-]+$")]
-    """Its sessions are `<key>_map` and `<key>_query`."""
+    """Name of the device in sessions and tables; its sessions are `<key>_map` and `<key>_query`."""
     label: str | None = None
-    """For people."""
+    """Name of the device in figures and the report."""
     color: Annotated[str, Field(pattern=r"^#[0-9a-fA-F]{6}$")] | None = None
-    """In figures, as #rrggbb."""
+    """Color of the device in figures, #rrggbb."""
     sessions: dict[Literal["map", "query"], str] | None = None
-    """Or: what the folders of its sessions are called, e.g. {query: query_drone}."""
+    """Names of its session folders, if they are not `<key>_map` and `<key>_query`; e.g. {query: query_drone}."""
 
 
 class Source(Settings):
-    """Where the data of one capture are: a dataset on the Hugging Face hub, or archives anywhere."""
+    """Download source of one capture: a dataset on the Hugging Face Hub, or zip archives."""
 
     hub: Annotated[str, Field(pattern=r"^[\w.-]+/[\w.-]+$")] | None = None
-    """Dataset on the hub, `owner/name`."""
+    """Dataset on the Hugging Face Hub, `owner/name`."""
     revision: str = "main"
-    """Branch, tag or commit of it."""
+    """Branch, tag or commit of the dataset."""
     urls: list[Annotated[str, Field(pattern=r"^https?://[^/]+/.+")]] = []
-    """Or: addresses of zip archives."""
+    """URLs of zip archives, instead of `hub`."""
     sha256: dict[str, Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]] = {}
-    """Checksums of archives by file name; the hub knows those of its files."""
+    """SHA-256 checksums of the archives by file name; not needed for `hub`, which has its own."""
 
     @model_validator(mode="after")
     def _one_place(self) -> Self:
         if (self.hub is None) == (not self.urls):
-            raise ValueError("a source has either `hub` (owner/name) or `urls` (a list), and not both")
+            raise ValueError("a source needs either `hub` (owner/name) or `urls` (a list), not both")
         return self
 
 
 class DatasetSettings(Settings):
-    """Where the captures of this manifest can be had; `python -m toolkit download` reads it."""
+    """Download sources of the captures, for `python -m toolkit download`."""
 
     page: str
-    """Where to read about the data, ask for access and accept terms."""
+    """Web page of the dataset, with its description, access requests and terms."""
     license: str
     """License of the data."""
     citation: str = ""
-    """What to cite."""
+    """Publication to cite."""
     into: Literal["", "sessions"] = ""
-    """Folder of the capture that the root of a hub dataset is."""
+    """Folder of the capture that corresponds to the root of a hub dataset: the capture itself, or `sessions`."""
     sessions: list[str] | dict[str, str]
-    """Sessions to fetch; or, where an archive names them otherwise, {name here: name there}."""
+    """Sessions to download: a list of names, or {name here: name in the archive} if the archive's names differ."""
     include: list[str] = []
-    """Further files to fetch: patterns such as `registration/*` of paths in the capture; * also matches /."""
+    """Further files to download: patterns of paths in the capture, such as `registration/*`; * also matches /."""
     sources: dict[str, Source]
-    """For each capture's folder name, where its data are."""
+    """Download source of each capture, by the name of its folder."""
 
     @property
     def session_names(self) -> dict[str, str]:
-        """The name in the source of each session to fetch."""
+        """Name of each downloaded session in the source, by its name here."""
         return self.sessions if isinstance(self.sessions, dict) else {name: name for name in self.sessions}
 
     @model_validator(mode="after")
@@ -132,75 +132,77 @@ class DatasetSettings(Settings):
 
 
 class Manifest(Settings):
-    """What to run. Paths are relative to the manifest's folder; `~` and `$VARIABLES` are expanded."""
+    """The captures to run on and the settings. Paths are relative to the manifest's folder; `~` and `$VARIABLES` are
+    expanded."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
-    """Name of the run folder; the manifest's file name when not given."""
+    """Name of the run folder; by default the file name of the manifest without its ending."""
     description: str = ""
-    """A sentence for the report."""
+    """A sentence about the run, shown in the report."""
     captures: list[str] = []
-    """Capture folders, each with `sessions/` in it. The folder's name is the scene's name."""
+    """Capture folders; each contains `sessions/`. The name of the folder is the name of the scene."""
     demo_data: DemoData | None = None
-    """Or: a capture to render."""
+    """A capture to render, instead of `captures`."""
     dataset: DatasetSettings | None = None
-    """Where to get the captures from, if they can be downloaded."""
+    """Download sources of the captures, if there are any."""
     allow_outside: bool = False
-    """Take images that `..`, absolute paths or links put outside of their capture: for captures of your own."""
+    """Accept images outside of the capture folder (through `..`, absolute paths or links); only for captures that you
+    trust."""
     output_root: str = "../runs"
-    """Results go to <output_root>/<name>."""
+    """Results are written to <output_root>/<name>."""
     extra_devices: list[ExtraDevice] = []
     """Kinds of devices besides ios, hl and spot."""
     devices: Literal["auto"] | list[str] = "auto"
-    """Devices to take part; auto: all that a capture has."""
+    """Devices to use; auto: all devices of a capture."""
     pairs: Literal["all"] | list[DevicePair] = "all"
-    """[map device, query device] pairs; all: every map with every query session."""
+    """List of [map device, query device] pairs to run; all: every map session with every query session."""
     queries: str = "keyframes_pruned_subsampled"
-    """List of keyframes to localize, from the query sessions' proc/; `all`: every device pose known."""
+    """Keyframes to localize: the name of a list in proc/ of the query sessions; `all`: every device pose known."""
     seed: Natural = 0
-    """The same seed gives the same poses."""
+    """Random seed of all stages. The same seed gives the same poses."""
     world_up: Direction | None = None
-    """Direction that is up in the captures' world; null: estimated from the map's cameras where it is needed."""
+    """Up direction of the captures' world, three numbers; null: estimate it from the map's camera poses if needed."""
     tolerate_failed: Tolerance = Tolerance()
-    """What may fail: the rest is done all the same, and the exit code tells."""
+    """Shares of failures that a run tolerates. Failures never stop the run; too many change its exit code."""
     unit: Unit = "m"
-    """Unit of the captures' poses; null: not known. Limits are then relative to the depth of what a map shows."""
+    """Unit of the captures' poses; null: unknown, and limits are relative to the depth of the scene in the map."""
     explore: ExploreSettings = ExploreSettings()
-    """What notebook 01 shows."""
+    """Contents of notebook 01, which shows the capture."""
     embed: EmbedSettings = EmbedSettings()
-    """How images become global descriptors."""
+    """Global descriptors of the images."""
     retrieve: RetrieveSettings = RetrieveSettings()
-    """How references are found."""
+    """Retrieval of references for each query image."""
     rerank: RerankSettings | None = None
-    """Optional: the stage runs if the section is there, also without a key in it, or is `true`."""
+    """Reranking of the references. Optional: runs if the section is present, even if empty, or `true`."""
     localize: LocalizeSettings = LocalizeSettings()
-    """How poses are found."""
+    """Poses of single queries."""
     sequence: SequenceSettings | None = None
-    """Optional, as `rerank`: poses of whole recordings, for queries with odometry."""
+    """Poses of whole recordings, for queries with odometry. Optional like `rerank`."""
     evaluate: EvaluateSettings = EvaluateSettings()
-    """What is counted."""
+    """Evaluation against ground truth."""
     visualize: VisualizeSettings = VisualizeSettings()
-    """What is drawn and recorded."""
+    """Figures and recordings."""
 
     @field_validator(*OPTIONAL, mode="before")
     @classmethod
     def _a_switch(cls, section: Any) -> Any:
-        """Take `rerank:` and `rerank: true` as a section without keys, and `false` as none."""
+        """Read `rerank:` and `rerank: true` as an empty section, and `rerank: false` as no section."""
         return {} if section is None or section is True else None if section is False else section
 
     @model_validator(mode="after")
     def _enough_references(self) -> Self:
-        given = "topk" in self.retrieve.model_fields_set
-        if self.rerank is not None and given and self.rerank.topn > self.retrieve.topk:
+        explicit = "topk" in self.retrieve.model_fields_set
+        if self.rerank is not None and explicit and self.rerank.topn > self.retrieve.topk:
             raise ValueError(
-                f"rerank.topn is {self.rerank.topn}, but retrieve.topk finds only {self.retrieve.topk}: raise it, or "
-                "leave it out"
+                f"rerank.topn is {self.rerank.topn}, but retrieve.topk is only {self.retrieve.topk}: raise or remove "
+                "retrieve.topk"
             )
         return self
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
         if bool(self.captures) == (self.demo_data is not None):
-            raise ValueError("give either `captures` (a list of folders) or `demo_data`, and not both")
+            raise ValueError("give either `captures` (a list of folders) or `demo_data`, not both")
         return self
 
     @model_validator(mode="after")
@@ -215,7 +217,7 @@ class Manifest(Settings):
         return self
 
     def stage(self, stage: str) -> Settings:
-        """Return the settings of one stage, also of one that is off, with what the manifest says for all stages."""
+        """Return the settings of a stage, even if it is off, with the manifest's settings for all stages applied."""
         section: Settings = getattr(self, stage) or self.defaults(stage)
         known, update = type(section).model_fields, dict[str, Any]()
         for key in {"seed", "world_up", "unit"} & known.keys() & self.model_fields_set - section.model_fields_set:
@@ -226,10 +228,10 @@ class Manifest(Settings):
 
     @classmethod
     def defaults(cls, stage: str) -> Settings:
-        """Return the settings of a stage of which nothing is said."""
-        off: dict[str, Settings] = {"rerank": RerankSettings(), "sequence": SequenceSettings()}
-        given: Settings = off.get(stage) or cls.model_fields[stage].default
-        return given
+        """Return the default settings of a stage, also of an optional one."""
+        optional: dict[str, Settings] = {"rerank": RerankSettings(), "sequence": SequenceSettings()}
+        section: Settings = optional.get(stage) or cls.model_fields[stage].default
+        return section
 
     @property
     def stages(self) -> tuple[str, ...]:

@@ -1,6 +1,6 @@
-"""The settings of every stage, as one tree: manifest, notebooks and functions share it.
+"""The settings of every stage, as one tree that manifest, notebooks and functions share.
 
-`python -m toolkit settings` prints it. The sentence under each field is its only documentation.
+`python -m toolkit settings` prints the tree. The sentence under each field is its only documentation.
 """
 
 import math
@@ -31,7 +31,7 @@ def _check_direction(direction: list[float]) -> list[float]:
 
 
 def _check_models(model: str | list[str]) -> str | list[str]:
-    """Return a list of one name as the name."""
+    """Refuse empty lists, repeated names and `auto` in a list; return a list of one name as that name."""
     if isinstance(model, str):
         return model
     twice = [name for name in dict.fromkeys(model) if model.count(name) > 1]
@@ -46,11 +46,11 @@ Direction = Annotated[list[float], Field(min_length=3, max_length=3), AfterValid
 
 
 class Settings(BaseModel):
-    """Frozen settings that refuse keys and types that they do not know."""
+    """Frozen settings. Unknown keys and values of the wrong type are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True)
     shorthand: ClassVar[str] = ""
-    """Name of the field that a plain value stands for: `matcher: mutual` is `matcher: {name: mutual}`."""
+    """Name of the field that a plain value sets: `matcher: mutual` means `matcher: {name: mutual}`."""
 
     @model_validator(mode="before")
     @classmethod
@@ -59,10 +59,10 @@ class Settings(BaseModel):
 
     @classmethod
     def of(cls, *layers: "Settings | Mapping[str, Any] | None") -> Self:
-        """Return the defaults with what the layers say merged over them, a later layer over an earlier one.
+        """Return the defaults, overridden by the layers in turn; a later layer wins.
 
         Raises:
-            ManifestError: an unknown key or a value that does not fit; names the key and what was expected.
+            ManifestError: a key is unknown or a value is not valid; names the key and what was expected.
         """
         merged: dict[str, Any] = {}
         for layer in layers:
@@ -77,16 +77,16 @@ class Settings(BaseModel):
 
     @classmethod
     def needed(cls) -> list[str]:
-        """Return the names of the fields that have no default."""
+        """Return the names of the fields without a default."""
         return [name for name, field in cls.model_fields.items() if field.is_required()]
 
     def given(self) -> dict[str, Any]:
-        """Return what was said, without what was left to the defaults; plain values."""
+        """Return the explicitly set fields as plain values; fields left at their defaults are absent."""
         return self.model_dump(mode="json", exclude_unset=True)
 
 
 def expand(model: type[Settings], raw: Mapping[str, Any]) -> dict[str, Any]:
-    """Return raw values of a model with every shorthand written out, so that they can be merged key by key."""
+    """Return the raw values of a model with every shorthand written out, ready to be merged key by key."""
     expanded: dict[str, Any] = {}
     for key, value in raw.items():
         inner = nested_model(model.model_fields[key].annotation) if key in model.model_fields else None
@@ -96,22 +96,22 @@ def expand(model: type[Settings], raw: Mapping[str, Any]) -> dict[str, Any]:
             elif inner.shorthand and value is not None:
                 value = {inner.shorthand: _plain(value)}
             elif value is True and model.model_fields[key].default is None:
-                value = {}  # switches an optional section on, and leaves what a base says in it
+                value = {}  # switches an optional section on and keeps the keys of an inherited file
             elif value is None and isinstance(model.model_fields[key].default, Settings):
-                value = {}  # a section without a key in it
+                value = {}  # a section without any key
         expanded[key] = _plain(value)
     return expanded
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as YAML has it, so that callers may also give tuples, paths and numpy's numbers."""
+    """Return a value as plain YAML data: tuples become lists, paths texts, NumPy scalars Python numbers."""
     if isinstance(value, list | tuple):
         return [_plain(part) for part in value]
     return str(value) if isinstance(value, Path) else value.item() if hasattr(value, "item") else value
 
 
 def merge(base: Mapping[str, Any], content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `base` with what `content` says: mappings are merged, anything else is replaced."""
+    """Return `base` overridden by `content`: mappings are merged key by key, all other values are replaced."""
     merged = dict(base)
     for key, value in content.items():
         both = isinstance(value, dict) and isinstance(merged.get(key), dict)
@@ -120,9 +120,9 @@ def merge(base: Mapping[str, Any], content: Mapping[str, Any]) -> dict[str, Any]
 
 
 def describe(model: type[Settings], indent: str = "") -> Iterator[str]:
-    """Yield the lines of a settings tree in YAML: every field with its meaning above it and its default.
+    """Yield the lines of a settings tree as YAML: each field with its default, below a comment that explains it.
 
-    What has to be given is left out. A section that is off is a comment with the defaults that it would have.
+    Fields without a default are left out. An optional section that is off is printed as a comment.
     """
     for name, field in model.model_fields.items():
         if field.is_required():
@@ -139,67 +139,68 @@ def describe(model: type[Settings], indent: str = "") -> Iterator[str]:
 
 
 class ExploreSettings(Settings):
-    """What notebook 01 shows."""
+    """Contents of notebook 01, which shows a capture."""
 
     samples: Positive = 4
-    """Images shown of each session."""
+    """Number of sample images shown per session."""
     world_up: Direction | None = None
-    """Direction that is up in the world; null: estimated from the cameras."""
+    """Up direction of the world, three numbers; null: estimate it from the camera poses."""
     unit: Unit = "m"
-    """Unit of the poses; null: not known, and not shown."""
+    """Unit of the poses; null: unknown, and figures show no unit."""
 
 
 class VladSettings(Settings):
-    """How a VLAD is built."""
+    """VLAD: a global descriptor aggregated from SIFT descriptors; its vocabulary is learned from the map."""
 
     words: Positive = 256
-    """Visual words; fewer where the map has too few descriptors."""
+    """Number of visual words; fewer if the map has too few descriptors."""
     local_dim: Positive = 64
-    """Local descriptors are PCA-whitened to this length."""
+    """Dimensions of the local descriptors after PCA whitening."""
     min_scale_px: float = 1.6
-    """Finer keypoints are left out: blur, noise and another camera's resolution change them first.
-    The standard deviation of the blob in pixels of the image as stored."""
+    """Smallest scale of a keypoint: the standard deviation of its blob, in pixels of the stored image.
+    Finer keypoints are the first to change with blur, noise and camera resolution."""
     min_features: Natural = 300
-    """At least this many of the coarsest keypoints are taken, however fine they are."""
+    """If fewer keypoints reach `min_scale_px`, use this many of the coarsest instead."""
     dim: Positive = 512
-    """Most dimensions of the result; it cannot have more than there are map images."""
+    """Largest dimension of the global descriptor; the number of map images limits it too."""
     prior_images: Natural = 2000
-    """Shrinkage of the whitening: the weight, in images, of the belief that all directions vary alike.
-    Directions learned from a hundred images say where those were taken, not what repeats between places."""
+    """Shrinkage of the whitening: a prior that all directions vary equally, with the weight of this many images.
+    Whitening learned from a hundred images describes the places they show, not what repeats between places."""
     sample_descriptors: Positive = 50_000
-    """Local descriptors that the vocabulary is learned from."""
+    """Number of local descriptors from which the vocabulary is learned."""
     iterations: Positive = 15
-    """Rounds of k-means."""
+    """Iterations of k-means."""
 
 
 class EmbedSettings(Settings):
-    """How images become global descriptors."""
+    """Global descriptors of the images."""
 
     model: Annotated[str | list[str], AfterValidator(_check_models)] = "vlad"
-    """Global descriptor: vlad, megaloc, or auto: megaloc if its weights are there. `vlad` needs no weights.
-    Of a list, such as [megaloc, vlad], the similarities are fused by their generalized harmonic mean."""
+    """Global descriptor: vlad (needs no weights), megaloc, or auto (megaloc if its weights are available, else vlad).
+    A list such as [megaloc, vlad] fuses the similarities by their generalized harmonic mean."""
     checkpoint: str | None = None
-    """File with the weights of a learned model; null: the hub's cache, else a download."""
+    """Weights file of a learned model; null: use the Hugging Face cache, else download."""
     batch_size: Positive = 8
-    """Images a step."""
+    """Images per batch."""
     image_size: Annotated[int, Field(ge=126, multiple_of=14)] = 322
-    """Side of the square that a learned model sees, pixels, a multiple of 14."""
+    """Side of the square input of a learned model, in pixels; a multiple of 14."""
     compute_device: ComputeDevice = "auto"
-    """Where a network runs: auto, cpu, cuda, cuda:<number> or mps. `vlad` runs on the CPU."""
+    """Device of the network: auto, cpu, cuda, cuda:<number> or mps. `vlad` always runs on the CPU."""
     dtype_compute: Precision = "auto"
-    """Precision of a learned model; auto: what is fast on the device."""
+    """Precision of the network; auto: a fast one for the device."""
     upright: bool | None = None
-    """Turn images so that gravity points down; null: for learned models. `vlad` does not need it."""
+    """Rotate images by quarter turns so that gravity points down; null: only for learned models (`vlad` does not
+    need it)."""
     normalize: bool = True
     """Scale descriptors to unit length."""
     dtype: Literal["float32", "float16"] = "float32"
-    """Type of the numbers in the .npy files."""
+    """Number type of the descriptors in the .npy files."""
     vlad: VladSettings = VladSettings()
-    """Of `vlad`."""
+    """Settings of `vlad`."""
     seed: Natural = 0
-    """Of the vocabulary."""
+    """Random seed for learning the vocabulary."""
     world_up: Direction | None = None
-    """Direction that is up in the map's world; null: estimated from its cameras."""
+    """Up direction of the map's world, three numbers; null: estimate it from the map's camera poses."""
 
     @property
     def models(self) -> list[str]:
@@ -207,126 +208,131 @@ class EmbedSettings(Settings):
 
 
 class MaskSettings(Settings):
-    """What is known of the place of a query image before the search, and leaves only a part of the map to it.
+    """Priors on the query's location that restrict the search to a part of the map: rough poses, GPS, radio signals.
 
-    All that is known is joined; what says nothing about a query, or contradicts what stands before it, does not count.
+    The search covers the map images that all enabled priors allow. Priors apply in the order below. For each query, a
+    prior without information, or one that contradicts those before it, is ignored.
     """
 
     poses: str | None = None
-    """File of rough poses of query devices in the map's frame, in the format of trajectories.txt: search only ..."""
+    """File with rough poses of the query devices in the map's frame, in the format of trajectories.txt; restricts the
+    search to map images near these poses. null: no such prior."""
     poses_distance_m: PositiveNumber = 10.0
-    """... map cameras so near, in the unit of the poses ..."""
+    """Largest distance between the rough pose and a map camera, in the unit of the poses."""
     poses_angle_deg: PositiveNumber = 90.0
-    """... that look in a direction at most so different. The roll about the viewing direction does not count."""
+    """Largest angle between the viewing directions of the rough pose and a map camera, degrees; roll is ignored."""
     gps: bool = False
-    """Search only map images whose fix in gps.txt is as near the query's as ..."""
+    """Search only map images whose GPS fix (gps.txt) is near the query's; map images without a fix are kept."""
     gps_margin_m: PositiveNumber = 25.0
-    """... this and twice both accuracies, and those without a fix."""
+    """Largest distance between the two fixes, meters, beyond twice the sum of their stated accuracies."""
     radio: bool = False
-    """Search only the map images at which WiFi and Bluetooth were received most nearly as at the query, ..."""
+    """Search only the map images whose WiFi and Bluetooth signals are most similar to the query's."""
     radio_share: Share = 0.025
-    """... this share of the map, and at least three times `topk`."""
+    """Share of the map images that `radio` keeps; at least three times `topk`."""
     window_s: PositiveNumber = 2.0
-    """Scans and fixes count for images so long before and after them."""
+    """Largest time difference between an image and the radio scans and GPS fixes used for it, seconds."""
 
 
 class RetrieveSettings(Settings):
-    """How references are found."""
+    """Retrieval: the map images (references) most similar to each query image."""
 
     topk: Positive = 10
-    """References a query image."""
+    """References per query image."""
     use_faiss: bool = True
-    """Exact search with FAISS, else with torch; the result is the same. An index is always FAISS's.
-    Fused similarities of several descriptors are torch's."""
+    """Exact search with FAISS (true) or torch (false), with the same result. An approximate index always uses FAISS;
+    fused similarities of several descriptors always use torch."""
     faiss_gpu: bool = False
-    """FAISS on the GPU; needs a FAISS built for it."""
+    """Run FAISS on the GPU; needs a FAISS built with GPU support."""
     normalize: bool = True
-    """Compare by cosine: scale descriptors to unit length before the search."""
+    """Scale descriptors to unit length before the search, so that it compares by cosine similarity."""
     index: str = "Flat"
-    """FAISS factory string, for large maps; such as PCA512,IVF4096,RaBitQ. Flat: exact search, without an index."""
+    """FAISS factory string of an approximate index for large maps, such as PCA512,IVF4096,RaBitQ. Flat: exact search
+    without an index."""
     index_candidates: Positive = 1000
-    """Of an index: found for each query, then compared exactly."""
+    """Candidates per query that an approximate index returns; they are then ranked by exact similarity."""
     nprobe: Positive | None = None
-    """Cells of an IVF index that are looked at; null: a 32nd of them, at least 16."""
+    """Cells of an IVF index to search per query; null: 1/32 of the cells, at least 16."""
     mask: MaskSettings = MaskSettings()
-    """What leaves a query only a part of the map."""
+    """Priors on the location that restrict the search to a part of the map."""
     compute_device: ComputeDevice = "auto"
-    """Where torch searches: auto, cpu, cuda, cuda:<number> or mps."""
+    """Device of the search with torch: auto, cpu, cuda, cuda:<number> or mps."""
 
 
 class SiftSettings(Settings):
-    """How SIFT features are extracted."""
+    """SIFT keypoints and descriptors."""
 
     min_long_side: Natural = 640
-    """Smaller images are enlarged to this long side, pixels, before detection."""
+    """Before detection, smaller images are enlarged to this length of the longer side, pixels."""
     max_long_side: Positive = 1280
-    """Larger images are reduced to this long side, pixels, before detection."""
+    """Before detection, larger images are reduced to this length of the longer side, pixels."""
     max_keypoints: Positive = 3072
-    """The strongest responses are kept."""
+    """Largest number of keypoints per image; those with the strongest response are kept."""
     contrast_threshold: Annotated[float, Field(ge=0)] = 0.01
-    """Least contrast of a keypoint, after the image's contrast has been stretched to the full range."""
+    """Smallest contrast of a keypoint, after the image's contrast is stretched to the full range."""
 
 
 class SuperPointSettings(Settings):
-    """How SuperPoint features are extracted."""
+    """SuperPoint keypoints and descriptors."""
 
     max_long_side: Annotated[int, Field(ge=8)] = 1024
-    """Larger images are reduced to this long side, pixels; the aspect is kept."""
+    """Larger images are reduced to this length of the longer side, pixels; the aspect ratio is kept."""
     max_keypoints: Positive = 2048
-    """The strongest responses are kept."""
+    """Largest number of keypoints per image; those with the strongest response are kept."""
     threshold: Annotated[float, Field(ge=0)] = 0.005
-    """Least response of a keypoint, of at most 1."""
+    """Smallest response of a keypoint; responses are at most 1."""
     nms_radius: Natural = 4
-    """No two keypoints are closer than this in x and in y, pixels of the reduced image."""
+    """Radius of non-maximum suppression, pixels of the resized image: two keypoints are further apart in x or in y."""
     border: Natural = 4
-    """Keypoints closer than this to the image's border are left out, pixels of the reduced image."""
+    """Keypoints closer to the image border than this are dropped, pixels of the resized image."""
 
 
 AlikedModel = Literal["aliked-n16", "aliked-n16rot", "aliked-n32", "aliked-t16"]
 
 
 class AlikedSettings(Settings):
-    """How ALIKED features are extracted."""
+    """ALIKED keypoints and descriptors."""
 
     model: AlikedModel = "aliked-n16"
-    """Variant of the network: n16rot bears more rotation in the image, n32 is larger, t16 smaller."""
+    """Variant of the network: n16rot tolerates more in-plane rotation, n32 is larger, t16 is smaller."""
     min_long_side: Natural = 640
-    """Smaller images are enlarged to this long side, pixels ..."""
+    """Smaller images are enlarged to this length of the longer side, pixels."""
     max_long_side: Annotated[int, Field(ge=32)] = 1024
-    """... and larger ones reduced to this one; the aspect is kept."""
+    """Larger images are reduced to this length of the longer side, pixels; the aspect ratio is kept."""
     max_keypoints: Positive = 1024
-    """The highest scores are kept. LightGlue takes three times as long for 2,048, and poses gain next to nothing."""
+    """Largest number of keypoints per image; those with the highest score are kept. With 2,048, LightGlue takes three
+    times as long and poses hardly improve."""
     threshold: Share = 0.02
-    """Least score of a keypoint. A dark photograph has few above the authors' 0.2; a plain wall has none above 0.02."""
+    """Smallest score of a keypoint. The authors' 0.2 leaves few keypoints in dark photographs; plain walls stay below
+    0.02."""
     nms_radius: Positive = 2
-    """No two maxima of the score are closer than this in x and in y, pixels of the resized image."""
+    """Radius of non-maximum suppression, pixels of the resized image: two maxima are further apart in x or in y."""
 
 
 Checkpoint = str | dict[Literal["superpoint", "aliked"], str]
-
 
 AUTO = "auto"
 
 
 class FeaturesSettings(Settings):
-    """Local features, and how each kind is extracted."""
+    """Local features: which kinds, and how each is extracted."""
 
     shorthand = "kinds"
     kinds: Annotated[list[str], Field(min_length=1)] = ["auto"]
-    """Kinds of local features: sift, superpoint, aliked; of several, the matches are pooled in one pose. auto: sift,
-    with aliked as `escalation`; on a GPU both from the start; where ALIKED's weights are not at hand, sift alone.
-    `features: [sift]` is short for it."""
+    """Kinds of local features: sift, superpoint, aliked; the matches of several kinds are pooled for one pose.
+    auto: sift, with aliked as `escalation`; on a GPU both from the start; sift alone if ALIKED's weights are missing.
+    `features: [sift]` is short for `features: {kinds: [sift]}`."""
     escalation: list[str] = []
-    """Kinds asked too where the pose is not `ok` otherwise; the matches of all then decide together."""
+    """Further kinds that are used only for queries whose pose is not `ok` without them; the matches of all kinds then
+    decide together."""
     checkpoint: Checkpoint | None = None
-    """File with the weights of learned features, or of several kinds a file each: `{aliked: <file>}`; null: an
-    installed package or a cache, else a download."""
+    """Weights file of the learned features, or one file per kind: `{aliked: <file>}`; null: use an installed package
+    or a cache, else download."""
     sift: SiftSettings = SiftSettings()
-    """Of `sift`."""
+    """Settings of `sift`."""
     superpoint: SuperPointSettings = SuperPointSettings()
-    """Of `superpoint`."""
+    """Settings of `superpoint`."""
     aliked: AlikedSettings = AlikedSettings()
-    """Of `aliked`."""
+    """Settings of `aliked`."""
 
     @model_validator(mode="before")
     @classmethod
@@ -340,55 +346,57 @@ class FeaturesSettings(Settings):
     def _each_kind_once(self) -> Self:
         kinds = [*self.kinds, *self.escalation]
         if AUTO in kinds and kinds != [AUTO]:
-            raise ValueError(f"kinds is {self.kinds} and escalation {self.escalation}; {AUTO} stands alone")
+            raise ValueError(f"kinds is {self.kinds} and escalation {self.escalation}; {AUTO} cannot be combined")
         if len(set(kinds)) < len(kinds):
             raise ValueError(f"kinds is {self.kinds} and escalation {self.escalation}; expected each kind once")
         return self
 
 
 def checkpoint_of(checkpoint: str | Mapping[Any, str] | None, kind: str) -> str | None:
-    """Return the file that a setting `checkpoint` names for a kind of local features."""
+    """Return the weights file that a `checkpoint` setting names for a kind of local features; None if none."""
     return checkpoint.get(kind) if isinstance(checkpoint, Mapping) else checkpoint
 
 
 class MatcherSettings(Settings):
-    """How the features of a query image and a reference image are matched."""
+    """Matching of the local features of a query image and a reference."""
 
     shorthand = "name"
     name: str | None = None
-    """mutual: nearest neighbors; lightglue: the network; null: what is usual for the features."""
+    """mutual: mutual nearest neighbors; lightglue: the LightGlue network; null: the usual matcher of each kind of
+    features."""
     checkpoint: Checkpoint | None = None
-    """File with the weights of a learned matcher, or a file for each kind of features: `{aliked: <file>}`; null: an
-    installed package or a cache, else a download."""
+    """Weights file of a learned matcher, or one file per kind of features: `{aliked: <file>}`; null: use an installed
+    package or a cache, else download."""
     min_confidence: Share = 0.1
-    """Least confidence of a match of a learned matcher."""
+    """Smallest confidence of a match of a learned matcher."""
 
 
 class RerankSettings(Settings):
-    """How references are put in the order of their verified matches."""
+    """Reranking: sorts retrieved images by their number of geometrically verified matches with the query image."""
 
     topn: Positive = 30
-    """Retrieved images whose matches are verified; retrieval finds so many, if `retrieve.topk` does not say."""
+    """Retrieved images per query image to verify. It is also the number to retrieve, unless `retrieve.topk` is set."""
     topk: Positive = 10
-    """References kept of them."""
+    """References per query image to keep after reranking."""
     features: FeaturesSettings = FeaturesSettings()
-    """Local features whose matches are verified: one kind; auto: sift."""
+    """Local features to match, one kind; auto: sift."""
     matcher: MatcherSettings = MatcherSettings()
-    """How they are matched."""
+    """Matcher of the local features."""
     max_features: Positive = 1536
-    """Features of an image that are matched at most, the strongest."""
+    """Largest number of features per image to match; those with the strongest response are used."""
     max_error_deg: PositiveNumber = 0.2
-    """Largest Sampson error of an inlier, as an angle seen from the camera."""
+    """Largest Sampson error of an inlier, as an angle seen from the camera, degrees."""
     max_trials: Positive = 500
-    """Samples of five matches, the best matches first."""
+    """Largest number of RANSAC samples, of five matches each; the best matches are sampled first."""
     compute_device: ComputeDevice = "auto"
-    """Where networks run: auto, cpu, cuda, cuda:<number> or mps."""
+    """Device of the networks: auto, cpu, cuda, cuda:<number> or mps."""
     dtype_compute: Precision = "auto"
-    """Precision of networks; auto: what is fast on the device."""
+    """Precision of the networks; auto: a fast one for the device."""
     seed: Natural = 0
-    """Of RANSAC. The same seed gives the same order."""
+    """Random seed of RANSAC. The same seed gives the same order."""
     world_up: Direction | None = None
-    """Direction that is up in the map's world, for learned features; null: estimated from its cameras."""
+    """Up direction of the map's world, three numbers, for learned features; null: estimate it from the map's camera
+    poses."""
 
     @model_validator(mode="after")
     def _one_kind_of_features(self) -> Self:
@@ -400,34 +408,37 @@ class RerankSettings(Settings):
 
 
 class SequenceSettings(Settings):
-    """How odometry and the poses of single queries are joined to poses of a whole recording."""
+    """Poses of whole recordings: a pose graph joins the odometry of the device and the poses of single queries."""
 
     position_drift: PositiveNumber = 0.03
-    """Standard deviation, by axis, that a meter of odometry adds to a position, meters; grows with the way's root. This
-    and the next become larger, up to 20 times, where the motions between `ok` queries ask for that."""
+    """Position drift of the odometry: standard deviation per axis after 1 m, in meters; grows with the square root of
+    the distance. If the motions between `ok` queries show more drift, this and `rotation_drift_deg` are raised to fit
+    them, by up to 20 times."""
     rotation_drift_deg: PositiveNumber = 0.15
-    """Standard deviation, by axis, that a second of odometry adds to a rotation; grows with the time's root."""
+    """Rotation drift of the odometry: standard deviation per axis after 1 s, in degrees; grows with the square root of
+    the time."""
     scale_std: PositiveNumber = 0.02
-    """Relative standard deviation of the lengths of a recording's odometry."""
+    """Relative standard deviation of the scale of a recording's odometry."""
     gravity_std_deg: PositiveNumber | None = None
-    """Standard deviation, by axis, of the direction that is up at the first pose of each piece, such as 0.5, where one
-    axis of the odometry's frame is found to be up, and not online; null: odometry may lean by any angle."""
+    """Standard deviation per axis, degrees, such as 0.5, of the up direction at the start of each piece of odometry. It
+    applies if one axis of the odometry's frame proves vertical in the map, and not if `online`. null: the odometry's
+    frame may be tilted by any angle."""
     max_gap_s: PositiveNumber = 10.0
-    """A longer time without a pose is a loss of tracking: a new piece, with a frame of its own, begins."""
+    """A longer time without odometry counts as a loss of tracking: a new piece with its own frame begins."""
     max_speed_m_s: PositiveNumber = 15.0
-    """So is a step that is faster."""
+    """A faster motion between two poses of the odometry also counts as a loss of tracking."""
     relocalize: bool = True
-    """Whether queries that are not `ok`, or contradict the others, are localized again near their predicted pose."""
+    """Localize queries again near their predicted pose if they are not `ok` or contradict the other queries."""
     bundle_adjust: bool = False
-    """Whether the poses at last fit the map points that `ok` queries show, in place of their poses; not online."""
+    """As a last step, fit the poses to the map points that `ok` queries observe, instead of to the poses of these
+    queries; has no effect if `online`."""
     online: bool = False
-    """Whether the pose of a query rests on what was before it alone; other frames then have none."""
+    """Estimate the pose of each query from earlier data only; other frames then get no pose."""
     length_s: PositiveNumber | None = None
-    """Seconds before a query that its pose rests on, if `online`; null: all that was before it in its piece."""
-
+    """If `online`: seconds of earlier data that a pose uses; null: everything since the start of its piece."""
     windows_s: list[PositiveNumber] = [10.0, 20.0]
-    """Seconds before a query: what it would be online, by single queries of so long, and of all that was before it, is
-    written beside the result for comparison; `[]`: not."""
+    """For comparison, the poses that `online` would give from single queries are also written: one variant for each of
+    these lengths of earlier data, in seconds, and one for all earlier data; `[]`: none."""
 
     @model_validator(mode="after")
     def _of_the_past(self) -> Self:
@@ -437,100 +448,105 @@ class SequenceSettings(Settings):
 
 
 class MapSettings(Settings):
-    """How a map is triangulated."""
+    """Triangulation of map points from the map images and their known poses."""
 
     pairs_per_image: Positive = 14
-    """Partners that an image is matched with."""
+    """Other map images that each map image is matched with."""
     max_epipolar_error_px: PositiveNumber = 4.0
-    """Largest distance of a match to its epipolar line, at either side, pixels."""
+    """Largest distance of a match from its epipolar line, on either side, pixels."""
     ratio: PositiveNumber = 0.9
-    """Lowe's ratio, among the candidates along the epipolar line."""
+    """Threshold of Lowe's ratio test among the candidates along the epipolar line."""
     max_reprojection_error_px: PositiveNumber = 4.0
-    """Observations further off, in pixels, are taken out of a point's track."""
+    """Observations with a larger reprojection error, in pixels, are removed from a point's track."""
     min_triangulation_angle_deg: PositiveNumber = 1.5
-    """Points seen under a smaller angle are dropped: their depth is not known."""
+    """Points with a smaller triangulation angle, degrees, are dropped, because their depth is unreliable."""
     tile_images: Positive = 400
-    """A map of more images is triangulated in tiles of about so many, and of their neighbors: some 3 MB an image."""
+    """A map with more images is triangulated in tiles of about this many images plus their neighbors, which limits
+    memory to about 3 MB per image of a tile."""
 
 
 class PnpSettings(Settings):
-    """How a pose is found from matches with map points. Angles are seen from the camera."""
+    """Pose estimation from matches with map points. Errors are angles seen from the camera, in degrees."""
 
     max_map_features: Positive = 1000
-    """Features of a map image that are used at most, those of the longest tracks."""
+    """Largest number of features per map image to match; those of the points with the longest tracks are used."""
     max_query_features: Positive = 1536
-    """Features of a query image that are matched by descriptors alone, the strongest; guided passes use all."""
+    """Largest number of features per query image to match by descriptors alone; those with the strongest response are
+    used. Guided matching uses all features."""
     ransac_max_error_deg: PositiveNumber = 0.45
-    """Largest reprojection error of an inlier in RANSAC."""
+    """Largest reprojection error of an inlier in RANSAC, degrees."""
     ransac_max_trials: Positive = 5000
-    """Samples that RANSAC draws at most."""
+    """Largest number of RANSAC samples."""
     clear_inlier_ratio: Share = 0.56
-    """With more inliers than this share of the matches, no other pose is looked for: what is left over cannot support
-    one by more than `ok_rival_support`."""
+    """Above this share of inliers among the matches, no rival pose is searched: the remaining matches are too few to
+    support one beyond `ok_rival_support`."""
     contested_inlier_ratio: Share = 0.4
-    """With fewer, the pose may lie between two: it is sought again under a tighter limit, and by single references."""
+    """Below this share of inliers, the pose may mix two places: RANSAC runs again with the tighter `max_error_deg`, and
+    separately for single references."""
     contested_references: Natural = 4
-    """References, those with the most matches, that then give a pose each: together, look-alikes can outvote the one
-    that shows the place."""
+    """How many references, those with the most matches, then get a RANSAC of their own: several similar-looking places
+    together can outvote the one reference that shows the right place."""
     guided_radii_deg: list[PositiveNumber] = [0.7, 0.35]
-    """Search radius around a projected map point, one guided pass each."""
+    """Guided matching: search radius around each projected map point, degrees; one pass per radius."""
     max_ransac_matches: Positive = 2500
-    """Matches that RANSAC sees at most, a random choice: the guided passes find the rest again."""
+    """Largest number of matches given to RANSAC, chosen at random; guided matching finds the others again."""
     max_guided_matches: Positive = 1000
-    """Guided matches of a camera at most, the most alike."""
+    """Largest number of guided matches per camera; those with the most similar descriptors are kept."""
     guided_images: Positive = 12
-    """Covisible map images whose points are projected."""
+    """Number of covisible map images whose points are projected for guided matching."""
     max_error_deg: PositiveNumber = 0.17
-    """Largest reprojection error of an inlier of the final pose."""
+    """Largest reprojection error of an inlier of the final pose, degrees."""
     min_inliers: Positive = 12
-    """Fewer independently matched inliers than this are no pose."""
+    """Smallest number of independent inliers, among the matches found without guidance, of a pose; with fewer, the
+    query has no pose."""
     ok_probability: Share = 0.99
-    """Probability of being right, within 5 degrees and 0.5 m, that a pose needs to be `ok`: see
-    `localizers/confidence.py`."""
+    """A pose is `ok` only if the estimated probability that it is right (within 5 degrees and 0.5 m) reaches this
+    value; see `localizers/confidence.py`."""
     ok_rival_support: PositiveNumber = 0.8
-    """Support of the best other pose, relative to this one's, up to which a pose is `ok`."""
+    """A pose is `ok` only if the best rival pose has at most this fraction of its support."""
     sure_position_std_m: PositiveNumber = 0.05
-    """Largest standard deviation of the position, meters, with which a pose that is `ok` is precise enough that no
-    further features are asked."""
+    """An `ok` pose with at most this standard deviation of the position, meters, is precise enough; otherwise the
+    further features of `escalation` are used too."""
 
 
 CONDITIONED = ("da3-base", "da3-small")
-"""Names of predictors that can be told cameras."""
+"""Names of the networks that accept known camera parameters as input."""
 
 
 class PredictorSettings(Settings):
-    """The network that predicts cameras, and what it is shown."""
+    """The feed-forward network that predicts cameras and depth from a query image and its references."""
 
     shorthand = "name"
     name: Literal["vggt", "vggt-omega", "da3-base", "da3-small", "simulated"] = "vggt"
-    """What `feed_forward` and `hybrid` ask; `simulated` looks up true poses, for trying things out."""
+    """Network of the methods `feed_forward` and `hybrid`. `simulated` looks up the true poses, for trials."""
     checkpoint: str | None = None
-    """File with the network's weights; null: the hub's cache, else a download."""
+    """Weights file of the network; null: use the Hugging Face cache, else download."""
     num_references: Positive = 5
-    """Map images that the network is shown with each query image."""
+    """Map images that the network receives with each query image."""
     candidates: Positive | None = None
-    """Retrieved images to choose them from, the best so many; null: all."""
+    """These map images are chosen from this many of the best retrieved images; null: from all."""
     batch_size: Positive = 4
-    """Query devices that the network is given at once. Poses do not depend on it."""
+    """Query devices per batch. Poses do not depend on it."""
     compile: bool = False
-    """Compile the network's blocks by `torch.compile`, which takes a minute or more at the start of each run, and on a
-    CPU a C++ compiler. Changes rounding only."""
+    """Compile the network with `torch.compile`: takes a minute or more at the start of each run and, on a CPU, needs a
+    C++ compiler. Changes only the rounding."""
     upright: bool = True
-    """Show the network images turned so that gravity points down."""
+    """Rotate images by quarter turns before the network, so that gravity points down."""
     depth_points: Positive = 200
-    """Map points of a reference at most whose depth is compared, those of the longest tracks."""
+    """Largest number of map points per reference whose depth is compared with the prediction; those with the longest
+    tracks are used."""
     least_points: Natural = 20
-    """With fewer, the capture's depth map of the reference is asked, where there is one."""
+    """If a reference sees fewer map points, its depth map in the capture is used instead, if there is one."""
     conditioned: bool = False
-    """Tell a network that takes cameras (da3-base, da3-small) those of the map: the intrinsics of all views, and of six
-    references or more the poses of every other one. The rest align the prediction. Officially all cameras are told or
-    none; what a partly told scene gains is not measured."""
+    """Give a network that accepts cameras (da3-base, da3-small) the known ones: the intrinsics of all views and, with
+    six or more references, the poses of every second reference. The other references align the prediction. Such
+    networks are meant to receive all cameras or none; the benefit of a part of them is not measured."""
 
     @model_validator(mode="after")
     def _cameras_to_who_takes_them(self) -> Self:
         if self.conditioned and self.name not in CONDITIONED:
             raise ValueError(
-                f"conditioned is true, but {self.name} cannot be told cameras; expected the name to be one of "
+                f"conditioned is true, but {self.name} does not accept cameras; expected the name to be one of "
                 f"{', '.join(CONDITIONED)}, or conditioned: false"
             )
         return self
@@ -538,76 +554,77 @@ class PredictorSettings(Settings):
 
 Method = Annotated[
     Literal["pnp", "nearest", "feed_forward", "hybrid"],
-    BeforeValidator(lambda value: "feed_forward" if value == "vggt" else value),  # its name until there were others
+    BeforeValidator(lambda value: "feed_forward" if value == "vggt" else value),  # the former name of the method
 ]
 
 
 class LocalizeSettings(Settings):
-    """How poses are found."""
+    """Poses of single queries."""
 
     method: Method = "pnp"
-    """pnp: matches with map points; nearest: the pose of the best reference, to compare against; feed_forward: a
-    network's cameras, aligned to the map; hybrid: the better supported of pnp and that, each helped by the other."""
+    """pnp: pose from matches with map points; nearest: the pose of the best reference, as a baseline; feed_forward:
+    cameras predicted by a network, aligned to the map; hybrid: pnp and feed_forward, where the predicted pose and depth
+    guide further matching and the best supported pose wins."""
     features: FeaturesSettings = FeaturesSettings()
     """Local features."""
     matcher: MatcherSettings = MatcherSettings()
-    """How a query image is matched with its references, for the kinds of features that the matcher suits."""
+    """Matcher of query images and references; applies to the kinds of features that it supports."""
     map: MapSettings | None = MapSettings()
-    """How the map is triangulated; null: it is not, and points are triangulated for each query, from its references."""
+    """Triangulation of the map; null: no map, points are triangulated for each query from its references."""
     pnp: PnpSettings = PnpSettings()
-    """How a pose is found from matches."""
+    """Pose estimation from matches."""
     predictor: PredictorSettings = PredictorSettings()
-    """Of `feed_forward` and `hybrid`."""
+    """Network of `feed_forward` and `hybrid`."""
     compute_device: ComputeDevice = "auto"
-    """Where networks run: auto, cpu, cuda, cuda:<number> or mps."""
+    """Device of the networks: auto, cpu, cuda, cuda:<number> or mps."""
     dtype_compute: Precision = "auto"
-    """Precision of networks; auto: what is fast on the device."""
+    """Precision of the networks; auto: a fast one for the device."""
     seed: Natural = 0
-    """Of RANSAC. The same seed gives the same poses, whatever the number of threads."""
+    """Random seed of RANSAC. The same seed gives the same poses for any number of threads."""
     world_up: Direction | None = None
-    """Direction that is up in the map's world; null: estimated from its cameras."""
+    """Up direction of the map's world, three numbers; null: estimate it from the map's camera poses."""
     unit: Unit = "m"
-    """Unit of the capture's poses; null: not known, and limits are relative to the depth of what the map shows."""
+    """Unit of the capture's poses; null: unknown, and limits are relative to the depth of the scene in the map."""
 
     @property
     def predicts(self) -> bool:
-        """Whether the method asks a network for cameras."""
+        """Whether the method predicts cameras with a network."""
         return self.method in ("feed_forward", "hybrid")
 
     @model_validator(mode="after")
     def _a_map_or_meters(self) -> Self:
         if self.unit is None and self.map is None:
-            raise ValueError("unit and map are null; the depth that limits are relative to is that of a map")
+            raise ValueError("unit and map are null; without a unit, limits are relative to the depth in the map")
         return self
 
 
 class EvaluateSettings(Settings):
-    """What is counted."""
+    """Evaluation against ground truth."""
 
     thresholds: list[Threshold] = [[1.0, 0.1], [5.0, 0.5], [5.0, 1.0]]
-    """Recall is counted at these (degrees, meters)."""
+    """Pose recall is reported at these thresholds: rotation error in degrees, translation error in meters."""
     retrieval_ks: list[Positive] = [1, 5, 10]
-    """Retrieval recall is counted at these numbers of references."""
+    """Retrieval recall is reported for these numbers of references."""
     retrieval_radius_m: PositiveNumber = 8.0
-    """A good reference is at most so far from the query, meters ..."""
+    """Largest distance of a correct reference from the query, meters."""
     retrieval_angle_deg: PositiveNumber = 45.0
-    """... and looks in a direction at most so different. The roll about the viewing direction does not count."""
+    """Largest angle between the viewing directions of a correct reference and the query, degrees; roll is ignored."""
 
 
 class VisualizeSettings(Settings):
-    """What is drawn and recorded."""
+    """Figures, and recordings for the rerun viewer. A pair is a map device and a query device."""
 
     samples: Natural = 2
-    """Queries shown of each pair, from the worst to the best."""
+    """Queries drawn per pair, evenly spread from the worst to the best."""
     recordings: bool = True
-    """Write a recording of each pair for the rerun viewer."""
+    """Write a rerun recording of each pair."""
     matched_queries: Natural = 12
-    """Queries of each pair shown in it with references and matches, the worst first."""
+    """Queries per pair whose references and matches the recording shows, the worst first."""
     session_recordings: bool = True
-    """Write a recording of each session."""
+    """Write a rerun recording of each session."""
     keyframes_only: bool = False
-    """Recordings of query sessions hold only keyframes."""
+    """Record only the keyframes of query sessions."""
     every: Positive | None = None
-    """Recordings of sessions hold every so many frames; null: so that a session has at most 1000 images."""
+    """Record every n-th frame of a session; null: choose n so that a session has at most 1000 images."""
     world_up: Direction | None = None
-    """Direction that is up in the world; null: estimated from the cameras."""
+    """Up direction of the world, three numbers; null: estimate it from the camera poses."""
