@@ -13,14 +13,14 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 
-from tests.rendered import LIST, LOW, Asked, World, run_stage
+from tests.rendered import LIST, LOW, World, run_stage
 from toolkit import geometry
 from toolkit import localize as localize_stage
 from toolkit.capture import Capture, Trajectory
 from toolkit.errors import ImageError, ManifestError, WeightsError
 from toolkit.files import SceneFiles
 from toolkit.localize import COLUMNS, PREDICTION_COLUMNS
-from toolkit.localizers.base import PoseEstimate, References, View
+from toolkit.localizers.base import PoseEstimate, QueryInput, References, View
 from toolkit.localizers.feed_forward import (
     FeedForwardAnswer,
     FeedForwardLocalizer,
@@ -35,7 +35,7 @@ from toolkit.show.visualize_prediction import draw_prediction
 Floats = NDArray[np.float64]
 
 
-def answers_of(localizer: FeedForwardLocalizer, queries: Sequence[Asked]) -> list[FeedForwardAnswer]:
+def answers_of(localizer: FeedForwardLocalizer, queries: Sequence[QueryInput]) -> list[FeedForwardAnswer]:
     """Return the answers of queries that the network is asked about in one call."""
     predicted = localizer.predict(queries)
     return [localizer.answer(*asked, one) for asked, one in zip(queries, predicted, strict=True)]
@@ -452,7 +452,7 @@ def test_a_killed_run_goes_on_where_it_was(
         return row(*args)  # type: ignore[arg-type]
 
     def counted(
-        self: FeedForwardLocalizer, queries: Sequence[Asked], following: Sequence[Asked]
+        self: FeedForwardLocalizer, queries: Sequence[QueryInput], following: Sequence[QueryInput]
     ) -> list[Predicted]:
         asked.extend(query.views[0].name for query, _ in queries)
         return predict(self, queries)

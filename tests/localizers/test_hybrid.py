@@ -11,13 +11,13 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.queries import session_query
-from tests.rendered import LIST, LOW, Asked, World, run_stage
+from tests.rendered import LIST, LOW, World, run_stage
 from toolkit import geometry
 from toolkit.capture import Capture, Trajectory
 from toolkit.features.matching import MutualMatcher
 from toolkit.features.stores import extract_session
 from toolkit.files import SceneFiles
-from toolkit.localizers.base import PoseEstimate, Prior
+from toolkit.localizers.base import PoseEstimate, Prior, QueryInput
 from toolkit.localizers.feed_forward import FeedForwardAnswer
 from toolkit.localizers.hybrid import HybridLocalizer
 from toolkit.localizers.matches import MappedFeatures
@@ -37,7 +37,7 @@ def hybrid(world: World, pnp: PnpLocalizer) -> HybridLocalizer:
     return HybridLocalizer(pnp, world.localizer(world.predictor(**LOW)))
 
 
-def asked_of(world: World, device: str, index: int) -> Asked:
+def asked_of(world: World, device: str, index: int) -> QueryInput:
     """Return a query with its features, and its references."""
     session = world.capture[f"{device}_query"]
     store = extract_session(session, world.files.features, progress=False)
@@ -45,7 +45,7 @@ def asked_of(world: World, device: str, index: int) -> Asked:
 
 
 def localize_told(
-    hybrid: HybridLocalizer, asked: Asked, predicted: PoseEstimate
+    hybrid: HybridLocalizer, asked: QueryInput, predicted: PoseEstimate
 ) -> PoseEstimate:
     """Localize where the network gives this pose."""
     network = copy(hybrid.feed_forward)

@@ -8,7 +8,7 @@ from toolkit.capture.images import pixels_of
 from toolkit.features.features import KINDS, LocalFeatures, extract_turned
 from toolkit.features.matching import AnyMethod
 from toolkit.features.stores import as_stored
-from toolkit.localizers.base import Asked, Localizer, PoseEstimate, Prior, Query, References, rank
+from toolkit.localizers.base import Localizer, PoseEstimate, Prior, Query, QueryInput, References, rank
 
 
 def is_sure(status: str, position_std_m: float, limit_m: float) -> bool:
@@ -45,7 +45,7 @@ class EscalatingLocalizer:
         self.first, self.second, self._further, self._limit_m = first, second, further, sure_position_std_m
         self.image_names, self.batch_size = first.image_names, first.batch_size
 
-    def predict(self, queries: Sequence[Asked], following: Sequence[Asked] = ()) -> list[Any]:
+    def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[Any]:
         """Return what the first's network says of each query; see `Localizer`."""
         return self.first.predict(queries, following)
 

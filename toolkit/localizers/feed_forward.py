@@ -14,7 +14,7 @@ from toolkit.capture.upright import Turns
 from toolkit.errors import first_line, reason_of
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.alignment import Alignment, align_to_map, is_trustworthy, query_pose
-from toolkit.localizers.base import CAMERA, Asked, PoseEstimate, Prior, Query, References, View, carried_over
+from toolkit.localizers.base import CAMERA, PoseEstimate, Prior, Query, QueryInput, References, View, carried_over
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.pose_mean import robust_mean_pose
 from toolkit.localizers.prediction import Prediction, Predictor
@@ -95,7 +95,7 @@ class FeedForwardLocalizer:
         self._length = length
         self._upright = turns is not None
         self._turns = np.zeros(len(session.images), np.int64) if turns is None else turns.of(session)
-        self._next: tuple[Sequence[Asked], _Groups] = (), ([], {})
+        self._next: tuple[Sequence[QueryInput], _Groups] = (), ([], {})
         """The queries of the next call."""
         self.image_names, self.batch_size = local_map.image_names, self.settings.batch_size
 
@@ -121,7 +121,7 @@ class FeedForwardLocalizer:
         cameras = tuple(self._camera_answer(*one) for one in found)
         return FeedForwardAnswer(_combine(query, cameras), cameras)
 
-    def predict(self, queries: Sequence[Asked], following: Sequence[Asked] = ()) -> list[Predicted]:
+    def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[Predicted]:
         """Return what the predictor, asked once for all, says of each query; see `Localizer`.
 
         Aligning it to the map is left to `localize`, which other threads can do while the network goes on. Nothing that
@@ -145,7 +145,7 @@ class FeedForwardLocalizer:
             for number, references in enumerate(chosen)
         ]
 
-    def _groups(self, queries: Sequence[Asked]) -> _Groups:
+    def _groups(self, queries: Sequence[QueryInput]) -> _Groups:
         chosen = [[self._choose(retrieved) for retrieved in references] for _, references in queries]
         groups = {
             (number, camera): [self._as_shown(query.views[camera]), *(self.view(int(index)) for index in references)]

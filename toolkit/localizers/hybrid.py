@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from toolkit.localizers.base import Asked, PoseEstimate, Prior, Query, References, agree, rank
+from toolkit.localizers.base import PoseEstimate, Prior, Query, QueryInput, References, agree, rank
 from toolkit.localizers.feed_forward import FeedForwardLocalizer, Predicted
 from toolkit.localizers.lifting import DepthLifter
 from toolkit.localizers.pnp import PnpLocalizer
@@ -22,7 +22,7 @@ class HybridLocalizer:
         self.lifter = DepthLifter(pnp, feed_forward)
         self.image_names, self.batch_size = pnp.image_names, feed_forward.batch_size
 
-    def predict(self, queries: Sequence[Asked], following: Sequence[Asked] = ()) -> list[Predicted]:
+    def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[Predicted]:
         """Return what the network says of each query; see `Localizer`."""
         return self.feed_forward.predict(queries, following)
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from toolkit import geometry
 from toolkit.geometry import Floats
-from toolkit.localizers.base import Asked, PoseEstimate, Prior, Query, References
+from toolkit.localizers.base import PoseEstimate, Prior, Query, QueryInput, References
 
 
 class NearestLocalizer:
@@ -17,7 +17,7 @@ class NearestLocalizer:
         self.image_names = image_names
         self.world_from_cams = world_from_cams
 
-    def predict(self, queries: Sequence[Asked], following: Sequence[Asked] = ()) -> list[None]:
+    def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[None]:
         """Return nothing for each query: no network is asked."""
         return [None] * len(queries)
 
