@@ -270,7 +270,7 @@ class Failing(SimulatedPredictor):
         ("raise", "failed: internal: RuntimeError: out of luck"),
         ("query", "failed: the predicted camera is not finite"),
         ("references", "failed: references 0, 1, 2, 3, 4 left out: not finite; no usable reference"),
-        ("too few", "failed: AlignmentError: Found 4 model_from_cams and 5 world_from_cams: expected as many"),
+        ("too few", "failed: AlignmentError: Found 4 model_from_cams and 5 world_from_cams: expected equal numbers"),
         ("no numbers", "failed: internal: ValueError: could not convert string to float: 'x'"),
     ],
 )
