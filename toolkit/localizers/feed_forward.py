@@ -220,8 +220,8 @@ class FeedForwardLocalizer:
             return CameraAnswer(references, prediction, reason=reason)
         ratios = [self._depth_ratios(int(index), prediction, view) for view, index in enumerate(references, start=1)]
         world = self.map.world_from_cams[references]
-        told = np.zeros(len(references), bool) if prediction.conditioned is None else prediction.conditioned[1:]
-        alignment = align_to_map(model[1:], world, ~told, ratios if any(len(r) for r in ratios) else None)
+        conditioned = np.zeros(len(references), bool) if prediction.conditioned is None else prediction.conditioned[1:]
+        alignment = align_to_map(model[1:], world, ~conditioned, ratios if any(len(r) for r in ratios) else None)
         if not np.isfinite(alignment.rotation_std_deg):
             reason = alignment.reason or "the rotation is unknown"
             return CameraAnswer(references, prediction, alignment, reason=reason, depth_ratios=tuple(ratios))
@@ -263,33 +263,34 @@ def _combine(query: Query, cameras: tuple[CameraAnswer, ...]) -> PoseEstimate:
     """Combine the poses of the cameras of a device into one estimate."""
     count = sum(len(answer.references) for answer in cameras if answer.prediction is not None)
     reasons = "; ".join(dict.fromkeys(answer.reason for answer in cameras if answer.reason))
-    posed = [index for index, answer in enumerate(cameras) if answer.world_from_cam is not None]
-    if not posed:
+    alignments = {index: answer.alignment for index, answer in enumerate(cameras) if answer.alignment is not None}
+    poses = {index: answer.world_from_cam for index, answer in enumerate(cameras) if answer.world_from_cam is not None}
+    covariances = {index: answer.covariance for index, answer in enumerate(cameras) if answer.covariance is not None}
+    if not poses:
         return PoseEstimate(f"failed: {reasons}", num_matches=count, found_by="feed_forward")
-    known = [index for index in posed if np.isfinite(_covariance(cameras[index])).all()]
+    known = [index for index in poses if np.isfinite(covariances[index]).all()]
     if known:
-        poses = np.stack([_pose(cameras[index]) for index in known]) @ geometry.invert(query.rig_from_cams[known])
-        covariances = np.stack([
-            carried_over(_covariance(cameras[index]), query.rig_from_cams[index]) for index in known
-        ])  # fmt: skip
-        mean = robust_mean_pose(poses, covariances)
+        mean = robust_mean_pose(
+            np.stack([poses[index] for index in known]) @ geometry.invert(query.rig_from_cams[known]),
+            np.stack([carried_over(covariances[index], query.rig_from_cams[index]) for index in known]),
+        )
         pose, covariance = mean.world_from_cam, mean.covariance
         kept = [index for index, inside in zip(known, mean.inliers, strict=True) if inside]
         reasons = "; ".join(filter(None, (reasons, mean.reason)))
         agreed = np.isfinite(covariance).all() and 2 * len(kept) > len(known)
-        sure = agreed and any(is_trustworthy(_alignment(cameras[index]), covariance) for index in kept)
+        sure = agreed and any(is_trustworthy(alignments[index], covariance) for index in kept)
     else:
-        kept = [min(posed, key=lambda index: _alignment(cameras[index]).rotation_std_deg)]
-        rig_from_cam = query.rig_from_cams[kept[0]]
-        pose, sure = _pose(cameras[kept[0]]) @ geometry.invert(rig_from_cam), False
-        turn, covariance = rig_from_cam[:3, :3], np.diag(np.full(6, np.inf))
-        covariance[:3, :3] = turn @ _covariance(cameras[kept[0]])[:3, :3] @ turn.T
+        best = min(poses, key=lambda index: alignments[index].rotation_std_deg)
+        rig_from_cam = query.rig_from_cams[best]
+        kept, pose, sure = [best], poses[best] @ geometry.invert(rig_from_cam), False
+        R, covariance = rig_from_cam[:3, :3], np.diag(np.full(6, np.inf))
+        covariance[:3, :3] = R @ covariances[best][:3, :3] @ R.T
     focals = tuple(answer.focal_px for answer in cameras)
     misfit = bool(np.isfinite(focals).any())
     if misfit:
         seen = ", ".join(f"{focal:.0f}" for focal in focals if np.isfinite(focal))
         reasons = "; ".join(filter(None, (reasons, f"the network sees a focal length of {seen} px")))
-    consistent = [int(i) for c in kept for i in cameras[c].references[_alignment(cameras[c]).inliers]]
+    consistent = [int(i) for index in kept for i in cameras[index].references[alignments[index].inliers]]
     shown = [int(i) for answer in cameras if answer.prediction is not None for i in answer.references]
     return PoseEstimate(
         status=CAMERA if misfit else "ok" if sure else "low_confidence",
@@ -299,7 +300,7 @@ def _combine(query: Query, cameras: tuple[CameraAnswer, ...]) -> PoseEstimate:
         num_inliers=len(consistent),
         references=tuple(dict.fromkeys(consistent)),
         found_by="feed_forward",
-        scale_std=min(_alignment(cameras[index]).scale_std for index in kept),
+        scale_std=min(alignments[index].scale_std for index in kept),
         rejected=tuple(index for index in dict.fromkeys(shown) if index not in consistent),
         reason=reasons,
         misfit=misfit,
@@ -317,25 +318,10 @@ def _other_focal(prediction: Prediction, cameras: Sequence[pycolmap.Camera]) -> 
     predicted_px = prediction.intrinsics[:, [0, 1], [0, 1]].mean(axis=1)
     ratios = predicted_px / [camera.mean_focal_length() for camera in cameras]
     logs = np.log(np.where(np.isfinite(ratios) & (ratios > 0), ratios, np.nan))
-    told = np.zeros(len(cameras), bool) if prediction.conditioned is None else prediction.conditioned
-    of_references = logs[1:][np.isfinite(logs[1:]) & ~told[1:]]
+    conditioned = np.zeros(len(cameras), bool) if prediction.conditioned is None else prediction.conditioned
+    of_references = logs[1:][np.isfinite(logs[1:]) & ~conditioned[1:]]
     if not len(of_references) or not np.isfinite(logs[0]):
         return np.nan
     middle = float(np.median(of_references))
     limit = max(FOCAL_TOLERANCE, 4 * float(np.median(np.abs(of_references - middle))))
     return float(cameras[0].mean_focal_length() * np.exp(logs[0] - middle)) if abs(logs[0] - middle) > limit else np.nan
-
-
-def _alignment(answer: CameraAnswer) -> Alignment:
-    assert answer.alignment is not None
-    return answer.alignment
-
-
-def _pose(answer: CameraAnswer) -> Floats:
-    assert answer.world_from_cam is not None
-    return answer.world_from_cam
-
-
-def _covariance(answer: CameraAnswer) -> Floats:
-    assert answer.covariance is not None
-    return answer.covariance

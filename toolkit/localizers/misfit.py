@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import fdtrc
 
@@ -23,6 +22,7 @@ from toolkit import geometry
 from toolkit.capture.cameras import projection_jacobian
 from toolkit.geometry import Floats
 from toolkit.localizers.rig import Matches, RigQuery
+from toolkit.localizers.robust import Bools
 
 SIGNIFICANCE = 1e-4
 """False alarm rate: the probability that noise alone makes correct intrinsics look wrong."""
@@ -35,8 +35,6 @@ STEPS = 15
 SETTLED_PX = 0.02  # largest motion of a projection in a step at which the fit has converged
 LEAST_SCALE_PX = 0.5  # least scale of the Cauchy weights
 PRIOR_STD = (0.2, 0.02, 0.02, 0.05)  # prior standard deviations of the four `Misfit.parameters`
-
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from toolkit.files import files_fingerprint
 from toolkit.geometry import invert, make_pose
 from toolkit.localizers.architectures import ARCHITECTURES, HEADS, Architecture, Size, estimate_bytes
 from toolkit.localizers.base import View
-from toolkit.localizers.placed import PlacedView, cameras_to_tell, shown_size, told_views
+from toolkit.localizers.placed import PlacedView, conditioned_views, input_cameras, shown_size
 from toolkit.localizers.prediction import Prediction
 from toolkit.models.compute import PRECISIONS, Fitting, free_bytes, on_device, resolve_device, resolve_precision
 from toolkit.models.weights import resolve_weights
@@ -342,20 +342,20 @@ class NetworkPredictor:
             if isinstance(of_group[0], str):
                 results[number] = _nothing(len(group), of_group[0])
                 continue
-            readable = {index: one for index, one in enumerate(of_group) if not isinstance(one, str)}
-            stacked = torch.stack([one.to(self._kept_on) for one in readable.values()])
-            alike.setdefault(len(readable), []).append((number, group, list(readable), stacked))
+            encoded = {index: one for index, one in enumerate(of_group) if not isinstance(one, str)}
+            stacked = torch.stack([one.to(self._kept_on) for one in encoded.values()])
+            alike.setdefault(len(encoded), []).append((number, group, list(encoded), stacked))
         for rows in alike.values():
             shown = [[group[index] for index in readable] for _, group, readable, _ in rows]
             output = self._forward(torch.stack([stacked for *_, stacked in rows]), shown).numpy()
             for (number, group, readable, _), views, values in zip(rows, shown, output, strict=True):
-                told = self._told(views[: len(values)])
-                results[number] = self._prediction(group, readable[: len(values)], values, told)
+                conditioned = self._conditioned(views[: len(values)])
+                results[number] = self._prediction(group, readable[: len(values)], values, conditioned)
         return results
 
-    def _told(self, views: Sequence[PlacedView]) -> NDArray[np.bool_]:
+    def _conditioned(self, views: Sequence[PlacedView]) -> NDArray[np.bool_]:
         """Return which of the input views (S,) the network gets with their poses."""
-        return told_views(views) if self.conditioned else np.zeros(len(views), bool)
+        return conditioned_views(views) if self.conditioned else np.zeros(len(views), bool)
 
     def _forward(self, tokens: "Tensor", groups: Sequence[Sequence[PlacedView]]) -> "Tensor":
         """Return outputs (B, S, 9 + 2 H W) on the CPU for tokens (B, S, P, C); S shrinks if the memory is too small."""
@@ -365,8 +365,8 @@ class NetworkPredictor:
         while True:
             views = min(tokens.shape[1], self._most_views.get(size, tokens.shape[1]))
             cameras = []
-            if any(self._told(group[:views]).any() for group in groups):
-                poses, intrinsics = zip(*(cameras_to_tell(group[:views]) for group in groups), strict=True)
+            if any(self._conditioned(group[:views]).any() for group in groups):
+                poses, intrinsics = zip(*(input_cameras(group[:views]) for group in groups), strict=True)
                 cameras = [torch.from_numpy(np.stack(poses)), torch.from_numpy(np.stack(intrinsics))]
             new = Fitting(self._network(size), f"groups of {views} views", self._device)
             run = self._fitting.setdefault((views, size), new)
@@ -397,7 +397,7 @@ class NetworkPredictor:
         return run
 
     def _prediction(
-        self, group: list[PlacedView], shown: Sequence[int], output: NDArray[np.float32], told: NDArray[np.bool_]
+        self, group: list[PlacedView], shown: Sequence[int], output: NDArray[np.float32], conditioned: NDArray[np.bool_]
     ) -> Prediction:
         """Convert the network output (shown views, 9 + 2 H W) to the prediction of a group."""
         poses, intrinsics = np.full((len(group), 4, 4), np.nan), np.full((len(group), 3, 3), np.nan)
@@ -409,7 +409,7 @@ class NetworkPredictor:
                 poses[index] = model_from_turned @ turned_from_cam(group[index].view.turns)
                 intrinsics[index] = group[index].intrinsics(K)
         map_from_image = np.stack([placed.map_from_image for placed in group])
-        conditioned = np.isin(np.arange(len(group)), np.array(shown)[told]) if told.any() else None
+        mask = np.isin(np.arange(len(group)), np.array(shown)[conditioned]) if conditioned.any() else None
         depth = [placed.turned_back(np.full(size, np.nan, np.float32)) for placed in group]
         confidence = [placed.turned_back(np.zeros(size, np.float32)) for placed in group]
         maps = output[:, 9:].reshape(len(shown), 2, *size)
@@ -417,7 +417,7 @@ class NetworkPredictor:
             placed, outside = group[index], group[index].outside
             depth[index] = placed.turned_back(np.where(outside, np.float32(np.nan), depth_map))
             confidence[index] = placed.turned_back(np.where(outside, np.float32(np.nan), confidence_map))
-        return Prediction(poses, depth, confidence, map_from_image, intrinsics, conditioned)
+        return Prediction(poses, depth, confidence, map_from_image, intrinsics, mask)
 
 
 _loaded: dict[tuple[Any, ...], Any] = {}

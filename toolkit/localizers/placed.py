@@ -95,18 +95,18 @@ class PlacedView:
         return outside
 
 
-def told_views(group: Sequence[PlacedView]) -> NDArray[np.bool_]:
+def conditioned_views(group: Sequence[PlacedView]) -> NDArray[np.bool_]:
     """Return the views (S,) of a group, query first, whose poses are inputs: every other reference from the best on."""
     posed = [number for number, placed in enumerate(group) if number and placed.view.world_from_cam is not None]
-    told = np.zeros(len(group), bool)
+    conditioned = np.zeros(len(group), bool)
     if len(posed) >= LEAST_REFERENCES:
-        told[posed[::2]] = True
-    return told
+        conditioned[posed[::2]] = True
+    return conditioned
 
 
-def cameras_to_tell(group: Sequence[PlacedView]) -> tuple[Floats, Floats]:
+def input_cameras(group: Sequence[PlacedView]) -> tuple[Floats, Floats]:
     """Return the input cameras of a group: cam_from_world (S, 4, 4), NaN for views without, and K (S, 3, 3) of all."""
     poses = np.full((len(group), 4, 4), np.nan)
-    for number in np.flatnonzero(told_views(group)).tolist():
+    for number in np.flatnonzero(conditioned_views(group)).tolist():
         poses[number] = group[number].shown_from_world
     return poses, np.stack([placed.shown_intrinsics for placed in group])

@@ -32,18 +32,18 @@ class Tile(NamedTuple):
     """(m,) core images and the images matched with them, ascending."""
 
 
-def plan_tiles(places: Floats, pairs: Ints, most: int) -> list[Tile]:
+def plan_tiles(positions: Floats, pairs: Ints, max_core: int) -> list[Tile]:
     """Partition the images of a map into tiles by the position that they look at.
 
     Args:
-        places: (N, 3) position that each image looks at.
+        positions: (N, 3) position that each image looks at.
         pairs: (Q, 2) pairs of images that are matched.
-        most: largest number of core images per tile.
+        max_core: largest number of core images per tile.
 
     Returns:
         The tiles; neighbors in the list are near each other.
     """
-    cores = _halved(places, np.arange(len(places)), -(-len(places) // most))
+    cores = _halved(positions, np.arange(len(positions)), -(-len(positions) // max_core))
     home = home_of(cores)
     both = np.concatenate([pairs, pairs[:, ::-1]])
     both = both[np.argsort(home[both[:, 0]], kind="stable")]
@@ -61,14 +61,14 @@ def home_of(cores: Sequence[Ints]) -> Ints:
     return home
 
 
-def _halved(places: Floats, images: Ints, count: int) -> list[Ints]:
+def _halved(positions: Floats, images: Ints, count: int) -> list[Ints]:
     """Split images recursively into `count` groups of similar size, across the axis of their largest extent."""
     if count <= 1:
         return [np.sort(images)]
-    along = places[images, np.ptp(places[images], axis=0).argmax()]
+    along = positions[images, np.ptp(positions[images], axis=0).argmax()]
     order = images[np.lexsort((images, along))]
     cut = len(images) * (count // 2) // count
-    return [*_halved(places, order[:cut], count // 2), *_halved(places, order[cut:], count - count // 2)]
+    return [*_halved(positions, order[:cut], count // 2), *_halved(positions, order[cut:], count - count // 2)]
 
 
 class JoinedImages(NamedTuple):
