@@ -33,9 +33,7 @@ log = logging.getLogger(__name__)
 
 CACHE_BYTES = 2 << 30
 """Size of the cache for encodings of map images: 500 of them at 518 x 392 in float32, twice as many in bfloat16."""
-# One group keeps a CPU busy; a batch of groups needs more memory and is not faster.
-_GROUPS_AT_A_TIME = {"cpu": 1}
-_GROUPS_AT_A_TIME_ELSEWHERE = 8
+_GROUPS_AT_A_TIME = 8  # on a CPU 1: one group keeps it busy, and a batch needs more memory and is not faster
 _IMAGES_AT_A_TIME = 8
 # The accelerator holds the cache itself if it has this many times CACHE_BYTES free beside the weights.
 _ROOM_FOR_CACHE = 4
@@ -207,8 +205,7 @@ class NetworkPredictor:
         estimate = partial(estimate_bytes, self._architecture, size=size, channels=channels, on_cpu=on_cpu)
         growing = 0 if self._kept_on.type == "cpu" else self._cache.max_bytes - self._cache.bytes
         free = int(_MEMORY_SHARE * free_bytes(self._device)) - growing
-        batch = self._batch_size or _GROUPS_AT_A_TIME.get(self._device.type, _GROUPS_AT_A_TIME_ELSEWHERE)
-        batch = min(batch, count)
+        batch = min(self._batch_size or (1 if on_cpu else _GROUPS_AT_A_TIME), count)
         while batch > 1 and estimate(batch, views) > free:
             batch -= 1
         fitting = views
