@@ -36,9 +36,9 @@ Floats = NDArray[np.float64]
 
 
 def answers_of(localizer: FeedForwardLocalizer, queries: Sequence[QueryInput]) -> list[FeedForwardAnswer]:
-    """Return the answers of queries that the network is asked about in one call."""
+    """Return the answers for queries that the network predicts in one call."""
     predicted = localizer.predict(queries)
-    return [localizer.answer(*asked, one) for asked, one in zip(queries, predicted, strict=True)]
+    return [localizer.answer(*query, one) for query, one in zip(queries, predicted, strict=True)]
 
 
 def errors(answers: Sequence[FeedForwardAnswer], true: Floats) -> tuple[Floats, Floats]:

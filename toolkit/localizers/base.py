@@ -278,7 +278,7 @@ def _scaled_poses(poses: Floats, factor: float) -> Floats:
 def stds_of(covariances: Floats) -> tuple[Floats, Floats]:
     """Return rotation standard deviations (...) in degrees and position ones (...) in meters, from (..., 6, 6).
 
-    Each is the root of a trace: the expected length of the error vector.
+    Each is the root of a trace, that is, the root mean square length of the error vector.
     """
     rotation, position = (np.trace(covariances[..., s, s], axis1=-2, axis2=-1) for s in (slice(3), slice(3, 6)))
     return np.degrees(np.sqrt(rotation)), np.sqrt(position)
