@@ -24,7 +24,7 @@ from toolkit.localizers.base import PoseEstimate, QueryInput, References, View
 from toolkit.localizers.feed_forward import (
     FeedForwardAnswer,
     FeedForwardLocalizer,
-    Predicted,
+    QueryPrediction,
     _other_focal,
 )
 from toolkit.localizers.prediction import Prediction
@@ -453,7 +453,7 @@ def test_a_killed_run_goes_on_where_it_was(
 
     def counted(
         self: FeedForwardLocalizer, queries: Sequence[QueryInput], following: Sequence[QueryInput]
-    ) -> list[Predicted]:
+    ) -> list[QueryPrediction]:
         asked.extend(query.views[0].name for query, _ in queries)
         return predict(self, queries)
 

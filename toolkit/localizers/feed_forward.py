@@ -52,7 +52,7 @@ class CameraAnswer:
 
 
 @dataclass(frozen=True)
-class Predicted:
+class QueryPrediction:
     """A network's predictions for a query, not yet aligned to the map."""
 
     references: tuple[Ints, ...]
@@ -110,14 +110,14 @@ class FeedForwardLocalizer:
         self,
         query: Query,
         references: Sequence[References],
-        prediction: Predicted | None = None,
+        prediction: QueryPrediction | None = None,
         priors: Sequence[Prior] = (),
     ) -> PoseEstimate:
         """Return the predicted pose of a query; see `Localizer`."""
         return self.answer(query, references, prediction).estimate
 
     def answer(
-        self, query: Query, references: Sequence[References], prediction: Predicted | None = None
+        self, query: Query, references: Sequence[References], prediction: QueryPrediction | None = None
     ) -> FeedForwardAnswer:
         """Return the predicted pose of a query with the results per image; the arguments are those of `localize`.
 
@@ -128,7 +128,7 @@ class FeedForwardLocalizer:
         cameras = tuple(self._camera_answer(*image) for image in images)
         return FeedForwardAnswer(_combine(query, cameras), cameras)
 
-    def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[Predicted]:
+    def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[QueryPrediction]:
         """Return the predictions for each query, made in one call of the predictor; see `Localizer`.
 
         `localize` aligns them to the map, in other threads while the network continues. An error in one query is not
@@ -145,7 +145,7 @@ class FeedForwardLocalizer:
         results = self._predict(list(groups.values()), list(next_groups[1].values()))
         predictions = dict(zip(groups, results, strict=True))
         return [
-            Predicted(
+            QueryPrediction(
                 tuple(references),
                 tuple(predictions.get((number, camera), "no references") for camera in range(len(references))),
             )

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.localizers.base import PoseEstimate, Prior, Query, QueryInput, References, agree, rank
-from toolkit.localizers.feed_forward import FeedForwardLocalizer, Predicted
+from toolkit.localizers.feed_forward import FeedForwardLocalizer, QueryPrediction
 from toolkit.localizers.lifting import DepthLifter
 from toolkit.localizers.pnp import PnpLocalizer
 
@@ -22,7 +22,7 @@ class HybridLocalizer:
         self.lifter = DepthLifter(pnp, feed_forward)
         self.image_names, self.batch_size = pnp.image_names, feed_forward.batch_size
 
-    def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[Predicted]:
+    def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[QueryPrediction]:
         """Return the prediction of the network for each query; see `Localizer`."""
         return self.feed_forward.predict(queries, following)
 
@@ -30,7 +30,7 @@ class HybridLocalizer:
         self,
         query: Query,
         references: Sequence[References],
-        prediction: Predicted | None = None,
+        prediction: QueryPrediction | None = None,
         priors: Sequence[Prior] = (),
     ) -> PoseEstimate:
         """Return one pose for the cameras of a rig, or for a single camera. `found_by` names its source:
