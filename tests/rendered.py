@@ -13,14 +13,13 @@ from tests.queries import likeness, session_query
 from toolkit.capture import Capture, Session
 from toolkit.files import SceneFiles
 from toolkit.localize import localize_pairs
-from toolkit.localizers.base import Query, References
+from toolkit.localizers.base import QueryInput
 from toolkit.localizers.feed_forward import FeedForwardLocalizer
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.simulated import SimulatedPredictor
 from toolkit.manifest import PredictorSettings
 
 Floats = NDArray[np.float64]
-Asked = tuple[Query, list[References]]
 LIST = "keyframes_original"
 LOW = {"rotation_noise_deg": 0.2, "position_noise_m": 0.01, "depth_noise": 0.02}
 
@@ -41,7 +40,7 @@ class World:
     def localizer(self, predictor: object, **settings: int) -> FeedForwardLocalizer:
         return FeedForwardLocalizer(self.map, self.map_session, predictor, PredictorSettings(**settings))  # type: ignore[arg-type]
 
-    def queries(self, device: str, count: int = 10) -> tuple[list[Asked], Floats]:
+    def queries(self, device: str, count: int = 10) -> tuple[list[QueryInput], Floats]:
         """Return the queries of a device with the map images that stand and look most alike, and their true poses."""
         session = self.capture[f"{device}_query"]
         keyframes = session.keyframes(LIST)

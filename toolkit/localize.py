@@ -42,7 +42,6 @@ from toolkit.files import (
     write_sidecar,
     write_text,
 )
-from toolkit.localizers.asked import localized_query, references_of_images, stored_query
 from toolkit.localizers.base import (
     Localizer,
     PoseEstimate,
@@ -66,6 +65,7 @@ from toolkit.localizers.mapping import map_settings
 from toolkit.localizers.misfit import LEAST_SIZE, SIGNIFICANCE
 from toolkit.localizers.picture import localize_image
 from toolkit.localizers.predictors import open_predictor
+from toolkit.localizers.queries import localized_query, references_of_images, stored_query
 from toolkit.manifest import LocalizeSettings
 from toolkit.runs.cluster import current_cluster
 from toolkit.runs.pairs import PairRows

@@ -13,18 +13,18 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 
-from tests.rendered import LIST, LOW, Asked, World, run_stage
+from tests.rendered import LIST, LOW, World, run_stage
 from toolkit import geometry
 from toolkit import localize as localize_stage
 from toolkit.capture import Capture, Trajectory
 from toolkit.errors import ImageError, ManifestError, WeightsError
 from toolkit.files import SceneFiles
 from toolkit.localize import COLUMNS, PREDICTION_COLUMNS
-from toolkit.localizers.base import PoseEstimate, References, View
+from toolkit.localizers.base import PoseEstimate, QueryInput, References, View
 from toolkit.localizers.feed_forward import (
     FeedForwardAnswer,
     FeedForwardLocalizer,
-    Predicted,
+    QueryPrediction,
     _other_focal,
 )
 from toolkit.localizers.prediction import Prediction
@@ -35,10 +35,10 @@ from toolkit.show.visualize_prediction import draw_prediction
 Floats = NDArray[np.float64]
 
 
-def answers_of(localizer: FeedForwardLocalizer, queries: Sequence[Asked]) -> list[FeedForwardAnswer]:
-    """Return the answers of queries that the network is asked about in one call."""
+def answers_of(localizer: FeedForwardLocalizer, queries: Sequence[QueryInput]) -> list[FeedForwardAnswer]:
+    """Return the answers for queries that the network predicts in one call."""
     predicted = localizer.predict(queries)
-    return [localizer.answer(*asked, one) for asked, one in zip(queries, predicted, strict=True)]
+    return [localizer.answer(*query, one) for query, one in zip(queries, predicted, strict=True)]
 
 
 def errors(answers: Sequence[FeedForwardAnswer], true: Floats) -> tuple[Floats, Floats]:
@@ -270,7 +270,7 @@ class Failing(SimulatedPredictor):
         ("raise", "failed: internal: RuntimeError: out of luck"),
         ("query", "failed: the predicted camera is not finite"),
         ("references", "failed: references 0, 1, 2, 3, 4 left out: not finite; no usable reference"),
-        ("too few", "failed: AlignmentError: Found 4 model_from_cams and 5 world_from_cams: expected as many"),
+        ("too few", "failed: AlignmentError: Found 4 model_from_cams and 5 world_from_cams: expected equal numbers"),
         ("no numbers", "failed: internal: ValueError: could not convert string to float: 'x'"),
     ],
 )
@@ -452,8 +452,8 @@ def test_a_killed_run_goes_on_where_it_was(
         return row(*args)  # type: ignore[arg-type]
 
     def counted(
-        self: FeedForwardLocalizer, queries: Sequence[Asked], following: Sequence[Asked]
-    ) -> list[Predicted]:
+        self: FeedForwardLocalizer, queries: Sequence[QueryInput], following: Sequence[QueryInput]
+    ) -> list[QueryPrediction]:
         asked.extend(query.views[0].name for query, _ in queries)
         return predict(self, queries)
 

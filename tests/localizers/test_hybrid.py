@@ -11,13 +11,13 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.queries import session_query
-from tests.rendered import LIST, LOW, Asked, World, run_stage
+from tests.rendered import LIST, LOW, World, run_stage
 from toolkit import geometry
 from toolkit.capture import Capture, Trajectory
 from toolkit.features.matching import MutualMatcher
 from toolkit.features.stores import extract_session
 from toolkit.files import SceneFiles
-from toolkit.localizers.base import PoseEstimate, Prior
+from toolkit.localizers.base import PoseEstimate, Prior, QueryInput
 from toolkit.localizers.feed_forward import FeedForwardAnswer
 from toolkit.localizers.hybrid import HybridLocalizer
 from toolkit.localizers.matches import MappedFeatures
@@ -37,20 +37,20 @@ def hybrid(world: World, pnp: PnpLocalizer) -> HybridLocalizer:
     return HybridLocalizer(pnp, world.localizer(world.predictor(**LOW)))
 
 
-def asked_of(world: World, device: str, index: int) -> Asked:
+def input_of(world: World, device: str, index: int) -> QueryInput:
     """Return a query with its features, and its references."""
     session = world.capture[f"{device}_query"]
     store = extract_session(session, world.files.features, progress=False)
     return session_query(session, session.rows_of_keyframes(session.keyframes(LIST))[index], world.map, store=store)
 
 
-def localize_told(
-    hybrid: HybridLocalizer, asked: Asked, predicted: PoseEstimate
+def localize_with(
+    hybrid: HybridLocalizer, query_input: QueryInput, predicted: PoseEstimate
 ) -> PoseEstimate:
     """Localize where the network gives this pose."""
     network = copy(hybrid.feed_forward)
     network.answer = lambda *_: FeedForwardAnswer(predicted)  # type: ignore[method-assign]
-    return HybridLocalizer(hybrid.pnp, network).localize(*asked)
+    return HybridLocalizer(hybrid.pnp, network).localize(*query_input)
 
 
 def same(one: PoseEstimate, other: PoseEstimate) -> bool:
@@ -67,24 +67,24 @@ def same(one: PoseEstimate, other: PoseEstimate) -> bool:
 def test_without_a_usable_prediction_the_hybrid_is_pnp(
     world: World, pnp: PnpLocalizer, hybrid: HybridLocalizer, device: str
 ) -> None:
-    asked = asked_of(world, device, 0)
-    expected = pnp.localize(*asked)
+    query_input = input_of(world, device, 0)
+    expected = pnp.localize(*query_input)
     assert expected.status == "ok"
-    assert same(localize_told(hybrid, asked, PoseEstimate("failed: no references")), expected)
+    assert same(localize_with(hybrid, query_input, PoseEstimate("failed: no references")), expected)
     unknown = np.diag([1e-4] * 3 + [np.inf] * 3)
     far = PoseEstimate("low_confidence", np.eye(4), unknown, found_by="feed_forward")
-    assert same(localize_told(hybrid, asked, far), expected)
+    assert same(localize_with(hybrid, query_input, far), expected)
 
 
 @pytest.mark.parametrize("device", ["ios", "spot"])
 def test_a_wrong_prediction_does_no_harm(
     world: World, pnp: PnpLocalizer, hybrid: HybridLocalizer, device: str
 ) -> None:
-    query, references = asked_of(world, device, 0)
+    query, references = input_of(world, device, 0)
     expected = pnp.localize(query, references)
     wrong = expected.world_from_rig @ geometry.make_pose(np.eye(3), [1.0, 0.5, 0.0])
     prediction = predicted_at(wrong, references[0].images[:4])
-    assert same(localize_told(hybrid, (query, references), prediction), expected)
+    assert same(localize_with(hybrid, (query, references), prediction), expected)
 
 
 def predicted_at(world_from_rig: Floats, references: Sequence[int]) -> PoseEstimate:
@@ -103,14 +103,14 @@ def prediction_near(true: Floats, references: Sequence[int], seed: int = 0) -> P
 
 def test_a_prediction_finds_what_descriptors_alone_do_not(world: World, hybrid: HybridLocalizer) -> None:
     """Descriptors too alike to be matched in all of an image are matched about the predicted pose."""
-    query, references = asked_of(world, "ios", 0)
+    query, references = input_of(world, "ios", 0)
     true, near = world.queries("ios")[1][0], references[0].images[:4]
     features = hybrid.pnp.matcher.mapped[0].features
     strict = PnpLocalizer([MappedFeatures(world.map, features, matcher=MutualMatcher(min_score=2.0))])
     alone = strict.localize(query, references)
     assert alone.status.startswith("failed")
     prediction = prediction_near(true, near)
-    found = localize_told(HybridLocalizer(strict, hybrid.feed_forward), (query, references), prediction)
+    found = localize_with(HybridLocalizer(strict, hybrid.feed_forward), (query, references), prediction)
     assert found.found_by == "pnp+feed_forward"
     assert found.status == "ok"
     error_deg, error_m = geometry.pose_error(found.world_from_rig, true)
@@ -120,11 +120,11 @@ def test_a_prediction_finds_what_descriptors_alone_do_not(world: World, hybrid: 
 
 
 def test_where_nothing_matches_the_prediction_is_the_answer(world: World, hybrid: HybridLocalizer) -> None:
-    query, references = asked_of(world, "ios", 0)
+    query, references = input_of(world, "ios", 0)
     blind = replace(query, features=[[kinds[0].take(slice(0))] for kinds in query.features])
     true = world.queries("ios")[1][0]
     prediction = prediction_near(true, references[0].images[:4])
-    found = localize_told(hybrid, (blind, references), prediction)
+    found = localize_with(hybrid, (blind, references), prediction)
     assert found.found_by == "feed_forward"
     assert found.status == "ok"
     np.testing.assert_array_equal(found.world_from_rig, prediction.world_from_rig)
@@ -132,20 +132,20 @@ def test_where_nothing_matches_the_prediction_is_the_answer(world: World, hybrid
 
 
 def test_a_hybrid_asks_its_network_where_no_prediction_is_given(world: World, hybrid: HybridLocalizer) -> None:
-    asked = asked_of(world, "ios", 0)
-    found = hybrid.localize(*asked)
-    assert same(found, hybrid.localize(*asked, hybrid.predict([asked])[0]))
+    query_input = input_of(world, "ios", 0)
+    found = hybrid.localize(*query_input)
+    assert same(found, hybrid.localize(*query_input, hybrid.predict([query_input])[0]))
     assert np.isfinite(found.scale_std)
 
 
 def test_a_prior_is_found_again_in_whatever_order(world: World, pnp: PnpLocalizer) -> None:
-    asked = asked_of(world, "spot", 1)
+    query_input = input_of(world, "spot", 1)
     true = world.queries("spot")[1][1]
-    images = np.unique(np.concatenate([retrieved.images for retrieved in asked[1]]))
+    images = np.unique(np.concatenate([retrieved.images for retrieved in query_input[1]]))
     priors = [Prior(prediction_near(true, [], seed).world_from_rig, images, 2.0, "feed_forward") for seed in range(2)]
-    found = [pnp.localize(*asked, priors=priors) for _ in range(2)]
+    found = [pnp.localize(*query_input, priors=priors) for _ in range(2)]
     assert same(*found)
-    assert same(found[0], pnp.localize(*asked, priors=priors[::-1]))
+    assert same(found[0], pnp.localize(*query_input, priors=priors[::-1]))
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import SceneFiles, write_text
 from toolkit.localize import localize_pairs
 from toolkit.localizers.base import PoseEstimate, Query, References, View
-from toolkit.localizers.feed_forward import FeedForwardAnswer, FeedForwardLocalizer, Predicted
+from toolkit.localizers.feed_forward import FeedForwardAnswer, FeedForwardLocalizer, QueryPrediction
 from toolkit.localizers.hybrid import HybridLocalizer
 from toolkit.localizers.lifting import DepthLifter
 from toolkit.localizers.local_map import LocalMap
@@ -190,7 +190,7 @@ def test_without_depth_nothing_is_lifted(world: World) -> None:
     nothing = FeedForwardAnswer(PoseEstimate("failed: no references"))
     query, references = world.queries[0]
     assert DepthLifter(world.pnp, feed_forward).localize(query, references, nothing) is None
-    untold = Predicted((np.zeros(0, np.int64),) * len(query.views), ("no references",) * len(query.views))
+    untold = QueryPrediction((np.zeros(0, np.int64),) * len(query.views), ("no references",) * len(query.views))
     found = HybridLocalizer(world.pnp, feed_forward).localize(query, references, untold)
     assert found.status == "failed: too few matches"
 

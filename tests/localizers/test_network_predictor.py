@@ -503,7 +503,7 @@ def test_fewer_views_where_memory_is_shorter(
     three = estimate_bytes(VGGT_ROW, 1, 3, (112, 518), channels=32)
     monkeypatch.setattr(network, "free_bytes", lambda _: 1.26 * three)
     [found] = predictor.predict([group])
-    assert "the first 3 go on" in caplog.text
+    assert "using the first 3" in caplog.text
     assert_only_first(found, expected, 3)
     monkeypatch.setattr(network, "free_bytes", lambda _: 0)
     assert np.isfinite(predictor.predict([group])[0].model_from_cams[:, 0, 0]).tolist() == [True] * 2 + [False] * 3

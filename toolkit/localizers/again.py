@@ -12,10 +12,10 @@ from toolkit.capture import Session
 from toolkit.errors import ManifestError
 from toolkit.features.stores import FeatureStore
 from toolkit.geometry import Ints
-from toolkit.localizers.asked import ReferencesOfImage, localized_query, references_of_images, stored_query
 from toolkit.localizers.base import Localizer, PoseEstimate
 from toolkit.localizers.correspondences import LocalizedQuery
 from toolkit.localizers.map import Map, create_localizer
+from toolkit.localizers.queries import ReferencesOfImage, localized_query, references_of_images, stored_query
 from toolkit.manifest import LocalizeSettings
 
 MADE_BEFORE = ("features", "matcher", "map", "unit", "world_up")

@@ -1,4 +1,4 @@
-"""What the scheduling of `NetworkPredictor` has to know of a network, and the networks that there are."""
+"""The supported networks, with what `NetworkPredictor` needs to know of each to schedule it."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -25,48 +25,51 @@ HEADS = ("camera", "depth")
 
 @dataclass(frozen=True)
 class Layout:
-    """How the photographs of a group lie in a network's images, which have one size."""
+    """Places of the photographs of a group in the network images, which have one size."""
 
     mode: str
-    """Of the network's loader."""
+    """Mode of the network's image loader."""
     size: Size
-    """(H, W) of the network's images."""
+    """(H, W) of the network images."""
     scale: Floats
-    """(S, 2): of x and of y. The point (x, y) of photograph i is at scale[i] * (x, y) + offset[i]; the center of the
-    top-left pixel is (0.5, 0.5) in both."""
+    """(S, 2) scale of x and y. The point (x, y) of photograph i maps to scale[i] * (x, y) + offset[i]; the center
+    of the top-left pixel is (0.5, 0.5) in both."""
     offset: Floats
-    """(S, 2), pixels of the network's images."""
+    """(S, 2) in pixels of the network images."""
 
 
 @dataclass(frozen=True)
 class Memory:
-    """Bytes that a network holds at most beside its weights, measured in float32."""
+    """Peak memory of a network in bytes, beside its weights, measured in float32.
+
+    A token value is one of views x tokens x channels.
+    """
 
     trunk: int
-    """For each number of the tokens (views x tokens x channels) during a block."""
+    """Bytes per token value inside a block."""
     kept: int
-    """For each number of the tokens: what the depth head reads of the layers."""
+    """Bytes per token value that are kept of the layers for the depth head."""
     dense_pixel: int
-    """For each pixel of a frame in the depth head."""
+    """Bytes per pixel of a frame in the depth head."""
     dense: int
-    """Of the depth head, apart from pixels."""
+    """Bytes of the depth head that do not depend on the number of pixels."""
     dense_frames: int
-    """Frames that the depth head takes at a time; on a CPU one."""
+    """Frames that the depth head processes at once; one on a CPU."""
     result_pixel: int
-    """For each pixel of the result."""
+    """Bytes per pixel of the result."""
 
 
 class Architecture(ABC):
-    """A network that tells cameras, and depth, of the views of one scene."""
+    """A network that predicts cameras and depth of the views of one scene."""
 
     name: str
-    """The predictor's."""
+    """Name of the predictor in the settings."""
     title: str
-    """For messages."""
+    """Name in messages."""
     package: str
-    """In `toolkit.models`, which imports torch: it is imported where it is needed."""
+    """Package in `toolkit.models`; imported only where it is used, as it imports torch."""
     network: str
-    """Its class in the package."""
+    """Class of the network in the package."""
     weights: WeightsSource
     patch: int
     """Side of a patch, pixels."""
@@ -76,21 +79,23 @@ class Architecture(ABC):
 
     @abstractmethod
     def lay_out(self, sizes: Sequence[Size]) -> Layout:
-        """Return how photographs of these (width, height) are shown to the network."""
+        """Return the layout of photographs of these sizes (width, height)."""
 
     def load(self, checkpoint: Path, dtype: "torch.dtype") -> Any:
-        """Return the network, on the CPU: `encode(images)`, and `(images, heads, tokens)` -> the outputs of its heads;
-        where it takes cameras also `(images, heads, tokens, extrinsics, intrinsics)`, see `DepthAnything3`.
+        """Return the network, on the CPU.
+
+        It has `encode(images)` and is called as `network(images, heads, tokens)`, which returns the outputs of its
+        heads. If it accepts cameras, also as `(images, heads, tokens, extrinsics, intrinsics)`, see `DepthAnything3`.
 
         Raises:
-            WeightsError: the file is not of this network.
+            WeightsError: the file does not belong to this network.
         """
         return getattr(self._imported, self.network).from_checkpoint(checkpoint, heads=HEADS, compute_dtype=dtype)
 
     def read(self, image: Path | NDArray[np.uint8], layout: Layout) -> "tuple[Tensor, Size]":
-        """Return the network's image (3, H, W) of a photograph, and the photograph's (width, height).
+        """Return the network image (3, H, W) of a photograph, and the (width, height) of the photograph.
 
-        One that is smaller than the images of its group gets a white border, of one that is larger the middle is shown.
+        A photograph smaller than the images of its group gets a white border; a larger one is cropped to its middle.
 
         Raises:
             ImageError: the file is missing or cannot be decoded.
@@ -104,7 +109,7 @@ class Architecture(ABC):
         return F.pad(loaded.images[0], (left, right - left, top, down - top), value=1.0), (width, height)
 
     def cameras(self, encoding: ArrayLike, size: Size) -> tuple[Floats, Floats]:
-        """Return `cam_from_model` (..., 3, 4) and K (..., 3, 3), pixels of the network's images (H, W)."""
+        """Return `cam_from_model` (..., 3, 4) and K (..., 3, 3) in pixels of network images of size (H, W)."""
         cameras: tuple[Floats, Floats] = self._imported.cameras_from_pose_encoding(encoding, size)
         return cameras
 
@@ -121,13 +126,14 @@ def estimate_bytes(
     channels: int = 1024,
     on_cpu: bool = True,
 ) -> int:
-    """Return the memory that a network needs, beside its weights, for so many groups of views at once.
+    """Return the memory in bytes that a network needs, beside its weights, for a batch of groups of views.
 
     Args:
-        groups, views: how many groups, of how many views each.
-        size: (H, W) of the network's images.
-        channels: of a token.
-        on_cpu: where the depth head takes one frame at a time.
+        architecture: the network.
+        groups, views: number of groups, and of views per group.
+        size: (H, W) of the network images.
+        channels: channels of a token.
+        on_cpu: whether it runs on a CPU, where the depth head processes one frame at a time.
     """
     (height, width), memory, frames = size, architecture.memory, groups * views
     patches = (height // architecture.patch) * (width // architecture.patch)
@@ -138,11 +144,11 @@ def estimate_bytes(
 
 
 class VggtArchitecture(Architecture):
-    """VGGT-1B. Photographs go in whole.
+    """VGGT-1B, with uncropped photographs.
 
-    The official "crop" would cut a portrait photograph of a phone to its middle 75 % (3:4) or 56 % (9:16); "pad" keeps
-    all of it, in an image of the same 518 x 518. Of a landscape photograph "crop" cuts nothing, and without white bars
-    it has a quarter to two fifths fewer tokens.
+    The official "crop" mode would cut a portrait photograph of a phone to its middle 75 % (3:4) or 56 % (9:16). "pad"
+    keeps all of it, in an image of the same 518 x 518. For landscape photographs "crop" cuts nothing, and as it adds no
+    white bars, it needs a quarter to two fifths fewer tokens.
     """
 
     name = "vggt"
@@ -158,7 +164,7 @@ class VggtArchitecture(Architecture):
         from toolkit.models.vggt.preprocess import resized_size
 
         portrait = any(height > width for width, height in sizes)
-        # Of a landscape photograph "crop" makes the same.
+        # "crop" resizes a landscape photograph to the same size.
         resized = np.array([resized_size(*size, "pad") for size in sizes]).reshape(-1, 2)
         height = self._side if portrait else int(resized[:, 1].max(initial=0))
         offset = (np.array([self._side, height]) - resized) // 2
@@ -167,8 +173,8 @@ class VggtArchitecture(Architecture):
 
 
 class OmegaArchitecture(Architecture):
-    """VGGT-Omega, 1B-512. Photographs are shown with about as many pixels of any shape; of one with sides of more than
-    2 to 1 the middle is shown, as by the official loader."""
+    """VGGT-Omega, 1B-512. Photographs of any shape get about the same number of pixels. As in the official loader,
+    those with an aspect ratio above 2 are cropped to the middle."""
 
     name = "vggt-omega"
     title = "VGGT-Omega"
@@ -181,18 +187,18 @@ class OmegaArchitecture(Architecture):
     def lay_out(self, sizes: Sequence[Size]) -> Layout:
         from toolkit.models.omega.preprocess import cropped_size, resized_size
 
-        given = np.array(sizes, np.int64).reshape(-1, 2)
+        original = np.array(sizes, np.int64).reshape(-1, 2)
         cropped = np.array([cropped_size(*size) for size in sizes], np.int64).reshape(-1, 2)
         shown = [resized_size(width, height, "balanced") for width, height in cropped.tolist()]
         resized = np.array(shown, np.float64).reshape(-1, 2)
         width, height = resized.max(axis=0, initial=0).tolist()
         scale = resized / cropped
-        offset = (np.array([width, height]) - resized) // 2 - scale * ((given - cropped) // 2)
+        offset = (np.array([width, height]) - resized) // 2 - scale * ((original - cropped) // 2)
         return Layout("balanced", (int(height), int(width)), scale, offset)
 
 
 class Da3Architecture(Architecture):
-    """Depth Anything 3. Of photographs of several shapes the middle is shown, as by the official loader."""
+    """Depth Anything 3. As in the official loader, photographs of different shapes are cropped to a common middle."""
 
     package, network = "da3", "DepthAnything3"
     patch = 14
@@ -226,12 +232,12 @@ class Da3Architecture(Architecture):
 _DA3_BASE = Memory(trunk=44, kept=32, dense_pixel=750, dense=0, dense_frames=8, result_pixel=24)
 _DA3_SMALL = Memory(trunk=44, kept=32, dense_pixel=505, dense=0, dense_frames=8, result_pixel=24)
 ARCHITECTURES: dict[str, Architecture] = {
-    one.name: one
-    for one in (
+    architecture.name: architecture
+    for architecture in (
         VggtArchitecture(),
         OmegaArchitecture(),
         Da3Architecture("da3-base", 768, _DA3_BASE),
         Da3Architecture("da3-small", 384, _DA3_SMALL),
     )
 }
-"""By the predictor's name."""
+"""The networks by name of the predictor."""

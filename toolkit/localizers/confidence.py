@@ -1,7 +1,7 @@
-"""How probable it is that a pose is right: within 5 degrees and 0.5 m.
+"""Probability that a pose is correct, that is, within 5 degrees and 0.5 m of the true pose.
 
-A logistic regression on what the localizer knows of a pose. `benchmarks/confidence.py` fits the weights on rendered
-captures and on photographs made dark, blurred, foggy and half hidden, and tells how well they hold on others.
+A logistic regression on statistics of the estimate. `benchmarks/confidence.py` fits the weights on rendered captures
+and on photographs that it darkens, blurs, fogs and half covers, and measures the calibration on held-out ones.
 """
 
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from toolkit.geometry import Floats
 EVIDENCE = (
     "num_inliers", "inlier_ratio", "coverage", "rival_support", "position_std_m", "rotation_std_deg", "agreement"
 )  # fmt: skip
-"""What is asked of a pose: attributes of `PoseEstimate` and columns of `poses/<pair>.csv`."""
+"""Inputs of the regression: attributes of `PoseEstimate` and columns of `poses/<pair>.csv`."""
 WEIGHTS: dict[str, float] = {
     "constant": -2.1948,
     "log_inliers": 1.2564,
@@ -25,14 +25,14 @@ WEIGHTS: dict[str, float] = {
     "log_rotation_std": -0.6491,
     "log_agreement": 0.4397,
 }
-"""Of the terms that `terms` returns."""
+"""Weights of the columns that `terms` returns."""
 
 
 def terms(evidence: Mapping[str, Floats | float]) -> Floats:
-    """Return what the regression weighs, in the order of `WEIGHTS`, (..., 8).
+    """Return the terms of the regression, in the order of `WEIGHTS`, (..., 8).
 
     Args:
-        evidence: of poses what `EVIDENCE` names; numbers, or arrays of equal shape.
+        evidence: the quantities in `EVIDENCE`, as numbers or arrays of equal shape, one entry per pose.
     """
     inliers, ratio, coverage, rival, position_std_m, rotation_std_deg, agreement = (
         np.asarray(evidence[name], np.float64)
@@ -47,11 +47,11 @@ def terms(evidence: Mapping[str, Floats | float]) -> Floats:
 
 
 def probability_right(evidence: Mapping[str, Floats | float], weights: Floats | None = None) -> Floats:
-    """Return the probability that poses are right, of the shape of the evidence; 0 where the deviation is unknown.
+    """Return the probability that each pose is correct, shaped like the evidence; 0 if a standard deviation is unknown.
 
     Args:
         evidence: as for `terms`.
-        weights: (8,); None: those of `WEIGHTS`.
+        weights: (8,); None takes `WEIGHTS`.
     """
     weights = np.array(list(WEIGHTS.values())) if weights is None else weights
     return np.asarray(np.nan_to_num(expit(terms(evidence) @ weights), nan=0.0), np.float64)

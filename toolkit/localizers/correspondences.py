@@ -1,7 +1,7 @@
-"""What each pose rests on: the correspondences of every query of a pair, in one HDF5 file beside the poses.
+"""The correspondences behind each pose of a pair, in one HDF5 file beside the poses.
 
-A group a query, `<timestamp>/<device_id>`, holds the arrays of `Correspondences` and the names of `LocalizedQuery`.
-Everything that shows, exports or evaluates a localization reads this file, so that it shows what was localized.
+The group `<timestamp>/<device_id>` of a query holds the arrays of `Correspondences` and the names of `LocalizedQuery`.
+Figures, exports and evaluations read this file, so they use exactly the correspondences of the localization.
 """
 
 import json
@@ -20,23 +20,23 @@ from toolkit.features.groups import HDF5_ERRORS, group_names_of, has_group, read
 from toolkit.geometry import Floats, Ints
 
 MAPS = "maps"
-"""Attribute of the file: names of the triangulated maps, one a kind of features, in the folder of maps."""
+"""File attribute: names of the triangulated maps in the folder of maps, one per kind of features."""
 _NAMES = ("images", "references", "rejected")
 _RIVALS = ("rivals", "rival_supports")
 
 
 class Rival(NamedTuple):
-    """A pose that is clearly another one than the answer, and that matches agree with, too."""
+    """A pose that clearly differs from the estimate but is supported by matches too."""
 
     world_from_rig: Floats
     """(4, 4)"""
     support: float
-    """Its guided matches, relative to those of the answer."""
+    """Number of its guided matches, divided by that of the estimate."""
 
 
 @dataclass(frozen=True)
 class Correspondences:
-    """K correspondences of a query device with the map, and the M places where references show their points."""
+    """K correspondences between a query device and the map, and M observations of their points in the references."""
 
     camera: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     """(K,) index of the query image."""
@@ -45,17 +45,17 @@ class Correspondences:
     points: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     """(K, 3) in the world, meters."""
     point_index: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    """(K,) index of the map point, those of several maps one after the other; -1: a point lifted by depth."""
+    """(K,) index of the map point, counted through all maps in order; -1 for a point lifted by depth."""
     inlier: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
-    """(K,) whether the pose agrees with it."""
+    """(K,) whether it is an inlier of the pose."""
     found_by: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, "U1"))
     """(K,) `<kind of features>/<descriptors, guided or lifted>`."""
     view_of: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    """(M,) index of a correspondence."""
+    """(M,) index of the correspondence whose point is observed."""
     view_reference: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    """(M,) index of a reference that sees its point."""
+    """(M,) index of the reference that observes it."""
     view_pixels: Floats = field(default_factory=lambda: np.zeros((0, 2)))
-    """(M, 2) where, in the reference."""
+    """(M, 2) pixel of the observation in the reference."""
 
     def __len__(self) -> int:
         return len(self.camera)
@@ -68,8 +68,8 @@ class Correspondences:
 _ARRAYS = tuple(Correspondences.__dataclass_fields__)
 
 
-def _shape_of(name: str, found: Correspondences) -> tuple[int, ...]:
-    count = len(found.view_of) if name.startswith("view_") else len(found.camera)
+def _shape_of(name: str, correspondences: Correspondences) -> tuple[int, ...]:
+    count = len(correspondences.view_of) if name.startswith("view_") else len(correspondences.camera)
     width = {"pixels": 2, "points": 3, "view_pixels": 2}.get(name)
     return (count,) if width is None else (count, width)
 
@@ -81,42 +81,42 @@ class LocalizedQuery:
     images: list[str] = field(default_factory=list)
     """Names of the C query images."""
     references: list[str] = field(default_factory=list)
-    """Names of the map images that the pose rests on, best first."""
+    """Names of the map images that support the pose, best first."""
     rejected: list[str] = field(default_factory=list)
-    """Names of the references that contradict the others."""
+    """Names of the references that contradict the other ones."""
     correspondences: Correspondences = field(default_factory=Correspondences)
     rivals: Sequence[Rival] | None = ()
-    """Other poses that matches agree with, best supported first; None: an older run did not keep them."""
+    """Clearly different poses that matches support, best supported first; None in files of older runs."""
 
     def arrays(self) -> dict[str, Any]:
-        """Return what a group of the file holds, by name."""
-        kept = dict(vars(self.correspondences))
-        labels, codes = np.unique(kept.pop("found_by"), return_inverse=True)
+        """Return the datasets of the query's group, by name."""
+        arrays = dict(vars(self.correspondences))
+        labels, codes = np.unique(arrays.pop("found_by"), return_inverse=True)
         text = h5py.string_dtype()
         names = {name: np.array(getattr(self, name), object).astype(text) for name in _NAMES}
-        # As float32, pixels of any image are exact to a hundredth; the file is smaller.
-        kept |= {"pixels": kept["pixels"].astype(np.float32), "view_pixels": kept["view_pixels"].astype(np.float32)}
-        kept |= {key: kept[key].astype(np.int32) for key in ("camera", "point_index", "view_of", "view_reference")}
-        kept |= {"found_by": codes.astype(np.uint8), "found_by_labels": labels.astype(object).astype(text)}
+        # float32 makes the file smaller and keeps pixels of any image exact to a hundredth.
+        arrays |= {key: arrays[key].astype(np.float32) for key in ("pixels", "view_pixels")}
+        arrays |= {key: arrays[key].astype(np.int32) for key in ("camera", "point_index", "view_of", "view_reference")}
+        arrays |= {"found_by": codes.astype(np.uint8), "found_by_labels": labels.astype(object).astype(text)}
         if self.rivals is not None:
-            kept["rivals"] = np.array([rival.world_from_rig for rival in self.rivals]).reshape(-1, 4, 4)
-            kept["rival_supports"] = np.array([rival.support for rival in self.rivals], np.float64)
-        return kept | names
+            arrays["rivals"] = np.array([rival.world_from_rig for rival in self.rivals]).reshape(-1, 4, 4)
+            arrays["rival_supports"] = np.array([rival.support for rival in self.rivals], np.float64)
+        return arrays | names
 
 
 def query_group(timestamp: int, device_id: str) -> str:
-    """Return the name of a query's group; in a device's id, `/` is `%2F`, for it would make another level."""
+    """Return the name of a query's group. A `/` in a device id is written as `%2F`, as it would add a level."""
     return f"{timestamp}/{device_id.replace('%', '%25').replace('/', '%2F')}"
 
 
 class LocalizedQueries(Mapping[tuple[int, str], LocalizedQuery]):
-    """The queries of one pair, by timestamp and device id; each is read when it is asked for."""
+    """The queries of one pair, by timestamp and device id; each is read on access."""
 
     def __init__(self, path: str | Path):
         """Open `poses/<pair>.h5`.
 
         Raises:
-            ArtifactError: it is missing or torn.
+            ArtifactError: the file is missing or damaged.
         """
         self.path = Path(path)
         try:
@@ -127,7 +127,7 @@ class LocalizedQueries(Mapping[tuple[int, str], LocalizedQuery]):
                 f"{self.path}: the correspondences of the poses cannot be read ({error}). Localize again."
             ) from None
         self.maps: list[str] = maps
-        """Names of the triangulated maps that `point_index` counts through."""
+        """Names of the triangulated maps whose points `point_index` counts through."""
 
     def __contains__(self, key: object) -> bool:
         return isinstance(key, tuple) and len(key) == 2 and has_group(self._file, query_group(*key))
@@ -149,10 +149,10 @@ class LocalizedQueries(Mapping[tuple[int, str], LocalizedQuery]):
             wide = {"f": np.float64, "i": np.int64, "b": np.bool_}
             arrays: dict[str, Any] = {key: array.astype(wide[array.dtype.kind]) for key, array in stored.items()}
             found_by = labels[codes] if len(labels) else np.zeros(0, "U1")
-            found = Correspondences(**{name: arrays[name] for name in arrays if name in _ARRAYS}, found_by=found_by)
-            if wrong := [name for name in _ARRAYS if getattr(found, name).shape != _shape_of(name, found)]:
-                raise ValueError(f"{wrong[0]} has the shape {getattr(found, wrong[0]).shape}")
-            return LocalizedQuery(**names, correspondences=found, rivals=rivals)
+            read = Correspondences(**{name: arrays[name] for name in arrays if name in _ARRAYS}, found_by=found_by)
+            if wrong := [name for name in _ARRAYS if getattr(read, name).shape != _shape_of(name, read)]:
+                raise ValueError(f"{wrong[0]} has the shape {getattr(read, wrong[0]).shape}")
+            return LocalizedQuery(**names, correspondences=read, rivals=rivals)
         except (*HDF5_ERRORS, AttributeError) as error:
             raise DamagedError(self.path, f"{self.path}: {name} is not as a run writes it ({first_line(error)}). "
                                "Localize again.") from None  # fmt: skip

@@ -1,4 +1,4 @@
-"""Scale from depth ratios: the metric depth of map points over the depth that a network predicts for them."""
+"""Scale from depth ratios: metric depth of map points over the depth that a network predicts for them."""
 
 from __future__ import annotations
 
@@ -29,15 +29,16 @@ class ScaleEstimate:
 def combined_scale(
     along: float, square_c: float, noise_in_model: float, depth: ScaleEstimate | None
 ) -> ScaleEstimate | None:
-    """Combine the scale of baselines and that of depth ratios; None if there is neither.
+    """Combine the scale from baselines with that from depth ratios; return None if there is neither.
 
-    1 / scale is linear in the model's noisy centers, so it is averaged by inverse variance. If the two differ by more
-    than three standard deviations, the variance is widened (Birge 1932).
+    1 / scale is linear in the noisy centers of the model, so the two values of 1 / scale are averaged by inverse
+    variance. If they differ by more than three standard deviations, the variance is widened (Birge 1932).
 
     Args:
         along: sum of the products of baselines in the map and in the model.
         square_c: sum of squared baselines in the map.
-        noise_in_model: noise of a predicted center by axis, in units of the model.
+        noise_in_model: noise of a predicted center per axis, in units of the model.
+        depth: scale from depth ratios, if any.
     """
     values, variances = np.zeros(0), np.zeros(0)
     if square_c > 0:
@@ -58,18 +59,18 @@ def combined_scale(
 
 @dataclass(frozen=True)
 class DepthRatios:
-    """Depth ratios of map points, checked."""
+    """Valid depth ratios of map points."""
 
     log: Floats
     """(R,) logarithms."""
     reference: Ints
-    """(R,) the reference of each, or -1."""
+    """(R,) the reference that each belongs to, -1 if unknown."""
     notes: list[str]
-    """What was left out."""
+    """Descriptions of what was left out."""
 
     @classmethod
     def of(cls, ratios: DepthSamples | None, count: int) -> DepthRatios:
-        """Check the samples that `align_to_map` was given for `count` references.
+        """Check the `depth_ratios` of `align_to_map` for `count` references.
 
         Raises:
             AlignmentError: a wrong shape.
@@ -80,7 +81,7 @@ class DepthRatios:
         if isinstance(ratios, list | tuple) and any(np.ndim(part) > 0 for part in ratios):
             if len(ratios) != count:
                 raise AlignmentError(
-                    f"depth_ratios has {len(ratios)} arrays: expected one array, or {count}, one a reference."
+                    f"depth_ratios has {len(ratios)} arrays: expected one array, or {count}, one per reference."
                 )
             parts = [np.asarray(part, np.float64).ravel() for part in ratios]
             values, reference = np.concatenate(parts), np.repeat(np.arange(count), [len(part) for part in parts])
@@ -102,11 +103,14 @@ class DepthRatios:
         return len(self.reference) > 0 and bool(self.reference[0] >= 0)
 
     def estimate(self, inliers: Bools | None) -> ScaleEstimate | None:
-        """Return the scale of the samples, of the inliers' only if their references are known; None without samples.
+        """Return the scale from the samples; None without samples.
 
-        Expectation maximization fits a mixture of noise about one value and of wrong samples anywhere. It starts from
-        the middle of the shortest interval that contains half of the samples (Rousseeuw 1984). The error that a
-        reference's samples share is estimated by moments (DerSimonian and Laird 1986).
+        Expectation maximization fits a mixture of noise around one value and uniformly distributed wrong samples. It
+        starts from the middle of the shortest interval that contains half of the samples (Rousseeuw 1984). The error
+        that the samples of one reference share is estimated by moments (DerSimonian and Laird 1986).
+
+        Args:
+            inliers: (M,) references whose samples are used; None uses all. Ignored if the references are unknown.
         """
         kept = inliers[self.reference] if self.grouped and inliers is not None else np.ones(len(self.log), bool)
         log, reference = self.log[kept], self.reference[kept]
@@ -137,10 +141,10 @@ class DepthRatios:
 def _between(
     log: Floats, share: Floats, reference: Ints, noise: float, center: float, variance: float
 ) -> tuple[float, float]:
-    """Return the mean of the references' means, and its variance with the variance between references."""
+    """Return the mean over the references' means, and its variance, which includes that between references."""
     _, index = np.unique(reference, return_inverse=True)
     total = np.bincount(index, share)
-    held = total > 0.5  # leaves out references whose samples are all wrong
+    held = total > 0.5  # excludes references whose samples are all wrong
     if held.sum() < 2:
         return center, variance
     means = np.bincount(index, share * log)[held] / total[held]

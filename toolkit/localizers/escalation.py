@@ -1,4 +1,4 @@
-"""Ask further kinds of local features where a pose is not sure without them."""
+"""Localize again with further kinds of local features if the first pose is uncertain."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,16 +8,16 @@ from toolkit.capture.images import pixels_of
 from toolkit.features.features import KINDS, LocalFeatures, extract_turned
 from toolkit.features.matching import AnyMethod
 from toolkit.features.stores import as_stored
-from toolkit.localizers.base import Asked, Localizer, PoseEstimate, Prior, Query, References, rank
+from toolkit.localizers.base import Localizer, PoseEstimate, Prior, Query, QueryInput, References, rank
 
 
 def is_sure(status: str, position_std_m: float, limit_m: float) -> bool:
-    """Tell whether a pose needs no further features: it is `ok`, and precise."""
-    return status == "ok" and not position_std_m > limit_m  # unknown for a pose that does not rest on matches
+    """Tell whether a pose is `ok` and precise, so that it needs no further features."""
+    return status == "ok" and not position_std_m > limit_m  # NaN for a pose without matches counts as precise
 
 
 def can_gain(query: Query, references: Sequence[References]) -> bool:
-    """Tell whether further features could find a pose: an image that can be read has references."""
+    """Tell whether further features could find a pose: at least one readable image has references."""
     return any(
         not isinstance(features, str) and len(retrieved.images)
         for features, retrieved in zip(query.features, references, strict=True)
@@ -25,28 +25,28 @@ def can_gain(query: Query, references: Sequence[References]) -> bool:
 
 
 def is_better(status: str, first_status: str) -> bool:
-    """Tell whether a pose by all features is taken, rather than the one that was found before; statuses of both."""
+    """Tell by their statuses whether the pose from all features replaces the first pose."""
     return rank(status) >= max(rank(first_status), 1)
 
 
 class EscalatingLocalizer:
-    """Asks one localizer first, and where its pose is not sure another that has more kinds of features."""
+    """Runs a localizer, and where its pose is uncertain a second one that has more kinds of features."""
 
     def __init__(
         self, first: Localizer, second: Localizer, further: Sequence[AnyMethod], sure_position_std_m: float
     ) -> None:
         """
         Args:
-            first: asked about every query.
-            second: its kinds of features are those of the first, then the further ones.
-            further: the further kinds.
+            first: localizes every query.
+            second: its kinds of features are those of `first`, followed by the further ones.
+            further: the further kinds of features.
             sure_position_std_m: see `PnpSettings`.
         """
         self.first, self.second, self._further, self._limit_m = first, second, further, sure_position_std_m
         self.image_names, self.batch_size = first.image_names, first.batch_size
 
-    def predict(self, queries: Sequence[Asked], following: Sequence[Asked] = ()) -> list[Any]:
-        """Return what the first's network says of each query; see `Localizer`."""
+    def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[Any]:
+        """Return the predictions of the first localizer; see `Localizer`."""
         return self.first.predict(queries, following)
 
     def localize(
@@ -54,11 +54,11 @@ class EscalatingLocalizer:
     ) -> PoseEstimate:
         """Return one pose for the cameras of a rig, or for a single camera; see `Localizer`.
 
-        `found_by` names the further kinds if the pose rests on the matches of all kinds.
+        `found_by` names the further kinds if the pose was computed with them.
         """
         estimate = self.first.localize(query, references, prediction, priors)
         sure = is_sure(estimate.status, estimate.position_std_m, self._limit_m)
-        if sure or estimate.misfit or not can_gain(query, references):  # further features do not mend a camera
+        if sure or estimate.misfit or not can_gain(query, references):  # no features repair wrong intrinsics
             return estimate
         escalated = self.escalate(self._with_all_features(query), references, None, priors)
         return escalated if is_better(escalated.status, estimate.status) else estimate
@@ -66,21 +66,21 @@ class EscalatingLocalizer:
     def escalate(
         self, query: Query, references: Sequence[References], prediction: None = None, priors: Sequence[Prior] = ()
     ) -> PoseEstimate:
-        """Return the pose by the matches of all kinds of features, all of which the query has; see `localize`."""
+        """Return the pose from all kinds of features, for a query that has them all; see `localize`."""
         escalated = self.second.localize(query, references, None, priors)
         return replace(escalated, found_by="+".join([escalated.found_by, *(kind.name for kind in self._further)]))
 
     def _with_all_features(self, query: Query) -> Query:
-        """Extract the features that the query lacks."""
+        """Add the further kinds of features to a query."""
         features: list[list[LocalFeatures] | str] = []
-        for view, known in zip(query.views, query.features, strict=True):
-            if isinstance(known, str):
-                features.append(known)
+        for view, first in zip(query.views, query.features, strict=True):
+            if isinstance(first, str):
+                features.append(first)
                 continue
-            found = []
+            further = []
             for method in self._further:
                 pixels = pixels_of(view.image, gray=not method.extractor.color)
                 turns = view.turns if KINDS[method.name].upright else 0
-                found.append(as_stored(extract_turned(method.extractor, [pixels], [turns])[0]))
-            features.append([*known, *found])
+                further.append(as_stored(extract_turned(method.extractor, [pixels], [turns])[0]))
+            features.append([*first, *further])
         return replace(query, features=features, network_matches=[])

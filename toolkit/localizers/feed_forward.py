@@ -1,4 +1,4 @@
-"""Localize by what a feed-forward network says of a query and its references, aligned to the map. No matching."""
+"""Localize without matching: align a network's predicted cameras of the query and its references to the map."""
 
 import logging
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from toolkit.capture.upright import Turns
 from toolkit.errors import first_line, reason_of
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.alignment import Alignment, align_to_map, is_trustworthy, query_pose
-from toolkit.localizers.base import CAMERA, Asked, PoseEstimate, Prior, Query, References, View, carried_over
+from toolkit.localizers.base import CAMERA, PoseEstimate, Prior, Query, QueryInput, References, View, carried_over
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.pose_mean import robust_mean_pose
 from toolkit.localizers.prediction import Prediction, Predictor
@@ -25,56 +25,56 @@ from toolkit.manifest import PredictorSettings
 log = logging.getLogger(__name__)
 
 FOCAL_TOLERANCE = 0.2
-"""Difference of the logarithms of predicted and stated focal length, beside that of the references, that tells a wrong
-camera: several times what networks err by."""
+"""Difference between the log focal length ratios (predicted over stated) of query and references above which the stated
+focal length is wrong; several times the usual error of the networks."""
 
 
 @dataclass(frozen=True)
 class CameraAnswer:
-    """What came out for one image of a query."""
+    """The result for one image of a query."""
 
     references: Ints
-    """(k,) map images chosen, in order of choice."""
+    """(k,) map images given to the network, in order of choice."""
     prediction: Prediction | None = None
-    """Of the query, first, and the references."""
+    """Prediction for the query, first, and its references."""
     alignment: Alignment | None = None
     world_from_cam: Floats | None = None
-    """(4, 4), None without a known rotation; where the scale is unknown, at the place of the first consistent
+    """(4, 4); None if the rotation is unknown. If the scale is unknown, the position is that of the first consistent
     reference."""
     covariance: Floats | None = None
-    """(6, 6), in the convention of `PoseEstimate`."""
+    """(6, 6), see `PoseEstimate.covariance`."""
     reason: str = ""
     """What was left out or is unknown; without a pose, why there is none."""
     depth_ratios: tuple[Floats, ...] = ()
-    """For each reference, metric over predicted depth at points that the map knows."""
+    """For each reference, metric over predicted depth at points of known depth."""
     focal_px: float = np.nan
-    """What the network sees, where the camera says something else; NaN where they agree or nothing is known."""
+    """Predicted focal length if it contradicts the camera, else NaN."""
 
 
 @dataclass(frozen=True)
-class Predicted:
-    """What a network says of a query, not yet aligned to the map."""
+class QueryPrediction:
+    """A network's predictions for a query, not yet aligned to the map."""
 
     references: tuple[Ints, ...]
-    """Those chosen for each image of the query, see `CameraAnswer`."""
+    """References chosen for each image of the query, see `CameraAnswer`."""
     predictions: tuple[Prediction | str, ...]
-    """Of each image; why there is none."""
+    """Prediction for each image, or the reason why there is none."""
 
 
 @dataclass(frozen=True)
 class FeedForwardAnswer:
-    """The estimate for a query device, and how it came about."""
+    """The estimate for a query device, and the results per image that it combines."""
 
     estimate: PoseEstimate
     cameras: tuple[CameraAnswer, ...] = ()
 
 
 _Groups = tuple[list[list[Ints]], dict[tuple[int, int], list[View]]]
-"""The references chosen for each image of each query, and the groups of views by query and image."""
+"""References chosen for each image of each query, and groups of views, keyed by query and image."""
 
 
 class FeedForwardLocalizer:
-    """Localizes queries in one map by a predictor's cameras."""
+    """Localizes queries in one map by predicted cameras."""
 
     def __init__(
         self,
@@ -85,8 +85,15 @@ class FeedForwardLocalizer:
         turns: Turns | None = None,
         length: float = 1.0,
     ):
-        """`session` has the map's images and depth maps, whose depths are divided by `length`; `turns` makes images
-        upright, None leaves them as they are."""
+        """
+        Args:
+            local_map: the triangulated map.
+            session: session with the map images and their depth maps.
+            predictor: predicts the cameras.
+            settings: default if None.
+            turns: turns that make images upright for the predictor; None shows them as stored.
+            length: depths of the depth maps are divided by it, see `Survey.length`.
+        """
         self.map = local_map
         self.predictor = predictor
         self.settings = settings or PredictorSettings()
@@ -95,57 +102,57 @@ class FeedForwardLocalizer:
         self._length = length
         self._upright = turns is not None
         self._turns = np.zeros(len(session.images), np.int64) if turns is None else turns.of(session)
-        self._next: tuple[Sequence[Asked], _Groups] = (), ([], {})
-        """The queries of the next call."""
+        self._next: tuple[Sequence[QueryInput], _Groups] = (), ([], {})
+        """Queries expected in the next call of `predict`, and their groups."""
         self.image_names, self.batch_size = local_map.image_names, self.settings.batch_size
 
     def localize(
         self,
         query: Query,
         references: Sequence[References],
-        prediction: Predicted | None = None,
+        prediction: QueryPrediction | None = None,
         priors: Sequence[Prior] = (),
     ) -> PoseEstimate:
         """Return the predicted pose of a query; see `Localizer`."""
         return self.answer(query, references, prediction).estimate
 
     def answer(
-        self, query: Query, references: Sequence[References], prediction: Predicted | None = None
+        self, query: Query, references: Sequence[References], prediction: QueryPrediction | None = None
     ) -> FeedForwardAnswer:
-        """Return the predicted pose of a query, and how it came about; the arguments are those of `localize`.
+        """Return the predicted pose of a query with the results per image; the arguments are those of `localize`.
 
-        Nothing that goes wrong is raised: the answer says `failed: <reason>`.
+        Errors are not raised: the status of the estimate becomes `failed: <reason>`.
         """
         predicted = self.predict([(query, references)])[0] if prediction is None else prediction
-        found = zip(query.views, predicted.references, predicted.predictions, strict=True)
-        cameras = tuple(self._camera_answer(*one) for one in found)
+        images = zip(query.views, predicted.references, predicted.predictions, strict=True)
+        cameras = tuple(self._camera_answer(*image) for image in images)
         return FeedForwardAnswer(_combine(query, cameras), cameras)
 
-    def predict(self, queries: Sequence[Asked], following: Sequence[Asked] = ()) -> list[Predicted]:
-        """Return what the predictor, asked once for all, says of each query; see `Localizer`.
+    def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[QueryPrediction]:
+        """Return the predictions for each query, made in one call of the predictor; see `Localizer`.
 
-        Aligning it to the map is left to `localize`, which other threads can do while the network goes on. Nothing that
-        goes wrong with one query is raised or touches another.
+        `localize` aligns them to the map, in other threads while the network continues. An error in one query is not
+        raised and does not affect the other queries.
 
         Raises:
-            Exception: what no other query would do better with: no such device, other weights, too little memory; see
-                `errors.reason_of`.
+            Exception: a problem of all queries: the device does not exist, the weights are of another network, or the
+                memory is too small; see `errors.reason_of`.
         """
-        expected, known = self._next
-        chosen, groups = known if queries is expected else self._groups(queries)
+        expected, expected_groups = self._next
+        chosen, groups = expected_groups if queries is expected else self._groups(queries)
         next_groups = self._groups(following)
         self._next = following, next_groups
-        found = self._predict(list(groups.values()), list(next_groups[1].values()))
-        predictions = dict(zip(groups, found, strict=True))
+        results = self._predict(list(groups.values()), list(next_groups[1].values()))
+        predictions = dict(zip(groups, results, strict=True))
         return [
-            Predicted(
+            QueryPrediction(
                 tuple(references),
                 tuple(predictions.get((number, camera), "no references") for camera in range(len(references))),
             )
             for number, references in enumerate(chosen)
         ]
 
-    def _groups(self, queries: Sequence[Asked]) -> _Groups:
+    def _groups(self, queries: Sequence[QueryInput]) -> _Groups:
         chosen = [[self._choose(retrieved) for retrieved in references] for _, references in queries]
         groups = {
             (number, camera): [self._as_shown(query.views[camera]), *(self.view(int(index)) for index in references)]
@@ -159,7 +166,7 @@ class FeedForwardLocalizer:
         return view if self._upright else replace(view, turns=0)
 
     def view(self, index: int) -> View:
-        """Return a map image as a network is shown it."""
+        """Return a map image as the network gets it."""
         name = self.map.image_names[index]
         row = self._session.row_of_name[name]
         turns = int(self._turns[row])
@@ -167,30 +174,30 @@ class FeedForwardLocalizer:
         return View(name, self._session.image_path(row), self.map.cameras[index], True, turns, pose)
 
     def _choose(self, references: References) -> Ints:
-        """Return the references of one query image to use."""
-        known = references.images < len(self.map.image_names)  # further images are those of other kinds of features
-        near, scores = references.images[known][: self.settings.candidates], references.scores[known]
-        if not len(near):
-            return near
-        points = np.concatenate([self.map.observations(int(index))[1] for index in near])
-        images = np.repeat(near, [len(self.map.observations(int(index))[1]) for index in near])
-        depth = np.einsum("oj,oj->o", self.map.cams_from_world[images, 2, :3], self.map.points[points])
+        """Choose the references of one query image."""
+        in_map = references.images < len(self.map.image_names)  # larger indices are images of other kinds of features
+        candidates, scores = references.images[in_map][: self.settings.candidates], references.scores[in_map]
+        if not len(candidates):
+            return candidates
+        points = [self.map.observations(int(index))[1] for index in candidates]
+        images = np.repeat(candidates, [len(observed) for observed in points])
+        depth = np.einsum("oj,oj->o", self.map.cams_from_world[images, 2, :3], self.map.points[np.concatenate(points)])
         depth += self.map.cams_from_world[images, 2, 3]
         chosen = select_references(
-            scores[: len(near)],
-            self.map.world_from_cams[near],
+            scores[: len(candidates)],
+            self.map.world_from_cams[candidates],
             self.settings.num_references,
-            [self.map.cameras[int(index)] for index in near],
-            self.map.shared_points(near),
+            [self.map.cameras[int(index)] for index in candidates],
+            self.map.shared_points(candidates),
             **({"depth_m": float(np.median(depth))} if len(depth) else {}),
         )
-        return near[chosen]
+        return candidates[chosen]
 
     def _predict(self, groups: list[list[View]], following: Sequence[list[View]] = ()) -> list[Prediction | str]:
-        """Return predictions, or why there is none."""
+        """Return a prediction per group, or the reason why there is none."""
         try:
             return [*self.predictor.predict(groups, following)] if groups else []
-        except Exception as error:  # one bad query never ends a run
+        except Exception as error:  # one bad query must not end a run; the groups are tried one by one
             if len(groups) == 1:
                 return [reason_of(error, f"predicting {groups[0][0].name}")]
         return [prediction for group in groups for prediction in self._predict([group])]
@@ -201,9 +208,9 @@ class FeedForwardLocalizer:
         try:
             cameras = [view.camera, *(self.map.cameras[int(index)] for index in references)]
             return replace(self._align(references, prediction), focal_px=_other_focal(prediction, cameras))
-        except AlignmentError as error:  # of this prediction alone
+        except AlignmentError as error:
             return CameraAnswer(references, prediction, reason=first_line(error))
-        except Exception as error:  # a prediction may be anything
+        except Exception as error:  # a predictor may return anything
             return CameraAnswer(references, prediction, reason=reason_of(error, "aligning a prediction"))
 
     def _align(self, references: Ints, prediction: Prediction) -> CameraAnswer:
@@ -213,19 +220,19 @@ class FeedForwardLocalizer:
             return CameraAnswer(references, prediction, reason=reason)
         ratios = [self._depth_ratios(int(index), prediction, view) for view, index in enumerate(references, start=1)]
         world = self.map.world_from_cams[references]
-        told = np.zeros(len(references), bool) if prediction.conditioned is None else prediction.conditioned[1:]
-        alignment = align_to_map(model[1:], world, ~told, ratios if any(len(r) for r in ratios) else None)
+        conditioned = np.zeros(len(references), bool) if prediction.conditioned is None else prediction.conditioned[1:]
+        alignment = align_to_map(model[1:], world, ~conditioned, ratios if any(len(r) for r in ratios) else None)
         if not np.isfinite(alignment.rotation_std_deg):
             reason = alignment.reason or "the rotation is unknown"
             return CameraAnswer(references, prediction, alignment, reason=reason, depth_ratios=tuple(ratios))
         pose, covariance = query_pose(alignment, model[0])
         if not alignment.scale_known:
-            # Whatever scale was taken, the query may be put anywhere along a line; near a reference is a better guess.
+            # An arbitrary scale moves the query along a line; the position of a reference is a better guess.
             pose[:3, 3] = world[int(np.argmax(alignment.inliers)), :3, 3]
         return CameraAnswer(references, prediction, alignment, pose, covariance, alignment.reason, tuple(ratios))
 
     def _depth_ratios(self, image: int, prediction: Prediction, view: int) -> Floats:
-        """Return metric over predicted depth (R,) at points that a map image sees."""
+        """Return metric over predicted depth (R,) at points that a map image observes."""
         points = self._points(image)
         in_cam = geometry.transform(self.map.cams_from_world[image], points)
         in_cam = in_cam[in_cam[:, 2] > 0.1]
@@ -234,55 +241,56 @@ class FeedForwardLocalizer:
         return np.asarray(ratios[np.isfinite(ratios)], np.float64)
 
     def _points(self, image: int) -> Floats:
-        """Return points (P, 3) in the world that a map image sees: triangulated, else of the capture's depth maps."""
+        """Return world points (P, 3) that a map image observes: triangulated, else from the capture's depth maps."""
         points = np.unique(self.map.observations(image)[1])
         if len(points) >= self.settings.least_points:
             order = np.argsort(-self.map.track_lengths(points), kind="stable")[: self.settings.depth_points]
             return self.map.points[points[order]]
         seen = self.seen_depth(image)
-        part = np.linspace(0, len(seen) - 1, min(len(seen), self.settings.depth_points)).astype(np.int64)
-        if not len(part):
+        sample = np.linspace(0, len(seen) - 1, min(len(seen), self.settings.depth_points)).astype(np.int64)
+        if not len(sample):
             return self.map.points[points]
-        in_cam = lifted(self.map.cameras[image], seen.pixels[part], seen.depth_m[part])
+        in_cam = lifted(self.map.cameras[image], seen.pixels[sample], seen.depth_m[sample])
         return geometry.transform(self.map.world_from_cams[image], in_cam)
 
     def seen_depth(self, image: int) -> SeenDepth:
-        """Return what the capture's depth maps say of a map image."""
+        """Return the depth of a map image from the capture's depth maps, in the unit of the local map."""
         seen = self._depths.of(self._session.row_of_name[self.map.image_names[image]])
         return replace(seen, depth_m=seen.depth_m / self._length)
 
 
 def _combine(query: Query, cameras: tuple[CameraAnswer, ...]) -> PoseEstimate:
-    """Return one pose of the device from those of its cameras."""
+    """Combine the poses of the cameras of a device into one estimate."""
     count = sum(len(answer.references) for answer in cameras if answer.prediction is not None)
     reasons = "; ".join(dict.fromkeys(answer.reason for answer in cameras if answer.reason))
-    posed = [index for index, answer in enumerate(cameras) if answer.world_from_cam is not None]
-    if not posed:
+    alignments = {index: answer.alignment for index, answer in enumerate(cameras) if answer.alignment is not None}
+    poses = {index: answer.world_from_cam for index, answer in enumerate(cameras) if answer.world_from_cam is not None}
+    covariances = {index: answer.covariance for index, answer in enumerate(cameras) if answer.covariance is not None}
+    if not poses:
         return PoseEstimate(f"failed: {reasons}", num_matches=count, found_by="feed_forward")
-    known = [index for index in posed if np.isfinite(_covariance(cameras[index])).all()]
+    known = [index for index in poses if np.isfinite(covariances[index]).all()]
     if known:
-        poses = np.stack([_pose(cameras[index]) for index in known]) @ geometry.invert(query.rig_from_cams[known])
-        covariances = np.stack([
-            carried_over(_covariance(cameras[index]), query.rig_from_cams[index]) for index in known
-        ])  # fmt: skip
-        mean = robust_mean_pose(poses, covariances)
+        mean = robust_mean_pose(
+            np.stack([poses[index] for index in known]) @ geometry.invert(query.rig_from_cams[known]),
+            np.stack([carried_over(covariances[index], query.rig_from_cams[index]) for index in known]),
+        )
         pose, covariance = mean.world_from_cam, mean.covariance
         kept = [index for index, inside in zip(known, mean.inliers, strict=True) if inside]
-        reasons = "; ".join(part for part in (reasons, mean.reason) if part)
+        reasons = "; ".join(filter(None, (reasons, mean.reason)))
         agreed = np.isfinite(covariance).all() and 2 * len(kept) > len(known)
-        sure = agreed and any(is_trustworthy(_alignment(cameras[index]), covariance) for index in kept)
+        sure = agreed and any(is_trustworthy(alignments[index], covariance) for index in kept)
     else:
-        kept = [min(posed, key=lambda index: _alignment(cameras[index]).rotation_std_deg)]
-        rig_from_cam = query.rig_from_cams[kept[0]]
-        pose, sure = _pose(cameras[kept[0]]) @ geometry.invert(rig_from_cam), False
-        turn, covariance = rig_from_cam[:3, :3], np.diag(np.full(6, np.inf))
-        covariance[:3, :3] = turn @ _covariance(cameras[kept[0]])[:3, :3] @ turn.T
+        best = min(poses, key=lambda index: alignments[index].rotation_std_deg)
+        rig_from_cam = query.rig_from_cams[best]
+        kept, pose, sure = [best], poses[best] @ geometry.invert(rig_from_cam), False
+        R, covariance = rig_from_cam[:3, :3], np.diag(np.full(6, np.inf))
+        covariance[:3, :3] = R @ covariances[best][:3, :3] @ R.T
     focals = tuple(answer.focal_px for answer in cameras)
     misfit = bool(np.isfinite(focals).any())
     if misfit:
         seen = ", ".join(f"{focal:.0f}" for focal in focals if np.isfinite(focal))
-        reasons = "; ".join(part for part in (reasons, f"the network sees a focal length of {seen} px") if part)
-    consistent = [int(i) for c in kept for i in cameras[c].references[_alignment(cameras[c]).inliers]]
+        reasons = "; ".join(filter(None, (reasons, f"the network sees a focal length of {seen} px")))
+    consistent = [int(i) for index in kept for i in cameras[index].references[alignments[index].inliers]]
     shown = [int(i) for answer in cameras if answer.prediction is not None for i in answer.references]
     return PoseEstimate(
         status=CAMERA if misfit else "ok" if sure else "low_confidence",
@@ -292,7 +300,7 @@ def _combine(query: Query, cameras: tuple[CameraAnswer, ...]) -> PoseEstimate:
         num_inliers=len(consistent),
         references=tuple(dict.fromkeys(consistent)),
         found_by="feed_forward",
-        scale_std=min(_alignment(cameras[index]).scale_std for index in kept),
+        scale_std=min(alignments[index].scale_std for index in kept),
         rejected=tuple(index for index in dict.fromkeys(shown) if index not in consistent),
         reason=reasons,
         misfit=misfit,
@@ -301,34 +309,19 @@ def _combine(query: Query, cameras: tuple[CameraAnswer, ...]) -> PoseEstimate:
 
 
 def _other_focal(prediction: Prediction, cameras: Sequence[pycolmap.Camera]) -> float:
-    """Return the focal length that a network sees in the first of a group's photographs, if its camera is wrong.
+    """Return the predicted focal length of the first photograph of a group if it contradicts the camera, else NaN.
 
-    A network errs by some percent, of all photographs of a group alike: the references tell by how much.
+    A network errs by some percent, equally for all photographs of a group, so the references give its error.
     """
     if prediction.intrinsics is None:
         return np.nan
     predicted_px = prediction.intrinsics[:, [0, 1], [0, 1]].mean(axis=1)
     ratios = predicted_px / [camera.mean_focal_length() for camera in cameras]
     logs = np.log(np.where(np.isfinite(ratios) & (ratios > 0), ratios, np.nan))
-    told = np.zeros(len(cameras), bool) if prediction.conditioned is None else prediction.conditioned
-    known = logs[1:][np.isfinite(logs[1:]) & ~told[1:]]
-    if not len(known) or not np.isfinite(logs[0]):
+    conditioned = np.zeros(len(cameras), bool) if prediction.conditioned is None else prediction.conditioned
+    of_references = logs[1:][np.isfinite(logs[1:]) & ~conditioned[1:]]
+    if not len(of_references) or not np.isfinite(logs[0]):
         return np.nan
-    middle = float(np.median(known))
-    limit = max(FOCAL_TOLERANCE, 4 * float(np.median(np.abs(known - middle))))
+    middle = float(np.median(of_references))
+    limit = max(FOCAL_TOLERANCE, 4 * float(np.median(np.abs(of_references - middle))))
     return float(cameras[0].mean_focal_length() * np.exp(logs[0] - middle)) if abs(logs[0] - middle) > limit else np.nan
-
-
-def _alignment(answer: CameraAnswer) -> Alignment:
-    assert answer.alignment is not None
-    return answer.alignment
-
-
-def _pose(answer: CameraAnswer) -> Floats:
-    assert answer.world_from_cam is not None
-    return answer.world_from_cam
-
-
-def _covariance(answer: CameraAnswer) -> Floats:
-    assert answer.covariance is not None
-    return answer.covariance

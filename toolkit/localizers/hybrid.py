@@ -1,20 +1,20 @@
-"""Localize by matching; a predicted pose and depth each allow another try, and the best supported answer is kept."""
+"""Combine matching with prediction: match alone, near the predicted pose, and with depth, and keep the best pose."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from toolkit.localizers.base import Asked, PoseEstimate, Prior, Query, References, agree, rank
-from toolkit.localizers.feed_forward import FeedForwardLocalizer, Predicted
+from toolkit.localizers.base import PoseEstimate, Prior, Query, QueryInput, References, agree, rank
+from toolkit.localizers.feed_forward import FeedForwardLocalizer, QueryPrediction
 from toolkit.localizers.lifting import DepthLifter
 from toolkit.localizers.pnp import PnpLocalizer
 
-TIE = 0.8  # of the other's matches: with more, there is no reason to change
+TIE = 0.8  # share of the lifted pose's matches above which the pose from matching alone is kept
 
 
 class HybridLocalizer:
-    """Adds a prediction to the hypotheses of a `PnpLocalizer`, and depth where its points do not suffice."""
+    """Adds a predicted pose to the hypotheses of a `PnpLocalizer`, and depth where its map points do not suffice."""
 
     def __init__(self, pnp: PnpLocalizer, feed_forward: FeedForwardLocalizer):
         self.pnp = pnp
@@ -22,24 +22,26 @@ class HybridLocalizer:
         self.lifter = DepthLifter(pnp, feed_forward)
         self.image_names, self.batch_size = pnp.image_names, feed_forward.batch_size
 
-    def predict(self, queries: Sequence[Asked], following: Sequence[Asked] = ()) -> list[Predicted]:
-        """Return what the network says of each query; see `Localizer`."""
+    def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[QueryPrediction]:
+        """Return the prediction of the network for each query; see `Localizer`."""
         return self.feed_forward.predict(queries, following)
 
     def localize(
         self,
         query: Query,
         references: Sequence[References],
-        prediction: Predicted | None = None,
+        prediction: QueryPrediction | None = None,
         priors: Sequence[Prior] = (),
     ) -> PoseEstimate:
-        """Return one pose for the cameras of a rig, or for a single camera; `found_by` says from what.
+        """Return one pose for the cameras of a rig, or for a single camera. `found_by` names its source:
 
-        `pnp`: the prediction has changed nothing. `pnp+feed_forward`: features sought around the predicted pose, in its
-        consistent references, support the answer better than those matched without it. `lifted`,
-        `lifted+feed_forward`: where that is not `ok`, and features placed by a capture's depth maps, or by predicted
-        depth too, support a pose better. `feed_forward`: the predicted pose itself, where matching finds none, or only
-        an uncertain one that a certain prediction contradicts.
+        - `pnp`: matching alone; the prediction changed nothing.
+        - `pnp+feed_forward`: matches guided by the predicted pose, with its consistent references, support a pose
+          better than matches found without it.
+        - `lifted`, `lifted+feed_forward`: neither is `ok`, and map features lifted by the depth maps of the capture, or
+          also by predicted depth, support a pose better.
+        - `feed_forward`: the predicted pose itself; matching finds no pose, or an uncertain one that a certain
+          prediction contradicts.
         """
         answer = self.feed_forward.answer(query, references, prediction)
         predicted = answer.estimate
@@ -51,24 +53,24 @@ class HybridLocalizer:
             estimate = estimate if lifted is None else _better(estimate, lifted)
         if predicted.world_from_rig is None:
             return estimate
-        lost = estimate.world_from_rig is None
-        elsewhere = not agree(estimate.world_from_rig, predicted.world_from_rig)
-        if lost or (elsewhere and estimate.status != "ok" and predicted.status == "ok"):
-            why = estimate.status if lost else "matching gives an uncertain pose elsewhere"
-            return replace(predicted, reason="; ".join(part for part in (predicted.reason, why) if part))
-        reason = "; ".join(part for part in (predicted.reason, estimate.reason) if part)
+        no_pose = estimate.world_from_rig is None
+        disagree = not agree(estimate.world_from_rig, predicted.world_from_rig)
+        if no_pose or (disagree and estimate.status != "ok" and predicted.status == "ok"):
+            why = estimate.status if no_pose else "matching gives an uncertain pose elsewhere"
+            return replace(predicted, reason="; ".join(filter(None, (predicted.reason, why))))
+        reason = "; ".join(filter(None, (predicted.reason, estimate.reason)))
         return replace(estimate, scale_std=predicted.scale_std, rejected=predicted.rejected, reason=reason)
 
 
 def _better(matched: PoseEstimate, lifted: PoseEstimate) -> PoseEstimate:
-    """Return the pose with the better status, else the lifted one only if clearly more matches support it."""
+    """Return the pose with the better status; at equal status the lifted one only if it has clearly more matches."""
     rank_matched, rank_lifted = rank(matched.status), rank(lifted.status)
     clearly_more = matched.num_guided <= TIE * lifted.num_guided
     return lifted if rank_lifted > rank_matched or (rank_lifted == rank_matched > 0 and clearly_more) else matched
 
 
 def _prior(predicted: PoseEstimate) -> Prior | None:
-    """Return where to look for features; None where the place is not known."""
+    """Return the predicted pose as a prior for matching; None if its position is unknown."""
     if predicted.world_from_rig is None or not np.isfinite(predicted.position_std_m):
         return None
     images = np.array(predicted.references, np.int64)

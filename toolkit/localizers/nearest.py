@@ -1,34 +1,34 @@
-"""The baseline: the pose of the best reference."""
+"""The simplest method, for comparison: the query gets the pose of its best reference."""
 
 from collections.abc import Sequence
 
 from toolkit import geometry
 from toolkit.geometry import Floats
-from toolkit.localizers.base import Asked, PoseEstimate, Prior, Query, References
+from toolkit.localizers.base import PoseEstimate, Prior, Query, QueryInput, References
 
 
 class NearestLocalizer:
-    """Puts the query image with the best score where its first reference is, looking the same way."""
+    """Gives the query image with the best retrieval score the pose of its first reference."""
 
     batch_size = 1
 
     def __init__(self, image_names: list[str], world_from_cams: Floats) -> None:
-        """`world_from_cams`, (N, 4, 4), are the poses of the map's N images."""
+        """`world_from_cams` (N, 4, 4) are the poses of the N map images."""
         self.image_names = image_names
         self.world_from_cams = world_from_cams
 
-    def predict(self, queries: Sequence[Asked], following: Sequence[Asked] = ()) -> list[None]:
-        """Return nothing for each query: no network is asked."""
+    def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[None]:
+        """Return None for each query: this method uses no network."""
         return [None] * len(queries)
 
     def localize(
         self, query: Query, references: Sequence[References], prediction: None = None, priors: Sequence[Prior] = ()
     ) -> PoseEstimate:
         """Return the pose of the best reference, never `ok`; see `Localizer`."""
-        best = [(float(part.scores[0]), camera) for camera, part in enumerate(references) if len(part.images)]
-        if not best:
+        scores = [(float(best.scores[0]), camera) for camera, best in enumerate(references) if len(best.images)]
+        if not scores:
             return PoseEstimate("failed: no references")
-        camera = max(best)[1]
+        camera = max(scores)[1]
         reference = int(references[camera].images[0])
         world_from_rig = self.world_from_cams[reference] @ geometry.invert(query.rig_from_cams[camera])
         return PoseEstimate("low_confidence", world_from_rig, references=(reference,), found_by="nearest")

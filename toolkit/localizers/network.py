@@ -1,4 +1,4 @@
-"""A network as a predictor: which views run together, on which device, what is kept, and what memory allows."""
+"""A network as a predictor: batching of views, choice of device, cache of encodings, and limits of memory."""
 
 import logging
 from collections import OrderedDict
@@ -18,7 +18,7 @@ from toolkit.files import files_fingerprint
 from toolkit.geometry import invert, make_pose
 from toolkit.localizers.architectures import ARCHITECTURES, HEADS, Architecture, Size, estimate_bytes
 from toolkit.localizers.base import View
-from toolkit.localizers.placed import PlacedView, cameras_to_tell, shown_size, told_views
+from toolkit.localizers.placed import PlacedView, conditioned_views, input_cameras, shown_size
 from toolkit.localizers.prediction import Prediction
 from toolkit.models.compute import PRECISIONS, Fitting, free_bytes, on_device, resolve_device, resolve_precision
 from toolkit.models.weights import resolve_weights
@@ -32,20 +32,18 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 CACHE_BYTES = 2 << 30
-"""Of encodings of map images that are kept: 500 of them at 518 x 392 in float32, twice as many in bfloat16."""
-# A CPU is kept busy by one group; more of them at once take memory and no less time.
-_GROUPS_AT_A_TIME = {"cpu": 1}
-_GROUPS_AT_A_TIME_ELSEWHERE = 8
+"""Size of the cache for encodings of map images: 500 of them at 518 x 392 in float32, twice as many in bfloat16."""
+_GROUPS_AT_A_TIME = 8  # on a CPU 1: one group keeps it busy, and a batch needs more memory and is not faster
 _IMAGES_AT_A_TIME = 8
-# An accelerator holds the encodings itself if so many times their most is free, beside the weights.
+# The accelerator holds the cache itself if it has this many times CACHE_BYTES free beside the weights.
 _ROOM_FOR_CACHE = 4
-# Part of the free memory to plan with: the rest is for what else runs, and for what the estimate leaves out.
+# Share of the free memory to plan with; the rest is for other programs and for errors of the estimate.
 _MEMORY_SHARE = 0.8
-_LEAST_VIEWS = 2
+_LEAST_VIEWS = 2  # the query and one reference
 
 
 class TokenCache:
-    """Encodings of map images, those that were not asked for the longest forgotten first. Not thread-safe."""
+    """Least recently used cache of encodings of map images. Not thread-safe."""
 
     def __init__(self, max_bytes: int) -> None:
         self.max_bytes = max_bytes
@@ -56,13 +54,13 @@ class TokenCache:
         return key in self._kept
 
     def get(self, key: Any) -> "Tensor | None":
-        """Return what is kept under a key, or None."""
+        """Return the encoding of a key, or None."""
         if key in self._kept:
             self._kept.move_to_end(key)
         return self._kept.get(key)
 
     def put(self, key: Any, tokens: "Tensor") -> None:
-        """Keep an encoding, and forget others until there is room; one larger than all the room is not kept."""
+        """Add an encoding and drop old ones to make room; an encoding larger than the cache is not kept."""
         if key in self._kept or tokens.nbytes > self.max_bytes:
             return
         self._kept[key] = tokens
@@ -71,15 +69,15 @@ class TokenCache:
             self.bytes -= self._kept.popitem(last=False)[1].nbytes
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Empty the cache."""
         self._kept.clear()
         self.bytes = 0
 
 
 class NetworkPredictor:
-    """Runs a network. The weights are looked for at once, and loaded when the first prediction is asked for.
+    """Runs a network. The constructor finds the weights, the first prediction loads them.
 
-    The encoding of map images, of VGGT a fifth of the work, is kept.
+    Encodings of map images are cached; for VGGT, encoding is a fifth of the work.
     """
 
     simulated = False
@@ -98,19 +96,19 @@ class NetworkPredictor:
     ) -> None:
         """
         Args:
-            checkpoint: file with the weights; None: the hub's cache, else a download.
-            compute_device, dtype_compute: as `models.compute` takes them, without float16: the trunk's numbers may
-                be larger than it can hold. `auto` is float32 where it would be that. The heads are always float32.
-            batch_size: groups at a time, at most; None: what is usual for the device.
-            cache_bytes: memory for the encodings of map images: of the device where that has plenty, else of the CPU.
-            architecture: which network.
+            checkpoint: file with the weights; None takes the hub's cache, else downloads them.
+            compute_device, dtype_compute: see `models.compute`. float16 is refused, as activations of the trunk may
+                overflow it; `auto` takes float32 where it would choose float16. The heads always run in float32.
+            batch_size: largest number of groups per batch; None takes a default for the device.
+            cache_bytes: memory for encodings of map images, on the device if it has plenty, else on the CPU.
+            architecture: the network.
             compile: see `PredictorSettings`.
-            conditioned: tell it the intrinsics of all views, and the poses of every other reference where there are
-                at least `placed.LEAST_REFERENCES`. For a network that takes cameras.
+            conditioned: give the network the intrinsics of all views, and the poses of every other reference if there
+                are at least `placed.LEAST_REFERENCES`. Only for networks that accept cameras.
 
         Raises:
-            ManifestError: no such precision.
-            WeightsError: no weights.
+            ManifestError: the precision does not exist or is float16.
+            WeightsError: the weights are missing.
         """
         expected = [name for name in PRECISIONS if name != "float16"]
         if dtype_compute not in expected:
@@ -129,7 +127,7 @@ class NetworkPredictor:
 
     @cached_property
     def settings(self) -> dict[str, Any]:
-        """What the predictions depend on besides the views. A device changes rounding only, a type more."""
+        """Everything besides the views that the predictions depend on. The device only changes rounding."""
         weights = files_fingerprint([self.checkpoint])
         precision = str(self._dtype).removeprefix("torch.")
         settings = {"name": self.name, "weights": weights, "dtype_compute": precision, "depth": True}
@@ -152,32 +150,32 @@ class NetworkPredictor:
 
     @cached_property
     def _kept_on(self) -> "torch.device":
-        """Where encodings are held."""
+        """Device that holds the cache."""
         import torch
 
         plenty = free_bytes(self._device) >= _ROOM_FOR_CACHE * self._cache.max_bytes
         return self._device if plenty else torch.device("cpu")
 
     def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
-        """Return a prediction for each group of views, in order: the query first, then its references.
+        """Return a prediction for each group of views. The first view of a group is the query.
 
-        Each has as many views as its group. Those that the network was not shown have NaN in `model_from_cams` and
-        `depth`, and 0 in `depth_conf`; why is logged:
+        A prediction has as many views as its group. Views that the network did not get have NaN in `model_from_cams`
+        and `depth`, and 0 in `depth_conf`. The log says why:
 
-        - A view whose file is missing, cannot be decoded or is not of its camera's size. Where it is the query, its
-          whole group is NaN, without depth, with the reason.
-        - The last references of a group that does not fit the memory.
+        - The file is missing, cannot be decoded, or does not have the size of its camera. If this is the query, the
+          whole prediction is NaN, without depth, and gives the reason.
+        - The group does not fit the memory; then its last references are left out.
 
-        Nothing else is raised for a group, and what one group holds does not change the others. Groups of equally many
-        views and equal image size run together, as many as fit the memory.
+        No other error is raised for a group, and groups do not influence each other. Groups with equal numbers of views
+        and equal image size run in one batch, as far as the memory allows.
 
         Args:
             groups: views of photographs.
-            following: groups of the next call, whose first photographs are decoded while the network runs.
+            following: groups of the next call; their first photographs are decoded while the network runs.
 
         Raises:
-            WeightsError: at the first call, the file is not of this network.
-            ToolkitError: there is no such device; or the memory does not hold a query and one reference.
+            WeightsError: at the first call, the file does not belong to this network.
+            ToolkitError: the device does not exist, or its memory does not hold a query and one reference.
         """
         placed = [self._place(group) for group in groups]
         begun = self._read_ahead(placed, [self._place(group) for group in following])
@@ -187,43 +185,41 @@ class NetworkPredictor:
             if group:
                 alike.setdefault((len(group), group[0].size), []).append(number)
         for (views, size), numbers in alike.items():
-            batch, views = self._plan(len(numbers), views, size)
-            batches = [numbers[start : start + batch] for start in range(0, len(numbers), batch)]
-            shown = {number: placed[number][:views] for number in numbers}
-            encoded = self._encoded([[shown[n] for n in b] for b in batches], begun)
-            for part, found in zip(batches, encoded, strict=True):
-                for number, prediction in self._run(part, [placed[n] for n in part], found).items():
+            batch_size, views = self._plan(len(numbers), views, size)
+            batches = [numbers[start : start + batch_size] for start in range(0, len(numbers), batch_size)]
+            encoded = self._encoded([[placed[number][:views] for number in batch] for batch in batches], begun)
+            for batch, tokens in zip(batches, encoded, strict=True):
+                for number, prediction in self._run(batch, [placed[number] for number in batch], tokens).items():
                     results[number] = prediction
         return results
 
     def _place(self, group: Sequence[View]) -> list[PlacedView]:
-        """Return how the views of a group lie in images of one size."""
+        """Return the views of a group with their places in network images of one size."""
         layout = self._architecture.lay_out([shown_size(view) for view in group])
         return [PlacedView(view, layout, number) for number, view in enumerate(group)]
 
     def _plan(self, count: int, views: int, size: Size) -> Size:
-        """Return how many groups to run at a time, and how many views of each, by the memory that is free."""
+        """Return the number of groups per batch and of views per group that fit the free memory."""
         channels = self._model.channels
         on_cpu = self._device.type == "cpu"
         estimate = partial(estimate_bytes, self._architecture, size=size, channels=channels, on_cpu=on_cpu)
         growing = 0 if self._kept_on.type == "cpu" else self._cache.max_bytes - self._cache.bytes
         free = int(_MEMORY_SHARE * free_bytes(self._device)) - growing
-        batch = self._batch_size or _GROUPS_AT_A_TIME.get(self._device.type, _GROUPS_AT_A_TIME_ELSEWHERE)
-        batch = min(batch, count)
+        batch = min(self._batch_size or (1 if on_cpu else _GROUPS_AT_A_TIME), count)
         while batch > 1 and estimate(batch, views) > free:
             batch -= 1
         fitting = views
         while fitting > _LEAST_VIEWS and estimate(batch, fitting) > free:
             fitting -= 1
         if fitting < views:
-            log.warning("%d views of %d x %d need %.1f GB of memory, %s has %.1f GB to spare: the first %d go on",
+            log.warning("%d views of %d x %d need %.1f GB of memory, %s has %.1f GB to spare: using the first %d",
                         views, *size[::-1], estimate(1, views) / 1e9, self._device, free / 1e9, fitting)  # fmt: skip
         return batch, fitting
 
     def _read_ahead(self, groups: Sequence[list[PlacedView]], following: Sequence[list[PlacedView]]) -> "_Begun":
-        """Return what the call before began to decode, and begin with the first photographs of the following groups.
+        """Start to decode the first photographs of the following groups; return those that the last call started.
 
-        Those whose encoding is kept, or will be after these groups, are not decoded.
+        Photographs whose encoding is cached, or will be after the current groups, are not decoded.
         """
         begun = self._begun
         encoded = {placed.key for group in groups for placed in group if placed.view.in_map}
@@ -238,9 +234,9 @@ class NetworkPredictor:
     def _encoded(
         self, batches: Sequence[Sequence[Sequence[PlacedView]]], begun: "_Begun"
     ) -> "Iterator[list[list[Tensor | str]]]":
-        """Yield the tokens (P, C) of each view of each group of each batch, or why it cannot be read.
+        """Yield, per batch, the tokens (P, C) of each view of each group, or the reason why it cannot be read.
 
-        Photographs are decoded in other threads meanwhile, those whose encoding is kept not at all.
+        Other threads decode the next photographs in the meantime, except those whose encoding is cached.
         """
 
         def read(placed: PlacedView | None) -> "Tensor | ImageError | None":
@@ -249,61 +245,61 @@ class NetworkPredictor:
 
         decoded = prefetch(read, self._to_read(batches), workers=default_workers(), ahead=_IMAGES_AT_A_TIME)
         for batch in batches:
-            found: dict[Any, Tensor | str] = {}
+            tokens: dict[Any, Tensor | str] = {}
             waiting: dict[Any, tuple[PlacedView, Tensor]] = {}
             for placed in (placed for group in batch for placed in group):
                 image = next(decoded)
-                kept = self._cache.get(placed.key)
-                if kept is not None:
-                    found[placed.key] = kept
-                if kept is not None or placed.key in waiting:
+                cached = self._cache.get(placed.key)
+                if cached is not None:
+                    tokens[placed.key] = cached
+                if cached is not None or placed.key in waiting:
                     continue
-                # Known when its turn to be read came, and forgotten since.
+                # The encoding was cached when the image was to be decoded, and has been dropped since.
                 image = self._read(placed) if image is None else image
                 if isinstance(image, ImageError):
                     log.warning("%s: left out. %s", placed.view.name, image)
-                    found[placed.key] = str(image)
+                    tokens[placed.key] = str(image)
                 elif image is not None:
                     waiting[placed.key] = (placed, image)
-            found.update(self._encode(list(waiting.values())))
-            yield [[found[placed.key] for placed in group] for group in batch]
+            tokens.update(self._encode(list(waiting.values())))
+            yield [[tokens[placed.key] for placed in group] for group in batch]
 
     def _to_read(self, batches: Sequence[Sequence[Sequence[PlacedView]]]) -> Iterator[PlacedView | None]:
-        """Yield each view, or None for a map image whose encoding is kept, or will be by then."""
-        asked = set()
+        """Yield each view, or None for a map image whose encoding is cached or will be by then."""
+        read = set()
         for placed in (placed for batch in batches for group in batch for placed in group):
-            yield None if placed.key in self._cache or placed.key in asked else placed
+            yield None if placed.key in self._cache or placed.key in read else placed
             if placed.view.in_map:
-                asked.add(placed.key)
+                read.add(placed.key)
 
     def _read(self, placed: PlacedView | None) -> "Tensor | ImageError | None":
-        """Return the image (3, H, W) for the network, or why it cannot be had; nothing of nothing."""
+        """Return the network image (3, H, W) of a view, the error if it cannot be read, or None for None."""
         if placed is None:
             return None
         try:
             image, turns = placed.view.image, placed.view.turns
             if turns:
                 image = turn_image(read_image(image) if isinstance(image, Path) else image, turns)
-            pixels, found = self._architecture.read(image, placed.layout)
+            pixels, actual = self._architecture.read(image, placed.layout)
         except ImageError as error:
             return error
         expected = shown_size(placed.view)
-        if found != expected:
+        if actual != expected:
             turned = " when upright" if turns else ""
             return ImageError(
-                f"Image of {found[0]} x {found[1]} pixels{turned}: {placed.view.name}; its camera has "
+                f"Image of {actual[0]} x {actual[1]} pixels{turned}: {placed.view.name}; its camera has "
                 f"{expected[0]} x {expected[1]}. Correct the size in `sensors.txt`, or the image."
             )
         return pixels
 
     def _encode(self, images: "Sequence[tuple[PlacedView, Tensor]]") -> "dict[Any, Tensor]":
-        """Return tokens (P, C) of images (3, H, W) of one size, by key; keep those of map images."""
+        """Return tokens (P, C) of images (3, H, W) of one size, by key; cache those of map images."""
         import torch
 
-        # Measured: float16 changes depth by 1.2e-4 of its size, a trunk in bfloat16 by 4e-3 whatever is kept.
+        # Measured: tokens in float16 change depth by 1.2e-4 of its value; a trunk in bfloat16 changes it by 4e-3.
         dtype = torch.float32 if self._dtype == torch.float32 else torch.float16
         fitting = Fitting(self._model.encode, "images", self._device)
-        found = {}
+        tokens = {}
         for start in range(0, len(images), _IMAGES_AT_A_TIME):
             part = images[start : start + _IMAGES_AT_A_TIME]
             batch = torch.stack([image for _, image in part])
@@ -313,20 +309,19 @@ class NetworkPredictor:
                 if not self._makes_room():
                     raise
                 encoded = fitting(batch)
-            for (placed, _), tokens in zip(part, encoded.to(self._kept_on, dtype), strict=True):
-                # A copy: a part of the batch would hold all of it in memory.
-                found[placed.key] = tokens.clone()
+            for (placed, _), of_image in zip(part, encoded.to(self._kept_on, dtype), strict=True):
+                tokens[placed.key] = of_image.clone()  # a view would keep the whole batch in memory
                 if placed.view.in_map:
-                    self._cache.put(placed.key, found[placed.key])
-        return found
+                    self._cache.put(placed.key, tokens[placed.key])
+        return tokens
 
     def _makes_room(self) -> bool:
-        """Hold encodings on the CPU from now on; tell whether that frees memory of the device."""
+        """Move the cache to the CPU, empty; tell whether that frees memory of the device."""
         import torch
 
         if self._kept_on.type == "cpu" or not self._cache.bytes:
             return False
-        log.warning("%s has no room for the encodings of map images any more: the CPU holds them", self._device)
+        log.warning("%s has no more room for the encodings of map images: the CPU will hold them", self._device)
         self._cache.clear()
         self._fitting.clear()
         self._kept_on = torch.device("cpu")
@@ -335,41 +330,41 @@ class NetworkPredictor:
     def _run(
         self, numbers: Sequence[int], groups: Sequence[list[PlacedView]], tokens: "Sequence[list[Tensor | str]]"
     ) -> dict[int, Prediction]:
-        """Return the predictions of a batch by number of the group."""
+        """Return the predictions of a batch, by number of the group."""
         import torch
 
         alike: dict[int, list[tuple[int, list[PlacedView], list[int], Tensor]]] = {}
         results = {}
-        for number, group, found in zip(numbers, groups, tokens, strict=True):
-            seen = [index for index, one in enumerate(found) if not isinstance(one, str)]
-            if isinstance(found[0], str):
-                results[number] = _nothing(len(group), found[0])
-            else:
-                stacked = torch.stack([one.to(self._kept_on) for one in found if not isinstance(one, str)])
-                alike.setdefault(len(seen), []).append((number, group, seen, stacked))
+        for number, group, of_group in zip(numbers, groups, tokens, strict=True):
+            if isinstance(of_group[0], str):
+                results[number] = _nothing(len(group), of_group[0])
+                continue
+            encoded = {index: one for index, one in enumerate(of_group) if not isinstance(one, str)}
+            stacked = torch.stack([one.to(self._kept_on) for one in encoded.values()])
+            alike.setdefault(len(encoded), []).append((number, group, list(encoded), stacked))
         for rows in alike.values():
-            shown = [[group[index] for index in seen] for _, group, seen, _ in rows]
+            shown = [[group[index] for index in readable] for _, group, readable, _ in rows]
             output = self._forward(torch.stack([stacked for *_, stacked in rows]), shown).numpy()
-            for (number, group, seen, _), views, values in zip(rows, shown, output, strict=True):
-                told = self._told(views[: len(values)])
-                results[number] = self._prediction(group, seen[: len(values)], values, told)
+            for (number, group, readable, _), views, values in zip(rows, shown, output, strict=True):
+                conditioned = self._conditioned(views[: len(values)])
+                results[number] = self._prediction(group, readable[: len(values)], values, conditioned)
         return results
 
-    def _told(self, views: Sequence[PlacedView]) -> NDArray[np.bool_]:
-        """Return which of the views (S,) that the network is shown it is told the poses of."""
-        return told_views(views) if self.conditioned else np.zeros(len(views), bool)
+    def _conditioned(self, views: Sequence[PlacedView]) -> NDArray[np.bool_]:
+        """Return which of the input views (S,) the network gets with their poses."""
+        return conditioned_views(views) if self.conditioned else np.zeros(len(views), bool)
 
     def _forward(self, tokens: "Tensor", groups: Sequence[Sequence[PlacedView]]) -> "Tensor":
-        """Return (B, S, 9 + 2 H W), on the CPU, of tokens (B, S, P, C); fewer views if need be."""
+        """Return outputs (B, S, 9 + 2 H W) on the CPU for tokens (B, S, P, C); S shrinks if the memory is too small."""
         import torch
 
         size = groups[0][0].size
         while True:
             views = min(tokens.shape[1], self._most_views.get(size, tokens.shape[1]))
             cameras = []
-            if any(self._told(group[:views]).any() for group in groups):
-                known = zip(*(cameras_to_tell(group[:views]) for group in groups), strict=True)
-                cameras = [torch.from_numpy(np.stack(part)) for part in known]
+            if any(self._conditioned(group[:views]).any() for group in groups):
+                poses, intrinsics = zip(*(input_cameras(group[:views]) for group in groups), strict=True)
+                cameras = [torch.from_numpy(np.stack(poses)), torch.from_numpy(np.stack(intrinsics))]
             new = Fitting(self._network(size), f"groups of {views} views", self._device)
             run = self._fitting.setdefault((views, size), new)
             try:
@@ -387,7 +382,7 @@ class NetworkPredictor:
             log.warning("going on with the first %d views of each group", self._most_views[size])
 
     def _network(self, size: Size) -> "Callable[..., Tensor]":
-        """Return the network as a function of tokens (B, S, P, C) and known cameras, if any, for images (H, W)."""
+        """Return the network as a function of tokens (B, S, P, C) and input cameras, if any, for images (H, W)."""
         import torch
 
         def run(tokens: "Tensor", *cameras: "Tensor") -> "Tensor":
@@ -399,31 +394,31 @@ class NetworkPredictor:
         return run
 
     def _prediction(
-        self, group: list[PlacedView], seen: Sequence[int], numbers: NDArray[np.float32], told: NDArray[np.bool_]
+        self, group: list[PlacedView], shown: Sequence[int], output: NDArray[np.float32], conditioned: NDArray[np.bool_]
     ) -> Prediction:
-        """Return the prediction of a group, of numbers (seen views, 9 + 2 H W)."""
+        """Convert the network output (shown views, 9 + 2 H W) to the prediction of a group."""
         poses, intrinsics = np.full((len(group), 4, 4), np.nan), np.full((len(group), 3, 3), np.nan)
         size = group[0].size
-        for index, encoding in zip(seen, numbers[:, :9].astype(np.float64), strict=True):
+        for index, encoding in zip(shown, output[:, :9].astype(np.float64), strict=True):
             if np.isfinite(encoding).all() and encoding[3:7].any():
                 cam_from_model, K = self._architecture.cameras(encoding, size)
                 model_from_turned = invert(make_pose(cam_from_model[:, :3], cam_from_model[:, 3]))
                 poses[index] = model_from_turned @ turned_from_cam(group[index].view.turns)
                 intrinsics[index] = group[index].intrinsics(K)
         map_from_image = np.stack([placed.map_from_image for placed in group])
-        conditioned = np.isin(np.arange(len(group)), np.array(seen)[told]) if told.any() else None
+        mask = np.isin(np.arange(len(group)), np.array(shown)[conditioned]) if conditioned.any() else None
         depth = [placed.turned_back(np.full(size, np.nan, np.float32)) for placed in group]
         confidence = [placed.turned_back(np.zeros(size, np.float32)) for placed in group]
-        maps = numbers[:, 9:].reshape(len(seen), 2, *size)
-        for index, (of_depth, of_confidence) in zip(seen, maps, strict=True):
+        maps = output[:, 9:].reshape(len(shown), 2, *size)
+        for index, (depth_map, confidence_map) in zip(shown, maps, strict=True):
             placed, outside = group[index], group[index].outside
-            depth[index] = placed.turned_back(np.where(outside, np.float32(np.nan), of_depth))
-            confidence[index] = placed.turned_back(np.where(outside, np.float32(np.nan), of_confidence))
-        return Prediction(poses, depth, confidence, map_from_image, intrinsics, conditioned)
+            depth[index] = placed.turned_back(np.where(outside, np.float32(np.nan), depth_map))
+            confidence[index] = placed.turned_back(np.where(outside, np.float32(np.nan), confidence_map))
+        return Prediction(poses, depth, confidence, map_from_image, intrinsics, mask)
 
 
 _loaded: dict[tuple[Any, ...], Any] = {}
-"""The network that was asked for last, if any."""
+"""The network that was loaded last, by its key; at most one."""
 
 
 def _load_network(
@@ -435,12 +430,12 @@ def _load_network(
 ) -> Any:
     """Return a network, ready to run.
 
-    The last network is kept until another is asked for: a notebook that looks into one query after a run makes a
-    predictor anew, and the weights are gigabytes.
+    The last network stays loaded: a notebook that inspects a query after a run creates a new predictor, and loading
+    gigabytes of weights again would be slow.
     """
     key = (checkpoint.resolve(), files_fingerprint([checkpoint]), architecture.name, dtype, device, compiled)
     if key not in _loaded:
-        _loaded.clear()  # before the load: the memory may hold one network, and not two
+        _loaded.clear()  # before loading, as the memory may hold only one network
         network = on_device(architecture.load(checkpoint, dtype), device, architecture.title)
         if compiled:
             _compile(network, architecture, device)
@@ -449,7 +444,7 @@ def _load_network(
 
 
 def _compile(network: Any, architecture: Architecture, device: "torch.device") -> None:
-    """Compile a network's blocks, and run them once: what does not compile says so before there are queries."""
+    """Compile the blocks of a network and run them once, so that compilation fails before the first query."""
     import torch
 
     network.compile_blocks()
@@ -457,7 +452,7 @@ def _compile(network: Any, architecture: Architecture, device: "torch.device") -
     try:
         with torch.inference_mode():
             network(torch.zeros(1, _LEAST_VIEWS, 3, side, side, device=device), ("camera",))
-    except Exception as error:  # of torch, of its compilers, and of the programs that these call
+    except Exception as error:  # torch, its compilers and the programs that they call raise anything
         raise ToolkitError(
             f"torch cannot compile {architecture.title} on {device} ({first_line(error)}). Use "
             "localize.predictor.compile: false."

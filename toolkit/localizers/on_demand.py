@@ -19,7 +19,7 @@ from toolkit.capture.cameras import rays_of
 from toolkit.features.features import KINDS, LocalFeatures
 from toolkit.features.matching import AnyMethod, PairMatches
 from toolkit.geometry import Floats, Ints
-from toolkit.localizers.base import Asked, NetworkMatches, PoseEstimate, Prior, Query, References
+from toolkit.localizers.base import NetworkMatches, PoseEstimate, Prior, Query, QueryInput, References
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.mapping import instants, match_pairs, select_pairs
 from toolkit.localizers.matches import MappedFeatures
@@ -88,7 +88,7 @@ class OnDemandLocalizer:
         self._network = Lock()
         self.image_names = posed.names
 
-    def predict(self, queries: Sequence[Asked], following: Sequence[Asked] = ()) -> list[None]:
+    def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[None]:
         """Return nothing for each query: no network is asked for cameras."""
         return [None] * len(queries)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from toolkit import geometry
 from toolkit.geometry import Floats, Ints
-from toolkit.localizers.base import CAMERA, Asked, NetworkMatches, PoseEstimate, Prior, Query, References, agree
+from toolkit.localizers.base import CAMERA, NetworkMatches, PoseEstimate, Prior, Query, QueryInput, References, agree
 from toolkit.localizers.confidence import EVIDENCE, probability_right
 from toolkit.localizers.correspondences import Correspondences, Rival
 from toolkit.localizers.matches import KnownMatches, MapMatcher, MappedFeatures, Vicinity
@@ -60,7 +60,7 @@ class PnpLocalizer:
     def image_names(self) -> list[str]:
         return self.map.image_names
 
-    def predict(self, queries: Sequence[Asked], following: Sequence[Asked] = ()) -> list[None]:
+    def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[None]:
         """Return nothing for each query: no network is asked."""
         return [None] * len(queries)
 

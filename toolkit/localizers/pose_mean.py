@@ -10,8 +10,8 @@ from toolkit import geometry
 from toolkit.geometry import Floats
 from toolkit.localizers.robust import AlignmentError, Bools, listed, rigid_poses
 
-_GATE = 3.0  # standard deviations by axis; hypotheses further from the mean are left out
-_TOO_SMALL = 2.0  # standard deviations of hypotheses are often that many times too small; the result is widened
+_GATE = 3.0  # standard deviations per axis; hypotheses further from the mean are outliers
+_TOO_SMALL = 2.0  # factor by which stated standard deviations are often too small
 
 
 @dataclass(frozen=True)
@@ -21,28 +21,28 @@ class PoseMean:
     world_from_cam: Floats
     """(4, 4)"""
     covariance: Floats
-    """(6, 6) of world_from_cam @ Exp(d), d = rotation, radians, then translation, meters, in the camera's frame;
-    infinite on the diagonal where as many hypotheses agree on another pose."""
+    """(6, 6) of d in world_from_cam @ Exp(d): rotation in radians, then translation in meters, in the camera frame.
+    Infinite on the diagonal if as many hypotheses agree on another pose."""
     inliers: Bools
     """(H,)"""
     reason: str
-    """What was left out or is unknown; empty if nothing."""
+    """What was left out or is unknown; may be empty."""
 
 
 def robust_mean_pose(world_from_cams: ArrayLike, covariances: ArrayLike) -> PoseMean:
-    """Return the robust mean of hypotheses of a pose on SE(3), and its covariance.
+    """Return the robust mean of pose hypotheses on SE(3), and its covariance.
 
-    The hypotheses count as independent. The one with the most others near it is refined by iteratively reweighted
-    least squares in its tangent space: Huber weights within the gate, 0 beyond.
+    The hypotheses are taken as independent. The start is the hypothesis closest to all of them. Iteratively reweighted
+    least squares in its tangent space refine it, with Huber weights within the gate and 0 beyond.
 
     Args:
-        world_from_cams: (H, 4, 4). Hypotheses that are not finite are left out.
-        covariances: (H, 6, 6) as `PoseMean.covariance`. A common factor widens them, never narrows them, to explain the
+        world_from_cams: (H, 4, 4); hypotheses that are not finite are left out.
+        covariances: (H, 6, 6), see `PoseMean.covariance`. A common factor of at least 1 widens them to explain the
             spread.
 
     Raises:
-        AlignmentError: no hypothesis, a wrong shape, a matrix that is not a rigid pose or a covariance that is not
-            positive definite (its index is named).
+        AlignmentError: there is no hypothesis, a shape is wrong, a matrix is not a rigid pose, or a covariance is not
+            positive definite; gives the index.
     """
     poses, finite = rigid_poses(world_from_cams, "world_from_cams")
     usable = np.flatnonzero(finite)
@@ -66,10 +66,10 @@ def _mean(poses: Floats, information: Floats) -> tuple[Floats, Floats, Bools]:
     """Return the mean (4, 4) of poses (H, 4, 4), its covariance (6, 6) and which hypotheses are inliers (H,)."""
 
     def distances(errors: Floats) -> Floats:
-        """Return distances (H,), 1 for one standard deviation along one axis, of errors (H, 6)."""
+        """Return distances (H,) in standard deviations per axis of errors (H, 6)."""
         return np.sqrt(np.einsum("hi,hij,hj->h", errors, information, errors) / 6 / _TOO_SMALL**2)
 
-    # The geodesic median among the hypotheses; all beyond the gate count as equally far.
+    # The geodesic median among the hypotheses; distances beyond the gate count as equal.
     costs = [np.minimum(distances(_log(geometry.invert(start) @ poses)), _GATE).sum() for start in poses]
     mean = poses[int(np.argmax(np.array(costs) < min(costs) + 1e-12))]
     for _ in range(30):
@@ -90,7 +90,7 @@ def _mean(poses: Floats, information: Floats) -> tuple[Floats, Floats, Bools]:
 
 
 def _log(poses: Floats) -> Floats:
-    """Return rotation vectors and translations (H, 6) of small poses: SO(3) x R^3, the same to first order."""
+    """Return rotation vectors and translations (H, 6) of small poses: SO(3) x R^3, equal to SE(3) to first order."""
     return np.hstack([Rotation.from_matrix(poses[:, :3, :3]).as_rotvec(), poses[:, :3, 3]])
 
 

@@ -1,4 +1,4 @@
-"""What a network says about a few views, and the interface between networks and localizers."""
+"""The output of a feed-forward network for a group of views, and the interface that localizers use."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,35 +11,35 @@ from toolkit.geometry import Floats
 from toolkit.localizers.base import View
 
 LOW_CONFIDENCE = 0.2
-"""Share of a view's depths, the least confident, that are not used."""
+"""Share of the depths of a view, the least confident ones, that are not used."""
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """Cameras and depth of the S views of one group, in a frame and a unit of its own, `model`."""
+    """Cameras and depth of the S views of one group, in a frame `model` with an arbitrary unit."""
 
     model_from_cams: Floats
-    """(S, 4, 4)."""
+    """(S, 4, 4); NaN where unknown."""
     depth: Sequence[NDArray[np.float32]] | NDArray[np.float32] | None = None
     """S arrays (h, w) along the optical axis, in units of the model; NaN where unknown."""
     depth_conf: Sequence[NDArray[np.float32]] | NDArray[np.float32] | None = None
-    """S arrays (h, w), larger is surer."""
+    """S arrays (h, w), larger is more confident."""
     map_from_image: Floats | None = None
-    """(S, 4) scale_x, scale_y, offset_x, offset_y of each view, from pixels of the photograph to those of the depth
+    """(S, 4) scale_x, scale_y, offset_x, offset_y of each view, from pixels of the photograph to pixels of the depth
     map; the center of the top-left pixel is (0.5, 0.5) in both."""
     intrinsics: Floats | None = None
-    """(S, 3, 3) K, pixels of the photographs; NaN where unknown."""
+    """(S, 3, 3) K in pixels of the photographs; NaN where unknown."""
     conditioned: NDArray[np.bool_] | None = None
-    """(S,) views whose poses the network was told. Those agree with the map by construction and confirm nothing: only
-    the others are aligned to it. None: it was told none."""
+    """(S,) views whose map poses were inputs of the network. Their predicted poses agree with the map by construction,
+    so only the other views are aligned to it. None: no pose was an input."""
     reason: str = ""
-    """Why there are no cameras, where that is known."""
+    """Why the cameras are missing, if known."""
 
     def depth_at(self, view: int, xy: ArrayLike) -> Floats:
         """Return the depth (N,), in units of the model, at pixels (N, 2) of the photograph.
 
-        Between pixels it is interpolated. NaN outside of the map, where one of the four neighbors is unknown or not
-        positive, and where the nearest is among the least confident of the view (`LOW_CONFIDENCE`).
+        The depth is bilinearly interpolated. It is NaN outside the depth map, if one of the four neighbors is unknown
+        or not positive, and if the nearest one is among the least confident of the view (`LOW_CONFIDENCE`).
         """
         pixels = np.asarray(xy, np.float64).reshape(-1, 2)
         if self.depth is None or self.map_from_image is None:
@@ -54,28 +54,29 @@ class Prediction:
         (x, y), (x0, y0), (x1, y1) = (at - low).T, low.T, high.T
         upper = depth[y0, x0] * (1 - x) + depth[y0, x1] * x
         lower = depth[y1, x0] * (1 - x) + depth[y1, x1] * x
-        found = np.where(inside, upper * (1 - y) + lower * y, np.nan)
+        interpolated = np.where(inside, upper * (1 - y) + lower * y, np.nan)
         if self.depth_conf is not None:
             confidence = self.depth_conf[view]
             column, row = np.rint(at).astype(np.int64).T
-            found[confidence[row, column] < np.nanquantile(confidence, LOW_CONFIDENCE)] = np.nan
-        return found
+            interpolated[confidence[row, column] < np.nanquantile(confidence, LOW_CONFIDENCE)] = np.nan
+        return interpolated
 
 
 class Predictor(Protocol):
-    """What the localizers need of a network, or of what stands in for one."""
+    """A network that predicts cameras, or its simulation."""
 
     name: str
     simulated: bool
-    """Whether it looks up the answers; what it takes part in is no result, and is labeled."""
+    """Whether it looks up the ground truth. Poses that depend on it are labeled and are no results."""
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What the predictions depend on besides the views; part of the poses' fingerprint."""
+        """Everything besides the views that the predictions depend on; part of the fingerprint of the poses."""
 
     def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
         """Return a prediction for each group of views; groups do not influence each other.
 
         Args:
-            following: groups that the next call is likely to have; their images may be read meanwhile.
+            groups: each holds the query view first, then its references.
+            following: probable groups of the next call; their images may be read in the meantime.
         """

@@ -1,4 +1,4 @@
-"""The predictors by name."""
+"""Open a predictor by name."""
 
 import logging
 from pathlib import Path
@@ -14,22 +14,22 @@ log = logging.getLogger(__name__)
 
 
 def open_predictor(settings: LocalizeSettings, capture: Capture, map_dir: Path) -> Predictor:
-    """Return what predicts cameras; warn of one that looks up the answers.
+    """Return the predictor of the settings. Warn about the simulated one, which uses the ground truth.
 
     Raises:
-        ManifestError: no such device or precision.
-        WeightsError: no weights; says what to do.
+        ManifestError: the device or the precision does not exist.
+        WeightsError: the weights are missing; the message says how to get them.
     """
-    asked = settings.predictor
-    if asked.name != "simulated":
+    predictor = settings.predictor
+    if predictor.name != "simulated":
         return NetworkPredictor(
-            asked.checkpoint,
+            predictor.checkpoint,
             settings.compute_device,
             settings.dtype_compute,
-            architecture=ARCHITECTURES[asked.name],
-            compile=asked.compile,
-            conditioned=asked.conditioned,
+            architecture=ARCHITECTURES[predictor.name],
+            compile=predictor.compile,
+            conditioned=predictor.conditioned,
         )
-    log.warning("predictor: simulated looks up the true poses of the queries. What comes out is no result.")
+    log.warning("predictor: simulated looks up the true poses of the queries. Its poses are no results.")
     sessions = [*capture.usable("map"), *capture.usable("query")]
     return SimulatedPredictor(sessions, map_dir, settings.features.kinds[0], seed=settings.seed)

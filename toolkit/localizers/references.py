@@ -1,7 +1,7 @@
-"""Which of the retrieved map images a network is shown beside the query.
+"""Choose the retrieved map images that a network gets together with the query.
 
-The most similar are often near-duplicates of each other: they say the same twice, and have no baseline that scale
-could be measured by. Their map poses are known, so they are chosen for what they add.
+The most similar ones are often near-duplicates: they add no information, and without a baseline they give no scale.
+The map poses are known, so the choice considers covisibility and baselines too.
 """
 
 from collections.abc import Sequence
@@ -14,11 +14,11 @@ from toolkit import geometry
 from toolkit.capture.cameras import in_view, view_bounds
 from toolkit.geometry import Floats, Ints
 
-WIDE_BASELINE = 0.25  # of the depth; wider adds nothing
-NEAR_DUPLICATE = 0.03  # of the depth
-LEAST_SIMILARITY = 0.25  # what the worst candidate's score counts, of the best one's
-ALL_SHARED = 50  # points that two images share from which on they count as seeing the same
-_LAST = 1e-3  # factor for what comes last: a near-duplicate, or an image that shares no view
+WIDE_BASELINE = 0.25  # baseline over depth; a wider one counts no more
+NEAR_DUPLICATE = 0.03  # baseline over depth; below, two images are near-duplicates
+LEAST_SIMILARITY = 0.25  # similarity of the worst candidate, where that of the best one is 1
+ALL_SHARED = 50  # shared points from which two images count as fully covisible
+_LAST = 1e-3  # factor that puts near-duplicates and images without shared view last
 
 
 def select_references(
@@ -29,24 +29,24 @@ def select_references(
     shared_points: ArrayLike | None = None,
     depth_m: float = 5.0,
 ) -> Ints:
-    """Choose references that are similar to the query, see what each other see, and stand apart.
+    """Choose references that are similar to the query, covisible, and apart from each other.
 
-    Greedy. The first is the best score, unless it alone shares no view with any other. Then, each time, the largest
-    product of similarity, view shared with those chosen, and baseline to the nearest chosen. Near-duplicates come
-    after all others, and so do images that share no view with those chosen.
+    The choice is greedy. The first reference has the best score; if other candidates share views, it must share one
+    too. Each next reference maximizes the product of its similarity, the view it shares with those chosen, and its
+    baseline to the nearest of them. Near-duplicates and images without shared view come last.
 
     Args:
         scores: (N,) similarities, higher is better.
         world_from_cams: (N, 4, 4) map poses.
-        k: how many.
-        cameras: N, for what they see of points laid at half, once and twice the depth.
-        shared_points: (N, N) triangulated points that two images both see, where known: overlapping frusta do not
-            tell of a wall between.
+        k: number of references to choose.
+        cameras: N cameras. Their views are compared by points at half, once and twice the depth.
+        shared_points: (N, N) number of triangulated points that both images observe, if known. Overlapping frusta
+            alone do not reveal a wall in between.
         depth_m: typical depth of the scene, meters.
 
     Returns:
-        At most k indices in order of choice; candidates whose pose or score is not finite are never chosen. Equal
-        candidates are taken in their order.
+        At most k indices in order of choice. A candidate whose pose or score is not finite is never chosen. Ties go to
+        the earlier candidate.
     """
     score = np.asarray(scores, np.float64).reshape(-1)
     poses = np.asarray(world_from_cams, np.float64).reshape(-1, 4, 4)
@@ -78,7 +78,7 @@ def select_references(
 
 
 def _shared_view(world_from_cams: Floats, cameras: Sequence[pycolmap.Camera], depth_m: float) -> Floats:
-    """Return the share (N, N) of what one camera sees that the other sees too, the mean of both directions."""
+    """Return the share (N, N) of one camera's view that the other sees too, averaged over both directions."""
     bounds = np.stack([view_bounds(camera) for camera in cameras])
     steps = np.linspace(0.1, 0.9, 5)
     x = bounds[:, :1] + steps * (bounds[:, 1:2] - bounds[:, :1])

@@ -1,4 +1,4 @@
-"""What robust estimates of poses share: checked input, the prior of the noise, the nearest rotation."""
+"""Common parts of robust pose estimation: input checks, the noise prior, the nearest rotation."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -8,19 +8,24 @@ from toolkit.geometry import Floats
 
 Bools = NDArray[np.bool_]
 
-NOISE_FACTOR = np.log(2.5)  # standard deviation of the prior of a noise, in its logarithm
-_LEVELS = np.exp(np.linspace(-3.5, 3.5, 29))  # noise over its expected size, to integrate over
+NOISE_FACTOR = np.log(2.5)  # standard deviation of the log-normal prior of the noise, as a logarithm
+_LEVELS = np.exp(np.linspace(-3.5, 3.5, 29))  # ratios of actual to expected noise, integrated over
 
 
 class AlignmentError(ToolkitError):
-    """Cameras, weights or depth ratios that cannot be what they should be."""
+    """Invalid poses, weights or depth ratios."""
 
 
 def noise_variance(squares: ArrayLike, free: ArrayLike, expected: float) -> Floats:
-    """Return the mean of the variance by axis, (...), given sums of squared residuals and their degrees of freedom.
+    """Return the posterior mean of the noise variance per axis, (...).
 
-    The prior of the noise is log-normal about `expected`, within a factor of exp(NOISE_FACTOR). The result is the mean,
-    not the most likely variance, because the variance of an estimate is proportional to it.
+    It is the mean and not the mode, as the variance of an estimate is proportional to it.
+
+    Args:
+        squares: (...) sums of squared residuals.
+        free: (...) their degrees of freedom.
+        expected: standard deviation of the noise around which its prior is log-normal, within a factor of
+            exp(NOISE_FACTOR).
     """
     squares, free = np.asarray(squares)[..., None], np.asarray(free)[..., None]
     logs = np.log(_LEVELS)
@@ -30,10 +35,7 @@ def noise_variance(squares: ArrayLike, free: ArrayLike, expected: float) -> Floa
 
 
 def nearest_rotation(matrices: Floats, keep: Floats | None = None) -> Floats:
-    """Return the rotations (K, 3, 3) with the largest trace of their transpose times the matrices (Umeyama 1991).
-
-    `keep` is returned where a matrix is zero.
-    """
+    """Return rotations R (K, 3, 3) that maximize trace(R^T M) for matrices M (Umeyama 1991); `keep` where M is 0."""
     U, values, Vt = np.linalg.svd(matrices)
     U[..., :, 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
     rotations = U @ Vt
@@ -43,10 +45,10 @@ def nearest_rotation(matrices: Floats, keep: Floats | None = None) -> Floats:
 
 
 def rigid_poses(poses: ArrayLike, name: str) -> tuple[Floats, Bools]:
-    """Return poses (M, 4, 4) with their rotations made exact, and which are finite; the others are identities.
+    """Return poses (M, 4, 4) with exact rotations, and which of them are finite; the other ones become identities.
 
     Raises:
-        AlignmentError: a wrong shape, or a finite matrix that is not a rigid pose; says which by `name` and index.
+        AlignmentError: a wrong shape, or a finite matrix that is not a rigid pose; gives `name` and the index.
     """
     matrices = np.array(poses, np.float64)
     if matrices.size == 0 and matrices.shape[:1] == (0,):
@@ -63,24 +65,24 @@ def rigid_poses(poses: ArrayLike, name: str) -> tuple[Floats, Bools]:
         mirrored = np.linalg.det(R[bad[0]]) < 0
         what = "is mirrored (determinant below 0)" if mirrored else "is not a rotation and a translation"
         raise AlignmentError(
-            f"{name}[{bad[0]}] {what}: expected a rigid pose, its rotation orthonormal to 1e-3. "
-            "A scale or a flip of axes has to be taken out before."
+            f"{name}[{bad[0]}] {what}: expected a rigid pose with a rotation orthonormal to 1e-3. "
+            "Remove a scale or a flip of axes first."
         )
     matrices[:, :3, :3] = nearest_rotation(R)
     return matrices, finite
 
 
 def checked_weights(weights: ArrayLike | None, count: int) -> Floats:
-    """Return weights (count,), all 1 where there are none.
+    """Return weights (count,), all 1 for None.
 
     Raises:
-        AlignmentError: a wrong shape, or one that is negative or not finite.
+        AlignmentError: a wrong shape, or a weight that is negative or not finite.
     """
     if weights is None:
         return np.ones(count)
     values = np.asarray(weights, np.float64)
     if values.shape != (count,):
-        raise AlignmentError(f"weights has shape {values.shape}: expected ({count},), one a camera.")
+        raise AlignmentError(f"weights has shape {values.shape}: expected ({count},), one per camera.")
     bad = np.flatnonzero(~np.isfinite(values) | (values < 0))
     if len(bad):
         raise AlignmentError(f"weights[{bad[0]}] is {values[bad[0]]}: expected a finite number, 0 or more.")
@@ -88,5 +90,5 @@ def checked_weights(weights: ArrayLike | None, count: int) -> Floats:
 
 
 def listed(chosen: Bools) -> str:
-    """Return the indices that are chosen, as a message lists them."""
+    """Return the chosen indices as text for a message."""
     return ", ".join(str(index) for index in np.flatnonzero(chosen))

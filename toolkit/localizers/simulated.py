@@ -1,7 +1,7 @@
-"""A stand-in for a network, for tests and for trying things out without weights: it looks up the true cameras.
+"""A simulated network for tests and for trials without weights: it looks up the ground truth.
 
-Poses come from the capture's ground truth and depth from triangulated map points, else from the capture's depth maps;
-both are put under a random similarity, with noise. What it takes part in says nothing about any network, and is
+Poses come from the ground truth of the capture, depth from triangulated map points, else from the depth maps of the
+capture. Both get noise and a random similarity. Results that depend on it say nothing about a real network and are
 labeled `simulated` everywhere.
 """
 
@@ -29,18 +29,18 @@ from toolkit.localizers.base import View
 from toolkit.localizers.local_map import LocalMap, map_path
 from toolkit.localizers.prediction import Prediction
 
-_GRID = 96  # pixels of the longer side of a depth map
-_NEAREST = 5  # points whose depth a pixel has; some triangulated points are wrong
-_FEW_POINTS = 20  # with fewer, a map image's depth maps are asked
+_GRID = 96  # longer side of a depth map, pixels
+_NEAREST = 5  # points whose median depth a pixel gets, as some triangulated points are wrong
+_FEW_POINTS = 20  # with fewer triangulated points, the depth maps of a map image are used
 _KEPT = 256  # depth maps of map images kept in memory
 
 
 class SimulatedPredictor:
-    """Ground truth under a random similarity for each group, with noise.
+    """Predicts the ground truth with noise, under a random similarity per group.
 
-    A group's prediction depends on the seed and the names in the group alone: not on their order, on other groups, or
-    on threads. Depth is, at each pixel of a small map, the median of those of the triangulated points seen nearest, or
-    of points of the capture's depth maps where there are few.
+    A prediction depends only on the seed and on the names in the group, not on their order, other groups or threads.
+    The depth at a pixel of the small depth map is the median over the nearest projected points: triangulated ones, or
+    points from the capture's depth maps if there are few.
     """
 
     name = "simulated"
@@ -60,13 +60,14 @@ class SimulatedPredictor:
     ) -> None:
         """
         Args:
-            sessions: those that the views are of, with ground truth.
-            map_dir: folder of triangulated maps; None, or none of a session: no depth.
-            features: kind of local features that they are triangulated from.
-            rotation_noise_deg: standard deviation of a camera's rotation, as an angle.
-            position_noise_m: standard deviation of a camera's place, as a length.
-            depth_noise: relative standard deviation of each pixel's depth.
-            wrong_references: share of the map images that are put anywhere, looking anywhere.
+            sessions: sessions of the views, with ground truth.
+            map_dir: folder of triangulated maps. Without it, or without a map of a session, there is no depth.
+            features: kind of local features that the maps are triangulated from.
+            rotation_noise_deg: standard deviation of the rotation of a camera, as an angle.
+            position_noise_m: standard deviation of the position of a camera, as a length.
+            depth_noise: relative standard deviation of the depth of each pixel.
+            wrong_references: share of map images that get a random position and orientation.
+            seed: seed of all random numbers.
         """
         self._sessions = {session.id: session for session in sessions}
         self._map_dir = None if map_dir is None else Path(map_dir)
@@ -103,7 +104,7 @@ class SimulatedPredictor:
         """Return a prediction for each group of views.
 
         Raises:
-            CaptureError: the true pose of a view is not known.
+            CaptureError: the true pose of a view is unknown.
         """
         return [self._predict(list(group)) for group in groups]
 
@@ -116,7 +117,7 @@ class SimulatedPredictor:
         for view in group:
             if view.name not in self._truth or not np.isfinite(self._truth[view.name]).all():
                 raise CaptureError(
-                    f"The simulated predictor has no true pose of {view.name}: it works only where "
+                    f"The simulated predictor has no true pose of {view.name}: it works only if "
                     "queries have ground truth in proc/alignment_trajectories.txt. Use another predictor or method."
                 )
         true = np.stack([self._truth[view.name] for view in group])
@@ -144,24 +145,25 @@ class SimulatedPredictor:
     def _depth(self, view: View, group: list[View], names: list[str], grid: Ints) -> Floats:
         key = f"{view.name} {grid}"
         with self._lock:
-            kept = self._depths.get(key) if view.in_map else None
-        if kept is None:
+            depth = self._depths.get(key) if view.in_map else None
+        if depth is None:
             points = self._points(view) if view.in_map else np.concatenate([self._points(v) for v in group])
-            kept = _nearest_depth(points, view, self._truth[view.name], grid)
+            depth = _nearest_depth(points, view, self._truth[view.name], grid)
             with self._lock:
-                if view.in_map:  # the depth of others depends on the group
-                    self._depths[key] = kept
+                if view.in_map:  # the depth of a query depends on its group
+                    self._depths[key] = depth
                 if len(self._depths) > _KEPT:
                     self._depths.popitem(last=False)
-        return kept * (1 + self._noise["depth_noise"] * self._random(names, view.name, "depth").normal(size=kept.shape))
+        noise = self._random(names, view.name, "depth").normal(size=depth.shape)
+        return depth * (1 + self._noise["depth_noise"] * noise)
 
     def _points(self, view: View) -> Floats:
-        """Return points (P, 3) that a map image sees, of the map, else of its depth maps; none of another image."""
+        """Return world points (P, 3) that a map image observes, else of its depth maps; none for a query image."""
         session = session_id(view.name.split("/", 1)[0])
-        found = self._map(session) if view.in_map else None
-        if found is None or view.name not in found.index_of:
+        local_map = self._map(session) if view.in_map else None
+        if local_map is None or view.name not in local_map.index_of:
             return np.zeros((0, 3))
-        points = found.points[np.unique(found.observations(found.index_of[view.name])[1])]
+        points = local_map.points[np.unique(local_map.observations(local_map.index_of[view.name])[1])]
         if len(points) >= _FEW_POINTS:
             return points
         seen = self._depth_maps[session].of(self._rows[view.name])
@@ -179,16 +181,16 @@ class SimulatedPredictor:
 
 
 def _nearest_depth(points: Floats, view: View, world_from_cam: Floats, grid: Ints) -> Floats:
-    """Return depth in meters, (h, w), the median of the points nearest to each pixel of a grid; NaN without points."""
+    """Return depth (h, w) in meters, the median over the projections nearest to each pixel; NaN without points."""
     in_cam = geometry.transform(geometry.invert(world_from_cam), points)
     in_cam = in_cam[in_view(in_cam[None], view_bounds(view.camera)[None])[0]] if len(in_cam) else in_cam
     if not len(in_cam):
         return np.full(grid[::-1], np.nan)
     pixels = np.asarray(view.camera.img_from_cam(in_cam)) * grid / [view.camera.width, view.camera.height]
-    kept = np.isfinite(pixels).all(axis=1)
+    finite = np.isfinite(pixels).all(axis=1)
     x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in grid))
-    if not kept.any():
+    if not finite.any():
         return np.full(x.shape, np.nan)
-    count = min(_NEAREST, int(kept.sum()))
-    _, nearest = KDTree(pixels[kept]).query(np.stack([x, y], -1).reshape(-1, 2), k=np.arange(1, count + 1))
-    return np.asarray(np.median(in_cam[kept, 2][nearest], axis=1)).reshape(x.shape)
+    count = min(_NEAREST, int(finite.sum()))
+    _, nearest = KDTree(pixels[finite]).query(np.stack([x, y], -1).reshape(-1, 2), k=np.arange(1, count + 1))
+    return np.asarray(np.median(in_cam[finite, 2][nearest], axis=1)).reshape(x.shape)

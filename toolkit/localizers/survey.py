@@ -1,8 +1,8 @@
-"""Whether the poses of a map are those of its images, and how far away the scene is: from matches made without poses.
+"""Check the poses of a map against its images, and measure the depth of the scene, with matches made without poses.
 
-A sample of image pairs is matched and verified by the essential matrix alone. Poses that are right put most of these
-matches on their epipolar lines, in front of both cameras. Where they do not, the usual mistakes are tried: another
-direction of the poses, other axes of the cameras or of the positions, mirrored ones, another order of the quaternions.
+A sample of image pairs is matched and verified by the essential matrix alone. Correct poses put most of these matches
+on their epipolar lines, in front of both cameras. If they do not, common mistakes are tried: inverted poses, other or
+mirrored axes of the cameras or of the positions, another order of the quaternions.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -27,38 +27,37 @@ from toolkit.localizers.local_map import OPENGL_AXES, Consistency, LocalMap
 from toolkit.manifest import RerankSettings
 
 ANCHORS = 12
-"""Images whose neighbors are matched, evenly spread over the map."""
+"""Number of images, evenly spread over the map, that are matched with their neighbors."""
 MAX_FEATURES = 1024
-"""Features of an image that are matched, the strongest."""
+"""Number of features that are matched per image, the strongest ones."""
 LEAST_MATCHES = 24
-"""Verified matches of a pair that tells something: few wrong pairs of look-alikes have as many."""
+"""Fewest verified matches of a pair that counts; few pairs of different places that look alike have as many."""
 LEAST_PAIRS = 5
-"""Pairs that tell something of a whole map, at least."""
+"""Fewest verified pairs for a verdict on a map."""
 MAX_ERROR_DEG = 1.0
-"""Largest angle, in the median, between the rays of a pair's matches and the planes in which the poses put them. Good
-poses have some hundredths; another convention has tens."""
+"""Largest median angle between the rays of a pair's matches and their epipolar planes. Good poses have some hundredths
+of a degree, poses in another convention tens of degrees."""
 LEAST_PARALLAX_DEG = 0.5
-"""Rays that are more parallel do not tell whether their point is in front of the cameras."""
+"""Least angle between two rays that tells whether their point is in front of the cameras."""
 MAX_ROTATION_ERROR_DEG = 5.0
-"""Largest difference, in the median, of relative rotations from those of the matches, under a convention that fits."""
+"""Largest median difference between the relative rotations of poses and matches under a convention that fits."""
 MOST_TRIED = 12
-"""Pairs, those with the most matches, that conventions are tried with."""
+"""Number of pairs that conventions are tried with, those with the most matches."""
 CLEAR = 0.75
-"""With as many of them that agree, no further convention is tried."""
+"""Share of agreeing pairs from which no further convention is tried."""
 COARSE_DEG = 3.0
-"""Poses that are right, but coarse, have smaller errors."""
+"""Largest median error of correct but coarse poses."""
 NOISE = 20.0
-"""An image's poses are wrong from so many times the usual error on, but not below 0.3 degrees."""
+"""Error of an image, in multiples of the median error, from which its pose is wrong; but at least 0.3 degrees."""
 WEAK = 0.3
-"""Images with less than this share of the median image's support in the map are looked at one by one ..."""
+"""Images with less than this share of the median number of shared points are checked individually."""
 MOST_WEAK = 8
-"""... at most so many, the weakest: what a survey takes does not grow with the map."""
-
+"""Largest number of images that are checked individually, so that the effort does not grow with the map."""
 
 NOMINAL_DEPTH = 10.0
-"""What the median depth of a map is to localizers where the unit of its poses is not known."""
+"""Median depth to which a map with poses of unknown unit is scaled for the localizers."""
 USUAL_DEPTHS_M = (2.0, 16.0)
-"""Limits of the median depth between which the limits of localizers, in meters, hold as they are."""
+"""Range of median depths for which the limits of the localizers, in meters, apply unchanged."""
 
 
 class SurveyedImages(NamedTuple):
@@ -67,13 +66,13 @@ class SurveyedImages(NamedTuple):
     names: Sequence[str]
     cameras: Sequence[pycolmap.Camera]
     world_from_rigs: Floats
-    """(N, 4, 4)."""
+    """(N, 4, 4)"""
     rig_from_cams: Floats
-    """(N, 4, 4)."""
+    """(N, 4, 4)"""
     instants: Ints
-    """(N,) images that one rig took at one instant have the same number."""
+    """(N,) number of the instant; images that a rig took at the same time share it."""
     sensors: Sequence[str]
-    """(N,)."""
+    """(N,) sensor ids."""
 
     @property
     def world_from_cams(self) -> Floats:
@@ -81,40 +80,41 @@ class SurveyedImages(NamedTuple):
 
 
 class VerifiedPair(NamedTuple):
-    """Two images with the matches that one essential matrix explains."""
+    """Two images and their matches that agree with one essential matrix."""
 
     i: int
     j: int
     rays_i: Floats
-    """(K, 3) unit rays in the camera's frame."""
+    """(K, 3) unit rays in the frame of camera i."""
     rays_j: Floats
+    """(K, 3) unit rays in the frame of camera j."""
     j_from_i: Floats
-    """(4, 4) the relative pose that the matches alone give; the translation has length 1."""
+    """(4, 4) relative pose from the matches alone; the translation has length 1."""
 
 
 class Survey:
-    """Matches a sample of a map's images without their poses, and compares."""
+    """Matches a sample of the map images without their poses, and compares the matches with the poses."""
 
     def __init__(
         self, images: SurveyedImages, load: Callable[[int], LocalFeatures], min_score: float, ratio: float = 0.8
     ):
         """
         Args:
-            images: all of the map.
-            load: returns the features of one, by index.
-            min_score, ratio: of matches of their descriptors.
+            images: all images of the map.
+            load: returns the features of an image, by index.
+            min_score, ratio: limits of descriptor matching, see `MutualMatcher`.
         """
         self.images = images
         self._matcher = MutualMatcher(ratio, min_score)
         self._load = lru_cache(maxsize=64)(lambda index: load(index).take(slice(MAX_FEATURES)))
         self._verified = lru_cache(maxsize=None)(self._verify)
         self.sample = self.verify(_sampled_pairs(images))
-        """Pairs all over the map."""
+        """Verified pairs all over the map."""
 
     def verify(self, pairs: Iterable[tuple[int, int]]) -> list[VerifiedPair]:
-        """Return those of some pairs of images that show the same, by their matches alone."""
-        found = (self._verified(min(pair), max(pair)) for pair in dict.fromkeys(pairs))
-        return [pair for pair in found if pair is not None]
+        """Return the covisible ones of pairs of images, by their matches alone."""
+        verified = (self._verified(min(pair), max(pair)) for pair in dict.fromkeys(pairs))
+        return [pair for pair in verified if pair is not None]
 
     def _verify(self, i: int, j: int) -> VerifiedPair | None:
         a, b = self._load(i), self._load(j)
@@ -130,104 +130,104 @@ class Survey:
         return VerifiedPair(i, j, *rays, geometry.make_pose(rotation, np.ravel(translation)))
 
     def typical_depth(self) -> float:
-        """Return the median depth of what the sample shows, by the poses, in their unit; NaN where there is none."""
+        """Return the median depth of matches triangulated with the poses, in their unit; NaN with too few matches."""
         poses = self.images.world_from_cams
-        depths = [np.zeros(0)]
+        per_pair = [np.zeros(0)]
         for pair in self.sample:
             error_deg, depth_i, depth_j, parallax_deg = _compare(pair, _relative(poses, pair))
             good = (error_deg < MAX_ERROR_DEG) & (parallax_deg > 2 * LEAST_PARALLAX_DEG) & (depth_i > 0) & (depth_j > 0)
-            depths += [depth_i[good], depth_j[good]]
-        every = np.concatenate(depths)
-        return float(np.median(every)) if len(every) >= LEAST_MATCHES else float("nan")
+            per_pair += [depth_i[good], depth_j[good]]
+        depths = np.concatenate(per_pair)
+        return float(np.median(depths)) if len(depths) >= LEAST_MATCHES else float("nan")
 
     def length(self, metric: bool) -> float:
-        """Return what localizers should take as a meter, in the unit of the poses.
+        """Return the length, in the unit of the poses, that localizers should treat as one meter.
 
         Args:
-            metric: the unit is the meter; then it is 1 but for scenes that are very near or very far.
+            metric: whether the unit is the meter; the length is then 1, except for very near or very far scenes.
         """
         depth = self.typical_depth()
         if metric:
             return 1.0 if np.isnan(depth) else float(depth / np.clip(depth, *USUAL_DEPTHS_M))
-        if np.isnan(depth):  # as if neighbors stood a tenth of the depth apart
+        if np.isnan(depth):  # assume that neighbors are a tenth of the depth apart
             centers = self.images.world_from_cams[:, :3, 3]
             depth = 10 * float(np.median(KDTree(centers).query(centers, k=2)[0][:, 1])) if len(centers) > 1 else 0.0
         return depth / NOMINAL_DEPTH or 1.0
 
     def consistency(self, local_map: LocalMap) -> Consistency:
-        """Judge the poses.
+        """Judge the poses of the map.
 
         Args:
-            local_map: what was triangulated with them; its images are those of the survey.
+            local_map: the map triangulated with the poses; it has the same images as the survey.
         """
         lengths = np.diff(local_map.point_starts)
         three = float((lengths >= 3).mean()) if len(lengths) else 0.0
         agree = _agreeing(self.images.world_from_cams, self.sample)
-        known = Consistency(pairs=len(agree), agreeing=int(agree.sum()), seen_by_three=round(three, 4))
+        result = Consistency(pairs=len(agree), agreeing=int(agree.sum()), seen_by_three=round(three, 4))
         if len(agree) < LEAST_PAIRS:
-            return known
+            return result
         share = float(agree.mean())
         if share < CLEAR:
             fits = _fitting_convention(self.images, self.sample, share)
-            # Without another convention that is better, the poses may just be coarse.
+            # If no convention fits better, the poses may just be coarse.
             if fits or (share < 0.5 and np.median(self._errors_deg(self.sample)) > COARSE_DEG):
-                return replace(known, verdict="inconsistent", fits=fits)
-        return replace(known, verdict="consistent", wrong=self._wrong_images(local_map))
+                return replace(result, verdict="inconsistent", fits=fits)
+        return replace(result, verdict="consistent", wrong=self._wrong_images(local_map))
 
     def _errors_deg(self, pairs: Sequence[VerifiedPair]) -> list[float]:
-        """Return the median angle of each pair's matches to their epipolar planes."""
+        """Return, per pair, the median angle between matches and their epipolar planes."""
         poses = self.images.world_from_cams
         return [float(np.median(_compare(pair, _relative(poses, pair))[0])) for pair in pairs]
 
     def _wrong_images(self, local_map: LocalMap) -> list[str]:
-        """Return the images that have hardly a part in the map, and whose matches contradict their poses."""
+        """Return the names of images with few points in the map whose matches contradict their poses."""
         poses = self.images.world_from_cams
         support = local_map.images_seeing(np.flatnonzero(np.diff(local_map.point_starts) >= 3))
         weak = np.flatnonzero(support < WEAK * np.median(support))
         suspects = weak[np.argsort(support[weak], kind="stable")][:MOST_WEAK].tolist()
-        pairs = self.verify((index, other) for index in suspects for other in self._likely(index))
-        usual = float(np.median(self._errors_deg(self.sample)))
-        agree = _agreeing(poses, pairs, float(np.clip(NOISE * usual, 0.3, MAX_ERROR_DEG)))
-        # With many matches of a pair, look-alikes are improbable.
+        pairs = self.verify((index, other) for index in suspects for other in self._candidates(index))
+        usual_deg = float(np.median(self._errors_deg(self.sample)))
+        agree = _agreeing(poses, pairs, float(np.clip(NOISE * usual_deg, 0.3, MAX_ERROR_DEG)))
+        # Pairs vote with their number of matches, as many matches between different places are improbable.
         votes = [(pair.i, pair.j, len(pair.rays_i), good) for pair, good in zip(pairs, agree, strict=True)]
         wrong: set[int] = set()
-        # The worst first: that an image contradicts it is no sign against that image.
+        # The worst image is taken first, and its pairs no longer count against the other images.
         while True:
             balance = {}
             for index in set(suspects) - wrong:
-                of = [(count, good) for i, j, count, good in votes if index in (i, j) and not {i, j} & wrong]
-                against = [count for count, good in of if not good]
-                in_favor = sum(count for count, good in of if good)
+                own = [(count, good) for i, j, count, good in votes if index in (i, j) and not {i, j} & wrong]
+                against = [count for count, good in own if not good]
+                in_favor = sum(count for count, good in own if good)
                 if len(against) >= 2 and sum(against) > max(4 * in_favor, 4 * LEAST_MATCHES):
                     balance[index] = sum(against) - in_favor
             if not balance:
                 return sorted(self.images.names[index] for index in wrong)
             wrong.add(max(balance, key=lambda index: (balance[index], -index)))
 
-    def _likely(self, index: int) -> list[int]:
-        """Return images that may show the same as one whose pose is in doubt: those before and after it, near it, and
-        some of all."""
+    def _candidates(self, index: int) -> list[int]:
+        """Return images that may be covisible with one of doubtful pose: neighbors in time and space, and a sample."""
         n, instants = len(self.images.names), self.images.instants
         centers = self.images.world_from_cams[:, :3, 3]
         near = np.argsort(np.linalg.norm(centers - centers[index], axis=1), kind="stable")[:6]
-        about = index + np.array([-3, -2, -1, 1, 2, 3])
+        in_time = index + np.array([-3, -2, -1, 1, 2, 3])
         spread = np.linspace(0, n - 1, 8).astype(np.int64)
-        every = dict.fromkeys(np.concatenate([about[(about >= 0) & (about < n)], near, spread]).tolist())
-        return [other for other in every if instants[other] != instants[index]]
+        images = dict.fromkeys(np.concatenate([in_time[(in_time >= 0) & (in_time < n)], near, spread]).tolist())
+        return [other for other in images if instants[other] != instants[index]]
 
 
 def _sampled_pairs(images: SurveyedImages) -> list[tuple[int, int]]:
-    """Return pairs all over a map that are likely to show the same: of images near each other, and of successive ones.
+    """Return pairs all over a map that are probably covisible: images near each other, and successive images.
 
-    Poses that are wrong as a whole leave next to each other what is so, or the order of the images does.
+    Where poses are wrong, one of the two still works: a wrong convention keeps neighbors close, and the order of the
+    images does not depend on poses.
     """
     n, pairs = len(images.names), list[tuple[int, int]]()
     centers, axes = images.world_from_cams[:, :3, 3], images.world_from_cams[:, :3, 2]
     tree = KDTree(centers)
     for i in np.unique(np.linspace(0, n - 1, ANCHORS).astype(np.int64)):
         other = images.instants != images.instants[i]
-        same = other & (np.asarray(images.sensors) == images.sensors[i])
-        following = np.flatnonzero((same if same.any() else other)[i:])[:2] + i
+        same_sensor = other & (np.asarray(images.sensors) == images.sensors[i])
+        following = np.flatnonzero((same_sensor if same_sensor.any() else other)[i:])[:2] + i
         _, near = tree.query(centers[i], k=min(n, 40))
         near = np.atleast_1d(near)[other[np.atleast_1d(near)]][:10]
         near = near[np.argsort(-(axes[near] @ axes[i]), kind="stable")[:2]]
@@ -236,14 +236,16 @@ def _sampled_pairs(images: SurveyedImages) -> list[tuple[int, int]]:
 
 
 def _relative(world_from_cams: Floats, pair: VerifiedPair) -> Floats:
-    """Return j_from_i (4, 4) by the poses."""
+    """Return j_from_i (4, 4) from the poses."""
     return geometry.invert(world_from_cams[pair.j]) @ world_from_cams[pair.i]
 
 
 def _compare(pair: VerifiedPair, j_from_i: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return of K matches the angle to their epipolar planes, their depths along both rays, the angle between the rays.
+    """Compare K matches with a relative pose.
 
-    Angles are in degrees. Where both cameras share one place, the first is the angle between the rays.
+    Returns:
+        Angles to the epipolar planes, depths along the rays of i and of j, and angles between the rays, each (K,), with
+        angles in degrees. Without a baseline, the first are the angles between the rays.
     """
     a, b = pair.rays_i @ j_from_i[:3, :3].T, pair.rays_j
     baseline = j_from_i[:3, 3]
@@ -252,12 +254,12 @@ def _compare(pair: VerifiedPair, j_from_i: Floats) -> tuple[Floats, Floats, Floa
     parallax_deg = np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), cosine))
     if length == 0:
         return parallax_deg, np.ones(len(a)), np.ones(len(a)), np.zeros(len(a))
-    # The larger of the two angles between a ray and the plane of the baseline and the other.
+    # Each ray has an angle to the plane of the baseline and the other ray; take the larger of the two.
     errors = [
         np.abs((geometry.unit(np.cross(baseline / length, one)) * other).sum(axis=1)) for one, other in ((a, b), (b, a))
     ]
     error_deg = np.degrees(np.arcsin(np.clip(np.max(errors, axis=0), 0, 1)))
-    # The places nearest to each other of the two rays: baseline + depth_i a = depth_j b.
+    # The closest points of the two rays: baseline + depth_i a = depth_j b.
     sine2 = np.maximum(1 - cosine**2, 1e-18)
     along_a, along_b = a @ baseline, b @ baseline
     return error_deg, (cosine * along_b - along_a) / sine2, (along_b - cosine * along_a) / sine2, parallax_deg
@@ -276,26 +278,25 @@ def _agreeing(
     return agree
 
 
-# The conventions that poses come in
-
-
 class _Convention(NamedTuple):
-    """A way in which a file of poses may be meant."""
+    """A convention that a file of poses may follow."""
 
     mistakes: float
-    """How much is otherwise than it should be."""
+    """Number of differences from the expected convention."""
     text: str
+    """Description of the differences."""
     poses: Callable[[], Floats]
-    """Returns world_from_cams (N, 4, 4) as they would be."""
+    """Returns world_from_cams (N, 4, 4) under this convention."""
 
 
 def _fitting_convention(images: SurveyedImages, pairs: Sequence[VerifiedPair], share_given: float) -> str:
-    """Return in words the simplest convention under which most pairs agree with the poses, and clearly more than the
-    share that does as they are given; empty if there is none."""
-    # A few pairs tell conventions apart.
-    pairs = sorted(pairs, key=lambda pair: -len(pair.rays_i))[:MOST_TRIED]
+    """Describe the simplest convention under which most pairs agree with the poses; return "" if there is none.
+
+    The share of agreeing pairs must clearly exceed `share_given`, that of the poses as they are.
+    """
+    pairs = sorted(pairs, key=lambda pair: -len(pair.rays_i))[:MOST_TRIED]  # a few pairs are enough
     best = (max(0.5, share_given + 0.25), "")
-    for convention in sorted(_conventions(images, pairs), key=lambda each: each.mistakes):
+    for convention in sorted(_conventions(images, pairs), key=lambda convention: convention.mistakes):
         share = float(_agreeing(convention.poses(), pairs).mean())
         if share > best[0]:
             best = share, convention.text
@@ -305,35 +306,35 @@ def _fitting_convention(images: SurveyedImages, pairs: Sequence[VerifiedPair], s
 
 
 def _conventions(images: SurveyedImages, pairs: Sequence[VerifiedPair]) -> Iterator[_Convention]:
-    """Yield the conventions under which the cameras turn from image to image as the matches of pairs say."""
+    """Yield the conventions under which the relative rotations of pairs agree with those of their matches."""
     i, j = (np.array(ends) for ends in zip(*((pair.i, pair.j) for pair in pairs), strict=True))
-    seen = np.stack([pair.j_from_i[:3, :3] for pair in pairs])
-    given, places = images.world_from_rigs[:, :3, :3], images.world_from_rigs[:, :3, 3]
-    reordered = geometry.quaternion_to_rotation(np.roll(geometry.rotation_to_quaternion(given), 1, axis=-1))
+    matched = np.stack([pair.j_from_i[:3, :3] for pair in pairs])
+    stated, positions = images.world_from_rigs[:, :3, :3], images.world_from_rigs[:, :3, 3]
+    reordered = geometry.quaternion_to_rotation(np.roll(geometry.rotation_to_quaternion(stated), 1, axis=-1))
     rigs = [("", images.rig_from_cams)]
     if not np.allclose(images.rig_from_cams, np.eye(4)):
         rigs.append(("rigs as sensor_from_rig", geometry.invert(images.rig_from_cams)))
-    every = [
+    signed_axes = [
         np.diag(signs) @ np.eye(3)[list(order)]
         for order in permutations(range(3))
         for signs in product((1, -1), repeat=3)
     ]
-    for order, inverse, X, (rigs_text, rig_from_cams) in product((0, 1), (0, 1), every, rigs):
+    for order, inverse, X, (rigs_text, rig_from_cams) in product((0, 1), (0, 1), signed_axes, rigs):
         if np.linalg.det(X) < 0:
             continue
-        R = (given, reordered)[order]
+        R = (stated, reordered)[order]
         R = np.swapaxes(R, 1, 2) if inverse else R
-        in_world = R @ X @ rig_from_cams[:, :3, :3]
-        turned = np.swapaxes(in_world[j], 1, 2) @ in_world[i]
-        if np.median(geometry.rotation_angle_deg(np.swapaxes(turned, 1, 2) @ seen)) > MAX_ROTATION_ERROR_DEG:
+        world_from_cams = R @ X @ rig_from_cams[:, :3, :3]
+        j_from_i = np.swapaxes(world_from_cams[j], 1, 2) @ world_from_cams[i]
+        if np.median(geometry.rotation_angle_deg(np.swapaxes(j_from_i, 1, 2) @ matched)) > MAX_ROTATION_ERROR_DEG:
             continue
-        # What is written as the place: that of the camera, or the translation of cam_from_world.
-        for translations, A in product((0, 1), every):
-            centers = -(R @ places[..., None])[..., 0] if translations else places
+        # The stated position is the camera center, or the translation of cam_from_world.
+        for translations, A in product((0, 1), signed_axes):
+            centers = -(R @ positions[..., None])[..., 0] if translations else positions
             direction = ["", "translations", "rotations", "poses"][2 * inverse + translations]
             texts = [f"{direction} of cam_from_world" if direction else "", rigs_text]
             texts.append("quaternions in the order x, y, z, w" if order else "")
-            # Mirroring world and cameras along one axis leaves rotations, about other axes, and opposite places.
+            # Mirroring world and cameras along one axis gives rotations about other axes, and negated positions.
             mirrored = np.trace(X) == -1 and np.array_equal(X, np.diag(np.diag(X))) and np.array_equal(A, -np.eye(3))
             texts.append("a mirrored world" if mirrored else _axes_text(X))
             flipped = "mirrored" if np.linalg.det(A) < 0 else "other"
@@ -343,17 +344,17 @@ def _conventions(images: SurveyedImages, pairs: Sequence[VerifiedPair]) -> Itera
             yield _Convention(
                 len(texts) + 0.5 * order + 0.5 * (not same) + 0.5 * (direction in ("translations", "rotations")),
                 ", ".join(texts),
-                partial(_as_meant, R @ X, centers @ A.T, rig_from_cams),
+                partial(_poses, R @ X, centers @ A.T, rig_from_cams),
             )
 
 
-def _as_meant(rotations: Floats, centers: Floats, rig_from_cams: Floats) -> Floats:
+def _poses(rotations: Floats, centers: Floats, rig_from_cams: Floats) -> Floats:
     """Return world_from_cams (N, 4, 4)."""
     return geometry.make_pose(rotations, centers) @ rig_from_cams
 
 
 def _axes_text(axes: Floats) -> str:
-    """Return in words what the columns of a rotation make of a camera's axes."""
+    """Describe the camera axes that the columns of a rotation give."""
     if np.array_equal(axes, np.eye(3)):
         return ""
     if np.array_equal(axes, np.diag([1, -1, -1])):
@@ -364,5 +365,5 @@ def _axes_text(axes: Floats) -> str:
 
 
 def _axes(axes: Floats) -> str:
-    """Return the signed axes that the columns of a matrix are."""
+    """Name the signed axes in the columns of a matrix, such as "x, -y, -z"."""
     return ", ".join(f"{'-' if column.sum() < 0 else ''}{'xyz'[int(np.argmax(np.abs(column)))]}" for column in axes.T)

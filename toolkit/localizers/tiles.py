@@ -1,8 +1,8 @@
-"""Large maps in tiles: parts of bounded size, which overlap, are triangulated one by one, and are joined without seams.
+"""Triangulate a large map in overlapping tiles of bounded size, and join them without seams.
 
-Tiles share images, and so observations: keypoints of an image. What two tiles triangulated from one observation is one
-point. It then has the observations of both, and its place is found again from all of them. Memory depends on the size
-of tiles, not on the map.
+Tiles share images, and so share observations (keypoints of images). Two points from different tiles that share an
+observation are one point: the joined point has the observations of both and is triangulated again from all of them.
+The memory needed depends on the size of a tile, not of the map.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,30 +20,30 @@ from toolkit.localizers.triangulation import refine_points
 from toolkit.manifest import MapSettings
 
 OPEN_TILES = 16
-"""Tiles whose files are open at once while they are joined."""
+"""Number of tiles whose files are open at once during joining."""
 
 
 class Tile(NamedTuple):
-    """Images whose points are triangulated together."""
+    """Images that are triangulated together."""
 
     core: Ints
-    """(n,) images that are in the core of no other tile, ascending."""
+    """(n,) core images, ascending; each image of the map is in the core of one tile."""
     images: Ints
-    """(m,) these and their partners, ascending."""
+    """(m,) core images and the images matched with them, ascending."""
 
 
-def plan_tiles(places: Floats, pairs: Ints, most: int) -> list[Tile]:
-    """Part the images of a map by the places that they look at.
+def plan_tiles(positions: Floats, pairs: Ints, max_core: int) -> list[Tile]:
+    """Partition the images of a map into tiles by the position that they look at.
 
     Args:
-        places: (N, 3) what each image looks at.
-        pairs: (Q, 2) images that are matched with each other.
-        most: images in the core of a tile.
+        positions: (N, 3) position that each image looks at.
+        pairs: (Q, 2) pairs of images that are matched.
+        max_core: largest number of core images per tile.
 
     Returns:
         The tiles; neighbors in the list are near each other.
     """
-    cores = _halved(places, np.arange(len(places)), -(-len(places) // most))
+    cores = _halved(positions, np.arange(len(positions)), -(-len(positions) // max_core))
     home = home_of(cores)
     both = np.concatenate([pairs, pairs[:, ::-1]])
     both = both[np.argsort(home[both[:, 0]], kind="stable")]
@@ -54,21 +54,21 @@ def plan_tiles(places: Floats, pairs: Ints, most: int) -> list[Tile]:
 
 
 def home_of(cores: Sequence[Ints]) -> Ints:
-    """Return the number of the tile whose core has each image, (N,)."""
+    """Return, for each image, the index (N,) of the tile that has it in its core."""
     home = np.zeros(sum(map(len, cores)), np.int64)
     for number, core in enumerate(cores):
         home[core] = number
     return home
 
 
-def _halved(places: Floats, images: Ints, count: int) -> list[Ints]:
-    """Part images into so many groups of about the same size, across the direction in which they spread the most."""
+def _halved(positions: Floats, images: Ints, count: int) -> list[Ints]:
+    """Split images recursively into `count` groups of similar size, across the axis of their largest extent."""
     if count <= 1:
         return [np.sort(images)]
-    along = places[images, np.ptp(places[images], axis=0).argmax()]
+    along = positions[images, np.ptp(positions[images], axis=0).argmax()]
     order = images[np.lexsort((images, along))]
     cut = len(images) * (count // 2) // count
-    return [*_halved(places, order[:cut], count // 2), *_halved(places, order[cut:], count - count // 2)]
+    return [*_halved(positions, order[:cut], count // 2), *_halved(positions, order[cut:], count - count // 2)]
 
 
 class JoinedImages(NamedTuple):
@@ -77,11 +77,11 @@ class JoinedImages(NamedTuple):
     names: list[str]
     cameras: list[pycolmap.Camera]
     world_from_cams: Floats
-    """(N, 4, 4)."""
+    """(N, 4, 4)"""
     keypoints: Callable[[int], NDArray[np.float32]]
     """Returns the keypoints (n, 2) of an image, pixels."""
     colors: Callable[[Ints, Ints], NDArray[np.uint8]]
-    """Returns the colors (n, 3) at n keypoints, of the images and the keypoints of each."""
+    """Returns the colors (n, 3) at n keypoints, given their image indices and keypoint indices."""
 
 
 def join_tiles(
@@ -90,16 +90,16 @@ def join_tiles(
     """Join the maps of tiles.
 
     Args:
-        tiles: as planned.
-        load: returns the map of a tile.
-        images: of all tiles.
-        settings: how points are refined.
-        folder: empty, for temporary files; the arrays of the joined map are in it.
+        tiles: the result of `plan_tiles`.
+        load: returns the map of a tile, by index.
+        images: all images of the map.
+        settings: settings of the refinement of points.
+        folder: empty folder for temporary files and for the memory-mapped arrays of the joined map.
     """
     opened = lru_cache(OPEN_TILES)(load)
     length = opened(0).length
-    near = images.world_from_cams.copy()
-    near[:, :3, 3] /= length
+    world_from_cams = images.world_from_cams.copy()
+    world_from_cams[:, :3, 3] /= length
     first, sharing = _assign(tiles, opened, len(images.names), folder)
     error2, freedom, counts = 0.0, 0, np.zeros((len(tiles), 2), np.int64)
     of_image = np.zeros(len(images.names), np.int64)
@@ -112,7 +112,7 @@ def join_tiles(
             opened(number).points / length,
             observations,
             [images.cameras[image] for image in seen],
-            near[seen],
+            world_from_cams[seen],
             [images.keypoints(int(image)) for image in seen],
             settings,
         )
@@ -135,72 +135,73 @@ def join_tiles(
 def _assign(
     tiles: Sequence[Tile], load: Callable[[int], LocalMap], count: int, folder: Path
 ) -> tuple[Ints, list[list[int]]]:
-    """Say of which point each observation of each tile is, counting all points of all tiles; -1: an earlier tile says.
+    """Assign each observation of each tile to a point, counted through all tiles.
 
-    A point that shares observations with points of earlier tiles is the one with which it shares the most.
+    A point that shares observations with points of earlier tiles becomes the one with which it shares the most. The
+    assignments are saved in `folder`; -1 marks an observation that an earlier tile has assigned.
 
     Returns:
-        The first point of each tile, (T + 1,), and of each tile, those that have observations of its points. What each
-        observation is of is in `folder`.
+        The first point of each tile, (T + 1,), and for each tile, the tiles with observations of its points.
     """
-    last = np.zeros(count, np.int64)
+    last = np.zeros(count, np.int64)  # last tile of each image
     for number, tile in enumerate(tiles):
         last[tile.images] = number
-    known: dict[int, tuple[Ints, Ints]] = {}  # keypoints, ascending, and points of images that later tiles have, too
+    # Keypoints, ascending, and their points, of images that later tiles have too.
+    assigned: dict[int, tuple[Ints, Ints]] = {}
     first, sharing = [0], [list[int]() for _ in tiles]
     for number, tile in enumerate(tiles):
         part = load(number)
-        parts = [slice(*part.image_starts[index : index + 2]) for index in range(len(tile.images))]
-        earlier = np.full(len(part.obs_point), -1)
-        for image, seen in zip(tile.images.tolist(), parts, strict=True):
-            keypoints, points = known.get(image, (np.zeros(0, np.int64),) * 2)
+        spans = [slice(*part.image_starts[index : index + 2]) for index in range(len(tile.images))]
+        earlier = np.full(len(part.obs_point), -1)  # point that an earlier tile assigned to each observation
+        for image, span in zip(tile.images.tolist(), spans, strict=True):
+            keypoints, points = assigned.get(image, (np.zeros(0, np.int64),) * 2)
             if len(keypoints):
-                at = np.minimum(np.searchsorted(keypoints, part.obs_keypoint[seen]), len(keypoints) - 1)
-                earlier[seen] = np.where(keypoints[at] == part.obs_keypoint[seen], points[at], -1)
-        there = earlier >= 0
-        same, shared = np.unique(
-            np.column_stack([part.obs_point[there], earlier[there]]), axis=0, return_counts=True
-        )  # (point here, point there)
-        order = np.lexsort((same[:, 1], -shared, same[:, 0]))
+                at = np.minimum(np.searchsorted(keypoints, part.obs_keypoint[span]), len(keypoints) - 1)
+                earlier[span] = np.where(keypoints[at] == part.obs_keypoint[span], points[at], -1)
+        shared = earlier >= 0
+        same, counts = np.unique(
+            np.column_stack([part.obs_point[shared], earlier[shared]]), axis=0, return_counts=True
+        )  # (point of this tile, earlier point)
+        order = np.lexsort((same[:, 1], -counts, same[:, 0]))
         same = same[order][np.unique(same[order, 0], return_index=True)[1]]
         final = first[-1] + np.arange(len(part.points))
         final[same[:, 0]] = same[:, 1]
         first.append(first[-1] + len(part.points))
-        point = np.where(there, -1, final[part.obs_point])
+        point = np.where(shared, -1, final[part.obs_point])
         np.save(folder / f"{number}.npy", point)
         for owner in np.unique(np.searchsorted(first, point[point >= 0], "right") - 1).tolist():
             sharing[owner].append(number)
-        for image, seen in zip(tile.images.tolist(), parts, strict=True):
-            before = known.pop(image, (np.zeros(0, np.int64),) * 2)
+        for image, span in zip(tile.images.tolist(), spans, strict=True):
+            before = assigned.pop(image, (np.zeros(0, np.int64),) * 2)
             if last[image] > number:
-                new = point[seen] >= 0
-                keypoints = np.concatenate([before[0], part.obs_keypoint[seen][new]])
-                points = np.concatenate([before[1], point[seen][new]])
+                new = point[span] >= 0
+                keypoints = np.concatenate([before[0], part.obs_keypoint[span][new]])
+                points = np.concatenate([before[1], point[span][new]])
                 order = np.argsort(keypoints)
-                known[image] = keypoints[order], points[order]
+                assigned[image] = keypoints[order], points[order]
     return np.array(first, np.int64), sharing
 
 
 def _rows_of(owner: int, number: int, tile: Tile, part: LocalMap, first: Ints, folder: Path) -> Ints:
-    """Return the observations (n, 3) of the points of one tile in another: image, keypoint, point of the owner."""
+    """Return the observations (n, 3) in one tile of the points of its owner tile: image, keypoint, point."""
     point = np.load(folder / f"{number}.npy")
-    mine = np.flatnonzero((point >= first[owner]) & (point < first[owner + 1]))
-    return np.column_stack([tile.images[part.obs_image[mine]], part.obs_keypoint[mine], point[mine] - first[owner]])
+    rows = np.flatnonzero((point >= first[owner]) & (point < first[owner + 1]))
+    return np.column_stack([tile.images[part.obs_image[rows]], part.obs_keypoint[rows], point[rows] - first[owner]])
 
 
 def _written(
     images: JoinedImages, length: float, counts: Ints, of_image: Ints, noise_px: float, folder: Path
 ) -> LocalMap:
-    """Return the map of points that are in files, one a tile.
+    """Join the files of points, one per tile, in a map.
 
     Args:
-        counts: (T, 2) points and observations of each tile.
-        of_image: (N,) observations of each image.
+        counts: (T, 2) number of points and of observations of each tile.
+        of_image: (N,) number of observations of each image.
     """
     num_points, num_observations = counts.sum(axis=0).tolist()
 
     def array(name: str, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
-        # What cannot be mapped, as it has no bytes, takes none either.
+        # An empty array cannot be memory-mapped.
         return np.lib.format.open_memmap(folder / f"{name}.npy", "w+", dtype, shape) if shape[0] else np.zeros(shape)
 
     points, colors = array("points", (num_points, 3), np.float64), array("colors", (num_points, 3), np.uint8)
@@ -210,7 +211,7 @@ def _written(
         array(name, (num_observations,), np.int64) for name in ("obs_image", "obs_keypoint", "obs_point", "by_point")
     )
     image_starts = np.concatenate([[0], np.cumsum(of_image)])
-    free = image_starts[:-1].copy()  # the next observation of each image
+    free = image_starts[:-1].copy()  # row for the next observation of each image
     point = observation = 0
     for number in range(len(counts)):
         with np.load(folder / f"{number}.npz") as tile:

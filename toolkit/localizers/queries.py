@@ -1,4 +1,4 @@
-"""Queries as a run asks them: their images, the features and matches that were stored, the references of each."""
+"""Read queries from what a run stored: images, local features, matches and references."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,26 +15,26 @@ from toolkit.localizers.base import NetworkMatches, PoseEstimate, Query, Referen
 from toolkit.localizers.correspondences import LocalizedQuery
 
 ReferencesOfImage = Mapping[tuple[int, str], References]
-"""References of a query image, by its timestamp and sensor."""
+"""References of each query image, by timestamp and sensor id."""
 
 
 def references_of_images(path: str | Path, index_of: Mapping[str, int]) -> dict[tuple[int, str], References]:
-    """Return what a file of references says, in indices of map images; those that the map does not have are left out.
+    """Read the references of query images, without those that are not in the map.
 
     Args:
         path: `retrieval/<pair>.jsonl`.
-        index_of: index of a map image by its name.
+        index_of: index of each map image by name.
 
     Raises:
         ArtifactError: see `files.read_references`.
     """
-    found = {}
+    references = {}
     for row in read_references(path):
         hits = [(image_name(hit["path"]), float(hit["score"])) for hit in row["topk"]]
-        known = [(index_of[name], score) for name, score in hits if name in index_of]
+        in_map = [(index_of[name], score) for name, score in hits if name in index_of]
         key = int(row["timestamp"]), str(row["sensor_id"])
-        found[key] = References.of([index for index, _ in known], [score for _, score in known])
-    return found
+        references[key] = References.of([index for index, _ in in_map], [score for _, score in in_map])
+    return references
 
 
 def stored_query(
@@ -45,23 +45,23 @@ def stored_query(
     matches: Sequence[MatchStore | None] = (),
     turns: Turns | None = None,
 ) -> tuple[Query, list[References]]:
-    """Return a query with the references of each of its images.
+    """Return a query and the references of each of its images.
 
     Args:
-        session: of the queries.
-        rows: of the images of one device at one instant.
-        references: of all query images; one that is not in it has none.
-        stores: features of the session, one a kind; none: the query needs none.
-        matches: of each kind the matches that a network made before, None where none did.
-        turns: what makes images upright for a network that is shown them; None: they are shown as they are.
+        session: the query session.
+        rows: rows of `session.images` that one device took at one instant.
+        references: references of all query images; an image without an entry has none.
+        stores: features of the session, one store per kind; empty if the localizer needs no features.
+        matches: per kind, the stored network matches, or None.
+        turns: turns that make images upright for a network; None shows them as stored.
     """
     images = session.images.iloc[rows]
     keys = list(zip(images["timestamp"].tolist(), images["sensor_id"].tolist(), strict=True))
-    of_rows = np.zeros(len(rows), int) if turns is None else turns.of(session, rows)
+    row_turns = np.zeros(len(rows), int) if turns is None else turns.of(session, rows)
     names = [session.image_name(int(row)) for row in rows]
     views = [
         View(name, session.image_path(int(row)), session.camera(sensor), in_map=False, turns=int(turn))
-        for row, name, (_, sensor), turn in zip(rows, names, keys, of_rows, strict=True)
+        for row, name, (_, sensor), turn in zip(rows, names, keys, row_turns, strict=True)
     ]
     query = Query(
         views,
@@ -73,10 +73,10 @@ def stored_query(
 
 
 def localized_query(query: Query, estimate: PoseEstimate, image_names: Sequence[str]) -> LocalizedQuery:
-    """Return what a pose rests on, with the names of its images.
+    """Return the correspondences of an estimate, with image names instead of indices.
 
     Args:
-        image_names: of the map's images, as the localizer counts them.
+        image_names: `Localizer.image_names`.
     """
     return LocalizedQuery(
         [view.name for view in query.views],
