@@ -1,8 +1,8 @@
-"""Errors of the Hugging Face hub, in words."""
+"""Explains errors of the Hugging Face hub."""
 
 
 def failure_reason(error: Exception, page: str = "the model's page") -> str:
-    """Return in a few words why a request to the hub failed; `page` is where its terms are accepted."""
+    """Return why a request to the hub failed, as a phrase; `page` is where users accept the license."""
     from huggingface_hub import constants, errors
 
     sign_in = f"accept the license on {page} and set HF_TOKEN (HTTP {status_of(error)})"
@@ -23,5 +23,5 @@ def failure_reason(error: Exception, page: str = "the model's page") -> str:
 
 
 def status_of(error: Exception) -> int | None:
-    """Return the HTTP status that an error of the hub's library stands for."""
+    """Return the HTTP status of an error of huggingface_hub; None if it has none."""
     return getattr(getattr(error, "response", None), "status_code", None)
