@@ -135,12 +135,7 @@ class _Folders:
 
 
 def _embed_with_model(
-    capture: Capture,
-    folders: _Folders,
-    settings: EmbedSettings,
-    device: str,
-    subsession: str,
-    skip_existing: bool,
+    capture: Capture, folders: _Folders, settings: EmbedSettings, device: str, subsession: str, skip_existing: bool
 ) -> pd.DataFrame:
     out_dir, features_dir = folders.out, folders.features
     parts, unreadable = _subsessions(capture, device, subsession)

@@ -23,15 +23,7 @@ from toolkit.embedders.index import EXACT, is_made, make_index
 from toolkit.embedders.search import Backend, Found, search
 from toolkit.embedders.stored import made_of
 from toolkit.errors import ArtifactError, CaptureError, ManifestError
-from toolkit.files import (
-    file_fingerprint,
-    fingerprint,
-    is_current,
-    pair_name,
-    write_atomic,
-    write_sidecar,
-    write_text,
-)  # fmt: skip
+from toolkit.files import file_fingerprint, fingerprint, is_current, pair_name, write_atomic, write_sidecar, write_text
 from toolkit.geometry import Ints
 from toolkit.manifest import MaskSettings, RetrieveSettings
 from toolkit.runs.pairs import PairRows
@@ -219,11 +211,7 @@ def _require_same_dimension(query: _Images, database: _Images) -> None:
 
 
 def _search(
-    queries: Mapping[str, _Images],
-    database: _Images,
-    settings: RetrieveSettings,
-    embeddings: Path,
-    skip_existing: bool,
+    queries: Mapping[str, _Images], database: _Images, settings: RetrieveSettings, embeddings: Path, skip_existing: bool
 ) -> dict[str, Found]:
     """Return the best map images of several sets of queries, with one pass over the map.
 

@@ -18,15 +18,7 @@ from numpy.typing import NDArray
 
 from toolkit.embedders.stored import JoinedVectors, StoredVectors, Vectors, blocks, made_of, require_finite
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError, first_line
-from toolkit.files import (
-    fingerprint,
-    is_current,
-    read_json,
-    require_whole,
-    sidecar_path,
-    write_atomic,
-    write_sidecar,
-)  # fmt: skip
+from toolkit.files import fingerprint, is_current, read_json, require_whole, sidecar_path, write_atomic, write_sidecar
 from toolkit.geometry import Ints
 from toolkit.manifest import RetrieveSettings
 
@@ -127,11 +119,7 @@ class JoinedIndex:
 
 
 def make_index(
-    embeddings: Path,
-    map_id: str,
-    vectors: Vectors,
-    settings: RetrieveSettings,
-    skip_existing: bool = True,
+    embeddings: Path, map_id: str, vectors: Vectors, settings: RetrieveSettings, skip_existing: bool = True
 ) -> VectorIndex | JoinedIndex | None:
     """Build the index of a map, or read the current one; None if none is needed, see `load_index`.
 

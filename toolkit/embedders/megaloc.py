@@ -15,7 +15,7 @@ from toolkit.errors import ManifestError, ToolkitError
 from toolkit.files import Remade
 from toolkit.models.compute import Fitting, is_out_of_memory, on_device, resolve_device, resolve_precision, upload
 from toolkit.models.megaloc import PATCH, MegaLoc
-from toolkit.models.vit import IMAGENET_MEAN, IMAGENET_STD
+from toolkit.models.vit import normalized
 from toolkit.models.weights import MEGALOC, given_or_resolved, weights_digest
 
 
@@ -63,8 +63,6 @@ class MegaLocEmbedder(Remade):
         self.dim = model.dim
         model.compute_in(self._dtype)
         self._model = on_device(model, self._device, "MegaLoc").eval()
-        self._mean = torch.tensor(IMAGENET_MEAN, device=self._device).view(1, 3, 1, 1)
-        self._std = torch.tensor(IMAGENET_STD, device=self._device).view(1, 3, 1, 1)
         self._fitting = Fitting(self._forward, "images", self._device)
 
     @property
@@ -124,6 +122,5 @@ class MegaLocEmbedder(Remade):
         return vectors
 
     def _forward(self, images: Tensor) -> Tensor:
-        normalized = (images.permute(0, 3, 1, 2).float() / 255 - self._mean) / self._std
-        descriptors: Tensor = self._model(normalized)
+        descriptors: Tensor = self._model(normalized(images.permute(0, 3, 1, 2).float() / 255))
         return descriptors

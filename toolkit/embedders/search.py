@@ -29,12 +29,14 @@ _EXTRA = 16
 _GAMMA = 0.5
 """Parameter of the generalized harmonic mean. Similarities of n >= 2 unit vectors are never below its pole, -n / 2."""
 
-Found = tuple[NDArray[np.float32], Ints]
+_Floats = NDArray[np.float32]
+_Bools = NDArray[np.bool_]
+Found = tuple[_Floats, Ints]
 """Scores and rows (Q, K) of the best database vectors of each query, best first."""
-_Best = Callable[[NDArray[np.float32], int, int], Found]
+_Best = Callable[[_Floats, int, int], Found]
 """Maps a block of the database, the number of its first row, and n to the n best scores and rows of each query, counted
 from the start of the block."""
-_Vectors = NDArray[np.float32] | Vectors
+_Vectors = _Floats | Vectors
 
 
 def search(
@@ -45,7 +47,7 @@ def search(
     compute_device: str = "cpu",
     faiss_gpu: bool = False,
     index: VectorIndex | JoinedIndex | None = None,
-    allowed: NDArray[np.bool_] | Masks | None = None,
+    allowed: _Bools | Masks | None = None,
     dims: Sequence[int] = (),
 ) -> Found:
     """Return the database rows with the largest dot products, best first; ties in order of the row.
@@ -137,11 +139,11 @@ def _fused(query: Any, vectors: Any, dims: Sequence[int], product: Callable[[Any
 
 
 def _search_block(
-    query: NDArray[np.float32],
+    query: _Floats,
     vectors: _Vectors,
-    make_backend: Callable[[NDArray[np.float32], Masks | None], _Best],
+    make_backend: Callable[[_Floats, Masks | None], _Best],
     masks: Masks | None,
-    scores: NDArray[np.float32],
+    scores: _Floats,
     indices: Ints,
     dims: Sequence[int],
 ) -> None:
@@ -173,12 +175,7 @@ def _tolerance(product_of_lengths: Any, dims: Sequence[int]) -> Any:
 
 
 def _rank_candidates(
-    query: NDArray[np.float32],
-    vectors: _Vectors,
-    candidates: Ints,
-    scores: NDArray[np.float32],
-    indices: Ints,
-    dims: Sequence[int],
+    query: _Floats, vectors: _Vectors, candidates: Ints, scores: _Floats, indices: Ints, dims: Sequence[int]
 ) -> None:
     """Fill in scores and indices (Q, K) of the best candidates (Q, C) of each query; -1 is no candidate."""
     for number, vector in enumerate(query):
@@ -195,7 +192,7 @@ def _rank_candidates(
         scores[number, :k], indices[number, :k] = exact[best], rows[near][best]
 
 
-def _products(query: NDArray[np.float32], vectors: NDArray[np.float32], dims: Sequence[int]) -> NDArray[np.float32]:
+def _products(query: _Floats, vectors: _Floats, dims: Sequence[int]) -> _Floats:
     """Return the row by row dot products (n,) of two (n, D) arrays, summed and fused in float64."""
     wide = query.astype(np.float64), vectors.astype(np.float64)
     fused: NDArray[np.float64] = _fused(*wide, dims, partial(np.einsum, "nd,nd->n"))
@@ -212,9 +209,7 @@ def _matrix(values: ArrayLike | Vectors, name: str) -> _Vectors:
     return matrix
 
 
-def _candidates(
-    vectors: _Vectors, best: _Best, queries: int, width: int, size: int
-) -> tuple[NDArray[np.float32], Ints, float]:
+def _candidates(vectors: _Vectors, best: _Best, queries: int, width: int, size: int) -> tuple[_Floats, Ints, float]:
     """Find candidates with the backend.
 
     Args:
@@ -238,12 +233,12 @@ def _candidates(
 
 
 def _rescore(
-    query: NDArray[np.float32],
+    query: _Floats,
     vectors: _Vectors,
     rows: Ints,
     candidates: Ints,
-    near: NDArray[np.bool_],
-    scores: NDArray[np.float32],
+    near: _Bools,
+    scores: _Floats,
     indices: Ints,
     dims: Sequence[int],
 ) -> None:
@@ -262,12 +257,7 @@ def _rescore(
 
 
 def _backend(
-    query: NDArray[np.float32],
-    masks: Masks | None,
-    backend: Backend,
-    compute_device: str,
-    faiss_gpu: bool,
-    dims: Sequence[int],
+    query: _Floats, masks: Masks | None, backend: Backend, compute_device: str, faiss_gpu: bool, dims: Sequence[int]
 ) -> _Best:
     """Return the function that searches a block of the database for the queries."""
     if backend not in ("faiss", "torch"):
@@ -291,13 +281,13 @@ def _backend(
     return lambda block, _, number: faiss.knn_gpu(gpu, query, block, number, metric=faiss.METRIC_INNER_PRODUCT)
 
 
-def _torch_backend(query: NDArray[np.float32], compute_device: str, dims: Sequence[int]) -> _Best:
+def _torch_backend(query: _Floats, compute_device: str, dims: Sequence[int]) -> _Best:
     import torch
 
     device = resolve_device(compute_device)
     queries = torch.from_numpy(query).to(device)
 
-    def find(block: NDArray[np.float32], _: int, number: int) -> Found:
+    def find(block: _Floats, _: int, number: int) -> Found:
         rows = torch.from_numpy(block).to(device)
         most = max(1, _QUERY_BYTES // (4 * len(block) * (len(dims) + 2)))
         best = [_fused(part, rows, dims, lambda a, b: a @ b.T).topk(number) for part in queries.split(most)]
@@ -308,10 +298,10 @@ def _torch_backend(query: NDArray[np.float32], compute_device: str, dims: Sequen
 
 
 def _masked(
-    query: NDArray[np.float32],
+    query: _Floats,
     masks: Masks,
-    best: Callable[[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], int], Found],
-    block: NDArray[np.float32],
+    best: Callable[[_Floats, _Floats, _Bools, int], Found],
+    block: _Floats,
     start: int,
     number: int,
 ) -> Found:
@@ -330,9 +320,7 @@ def _masked(
     return scores, indices
 
 
-def _numpy_best(
-    query: NDArray[np.float32], block: NDArray[np.float32], allowed: NDArray[np.bool_], number: int
-) -> Found:
+def _numpy_best(query: _Floats, block: _Floats, allowed: _Bools, number: int) -> Found:
     scores = query @ block.T
     scores[~allowed] = -np.inf
     indices = np.argpartition(scores, -number, axis=1)[:, -number:]
@@ -340,12 +328,7 @@ def _numpy_best(
 
 
 def _torch_best(
-    query: NDArray[np.float32],
-    block: NDArray[np.float32],
-    allowed: NDArray[np.bool_],
-    number: int,
-    device: str,
-    dims: Sequence[int],
+    query: _Floats, block: _Floats, allowed: _Bools, number: int, device: str, dims: Sequence[int]
 ) -> Found:
     import torch
 

@@ -124,9 +124,7 @@ def made_of(paths: Sequence[Path]) -> list[Any]:
     ]
 
 
-def blocks(
-    vectors: NDArray[np.float32] | Vectors, size: int
-) -> Iterator[tuple[int, NDArray[np.float32]]]:
+def blocks(vectors: NDArray[np.float32] | Vectors, size: int) -> Iterator[tuple[int, NDArray[np.float32]]]:
     """Yield blocks of at most `size` bytes (of float32): the number of the first row, and the rows (n, D)."""
     step = max(1, size // (4 * max(1, vectors.shape[1])))
     for start in range(0, len(vectors), step):
@@ -182,9 +180,7 @@ def open_embeddings(folder: str | Path) -> tuple[StoredVectors, pd.DataFrame]:
                 f"{matrix.shape}; expected columns {', '.join(MANIFEST_COLUMNS)} and one row per vector. Embed again."
             )
         if paths and matrix.shape[1] != dim:
-            raise ArtifactError(
-                f"{path} has {matrix.shape[1]} dimensions, {manifests[0].parent} {dim}; embed again."
-            )
+            raise ArtifactError(f"{path} has {matrix.shape[1]} dimensions, {manifests[0].parent} {dim}; embed again.")
         dim = matrix.shape[1]
         paths.append(path)
         starts.append(starts[-1] + len(matrix))

@@ -168,34 +168,6 @@ class CrossBlock(_Block):
         return a, self._update(b, _attend(keys_b, keys_a, values_a, mask_a))
 
 
-class _Layer(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.self_attn = SelfBlock()
-        self.cross_attn = CrossBlock()
-
-
-class _Assignment(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.matchability = nn.Linear(DIM, 1)
-        self.final_proj = nn.Linear(DIM, DIM)
-
-
-class _Confidence(nn.Module):
-    """Confidence of a feature's match after a layer. Part of the checkpoints, but not used here."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.token = nn.Sequential(nn.Linear(DIM, 1))
-
-
-class _PositionalEncoding(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.Wr = nn.Linear(2, DIM // _HEADS // 2, bias=False)
-
-
 class LightGlue(nn.Module):
     """Matches the features of two images: `encode` each image, then pass both to `forward`."""
 
@@ -203,10 +175,18 @@ class LightGlue(nn.Module):
         """`input_dim` is the length of the descriptors."""
         super().__init__()
         self.input_proj = nn.Identity() if input_dim == DIM else nn.Linear(input_dim, DIM)
-        self.posenc = _PositionalEncoding()
-        self.transformers: Any = nn.ModuleList(_Layer() for _ in range(_LAYERS))
-        self.log_assignment: Any = nn.ModuleList(_Assignment() for _ in range(_LAYERS))
-        self.token_confidence = nn.ModuleList(_Confidence() for _ in range(_LAYERS - 1))
+        self.posenc: Any = nn.ModuleDict({"Wr": nn.Linear(2, DIM // _HEADS // 2, bias=False)})
+        self.transformers: Any = nn.ModuleList(
+            nn.ModuleDict({"self_attn": SelfBlock(), "cross_attn": CrossBlock()}) for _ in range(_LAYERS)
+        )
+        self.log_assignment: Any = nn.ModuleList(
+            nn.ModuleDict({"matchability": nn.Linear(DIM, 1), "final_proj": nn.Linear(DIM, DIM)})
+            for _ in range(_LAYERS)
+        )
+        # Confidence of a feature's match after a layer: part of the checkpoints, but not used here.
+        self.token_confidence = nn.ModuleList(
+            nn.ModuleDict({"token": nn.Sequential(nn.Linear(DIM, 1))}) for _ in range(_LAYERS - 1)
+        )
 
     @torch.no_grad()
     def fold_(self, dtype: torch.dtype) -> None:

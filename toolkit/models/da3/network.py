@@ -5,7 +5,7 @@ under the Apache License 2.0.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
@@ -93,9 +93,7 @@ class DepthAnything3(MultiView):
 
     @property
     def trunk(self) -> Backbone:
-        trunk: Any = self.backbone["pretrained"]
-        backbone: Backbone = trunk
-        return backbone
+        return cast(Backbone, self.backbone["pretrained"])
 
     @property
     def channels(self) -> int:
