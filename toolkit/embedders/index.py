@@ -104,18 +104,18 @@ class VectorIndex:
 class JoinedIndex:
     """One index per descriptor of the same images. Every index contributes candidates."""
 
-    parts: tuple[VectorIndex, ...]
+    indexes: tuple[VectorIndex, ...]
     dims: tuple[int, ...]
 
     @property
     def candidates(self) -> int:
-        return sum(part.candidates for part in self.parts)
+        return sum(index.candidates for index in self.indexes)
 
     def find(self, query: NDArray[np.float32], allowed: NDArray[np.bool_] | None = None) -> Ints:
         """Return the candidate rows (Q, C) of all indexes for each query (Q, sum of D); rows may repeat."""
         queries = np.split(query, np.cumsum(self.dims)[:-1], axis=1)
-        pairs = zip(self.parts, queries, strict=True)
-        return np.hstack([part.find(np.ascontiguousarray(columns), allowed) for part, columns in pairs])
+        pairs = zip(self.indexes, queries, strict=True)
+        return np.hstack([index.find(np.ascontiguousarray(columns), allowed) for index, columns in pairs])
 
 
 def make_index(

@@ -47,7 +47,7 @@ def search(
     compute_device: str = "cpu",
     faiss_gpu: bool = False,
     index: VectorIndex | JoinedIndex | None = None,
-    allowed: _Bools | Masks | None = None,
+    allowed: NDArray[np.bool_] | Masks | None = None,
     dims: Sequence[int] = (),
 ) -> Found:
     """Return the database rows with the largest dot products, best first; ties in order of the row.
@@ -68,8 +68,8 @@ def search(
             are fused by torch, whatever the backend, see `fuse`. Empty: one descriptor.
 
     Returns:
-        Scores (Q, K) float32 and rows (Q, K) int64, K = min(k, N). -inf and -1 fill up where fewer rows are allowed, or
-        where the index found fewer.
+        Scores (Q, K) float32 and rows (Q, K) int64, K = min(k, N); -inf and -1 if fewer rows are allowed, or the index
+        found fewer.
 
     Raises:
         ValueError: shapes do not fit, k is below 1, or a value is not finite.

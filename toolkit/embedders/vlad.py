@@ -50,11 +50,9 @@ class Vlad:
         return {"name": self.name, **self._settings.model_dump(), "vocabulary": self._fingerprint}
 
     def prepare(self, item: LocalFeatures) -> LocalFeatures:
-        """Return the features unchanged."""
         return item
 
     def stack(self, inputs: Sequence[LocalFeatures]) -> Sequence[LocalFeatures]:
-        """Return the features unchanged."""
         return inputs
 
     @threadpool_limits.wrap(limits=1, user_api="blas")  # the products are small: two threads take three times as long

@@ -52,10 +52,10 @@ def official_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
             name = re.sub(pattern, own, name)
         renamed[name] = value
     for name in [name for name in renamed if "self_attention.q_proj" in name]:
-        parts = [name.replace("q_proj", part) for part in ("q_proj", "k_proj", "v_proj")]
-        if all(part in renamed for part in parts):
+        names = [name.replace("q_proj", projection) for projection in ("q_proj", "k_proj", "v_proj")]
+        if all(part in renamed for part in names):
             # `Wqkv` interleaves the rows of queries, keys and values.
-            value = torch.stack([renamed.pop(part) for part in parts], dim=1).flatten(0, 1)
+            value = torch.stack([renamed.pop(part) for part in names], dim=1).flatten(0, 1)
             renamed[name.replace("self_attention.q_proj", "self_attn.Wqkv")] = value
     for name in [name for name in renamed if "cross_attn.to_qk" in name]:
         # In cross-attention, queries and keys share one projection. If they differ, the file is of another network.

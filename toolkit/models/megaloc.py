@@ -111,9 +111,9 @@ class MegaLoc(nn.Module):
     ) -> None:
         """
         Args:
-            dim, depth, num_heads: of the transformer.
+            dim, depth, num_heads: sizes of the transformer.
             grid: rows and columns of patches for which the position embedding was trained.
-            clusters, cluster_dim, token_dim, hidden: of the aggregation.
+            clusters, cluster_dim, token_dim, hidden: sizes of the aggregation.
             out: length of the descriptor.
         """
         super().__init__()

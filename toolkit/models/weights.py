@@ -78,7 +78,7 @@ class WeightsSource:
             with open(path, "rb") as stream:
                 actual = hashlib.file_digest(stream, "sha256").hexdigest()
             if actual != expected:
-                for file in (path.resolve(), path):  # `path` is a link into the cache
+                for file in (path.resolve(), path):  # `path` is a link to the file
                     file.unlink(missing_ok=True)
                 raise _not_downloaded(
                     self, f"wrong checksum, found SHA-256 {actual}, expected {expected}; the file was deleted"
@@ -302,7 +302,7 @@ def check_weights(source: WeightsSource, path: Path) -> None:
 
     try:
         with safe_open(path, "pt") as file:
-            names = {name.removeprefix("module.") for name in file.keys()}  # noqa: SIM118 - it is no mapping
+            names = {name.removeprefix("module.") for name in file.keys()}  # noqa: SIM118 - not a mapping
         found = f"{len(names)} tensors, none of which is {source.tensor}"
     except (SafetensorError, OSError) as error:
         names, found = set(), f"no complete safetensors file ({first_line(error)})"

@@ -51,7 +51,7 @@ class Backbone(Dinov2):
         layers: Collection[int],
         cameras_only: bool = False,
     ) -> tuple[dict[int, LayerTokens], Tensor]:
-        """Return the tokens after some of the later blocks.
+        """Return the tokens after the given blocks.
 
         Args:
             tokens: (B, S, 1 + rows * columns, C) from `encode`.

@@ -44,7 +44,7 @@ class PlaceRope(nn.Module):
 
 
 class PatchEncoder(nn.Module):
-    """DINOv3 ViT-16 with storage tokens, of which only the patch tokens are used."""
+    """DINOv3 ViT-16 with storage tokens. Returns only the patch tokens."""
 
     def __init__(self, dim: int, depth: int, num_heads: int) -> None:
         super().__init__()
@@ -90,7 +90,7 @@ class Aggregator(nn.Module):
     def forward(
         self, patch_tokens: Tensor, rows: int, columns: int, layers: Collection[int], cameras_only: bool = False
     ) -> dict[int, LayerTokens]:
-        """Return the tokens after each of some layers.
+        """Return the tokens after the given layers.
 
         Args:
             patch_tokens: (B, S, rows * columns, C) from `patch_embed`.

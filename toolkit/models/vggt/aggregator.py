@@ -17,7 +17,7 @@ _EPS = 1e-5
 
 
 class PatchEncoder(Dinov2):
-    """DINOv2 with registers (Darcet et al., ICLR 2024), of which only the patch tokens are used."""
+    """DINOv2 with registers (Darcet et al., ICLR 2024). Returns only the patch tokens."""
 
     def __init__(self, dim: int, depth: int, num_heads: int, grid: int) -> None:
         super().__init__(dim, depth, num_heads, grid)
@@ -50,7 +50,7 @@ class Aggregator(nn.Module):
     def forward(
         self, patch_tokens: Tensor, rows: int, columns: int, layers: Collection[int], cameras_only: bool = False
     ) -> dict[int, LayerTokens]:
-        """Return the tokens after each of some layers.
+        """Return the tokens after the given layers.
 
         Args:
             patch_tokens: (B, S, rows * columns, C) from `patch_embed`.
