@@ -19,9 +19,9 @@ from toolkit.capture.masks import Masks, combine, gps_masks, pose_masks, radio_m
 from toolkit.capture.session import SUBSESSIONS
 from toolkit.capture.tables import SIGNALS
 from toolkit.embedders import Vectors, embedding_folders, load_embeddings, open_descriptors
-from toolkit.embedders.index import EXACT, is_made, make_index
+from toolkit.embedders.index import EXACT, is_index_current, make_index
 from toolkit.embedders.search import Backend, Found, search
-from toolkit.embedders.stored import made_of
+from toolkit.embedders.stored import matrix_fingerprints
 from toolkit.errors import ArtifactError, CaptureError, ManifestError
 from toolkit.files import file_fingerprint, fingerprint, is_current, pair_name, write_atomic, write_sidecar, write_text
 from toolkit.geometry import Ints
@@ -110,7 +110,7 @@ def retrieve_pairs(
                 masks, without = _masks(settings, poses, database, query)
                 skipped = skip_existing and is_current(path, record)
                 # Single photographs that are localized later search the map's index, too.
-                skipped = skipped and is_made(embeddings, database.session.id, database.vectors, settings)
+                skipped = skipped and is_index_current(embeddings, database.session.id, database.vectors, settings)
                 if not skipped:
                     _require_same_dimension(query, database)
                     todo[device] = replace(query, masks=masks), path, record
@@ -261,7 +261,7 @@ def _inputs(session: Session, embeddings: Path) -> list[Any]:
     folders = [folder / session.id for folder in embedding_folders(embeddings).values()]
     matrices = [path for folder in folders for path in sorted(folder.rglob("*.npy"))]
     texts = [session.path / name for name in ("images.txt", "trajectories.txt", "rigs.txt")]
-    return [made_of(matrices), [file_fingerprint(path) for path in texts if path.exists()]]
+    return [matrix_fingerprints(matrices), [file_fingerprint(path) for path in texts if path.exists()]]
 
 
 def _rough_poses(settings: MaskSettings) -> Trajectory | None:

@@ -16,7 +16,7 @@ import faiss as typed_faiss
 import numpy as np
 from numpy.typing import NDArray
 
-from toolkit.embedders.stored import JoinedVectors, StoredVectors, Vectors, blocks, made_of, require_finite
+from toolkit.embedders.stored import JoinedVectors, StoredVectors, Vectors, blocks, matrix_fingerprints, require_finite
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError, first_line
 from toolkit.files import fingerprint, is_current, read_json, require_whole, sidecar_path, write_atomic, write_sidecar
 from toolkit.geometry import Ints
@@ -156,11 +156,11 @@ def _join(
     return JoinedIndex(indexes, vectors.dims) if len(indexes) == len(opened) else None
 
 
-def is_made(embeddings: Path, map_id: str, vectors: Vectors, settings: RetrieveSettings) -> bool:
+def is_index_current(embeddings: Path, map_id: str, vectors: Vectors, settings: RetrieveSettings) -> bool:
     """Tell whether the map's index is current, or none is needed."""
     if isinstance(vectors, JoinedVectors):
         parts = vectors.parts.items()
-        return all(is_made(embeddings, f"{name}/{map_id}", part, settings) for name, part in parts)
+        return all(is_index_current(embeddings, f"{name}/{map_id}", part, settings) for name, part in parts)
     needed = _is_needed(settings, vectors)
     return not needed or is_current(_index_path(embeddings, map_id), _record(vectors, settings))
 
@@ -245,8 +245,8 @@ def _empty(vectors: StoredVectors, factory: str) -> Any:
 
 
 def _record(vectors: StoredVectors, settings: RetrieveSettings) -> dict[str, Any]:
-    rows = fingerprint(vectors.rows.tolist())
-    return {"index": settings.index, "vectors": [made_of(vectors.paths), rows], "normalize": vectors.normalize}
+    identity = [matrix_fingerprints(vectors.paths), fingerprint(vectors.rows.tolist())]
+    return {"index": settings.index, "vectors": identity, "normalize": vectors.normalize}
 
 
 def _index_path(embeddings: Path, map_id: str) -> Path:

@@ -115,7 +115,7 @@ class JoinedVectors:
 Vectors = StoredVectors | JoinedVectors
 
 
-def made_of(paths: Sequence[Path]) -> list[Any]:
+def matrix_fingerprints(paths: Sequence[Path]) -> list[Any]:
     """Return, as JSON, names and fingerprints that identify the matrices in these files."""
     # The record beside a matrix identifies it, and is quick to read; a foreign matrix may have none.
     return [
