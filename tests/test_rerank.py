@@ -361,7 +361,7 @@ def test_wrong_settings_and_files_are_refused(small_capture: Path, files: SceneF
     with pytest.raises(ArtifactError, match=r"\.jsonl, line \d+"):
         run(small_capture, files)
     path.write_text(path.read_text().splitlines()[0].replace("ios_map/raw_data/", "ios_map/raw_data/x") + "\n")
-    with pytest.raises(ArtifactError, match="of another capture"):
+    with pytest.raises(ArtifactError, match="belongs to another capture"):
         run(small_capture, files)
     path.unlink()
     with pytest.raises(ArtifactError, match="Run the retrieve stage first"):

@@ -1,4 +1,4 @@
-"""Global descriptors of all images of a capture: one matrix and one table a subsession."""
+"""The embed stage: global descriptors of all images of a capture, one matrix and one table per subsession."""
 
 import logging
 import os
@@ -44,9 +44,9 @@ from toolkit.models.weights import resolve_weights
 log = logging.getLogger(__name__)
 
 VECTORS = "vectors"
-"""Name of the array of a batch."""
+"""Name of a batch's array in the file of progress."""
 VOCABULARY_IMAGES = 2048
-"""Map images that the vocabulary is learned from at most, spread evenly: bounds time and memory."""
+"""Map images from which the vocabulary is learned, at most, spread evenly: bounds time and memory."""
 
 
 @heals
@@ -62,99 +62,93 @@ def embed_sessions(
 ) -> pd.DataFrame:
     """Write `<out_dir>/<session>/<subsession>/<subsession>.npy` (N, D) and its `manifest.csv`.
 
-    Of several models, each writes the same below `<out_dir>/<model>`.
-
-    Images that cannot be read are left out of both, and listed with the reason in `failed.csv` beside them.
-    Memory does not grow with the number of images, and a killed run goes on within a subsession.
+    With several models, each writes these files below `<out_dir>/<model>`. Both files omit images that cannot be read;
+    `failed.csv` beside them lists these with the reason. Memory does not grow with the number of images. A killed run
+    continues within a subsession.
 
     Args:
         sessions_root: `<capture>/sessions`.
         out_dir: the embeddings folder; the vocabulary goes there too.
-        settings: see `EmbedSettings`; a dict holds what differs from the defaults.
-        device: `ios`, `hl`, `spot`, or `auto`: all that the capture has.
+        settings: see `EmbedSettings`; a dict needs only the values that differ from the defaults.
+        device: `ios`, `hl`, `spot`, or `auto`: all devices of the capture.
         subsession: one subsession's name, or `all`.
-        features_dir: folder of the local features that stages share; `<out_dir>/../features` where None.
+        features_dir: folder of the local features that stages share; None: `<out_dir>/../features`.
         skip_existing: reuse subsessions made from the same images and settings.
 
     Returns:
-        One row a subsession and model: session, subsession, images, embedded, unreadable, turned, seconds, skipped,
-        model, dim, reason; and one for each session that cannot be read, with the `reason`.
+        One row per subsession and model: session, subsession, images, embedded, unreadable, turned, seconds, skipped,
+        model, dim, reason; and one row, with the `reason`, per session that cannot be read.
 
     Raises:
         CaptureError: no session can be read.
         ManifestError: a parameter is not valid.
-        WeightsError: a learned model has no weights, or other ones; before any work.
+        WeightsError: the weights of a learned model are missing, or of another network. Raised before any work.
     """
     settings = EmbedSettings.of(settings)
     out_dir = Path(out_dir)
     features_dir = Path(features_dir) if features_dir is not None else out_dir.parent / "features"
     capture = Capture.from_sessions_root(sessions_root)
-    named = resolve_model(settings.model, settings.checkpoint)
+    model = resolve_model(settings.model, settings.checkpoint)
     if settings.model == "auto":
-        log.warning("model auto: %s", named)
-    settings = settings.model_copy(update={"model": named})
+        log.warning("model auto: %s", model)
+    settings = settings.model_copy(update={"model": model})
     several = len(settings.models) > 1
     if several:
         for name in settings.models:
-            if name in WEIGHTS:  # before the work of another one
+            if name in WEIGHTS:  # fail before another model has worked for hours
                 resolve_weights(WEIGHTS[name], settings.checkpoint)
     tables = []
     for name in settings.models:
-        # What a run with this model alone left is taken over into the model's own folder, and the other way round.
+        # A run with several models reuses the files of a run with one of them alone, and vice versa.
         own, other = (out_dir / name, out_dir) if several else (out_dir, out_dir / name)
         folders = _Folders(own, other, features_dir)
-        chosen = settings.model_copy(update={"model": name})
-        tables.append(_embed_with_one(capture, folders, chosen, device, subsession, skip_existing))
+        model_settings = settings.model_copy(update={"model": name})
+        tables.append(_embed_with_model(capture, folders, model_settings, device, subsession, skip_existing))
     write_text(out_dir / "settings.json", settings.model_dump_json(indent=1) + "\n")
     return pd.concat(tables, ignore_index=True) if several else tables[0]
 
 
 @dataclass(frozen=True)
 class _Folders:
-    """Where the embeddings of one model go, and what they are made of."""
+    """Folders of one model: its embeddings, and its inputs."""
 
     out: Path
     other: Path
-    """Where the same may lie, of a run with this model alone or with others."""
+    """Folder where a run with another number of models puts the same embeddings."""
     features: Path
 
     def take_over(self, path: Path, record: dict[str, Any]) -> bool:
-        """Take an artifact and the files of its record from the other folder; False if it is not current there."""
-        found = self.other / path.relative_to(self.out)
-        if not is_current(found, record):
+        """Copy an artifact and the files of its record from the other folder; False if it is not current there."""
+        source = self.other / path.relative_to(self.out)
+        if not is_current(source, record):
             return False
         (path.parent / "failed.csv").unlink(missing_ok=True)
-        # Files are replaced and never changed, so that both places can share them.
-        for name in [*read_json(sidecar_path(found))["files"], sidecar_path(found).name]:
+        # Files are replaced, never changed, so both folders can share them by hard links.
+        for name in [*read_json(sidecar_path(source))["files"], sidecar_path(source).name]:
             with write_atomic(path.with_name(name)) as temporary:
                 try:
                     temporary.unlink()
-                    os.link(found.with_name(name), temporary)
+                    os.link(source.with_name(name), temporary)
                 except OSError:  # a file system without links
-                    shutil.copyfile(found.with_name(name), temporary)
+                    shutil.copyfile(source.with_name(name), temporary)
         return True
 
 
-def _embed_with_one(
-    capture: Capture,
-    folders: _Folders,
-    settings: EmbedSettings,
-    device: str,
-    subsession: str,
-    skip_existing: bool,
+def _embed_with_model(
+    capture: Capture, folders: _Folders, settings: EmbedSettings, device: str, subsession: str, skip_existing: bool
 ) -> pd.DataFrame:
     out_dir, features_dir = folders.out, folders.features
-    parts, left_out = _subsessions(capture, device, subsession)
+    parts, unreadable = _subsessions(capture, device, subsession)
     embedder = _open_embedder(capture, settings, folders, skip_existing)
     if (turns := _turns(capture, embedder, settings)) is not None:
         parts = [replace(part, turns=turns.of(part.session, part.rows)) for part in parts]
     if subsession == "all":
-        names = [name for name in _session_names(capture, device) if name not in left_out]
+        names = [name for name in _session_names(capture, device) if name not in unreadable]
         _remove_former(out_dir, names, parts)
 
     @cache
     def store_of(session_id: str) -> FeatureStore:
-        """Return the features of all that is embedded of a session: its file is then written once."""
+        """Return the features of all subsessions of a session, so that its file is written once."""
         rows = [part.rows for part in parts if part.session.id == session_id]
         return extract_session(capture[session_id], features_dir, rows=np.concatenate(rows))
 
@@ -177,9 +171,8 @@ def _embed_with_one(
             sweep(matrix_path)
             embedded = len(np.load(matrix_path, mmap_mode="r"))
         else:
-            # The same images in batches of another size are the same up to rounding.
-            made_by = {**record, "rows_a_batch": settings.batch_size}
-            with GroupWriter(matrix_path, made_by) as batches:
+            # Progress is kept per batch, so it depends on the batch size; the finished matrix does not, up to rounding.
+            with GroupWriter(matrix_path, {**record, "rows_a_batch": settings.batch_size}) as batches:
                 if not skip_existing:
                     batches.discard()
                 failed = _embed(embedder, part, batches, settings, store_of)
@@ -203,8 +196,8 @@ def _embed_with_one(
                 "reason": "",
             }
         )
-    nothing = {name: type(value)() for name, value in table[0].items()}
-    table += [{**nothing, "session": name, "reason": reason} for name, reason in left_out.items()]
+    empty_row = {name: type(value)() for name, value in table[0].items()}
+    table += [{**empty_row, "session": name, "reason": reason} for name, reason in unreadable.items()]
     return pd.DataFrame(table)
 
 
@@ -215,9 +208,9 @@ class _Subsession:
     session: Session
     name: str
     rows: NDArray[np.intp]
-    """(N,) its images, rows of `session.images`."""
+    """(N,) rows of `session.images`."""
     turns: Ints
-    """(N,) counter-clockwise quarter turns that make each image upright for the embedder."""
+    """(N,) counter-clockwise quarter turns that make each image upright; 0 if the embedder takes them as stored."""
 
 
 def _open_embedder(capture: Capture, settings: EmbedSettings, folders: _Folders, skip_existing: bool) -> Embedder:
@@ -234,7 +227,7 @@ def _open_embedder(capture: Capture, settings: EmbedSettings, folders: _Folders,
 
 
 def _turns(capture: Capture, embedder: Embedder, settings: EmbedSettings) -> Turns | None:
-    """Return how images are turned upright, or None where they are taken as they are."""
+    """Return the turns that make images upright, or None if the embedder takes them as stored."""
     upright = embedder.upright if settings.upright is None else settings.upright
     if embedder.inputs == "features" or not upright:
         return None
@@ -248,48 +241,48 @@ def _session_names(capture: Capture, device: str) -> list[str]:
 
 
 def _subsessions(capture: Capture, device: str, subsession: str) -> tuple[list[_Subsession], dict[str, str]]:
-    """Return the subsessions to embed, whose images are not turned, and why sessions cannot be read."""
+    """Return the subsessions to embed, without turns, and for each unreadable session the reason."""
     if device not in ("auto", "all", *capture.devices):
         raise ManifestError(f"device is {device!r}; {capture.name} has {', '.join(capture.devices)} (or `auto`).")
     names = _session_names(capture, device)
-    parts, left_out = list[_Subsession](), dict[str, CaptureError]()
+    parts, unreadable = list[_Subsession](), dict[str, CaptureError]()
     for id_ in names:
         try:
             session = capture[id_]
             rows = session.camera_rows
         except CaptureError as error:
             log.warning("%s is left out: %s", id_, error)
-            left_out[id_] = error
+            unreadable[id_] = error
             continue
-        of_row = session.subsession_of(rows)
-        # Images outside every listed subsession are embedded too, under the session's name.
-        of_row = np.where(of_row == "", session.id, of_row)
-        for name in dict.fromkeys(of_row.tolist()):
-            members = rows[of_row == name]
+        subsessions = session.subsession_of(rows)
+        # Images outside all listed subsessions are embedded too, under the session's name.
+        subsessions = np.where(subsessions == "", session.id, subsessions)
+        for name in dict.fromkeys(subsessions.tolist()):
+            members = rows[subsessions == name]
             parts.append(_Subsession(session, name, members, np.zeros(len(members), np.int64)))
-    chosen = [part for part in parts if subsession in ("all", part.name)]
-    if not parts and left_out:
-        raise next(iter(left_out.values()))
-    if not chosen:
+    selected = [part for part in parts if subsession in ("all", part.name)]
+    if not parts and unreadable:
+        raise next(iter(unreadable.values()))
+    if not selected:
         known = ", ".join(part.name for part in parts)
         raise ManifestError(f"No images of subsession {subsession!r} in {', '.join(names)}; known: {known}.")
-    return chosen, {id_: str(error) for id_, error in left_out.items()}
+    return selected, {id_: str(error) for id_, error in unreadable.items()}
 
 
 def _remove_former(out_dir: Path, names: list[str], parts: list[_Subsession]) -> None:
-    """Remove the embeddings of subsessions that these sessions no longer have: whoever reads a session reads all."""
+    """Remove embeddings of subsessions that the sessions no longer have; `open_embeddings` would read them."""
     folders = {out_dir / part.session.id / part.name for part in parts}
     for name in names:
         for manifest in sorted((out_dir / name).rglob("manifest.csv")):
             if manifest.parent not in folders:
-                log.warning("%s: no such subsession any more, removed", manifest.parent)
+                log.warning("%s: removed, the session no longer has this subsession", manifest.parent)
                 matrix = manifest.parent / f"{manifest.parent.name}.npy"
                 for path in (manifest, matrix, sidecar_path(matrix), manifest.parent / "failed.csv"):
                     path.unlink(missing_ok=True)
 
 
 def _vocabulary(capture: Capture, folders: _Folders, settings: EmbedSettings, skip_existing: bool) -> Path:
-    """Learn the VLAD vocabulary from the map images of all devices, unless a current one is there."""
+    """Learn the VLAD vocabulary from the map images of all devices, unless the file is current."""
     from toolkit.embedders.vlad import Vlad
 
     maps = capture.usable("map")
@@ -298,22 +291,23 @@ def _vocabulary(capture: Capture, folders: _Folders, settings: EmbedSettings, sk
             f"{capture.path}/sessions has no <device>_map session that can be read; `vlad` learns its vocabulary from "
             "the map."
         )
-    every = [(session.id, int(row)) for session in maps for row in session.camera_rows]
-    chosen: dict[str, list[int]] = {}
-    for index in np.linspace(0, len(every) - 1, min(len(every), VOCABULARY_IMAGES)).astype(int).tolist():
-        name, row = every[index]
-        chosen.setdefault(name, []).append(row)
+    images = [(session.id, int(row)) for session in maps for row in session.camera_rows]
+    rows_by_session: dict[str, list[int]] = {}
+    for index in np.linspace(0, len(images) - 1, min(len(images), VOCABULARY_IMAGES)).astype(int).tolist():
+        name, row = images[index]
+        rows_by_session.setdefault(name, []).append(row)
+    chosen = {name: np.array(rows) for name, rows in rows_by_session.items()}
     record = {
         "vlad": settings.vlad.model_dump(),
         "features": SiftExtractor().settings,
-        "images": {name: _images_fingerprint(capture[name], np.array(rows)) for name, rows in chosen.items()},
+        "images": {name: _images_fingerprint(capture[name], rows) for name, rows in chosen.items()},
         "seed": settings.seed,
     }
     path, features_dir = folders.out / "vlad.npz", folders.features
     if skip_existing and (is_current(path, record) or folders.take_over(path, record)):
         return path
-    stores = {name: extract_session(capture[name], features_dir, rows=np.array(rows)) for name, rows in chosen.items()}
-    keys = [(name, capture[name].image_name(row)) for name, rows in chosen.items() for row in rows]
+    stores = {name: extract_session(capture[name], features_dir, rows=rows) for name, rows in chosen.items()}
+    keys = [(name, capture[name].image_name(row)) for name, rows in rows_by_session.items() for row in rows]
     keys = [(name, image) for name, image in keys if image in stores[name]]
 
     def features() -> Iterator[LocalFeatures]:
@@ -333,12 +327,12 @@ def _embed(
     settings: EmbedSettings,
     store_of: Callable[[str], FeatureStore],
 ) -> dict[int, str]:
-    """Add the vectors of the readable images, in order; return why the others (by row) have none."""
+    """Add the vectors of the readable images, in order; return the reason for each unreadable one, by row."""
     store = store_of(part.session.id) if embedder.inputs == "features" else None
     count, label = -(-len(part.rows) // settings.batch_size), f"embed {part.session.id}/{part.name}"
     todo = batches.left([(f"{number:08d}", "", number) for number in range(count)])
-    others = embedder, part, settings, store, label
-    _embed_into(batches, batches.spread(_embed_into, todo, others, label, "batch"), *others)
+    arguments = embedder, part, settings, store, label
+    _embed_into(batches, batches.spread(_embed_into, todo, arguments, label, "batch"), *arguments)
     return {row: reason for note in batches.notes().values() for row, reason in note["failed"]}
 
 
@@ -351,23 +345,22 @@ def _embed_into(
     store: FeatureStore | None,
     label: str,
 ) -> None:
-    """Add the vectors of batches, by group and number, and why images in them have none."""
+    """Embed the batches `todo` (group, "", number); store their vectors and the reasons for unreadable images."""
     size = settings.batch_size
     slices = [slice(number * size, (number + 1) * size) for *_, number in todo]
-    chosen = np.concatenate([np.zeros(0, np.int64), *(np.arange(len(part.rows))[rows] for rows in slices)])
-    inputs = _inputs(embedder, replace(part, rows=part.rows[chosen], turns=part.turns[chosen]), size, store)
+    left = np.concatenate([np.zeros(0, np.int64), *(np.arange(len(part.rows))[rows] for rows in slices)])
+    inputs = _inputs(embedder, replace(part, rows=part.rows[left], turns=part.turns[left]), size, store)
 
     def stack(items: list[tuple[int, Any | str]]) -> tuple[Any, dict[int, str]]:
         readable = [item for _, item in items if not isinstance(item, str)]
         unreadable = {row: item for row, item in items if isinstance(item, str)}
         return embedder.stack(readable) if readable else readable, unreadable
 
-    # The next batch is copied to the device while one is embedded.
-    of_batches = (list(islice(inputs, len(part.rows[rows]))) for rows in slices)
-    with tqdm(total=len(part.rows), initial=len(part.rows) - len(chosen), desc=label, unit="image") as bar:
-        for (group, *_), (batch, unreadable) in zip(
-            todo, prefetch(stack, of_batches, workers=1, ahead=0), strict=True
-        ):
+    # Copy the next batch to the device while one is embedded.
+    inputs_of_batches = (list(islice(inputs, len(part.rows[rows]))) for rows in slices)
+    stacked = prefetch(stack, inputs_of_batches, workers=1, ahead=0)
+    with tqdm(total=len(part.rows), initial=len(part.rows) - len(left), desc=label, unit="image") as bar:
+        for (group, *_), (batch, unreadable) in zip(todo, stacked, strict=True):
             vectors = embedder.embed(batch)
             if vectors.shape != (len(batch), embedder.dim):
                 raise ValueError(f"{embedder.name} gave {vectors.shape}; expected {(len(batch), embedder.dim)}.")
@@ -378,7 +371,7 @@ def _embed_into(
 
 
 def write_matrix(path: Path, batches: GroupWriter, rows: int, dim: int, dtype: str) -> None:
-    """Write the vectors of all batches to a file `.npy`, (rows, dim), without holding them in memory."""
+    """Write the vectors of all batches to a `.npy` file (rows, dim), one batch in memory at a time."""
     with write_atomic(path) as temporary, open(temporary, "wb") as stream:
         header = {"descr": np.dtype(dtype).str, "fortran_order": False, "shape": (rows, dim)}
         np.lib.format.write_array_header_1_0(stream, header)
@@ -389,7 +382,7 @@ def write_matrix(path: Path, batches: GroupWriter, rows: int, dim: int, dtype: s
 def _inputs(
     embedder: Embedder, part: _Subsession, batch_size: int, store: FeatureStore | None
 ) -> Iterator[tuple[int, Any | str]]:
-    """Yield row and input (features or a prepared image) of the images, or why it has none."""
+    """Yield the row and the input (features or a prepared image) of each image; a str is why it has none."""
     session = part.session
     if store is not None:
         for row in part.rows.tolist():
@@ -410,7 +403,7 @@ def _inputs(
 
 
 def _images_fingerprint(session: Session, rows: NDArray[np.intp]) -> str:
-    """Identify images by their keys, and their files by name, size and time of change."""
+    """Return a fingerprint of images: their keys, and the name, size and time of change of their files."""
     table = session.images.iloc[rows]
     keys = [table[column].tolist() for column in ("timestamp", "sensor_id", "path")]
     files = files_fingerprint([session.image_path(int(row)) for row in rows])
@@ -418,7 +411,7 @@ def _images_fingerprint(session: Session, rows: NDArray[np.intp]) -> str:
 
 
 def _write_tables(folder: Path, capture: str, part: _Subsession, failed: dict[int, str]) -> list[Path]:
-    """Write the manifest of the embedded images, and the table of the unreadable ones where there are any."""
+    """Write the manifest of the embedded images, and `failed.csv` if any are unreadable; return the files."""
     session, images = part.session, part.session.images.iloc[part.rows]
     table = pd.DataFrame(
         {

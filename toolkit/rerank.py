@@ -1,7 +1,7 @@
-"""The rerank stage: the retrieved map images of every query, ordered by how many matches agree with a relative pose.
+"""The rerank stage: orders the references of every query image by the number of matches that fit one relative pose.
 
-Global descriptors confuse places that look alike. Local features that match *and* obey one essential matrix of the two
-calibrated cameras are rarely found between different places, so the right reference comes first.
+Global descriptors confuse places that look alike. Images of different places rarely have many local matches that also
+fit one essential matrix of the two calibrated cameras, so the right reference comes first.
 """
 
 import json
@@ -56,33 +56,32 @@ def rerank_pairs(
     skip_existing: bool = True,
     workers: int = 0,
 ) -> pd.DataFrame:
-    """Write, for every pair of devices, the retrieved map images of each query image in order of verified inliers.
+    """Write, for every pair of devices, the references of each query image in order of verified inliers.
 
-    The files have the retrieval stage's format. `score` is the number of inliers, 0 where chance would give as many;
-    references with the same score keep the order of retrieval. They have in addition `retrieval_score`,
-    `retrieval_rank`, and `num_matches`, the matches among which the inliers are. A query image that cannot be verified
-    keeps the order of retrieval, and its `reason` says why. Every image of a rig is verified on its own.
+    The files have the retrieval stage's format. `score` is the number of inliers, or 0 if as many occur by chance;
+    references with equal scores keep their order. Each reference also has `retrieval_score`, `retrieval_rank`, and
+    `num_matches`, of which the inliers are a part. A query image that cannot be verified keeps the order of retrieval,
+    and its `reason` says why. Every image of a rig is verified separately.
 
     Args:
         sessions_root: `<capture>/sessions`.
         retrieval_dir: folder of the retrieval stage's files.
         features_dir: folder of local features, shared with the other stages.
         out_dir: folder of the reranked files.
-        settings: see `RerankSettings`; a dict holds what differs from the defaults.
-        map_device, query_device: `ios`, `hl`, `spot`, or `all` that the capture has.
-        skip_existing: reuse what was made from the same inputs and settings, and go on where a run was killed.
-        workers: threads; 0 takes the number of cores.
+        settings: see `RerankSettings`; a dict needs only the values that differ from the defaults.
+        map_device, query_device: `ios`, `hl`, `spot`, or `all` devices of the capture.
+        skip_existing: reuse files made from the same inputs and settings, and continue a killed run.
+        workers: threads; 0: one per core.
 
     Returns:
-        One row a pair: map_device, query_device, queries (images) = confirmed + kept, changed (confirmed ones that have
-        another first reference than before), seconds, skipped, path, reason. A pair that cannot be done has zeros and
-        the `reason`.
+        One row per pair: map_device, query_device, query_images = confirmed + kept, changed (confirmed query images
+        with a new first reference), seconds, skipped, path, reason. A pair that fails has zeros and the `reason`.
 
     Raises:
         ManifestError: topk is below 1 or above topn; unknown features, or a matcher that does not suit them.
-        WeightsError: a network has no weights.
+        WeightsError: the weights of a network are missing.
         CaptureError: unknown device.
-        ArtifactError: no pair can be done; of one, the retrieval is missing, torn, or of another capture.
+        ArtifactError: all pairs fail, and the retrieval of one is missing, torn, or of another capture.
     """
     settings = resolve_auto(RerankSettings.of(settings))
     capture = Capture.from_sessions_root(sessions_root)
@@ -113,7 +112,7 @@ def rerank_pairs(
 
 @dataclass(frozen=True)
 class _Pair:
-    """A map session and a query session, the files of both, and how their images are compared."""
+    """A map session and a query session, the retrieved and the reranked file, and how to match images."""
 
     map_session: Session
     query_session: Session
@@ -125,9 +124,9 @@ class _Pair:
 
     @cached_property
     def record(self) -> dict[str, Any]:
-        """What the reranked file depends on."""
+        """Settings and fingerprints of the inputs of the reranked file."""
         if not self.retrieval.exists():
-            read_references(self.retrieval)  # says what is missing
+            read_references(self.retrieval)  # raises the error that says what to do
         sessions = self.map_session, self.query_session
         return {
             "retrieval": file_fingerprint(self.retrieval),
@@ -139,7 +138,7 @@ class _Pair:
         }
 
     def rerank(self, features_dir: Path, workers: int, skip_existing: bool, turns: Turns | None) -> None:
-        """Write the reranked file; take over the rows that a stopped run finished."""
+        """Write the reranked file; reuse the rows that a stopped run finished."""
         queries = read_references(self.retrieval, "path")
         references = [reference for query in queries for reference in query["topk"][: self.settings.topn]]
         stores = [
@@ -158,46 +157,46 @@ class _Pair:
         def rerank(index: int) -> tuple[int, dict[str, Any]]:
             try:
                 return index, self._reranked(queries[index], verifier, *stores)
-            except Exception as error:  # one bad query never ends a run
+            except Exception as error:  # one bad query must not end the run
                 return index, self._kept(queries[index], reason_of(error, f"reranking {queries[index]['path']}"))
 
         with GroupWriter(self.path, self.record) as progress:
             if not skip_existing:
                 progress.discard()
             todo = [index for index in range(len(queries)) if str(index) not in progress.notes()]
-            # Queries with the same best reference follow each other: what they share is read once.
+            # Queries with the same first reference run one after another, so that it is read once.
             todo.sort(key=lambda index: _name(queries[index]["topk"][0]) if queries[index]["topk"] else "")
             label = f"rerank {self.query_session.device} in {self.map_session.device}"
-            # A network matches the references of one query as a batch, and keeps the device busy by that.
+            # One thread suffices for a network: a query's references are one batch, which keeps the device busy.
             threads = workers if self.method.extractor.threaded else 1
-            again: dict[str, dict[str, Any]] = {}  # rows of queries that are not recorded as done
+            broken: dict[str, dict[str, Any]] = {}  # rows of internal errors: written, but tried again by the next run
             for index, row in tqdm(prefetch(rerank, todo, threads), total=len(todo), desc=label, unit="image"):
                 if row["reason"].startswith(INTERNAL):
-                    again[str(index)] = row
+                    broken[str(index)] = row
                 else:
                     progress.add(str(index), note=row)
-            rows = progress.notes() | again
+            rows = progress.notes() | broken
             write_text(self.path, "".join(json.dumps(rows[str(index)]) + "\n" for index in range(len(queries))))
-            write_sidecar(self.path, self.record, unfinished=bool(again))
-            if not again:
+            write_sidecar(self.path, self.record, unfinished=bool(broken))
+            if not broken:
                 progress.discard()
 
     def _rows(self, session: Session, images: Sequence[dict[str, Any]]) -> Ints:
-        """Return the rows of `session.images` of images in the retrieval file; refuse one that the session lacks."""
+        """Return the rows of `session.images` of images in the retrieval file; raise if the session lacks one."""
         prefix = f"{session.path.name}/raw_data/"
         names = list(dict.fromkeys(_name(image) for image in images))
         rows = pd.Index(session.images["path"]).get_indexer([name.removeprefix(prefix) for name in names])
         if (rows < 0).any():
             raise ArtifactError(
                 f"{self.retrieval}: {(rows < 0).sum()} images are not in {session.path / 'images.txt'}, first "
-                f"{names[int(np.argmax(rows < 0))]}. The file is of another capture: retrieve again."
+                f"{names[int(np.argmax(rows < 0))]}. The file belongs to another capture: retrieve again."
             )
         return np.asarray(rows, np.int64)
 
     def _reranked(
         self, query: dict[str, Any], verifier: Verifier, map_store: FeatureStore, query_store: FeatureStore
     ) -> dict[str, Any]:
-        """Return a query image's row in the order of verified inliers."""
+        """Return a query image's row with its references in order of verified inliers."""
         name, references = _name(query), query["topk"][: self.settings.topn]
         if name not in query_store:
             return self._kept(query, query_store.failed.get(name, "no local features of the query image"))
@@ -212,19 +211,19 @@ class _Pair:
         )
         if not any(inliers):
             return self._kept(query, "no reference agrees with the query by more than chance")
-        counted = dict(zip(map(_name, readable), zip(inliers, matches, strict=True), strict=True))
-        rows = [_entry(reference, *counted.get(_name(reference), (0, 0))) for reference in references]
+        counts = dict(zip(map(_name, readable), zip(inliers, matches, strict=True), strict=True))
+        rows = [_entry(reference, *counts.get(_name(reference), (0, 0))) for reference in references]
         rows.sort(key=lambda row: (-row["score"], row["retrieval_rank"]))
         return _row(query, rows[: self.settings.topk], "")
 
     def _kept(self, query: dict[str, Any], reason: str) -> dict[str, Any]:
-        """Return a query image's row in the order of retrieval."""
+        """Return a query image's row with its references in the order of retrieval."""
         return _row(query, [_entry(reference, 0, 0) for reference in query["topk"][: self.settings.topk]], reason)
 
 
 def _entry(reference: dict[str, Any], inliers: int, matches: int) -> dict[str, Any]:
-    before = {"retrieval_score": reference["score"], "retrieval_rank": reference["rank"]}
-    return reference | {"score": inliers, "num_matches": matches} | before
+    retrieved = {"retrieval_score": reference["score"], "retrieval_rank": reference["rank"]}
+    return reference | {"score": inliers, "num_matches": matches} | retrieved
 
 
 def _row(query: dict[str, Any], references: list[dict[str, Any]], reason: str) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The K most similar map images of every query image, for all map x query device pairs."""
+"""The retrieve stage: the K most similar map images of every query image, for all pairs of map and query device."""
 
 import json
 import logging
@@ -19,19 +19,11 @@ from toolkit.capture.masks import Masks, combine, gps_masks, pose_masks, radio_m
 from toolkit.capture.session import SUBSESSIONS
 from toolkit.capture.tables import SIGNALS
 from toolkit.embedders import Vectors, embedding_folders, load_embeddings, open_descriptors
-from toolkit.embedders.index import EXACT, is_made, make_index
+from toolkit.embedders.index import EXACT, is_index_current, make_index
 from toolkit.embedders.search import Backend, Found, search
-from toolkit.embedders.stored import made_of
+from toolkit.embedders.stored import matrix_fingerprints
 from toolkit.errors import ArtifactError, CaptureError, ManifestError
-from toolkit.files import (
-    file_fingerprint,
-    fingerprint,
-    is_current,
-    pair_name,
-    write_atomic,
-    write_sidecar,
-    write_text,
-)  # fmt: skip
+from toolkit.files import file_fingerprint, fingerprint, is_current, pair_name, write_atomic, write_sidecar, write_text
 from toolkit.geometry import Ints
 from toolkit.manifest import MaskSettings, RetrieveSettings
 from toolkit.runs.pairs import PairRows
@@ -40,9 +32,10 @@ __all__ = ["load_embeddings", "retrieve_pairs", "search"]
 
 log = logging.getLogger(__name__)
 
-_OF_INDEX = {"index", "index_candidates", "nprobe"}
+_INDEX_SETTINGS = {"index", "index_candidates", "nprobe"}
 _CHOICE = 3
-"""Map images for each reference that radio leaves to choose from by their looks: it does not know where they look."""
+"""Map images that a radio mask leaves per reference, at least. Radio knows the place but not the viewing direction, so
+the descriptors must have some to choose from."""
 
 
 def retrieve_pairs(
@@ -56,27 +49,27 @@ def retrieve_pairs(
     queries: str = "keyframes_pruned_subsampled",
     skip_existing: bool = True,
 ) -> pd.DataFrame:
-    """Write, for every pair of devices, one JSON line a query image with its `topk` map images.
+    """Write, for every pair of devices, one JSON line per query image with its `topk` map images.
 
     Args:
         sessions_root: `<capture>/sessions`.
         map_feats_root: the embeddings folder, of map and query sessions.
-        out_jsonl: a folder, or for one pair a file `*.jsonl`; `<map_feats_root>/../retrieval` where None.
-        settings: see `RetrieveSettings`; a dict holds what differs from the defaults.
-        map_device, query_device: `ios`, `hl`, `spot`, or `all` that the capture has.
-        queries: the keyframe list that says which devices are asked for, or `all`.
+        out_jsonl: a folder, or for one pair a file `*.jsonl`; None: `<map_feats_root>/../retrieval`.
+        settings: see `RetrieveSettings`; a dict needs only the values that differ from the defaults.
+        map_device, query_device: `ios`, `hl`, `spot`, or `all` devices of the capture.
+        queries: name of the keyframe list whose keyframes are the queries, or `all`.
         skip_existing: reuse files made from the same embeddings, poses and settings.
 
     Returns:
-        One row a pair: map_device, query_device, keyframes, keyframes_missing (no image of theirs has an
-        embedding), queries and images_missing (images of the keyframes, with and without an embedding),
-        database, unposed (map images left out for want of a pose), seconds, skipped, path, reason. A pair that
-        cannot be done has zeros and the `reason`. For what is in `settings.mask`, such as `radio`, also
-        without_radio: the queries to which the whole map was left by it.
+        One row per pair: map_device, query_device, keyframes, keyframes_missing (without any embedded image),
+        query_images and images_missing (images of the keyframes, with and without an embedding), database, unposed
+        (map images left out because they have no pose), seconds, skipped, path, reason. A pair that fails has zeros
+        and the `reason`. For each mask in the settings, such as `radio`, also without_radio: the number of queries
+        that it leaves the whole map.
 
     Raises:
-        ToolkitError: see the message: unknown device; or no pair can be done: no such list, embeddings missing or of
-            different dimensions.
+        ToolkitError: unknown device; or all pairs fail: there is no such list, embeddings are missing or have
+            different dimensions. The message says which.
     """
     settings = RetrieveSettings.of(settings)
     capture = Capture.from_sessions_root(sessions_root)
@@ -99,28 +92,28 @@ def retrieve_pairs(
     def load_database(device: str) -> _Images:
         return _load_database(capture[f"{device}_map"], embeddings, settings.normalize)
 
-    for device in map_devices:
+    for map_device in map_devices:
         todo: dict[str, tuple[_Images, Path, dict[str, Any]]] = {}
-        for queried in query_devices:
-            with table.row(device, queried) as row:
-                query, database = load_queries(queried), load_database(device)
-                path = out if out.suffix == ".jsonl" else out / f"{pair_name(capture.name, device, queried)}.jsonl"
+        for device in query_devices:
+            with table.row(map_device, device) as row:
+                query, database = load_queries(device), load_database(map_device)
+                path = out if out.suffix == ".jsonl" else out / f"{pair_name(capture.name, map_device, device)}.jsonl"
                 record = {
                     "map": _inputs(database.session, embeddings),
                     "query": _inputs(query.session, embeddings),
                     "rows": fingerprint(query.rows.tolist()),
                     "topk": settings.topk,
                     "normalize": settings.normalize,
-                    **({} if settings.index == EXACT else settings.model_dump(include=_OF_INDEX)),
+                    **({} if settings.index == EXACT else settings.model_dump(include=_INDEX_SETTINGS)),
                     **_mask_record(settings.mask, database.session, query.session),
                 }
                 masks, without = _masks(settings, poses, database, query)
                 skipped = skip_existing and is_current(path, record)
-                # Pictures that are localized in the map need its index, too.
-                skipped = skipped and is_made(embeddings, database.session.id, database.vectors, settings)
+                # Single photographs that are localized later search the map's index, too.
+                skipped = skipped and is_index_current(embeddings, database.session.id, database.vectors, settings)
                 if not skipped:
                     _require_same_dimension(query, database)
-                    todo[queried] = replace(query, masks=masks), path, record
+                    todo[device] = replace(query, masks=masks), path, record
                 row |= query.counts | database.counts | without
                 row |= {"seconds": 0.0, "skipped": skipped, "path": str(path)}
         if not todo:
@@ -130,14 +123,14 @@ def retrieve_pairs(
         find = partial(
             _search, database=database, settings=settings, embeddings=embeddings, skip_existing=skip_existing
         )
-        with suppress(ArtifactError):  # a value is not finite: the row of its pair says so
-            found = find({queried: query for queried, (query, _, _) in todo.items()})
+        with suppress(ArtifactError):  # a value is not finite: search pair by pair, so that only its row fails
+            found = find({device: query for device, (query, _, _) in todo.items()})
         shared = (time.perf_counter() - started) / len(todo)
-        for queried, (query, path, record) in todo.items():
-            with table.row(device, queried) as row:
+        for device, (query, path, record) in todo.items():
+            with table.row(map_device, device) as row:
                 started = time.perf_counter()
-                found = found or find({queried: query})
-                _write_pair(path, query, database, found.pop(queried))
+                found = found or find({device: query})
+                _write_pair(path, query, database, found.pop(device))
                 write_sidecar(path, record)
                 row["seconds"] = round(shared + time.perf_counter() - started, 3)
     frame = table.frame()
@@ -147,19 +140,22 @@ def retrieve_pairs(
 
 @dataclass(frozen=True)
 class _Images:
-    """Embedded images of a session: rows of `session.images`, their vectors and their lines of the manifests."""
+    """Embedded images of a session."""
 
     session: Session
     rows: Ints
+    """Rows of `session.images`."""
     vectors: Vectors
     table: pd.DataFrame
+    """Their lines of the manifests."""
     counts: dict[str, int] = field(default_factory=dict)
     """Columns of a pair's row."""
     masks: Masks | None = None
+    """For query images: the map images that each may find."""
 
-    def take(self, chosen: Ints) -> "_Images":
-        table = self.table.iloc[chosen].reset_index(drop=True)
-        return replace(self, rows=self.rows[chosen], vectors=self.vectors.choose(chosen), table=table)
+    def take(self, positions: Ints) -> "_Images":
+        table = self.table.iloc[positions].reset_index(drop=True)
+        return replace(self, rows=self.rows[positions], vectors=self.vectors.choose(positions), table=table)
 
 
 def _load(session: Session, embeddings: Path, normalize: bool) -> _Images:
@@ -169,8 +165,8 @@ def _load(session: Session, embeddings: Path, normalize: bool) -> _Images:
     if (rows < 0).any():
         raise ArtifactError(
             f"{embeddings / session.id}: {(rows < 0).sum()} embedded images are not in "
-            f"{session.path / 'images.txt'}, first {table['abs_path'][int(np.argmax(rows < 0))]}. They are of another "
-            "capture: embed again."
+            f"{session.path / 'images.txt'}, first {table['abs_path'][int(np.argmax(rows < 0))]}. They belong to "
+            "another capture: embed again."
         )
     return _Images(session, rows, vectors, table)
 
@@ -210,18 +206,14 @@ def _require_same_dimension(query: _Images, database: _Images) -> None:
         ours, theirs = (" + ".join(map(str, images.vectors.dims)) for images in (database, query))
         raise ArtifactError(
             f"map {database.session.id}, query {query.session.id}: the map's embeddings have {ours} "
-            f"dimensions, the query's {theirs}. They are of different models: embed both again with one."
+            f"dimensions, the query's {theirs}. Embed both again with the same model."
         )
 
 
 def _search(
-    queries: Mapping[str, _Images],
-    database: _Images,
-    settings: RetrieveSettings,
-    embeddings: Path,
-    skip_existing: bool,
+    queries: Mapping[str, _Images], database: _Images, settings: RetrieveSettings, embeddings: Path, skip_existing: bool
 ) -> dict[str, Found]:
-    """Return scores and rows (Q, K) of the best map images for several sets of queries, by one pass over the map.
+    """Return the best map images of several sets of queries, with one pass over the map.
 
     Raises:
         ArtifactError: a value is not finite.
@@ -236,10 +228,10 @@ def _search(
             Masks.stack(masks) if masks else None, database.vectors.dims,
         )  # fmt: skip
     except ValueError as error:
-        of = ", ".join(query.session.id for query in queries.values())
-        raise ArtifactError(f"map {database.session.id}, query {of}: {error}") from error
+        names = ", ".join(query.session.id for query in queries.values())
+        raise ArtifactError(f"map {database.session.id}, query {names}: {error}") from error
     cuts = np.cumsum([len(query.rows) for query in queries.values()])[:-1]
-    return dict(zip(queries, zip(*(np.split(part, cuts) for part in found), strict=True), strict=True))
+    return dict(zip(queries, zip(*(np.split(array, cuts) for array in found), strict=True), strict=True))
 
 
 def _write_pair(path: Path, query: _Images, database: _Images, found: Found) -> None:
@@ -265,11 +257,11 @@ def _records(table: pd.DataFrame, *columns: str) -> list[dict[str, Any]]:
 
 
 def _inputs(session: Session, embeddings: Path) -> list[Any]:
-    """Identify what a session contributes to a pair's file: its embeddings, poses and calibration."""
+    """Return fingerprints of a session's embeddings, poses and calibration, on which a pair's file depends."""
     folders = [folder / session.id for folder in embedding_folders(embeddings).values()]
     matrices = [path for folder in folders for path in sorted(folder.rglob("*.npy"))]
     texts = [session.path / name for name in ("images.txt", "trajectories.txt", "rigs.txt")]
-    return [made_of(matrices), [file_fingerprint(path) for path in texts if path.exists()]]
+    return [matrix_fingerprints(matrices), [file_fingerprint(path) for path in texts if path.exists()]]
 
 
 def _rough_poses(settings: MaskSettings) -> Trajectory | None:
@@ -286,29 +278,30 @@ def _rough_poses(settings: MaskSettings) -> Trajectory | None:
 def _masks(
     settings: RetrieveSettings, poses: Trajectory | None, database: _Images, query: _Images
 ) -> tuple[Masks | None, dict[str, int]]:
-    """Return which map images each query image may find, None: all; and columns of the pair's row."""
+    """Return the map images that each query image may find, None: all; and columns of the pair's row."""
     mask = settings.mask
-    both = database.session, database.rows, query.session, query.rows
+    images = database.session, database.rows, query.session, query.rows
     priors = dict[str, Masks]()
     if poses is not None:
-        priors["poses"] = pose_masks(poses, *both, mask.poses_distance_m, mask.poses_angle_deg)
+        priors["poses"] = pose_masks(poses, *images, mask.poses_distance_m, mask.poses_angle_deg)
     if mask.gps:
-        priors["gps"] = gps_masks(*both, mask.gps_margin_m, mask.window_s)
+        priors["gps"] = gps_masks(*images, mask.gps_margin_m, mask.window_s)
     if mask.radio:
         least = max(_CHOICE * settings.topk, int(np.ceil(mask.radio_share * len(database.rows))))
-        priors["radio"] = radio_masks(*both, least, mask.window_s)
+        priors["radio"] = radio_masks(*images, least, mask.window_s)
     if not priors:
         return None, {}
-    masks, without = combine(list(priors.values()))
-    for prior, number in zip(priors, without, strict=True):
-        if number:
+    masks, counts = combine(list(priors.values()))
+    without = dict(zip(priors, counts, strict=True))
+    for prior, count in without.items():
+        if count:
             message = "map %s, query %s: %s leaves the whole map to %d of %d query images"
-            log.warning(message, database.session.id, query.session.id, prior, number, len(masks))
-    return masks, {f"without_{prior}": number for prior, number in zip(priors, without, strict=True)}
+            log.warning(message, database.session.id, query.session.id, prior, count, len(masks))
+    return masks, {f"without_{prior}": count for prior, count in without.items()}
 
 
 def _mask_record(settings: MaskSettings, *sessions: Session) -> dict[str, Any]:
-    """Identify what masks are made of; nothing without any."""
+    """Return the settings and fingerprints of the files that masks depend on; empty without masks."""
     record: dict[str, Any] = {}
     names: list[str] = []
     if settings.poses:

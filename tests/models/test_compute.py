@@ -100,7 +100,7 @@ def test_a_batch_that_does_not_fit_is_halved(caplog: pytest.LogCaptureFixture) -
     with caplog.at_level(logging.WARNING):
         torch.testing.assert_close(fitting(batch), batch * 2)
     assert memory.tried == [10, 5, 2, 2, 2, 2, 2]
-    assert "10 images do not fit the memory of cpu, going on with 5" in caplog.text
+    assert "10 images do not fit the memory of cpu, continuing with 5" in caplog.text
     torch.testing.assert_close(fitting(batch), batch * 2)
     assert memory.tried[7:] == [2, 2, 2, 2, 2], "what fits is remembered"
 

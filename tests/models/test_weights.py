@@ -617,7 +617,7 @@ def test_long_lists_are_cut() -> None:
 def test_weights_of_a_part_are_recognized() -> None:
     given = {key.removeprefix("backbone."): value for key, value in state().items() if key.startswith("backbone.")}
     message = refusal(given | {"mask_token": torch.ones(1)})  # plain DINOv2 has one
-    assert "those of its part `backbone` alone" in message
+    assert "belong to its part `backbone` alone" in message
     assert "of its part" not in refusal({**state(), "mask_token": torch.ones(1)})
 
 

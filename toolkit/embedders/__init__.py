@@ -1,4 +1,4 @@
-"""Global descriptors: one vector an image, for search. A new one is a file here and a line in `EMBEDDERS`."""
+"""Global descriptors: one vector per image, for search. To add one, add a file here and a line in `EMBEDDERS`."""
 
 import pkgutil
 from collections.abc import Sequence
@@ -23,16 +23,16 @@ from toolkit.models.weights import MEGALOC, find_weights
 
 
 class Embedder(Protocol):
-    """What the embed stage and others need of a global descriptor."""
+    """Interface of a global descriptor, as the embed stage and the localizer of single photographs use it."""
 
     name: str
     inputs: Literal["images", "features"]
-    """What `embed` takes: images (H, W, 3) uint8 RGB, or `toolkit.features.features.LocalFeatures`."""
+    """Input of `embed`: images (H, W, 3) uint8 RGB, or `toolkit.features.features.LocalFeatures`."""
     upright: bool
-    """Whether it was trained with upright photographs, so that images should be turned upright for it."""
+    """Whether it was trained on upright photographs, so that images should be turned upright for it."""
     least_side: int | None
-    """Pixels that the shorter side of an image must have: larger ones may be decoded smaller, see `read_image`. None:
-    images are wanted as they are stored."""
+    """Pixels that the shorter side of an image must keep; larger images may be decoded smaller, see `read_image`. None:
+    always decode at full size."""
 
     @property
     def dim(self) -> int:
@@ -40,16 +40,16 @@ class Embedder(Protocol):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What the vectors depend on besides the images; part of their fingerprint."""
+        """All settings that the vectors depend on; part of their fingerprint."""
 
     def prepare(self, item: Any) -> Any:
-        """Return an input as the embedder needs it; threads call this while other inputs are embedded."""
+        """Preprocess one input, for example resize an image. Threads call this while other inputs are embedded."""
 
     def stack(self, inputs: Sequence[Any]) -> Any:
-        """Return inputs, at least one, as a batch on the device; a thread calls this while another is embedded."""
+        """Return at least one input as a batch on the device. A thread calls this while another batch is embedded."""
 
     def embed(self, inputs: Any) -> NDArray[np.float32]:
-        """Return the vectors (B, D) float32 of inputs, or of what `stack` made of them.
+        """Return the vectors (B, D) float32 of inputs, or of a batch that `stack` returned.
 
         An image without structure may have a zero vector.
         """
@@ -59,17 +59,17 @@ EMBEDDERS: dict[str, str] = {
     "megaloc": "toolkit.embedders.megaloc:MegaLocEmbedder",
     "vlad": "toolkit.embedders.vlad:Vlad.load",
 }
-"""Name of an embedder -> `module:callable` that makes it, imported when it is needed. `auto` prefers the first."""
+"""Name of an embedder -> `module:callable` that creates it, imported on use. `auto` prefers the first."""
 WEIGHTS = {"megaloc": MEGALOC}
-"""The weights of the embedders that need some."""
+"""Weights of the learned embedders, by name."""
 
 
 def resolve_name(name: str, checkpoint: str | Path | None = None) -> str:
-    """Return the embedder that `name` stands for: itself; for `auto` the first whose weights are on this machine.
+    """Return the name of the embedder; for `auto`, the first whose weights are on this machine, if it needs any.
 
     Raises:
         ManifestError: unknown embedder.
-        WeightsError: `checkpoint` is given and is missing.
+        WeightsError: the file `checkpoint` is missing.
     """
     if name == "auto":
         return next(key for key in EMBEDDERS if key not in WEIGHTS or find_weights(WEIGHTS[key], checkpoint))
@@ -79,21 +79,21 @@ def resolve_name(name: str, checkpoint: str | Path | None = None) -> str:
 
 
 def resolve_model(model: str | list[str], checkpoint: str | Path | None = None) -> str | list[str]:
-    """Return the embedder that a name stands for, or those of several names; see `resolve_name`."""
+    """Apply `resolve_name` to a name, or to each of several names."""
     if isinstance(model, str):
         return resolve_name(model, checkpoint)
     return [resolve_name(name, checkpoint) for name in model]
 
 
 def create_embedder(name: str, **options: Any) -> Embedder:
-    """Return a ready embedder.
+    """Create an embedder.
 
     Args:
         name: a key of `EMBEDDERS`, or `auto`.
-        options: the embedder's own: `vocabulary=<file>` of `vlad`; `checkpoint`, `device`, `dtype_compute` and
-            `image_size` of `megaloc`.
+        options: arguments of the embedder: `vocabulary=<file>` for `vlad`; `checkpoint`, `device`, `dtype_compute` and
+            `image_size` for `megaloc`.
     """
     checkpoint = options.get("checkpoint")
-    place = checkpoint if isinstance(checkpoint, str | Path) else None
-    embedder: Embedder = pkgutil.resolve_name(EMBEDDERS[resolve_name(name, place)])(**options)
+    file = checkpoint if isinstance(checkpoint, str | Path) else None
+    embedder: Embedder = pkgutil.resolve_name(EMBEDDERS[resolve_name(name, file)])(**options)
     return embedder

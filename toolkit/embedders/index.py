@@ -1,7 +1,7 @@
-"""Candidates among more global descriptors than are to be compared one by one, by FAISS's indexes.
+"""Approximate nearest neighbors with FAISS indexes, for maps too large to compare every vector.
 
-An index holds vectors in fewer bytes, and looks at a part of them. What it finds is compared again by the vectors on
-disk, see `search`.
+An index compresses the vectors and compares a query with some of them only. `search` computes the exact scores of its
+candidates from the vectors on disk.
 """
 
 import logging
@@ -16,32 +16,28 @@ import faiss as typed_faiss
 import numpy as np
 from numpy.typing import NDArray
 
-from toolkit.embedders.stored import JoinedVectors, StoredVectors, Vectors, blocks, made_of, require_finite
+from toolkit.embedders.stored import JoinedVectors, StoredVectors, Vectors, blocks, matrix_fingerprints, require_finite
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError, first_line
-from toolkit.files import (
-    fingerprint,
-    is_current,
-    read_json,
-    require_whole,
-    sidecar_path,
-    write_atomic,
-    write_sidecar,
-)  # fmt: skip
+from toolkit.files import fingerprint, is_current, read_json, require_whole, sidecar_path, write_atomic, write_sidecar
 from toolkit.geometry import Ints
 from toolkit.manifest import RetrieveSettings
 
 log = logging.getLogger(__name__)
-faiss: Any = typed_faiss  # its stubs lack much of it
+faiss: Any = typed_faiss  # its type stubs are incomplete
 
 EXACT = "Flat"
 """Factory string of the exact search, which needs no index."""
+_EXPECTED = (
+    f"Expected a string of FAISS's index factory, such as PCA512,IVF4096,RaBitQ; {EXACT} searches without an index."
+)
 _BLOCK_BYTES = 128 << 20
+"""Vectors added to an index at a time, bytes of float32: bounds the memory."""
 _TRAIN_BYTES = 1 << 30
-"""Of vectors, in float32, that are in memory: those that are added at a time, those that an index is trained with."""
-_PER_PART = 64
-"""Vectors that each dimension of PCA and each cell of an inverted file is trained with, if there are so many."""
-_OF_CODES = 1 << 16
-"""Vectors that codes are trained with at least, however few cells there are; a PQ cannot do with less than 256."""
+"""Training vectors of an index, at most, bytes of float32."""
+_TRAIN_PER_UNIT = 64
+"""Training vectors per PCA dimension and per cell of an inverted file, if the map has as many."""
+_TRAIN_CODES = 1 << 16
+"""Training vectors of the codes, at least, however few cells there are; PQ needs 256 or more."""
 
 
 @dataclass(frozen=True)
@@ -50,45 +46,45 @@ class VectorIndex:
 
     index: Any
     candidates: int
-    """How many are found for each query."""
+    """Candidates per query."""
     nprobe: int | None = None
-    """Cells of an inverted file that are looked at; None: a 32nd of them, at least 16."""
+    """Cells of an inverted file searched per query; None: 1/32 of them, at least 16."""
 
     def find(self, query: NDArray[np.float32], allowed: NDArray[np.bool_] | None = None) -> Ints:
-        """Return for each query (Q, D) the rows of candidates (Q, C) int64, -1 where there are fewer.
+        """Return the candidate rows (Q, C) int64 of each query (Q, D); -1 pads missing candidates.
 
         Args:
-            allowed: (N,) the rows that may be found; None: all.
+            allowed: (N,) rows that may be returned; None: all.
         """
-        number = min(self.candidates, self.index.ntotal)
+        count = min(self.candidates, self.index.ntotal)
         if allowed is None:
-            return self._search(query, number)
+            return self._search(query, count)
         try:
-            return self._search(query, number, faiss.IDSelectorBitmap(np.packbits(allowed, bitorder="little")))
-        except RuntimeError:  # LSH, PQ, NSG, and others know no selection
-            return self._selected(query, number, allowed)
+            return self._search(query, count, faiss.IDSelectorBitmap(np.packbits(allowed, bitorder="little")))
+        except RuntimeError:  # LSH, PQ, NSG and some other indexes do not support selectors
+            return self._search_and_filter(query, count, allowed)
 
-    def _search(self, query: NDArray[np.float32], number: int, selector: Any = None) -> Ints:
-        _, rows = self.index.search(query, number, params=self._parameters(self.index, selector))
+    def _search(self, query: NDArray[np.float32], count: int, selector: Any = None) -> Ints:
+        _, rows = self.index.search(query, count, params=self._parameters(self.index, selector))
         return np.asarray(rows, np.int64)
 
-    def _selected(self, query: NDArray[np.float32], number: int, allowed: NDArray[np.bool_]) -> Ints:
-        """Return what `find` does, of an index that finds allowed rows only among all."""
-        found = np.full((len(query), number), -1, np.int64)
-        for row, one in zip(found, query[:, None], strict=True):
-            wanted = number
+    def _search_and_filter(self, query: NDArray[np.float32], count: int, allowed: NDArray[np.bool_]) -> Ints:
+        """Search without a selector: ask for more rows until `count` of them are allowed."""
+        candidates = np.full((len(query), count), -1, np.int64)
+        for row, vector in zip(candidates, query[:, None], strict=True):
+            depth = count
             while True:
-                rows = self._search(one, wanted)[0]
-                rows = rows[(rows >= 0) & allowed[rows]][:number]
-                if len(rows) == number or wanted == self.index.ntotal:
+                rows = self._search(vector, depth)[0]
+                rows = rows[(rows >= 0) & allowed[rows]][:count]
+                if len(rows) == count or depth == self.index.ntotal:
                     break
-                wanted = min(4 * wanted, self.index.ntotal)
+                depth = min(4 * depth, self.index.ntotal)
             row[: len(rows)] = rows
-        return found
+        return candidates
 
     def _parameters(self, index: Any, selector: Any) -> Any:
         index = faiss.downcast_index(index)
-        chosen = {} if selector is None else {"sel": selector}
+        selection = {} if selector is None else {"sel": selector}
         if isinstance(index, faiss.IndexPreTransform):
             return faiss.SearchParametersPreTransform(index_params=self._parameters(index.index, selector))
         if isinstance(index, faiss.IndexRefine):
@@ -97,51 +93,47 @@ class VectorIndex:
         if isinstance(index, faiss.IndexIVF):
             nprobe = self.nprobe or max(16, index.nlist // 32)
             if isinstance(index, faiss.IndexIVFRaBitQ):
-                return faiss.IVFRaBitQSearchParameters(nprobe=nprobe, qb=index.qb, **chosen)
-            return faiss.SearchParametersIVF(nprobe=nprobe, **chosen)
+                return faiss.IVFRaBitQSearchParameters(nprobe=nprobe, qb=index.qb, **selection)
+            return faiss.SearchParametersIVF(nprobe=nprobe, **selection)
         if isinstance(index, faiss.IndexHNSW):
-            return faiss.SearchParametersHNSW(efSearch=max(self.candidates, index.hnsw.efSearch), **chosen)
-        return faiss.SearchParameters(**chosen) if chosen else None
+            return faiss.SearchParametersHNSW(efSearch=max(self.candidates, index.hnsw.efSearch), **selection)
+        return faiss.SearchParameters(**selection) if selection else None
 
 
 @dataclass(frozen=True)
 class JoinedIndex:
-    """The indexes of several descriptors of the same images, side by side: each finds candidates."""
+    """One index per descriptor of the same images. Every index contributes candidates."""
 
-    parts: tuple[VectorIndex, ...]
+    indexes: tuple[VectorIndex, ...]
     dims: tuple[int, ...]
 
     @property
     def candidates(self) -> int:
-        return sum(part.candidates for part in self.parts)
+        return sum(index.candidates for index in self.indexes)
 
     def find(self, query: NDArray[np.float32], allowed: NDArray[np.bool_] | None = None) -> Ints:
-        """Return for each query (Q, sum of D) what any of the indexes finds, (Q, C); rows may come twice."""
+        """Return the candidate rows (Q, C) of all indexes for each query (Q, sum of D); rows may repeat."""
         queries = np.split(query, np.cumsum(self.dims)[:-1], axis=1)
-        found = [part.find(np.ascontiguousarray(of), allowed) for part, of in zip(self.parts, queries, strict=True)]
-        return np.hstack(found)
+        pairs = zip(self.indexes, queries, strict=True)
+        return np.hstack([index.find(np.ascontiguousarray(columns), allowed) for index, columns in pairs])
 
 
 def make_index(
-    embeddings: Path,
-    map_id: str,
-    vectors: Vectors,
-    settings: RetrieveSettings,
-    skip_existing: bool = True,
+    embeddings: Path, map_id: str, vectors: Vectors, settings: RetrieveSettings, skip_existing: bool = True
 ) -> VectorIndex | JoinedIndex | None:
-    """Return the index of a map, made if it is not there; None where none is needed, see `load_index`.
+    """Build the index of a map, or read the current one; None if none is needed, see `load_index`.
 
-    Memory is taken for the index and for 1 GB of vectors.
+    Needs memory for the index and for 1 GB of vectors.
 
     Args:
-        embeddings: folder of the embeddings; the index is a file in `index` beside it, of each of several descriptors
-            one in a folder of its name.
+        embeddings: folder of the embeddings. The index is a file in the folder `index` beside it; with several
+            descriptors, each has a subfolder with its name.
         map_id: the map session.
         vectors: (N, D) of the map.
-        skip_existing: take the file if it is of these vectors.
+        skip_existing: reuse the file if it was made from these vectors.
 
     Raises:
-        ManifestError: there is no such index, or it cannot be made of so many vectors.
+        ManifestError: FAISS has no such index, or cannot build it from N vectors.
         ValueError: a value is not finite.
     """
     if isinstance(vectors, JoinedVectors):
@@ -156,19 +148,19 @@ def make_index(
 
 
 def _join(
-    vectors: JoinedVectors, of_one: Callable[[str, StoredVectors], VectorIndex | JoinedIndex | None], map_id: str
+    vectors: JoinedVectors, open_one: Callable[[str, StoredVectors], VectorIndex | JoinedIndex | None], map_id: str
 ) -> JoinedIndex | None:
     """Return the indexes of all descriptors, or None if one of them needs none."""
-    parts = [of_one(f"{name}/{map_id}", part) for name, part in vectors.parts.items()]
-    single = tuple(part for part in parts if isinstance(part, VectorIndex))
-    return JoinedIndex(single, vectors.dims) if len(single) == len(parts) else None
+    opened = [open_one(f"{name}/{map_id}", part) for name, part in vectors.parts.items()]
+    indexes = tuple(index for index in opened if isinstance(index, VectorIndex))
+    return JoinedIndex(indexes, vectors.dims) if len(indexes) == len(opened) else None
 
 
-def is_made(embeddings: Path, map_id: str, vectors: Vectors, settings: RetrieveSettings) -> bool:
-    """Tell whether `load_index` finds what it looks for."""
+def is_index_current(embeddings: Path, map_id: str, vectors: Vectors, settings: RetrieveSettings) -> bool:
+    """Tell whether the map's index is current, or none is needed."""
     if isinstance(vectors, JoinedVectors):
         parts = vectors.parts.items()
-        return all(is_made(embeddings, f"{name}/{map_id}", part, settings) for name, part in parts)
+        return all(is_index_current(embeddings, f"{name}/{map_id}", part, settings) for name, part in parts)
     needed = _is_needed(settings, vectors)
     return not needed or is_current(_index_path(embeddings, map_id), _record(vectors, settings))
 
@@ -176,12 +168,13 @@ def is_made(embeddings: Path, map_id: str, vectors: Vectors, settings: RetrieveS
 def load_index(
     embeddings: Path, map_id: str, vectors: Vectors, settings: RetrieveSettings
 ) -> VectorIndex | JoinedIndex | None:
-    """Return the index that the retrieve stage made of the vectors of a map; None if the settings ask for none.
+    """Read the index that the retrieve stage built for a map; None for an exact search.
 
-    A map of no more vectors than candidates, cells or dimensions of PCA needs none either.
+    The search is exact if the settings say so, or if the map has no more vectors than the index has candidates, cells
+    or PCA dimensions.
 
     Raises:
-        ArtifactError: it is missing or damaged, or of other vectors.
+        ArtifactError: the file is missing or damaged, or was made from other vectors.
     """
     if isinstance(vectors, JoinedVectors):
         return _join(vectors, lambda name, part: load_index(embeddings, name, part, settings), map_id)
@@ -196,10 +189,12 @@ def _open(path: Path, record: dict[str, Any], vectors: StoredVectors, settings: 
         index = faiss.read_index(str(path))
     except RuntimeError as error:
         raise ArtifactError(f"{path}: the map's index cannot be read ({first_line(error)}). Retrieve again.") from error
-    wanted = fingerprint(record)
-    found = read_json(sidecar_path(path)).get("fingerprint", wanted)
-    if found != wanted or (index.ntotal, index.d) != vectors.shape:
-        raise ArtifactError(f"{path}: the map's index is of other embeddings, poses or settings. Retrieve again.")
+    expected = fingerprint(record)
+    stored = read_json(sidecar_path(path)).get("fingerprint", expected)
+    if stored != expected or (index.ntotal, index.d) != vectors.shape:
+        raise ArtifactError(
+            f"{path}: the map's index was made from other embeddings, poses or settings. Retrieve again."
+        )
     if settings.faiss_gpu:
         index = _on_gpu(index, settings.index)
     return VectorIndex(index, max(settings.index_candidates, settings.topk), settings.nprobe)
@@ -208,53 +203,50 @@ def _open(path: Path, record: dict[str, Any], vectors: StoredVectors, settings: 
 def _is_needed(settings: RetrieveSettings, vectors: StoredVectors) -> bool:
     if settings.index == EXACT:
         return False
-    empty = _empty(vectors, settings.index)  # is to live as long as what `downcast_index` returns
+    empty = _empty(vectors, settings.index)  # owns what `downcast_index` returns: keep it alive
     index = faiss.downcast_index(empty)
-    trained_with = [settings.index_candidates]
+    least = [settings.index_candidates]
     if isinstance(index, faiss.IndexPreTransform):
-        trained_with += [index.chain.at(number).d_out for number in range(index.chain.size())]
+        least += [index.chain.at(step).d_out for step in range(index.chain.size())]
         index = faiss.downcast_index(index.index)
     if isinstance(index, faiss.IndexIVF):
-        trained_with.append(index.nlist)
-    return len(vectors) > max(trained_with)
+        least.append(index.nlist)
+    return len(vectors) > max(least)
 
 
 def check_factory(factory: str) -> None:
-    """Refuse a string that FAISS's index factory cannot make an index of for vectors of any usual length.
+    """Check that FAISS's index factory accepts a string for at least one usual descriptor length.
 
     Raises:
-        ManifestError: naming the string.
+        ManifestError: it does not.
     """
-    said = []
-    for dim in () if factory == EXACT else (8448, 15360, 512):  # MegaLoc, a length that most numbers divide, VLAD
+    reasons = []
+    for dim in () if factory == EXACT else (8448, 15360, 512):  # MegaLoc, a length with many divisors, VLAD
         try:
             faiss.index_factory(dim, factory)
         except RuntimeError as error:
-            said.append(_said(error))
+            reasons.append(_reason(error))
         else:
             return
-    if said:
-        raise ManifestError(
-            f"retrieve.index: found {factory!r} ({said[0]}). Expected a string of FAISS's index factory, such as "
-            f"PCA512,IVF4096,RaBitQ; {EXACT} needs no index."
-        )
+    if reasons:
+        raise ManifestError(f"retrieve.index: found {factory!r} ({reasons[0]}). {_EXPECTED}")
 
 
 def _empty(vectors: StoredVectors, factory: str) -> Any:
-    # Of vectors of length 1 the nearest have the largest product, and centering by PCA does not change distances.
+    # L2 ranks unit vectors as the dot product does, and the centering by PCA does not change it.
     metric = faiss.METRIC_L2 if vectors.normalize else faiss.METRIC_INNER_PRODUCT
     try:
         return faiss.index_factory(vectors.dim, factory, metric)
     except RuntimeError as error:
         raise ManifestError(
-            f"retrieve.index: {factory!r} cannot hold vectors of {vectors.dim} dimensions ({_said(error)}). Expected "
-            f"a string of FAISS's index factory, such as PCA512,IVF4096,RaBitQ; {EXACT} needs no index."
+            f"retrieve.index: {factory!r} cannot hold vectors of {vectors.dim} dimensions ({_reason(error)}). "
+            f"{_EXPECTED}"
         ) from error
 
 
 def _record(vectors: StoredVectors, settings: RetrieveSettings) -> dict[str, Any]:
-    rows = fingerprint(vectors.rows.tolist())
-    return {"index": settings.index, "vectors": [made_of(vectors.paths), rows], "normalize": vectors.normalize}
+    identity = [matrix_fingerprints(vectors.paths), fingerprint(vectors.rows.tolist())]
+    return {"index": settings.index, "vectors": identity, "normalize": vectors.normalize}
 
 
 def _index_path(embeddings: Path, map_id: str) -> Path:
@@ -271,10 +263,10 @@ def _build(vectors: StoredVectors, factory: str) -> Any:
             index.add(block)
     except RuntimeError as error:
         raise ManifestError(
-            f"retrieve.index: {factory!r} cannot be made of {count} vectors of {dim} dimensions ({_said(error)}). "
-            f"{EXACT} needs no index, nor does this map with index_candidates: {count}."
+            f"retrieve.index: {factory!r} cannot be built from {count} vectors of {dim} dimensions ({_reason(error)}). "
+            f"Set index: {EXACT}, or index_candidates: {count}: neither builds an index for this map."
         ) from error
-    log.info("index %s of %d vectors is made", factory, count)
+    log.info("built index %s of %d vectors", factory, count)
     return index
 
 
@@ -284,54 +276,54 @@ def _write(path: Path, index: Any) -> None:
             faiss.write_index(index, str(temporary))
         except RuntimeError as error:
             raise ToolkitError(
-                f"{path}: the map's index cannot be written ({_said(error)}). Free some space on the disk."
+                f"{path}: the map's index cannot be written ({_reason(error)}). Free some space on the disk."
             ) from error
 
 
-def _said(error: RuntimeError) -> str:
-    """Return what FAISS says, without the name of its function."""
+def _reason(error: RuntimeError) -> str:
+    """Return the message of a FAISS error without the location in its source code."""
     return re.sub(r"^Error in .* at \S+:\d+: (Error: )?", "", str(error).strip().splitlines()[-1])
 
 
 def _train(index: Any, vectors: StoredVectors) -> None:
-    """Train the parts of an index one after the other: those that see fewer dimensions see more vectors."""
+    """Train the steps of an index in order. Steps after PCA see shorter vectors, so more of them fit in memory."""
     rng = np.random.default_rng(0)
     index = faiss.downcast_index(index)
-    applied = list[Callable[[NDArray[np.float32]], NDArray[np.float32]]]()
+    transforms = list[Callable[[NDArray[np.float32]], NDArray[np.float32]]]()
 
     def sample(dim: int, most: int) -> NDArray[np.float32]:
-        number = min(len(vectors), most, _TRAIN_BYTES // (4 * dim))
-        rows = np.sort(rng.choice(len(vectors), number, replace=False))
-        taken = np.empty((number, dim), np.float32)
+        count = min(len(vectors), most, _TRAIN_BYTES // (4 * dim))
+        rows = np.sort(rng.choice(len(vectors), count, replace=False))
+        samples = np.empty((count, dim), np.float32)
         for start, block in blocks(vectors.choose(rows), _BLOCK_BYTES):
             require_finite(block, "database", rows[start:])
-            for apply in applied:
+            for apply in transforms:
                 block = apply(block)
-            taken[start : start + len(block)] = block
-        return taken
+            samples[start : start + len(block)] = block
+        return samples
 
     if not isinstance(index, faiss.IndexPreTransform):
         _train_last(index, sample)
         return
-    for number in range(index.chain.size()):
-        transform = faiss.downcast_VectorTransform(index.chain.at(number))
+    for step in range(index.chain.size()):
+        transform = faiss.downcast_VectorTransform(index.chain.at(step))
         if not transform.is_trained:
             train = partial(_train_pca, transform) if isinstance(transform, faiss.PCAMatrix) else transform.train
-            train(sample(transform.d_in, _PER_PART * transform.d_out))
-        applied.append(transform.apply)
+            train(sample(transform.d_in, _TRAIN_PER_UNIT * transform.d_out))
+        transforms.append(transform.apply)
     _train_last(faiss.downcast_index(index.index), sample)
     index.is_trained = True
 
 
 def _train_pca(pca: Any, rows: NDArray[np.float32]) -> None:
-    """Train PCA by random projections, in half a minute for 8,448 dimensions: FAISS's exact solution takes far longer.
+    """Train PCA by random projections: half a minute for 8,448 dimensions, far faster than FAISS's exact solution.
 
     N. Halko, P. G. Martinsson, J. A. Tropp, "Finding Structure with Randomness", SIAM Review 2011.
     """
-    import torch  # a second of start-up, which localizing without networks does not need
+    import torch  # here, because localizing without networks shall not wait a second for the import
 
     if min(rows.shape) < pca.d_out:
-        raise RuntimeError(f"PCA to {pca.d_out} dimensions needs as many, and as many vectors")
+        raise RuntimeError(f"PCA to {pca.d_out} dimensions needs at least as many dimensions and vectors")
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         _, lengths, directions = torch.pca_lowrank(torch.from_numpy(rows), q=pca.d_out, niter=2)
@@ -344,15 +336,15 @@ def _train_pca(pca: Any, rows: NDArray[np.float32]) -> None:
 
 def _train_last(index: Any, sample: Callable[[int, int], NDArray[np.float32]]) -> None:
     if not index.is_trained:
-        most = max(_PER_PART * index.nlist, _OF_CODES) if isinstance(index, faiss.IndexIVF) else 1 << 20
+        most = max(_TRAIN_PER_UNIT * index.nlist, _TRAIN_CODES) if isinstance(index, faiss.IndexIVF) else 1 << 20
         index.train(sample(index.d, most))
 
 
 def _on_gpu(index: Any, factory: str) -> Any:
     try:
         return faiss.index_cpu_to_all_gpus(index)
-    except (AttributeError, NameError, RuntimeError) as error:  # faiss-cpu lacks what its own functions name
+    except (AttributeError, NameError, RuntimeError) as error:  # faiss-cpu lacks classes that this function uses
         raise ToolkitError(
-            f"faiss_gpu: the installed FAISS cannot have the index {factory} on a GPU ({first_line(error)}). "
+            f"faiss_gpu: the installed FAISS cannot put the index {factory} on a GPU ({first_line(error)}). "
             "Set faiss_gpu: false."
         ) from error

@@ -1,4 +1,4 @@
-"""MegaLoc as an embedder: photographs as they come, resized, in batches, on any device."""
+"""MegaLoc as an embedder: resizes photographs of any size and embeds them in batches, on any device."""
 
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
@@ -15,7 +15,7 @@ from toolkit.errors import ManifestError, ToolkitError
 from toolkit.files import Remade
 from toolkit.models.compute import Fitting, is_out_of_memory, on_device, resolve_device, resolve_precision, upload
 from toolkit.models.megaloc import PATCH, MegaLoc
-from toolkit.models.vit import IMAGENET_MEAN, IMAGENET_STD
+from toolkit.models.vit import normalized
 from toolkit.models.weights import MEGALOC, given_or_resolved, weights_digest
 
 
@@ -35,14 +35,15 @@ class MegaLocEmbedder(Remade):
     ) -> None:
         """
         Args:
-            checkpoint: the official file, its tensors by name, or a network; None: from the hub's cache, else
-                downloaded there.
+            checkpoint: the official file, its tensors by name, or a network; None: the file in the hub's cache,
+                downloaded if it is not there.
             device: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
-            dtype_compute: `float32`, `bfloat16`, `float16`; `auto`: what is fast on the device.
-            image_size: images are squeezed to a square of so many pixels a side, a multiple of 14.
+            dtype_compute: `float32`, `bfloat16`, `float16`; `auto`: the fastest on the device, see `resolve_precision`.
+            image_size: side of the square to which images are resized, pixels, a multiple of 14; the aspect ratio is
+                not kept.
 
         Raises:
-            WeightsError: no weights, or other ones.
+            WeightsError: the weights are missing, or of another network.
             ManifestError, ToolkitError: see `toolkit.models.compute`.
         """
         if not isinstance(image_size, int) or image_size < 9 * PATCH or image_size % PATCH:
@@ -50,20 +51,18 @@ class MegaLocEmbedder(Remade):
                 f"image_size is {image_size}; expected a multiple of {PATCH}, at least {9 * PATCH} (322 is usual)."
             )
         self._size = image_size
-        # Twice the size, as where Pillow makes thumbnails: cosines with the descriptors of images that were decoded
-        # whole are above 1 - 1e-4, what bfloat16 changes; once the size, 1 - 1e-3.
+        # Images may be decoded at twice the network's size, as Pillow does for thumbnails. The cosines to descriptors
+        # of fully decoded images are then above 1 - 1e-4, the error of bfloat16; at the network's size, 1 - 1e-3.
         self.least_side = 2 * image_size
         self._device = resolve_device(device)
         self._dtype = resolve_precision(dtype_compute, self._device)
         weights: Path | Mapping[str, Tensor] | MegaLoc = given_or_resolved(MEGALOC, checkpoint)
-        # A network that is given stays the caller's, with its type and device.
+        # Copy the caller's network: its type and device must not change.
         model = deepcopy(weights) if isinstance(weights, MegaLoc) else MegaLoc.from_checkpoint(weights)
         self._weights = weights_digest(model)
         self.dim = model.dim
         model.compute_in(self._dtype)
         self._model = on_device(model, self._device, "MegaLoc").eval()
-        self._mean = torch.tensor(IMAGENET_MEAN, device=self._device).view(1, 3, 1, 1)
-        self._std = torch.tensor(IMAGENET_STD, device=self._device).view(1, 3, 1, 1)
         self._fitting = Fitting(self._forward, "images", self._device)
 
     @property
@@ -78,10 +77,10 @@ class MegaLocEmbedder(Remade):
         }
 
     def prepare(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return an image (H, W, 3) or (H, W), uint8 RGB or gray, as the network takes it, (S, S, 3).
+        """Resize an image (H, W, 3) or (H, W), uint8 RGB or gray, to the network's input (S, S, 3).
 
         Raises:
-            ValueError: another shape or type.
+            ValueError: wrong shape or type.
         """
         image = np.asarray(image)
         if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)) or not image.size:
@@ -90,22 +89,22 @@ class MegaLocEmbedder(Remade):
             image = np.repeat(image[:, :, None], 3, axis=2)
         if image.shape[:2] == (self._size, self._size):
             return image
-        # Pillow's bilinear filter is antialiased: the one that the official code resizes photographs with.
+        # Pillow's bilinear filter is antialiased, as the resizing of the official code.
         square = (self._size, self._size)
         return np.asarray(Image.fromarray(np.ascontiguousarray(image)).resize(square, Image.Resampling.BILINEAR))
 
     def stack(self, inputs: Sequence[NDArray[np.uint8]]) -> Tensor:
-        """Return images (H, W, 3), uint8 RGB, of any sizes as a batch (B, S, S, 3), on the device if it has room."""
+        """Return images (H, W, 3), uint8 RGB, of any sizes as a batch (B, S, S, 3), on the device if it fits there."""
         batch = torch.from_numpy(np.stack([self.prepare(image) for image in inputs]))
         try:
             return upload(batch, self._device)
         except RuntimeError as error:
             if not is_out_of_memory(error):
                 raise
-        return batch  # goes there in parts
+        return batch  # `embed` moves it there in parts
 
     def embed(self, inputs: Sequence[NDArray[np.uint8]] | Tensor) -> NDArray[np.float32]:
-        """Return unit vectors (B, 8448) of images (H, W, 3), uint8 RGB, of any sizes, or of what `stack` made of them.
+        """Return unit vectors (B, 8448) of images (H, W, 3), uint8 RGB, of any sizes, or of a batch from `stack`.
 
         Raises:
             ToolkitError: a vector is not finite.
@@ -117,12 +116,11 @@ class MegaLocEmbedder(Remade):
             vectors = self._fitting(batch).float().cpu().numpy()
         if not np.isfinite(vectors).all():
             raise ToolkitError(
-                "MegaLoc gave a descriptor that is not finite. Its weights may hold NaN: compare the file with the "
-                "official one. With dtype_compute: float16, numbers may have been too large: use bfloat16 or float32."
+                "MegaLoc returned a descriptor that is not finite. Its weights may hold NaN: compare the file with the "
+                "official one. With dtype_compute: float16, numbers may have overflowed: use bfloat16 or float32."
             )
         return vectors
 
     def _forward(self, images: Tensor) -> Tensor:
-        normalized = (images.permute(0, 3, 1, 2).float() / 255 - self._mean) / self._std
-        descriptors: Tensor = self._model(normalized)
+        descriptors: Tensor = self._model(normalized(images.permute(0, 3, 1, 2).float() / 255))
         return descriptors

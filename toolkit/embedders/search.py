@@ -1,4 +1,4 @@
-"""Exact nearest neighbors among global descriptors, by whatever library is quick at it."""
+"""Exact nearest neighbors among global descriptors: candidates by FAISS, torch or an index, then exact scores."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -16,23 +16,27 @@ from toolkit.models.compute import resolve_device
 
 Backend = Literal["faiss", "torch"]
 _BLOCK_BYTES = 128 << 20
-"""Of the rows of the database, in float32, that are in memory at a time."""
+"""Database rows read at a time, bytes of float32."""
 _QUERY_BYTES = 512 << 20
-"""Of the queries, in float32, that one pass over the database is for."""
+"""Queries compared in one pass over the database, bytes of float32."""
 _PRODUCTS = 1 << 23
-"""Of queries that have masks and rows of the database, that are in memory at a time."""
+"""Dot products computed at a time for queries with masks; bounds the memory."""
 _MASKED_ROWS = 1 << 12
-"""Of the database, in memory at a time where queries have masks: of so few, most queries find none, if masks leave
-parts of recordings."""
-_MORE = 16
-"""Candidates beyond k: the backend's rounding may exchange neighbors in rank."""
+"""Database rows read at a time for queries with masks. Masks select parts of recordings, so a small block has no
+allowed rows for most queries, which then skip it."""
+_EXTRA = 16
+"""Candidates beyond k: rounding in the backend may swap neighbors."""
 _GAMMA = 0.5
-"""Of the generalized harmonic mean. With it no similarity of n >= 2 unit vectors is below its pole, -n/2."""
+"""Parameter of the generalized harmonic mean. Similarities of n >= 2 unit vectors are never below its pole, -n / 2."""
 
-Found = tuple[NDArray[np.float32], Ints]
-_Best = Callable[[NDArray[np.float32], int, int], Found]
-"""Finds in a block of the database, which begins at a row, for each query so many of the best."""
-_Vectors = NDArray[np.float32] | Vectors
+_Floats = NDArray[np.float32]
+_Bools = NDArray[np.bool_]
+Found = tuple[_Floats, Ints]
+"""Scores and rows (Q, K) of the best database vectors of each query, best first."""
+_Best = Callable[[_Floats, int, int], Found]
+"""Maps a block of the database, the number of its first row, and n to the n best scores and rows of each query, counted
+from the start of the block."""
+_Vectors = _Floats | Vectors
 
 
 def search(
@@ -46,26 +50,26 @@ def search(
     allowed: NDArray[np.bool_] | Masks | None = None,
     dims: Sequence[int] = (),
 ) -> Found:
-    """Return the rows of the database with the largest dot products, best first; equal ones by index.
+    """Return the database rows with the largest dot products, best first; ties in order of the row.
 
-    The database is read in blocks, once for as many queries as fit in 512 MB. The backend finds candidates; their
-    scores are then computed alike for all backends, so that the result does not depend on it.
+    The database is read in blocks, once per 512 MB of queries. The backend finds candidates; their scores are then
+    recomputed in the same way for all backends, so the result does not depend on the backend.
 
     Args:
         query, database: (Q, D) and (N, D), any float type; `StoredVectors` and `JoinedVectors` stay on disk.
-        k: how many; at most N are returned.
+        k: neighbors per query; at most N are returned.
         backend: `faiss` or `torch`.
         compute_device: where torch computes: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
         faiss_gpu: let faiss compute on the GPU (needs a faiss built for it).
-        index: of the database; finds the candidates instead of the backend. What it misses is missing.
-        allowed: (N,) which rows of the database may be found, or masks of each query; None: all. With masks of each,
-            faiss without an index leaves the products to NumPy, on the CPU.
-        dims: of several descriptors side by side in each row, how many of the D columns each has, in order: their
-            products are fused, see `fuse`, by torch whatever the backend. Empty: one.
+        index: index of the database; it replaces the backend in finding candidates, and may miss neighbors.
+        allowed: (N,) rows of the database that may be returned, or a mask per query; None: all. With a mask per query
+            and no index, NumPy computes on the CPU in place of faiss.
+        dims: number of columns of each descriptor, in order, if a row holds several side by side. Their similarities
+            are fused by torch, whatever the backend, see `fuse`. Empty: one descriptor.
 
     Returns:
-        Scores (Q, K) float32 and indices (Q, K) int64, K = min(k, N); -inf and -1 where an index found no more, or no
-        more are allowed.
+        Scores (Q, K) float32 and rows (Q, K) int64, K = min(k, N); -inf and -1 if fewer rows are allowed, or the index
+        found fewer.
 
     Raises:
         ValueError: shapes do not fit, k is below 1, or a value is not finite.
@@ -84,12 +88,12 @@ def search(
             f"{len(allowed)} masks of {allowed.count} rows for {len(query)} queries and {len(vectors)} rows."
         )
     if isinstance(allowed, Masks) and index is not None and k:
-        for queries, mask in allowed.distinct():
-            those = query.choose(queries) if isinstance(query, Vectors) else query[queries]
-            found = search(those, vectors, k, backend, compute_device, faiss_gpu, index, mask, dims)
-            scores[queries], indices[queries] = found
+        for numbers, mask in allowed.distinct():
+            queries = query.choose(numbers) if isinstance(query, Vectors) else query[numbers]
+            found = search(queries, vectors, k, backend, compute_device, faiss_gpu, index, mask, dims)
+            scores[numbers], indices[numbers] = found
         return scores, indices
-    # Among few allowed rows an index finds next to none: what it looks at is chosen by all rows.
+    # An index visits cells near the query, whether allowed or not: with few allowed rows it would find almost none.
     if isinstance(allowed, np.ndarray) and (index is None or np.count_nonzero(allowed) <= index.candidates):
         rows = np.flatnonzero(allowed)
         chosen = vectors.choose(rows) if isinstance(vectors, Vectors) else vectors[rows]
@@ -97,35 +101,36 @@ def search(
             found = search(query, chosen, k, backend, compute_device, faiss_gpu, dims=dims)
             scores[:, : len(rows)], indices[:, : len(rows)] = found[0], rows[found[1]]
         return scores, indices
-    for start, part in blocks(query, _QUERY_BYTES) if k else ():
-        require_finite(part, "query", start)
-        here = slice(start, start + len(part))
+    for start, block in blocks(query, _QUERY_BYTES) if k else ():
+        require_finite(block, "query", start)
+        here = slice(start, start + len(block))
         if index is not None:
             mask = allowed if isinstance(allowed, np.ndarray) else None
-            _compare(part, vectors, index.find(part, mask), scores[here], indices[here], dims)
+            _rank_candidates(block, vectors, index.find(block, mask), scores[here], indices[here], dims)
             continue
         make = partial(_backend, backend=backend, compute_device=compute_device, faiss_gpu=faiss_gpu, dims=dims)
         masks = allowed.choose(here) if isinstance(allowed, Masks) else None
-        _search_part(part, vectors, make, masks, scores[here], indices[here], dims)
+        _search_block(block, vectors, make, masks, scores[here], indices[here], dims)
     return scores, indices
 
 
 def fuse(similarities: Sequence[Any]) -> Any:
     """Return the generalized harmonic mean of n similarities (arrays or tensors of one shape), in the same shape.
 
-    1 / mean(1 / (gamma + s / n)) - gamma with gamma = 0.5, as kapture-localization and the LaMAR benchmark fuse: M.
-    Humenberger et al., "Investigating the Role of Image Retrieval for Visual Localization", IJCV 2022, after G. Csurka
-    and S. Clinchant, "An Empirical Study of Fusion Operators for Multimodal Image Retrieval", CBMI 2012. It grows with
-    each similarity, and is 1 / n where all are 1. A similarity of 0, such as that of an image without structure, leaves
-    the order to the others; at the pole, -n / 2, and below, which only vectors longer than 1 have, it is -gamma.
+    The mean is 1 / mean(1 / (gamma + s / n)) - gamma with gamma = 0.5, as in kapture-localization and the LaMAR
+    benchmark: M. Humenberger et al., "Investigating the Role of Image Retrieval for Visual Localization", IJCV 2022,
+    after G. Csurka and S. Clinchant, "An Empirical Study of Fusion Operators for Multimodal Image Retrieval", CBMI
+    2012. It increases with each similarity, and is 1 / n if all are 1. If one descriptor has similarity 0 to all rows
+    (an image without structure), the other descriptors decide the order. At and below the pole, -n / 2, which only
+    vectors longer than 1 reach, the mean is -gamma.
     """
     count = len(similarities)
     with np.errstate(divide="ignore"):
-        return count / sum(1 / (_GAMMA + each / count).clip(min=0) for each in similarities) - _GAMMA
+        return count / sum(1 / (_GAMMA + scores / count).clip(min=0) for scores in similarities) - _GAMMA
 
 
 def _fused(query: Any, vectors: Any, dims: Sequence[int], product: Callable[[Any, Any], Any]) -> Any:
-    """Return the product of queries (..., D) and vectors (..., D); of several descriptors, their fused products."""
+    """Return the products of queries (..., D) and vectors (..., D), fused if there are several descriptors."""
     if len(dims) < 2:
         return product(query, vectors)
     ends = np.cumsum(dims).tolist()
@@ -133,23 +138,23 @@ def _fused(query: Any, vectors: Any, dims: Sequence[int], product: Callable[[Any
     return fuse([product(query[..., cut], vectors[..., cut]) for cut in cuts])
 
 
-def _search_part(
-    query: NDArray[np.float32],
+def _search_block(
+    query: _Floats,
     vectors: _Vectors,
-    make_backend: Callable[[NDArray[np.float32], Masks | None], _Best],
+    make_backend: Callable[[_Floats, Masks | None], _Best],
     masks: Masks | None,
-    scores: NDArray[np.float32],
+    scores: _Floats,
     indices: Ints,
     dims: Sequence[int],
 ) -> None:
     """Fill in scores and indices (Q, K) of queries that fit in memory."""
     count, k = len(vectors), scores.shape[1]
     lengths = np.linalg.norm(query, axis=1)
-    # To a query of zeros, an image without features, all rows are equal.
+    # All rows are equally similar to a zero vector, the descriptor of an image without features.
     for number in np.flatnonzero(lengths == 0):
         rows = np.arange(k) if masks is None else np.flatnonzero(masks.choose(slice(number, number + 1)).rows(0, count))
         scores[number, : len(rows)], indices[number, : len(rows)] = 0, rows[:k]
-    pending, width = np.flatnonzero(lengths), min(count, k + _MORE)
+    pending, width = np.flatnonzero(lengths), min(count, k + _EXTRA)
     size = _BLOCK_BYTES if masks is None else min(_BLOCK_BYTES, 4 * query.shape[1] * _MASKED_ROWS)
     while len(pending):
         best = make_backend(
@@ -157,7 +162,7 @@ def _search_part(
         )
         rough, candidates, longest = _candidates(vectors, best, len(pending), width, size)
         tolerance = _tolerance(longest * lengths[pending], dims)
-        # Rounding in the backend cuts nothing off once the last candidate is clearly below rank k.
+        # If the last candidate scores clearly below rank k, no neighbor was lost to rounding in the backend.
         done = (rough[:, -1] < rough[:, k - 1] - tolerance) | (width == count) | np.isneginf(rough[:, -1])
         near = (rough >= (rough[:, k - 1] - 2 * tolerance)[:, None]) & (rough > -np.inf)
         _rescore(query, vectors, pending[done], candidates[done], near[done], scores, indices, dims)
@@ -165,35 +170,30 @@ def _search_part(
 
 
 def _tolerance(product_of_lengths: Any, dims: Sequence[int]) -> Any:
-    """Return how far rounding may move a score: fused ones no further than any product, but for their own rounding."""
+    """Return the largest rounding error of a score. Fusing adds rounding of its own, but never amplifies."""
     return 1e-5 * (product_of_lengths + (len(dims) > 1))
 
 
-def _compare(
-    query: NDArray[np.float32],
-    vectors: _Vectors,
-    candidates: Ints,
-    scores: NDArray[np.float32],
-    indices: Ints,
-    dims: Sequence[int],
+def _rank_candidates(
+    query: _Floats, vectors: _Vectors, candidates: Ints, scores: _Floats, indices: Ints, dims: Sequence[int]
 ) -> None:
-    """Fill in scores and indices (Q, K) of the best among the candidates (Q, C) of each query, of which -1 is none."""
-    for number, one in enumerate(query):
-        rows = np.unique(candidates[number])  # as they lie on disk
+    """Fill in scores and indices (Q, K) of the best candidates (Q, C) of each query; -1 is no candidate."""
+    for number, vector in enumerate(query):
+        rows = np.unique(candidates[number])  # in the order of the file
         rows = rows[rows >= 0]
         if not len(rows):
             continue
         block, k = vectors[rows], min(scores.shape[1], len(rows))
-        rough = _fused(one, block, dims, lambda a, b: b @ a)
-        tolerance = _tolerance(np.linalg.norm(block, axis=1).max() * np.linalg.norm(one), dims)
+        rough = _fused(vector, block, dims, lambda a, b: b @ a)
+        tolerance = _tolerance(np.linalg.norm(block, axis=1).max() * np.linalg.norm(vector), dims)
         near = rough >= np.partition(rough, -k)[-k] - 2 * tolerance
-        exact = _products(np.broadcast_to(one, (int(near.sum()), len(one))), block[near], dims)
+        exact = _products(np.broadcast_to(vector, (int(near.sum()), len(vector))), block[near], dims)
         best = np.lexsort((rows[near], -exact))[:k]
         scores[number, :k], indices[number, :k] = exact[best], rows[near][best]
 
 
-def _products(query: NDArray[np.float32], vectors: NDArray[np.float32], dims: Sequence[int]) -> NDArray[np.float32]:
-    """Return the dot products (n,) of rows (n, D), summed and fused in float64."""
+def _products(query: _Floats, vectors: _Floats, dims: Sequence[int]) -> _Floats:
+    """Return the row by row dot products (n,) of two (n, D) arrays, summed and fused in float64."""
     wide = query.astype(np.float64), vectors.astype(np.float64)
     fused: NDArray[np.float64] = _fused(*wide, dims, partial(np.einsum, "nd,nd->n"))
     return fused.astype(np.float32)
@@ -204,18 +204,19 @@ def _matrix(values: ArrayLike | Vectors, name: str) -> _Vectors:
         return values
     matrix = np.ascontiguousarray(values, np.float32)
     if matrix.ndim != 2:
-        raise ValueError(f"{name} has shape {matrix.shape}; expected two dimensions, one row a vector.")
+        raise ValueError(f"{name} has shape {matrix.shape}; expected two dimensions, one row per vector.")
     require_finite(matrix, name)
     return matrix
 
 
-def _candidates(
-    vectors: _Vectors, best: _Best, queries: int, width: int, size: int
-) -> tuple[NDArray[np.float32], Ints, float]:
-    """Return the `width` best scores and indices (Q, width), best first, up to rounding, and the longest length.
+def _candidates(vectors: _Vectors, best: _Best, queries: int, width: int, size: int) -> tuple[_Floats, Ints, float]:
+    """Find candidates with the backend.
 
     Args:
         size: bytes of a block of the database.
+
+    Returns:
+        The `width` best scores and rows (Q, width), best first up to rounding, and the length of the longest vector.
     """
     scores, indices = np.zeros((queries, 0), np.float32), np.zeros((queries, 0), np.int64)
     longest = 0.0
@@ -224,52 +225,47 @@ def _candidates(
         if not np.isfinite(length):
             require_finite(block, "database", start)
         longest = max(longest, length)
-        of_block, inside = best(block, start, min(width, len(block)))
-        scores, indices = np.hstack([scores, of_block]), np.hstack([indices, inside + start])
+        block_scores, block_rows = best(block, start, min(width, len(block)))
+        scores, indices = np.hstack([scores, block_scores]), np.hstack([indices, block_rows + start])
         order = np.argsort(-scores, axis=1, kind="stable")[:, :width]
         scores, indices = np.take_along_axis(scores, order, 1), np.take_along_axis(indices, order, 1)
     return scores, indices, longest
 
 
 def _rescore(
-    query: NDArray[np.float32],
+    query: _Floats,
     vectors: _Vectors,
     rows: Ints,
     candidates: Ints,
-    near: NDArray[np.bool_],
-    scores: NDArray[np.float32],
+    near: _Bools,
+    scores: _Floats,
     indices: Ints,
     dims: Sequence[int],
 ) -> None:
-    """Fill in scores and indices of query rows: of the candidates that are near enough to be among the k best."""
+    """Fill in exact scores and indices of query rows, from the candidates `near` enough to be among the k best."""
     exact = np.full(candidates.shape, -np.inf, np.float32)
-    who, rank = np.nonzero(near)
-    order = np.argsort(candidates[who, rank], kind="stable")  # as they lie on disk
+    pending, rank = np.nonzero(near)
+    order = np.argsort(candidates[pending, rank], kind="stable")  # in the order of the file
     step = max(1, _BLOCK_BYTES // (16 * query.shape[1]))
     for start in range(0, len(order), step):
         part = order[start : start + step]
-        numbers, where = np.unique(candidates[who[part], rank[part]], return_inverse=True)
-        exact[who[part], rank[part]] = _products(query[rows[who[part]]], vectors[numbers][where], dims)
+        numbers, where = np.unique(candidates[pending[part], rank[part]], return_inverse=True)
+        exact[pending[part], rank[part]] = _products(query[rows[pending[part]]], vectors[numbers][where], dims)
     best = np.lexsort((candidates, -exact), axis=1)[:, : scores.shape[1]]
     scores[rows], indices[rows] = np.take_along_axis(exact, best, 1), np.take_along_axis(candidates, best, 1)
     indices[np.isneginf(scores)] = -1
 
 
 def _backend(
-    query: NDArray[np.float32],
-    masks: Masks | None,
-    backend: Backend,
-    compute_device: str,
-    faiss_gpu: bool,
-    dims: Sequence[int],
+    query: _Floats, masks: Masks | None, backend: Backend, compute_device: str, faiss_gpu: bool, dims: Sequence[int]
 ) -> _Best:
-    """Return what finds the best (scores, indices) (Q, n) of a block of the database for the queries."""
+    """Return the function that searches a block of the database for the queries."""
     if backend not in ("faiss", "torch"):
         raise ValueError(f"Unknown backend {backend!r}; expected faiss or torch.")
     by_torch = backend == "torch" or len(dims) > 1
     if masks is not None:
-        masked = partial(_torch_best, device=compute_device, dims=dims) if by_torch else _numpy_best
-        return lambda block, start, number: _masked(query, masks, masked, block, start, number)
+        best = partial(_torch_best, device=compute_device, dims=dims) if by_torch else _numpy_best
+        return lambda block, start, number: _masked(query, masks, best, block, start, number)
     if by_torch:
         return _torch_backend(query, compute_device, dims)
     import faiss
@@ -285,49 +281,46 @@ def _backend(
     return lambda block, _, number: faiss.knn_gpu(gpu, query, block, number, metric=faiss.METRIC_INNER_PRODUCT)
 
 
-def _torch_backend(query: NDArray[np.float32], compute_device: str, dims: Sequence[int]) -> _Best:
+def _torch_backend(query: _Floats, compute_device: str, dims: Sequence[int]) -> _Best:
     import torch
 
     device = resolve_device(compute_device)
     queries = torch.from_numpy(query).to(device)
 
-    def best(block: NDArray[np.float32], _: int, number: int) -> Found:
+    def find(block: _Floats, _: int, number: int) -> Found:
         rows = torch.from_numpy(block).to(device)
         most = max(1, _QUERY_BYTES // (4 * len(block) * (len(dims) + 2)))
-        found = [_fused(some, rows, dims, lambda a, b: a @ b.T).topk(number) for some in queries.split(most)]
-        scores, indices = (torch.cat(parts).cpu().numpy() for parts in zip(*found, strict=True))
+        best = [_fused(part, rows, dims, lambda a, b: a @ b.T).topk(number) for part in queries.split(most)]
+        scores, indices = (torch.cat(parts).cpu().numpy() for parts in zip(*best, strict=True))
         return scores, indices
 
-    return best
+    return find
 
 
 def _masked(
-    query: NDArray[np.float32],
+    query: _Floats,
     masks: Masks,
-    best: Callable[[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], int], Found],
-    block: NDArray[np.float32],
+    best: Callable[[_Floats, _Floats, _Bools, int], Found],
+    block: _Floats,
     start: int,
     number: int,
 ) -> Found:
-    """Return what `_Best` does, of queries that may find some rows alone; -inf where there are fewer.
+    """Return the best allowed rows of a block, see `_Best`; -inf where fewer are allowed.
 
     Args:
-        best: of queries (n, D) the best rows (m, D) that they may find (n, m), so many.
+        best: maps queries (n, D), a block (m, D), the allowed rows (n, m) and `number` to the best allowed rows.
     """
     scores, indices = np.full((len(query), number), -np.inf, np.float32), np.zeros((len(query), number), np.int64)
     step = max(1, _PRODUCTS // len(block))
     for first in range(0, len(query), step):
         allowed = masks.choose(slice(first, first + step)).rows(start, start + len(block))
-        finds = np.flatnonzero(allowed.any(axis=1))
-        if len(finds):
-            found = best(query[first + finds], block, allowed[finds], number)
-            scores[first + finds], indices[first + finds] = found
+        some = np.flatnonzero(allowed.any(axis=1))
+        if len(some):
+            scores[first + some], indices[first + some] = best(query[first + some], block, allowed[some], number)
     return scores, indices
 
 
-def _numpy_best(
-    query: NDArray[np.float32], block: NDArray[np.float32], allowed: NDArray[np.bool_], number: int
-) -> Found:
+def _numpy_best(query: _Floats, block: _Floats, allowed: _Bools, number: int) -> Found:
     scores = query @ block.T
     scores[~allowed] = -np.inf
     indices = np.argpartition(scores, -number, axis=1)[:, -number:]
@@ -335,16 +328,11 @@ def _numpy_best(
 
 
 def _torch_best(
-    query: NDArray[np.float32],
-    block: NDArray[np.float32],
-    allowed: NDArray[np.bool_],
-    number: int,
-    device: str,
-    dims: Sequence[int],
+    query: _Floats, block: _Floats, allowed: _Bools, number: int, device: str, dims: Sequence[int]
 ) -> Found:
     import torch
 
-    queries, rows, refused = (torch.from_numpy(part).to(resolve_device(device)) for part in (query, block, ~allowed))
+    queries, rows, excluded = (torch.from_numpy(array).to(resolve_device(device)) for array in (query, block, ~allowed))
     products = _fused(queries, rows, dims, lambda a, b: a @ b.T)
-    scores, indices = products.masked_fill_(refused, -torch.inf).topk(number)
+    scores, indices = products.masked_fill_(excluded, -torch.inf).topk(number)
     return scores.cpu().numpy(), indices.cpu().numpy()

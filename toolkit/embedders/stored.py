@@ -1,4 +1,4 @@
-"""Global descriptors on disk: the matrices of a session as one, read in parts, so that a map need not fit in memory."""
+"""Global descriptors on disk: reads the matrices of a session as one, in parts, so a map need not fit in memory."""
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,25 +17,25 @@ from toolkit.geometry import Ints, unit
 log = logging.getLogger(__name__)
 
 MANIFEST_COLUMNS = ["row_index", "device_id", "sensor_id", "timestamp", "abs_path"]
-"""Columns of the `manifest.csv` that names the image of each row of embeddings."""
+"""Columns of `manifest.csv`, which names the image of each row of embeddings."""
 
 
 @dataclass(frozen=True)
 class StoredVectors:
-    """Chosen rows of matrices in `.npy` files, one below the other; float32 when they are read."""
+    """Selected rows of `.npy` matrices that are concatenated along axis 0; read as float32."""
 
     paths: tuple[Path, ...]
     starts: tuple[int, ...]
-    """Number of the first row of each file, and behind them the number of all rows."""
+    """First row of each file in the concatenation, then the total number of rows."""
     dim: int
     rows: Ints
-    """Numbers of the chosen rows, in any order."""
+    """The selected rows of the concatenation, in any order."""
     normalize: bool = False
-    """Whether vectors are brought to length 1 as they are read."""
+    """Whether to scale vectors to length 1 when reading."""
 
     @classmethod
     def stack(cls, parts: Sequence["StoredVectors"]) -> "StoredVectors":
-        """Return several, of one dimension, one below the other."""
+        """Concatenate the rows of several, which have the same dimension."""
         starts, rows = [0], list[Ints]()
         for part in parts:
             rows.append(part.rows + starts[-1])
@@ -55,42 +55,42 @@ class StoredVectors:
         return len(self.rows)
 
     def choose(self, positions: Ints) -> "StoredVectors":
-        """Return only some of the rows, by their positions."""
+        """Return the rows at these positions, without reading them."""
         return replace(self, rows=self.rows[positions])
 
     def __getitem__(self, positions: slice | Ints) -> NDArray[np.float32]:
-        """Read rows (n, D), by their positions."""
+        """Read the rows (n, D) at these positions."""
         rows = self.rows[positions]
-        if (np.diff(rows) < 0).any():  # files are read from their start to their end
+        if (np.diff(rows) < 0).any():  # read files from start to end
             order = np.argsort(rows)
-            read = replace(self, rows=rows[order])[:]
-            vectors = np.empty_like(read)
-            vectors[order] = read
+            in_order = replace(self, rows=rows[order])[:]
+            vectors = np.empty_like(in_order)
+            vectors[order] = in_order
             return vectors
         vectors = np.empty((len(rows), self.dim), np.float32)
         cuts = np.searchsorted(rows, self.starts)
         for path, start, first, last in zip(self.paths, self.starts, cuts, cuts[1:], strict=False):
             if first < last:
                 inside = rows[first:last] - start
-                together = inside[-1] - inside[0] == len(inside) - 1
-                # Mapped anew each time: pages of a mapping that is kept would count as this process's memory.
+                contiguous = inside[-1] - inside[0] == len(inside) - 1
+                # Map the file anew each time: the pages of a lasting mapping would count as this process's memory.
                 matrix = np.load(path, mmap_mode="r")
-                vectors[first:last] = matrix[inside[0] : inside[-1] + 1] if together else matrix[inside]
+                vectors[first:last] = matrix[inside[0] : inside[-1] + 1] if contiguous else matrix[inside]
         return unit(vectors) if self.normalize else vectors
 
 
 @dataclass(frozen=True)
 class JoinedVectors:
-    """The vectors of several descriptors of the same images, side by side in a row."""
+    """Several descriptors of the same images; a row holds those of one image side by side."""
 
     parts: Mapping[str, StoredVectors]
-    """Of each descriptor, by its name."""
+    """Vectors by the name of the descriptor."""
 
     @classmethod
-    def stack(cls, several: Sequence["JoinedVectors"]) -> "JoinedVectors":
-        """Return several, of the same descriptors, one below the other."""
-        names = several[0].parts
-        return cls({name: StoredVectors.stack([joined.parts[name] for joined in several]) for name in names})
+    def stack(cls, parts: Sequence["JoinedVectors"]) -> "JoinedVectors":
+        """Concatenate the rows of several, which have the same descriptors."""
+        names = parts[0].parts
+        return cls({name: StoredVectors.stack([joined.parts[name] for joined in parts]) for name in names})
 
     @property
     def dims(self) -> tuple[int, ...]:
@@ -104,56 +104,59 @@ class JoinedVectors:
         return len(next(iter(self.parts.values())))
 
     def choose(self, positions: Ints) -> "JoinedVectors":
-        """Return only some of the rows, by their positions."""
+        """Return the rows at these positions, without reading them."""
         return JoinedVectors({name: part.choose(positions) for name, part in self.parts.items()})
 
     def __getitem__(self, positions: slice | Ints) -> NDArray[np.float32]:
-        """Read rows (n, sum of D), by their positions."""
+        """Read the rows (n, sum of D) at these positions."""
         return np.hstack([part[positions] for part in self.parts.values()])
 
 
 Vectors = StoredVectors | JoinedVectors
 
 
-def made_of(paths: Sequence[Path]) -> list[Any]:
-    """Identify matrices in files by what they were made from, as JSON."""
-    # The record beside a matrix says it, and is small; a foreign matrix may have none.
+def matrix_fingerprints(paths: Sequence[Path]) -> list[Any]:
+    """Return, as JSON, names and fingerprints that identify the matrices in these files."""
+    # The record beside a matrix identifies it, and is quick to read; a foreign matrix may have none.
     return [
         [path.name, file_fingerprint(record if record.exists() else path)]
         for path, record in zip(paths, map(sidecar_path, paths), strict=True)
     ]
 
 
-def blocks(
-    vectors: NDArray[np.float32] | Vectors, size: int
-) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    """Yield the number of the first row and the rows (n, D) of one block of so many bytes after the other."""
+def blocks(vectors: NDArray[np.float32] | Vectors, size: int) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    """Yield blocks of at most `size` bytes (of float32): the number of the first row, and the rows (n, D)."""
     step = max(1, size // (4 * max(1, vectors.shape[1])))
     for start in range(0, len(vectors), step):
         yield start, vectors[start : start + step]
 
 
 def require_finite(matrix: NDArray[np.float32], name: str, first: int | Ints = 0) -> None:
-    """Raise ValueError if a value is not finite; `name` is what the matrix is, `first` the number of its first row, or
-    those of all."""
+    """Raise ValueError if a value is not finite.
+
+    Args:
+        name: name of the matrix, for the message.
+        first: number of its first row, or the numbers of all its rows.
+    """
     bad = ~np.isfinite(matrix).all(axis=1)
     if bad.any():
-        number = int(bad.argmax())
-        row = first + number if isinstance(first, int) else int(first[number])
+        index = int(bad.argmax())
+        row = first + index if isinstance(first, int) else int(first[index])
         raise ValueError(f"{name} has {bad.sum()} rows with NaN or infinite values, first row {row}.")
 
 
 def open_embeddings(folder: str | Path) -> tuple[StoredVectors, pd.DataFrame]:
-    """Open the embeddings of a session, or of one subsession; vectors stay on disk until they are asked for.
+    """Open the embeddings of a session, or of one subsession; vectors stay on disk until they are indexed.
 
     Args:
         folder: `<embeddings>/<session>` or `<embeddings>/<session>/<subsession>`.
 
     Returns:
-        The vectors (N, D); a table of its rows: row_index, device_id, sensor_id, timestamp, abs_path, subsession.
+        The vectors (N, D), and a table of their images: row_index, device_id, sensor_id, timestamp, abs_path,
+        subsession.
 
     Raises:
-        ArtifactError: there are none, one is damaged, or files do not fit together.
+        ArtifactError: there are none, a file is damaged, or files do not fit together.
     """
     folder = Path(folder)
     manifests = sorted(folder.rglob("manifest.csv"))
@@ -164,8 +167,8 @@ def open_embeddings(folder: str | Path) -> tuple[StoredVectors, pd.DataFrame]:
     paths, tables, starts, dim = list[Path](), [], [0], 0
     for manifest in manifests:
         path = manifest.parent / f"{manifest.parent.name}.npy"
-        for part in (path, manifest):
-            require_whole(part, of=path)
+        for file in (path, manifest):
+            require_whole(file, of=path)
         try:
             matrix = np.load(path, mmap_mode="r")
             table = pd.read_csv(manifest, dtype={"device_id": str, "sensor_id": str, "abs_path": str})
@@ -174,12 +177,10 @@ def open_embeddings(folder: str | Path) -> tuple[StoredVectors, pd.DataFrame]:
         if list(table.columns) != MANIFEST_COLUMNS or matrix.ndim != 2 or len(matrix) != len(table):
             raise ArtifactError(
                 f"{manifest} ({len(table)} rows, {', '.join(table.columns)}) does not fit {path.name} "
-                f"{matrix.shape}; expected columns {', '.join(MANIFEST_COLUMNS)} and one row a vector. Embed again."
+                f"{matrix.shape}; expected columns {', '.join(MANIFEST_COLUMNS)} and one row per vector. Embed again."
             )
         if paths and matrix.shape[1] != dim:
-            raise ArtifactError(
-                f"{path} has {matrix.shape[1]} dimensions, {manifests[0].parent} {dim}; embed again."
-            )
+            raise ArtifactError(f"{path} has {matrix.shape[1]} dimensions, {manifests[0].parent} {dim}; embed again.")
         dim = matrix.shape[1]
         paths.append(path)
         starts.append(starts[-1] + len(matrix))
@@ -190,16 +191,16 @@ def open_embeddings(folder: str | Path) -> tuple[StoredVectors, pd.DataFrame]:
 
 
 def embedding_folders(embeddings: str | Path) -> dict[str, Path]:
-    """Return the folders of the descriptors in an embeddings folder, by name: of one, which has no name, it itself."""
+    """Return the folder of each descriptor in an embeddings folder; a single one has the name "" and no subfolder."""
     model = read_json(Path(embeddings) / "settings.json").get("model")
     return {name: Path(embeddings) / name for name in model} if isinstance(model, list) else {"": Path(embeddings)}
 
 
 def open_descriptors(embeddings: str | Path, session: str, normalize: bool) -> tuple[Vectors, pd.DataFrame]:
-    """Open what an embeddings folder has of a session: of several descriptors, the images that all of them describe.
+    """Open all descriptors of a session; with several, only the images that have all of them.
 
     Args:
-        normalize: bring the vectors of each descriptor to length 1 as they are read.
+        normalize: scale the vectors of each descriptor to length 1 when reading.
 
     Raises:
         ArtifactError: see `open_embeddings`; or no image has all descriptors.
@@ -213,15 +214,15 @@ def open_descriptors(embeddings: str | Path, session: str, normalize: bool) -> t
     table = tables[0][tables[0]["abs_path"].map(in_all)].reset_index(drop=True)
     if not len(table):
         raise ArtifactError(f"{embeddings}: no image of {session} has all of {', '.join(parts)}. Embed again.")
-    if lost := len(in_all) - len(table):
-        log.warning("%s: %d of %d images lack a descriptor of %s and are left out, see failed.csv",
-                    session, lost, len(in_all), ", ".join(parts))  # fmt: skip
-    rows = [pd.Index(each["abs_path"]).get_indexer(table["abs_path"]) for each in tables]
-    chosen = {name: part.choose(of) for (name, part), of in zip(parts.items(), rows, strict=True)}
-    return JoinedVectors(chosen), table
+    if missing := len(in_all) - len(table):
+        log.warning("%s: %d of %d images are left out: they lack one of the descriptors %s, see failed.csv",
+                    session, missing, len(in_all), ", ".join(parts))  # fmt: skip
+    positions = [pd.Index(own["abs_path"]).get_indexer(table["abs_path"]) for own in tables]
+    common = {name: vectors.choose(chosen) for (name, vectors), chosen in zip(parts.items(), positions, strict=True)}
+    return JoinedVectors(common), table
 
 
 def load_embeddings(folder: str | Path) -> tuple[NDArray[np.float32], pd.DataFrame]:
-    """Read the embeddings of a session, or of one subsession, into memory: (N, D) float32; see `open_embeddings`."""
+    """Read the embeddings (N, D) float32 of a session, or of one subsession, into memory; see `open_embeddings`."""
     vectors, table = open_embeddings(folder)
     return vectors[:], table

@@ -1,8 +1,8 @@
-"""VLAD of RootSIFT: a global descriptor without weights, its vocabulary learned from the map's images.
+"""VLAD of RootSIFT: a global descriptor that needs no weights. It learns its vocabulary from the map images.
 
-Residuals of whitened local descriptors to their visual word are summed per word (Jegou et al., CVPR 2010),
-each residual and each word's sum normalized (Delhumeau et al., ACM MM 2013; Arandjelovic and Zisserman,
-CVPR 2013), and projected to the principal directions of the map's images.
+For each visual word, the residuals of the whitened local descriptors assigned to it are summed (Jegou et al., CVPR
+2010). Residuals and sums are normalized (Delhumeau et al., ACM MM 2013; Arandjelovic and Zisserman, CVPR 2013). The
+result is projected to the principal directions of the map images.
 """
 
 import json
@@ -24,11 +24,11 @@ from toolkit.manifest import VladSettings
 
 Floats = NDArray[np.float32]
 
-_SHORTEST = 1e-9  # a shorter vector, of rounding errors, is not stretched to length 1
+_SHORTEST = 1e-9  # shorter vectors are rounding errors, and are not normalized
 
 
 class Vlad:
-    """A learned VLAD: turns the local features of images into global descriptors."""
+    """A VLAD with its vocabulary: computes global descriptors from local features."""
 
     name = "vlad"
     inputs: Literal["features"] = "features"
@@ -50,18 +50,16 @@ class Vlad:
         return {"name": self.name, **self._settings.model_dump(), "vocabulary": self._fingerprint}
 
     def prepare(self, item: LocalFeatures) -> LocalFeatures:
-        """Return the features as they are."""
         return item
 
     def stack(self, inputs: Sequence[LocalFeatures]) -> Sequence[LocalFeatures]:
-        """Return the features as they are."""
         return inputs
 
-    @threadpool_limits.wrap(limits=1, user_api="blas")  # small products: two threads take three times as long
+    @threadpool_limits.wrap(limits=1, user_api="blas")  # the products are small: two threads take three times as long
     def embed(self, inputs: Sequence[LocalFeatures]) -> Floats:
-        """Return the global descriptors (B, dim) of images; rows of zeros where an image has no features.
+        """Return the global descriptors (B, dim) of images; zeros for an image without features.
 
-        Similarities are exact dot products; normalize the rows for cosines.
+        The rows do not have length 1: compare them by dot products, or normalize them for cosines.
         """
         return self._aggregate(inputs) @ self.projection
 
@@ -74,11 +72,11 @@ class Vlad:
         settings: VladSettings | None = None,
         seed: int = 0,
     ) -> "Vlad":
-        """Learn vocabulary and projection from `count` map images; the same input gives the same bytes.
+        """Learn vocabulary and projection from `count` map images; equal inputs give equal bytes.
 
         Args:
-            features: yields the features of the same images in the same order each time it is called. It is called
-                twice, so that memory does not grow with the number of local features.
+            features: yields the features of the images, in the same order at each call. It is called twice, so memory
+                does not grow with the number of local features.
 
         Raises:
             ToolkitError: the images have no local features.
@@ -99,7 +97,7 @@ class Vlad:
         mean = sample.mean(axis=0)
         variance, directions = np.linalg.eigh(np.cov((sample - mean).T.astype(np.float64)))
         keep = np.argsort(-variance, kind="stable")[: min(settings.local_dim, len(sample) - 1)]
-        # An almost constant direction would be amplified to noise.
+        # Without a lower bound, whitening would amplify the noise of almost constant directions.
         scale = np.sqrt(np.maximum(variance[keep], 1e-4 * variance.max() + 1e-12))
         arrays: dict[str, Floats] = {
             "local_mean": mean.astype(np.float32),
@@ -129,7 +127,7 @@ class Vlad:
             raise ArtifactError(f"Not a VLAD vocabulary: {vocabulary} ({error}). Delete it and embed again.") from error
 
     def save(self, path: str | Path) -> None:
-        """Write the vocabulary, .npz; its bytes identify it from then on."""
+        """Write the vocabulary (.npz) and take the file's fingerprint as its own."""
         arrays = {name: getattr(self, name) for name in ("local_mean", "local_projection", "centroids", "projection")}
         settings = np.array(json.dumps(self._settings.model_dump()))
         with write_atomic(path) as temporary, open(temporary, "wb") as stream:
@@ -137,7 +135,7 @@ class Vlad:
         self._fingerprint = file_fingerprint(path)
 
     def _aggregate(self, images: Sequence[LocalFeatures]) -> Floats:
-        """Return the VLADs (B, words * local_dim) before projection, of length 1 or 0."""
+        """Return the VLADs (B, words * local_dim) before the projection, of length 1, or 0 without features."""
         words, size = self.centroids.shape
         vectors = np.zeros((len(images), words, size), np.float32)
         for vector, image in zip(vectors, images, strict=True):
@@ -155,7 +153,7 @@ class Vlad:
 
 
 def _select(image: LocalFeatures, settings: VladSettings) -> Floats:
-    """Return the RootSIFT vectors (N, 128) of the keypoints that are coarse enough, in their order."""
+    """Return the RootSIFT vectors (N, 128) of the coarse keypoints, at least `min_features` if there are, in order."""
     scales = image.scales
     chosen = np.flatnonzero(scales >= settings.min_scale_px)
     if len(chosen) < settings.min_features:
@@ -164,12 +162,12 @@ def _select(image: LocalFeatures, settings: VladSettings) -> Floats:
 
 
 def _assign(points: Floats, centroids: Floats) -> NDArray[np.intp]:
-    """Return the nearest centroid of each point, (N,)."""
+    """Return the index (N,) of each point's nearest centroid."""
     return np.asarray((points @ centroids.T - 0.5 * (centroids**2).sum(axis=1)).argmax(axis=1))
 
 
 def _kmeans(points: Floats, words: int, iterations: int, rng: np.random.Generator) -> Floats:
-    """Return centroids (words, D) by Lloyd's rounds from a random choice of points."""
+    """Return centroids (words, D) by Lloyd's algorithm, starting from random points."""
     centroids = points[np.sort(rng.permutation(len(points))[:words])].copy()
     for _ in range(iterations):
         nearest = _assign(points, centroids)
@@ -182,10 +180,10 @@ def _kmeans(points: Floats, words: int, iterations: int, rng: np.random.Generato
 
 
 def _principal_projection(vectors: Floats, settings: VladSettings) -> Floats:
-    """Return the projection (D, dim) to the map's principal directions, with shrunken whitening.
+    """Return the projection (D, dim) to the map's principal directions, with shrunk whitening.
 
-    Not centered: as long as no direction is cut, map images rank by similarity to a query as their whole VLADs
-    do, and a query with nothing in common with the map stays short.
+    The vectors are not centered: as long as no direction is dropped, map images rank by similarity to a query as they
+    do with whole VLADs, and a query that has nothing in common with the map gets a short vector.
     """
     count = len(vectors)
     energy, weights = np.linalg.eigh((vectors @ vectors.T).astype(np.float64))
@@ -194,6 +192,6 @@ def _principal_projection(vectors: Floats, settings: VladSettings) -> Floats:
     energy = energy[order]
     basis = vectors.T @ (weights[:, order] / np.sqrt(energy)).astype(np.float32)
     mean_energy = energy.mean()
-    # The posterior of the energies under a prior of `prior_images` images whose energies are all equal.
+    # Posterior of the energies, given a prior worth `prior_images` images with the mean energy in each direction.
     shrunk = (count * energy + settings.prior_images * mean_energy) / (count + settings.prior_images)
     return (basis * np.sqrt(mean_energy / shrunk)).astype(np.float32)

@@ -1,1 +1,1 @@
-"""The networks. Each loads the official checkpoint, key for key, and computes the official numbers."""
+"""The networks. Each loads the official checkpoint key by key, and computes the same numbers as the official code."""

@@ -1,9 +1,9 @@
-"""ALIKED (Zhao et al., 2023): keypoints and descriptors by deformable convolutions, the official weights and numbers.
+"""ALIKED (Zhao et al., 2023): keypoints and descriptors by deformable convolutions; official weights and results.
 
-The authors' code builds a map of 128 channels of the image's size. It is needed in few places only, so it is never
-built here: the score is linear in the map up to the first activation, so each level goes through the head's first
-convolution before it is enlarged; descriptors need the map near keypoints only, where it is put together pixel by
-pixel. Batch normalization is folded into the convolutions, and all maps have their channels last.
+The authors' code computes a feature map of 128 channels at full image size. This code avoids it. The scores are linear
+in the map up to the first activation, so each level passes the head's first convolution before it is enlarged.
+Descriptors need the map near keypoints only, where it is computed pixel by pixel. Batch normalization is folded into
+the convolutions, and all maps have their channels last.
 """
 
 from collections.abc import Mapping
@@ -24,9 +24,9 @@ from toolkit.models.weights import load_checkpoint
 @dataclass(frozen=True)
 class _Sizes:
     channels: tuple[int, int, int, int]
-    """Of the four levels of the encoder; the last is also the length of a descriptor."""
+    """Channels of the encoder's four levels; the last is also the length of a descriptor."""
     samples: int
-    """Positions around a keypoint that its descriptor is made from."""
+    """Positions around a keypoint at which its descriptor samples features."""
 
 
 MODELS = {
@@ -36,14 +36,14 @@ MODELS = {
     "aliked-n32": _Sizes((16, 32, 64, 128), 32),
 }
 """The variants of the network."""
-_COARSEST = 32  # pixels of the image to a pixel of the coarsest level, along a side
-_PATCH = 3  # side of the patch around a keypoint that tells where to sample, pixels
-_TEMPERATURE = 0.1  # of the soft maximum that places a keypoint between pixels
-_CPU_ROWS = 8192  # pixels at a time whose activations stay in a CPU's cache
+_COARSEST = 32  # side of a pixel of the coarsest level, image pixels
+_PATCH = 3  # side of the patch around a keypoint from which the sample positions are computed, pixels
+_TEMPERATURE = 0.1  # of the soft maximum that gives keypoints subpixel positions
+_CPU_ROWS = 8192  # pixels at a time: their activations fit a CPU's cache
 
 
 class Aliked(nn.Module):
-    """Finds and describes keypoints in batches of images of one size.
+    """Detects and describes keypoints in batches of images of one size.
 
     Modules have the names of the official checkpoint.
     """
@@ -70,10 +70,10 @@ class Aliked(nn.Module):
 
     @classmethod
     def from_checkpoint(cls, checkpoint: str | Path | Mapping[str, Tensor], model: str = "aliked-n16") -> "Aliked":
-        """Return a network with the weights of an official file, or of tensors under the official names.
+        """Create the network from an official file, or from tensors under the official names.
 
         Raises:
-            WeightsError: other weights; names missing, unexpected and mis-shaped keys.
+            WeightsError: the weights are of another network; names missing, unexpected and mis-shaped keys.
         """
         with torch.device("meta"):
             network = cls(model)
@@ -86,9 +86,9 @@ class Aliked(nn.Module):
         return network
 
     def encode(self, images: Tensor) -> "Levels":
-        """Return what all else is computed from, of images (B, 3, H, W) RGB in 0..1. Autocast is safe around it."""
+        """Compute the feature levels of images (B, 3, H, W), RGB in 0..1. Can run under autocast."""
         height, width = images.shape[2:]
-        # The authors pad to whole pixels of the coarsest level, on both sides.
+        # As the authors, pad both sides to a multiple of the coarsest level's pixel.
         down, across = -height % _COARSEST, -width % _COARSEST
         left, top = across // 2, down // 2
         padded = F.pad(images, (left, across - left, top, down - top), mode="replicate")
@@ -103,16 +103,16 @@ class Aliked(nn.Module):
         """Return the score of each pixel, (B, H, W) in 0..1, float32."""
         first: Any
         first, *rest = self.score_head
-        head = first.weight.chunk(4, dim=1)  # by levels
+        heads = first.weight.chunk(4, dim=1)  # one per level
         fine = levels.fine
         batch, _, height, width = fine.shape
         pixels = fine.permute(0, 2, 3, 1).flatten(0, 2)
         parts = pixels.split(_CPU_ROWS if fine.device.type == "cpu" else len(pixels))
-        weight, first_head = self.conv1.weight[:, :, 0, 0], head[0][:, :, 0, 0].contiguous()
-        summed = torch.cat([linear(F.selu_(linear(part, weight)), first_head) for part in parts])
+        weight, fine_head = self.conv1.weight[:, :, 0, 0], heads[0][:, :, 0, 0].contiguous()
+        summed = torch.cat([linear(F.selu_(linear(part, weight)), fine_head) for part in parts])
         summed = summed.view(batch, height, width, -1).permute(0, 3, 1, 2)
-        for level, part_of_head in zip(levels.coarse, head[1:], strict=True):
-            small = F.conv2d(level, part_of_head)
+        for level, head in zip(levels.coarse, heads[1:], strict=True):
+            small = F.conv2d(level, head)
             summed += F.interpolate(small, size=(height, width), mode="bilinear", align_corners=True)
         for layer in rest:
             summed = layer(summed)
@@ -128,7 +128,7 @@ class Aliked(nn.Module):
             return keypoints.new_zeros(0, self.descriptor_length)
         head, (width, height) = self.desc_head, levels.size
         size = torch.tensor([width, height], device=keypoints.device)
-        # The authors' patches stay a pixel further from the right and the lower border than they need to.
+        # As in the authors' code, patches stay one pixel further from the right and lower border than necessary.
         low = (keypoints.long() - _PATCH // 2).clamp(min=0).minimum(size - 1 - _PATCH)
         patch = low[:, None] + _grid(0, _PATCH, low)
         features, lengths = self._features(levels, image, patch.flatten(0, 1))
@@ -136,7 +136,7 @@ class Aliked(nn.Module):
         offsets = head.offsets(patches).clamp(-max(levels.size) / 4, max(levels.size) / 4)
         positions = keypoints[:, None] + offsets.view(len(keypoints), 2, -1).transpose(1, 2)
         indices, weights = _corners(positions.flatten(0, 1), (height, width))
-        # Neighboring positions share pixels: each is put together once.
+        # Neighboring positions share pixels: compute the features of each pixel once.
         pixels, rows = indices.unique(return_inverse=True)
         features, lengths = self._features(levels, image, torch.stack([pixels % width, pixels // width], dim=1))
         weights = weights / lengths[rows]
@@ -144,15 +144,15 @@ class Aliked(nn.Module):
         return F.normalize(head(sampled.view(*positions.shape[:2], -1)), dim=1)
 
     def _features(self, levels: "Levels", image: int, pixels: Tensor) -> tuple[list[Tensor], Tensor]:
-        """Return the features of one image at whole pixels (N, 2), level by level (N, D / 4), and their length (N,).
+        """Return the features of one image at whole pixels (N, 2), one (N, D / 4) per level, and their length (N,).
 
-        The authors' map has them side by side, divided by their length.
+        The authors' map holds the concatenated features, divided by their length.
         """
         fine = levels.fine[image].permute(1, 2, 0)
         x, y = (pixels + torch.tensor(levels.corner, device=pixels.device)).unbind(1)
         parts = [F.selu_(linear(fine[y, x], self.conv1.weight[:, :, 0, 0]))]
         for level in levels.coarse:
-            # Enlarging keeps the centers of the corners' pixels where they are.
+            # The interpolation aligns the centers of the corner pixels of both maps.
             scale = [(small - 1) / (large - 1) for small, large in zip(level.shape[2:], fine.shape[:2], strict=True)]
             parts.append(sample(level[image, None], torch.stack([x * scale[1], y * scale[0]], dim=1)[None])[0])
         lengths = torch.stack([torch.linalg.vector_norm(part, dim=1) for part in parts]).norm(dim=0)
@@ -161,27 +161,27 @@ class Aliked(nn.Module):
 
 @dataclass(frozen=True)
 class Levels:
-    """Maps of a batch of images, float32, from fine to coarse."""
+    """Feature maps of a batch of images, float32, from fine to coarse."""
 
     fine: Tensor
-    """(B, C, H', W'), of the padded images."""
+    """(B, C, H', W'), at the size of the padded images."""
     coarse: list[Tensor]
-    """Three maps (B, D / 4, H' / n, W' / n) of features: a quarter of a descriptor's channels each."""
+    """Three maps (B, D / 4, H' / n, W' / n), each with a quarter of a descriptor's channels."""
     corner: tuple[int, int]
-    """x y of the images' top-left pixel in the padded images."""
+    """(x, y) of the images' top-left pixel in the padded images."""
     size: tuple[int, int]
-    """Width, height of the images without padding, pixels."""
+    """(width, height) of the images without padding, pixels."""
 
 
 def find_keypoints(scores: Tensor, most: int, threshold: float = 0.0, radius: int = 2) -> tuple[Tensor, Tensor]:
-    """Return x y (K, 2) and scores (K,) of the maxima of a map of scores (H, W), the highest first.
+    """Return the positions x y (K, 2) and scores (K,) of the maxima of a score map (H, W), highest score first.
 
-    Maxima are placed between pixels; the center of the top-left pixel is at (0, 0).
+    Positions have subpixel precision; the center of the top-left pixel is at (0, 0).
 
     Args:
-        most: number of keypoints at most.
-        threshold: the score of a keypoint's pixel is above it.
-        radius: no two keypoints' pixels are closer than this, and none is closer to the border.
+        most: largest number of keypoints.
+        threshold: lower bound of the score at a keypoint's pixel, exclusive.
+        radius: smallest distance between the pixels of two keypoints, and from a keypoint's pixel to the border.
     """
     height, width = scores.shape
     maxima = _suppress(scores, radius)
@@ -202,7 +202,10 @@ def find_keypoints(scores: Tensor, most: int, threshold: float = 0.0, radius: in
 
 
 def _suppress(scores: Tensor, radius: int) -> Tensor:
-    """Return scores (H, W), zero where they are no maximum; a maximum hides others only where it is one itself."""
+    """Return the scores (H, W) with all but the maxima set to zero.
+
+    Finds the pixels that are the maximum of their window, then twice those among pixels outside of all such windows.
+    """
     maxima = scores == _window_max(scores, radius)
     for _ in range(2):
         hidden = _window_max(maxima.to(torch.uint8), radius) > 0
@@ -212,7 +215,7 @@ def _suppress(scores: Tensor, radius: int) -> Tensor:
 
 
 def _window_max(image: Tensor, radius: int) -> Tensor:
-    """Return the largest value, at least 0, within `radius` along x and y; 20 times as fast as `max_pool2d` on CPUs."""
+    """Return the largest value within `radius` along x and y, at least 0. On CPUs 20 times as fast as `max_pool2d`."""
     for dim in (1, 0):
         length = image.shape[dim]
         wide = F.pad(image, (radius, radius, 0, 0) if dim else (0, 0, radius, radius))
@@ -223,10 +226,10 @@ def _window_max(image: Tensor, radius: int) -> Tensor:
 
 
 def sample(image: Tensor, positions: Tensor) -> Tensor:
-    """Return a map (B, C, H, W) at positions (B, N, 2), x y, by bilinear interpolation, (B, N, C) float32.
+    """Interpolate a map (B, C, H, W) bilinearly at positions (B, N, 2), x y; return (B, N, C) float32.
 
-    The center of the top-left pixel is at (0, 0); beyond the map all is zero. It is quicker than `grid_sample` where
-    channels are last.
+    The center of the top-left pixel is at (0, 0); the map is zero outside. With channels last, this is faster than
+    `grid_sample`.
     """
     batch, channels, height, width = image.shape
     indices, weights = _corners(positions, (height, width))
@@ -236,34 +239,37 @@ def sample(image: Tensor, positions: Tensor) -> Tensor:
 
 
 def _weighted_sum(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
-    """Return weighted sums of rows of a table (N, C), (M, C), by indices and weights (M, 4)."""
+    """Return weighted sums (M, C) of rows of a table (N, C), by row indices and weights (M, 4)."""
     return F.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
 
 
 def _corners(positions: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Return the indices and weights, both (..., 4), of the pixels of a map (H, W) around positions (..., 2), x y."""
-    sides = []
+    """Return the indices and weights, both (..., 4), of the four pixels of a map (H, W) around positions (..., 2), x y.
+
+    Indices are into the flattened map.
+    """
+    axes = []
     for position, length in ((positions[..., 1], shape[0]), (positions[..., 0], shape[1])):
         low = position.floor()
-        part = position - low
+        fraction = position - low
         index = torch.stack([low, low + 1], dim=-1)
-        weight = torch.stack([1 - part, part], dim=-1) * ((index >= 0) & (index < length))
-        # A position that is not a number has such weights, and any index.
-        sides.append((index.clamp(0, length - 1).nan_to_num(0).long(), weight))
-    (rows, row_weights), (columns, column_weights) = sides
+        weight = torch.stack([1 - fraction, fraction], dim=-1) * ((index >= 0) & (index < length))
+        # A NaN position gets NaN weights; any valid index will do.
+        axes.append((index.clamp(0, length - 1).nan_to_num(0).long(), weight))
+    (rows, row_weights), (columns, column_weights) = axes
     indices = rows[..., :, None] * shape[1] + columns[..., None, :]
     return indices.flatten(-2), (row_weights[..., :, None] * column_weights[..., None, :]).flatten(-2)
 
 
 def _grid(start: int, stop: int, like: Tensor) -> Tensor:
-    """Return x y of a square of pixels, row by row, (N, 2), of the type of `like`."""
+    """Return x y (N, 2) of the pixels of a square, row by row, with the type and device of `like`."""
     side = torch.arange(start, stop, dtype=like.dtype, device=like.device)
     y, x = torch.meshgrid(side, side, indexing="ij")
     return torch.stack([x, y], dim=-1).view(-1, 2)
 
 
 class _DeformableConv(nn.Module):
-    """A 3 x 3 convolution whose taps are moved by what another convolution finds."""
+    """A 3 x 3 convolution at positions that another convolution shifts."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
@@ -284,7 +290,7 @@ class _DeformableConv(nn.Module):
 
 
 class _Block(nn.Module):
-    """Two convolutions, each with a norm and an activation."""
+    """Two convolutions, each followed by a norm and an activation."""
 
     def __init__(self, inputs: int, outputs: int, deformable: bool, residual: bool = True) -> None:
         super().__init__()
@@ -298,17 +304,17 @@ class _Block(nn.Module):
         return F.selu_(inner if self.downsample is None else inner.add_(self.downsample(x)))
 
     def fold_norms(self) -> None:
-        """Let the convolutions do what the norms would do after them, at inference."""
+        """Fold the norms into the convolutions before them, for inference."""
         norm: Any
-        for conv, norm in ((self.conv1, self.bn1), (self.conv2, self.bn2)):
-            plain = conv.regular_conv if isinstance(conv, _DeformableConv) else conv
-            plain.weight, plain.bias = fuse_conv_bn_weights(
-                plain.weight, None, norm.running_mean, norm.running_var, norm.eps, norm.weight, norm.bias
+        for layer, norm in ((self.conv1, self.bn1), (self.conv2, self.bn2)):
+            conv = layer.regular_conv if isinstance(layer, _DeformableConv) else layer
+            conv.weight, conv.bias = fuse_conv_bn_weights(
+                conv.weight, None, norm.running_mean, norm.running_var, norm.eps, norm.weight, norm.bias
             )
 
 
 class _DescriptorHead(nn.Module):
-    """Makes a descriptor of features at positions around a keypoint, which it chooses."""
+    """Computes sample positions around a keypoint, and a descriptor from the features there."""
 
     def __init__(self, channels: int, samples: int) -> None:
         super().__init__()
@@ -319,7 +325,7 @@ class _DescriptorHead(nn.Module):
         self.agg_weights = nn.Parameter(torch.empty(samples, channels, channels))
 
     def offsets(self, patches: Tensor) -> Tensor:
-        """Return where to sample, (K, 2 * samples), all x before all y, of patches (K, 9 * C), row by row."""
+        """Return the sample offsets (K, 2 * samples), all x before all y, for patches (K, 9 * C), row by row."""
         first: Any
         last: Any
         first, _, last = self.offset_conv
@@ -327,6 +333,6 @@ class _DescriptorHead(nn.Module):
         return linear(inner, last.weight.flatten(1), last.bias)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Return descriptors (K, C), of any length, of the sampled features (K, samples, C)."""
+        """Return descriptors (K, C), not normalized, of the sampled features (K, samples, C)."""
         inner = F.selu_(linear(features, self.sf_conv.weight.flatten(1)))
         return linear(inner.flatten(1), self.agg_weights.flatten(0, 1).T)

@@ -1,4 +1,4 @@
-"""Devices and precisions that networks run in, and batches that do not fit the memory of the device."""
+"""Devices and precisions of the networks, and batches that do not fit the memory of the device."""
 
 import logging
 import os
@@ -17,8 +17,8 @@ from toolkit.errors import ManifestError, ToolkitError, first_line
 if TYPE_CHECKING:
     import torch
 
-# oneDNN keeps what it made for each shape, and images differ in their numbers of features: 1,024 shapes, its default,
-# take gigabytes. It reads this when it is first used.
+# oneDNN caches a primitive for each input shape, and images differ in their number of features: its default of 1,024
+# primitives takes gigabytes. It reads this variable at its first use.
 os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "64")
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -26,24 +26,24 @@ Result = TypeVar("Result")
 log = logging.getLogger(__name__)
 
 DEVICE_NAME = r"auto|cpu|mps|cuda(:\d+)?"
-"""Regular expression of the names of devices."""
+"""Regular expression of device names."""
 PRECISIONS = ("auto", "float32", "bfloat16", "float16")
 
 
 def resolve_device(name: str = "auto") -> "torch.device":
-    """Return the device that `auto`, `cpu`, `cuda`, `cuda:<i>` or `mps` stands for.
+    """Return the device named `auto`, `cpu`, `cuda`, `cuda:<i>` or `mps`.
 
     `auto`: the first GPU, else Apple's, else the CPU.
 
     Raises:
-        ManifestError: another name.
+        ManifestError: unknown name.
         ToolkitError: torch finds no such device on this machine.
     """
     import torch
 
     if not re.fullmatch(DEVICE_NAME, name):
         raise ManifestError(f"compute_device is {name!r}; expected auto, cpu, cuda, cuda:<number> or mps.")
-    # Where the driver is too old for this torch, GPUs are counted and cannot be used.
+    # With a driver too old for this torch, torch counts GPUs that it cannot use.
     gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
     apple = torch.backends.mps.is_available()
     if name == "auto":
@@ -58,7 +58,7 @@ def resolve_device(name: str = "auto") -> "torch.device":
 
 
 def resolve_precision(name: str, device: "torch.device") -> "torch.dtype":
-    """Return the type in which a network computes.
+    """Return the data type in which a network computes.
 
     `auto`: bfloat16 where the device multiplies it natively (GPUs since Ampere; CPUs with AMX or AVX512-BF16),
     float16 on older GPUs, else float32.
@@ -79,7 +79,7 @@ def resolve_precision(name: str, device: "torch.device") -> "torch.dtype":
 
 
 def has_accelerator(name: str) -> bool:
-    """Tell whether a device is, or `auto` would be, another than the CPU; imports torch only if there may be one."""
+    """Tell whether a device name resolves to another device than the CPU; imports torch only if there may be one."""
     if name == "auto" and sys.platform == "linux":
         drivers = ("nvidiactl", "kfd", "dxg")
         if not any(Path("/dev", driver).exists() for driver in drivers):
@@ -88,27 +88,29 @@ def has_accelerator(name: str) -> bool:
 
 
 def precision_of_matches(name: str, device: "torch.device") -> "torch.dtype":
-    """Return the type in which networks for local features compute: as `resolve_precision`, but on a CPU `auto` is
-    float32, so that equal photographs give equal matches on any of them. bfloat16 changes a few percent of the matches.
+    """Return the data type in which networks for local features compute.
+
+    As `resolve_precision`, but `auto` on a CPU is float32, so that all CPUs give the same matches. bfloat16 changes a
+    few percent of the matches.
     """
     return resolve_precision("float32" if name == "auto" and device.type == "cpu" else name, device)
 
 
 def cpu_multiplies_bfloat16() -> bool:
-    """Tell whether this CPU has instructions for products of bfloat16 matrices: AMX or AVX512-BF16.
+    """Tell whether this CPU has instructions for bfloat16 matrix products: AMX or AVX512-BF16.
 
-    Other CPUs emulate them, some ten times slower than float32.
+    Other CPUs emulate them, about ten times slower than float32.
     """
     import torch
 
     capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
-    # torch before 2.8 has no list of capabilities, but can tell AMX.
+    # torch before 2.8 does not list capabilities, but detects AMX.
     amx = getattr(torch.cpu, "_is_amx_tile_supported", bool)()
     return bool(amx or capabilities.get("amx_bf16") or capabilities.get("avx512_bf16"))
 
 
 def has_onednn(x: "torch.Tensor") -> bool:
-    """Tell whether `linear` uses oneDNN for this tensor."""
+    """Tell whether `linear` can use oneDNN for this tensor."""
     import torch
 
     if (
@@ -119,15 +121,18 @@ def has_onednn(x: "torch.Tensor") -> bool:
         or not hasattr(torch.ops.mkldnn, "_linear_pointwise")
     ):
         return False
-    # Few processors have products of float16; without AVX-512 there are none of bfloat16.
+    # Few CPUs multiply float16, and oneDNN multiplies bfloat16 only with AVX-512.
     return x.dtype == torch.float32 or (x.dtype == torch.bfloat16 and torch.ops.mkldnn._is_mkldnn_bf16_supported())
 
 
 def linear(x: "torch.Tensor", weight: "torch.Tensor", bias: "torch.Tensor | None" = None) -> "torch.Tensor":
-    """Return `torch.nn.functional.linear(x, weight, bias)`, which have one type; `weight` is contiguous or transposed.
+    """Return `torch.nn.functional.linear(x, weight, bias)`, through oneDNN if possible.
 
-    On a CPU, torch leaves products in float32 to MKL, which does not use AVX-512 on processors of AMD: oneDNN, which
-    torch uses for bfloat16 and in compiled models, is then twice as fast.
+    On a CPU, torch multiplies float32 with MKL, which does not use AVX-512 on AMD processors. oneDNN, which torch uses
+    for bfloat16 and in compiled models, is then twice as fast.
+
+    Args:
+        x, weight, bias: of one data type; `weight` is contiguous, or the transpose of a contiguous matrix.
     """
     import torch
     import torch.nn.functional as F
@@ -139,29 +144,29 @@ def linear(x: "torch.Tensor", weight: "torch.Tensor", bias: "torch.Tensor | None
 
 
 def in_single_threads(run: "Callable[[Item], Result]", items: "Iterable[Item]") -> "list[Result]":
-    """Return `run(item)` of each item on the CPU: several at a time, each with a single thread of torch.
+    """Return `run(item)` of each item on the CPU: several items at a time, each with a single torch thread.
 
-    Threads within operations wait for each other, long where cores are shared; and what they compute differs in the
-    last digits with their number. Items by themselves do neither.
+    Threads within one operation wait for each other, long if other processes share the cores, and the last digits of
+    their result depend on the number of threads. Running whole items in parallel avoids both.
     """
     import torch
 
     def run_one(item: Item) -> Result:
-        with torch.inference_mode():  # each thread has a mode of its own
+        with torch.inference_mode():  # the mode is per thread
             return run(item)
 
     threads = torch.get_num_threads()
     with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
         results = list(pool.map(run_one, items))
-    torch.set_num_threads(threads)  # also of threads that are not started yet
+    torch.set_num_threads(threads)  # restore it also for threads that start later
     return results
 
 
 def upload(batch: "torch.Tensor", device: "torch.device") -> "torch.Tensor":
-    """Return a tensor of the CPU on a device.
+    """Copy a CPU tensor to a device.
 
-    To a GPU it is copied from page-locked memory, on a stream of its own: a thread can do this while the network runs
-    on another batch. The copy is complete when this returns.
+    The copy to a GPU goes through page-locked memory on a separate stream, so a thread can upload a batch while the
+    network runs on another. The copy is complete on return.
     """
     import torch
 
@@ -171,16 +176,16 @@ def upload(batch: "torch.Tensor", device: "torch.device") -> "torch.Tensor":
     with torch.cuda.stream(stream):
         copied = batch.pin_memory().to(device, non_blocking=True)
     stream.synchronize()
-    # Its memory is of the stream of copies, which shall not have it back before the network is done with it.
+    # The memory belongs to the copy stream, which must not reuse it before the network is done with it.
     copied.record_stream(torch.cuda.current_stream(device))
     return copied
 
 
 def on_device(model: "torch.nn.Module", device: "torch.device", title: str) -> "torch.nn.Module":
-    """Return a network that was moved to a device; `title` is its name, for messages.
+    """Move a network to a device; `title` is its name, for messages.
 
     Raises:
-        ToolkitError: the device's memory does not hold its weights.
+        ToolkitError: its weights do not fit the memory of the device.
     """
     try:
         return model.to(device)
@@ -195,12 +200,12 @@ def on_device(model: "torch.nn.Module", device: "torch.device", title: str) -> "
 
 
 def free_bytes(device: "torch.device") -> int:
-    """Return the memory of a device that nobody uses; of Apple's, that of the machine."""
+    """Return the free memory of a device; for Apple's GPU and the CPU, the machine's free memory."""
     import psutil
     import torch
 
     if device.type == "cuda":
-        # What torch has reserved and not handed out is as good as free.
+        # Memory that torch has reserved but not allocated is free for the network.
         reserved = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
         return int(torch.cuda.mem_get_info(device)[0]) + reserved
     return int(psutil.virtual_memory().available)
@@ -208,15 +213,15 @@ def free_bytes(device: "torch.device") -> int:
 
 @contextmanager
 def full_float32(device: "torch.device") -> Iterator[None]:
-    """Multiply float32 as float32 on a GPU, whatever the process has chosen; then as before.
+    """Multiply float32 in full precision on a GPU inside the context, whatever the process has set.
 
-    By its default, cuDNN rounds what a convolution multiplies to TF32, which has the 10 bits of float16.
+    By default, cuDNN rounds the factors in convolutions to TF32, which has 10 bits of mantissa like float16.
     """
     import torch
 
     cudnn: Any = torch.backends.cudnn
     matmul: Any = torch.backends.cuda.matmul
-    # torch 2.9 has new flags; with them set, the older ones cannot be read.
+    # torch 2.9 has new flags; once they are set, reading the old ones fails.
     new = hasattr(cudnn, "conv")
     owners = [] if device.type != "cuda" else [cudnn.conv, matmul] if new else [cudnn, matmul]
     name, exact = ("fp32_precision", "ieee") if new else ("allow_tf32", False)
@@ -232,29 +237,33 @@ def full_float32(device: "torch.device") -> Iterator[None]:
 
 @cache
 def _copy_stream(device: "torch.device") -> "torch.cuda.Stream":
-    """Return the stream for copies to a GPU: one, as torch keeps memory apart for each stream that had some."""
+    """Return the stream for copies to a GPU. There is only one, because torch keeps separate memory for each stream."""
     import torch
 
     return torch.cuda.Stream(device)
 
 
 class Fitting:
-    """Runs a function on a device; splits batches into smaller parts once one did not fit its memory."""
+    """Runs a function on a device; splits batches into smaller ones after one did not fit its memory."""
 
     def __init__(self, run: "Callable[..., torch.Tensor]", what: str, device: "torch.device | None" = None) -> None:
-        """`run` maps (B, ...), and what else it takes, to (B, ...), each row on its own; `what` the rows are, in the
-        plural, is for messages."""
+        """
+        Args:
+            run: maps one or more tensors (B, ...) to (B, ...), each row independently.
+            what: name of the rows in the plural, for messages.
+            device: where to run; None: the device of the batch.
+        """
         self._run = run
         self._device = device
         self._what = what
         self._limit: int | None = None
 
     def __call__(self, batch: "torch.Tensor", *others: "torch.Tensor") -> "torch.Tensor":
-        """Return `run(batch, *others)`; halves the batch as often as needed, logs a warning, and remembers the size
-        that fits.
+        """Return `run(batch, *others)`.
 
-        A batch that is elsewhere is moved to the device by parts; others (B, ...) are cut alike and stay where they
-        are. float32 is computed in full, see `full_float32`.
+        If the batch does not fit, halves it as often as needed, logs a warning, and remembers the size that fits.
+        Moves the parts of the batch to the device; splits `others` (B, ...) likewise, but leaves them where they are.
+        Computes float32 in full precision, see `full_float32`.
 
         Raises:
             ToolkitError: not even one row fits.
@@ -276,14 +285,14 @@ class Fitting:
                 if not is_out_of_memory(error):
                     raise
                 reason = first_line(error)
-            # Outside the handler, where the traceback would keep the tensors of the failed attempt alive.
+            # Not in the handler, whose traceback would keep the tensors of the failed attempt alive.
             if count == 1:
                 raise ToolkitError(
                     f"The memory of {device} does not hold the network with one of the {self._what} "
                     f"({reason}). Use a smaller image_size, dtype_compute: bfloat16, or compute_device: cpu."
                 )
             self._limit = count // 2
-            log.warning("%d %s do not fit the memory of %s, going on with %d at a time",
+            log.warning("%d %s do not fit the memory of %s, continuing with %d at a time",
                         count, self._what, device, self._limit)  # fmt: skip
             if device.type == "cuda":
                 torch.cuda.empty_cache()
@@ -294,11 +303,11 @@ _NO_MEMORY = re.compile(
     r"out of memory|can't allocate memory|CU(BLAS|DNN|SOLVER|SPARSE)_STATUS_ALLOC_FAILED"
     r"|unable to find an engine|Invalid buffer size", re.IGNORECASE
 )  # fmt: skip
-"""What CUDA's libraries, cuDNN without room for any of its engines, Metal and the CPU's allocator say."""
+"""Messages of CUDA's libraries, of cuDNN when none of its engines fits, of Metal, and of the CPU's allocator."""
 
 
 def is_out_of_memory(error: Exception) -> bool:
-    """Tell whether torch says by an error that a device's memory does not suffice."""
+    """Tell whether a torch error means that a device is out of memory."""
     import torch
 
     return isinstance(error, torch.OutOfMemoryError) or bool(_NO_MEMORY.search(str(error)))

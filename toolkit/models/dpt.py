@@ -1,4 +1,4 @@
-"""Dense Prediction Transformer (Ranftl et al., ICCV 2021), as VGGT and its successor use it."""
+"""Dense Prediction Transformer (Ranftl et al., ICCV 2021), as in VGGT, VGGT-Omega and Depth Anything 3."""
 
 from collections.abc import Mapping, Sequence
 
@@ -7,18 +7,18 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 FRAMES_AT_A_TIME = 8
-"""Of the dense heads, on a GPU."""
+"""Images that a dense head processes at a time on a GPU; bounds the memory."""
 _EPS = 1e-5
 
 LayerTokens = tuple[Tensor, Tensor]
-"""Tokens (B, S, T, C) after a layer's attention within views, and after its attention among views; patches last."""
+"""Tokens (B, S, T, C) after a layer's attention within views, and after its attention among views, patches last."""
 
 
 class ResidualUnit(nn.Module):
-    """Two 3 x 3 convolutions, added to the input, or to the *rectified* input where the official code's ReLU
-    overwrites the input."""
+    """Two 3 x 3 convolutions with a residual connection."""
 
     def __init__(self, channels: int, overwrites: bool) -> None:
+        """`overwrites`: add the rectified input, not the input, because the official code's ReLU works in place."""
         super().__init__()
         self.conv1 = nn.Conv2d(channels, channels, 3, padding=1)
         self.conv2 = nn.Conv2d(channels, channels, 3, padding=1)
@@ -40,24 +40,24 @@ class Fusion(nn.Module):
         self.resConfUnit2 = ResidualUnit(channels, overwrites)
 
     def forward(self, coarse: Tensor | None, fine: Tensor, size: Sequence[int]) -> Tensor:
-        """Return (N, C, *size) of maps (N, C, h, w)."""
+        """Return the fused map (N, C, *size) of maps (N, C, h, w)."""
         coarse = fine if coarse is None else self.resConfUnit1(fine).add_(coarse)
-        # A 1 x 1 convolution and an interpolation commute: convolving the small map is cheaper.
+        # A 1 x 1 convolution commutes with an interpolation, and is cheaper on the small map.
         return resize(self.out_conv(self.resConfUnit2(coarse)), size)
 
 
 class Scratch(nn.Module):
-    """Fuses the maps of the four layers. (The name is the checkpoint's.)"""
+    """Fuses the maps of the four layers; named as in the checkpoint."""
 
     def __init__(self, channels: Sequence[int], features: int, overwrites: bool) -> None:
-        """`overwrites` is of `ResidualUnit`."""
+        """For `overwrites`, see `ResidualUnit`."""
         super().__init__()
         for level, channel in enumerate(channels, start=1):
             self.add_module(f"layer{level}_rn", nn.Conv2d(channel, features, 3, padding=1, bias=False))
             self.add_module(f"refinenet{level}", Fusion(features, level < len(channels), overwrites))
 
     def forward(self, maps: Sequence[Tensor], size: Sequence[int]) -> Tensor:
-        """Return (N, features, *size) of maps from fine to coarse, (N, channels[level], h, w)."""
+        """Return the fused map (N, features, *size) of maps (N, channels[level], h, w), given from fine to coarse."""
         sizes = [size, *(x.shape[2:] for x in maps[:-1])]
         x = None
         for level in range(len(maps), 0, -1):
@@ -68,16 +68,16 @@ class Scratch(nn.Module):
 
 
 class DenseHead(nn.Module):
-    """Maps of four layers, fused from coarse to fine. Subclasses say what becomes of them."""
+    """Turns the tokens of four layers into maps. Subclasses implement `decode`, which fuses the maps."""
 
     def __init__(self, dim: int, channels: Sequence[int], patch: int, out: int, scratch: nn.Module) -> None:
         """
         Args:
             dim: channels of the concatenated tokens of both blocks of a layer.
-            channels: of the maps of the four layers.
+            channels: channels of the maps of the four layers.
             patch: side of a patch, pixels.
             out: channels of the result, including the confidence.
-            scratch: fuses the maps.
+            scratch: module that fuses the maps.
         """
         super().__init__()
         self.patch = patch
@@ -98,48 +98,51 @@ class DenseHead(nn.Module):
         """Return (N, out, H, W) before activation, size = (H, W), for tokens (N, T, C) of the four layers."""
         rows, columns = size[0] // self.patch, size[1] // self.patch
         maps = []
-        for both, project, enlarge in zip(layers, self.projects, self.resize_layers, strict=True):
-            patches = torch.cat([tokens[:, -rows * columns :] for tokens in both], dim=-1)
+        for layer, project, resize_layer in zip(layers, self.projects, self.resize_layers, strict=True):
+            patches = torch.cat([tokens[:, -rows * columns :] for tokens in layer], dim=-1)
             x = project(self.norm(patches.float()).transpose(1, 2).unflatten(2, (rows, columns)))
-            maps.append(enlarge(add_position(x, size[1] / size[0])))
+            maps.append(resize_layer(add_position(x, size[1] / size[0])))
         return self.decode(maps, size)
 
     def decode(self, maps: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
-        """Return (N, out, H, W) of maps (N, channels[level], h, w) that are 4, 2, 1 and 1/2 times the patches."""
+        """Return (N, out, H, W) for maps (N, channels[level], h, w) of 4, 2, 1 and 1/2 times the grid of patches."""
         raise NotImplementedError
 
 
 def dense_output(
     head: DenseHead, layers: Mapping[int, LayerTokens], read: Sequence[int], size: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
-    """Return the values (B, S, H, W, out - 1) before activation, and the confidence (B, S, H, W), above 1.
+    """Run a dense head on all views, a few at a time.
 
     Args:
         layers: tokens (B, S, T, C) by layer.
         read: the four layers that the head reads.
         size: (H, W) of the images.
+
+    Returns:
+        The values (B, S, H, W, out - 1) before activation, and the confidence (B, S, H, W), above 1.
     """
     B, S = layers[read[0]][0].shape[:2]
     flat = [(layers[layer][0].flatten(0, 1), layers[layer][1].flatten(0, 1)) for layer in read]
     device = flat[0][0].device
     result = torch.empty(B * S, *size, head.out, device=device)
-    # A frame's maps take many times the memory of its tokens; on a CPU, one frame keeps all cores busy.
-    frames = 1 if device.type == "cpu" else FRAMES_AT_A_TIME
-    for start in range(0, B * S, frames):
-        part = slice(start, start + frames)
+    # The maps of a view take many times the memory of its tokens; on a CPU, one view keeps all cores busy.
+    views = 1 if device.type == "cpu" else FRAMES_AT_A_TIME
+    for start in range(0, B * S, views):
+        part = slice(start, start + views)
         result[part] = head([(within[part], among[part]) for within, among in flat], size).permute(0, 2, 3, 1)
     result = result.unflatten(0, (B, S))
     return result[..., :-1], 1 + result[..., -1].exp()
 
 
 def add_position(x: Tensor, aspect: float, factor: float = 0.1) -> Tensor:
-    """Add sines and cosines of each pixel's x (in the first C / 2 channels) and y to maps (N, C, h, w), in place.
+    """Add sines and cosines of each pixel's x (first C / 2 channels) and y (other channels) to maps (N, C, h, w).
 
-    x and y are coordinates on an image plane whose half diagonal is 1, for width / height = `aspect`.
+    Works in place. x and y are coordinates on an image plane with half diagonal 1 and width / height = `aspect`.
     """
     _, C, height, width = x.shape
     diagonal = (1 + aspect**2) ** 0.5
-    # In float64 on the CPU: Apple's GPUs have none.
+    # On the CPU, because Apple's GPUs have no float64.
     frequencies = 1.0 / 100.0 ** (torch.arange(C // 4, dtype=torch.float64) / (C / 4))
     for channels, span, count, axis in (
         (slice(0, C // 2), aspect / diagonal, width, 1),
@@ -153,5 +156,5 @@ def add_position(x: Tensor, aspect: float, factor: float = 0.1) -> Tensor:
 
 
 def resize(x: Tensor, size: Sequence[int]) -> Tensor:
-    """Return maps (N, C, *size), interpolated such that corner pixels keep their values."""
+    """Resize maps to (N, C, *size) by bilinear interpolation; corner pixels keep their values."""
     return F.interpolate(x, list(size), mode="bilinear", align_corners=True)

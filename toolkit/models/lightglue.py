@@ -1,7 +1,7 @@
-"""The network LightGlue (Lindenberger, Sarlin and Pollefeys, ICCV 2023), with the key names of its authors' files.
+"""The network LightGlue (Lindenberger, Sarlin and Pollefeys, ICCV 2023), with the key names of the authors' files.
 
-All layers run for all features: the network's early stopping and pruning are not used. Before use, `fold_` merges
-matrices of which only the product counts; the result is the same but for rounding.
+All layers run for all features, without the network's early stopping and pruning. Call `fold_` before use: it merges
+matrices that are only ever multiplied with each other. The result is equal up to rounding.
 """
 
 import re
@@ -16,13 +16,13 @@ from toolkit.models.compute import has_onednn, linear
 from toolkit.models.vit import Rope, rotate_
 
 DIM = 256
-"""Channels of a feature inside of the network."""
+"""Channels of a feature inside the network."""
 _HEADS = 4
 _LAYERS = 9
-# Rows of the attention matrix at a time, per thread of the CPU: they shall stay in its cache.
+# Rows of the attention matrix at a time, per CPU thread: they fit the cache.
 _ROWS = 128
 
-# Names in the checkpoints of the package `transformers`, and those of the first files of the authors.
+# Patterns of key names in checkpoints of the package `transformers` and in the authors' first files, and our names.
 _NAMES = {
     r"^positional_encoder\.projector": "posenc.Wr",
     r"^input_projection": "input_proj",
@@ -42,9 +42,9 @@ _NAMES = {
 
 
 def official_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return a checkpoint under the names of `LightGlue`, be it the authors' or of the package `transformers`.
+    """Rename the tensors of a checkpoint, the authors' or one of the package `transformers`, to those of `LightGlue`.
 
-    Names of neither stay as they are.
+    Unknown names stay unchanged.
     """
     renamed = {}
     for name, value in state.items():
@@ -52,13 +52,13 @@ def official_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
             name = re.sub(pattern, own, name)
         renamed[name] = value
     for name in [name for name in renamed if "self_attention.q_proj" in name]:
-        parts = [name.replace("q_proj", part) for part in ("q_proj", "k_proj", "v_proj")]
-        if all(part in renamed for part in parts):
-            # The rows of queries, keys and values alternate.
-            value = torch.stack([renamed.pop(part) for part in parts], dim=1).flatten(0, 1)
+        names = [name.replace("q_proj", projection) for projection in ("q_proj", "k_proj", "v_proj")]
+        if all(part in renamed for part in names):
+            # `Wqkv` interleaves the rows of queries, keys and values.
+            value = torch.stack([renamed.pop(part) for part in names], dim=1).flatten(0, 1)
             renamed[name.replace("self_attention.q_proj", "self_attn.Wqkv")] = value
     for name in [name for name in renamed if "cross_attn.to_qk" in name]:
-        # Across images, queries and keys are the same. A file where they differ is of another network.
+        # In cross-attention, queries and keys share one projection. If they differ, the file is of another network.
         keys = name.replace("cross_attn.to_qk", "cross_attention.k_proj")
         if keys in renamed and torch.equal(renamed[keys], renamed[name]):
             del renamed[keys]
@@ -66,30 +66,30 @@ def official_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _rotate(x: Tensor, rope: Rope) -> Tensor:
-    """Return queries or keys (B, N, heads, D), each pair of channels rotated by its own angle, see `rotate_`."""
+    """Rotate each pair of channels of queries or keys (B, N, heads, D) by its own angle, see `rotate_`."""
     return rotate_(x.float(), rope, groups=1).to(x.dtype)
 
 
 def _attend(queries: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None) -> Tensor:
-    """Return for each query the mean of values, weighted by the softmax of products with keys, (B, N, heads * D).
+    """Return the attention output without scaling: softmax(queries @ keys.T) @ values, (B, N, heads * D).
 
     Args:
-        queries, keys, values: (B, N, heads, D) or (B, M, heads, D).
-        mask: (B, 1, 1, M), which keys count; None: all.
+        queries, keys, values: (B, N, heads, D) for queries, (B, M, heads, D) for keys and values.
+        mask: (B, 1, 1, M), True for real keys; None: all.
     """
-    q, k, v = (part.transpose(1, 2).contiguous() for part in (queries, keys, values))
+    q, k, v = (tensor.transpose(1, 2).contiguous() for tensor in (queries, keys, values))
     if mask is not None or not has_onednn(queries):
         return F.scaled_dot_product_attention(q, k, v, attn_mask=mask, scale=1.0).transpose(1, 2).flatten(2)
-    # On a CPU this is 1.7 (float32) to 2.6 times (bfloat16) as fast as torch's, which uses slower matrix products.
-    gathered = torch.empty_like(queries, memory_format=torch.contiguous_format)
+    # On a CPU this is 1.7 (float32) to 2.6 (bfloat16) times as fast as torch's function, whose products are slower.
+    attended = torch.empty_like(queries, memory_format=torch.contiguous_format)
     rows = _ROWS * max(2, torch.get_num_threads())
-    for image, of_image in enumerate(zip(q, k, v, strict=True)):
-        for head, (query, key, value) in enumerate(zip(*of_image, strict=True)):
+    for image, heads in enumerate(zip(q, k, v, strict=True)):
+        for head, (query, key, value) in enumerate(zip(*heads, strict=True)):
             for start in range(0, len(query), rows):
                 weights = linear(query[start : start + rows], key)
                 mean = linear(torch.softmax(weights, dim=-1, out=weights), value.t())
-                gathered[image, start : start + rows, head] = mean
-    return gathered.flatten(2)
+                attended[image, start : start + rows, head] = mean
+    return attended.flatten(2)
 
 
 def _project(layer: nn.Linear, x: Tensor) -> Tensor:
@@ -97,7 +97,7 @@ def _project(layer: nn.Linear, x: Tensor) -> Tensor:
 
 
 class _Block(nn.Module):
-    """What self-attention and cross-attention have in common: how features take up what they gathered."""
+    """Common part of self-attention and cross-attention: updates features with the attention output."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -105,21 +105,21 @@ class _Block(nn.Module):
         self.ffn: Any = nn.Sequential(*layers)
 
     def _fold_(self, projection: nn.Linear) -> None:
-        """Merge the projection of what was gathered into the layer that follows it."""
+        """Merge the output projection of the attention into the first layer of the MLP."""
         layer = self.ffn[0]
         first, second = layer.weight.double().chunk(2, dim=1)
         layer.bias.data = (layer.bias + second @ projection.bias.double()).float()
         layer.weight.data = torch.cat([first, second @ projection.weight.double()], dim=1).float()
 
-    def _update(self, states: Tensor, gathered: Tensor) -> Tensor:
-        """Return features (B, N, DIM), float32, with what they gathered, (B, N, DIM)."""
+    def _update(self, states: Tensor, attended: Tensor) -> Tensor:
+        """Return updated features (B, N, DIM), float32, for the attention output (B, N, DIM)."""
         first, norm, _, last = self.ffn
-        hidden = _project(first, torch.cat([states.to(gathered.dtype), gathered], dim=-1))
+        hidden = _project(first, torch.cat([states.to(attended.dtype), attended], dim=-1))
         return states + _project(last, F.gelu(norm(hidden)))
 
 
 class SelfBlock(_Block):
-    """Attention among the features of an image."""
+    """Attention among the features of one image."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -127,8 +127,8 @@ class SelfBlock(_Block):
         self.out_proj = nn.Linear(DIM, DIM)
 
     def fold_(self) -> None:
-        # The rows are heads x pairs of channels x 2 x (query, key, value). Queries, keys and values are put one after
-        # another, and of queries and keys the first channels of all pairs before the second ones: see `_rotate`.
+        # The rows are heads x pairs of channels x 2 x (query, key, value). Reorder them to all queries, all keys, all
+        # values; for queries and keys, put the first channels of all pairs before the second ones, as `_rotate` needs.
         rows = torch.arange(3 * DIM).view(_HEADS, -1, 2, 3)
         queries_and_keys, values = rows[..., :2].permute(3, 0, 2, 1), rows[..., 2]
         order = torch.cat([queries_and_keys.flatten(), values.flatten()])
@@ -158,7 +158,7 @@ class CrossBlock(_Block):
         self._fold_(self.to_out)
 
     def forward(self, a: Tensor, b: Tensor, mask_a: Tensor | None, mask_b: Tensor | None) -> tuple[Tensor, Tensor]:
-        # Queries of an image are its keys too.
+        # The keys of an image are also its queries.
         keys_a, values_a, keys_b, values_b = (
             _project(layer, states).unflatten(-1, (_HEADS, -1))
             for states in (a, b)
@@ -168,51 +168,31 @@ class CrossBlock(_Block):
         return a, self._update(b, _attend(keys_b, keys_a, values_a, mask_a))
 
 
-class _Layer(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.self_attn = SelfBlock()
-        self.cross_attn = CrossBlock()
-
-
-class _Assignment(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.matchability = nn.Linear(DIM, 1)
-        self.final_proj = nn.Linear(DIM, DIM)
-
-
-class _Confidence(nn.Module):
-    """Part of the checkpoints: how sure a feature is of its match after a layer. Not used."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.token = nn.Sequential(nn.Linear(DIM, 1))
-
-
-class _PositionalEncoding(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.Wr = nn.Linear(2, DIM // _HEADS // 2, bias=False)
-
-
 class LightGlue(nn.Module):
-    """Matches the features of two images: `encode` each image, then give both to `forward`."""
+    """Matches the features of two images: `encode` each image, then pass both to `forward`."""
 
     def __init__(self, input_dim: int) -> None:
         """`input_dim` is the length of the descriptors."""
         super().__init__()
         self.input_proj = nn.Identity() if input_dim == DIM else nn.Linear(input_dim, DIM)
-        self.posenc = _PositionalEncoding()
-        self.transformers: Any = nn.ModuleList(_Layer() for _ in range(_LAYERS))
-        self.log_assignment: Any = nn.ModuleList(_Assignment() for _ in range(_LAYERS))
-        self.token_confidence = nn.ModuleList(_Confidence() for _ in range(_LAYERS - 1))
+        self.posenc: Any = nn.ModuleDict({"Wr": nn.Linear(2, DIM // _HEADS // 2, bias=False)})
+        self.transformers: Any = nn.ModuleList(
+            nn.ModuleDict({"self_attn": SelfBlock(), "cross_attn": CrossBlock()}) for _ in range(_LAYERS)
+        )
+        self.log_assignment: Any = nn.ModuleList(
+            nn.ModuleDict({"matchability": nn.Linear(DIM, 1), "final_proj": nn.Linear(DIM, DIM)})
+            for _ in range(_LAYERS)
+        )
+        # Confidence of a feature's match after a layer: part of the checkpoints, but not used here.
+        self.token_confidence = nn.ModuleList(
+            nn.ModuleDict({"token": nn.Sequential(nn.Linear(DIM, 1))}) for _ in range(_LAYERS - 1)
+        )
 
     @torch.no_grad()
     def fold_(self, dtype: torch.dtype) -> None:
-        """Merge matrices, and convert those of the attention to the type to compute in. Call it once, on the CPU.
+        """Merge matrices, and convert the attention blocks to the type in which to compute. Call it once, on the CPU.
 
-        The tensors that were loaded are not changed: they may be a file's, or a caller's.
+        Does not change the loaded tensors, which may be mapped from a file or belong to the caller.
         """
         for layer in self.transformers:
             for block in (layer.self_attn, layer.cross_attn):
@@ -220,12 +200,12 @@ class LightGlue(nn.Module):
                 block.to(dtype)
 
     def encode(self, keypoints: Tensor, descriptors: Tensor, mask: Tensor | None) -> Tensor:
-        """Return features (B, N, DIM), float32, as they are before they first see another image.
+        """Return features (B, N, DIM), float32, before the first cross-attention. They depend on this image only.
 
         Args:
             keypoints: (B, N, 2), from -1 to 1 along the longer side of the image.
             descriptors: (B, N, input_dim).
-            mask: (B, N), which features are real; None: all.
+            mask: (B, N), True for real features, False for padding; None: all are real.
         """
         mask = None if mask is None else mask[:, None, None]
         return self.transformers[0].self_attn(self.input_proj(descriptors), self._rope(keypoints), mask)
@@ -236,12 +216,12 @@ class LightGlue(nn.Module):
         encoded: tuple[Tensor, Tensor],
         masks: tuple[Tensor | None, Tensor | None],
     ) -> tuple[Tensor, Tensor]:
-        """Return for each feature of the first images its partner, -1 for none, and the confidence, each (B, N).
+        """Return the match of each feature of the first images, -1 for none, and its confidence, each (B, N).
 
         Args:
             keypoints: of both images, as in `encode`.
-            encoded: what `encode` returned for both, (B, N, DIM) and (B, M, DIM).
-            masks: which features are real, (B, N) and (B, M), at least one of each image; None: all.
+            encoded: features from `encode` of both images, (B, N, DIM) and (B, M, DIM).
+            masks: (B, N) and (B, M), True for real features, at least one per image; None: all are real.
         """
         ropes = [self._rope(xy) for xy in keypoints]
         attended = [None if mask is None else mask[:, None, None] for mask in masks]
@@ -253,25 +233,24 @@ class LightGlue(nn.Module):
         return self._assign(a, b, *masks)
 
     def _assign(self, a: Tensor, b: Tensor, mask_a: Tensor | None, mask_b: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return mutual best partners, see `forward`, by the sum of the log softmax over rows and over columns."""
+        """Return mutual best matches, see `forward`, by the sum of the log softmax over rows and over columns."""
         layer = self.log_assignment[-1]
         scores = layer.final_proj(a) @ (layer.final_proj(b) / DIM**0.5).mT
         for mask, dim in ((mask_a, 2), (mask_b, 1)):
-            if mask is not None:  # not -inf, of which the softmax is NaN where nothing else is in a row
+            if mask is not None:  # -inf would make the softmax of fully masked rows NaN
                 scores.masked_fill_(~mask.unsqueeze(dim), torch.finfo(scores.dtype).min / 4)
-        # Differences first: of sums of large numbers, the rounding would show in the confidence.
-        of_rows, of_columns = scores - scores.logsumexp(2, keepdim=True), scores.sub_(scores.logsumexp(1, keepdim=True))
+        # Subtract before adding: the rounding of sums of large numbers would show in the confidence.
+        rows, columns = scores - scores.logsumexp(2, keepdim=True), scores.sub_(scores.logsumexp(1, keepdim=True))
         matchable = F.logsigmoid(layer.matchability(a)), F.logsigmoid(layer.matchability(b)).mT
-        scores = of_rows.add_(of_columns).add_(matchable[0]).add_(matchable[1])
-        best, partners = scores.max(dim=2)
-        rows = torch.arange(a.shape[1], device=a.device)
-        mutual = scores.argmax(dim=1).gather(1, partners) == rows
+        scores = rows.add_(columns).add_(matchable[0]).add_(matchable[1])
+        best, matches = scores.max(dim=2)
+        mutual = scores.argmax(dim=1).gather(1, matches) == torch.arange(a.shape[1], device=a.device)
         if mask_a is not None:
-            mutual &= mask_a  # what pads one image may match what pads the other
-        return partners.where(mutual, -1), best.exp()
+            mutual &= mask_a  # the padding of one image may match the padding of the other
+        return matches.where(mutual, -1), best.exp()
 
     def _rope(self, keypoints: Tensor) -> Rope:
-        """Return the position embedding (B, N, 1, DIM / heads) of features, see `rotate_`."""
+        """Return the rotary position embedding (B, N, 1, DIM / heads) of features, see `rotate_`."""
         angles = F.linear(keypoints, self.posenc.Wr.weight)[:, :, None]
         cosine, sine = angles.cos(), angles.sin()
         return torch.cat([cosine, cosine], dim=-1), torch.cat([-sine, sine], dim=-1)

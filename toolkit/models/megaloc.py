@@ -1,7 +1,7 @@
-"""MegaLoc (Berton and Masone, 2025): a global descriptor of a photograph for place recognition.
+"""MegaLoc (Berton and Masone, 2025): a global descriptor of photographs for place recognition.
 
-A DINOv2 ViT-B/14 and an optimal-transport aggregation of its patches (SALAD, Izquierdo and Civera, CVPR 2024).
-The official network is MIT-licensed, at github.com/gmberton/MegaLoc.
+A DINOv2 ViT-B/14, whose patches are aggregated by optimal transport (SALAD, Izquierdo and Civera, CVPR 2024). The
+official network is MIT-licensed, at github.com/gmberton/MegaLoc.
 """
 
 import math
@@ -29,22 +29,22 @@ class Backbone(Dinov2):
 
 
 class PatchMlp(nn.Sequential):
-    """Two linear layers on each patch, (B, N, C) -> (B, N, out), with the keys of 1 x 1 convolutions."""
+    """Two linear layers on each patch, (B, N, C) -> (B, N, out); the checkpoint stores them as 1 x 1 convolutions."""
 
     def __init__(self, dim: int, hidden: int, out: int) -> None:
-        # The identity keeps the place of a dropout that only training has.
+        # The identity takes the position of the dropout in training, so that keys have the official numbers.
         super().__init__(nn.Conv2d(dim, hidden, 1), nn.Identity(), nn.ReLU(), nn.Conv2d(hidden, out, 1))
 
     def forward(self, patches: Tensor) -> Tensor:
         first: Any = self[0]
         last: Any = self[3]
-        # Written as matrix products: the patches need not be arranged in rows and columns.
+        # Linear layers, unlike convolutions, need no arrangement of the patches in rows and columns.
         hidden = F.relu(F.linear(patches, first.weight.flatten(1), first.bias))
         return F.linear(hidden, last.weight.flatten(1), last.bias)
 
 
 class Salad(nn.Module):
-    """Aggregation: patches are assigned to clusters by optimal transport, and their features summed in each."""
+    """Aggregation: assigns patches to clusters by optimal transport, and sums their features per cluster."""
 
     def __init__(self, dim: int, clusters: int, cluster_dim: int, token_dim: int, hidden: int) -> None:
         super().__init__()
@@ -54,7 +54,7 @@ class Salad(nn.Module):
         self.dust_bin = nn.Parameter(torch.empty(()))
 
     def forward(self, patches: Tensor, cls_token: Tensor) -> Tensor:
-        """Return unit vectors (B, token_dim + cluster_dim * clusters) of patches (B, N, C), class tokens (B, C)."""
+        """Return unit vectors (B, token_dim + cluster_dim * clusters) of patches (B, N, C) and class tokens (B, C)."""
         features = self.cluster_features(patches)
         share = transport(self.score(patches).transpose(1, 2).float(), self.dust_bin)
         clusters = features.float().transpose(1, 2) @ share.transpose(1, 2)  # (B, cluster_dim, clusters)
@@ -65,15 +65,15 @@ class Salad(nn.Module):
 def transport(scores: Tensor, dust_bin: Tensor) -> Tensor:
     """Return the share of each patch that each cluster receives, (B, M, N), for scores (B, M, N), N > M.
 
-    Sinkhorn's iteration on logarithms (Cuturi, NeurIPS 2013). The margins ask that each of the M clusters receives
-    one patch, and that a dust bin (one more row, with the score `dust_bin`) receives the other N - M.
+    Sinkhorn's iteration on logarithms (Cuturi, NeurIPS 2013). The margins require that each of the M clusters receives
+    one patch in total, and that a dust bin (an additional row with the score `dust_bin`) receives the other N - M.
     """
     B, M, N = scores.shape
     scores = torch.cat([scores, dust_bin.to(scores.dtype).expand(B, 1, N)], dim=1)
     log_received = scores.new_zeros(M + 1)
     log_received[M] = math.log(N - M)
     log_given = 0.0
-    # Both margins would have the factor 1 / (N + M), which cancels.
+    # The factor 1 / (N + M) of both margins cancels.
     columns = scores.new_zeros(B, 1, N)
     for _ in range(_SINKHORN_STEPS):
         rows = log_received[:, None] - torch.logsumexp(scores + columns, dim=2, keepdim=True)
@@ -82,7 +82,7 @@ def transport(scores: Tensor, dust_bin: Tensor) -> Tensor:
 
 
 class Aggregator(nn.Module):
-    """From patches and class token to the descriptor before its last normalization."""
+    """Computes the descriptor, before its last normalization, from the patches and the class token."""
 
     def __init__(self, dim: int, clusters: int, cluster_dim: int, token_dim: int, hidden: int, out: int) -> None:
         super().__init__()
@@ -95,7 +95,7 @@ class Aggregator(nn.Module):
 
 
 class MegaLoc(nn.Module):
-    """The network: photographs in, unit vectors out. The defaults are the official sizes."""
+    """The network: maps photographs to unit vectors. The defaults are the official sizes."""
 
     def __init__(
         self,
@@ -111,9 +111,9 @@ class MegaLoc(nn.Module):
     ) -> None:
         """
         Args:
-            dim, depth, num_heads: of the transformer.
-            grid: rows and columns of patches that the position embedding was trained for.
-            clusters, cluster_dim, token_dim, hidden: of the aggregation.
+            dim, depth, num_heads: sizes of the transformer.
+            grid: rows and columns of patches for which the position embedding was trained.
+            clusters, cluster_dim, token_dim, hidden: sizes of the aggregation.
             out: length of the descriptor.
         """
         super().__init__()
@@ -134,7 +134,7 @@ class MegaLoc(nn.Module):
             checkpoint: the official `model.safetensors`, or its tensors by name (shared, not copied).
 
         Raises:
-            WeightsError: the file is no checkpoint, or of another model; names missing, unexpected, mis-shaped keys.
+            WeightsError: no checkpoint, or one of another model; names missing, unexpected, mis-shaped keys.
         """
         with torch.device("meta"):
             model = cls()
@@ -142,9 +142,9 @@ class MegaLoc(nn.Module):
         return model
 
     def compute_in(self, dtype: torch.dtype) -> None:
-        """Choose the type of the transformer's matrix products; its sums and the aggregation stay float32.
+        """Choose the data type of the transformer's matrix products; its sums and the aggregation stay float32.
 
-        Cosines with the descriptors in float32 are above 1 - 1e-5 in bfloat16; above 1 - 1e-4 with sums in it, too.
+        With bfloat16, the cosines to the float32 descriptors are above 1 - 1e-5; with bfloat16 sums, above 1 - 1e-4.
         """
         set_matrix_type(self.backbone, dtype)
 
@@ -152,11 +152,11 @@ class MegaLoc(nn.Module):
         """Return descriptors (B, 8448) float32, of length 1.
 
         Args:
-            images: (B, 3, H, W), RGB in [0, 1] minus `vit.IMAGENET_MEAN`, divided by `vit.IMAGENET_STD`. Height and
-                width are resized to the nearest multiples of 14.
+            images: (B, 3, H, W), RGB in [0, 1] minus `vit.IMAGENET_MEAN`, divided by `vit.IMAGENET_STD`. Resized to
+                the nearest multiples of 14.
 
         Raises:
-            ValueError: another shape, or too small: the aggregation needs more patches of 14 x 14 than clusters.
+            ValueError: wrong shape, or too small: the aggregation needs more patches of 14 x 14 pixels than clusters.
         """
         if images.ndim != 4 or images.shape[1] != 3 or not images.is_floating_point():
             raise ValueError(

@@ -1,4 +1,4 @@
-"""What networks for several views have in common: heads on a trunk, tokens of single images, official checkpoints."""
+"""Base class of networks for several views: heads on a trunk, tokens of single images, official checkpoints."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,23 +12,24 @@ from toolkit.models.weights import checkpoint_tensors, load_checkpoint
 
 
 class MultiView(nn.Module):
-    """A network for several views of a scene, with a patch encoder that sees each view by itself.
+    """A network for several views of a scene, with a patch encoder that processes each view separately.
 
-    It may hold only some of the official heads. A whole official checkpoint loads strictly all the same: the keys of
-    other heads are ignored.
+    It may have only some of the official heads. A complete official checkpoint still loads strictly, because the keys
+    of the other heads are ignored.
     """
 
     title: ClassVar[str]
-    """For messages."""
+    """Name of the network, for messages."""
     patch: ClassVar[int]
     """Side of a patch, pixels."""
     known_heads: ClassVar[tuple[str, ...]]
+    """The official heads that are implemented."""
     prefixes: ClassVar[Mapping[str, str]]
-    """Prefixes of the keys of the official heads, held or not."""
+    """Key prefix of each official head, implemented or not."""
     unused: ClassVar[tuple[str, ...]] = ()
-    """Prefixes of the keys of official parts that are never held."""
+    """Key prefixes of official modules that are not implemented."""
     class_tokens: ClassVar[int] = 0
-    """Tokens of an image that `encode` returns before its patches."""
+    """Number of tokens that `encode` returns before the patches of an image."""
     aggregator: Any
     """The trunk: `patch_embed` encodes patches, `camera_token` is a parameter (..., C)."""
 
@@ -47,13 +48,13 @@ class MultiView(nn.Module):
         """Return the network with official weights, on the CPU, in evaluation mode.
 
         Args:
-            checkpoint: the official file, `.pt` or `.safetensors`, or its tensors by name (shared, not copied, where
-                the type stays).
-            heads: the heads to hold; None: all.
+            checkpoint: the official file, `.pt` or `.safetensors`, or its tensors by name (shared, not copied, if
+                their data type stays).
+            heads: the heads to create; None: all.
             compute_dtype: as for the constructor. bfloat16 halves the memory of the weights.
 
         Raises:
-            WeightsError: the file is no checkpoint, or of another model; names missing, unexpected, mis-shaped keys.
+            WeightsError: no checkpoint, or one of another model; names missing, unexpected, mis-shaped keys.
             ValueError: unknown head.
         """
         where, state = checkpoint_tensors(checkpoint)
@@ -64,35 +65,36 @@ class MultiView(nn.Module):
 
     @classmethod
     def _sizes(cls, state: Mapping[str, Tensor]) -> dict[str, Any]:
-        """Return arguments of the constructor that the official checkpoints differ by."""
+        """Return the constructor arguments in which the official checkpoints differ."""
         return {}
 
     @property
     def _ignored_keys(self) -> tuple[str, ...]:
-        """Prefixes of the official checkpoint's keys that the model does not need."""
+        """Key prefixes of the official checkpoint that the model does not need."""
         return (*self.unused, *(prefix for head, prefix in self.prefixes.items() if head not in self.heads))
 
     @property
     def channels(self) -> int:
-        """Of a token."""
+        """Channels of a token."""
         return int(self.aggregator.camera_token.shape[-1])
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """As `torch.nn.Module.load_state_dict`; keys of heads that are not held are ignored, strict or not."""
-        held = {key: value for key, value in state_dict.items() if not key.startswith(self._ignored_keys)}
-        return super().load_state_dict(held, strict=strict, assign=assign)
+        """As `torch.nn.Module.load_state_dict`, but always ignores keys of heads that this network does not have."""
+        needed = {key: value for key, value in state_dict.items() if not key.startswith(self._ignored_keys)}
+        return super().load_state_dict(needed, strict=strict, assign=assign)
 
     def compile_blocks(self) -> None:
-        """Let `torch.compile` make code of the blocks, for images of any size, when they first run."""
-        for part in self.modules():
-            if isinstance(part, Block):
-                part.compile(dynamic=True)
+        """Compile the blocks with `torch.compile` at their first run, for images of any size."""
+        for module in self.modules():
+            if isinstance(module, Block):
+                module.compile(dynamic=True)
 
     @torch.no_grad()
     def encode(self, images: Tensor) -> Tensor:
         """Return the tokens (N, P, C) float32 of images (N, 3, H, W), P = H / patch * W / patch + `class_tokens`.
 
-        The tokens of an image depend on no other image: compute those of a map once and give them to `forward`.
+        The tokens of an image do not depend on other images: compute those of map images once and pass them to
+        `forward`.
 
         Raises:
             ValueError: wrong shape.
@@ -109,10 +111,10 @@ class MultiView(nn.Module):
     def _checked(
         self, images: Tensor, heads: Sequence[str] | None, patch_tokens: Tensor | None
     ) -> tuple[tuple[int, int], tuple[str, ...], Tensor]:
-        """Return (H, W), the heads to compute and the patch tokens (B, S, P, C) of what `forward` is given.
+        """Check the arguments of `forward`; return (H, W), the heads to compute, and the patch tokens (B, S, P, C).
 
         Raises:
-            ValueError: wrong shape, or a head that is not held.
+            ValueError: wrong shape, or a head that this network does not have.
         """
         if images.ndim == 4:
             images = images[None]
@@ -137,12 +139,12 @@ class MultiView(nn.Module):
         if channels != 3 or height % self.patch or width % self.patch or not images.numel():
             raise ValueError(
                 f"images have shape {tuple(images.shape)}; expected 3 channels, at least one image, and height and "
-                f"width that are multiples of {self.patch}. `load_images` makes such."
+                f"width that are multiples of {self.patch}. `load_images` makes such images."
             )
 
 
-def _ordered_heads(heads: Sequence[str], held: Sequence[str]) -> tuple[str, ...]:
-    """Return heads without repetition, in the order of `held`; refuse others."""
-    if isinstance(heads, str) or not heads or not set(heads) <= set(held):
-        raise ValueError(f"heads are {heads!r}; expected some of {list(held)}, in a list.")
-    return tuple(head for head in held if head in heads)
+def _ordered_heads(heads: Sequence[str], known: Sequence[str]) -> tuple[str, ...]:
+    """Return heads without repetition, in the order of `known`; raise ValueError if there are none, or unknown ones."""
+    if isinstance(heads, str) or not heads or not set(heads) <= set(known):
+        raise ValueError(f"heads are {heads!r}; expected some of {list(known)}, in a list.")
+    return tuple(head for head in known if head in heads)

@@ -1,4 +1,4 @@
-"""Photographs as the images of a network that takes several views at once, and where their pixels come from."""
+"""Preprocessed photographs for networks that take several views, and the map from original to network pixels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ Source = str | Path | Image.Image | NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Views:
-    """Images for the network, and how their pixels map to those of the given images.
+    """Images for the network, and how original pixels map to network pixels.
 
     Image coordinates (x, y) are in pixels; the center of the top-left one is (0.5, 0.5).
     """
@@ -30,15 +30,15 @@ class Views:
     images: Tensor
     """(S, 3, H, W) float32, RGB in [0, 1]."""
     scale: Floats
-    """(S, 2): for x and y. The point (x, y) of the given image i is at scale[i] * (x, y) + offset[i] in images[i]."""
+    """(S, 2) for x and y. Point (x, y) of original image i is at scale[i] * (x, y) + offset[i] in images[i]."""
     offset: Floats
     """(S, 2), network pixels."""
     sizes: Ints
-    """(S, 2): width and height of the given images."""
+    """(S, 2): width and height of the original images."""
 
 
 def open_image(source: Source) -> Image.Image:
-    """Return an RGB image; one with an alpha channel is blended with white. EXIF orientation is not applied.
+    """Return an RGB image; blends transparent pixels with white. Does not apply the EXIF orientation.
 
     Raises:
         ImageError: the file is missing or cannot be decoded.
@@ -60,10 +60,10 @@ def open_image(source: Source) -> Image.Image:
 
 
 def check_arguments(sources: Sequence[Source], mode: str, modes: Sequence[str]) -> None:
-    """Refuse no images, and unknown modes.
+    """Check that there are images, and that the mode is known.
 
     Raises:
-        ValueError: one of them.
+        ValueError: no images, or an unknown mode.
     """
     if mode not in modes:
         raise ValueError(f"mode is {mode!r}; expected one of {list(modes)}.")
@@ -72,10 +72,10 @@ def check_arguments(sources: Sequence[Source], mode: str, modes: Sequence[str]) 
 
 
 def too_elongated(size: tuple[int, int], where: str | Path) -> ImageError:
-    """Return what is wrong with an image of this width and height of which a side vanishes."""
+    """Return the error for an image of this width and height whose shorter side would shrink to nothing."""
     return ImageError(
         f"Image of {size[0]} x {size[1]} pixels is too elongated for the network: {where}. Its shorter side would be "
-        f"less than half a patch of {PATCH} pixels; cut it."
+        f"less than half a patch of {PATCH} pixels; crop it."
     )
 
 
@@ -83,17 +83,17 @@ def stack(
     pixels: Sequence[Image.Image], scales: ArrayLike, offsets: ArrayLike, sizes: ArrayLike,
     least: tuple[int, int] = (0, 0),
 ) -> Views:  # fmt: skip
-    """Return images of one size: each in the middle of white, at the upper left of it where that is between pixels.
+    """Center the images on white canvases of one size; an odd border is one pixel narrower at the left and top.
 
     Args:
         pixels: the images, RGB.
-        scales, offsets, sizes: as of `Views`, for these images.
-        least: (W, H) of the result where none of the images is larger.
+        scales, offsets, sizes: see `Views`, for these images.
+        least: smallest (W, H) of the canvases.
     """
     width, height = (max(least[axis], *(image.size[axis] for image in pixels)) for axis in (0, 1))
     images = torch.ones(len(pixels), 3, height, width)
     borders = np.array([((width - image.width) // 2, (height - image.height) // 2) for image in pixels])
-    for whole, image, (left, top) in zip(images, pixels, borders, strict=True):
+    for canvas, image, (left, top) in zip(images, pixels, borders, strict=True):
         tensor = torch.from_numpy(np.array(image)).permute(2, 0, 1)
-        whole[:, top : top + image.height, left : left + image.width] = tensor.float() / 255
+        canvas[:, top : top + image.height, left : left + image.width] = tensor.float() / 255
     return Views(images, np.array(scales), np.array(offsets) + borders, np.array(sizes, np.int64))

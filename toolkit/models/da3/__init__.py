@@ -1,4 +1,4 @@
-"""Depth Anything 3: the network, its images, and the cameras that it takes and returns."""
+"""Depth Anything 3: the network, the loader of its images, and its pose encoding."""
 
 from toolkit.models.da3.cameras import cameras_from_pose_encoding, pose_encoding
 from toolkit.models.da3.network import HEADS, DepthAnything3

@@ -1,4 +1,4 @@
-"""Depth Anything 3's trunk: a DINOv2 of which the later blocks attend within each view and among all views in turns."""
+"""Depth Anything 3's trunk: a DINOv2 whose later blocks alternate attention within each view and among all views."""
 
 from collections.abc import Collection
 
@@ -9,29 +9,32 @@ from toolkit.models.dpt import LayerTokens
 from toolkit.models.vit import Dinov2, normalized, places_of_view, rope_of_places
 
 REFERENCES = ("saddle_balanced", "first")
-"""Ways to choose the view whose frame is the world."""
-_LEAST_CHOICE = 3  # views, of which one is chosen; of fewer it is the first
-_NORM_EPS = 1e-5  # of the last norm, and of queries and keys
+"""Ways to choose the reference view, whose frame is the world."""
+_LEAST_CHOICE = 3  # with fewer views, the first is the reference
+_NORM_EPS = 1e-5  # epsilon of the last norm, and of those on queries and keys
 
 
 class Backbone(Dinov2):
-    """The trunk. A camera token takes the place of each view's class token before the first block of the later ones."""
+    """The trunk. A camera token replaces each view's class token before the first of the later blocks."""
 
     def __init__(self, dim: int, depth: int, num_heads: int, grid: int, alternate_from: int) -> None:
         """
         Args:
-            dim, depth, num_heads, grid: as of `Dinov2`.
-            alternate_from: the first of the later blocks, of which those of odd numbers attend among views.
+            dim, depth, num_heads, grid: see `Dinov2`.
+            alternate_from: number of the first of the later blocks; those with odd numbers attend among views.
         """
         super().__init__(dim, depth, num_heads, grid, _NORM_EPS, (alternate_from, _NORM_EPS))
         self.alternate_from = alternate_from
         self.head_dim = dim // num_heads
-        # One token for the view whose frame is the world, and one for all others.
+        # One token for the reference view, whose frame is the world, and one for all other views.
         self.camera_token = torch.nn.Parameter(torch.empty(1, 2, dim))
 
     def encode(self, images: Tensor) -> Tensor:
-        """Return tokens (N, 1 + P, C) of images (N, 3, H, W) in [0, 1]: the patches after the blocks before the later
-        ones, and before them the class token one block earlier, where the reference view is chosen."""
+        """Return tokens (N, 1 + P, C) of images (N, 3, H, W) in [0, 1].
+
+        The P patch tokens are the input of the later blocks. The class token before them is from one block earlier,
+        where the network chooses the reference view.
+        """
         x = self._embedded(normalized(images))
         class_token = x[:, :1]
         for block in self.blocks[: self.alternate_from]:
@@ -48,24 +51,24 @@ class Backbone(Dinov2):
         layers: Collection[int],
         cameras_only: bool = False,
     ) -> tuple[dict[int, LayerTokens], Tensor]:
-        """Return the tokens after some of the later blocks.
+        """Return the tokens after the given blocks.
 
         Args:
-            tokens: (B, S, 1 + rows * columns, C) of `encode`.
+            tokens: (B, S, 1 + rows * columns, C) from `encode`.
             cameras: (B, S, C) camera tokens.
-            rows, columns: of patches.
-            layers: numbers of these blocks, which attend among views.
-            cameras_only: compute only the camera tokens of the last of them, and return no others.
+            rows, columns: rows and columns of patches.
+            layers: numbers of the blocks whose tokens to return; these blocks attend among views.
+            cameras_only: compute and return only the camera tokens of the last of them.
 
         Returns:
-            By block, the tokens (B, S, T, C) after the block before it, and after it, these normed; and the camera
-            tokens (B, S, 2 C) of both, after the last of them, not normed.
+            By block, the tokens (B, S, T, C) after the preceding block, and the normalized tokens after the block
+            itself; and the camera tokens (B, S, 2 C) after the last two blocks, not normalized.
         """
         B, S, T, C = tokens.shape
         x = torch.cat([cameras[:, :, None], tokens[:, :, 1:]], dim=2)
         places = places_of_view(rows, columns, 1, x.device)
-        # Among views all patches are at one place: only the camera tokens differ from them.
-        rope, among = (rope_of_places(part, self.head_dim) for part in (places, places.clamp(max=1)))
+        # Among views, all patches have the same place; only the camera tokens have another.
+        rope, among = (rope_of_places(grid, self.head_dim) for grid in (places, places.clamp(max=1)))
         rope_of_views = (among[0].repeat(S, 1), among[1].repeat(S, 1))
         kept, last, within = {}, max(layers), x
         for number in range(self.alternate_from, last + 1):
@@ -81,14 +84,15 @@ class Backbone(Dinov2):
 
 
 def choose_reference(class_tokens: Tensor, way: str) -> Tensor:
-    """Return the view (B,) whose frame is to be the world, of class tokens (B, S, C).
+    """Return the index (B,) of the reference view, whose frame is the world, for class tokens (B, S, C).
 
-    "first" takes the first. "saddle_balanced" takes, of three or more, the view that is nearest the middle in three
-    respects, each scaled to [0, 1] over the views: its mean cosine similarity to the others, the length of its class
-    token, and the variance of that token at length 1. (Lin et al., Depth Anything 3, 2025.)
+    "first" chooses the first view. "saddle_balanced" chooses, from three or more views, the one closest to the middle
+    in three measures, each scaled to [0, 1] over the views: the mean cosine similarity to the other views, the length
+    of the class token, and the variance of the class token normalized to length 1. (Lin et al., Depth Anything 3,
+    2025.)
 
     Raises:
-        ValueError: another way.
+        ValueError: unknown way.
     """
     if way not in REFERENCES:
         raise ValueError(f"reference is {way!r}; expected one of {list(REFERENCES)}.")
@@ -98,7 +102,7 @@ def choose_reference(class_tokens: Tensor, way: str) -> Tensor:
     lengths = class_tokens.norm(dim=-1)
     units = class_tokens / lengths[..., None]
     similarity = ((units @ units.transpose(1, 2)).sum(dim=-1) - 1) / (S - 1)
-    respects = torch.stack([similarity, lengths, units.var(dim=-1)])  # (3, B, S)
-    least, most = respects.amin(dim=-1, keepdim=True), respects.amax(dim=-1, keepdim=True)
-    scaled = (respects - least) / (most - least + 1e-8)
+    measures = torch.stack([similarity, lengths, units.var(dim=-1)])  # (3, B, S)
+    least, most = measures.amin(dim=-1, keepdim=True), measures.amax(dim=-1, keepdim=True)
+    scaled = (measures - least) / (most - least + 1e-8)
     return (scaled - 0.5).abs().sum(dim=0).argmin(dim=-1)

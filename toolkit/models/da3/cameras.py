@@ -1,8 +1,8 @@
-"""Cameras as Depth Anything 3 takes and returns them.
+"""Pose encodings of Depth Anything 3.
 
-The encoding of a camera has nine numbers, as VGGT's, but of the inverse pose: translation and quaternion (x, y, z, w,
-of any length) of `world_from_cam`, then the vertical and the horizontal field of view in radians. The principal point
-is the image's center.
+The encoding of a camera has nine numbers like VGGT's, but with the inverse pose: translation and quaternion (x, y, z,
+w, of any length) of `world_from_cam`, then the vertical and horizontal field of view in radians. The principal point is
+the image's center.
 """
 
 import numpy as np
@@ -11,17 +11,17 @@ from numpy.typing import ArrayLike
 from toolkit.geometry import Floats, invert, make_pose, rotation_to_quaternion
 from toolkit.models.vggt.pose_encoding import cameras_from_pose_encoding as vggt_cameras
 
-_LEAST_DISTANCE = 0.1
+_LEAST_DISTANCE = 0.1  # in the unit of the given poses
 _LEAST_TANGENT = 1e-6
 
 
 def cameras_from_pose_encoding(pose_enc: ArrayLike, size: tuple[int, int]) -> tuple[Floats, Floats]:
     """Return `cam_from_world` (..., 3, 4) and intrinsics K (..., 3, 3), pixels, of pose encodings (..., 9).
 
-    As officially, half a field of view has a tangent of at least 1e-6, so that focal lengths are finite.
+    As in the official code, the tangent of half a field of view is at least 1e-6, so that focal lengths are finite.
 
     Args:
-        pose_enc: (..., 9), numbers or a tensor on the CPU.
+        pose_enc: (..., 9), an array or a tensor on the CPU.
         size: (H, W) of the images.
 
     Raises:
@@ -39,7 +39,7 @@ def pose_encoding(cam_from_world: ArrayLike, intrinsics: ArrayLike, size: tuple[
 
     Args:
         cam_from_world: (..., 3, 4) or (..., 4, 4).
-        intrinsics: K, (..., 3, 3), pixels of the images; the principal point is not read.
+        intrinsics: K, (..., 3, 3), image pixels; only the focal lengths are used.
         size: (H, W) of the images.
     """
     pose, K = np.asarray(cam_from_world, np.float64), np.asarray(intrinsics, np.float64)
@@ -50,10 +50,10 @@ def pose_encoding(cam_from_world: ArrayLike, intrinsics: ArrayLike, size: tuple[
 
 
 def normalized_poses(cam_from_world: ArrayLike) -> Floats:
-    """Return poses (S, 4, 4) in the frame of the first camera, and in a unit of their own, of poses (S, 3 or 4, 4).
+    """Return poses (S, 4, 4) relative to the first camera, in a normalized unit, for poses (S, 3 or 4, 4).
 
-    The unit is the median distance of the cameras (the first included, of the two middle ones of an even number the
-    smaller) from the first, but at least 0.1, as in the official interface.
+    As in the official interface, the unit is the median distance of the cameras from the first, but at least 0.1. The
+    median includes the first camera; for an even number of cameras it is the smaller of the two middle distances.
     """
     pose = np.asarray(cam_from_world, np.float64)
     from_world = make_pose(pose[:, :3, :3], pose[:, :3, 3])

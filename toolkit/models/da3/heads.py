@@ -1,4 +1,4 @@
-"""Depth Anything 3's parts for cameras: an encoder of those that are known, and a head that predicts all."""
+"""Depth Anything 3's camera modules: an encoder of known cameras, and a head that predicts cameras."""
 
 import torch
 from torch import Tensor, nn
@@ -10,7 +10,7 @@ _POSE = 9
 
 
 class CameraEncoder(nn.Module):
-    """Makes camera tokens of known cameras, which attend among each other."""
+    """Encodes known cameras as camera tokens, with attention among the cameras."""
 
     def __init__(self, dim: int, depth: int, num_heads: int) -> None:
         super().__init__()
@@ -39,6 +39,6 @@ class CameraHead(nn.Module):
         self.fc_fov = nn.Sequential(nn.Linear(dim, 2), nn.ReLU())
 
     def forward(self, tokens: Tensor) -> Tensor:
-        """Return the pose encoding (B, S, 9) for camera tokens (B, S, C); fields of view are not negative."""
+        """Return the pose encodings (B, S, 9) for camera tokens (B, S, C); fields of view are not negative."""
         x = self.backbone(tokens)
         return torch.cat([self.fc_t(x), self.fc_qvec(x), self.fc_fov(x)], dim=-1)

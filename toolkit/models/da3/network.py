@@ -1,11 +1,11 @@
 """Depth Anything 3 (Lin et al., 2025), Base and Small: cameras and depth of the views of a scene, in one forward pass.
 
-The official network is at github.com/ByteDance-Seed/Depth-Anything-3. Its code, and the weights of these two sizes,
-have the Apache License 2.0.
+The official network is at github.com/ByteDance-Seed/Depth-Anything-3. Its code and the weights of these two sizes are
+under the Apache License 2.0.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
@@ -22,14 +22,14 @@ from toolkit.models.vit import PATCH, set_matrix_type
 HEADS = ("camera", "depth")
 _HEAD_DIM = 64
 _SIZES = (768, 384)
-"""Channels of Base and of Small."""
+"""Channels of Base and Small."""
 
 
 class DepthAnything3(MultiView):
-    """The network: photographs in, their cameras and depth out. The defaults are the official sizes, of Base.
+    """The network: predicts cameras and depth of photographs. The defaults are the official sizes of Base.
 
-    Of an official checkpoint, the branch for rays and the head for Gaussians are not held. `from_checkpoint` reads off
-    its shapes whether it is Base or Small.
+    It omits the official branch for rays and head for Gaussians. `from_checkpoint` tells Base from Small by the shapes
+    of the tensors.
     """
 
     title = "Depth Anything 3"
@@ -61,11 +61,11 @@ class DepthAnything3(MultiView):
     ) -> None:
         """
         Args:
-            heads: the heads to hold, of `HEADS`.
-            compute_dtype: float32 or bfloat16, of the trunk's matrix products and attention. Sums, norms, heads and the
-                encoder of known cameras are float32.
-            dim, depth, num_heads, grid, alternate_from: of the trunk, see `Backbone`.
-            camera_depth, camera_num_heads: of the encoder of known cameras.
+            heads: the heads to create, of `HEADS`.
+            compute_dtype: float32 or bfloat16, for the trunk's matrix products and attention. Sums, norms, heads and
+                the encoder of known cameras are float32.
+            dim, depth, num_heads, grid, alternate_from: sizes of the trunk, see `Backbone`.
+            camera_depth, camera_num_heads: sizes of the encoder of known cameras.
             dense_layers: the four blocks that the depth head reads.
             dense_channels, dense_features: channels of the depth head.
 
@@ -87,15 +87,13 @@ class DepthAnything3(MultiView):
         token = state.get("backbone.pretrained.camera_token")
         dim = 0 if token is None else token.shape[-1]
         if dim not in _SIZES:
-            return {}  # of another network, as loading will say
+            return {}  # another network: loading will raise the error
         channels = (dim // 8, dim // 4, dim // 2, dim)
         return {"dim": dim, "num_heads": dim // _HEAD_DIM, "dense_channels": channels, "dense_features": dim // 6}
 
     @property
     def trunk(self) -> Backbone:
-        trunk: Any = self.backbone["pretrained"]
-        backbone: Backbone = trunk
-        return backbone
+        return cast(Backbone, self.backbone["pretrained"])
 
     @property
     def channels(self) -> int:
@@ -114,41 +112,40 @@ class DepthAnything3(MultiView):
         intrinsics: Tensor | None = None,
         reference: str = "saddle_balanced",
     ) -> dict[str, Tensor]:
-        """Return what the heads predict, under the official names, float32.
+        """Return the predictions of the heads under the official names, float32.
 
-        Cameras that are known may be told. Officially those of all views are, or of none. Where some are, they are
-        encoded together, and the other views have the learned token of views that are not the reference: their
-        cameras are then in the frame, and nearly the unit, of those that are told. As in the official interface, told
-        poses are taken relative to the first told camera, and divided by the median distance of told cameras from it
-        (itself included; at least 0.1).
+        The network can use known cameras. Officially, the cameras of all views are known, or of none. If only some are
+        known, they are encoded together, and the other views get the learned token of views that are not the reference;
+        their predicted cameras are then in the frame, and nearly in the unit, of the known ones. As in the official
+        interface, known poses are made relative to the first known camera and divided by the median distance of the
+        known cameras from it (itself included; at least 0.1).
 
         Args:
             images: (B, S, 3, H, W) or (S, 3, H, W), RGB in [0, 1], sides multiples of 14: S views of each of B
                 scenes. `load_images` makes such images.
-            heads: which of the held heads to compute; None: all.
-            patch_tokens: (B, S, 1 + P, C), or (S, 1 + P, C) like the images, of `encode`, if already computed. Then
+            heads: the heads to compute, of those that this network has; None: all.
+            patch_tokens: (B, S, 1 + P, C), or (S, 1 + P, C) like the images, from `encode`, if already computed. Then
                 only the shape of `images` is read: `torch.empty(shape, device="meta")` will do.
-            extrinsics: `cam_from_world` (B, S, 3 or 4, 4) of known cameras, in any one frame and unit, without the
-                first axis like the images; NaN for a view whose pose is unknown. On any device, as `intrinsics`.
-            intrinsics: K (B, S, 3, 3), pixels of `images`, read where the pose is known; of each only the focal
-                lengths.
-            reference: how the view is chosen whose frame is the world where no camera is told; see
-                `choose_reference`.
+            extrinsics: `cam_from_world` (B, S, 3 or 4, 4) of known cameras, in any common frame and unit; NaN if the
+                pose of a view is unknown. Without the axis B if the images have none. On any device.
+            intrinsics: K (B, S, 3, 3), pixels of `images`; only the focal lengths of known cameras are used. Axes and
+                device as for `extrinsics`.
+            reference: how to choose the view whose frame is the world if no camera is known; see `choose_reference`.
 
         Returns:
-            For "camera": `pose_enc` (B, S, 9), see `cameras_from_pose_encoding`, and the cameras of it, `extrinsics`
-            (B, S, 3, 4), cam_from_world, and `intrinsics` (B, S, 3, 3), pixels; NaN where it is no camera. For "depth":
-            `depth` (B, S, H, W), along the camera's z, and `depth_conf` (B, S, H, W), at least 1. Cameras and depth
-            share one scale, which is not meters. B = 1 for images with four axes.
+            For "camera": `pose_enc` (B, S, 9), see `cameras_from_pose_encoding`, and the cameras computed from it:
+            `extrinsics` (B, S, 3, 4), cam_from_world, and `intrinsics` (B, S, 3, 3), pixels; NaN for an invalid
+            encoding. For "depth": `depth` (B, S, H, W), along the camera's z, and `depth_conf` (B, S, H, W), at least
+            1. Cameras and depth share one scale, which is not metric. B = 1 for images with four axes.
 
         Raises:
-            ValueError: wrong shape, a head that is not held, an unknown way to choose the reference, a known pose
-                without intrinsics.
+            ValueError: wrong shape, a head that this network does not have, an unknown way to choose the reference, or
+                a known pose without intrinsics.
         """
         size, heads, tokens = self._checked(images, heads, patch_tokens)
         cameras = self._camera_tokens(tokens, reference)
         if extrinsics is not None:
-            self._tell(cameras, *_known(extrinsics, intrinsics, (*cameras.shape[:2],)), size)
+            self._encode_known(cameras, *_known(extrinsics, intrinsics, (*cameras.shape[:2],)), size)
         last = len(self.trunk.blocks) - 1
         read = {last, *(self.dense_layers if "depth" in heads else ())}
         rows, columns = size[0] // PATCH, size[1] // PATCH
@@ -163,31 +160,33 @@ class DepthAnything3(MultiView):
         return output
 
     def _camera_tokens(self, tokens: Tensor, reference: str) -> Tensor:
-        """Return the learned camera tokens (B, S, C), as if no camera were known, for tokens of `encode`.
+        """Return the learned camera tokens (B, S, C) for tokens from `encode`, if no camera is known.
 
-        Officially the reference view is also moved before the others. That changes rounding only.
+        The official code also moves the reference view to the front, which changes rounding only.
         """
         chosen = choose_reference(tokens[:, :, 0].float(), reference)
         is_reference = torch.arange(tokens.shape[1], device=tokens.device) == chosen[:, None]
-        of_reference, of_others = self.trunk.camera_token[0]
-        return torch.where(is_reference[..., None], of_reference, of_others)
+        reference_token, other_token = self.trunk.camera_token[0]
+        return torch.where(is_reference[..., None], reference_token, other_token)
 
-    def _tell(self, cameras: Tensor, extrinsics: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]) -> None:
+    def _encode_known(
+        self, cameras: Tensor, extrinsics: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]
+    ) -> None:
         """Replace the camera tokens (B, S, C) of scenes with known cameras, see `forward`."""
         for scene, poses, K in zip(cameras, extrinsics, intrinsics, strict=True):
-            told = np.isfinite(poses).all(axis=(1, 2))
-            if told.any():
-                encoding = torch.from_numpy(pose_encoding(normalized_poses(poses[told]), K[told], size)).float()
+            known = np.isfinite(poses).all(axis=(1, 2))
+            if known.any():
+                encoding = torch.from_numpy(pose_encoding(normalized_poses(poses[known]), K[known], size)).float()
                 scene[:] = self.trunk.camera_token[0, 1]
-                views = torch.from_numpy(np.flatnonzero(told)).to(scene.device)
+                views = torch.from_numpy(np.flatnonzero(known)).to(scene.device)
                 scene[views] = self.cam_enc(encoding.to(scene.device)[None])[0]
 
 
 def _known(extrinsics: Tensor, intrinsics: Tensor | None, views: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return known cameras as float64, with B and S axes, or refuse them."""
+    """Check known cameras; return poses and intrinsics as float64, with the axes B and S."""
     if intrinsics is None:
-        raise ValueError("extrinsics are given without intrinsics; expected both: a camera is told as a whole.")
-    poses, K = (np.asarray(given.detach().cpu(), np.float64) for given in (extrinsics, intrinsics))
+        raise ValueError("extrinsics are given without intrinsics; expected both for a known camera.")
+    poses, K = (np.asarray(tensor.detach().cpu(), np.float64) for tensor in (extrinsics, intrinsics))
     if poses.ndim == K.ndim == 3:
         poses, K = poses[None], K[None]
     if poses.shape not in ((*views, 3, 4), (*views, 4, 4)) or K.shape != (*views, 3, 3):
@@ -197,17 +196,20 @@ def _known(extrinsics: Tensor, intrinsics: Tensor | None, views: tuple[int, ...]
         )
     known = np.isfinite(poses).all(axis=(2, 3))
     if not (K[known][:, [0, 1], [0, 1]] > 0).all():
-        raise ValueError("a view has a known pose and no intrinsics; expected focal lengths above 0, or NaN as pose.")
+        raise ValueError("a view has a known pose and no intrinsics; expected focal lengths above 0, or a pose of NaN.")
     return poses, K
 
 
 def _cameras(pose_enc: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Return `cam_from_world` (B, S, 3, 4) and K (B, S, 3, 3) like the encodings, NaN where those are no camera."""
+    """Return `cam_from_world` (B, S, 3, 4) and K (B, S, 3, 3) of pose encodings, with their type and device.
+
+    NaN if an encoding is not finite or its quaternion is zero.
+    """
     encoding = np.asarray(pose_enc.cpu(), np.float64)
-    wrong = ~(np.isfinite(encoding).all(axis=-1) & encoding[..., 3:7].any(axis=-1))
-    encoding[wrong] = 1.0
+    invalid = ~(np.isfinite(encoding).all(axis=-1) & encoding[..., 3:7].any(axis=-1))
+    encoding[invalid] = 1.0
     cameras = cameras_from_pose_encoding(encoding, size)
-    for part in cameras:
-        part[wrong] = np.nan
-    extrinsics, intrinsics = (torch.from_numpy(part).to(pose_enc.dtype).to(pose_enc.device) for part in cameras)
+    for array in cameras:
+        array[invalid] = np.nan
+    extrinsics, intrinsics = (torch.from_numpy(array).to(pose_enc.dtype).to(pose_enc.device) for array in cameras)
     return extrinsics, intrinsics

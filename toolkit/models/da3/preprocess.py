@@ -1,4 +1,4 @@
-"""Images in the form that Depth Anything 3 takes."""
+"""Loads images for Depth Anything 3."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,10 +14,10 @@ MODES = ("upper_bound_resize",)
 
 
 def resized_sizes(width: int, height: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Return the width and height to which `load_images` resizes an image, first and then, before it crops."""
+    """Return the width and height after each of the two steps in which `load_images` resizes an image."""
     scale = SIDE / max(width, height)
     first = (max(1, round(width * scale)), max(1, round(height * scale)))
-    # To the nearest multiple, of two as near the larger.
+    # The nearest multiple of the patch; half way, the larger.
     columns, rows = ((side + PATCH // 2) // PATCH for side in first)
     return first, (PATCH * columns, PATCH * rows)
 
@@ -25,10 +25,10 @@ def resized_sizes(width: int, height: int) -> tuple[tuple[int, int], tuple[int, 
 def load_images(sources: Sequence[Source], mode: str = "upper_bound_resize") -> Views:
     """Load images as the official loader does.
 
-    The longer side becomes 504, and both sides the nearest multiples of 14, in two steps (OpenCV's, by area where an
-    image shrinks, else bicubic). Of images of several sizes the middle is shown, of the least width and height among
-    them. Transparent pixels become white (the official loader shows what color is behind). EXIF orientation is not
-    applied.
+    Resizes the longer side to 504 pixels, then both sides to the nearest multiples of 14 (by OpenCV, with area
+    interpolation if the image shrinks, else bicubic). Crops images of different sizes at their center to the smallest
+    width and height among them. Transparent pixels become white (the official loader keeps their hidden color). Does
+    not apply the EXIF orientation.
 
     Args:
         sources: paths, Pillow images or arrays.
@@ -45,19 +45,19 @@ def load_images(sources: Sequence[Source], mode: str = "upper_bound_resize") -> 
         first, second = resized_sizes(*image.size)
         if not min(second):
             raise too_elongated(image.size, source if isinstance(source, str | Path) else f"no. {position}")
-        pixels.append(_resized(_resized(np.asarray(image), first), second))
+        pixels.append(_resize(_resize(np.asarray(image), first), second))
         scales.append(np.divide(second, image.size))
         sizes.append(image.size)
     height, width = (min(image.shape[axis] for image in pixels) for axis in (0, 1))
-    cut = [((image.shape[1] - width) // 2, (image.shape[0] - height) // 2) for image in pixels]
-    shown = [
+    corners = [((image.shape[1] - width) // 2, (image.shape[0] - height) // 2) for image in pixels]
+    cropped = [
         Image.fromarray(image[top : top + height, left : left + width])
-        for image, (left, top) in zip(pixels, cut, strict=True)
+        for image, (left, top) in zip(pixels, corners, strict=True)
     ]
-    return stack(shown, scales, -np.array(cut, np.float64), sizes)
+    return stack(cropped, scales, -np.array(corners, np.float64), sizes)
 
 
-def _resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def _resize(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     import cv2
 
     if image.shape[1::-1] == size:

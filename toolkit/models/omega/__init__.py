@@ -1,4 +1,4 @@
-"""VGGT-Omega: the network, its images, and the cameras it returns, which are encoded as VGGT's."""
+"""VGGT-Omega: the network, the loader of its images, and its pose encoding, which is VGGT's."""
 
 from toolkit.models.omega.network import HEADS, VGGTOmega
 from toolkit.models.omega.preprocess import load_images

@@ -1,4 +1,4 @@
-"""VGGT-Omega's trunk: DINOv3 encodes the patches of each image, then layers attend within each view and among views."""
+"""VGGT-Omega's trunk: DINOv3 encodes the patches of each image; then layers attend within each view and among views."""
 
 import math
 from collections.abc import Collection
@@ -10,7 +10,7 @@ from toolkit.models.dpt import LayerTokens
 from toolkit.models.vit import Block, PatchEmbed, Rope, normalized
 
 PATCH = 16
-"""Side of a patch in pixels."""
+"""Side of a patch, pixels."""
 SPECIAL = 17
 """Number of tokens of a view before its patches: one camera token, then the registers."""
 EPS = 1e-5
@@ -18,7 +18,7 @@ _STORAGE = 4
 
 
 class PlaceRope(nn.Module):
-    """Rotary position embedding of DINOv3 (Siméoni et al., 2025): places in an image go from -1 to 1."""
+    """Rotary position embedding of DINOv3 (Siméoni et al., 2025): image coordinates range from -1 to 1."""
 
     def __init__(self, head_dim: int) -> None:
         super().__init__()
@@ -27,31 +27,31 @@ class PlaceRope(nn.Module):
     def forward(self, rows: int, columns: int, special: int) -> Rope:
         """Return cosines and signed sines (special + rows * columns, head_dim); special tokens are not rotated.
 
-        The centers of patches along the longer side of the image are spread evenly from -1 to 1; along the shorter
-        one, at the same distances, from -1. Pairs of channels rotate by 2 pi place / period: the first half of the
-        pairs with the row, the second with the column.
+        Along the longer side of the image, the centers of patches are spread evenly between -1 and 1; along the shorter
+        side they start from -1 with the same spacing. A pair of channels rotates by 2 pi place / period, where place is
+        the row for the first half of the pairs and the column for the second half.
         """
         periods = self.get_buffer("periods")
-        numbers = torch.arange(max(rows, columns), dtype=periods.dtype, device=periods.device)
-        places = 2 * ((0.5 + numbers) / max(rows, columns)) - 1
+        indices = torch.arange(max(rows, columns), dtype=periods.dtype, device=periods.device)
+        places = 2 * ((0.5 + indices) / max(rows, columns)) - 1
         angles = 2 * math.pi * places[:, None] / periods
-        of_row = angles[:rows, None].expand(-1, columns, -1)
-        of_column = angles[None, :columns].expand(rows, -1, -1)
-        pairs = torch.cat([of_row, of_column], dim=-1).flatten(0, 1)  # (rows * columns, head_dim / 2)
+        row_angles = angles[:rows, None].expand(-1, columns, -1)
+        column_angles = angles[None, :columns].expand(rows, -1, -1)
+        pairs = torch.cat([row_angles, column_angles], dim=-1).flatten(0, 1)  # (rows * columns, head_dim / 2)
         pairs = torch.cat([pairs.new_zeros(special, pairs.shape[1]), pairs])
         cosine, sine = pairs.cos(), pairs.sin()
         return torch.cat([cosine, cosine], dim=-1), torch.cat([-sine, sine], dim=-1)
 
 
 class PatchEncoder(nn.Module):
-    """DINOv3 ViT-16 with storage tokens, of which only the patch tokens are used."""
+    """DINOv3 ViT-16 with storage tokens. Returns only the patch tokens."""
 
     def __init__(self, dim: int, depth: int, num_heads: int) -> None:
         super().__init__()
         self.patch_embed = PatchEmbed(dim, PATCH)
         self.cls_token = nn.Parameter(torch.empty(1, 1, dim))
         self.storage_tokens = nn.Parameter(torch.empty(1, _STORAGE, dim))
-        self.mask_token = nn.Parameter(torch.empty(1, dim))  # only used in training, but in the checkpoint
+        self.mask_token = nn.Parameter(torch.empty(1, dim))  # in the checkpoint, but used in training only
         self.rope_embed = PlaceRope(dim // num_heads)
         self.blocks = nn.ModuleList([Block(dim, num_heads, EPS, dinov3=True) for _ in range(depth)])
         self.norm = nn.LayerNorm(dim, eps=EPS)
@@ -81,7 +81,7 @@ class Aggregator(nn.Module):
         self.register_layers = frozenset(register_layers)
         self.patch_embed = PatchEncoder(dim, encoder_depth, encoder_num_heads)
         self.rope_embed = PlaceRope(dim // num_heads)
-        # One token for the first view, whose frame is the world, and one for all others.
+        # One token for the first view, whose frame is the world, and one for all other views.
         self.camera_token = nn.Parameter(torch.empty(1, 2, 1, dim))
         self.register_token = nn.Parameter(torch.empty(1, 2, SPECIAL - 1, dim))
         self.frame_blocks = nn.ModuleList([Block(dim, num_heads, EPS, EPS, dinov3=True) for _ in range(depth)])
@@ -90,12 +90,12 @@ class Aggregator(nn.Module):
     def forward(
         self, patch_tokens: Tensor, rows: int, columns: int, layers: Collection[int], cameras_only: bool = False
     ) -> dict[int, LayerTokens]:
-        """Return the tokens after each of some layers.
+        """Return the tokens after the given layers.
 
         Args:
-            patch_tokens: (B, S, rows * columns, C) of `patch_embed`.
-            rows, columns: of patches.
-            layers: numbers of these layers, from 0.
+            patch_tokens: (B, S, rows * columns, C) from `patch_embed`.
+            rows, columns: rows and columns of patches.
+            layers: numbers of the layers whose tokens to return, from 0.
             cameras_only: compute and return only the camera and register tokens of the last of them, T = SPECIAL.
 
         Returns:
@@ -112,7 +112,7 @@ class Aggregator(nn.Module):
             within = self.frame_blocks[layer](tokens.view(B * S, T, C), rope).view(B, S, T, C)
             among = self.inter_frame_blocks[layer]
             if layer in self.register_layers:
-                # What is kept shall not change.
+                # The assignment below must not change tokens that are returned.
                 tokens = within.clone() if layer in layers else within
                 tokens[:, :, :SPECIAL] = among(within[:, :, :SPECIAL].flatten(1, 2)).view(B, S, SPECIAL, C)
             else:

@@ -1,4 +1,4 @@
-"""VGGT-Omega's heads: one for cameras, and a dense one for depth, with a confidence for each pixel."""
+"""VGGT-Omega's heads: one for cameras, and a dense one for depth and its confidence."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ from toolkit.models.omega.aggregator import EPS, PATCH
 from toolkit.models.vit import Block
 
 _POSE = 9
-_LEAST_FIELD_OF_VIEW = 0.01
+_LEAST_FIELD_OF_VIEW = 0.01  # radians
 
 
 class CameraHead(nn.Module):
@@ -25,7 +25,7 @@ class CameraHead(nn.Module):
         self.camera_branch = nn.Sequential(nn.Linear(dim, dim // 2), nn.GELU(), nn.Linear(dim // 2, _POSE))
 
     def forward(self, tokens: Tensor) -> Tensor:
-        """Return the pose encoding (B, S, 9) for tokens (B, S, SPECIAL, C); fields of view are at least 0.01."""
+        """Return the pose encodings (B, S, 9) for tokens (B, S, SPECIAL, C); fields of view are at least 0.01."""
         S, count = tokens.shape[1:3]
         cameras = torch.arange(0, S * count, count, device=tokens.device)
         x = self.token_norm(tokens).flatten(1, 2)
@@ -36,10 +36,10 @@ class CameraHead(nn.Module):
 
 
 class DenseHead(dpt.DenseHead):
-    """Depth and its confidence: each fused pixel becomes a square of pixels."""
+    """Depth and its confidence. The last layer expands each pixel of the fused map to a square of pixels."""
 
     def __init__(self, dim: int, channels: Sequence[int], features: int) -> None:
-        """`features` is the number of channels of the fused maps; the others as for `dpt.DenseHead`."""
+        """`features` is the number of channels of the fused map; for the other arguments, see `dpt.DenseHead`."""
         super().__init__(dim, channels, PATCH, 2, dpt.Scratch(channels, features, overwrites=False))
         self.enlarged = PATCH // 4
         self.proj = nn.Conv2d(features, self.enlarged**2, 1)
@@ -47,4 +47,4 @@ class DenseHead(dpt.DenseHead):
 
     def decode(self, maps: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
         x = dpt.add_position(self.scratch(maps, maps[0].shape[2:]), size[1] / size[0])
-        return torch.cat([F.pixel_shuffle(part(x), self.enlarged) for part in (self.proj, self.proj_conf)], dim=1)
+        return torch.cat([F.pixel_shuffle(conv(x), self.enlarged) for conv in (self.proj, self.proj_conf)], dim=1)

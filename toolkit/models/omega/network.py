@@ -19,7 +19,7 @@ HEADS = ("camera", "depth")
 
 
 class VGGTOmega(MultiView):
-    """The network: photographs in, their cameras and depth out. The defaults are the official sizes, of 1B-512."""
+    """The network: predicts cameras and depth of photographs. The defaults are the official sizes of 1B-512."""
 
     title = "VGGT-Omega"
     patch = PATCH
@@ -44,13 +44,13 @@ class VGGTOmega(MultiView):
     ) -> None:
         """
         Args:
-            heads: the heads to hold, of `HEADS`.
-            compute_dtype: float32 or bfloat16, of the trunk's matrix products and attention. Sums, norms and heads
+            heads: the heads to create, of `HEADS`.
+            compute_dtype: float32 or bfloat16, for the trunk's matrix products and attention. Sums, norms and heads
                 are float32.
-            dim, depth, num_heads: of the trunk; each of `depth` layers has two blocks.
-            encoder_depth, encoder_num_heads: of the patch encoder, which has the same `dim`.
+            dim, depth, num_heads: sizes of the trunk; each of the `depth` layers has two blocks.
+            encoder_depth, encoder_num_heads: sizes of the patch encoder, which has the same `dim`.
             register_layers: layers in which only camera and register tokens attend among views.
-            camera_depth, camera_num_heads: of the camera head.
+            camera_depth, camera_num_heads: sizes of the camera head.
             dense_layers: the four layers that the dense head reads.
             dense_channels, dense_features: channels of the dense head.
 
@@ -70,23 +70,23 @@ class VGGTOmega(MultiView):
     def forward(
         self, images: Tensor, heads: Sequence[str] | None = None, patch_tokens: Tensor | None = None
     ) -> dict[str, Tensor]:
-        """Return what the heads predict, under the official names, float32.
+        """Return the predictions of the heads under the official names, float32.
 
         Args:
             images: (B, S, 3, H, W) or (S, 3, H, W), RGB in [0, 1], sides multiples of 16: S views of each of B
-                scenes; the first view is the frame of the cameras. `load_images` makes such images.
-            heads: which of the held heads to compute; None: all.
-            patch_tokens: (B, S, P, C), or (S, P, C) like the images, of `encode`, if already computed. Then only the
-                shape of `images` is read: `torch.empty(shape, device="meta")` will do.
+                scenes; the frame of the first view is the world. `load_images` makes such images.
+            heads: the heads to compute, of those that this network has; None: all.
+            patch_tokens: (B, S, P, C), or (S, P, C) like the images, from `encode`, if already computed. Then only
+                the shape of `images` is read: `torch.empty(shape, device="meta")` will do.
 
         Returns:
             `camera_and_register_tokens` (B, S, 17, 2 C) of the last layer. For "camera": `pose_enc` (B, S, 9), see
             `cameras_from_pose_encoding`. For "depth": `depth` (B, S, H, W, 1), along the camera's z, and `depth_conf`
-            (B, S, H, W), at least 1. Cameras and depth share one scale, which is not meters. B = 1 for images with
+            (B, S, H, W), at least 1. Cameras and depth share one scale, which is not metric. B = 1 for images with
             four axes.
 
         Raises:
-            ValueError: wrong shape, or a head that is not held.
+            ValueError: wrong shape, or a head that this network does not have.
         """
         size, heads, patch_tokens = self._checked(images, heads, patch_tokens)
         last = len(self.aggregator.frame_blocks) - 1

@@ -1,4 +1,4 @@
-"""Images in the form that VGGT-Omega takes."""
+"""Loads images for VGGT-Omega."""
 
 import math
 from collections.abc import Sequence
@@ -14,13 +14,13 @@ MODES = ("balanced", "max_size")
 
 
 def cropped_size(width: int, height: int) -> tuple[int, int]:
-    """Return the width and height of the middle of an image that `load_images` shows: at most 2 to 1, or 1 to 2."""
+    """Return the width and height of the central crop of an image, with an aspect ratio of at most 2 to 1 or 1 to 2."""
     return min(width, 2 * height), min(height, 2 * width)
 
 
 def resized_size(width: int, height: int, mode: str) -> tuple[int, int]:
     """Return the width and height to which `load_images` resizes a cropped image, before it pads."""
-    # Computed in the order of the official code: near a half, another order rounds differently.
+    # Keep the official order of operations: near one half, another order rounds differently.
     aspect = height / width
     if mode == "balanced":
         patches = (SIDE // PATCH) ** 2
@@ -34,10 +34,10 @@ def resized_size(width: int, height: int, mode: str) -> tuple[int, int]:
 def load_images(sources: Sequence[Source], mode: str = "balanced") -> Views:
     """Load images as the official loader does.
 
-    Transparent pixels become white. Of an image with sides of more than 2 to 1, the middle is shown. Images are
-    resized (bicubic, by Pillow) to multiples of 16, in proportion up to these: "balanced" makes about 512 x 512 pixels
-    of any shape; "max_size" makes the longer side 512. Smaller images then get a white border, up to the largest width
-    and height among them. EXIF orientation is not applied.
+    Transparent pixels become white. Crops images of more than 2 to 1 at their center. Resizes images (bicubic, by
+    Pillow) in proportion, rounded to multiples of 16: "balanced" to about the area of 512 x 512 pixels; "max_size" to
+    a longer side of 512 pixels. Smaller images then get a white border, up to the largest width and height among them.
+    Does not apply the EXIF orientation.
 
     Args:
         sources: paths, Pillow images or arrays.

@@ -1,4 +1,4 @@
-"""VGGT: the network, its images, and the cameras it returns."""
+"""VGGT: the network, the loader of its images, and its pose encoding."""
 
 from toolkit.models.vggt.network import HEADS, VGGT
 from toolkit.models.vggt.pose_encoding import cameras_from_pose_encoding, unproject_depth

@@ -1,4 +1,4 @@
-"""VGGT's trunk: DINOv2 encodes the patches of each image, then layers attend within each view and among all views."""
+"""VGGT's trunk: DINOv2 encodes the patches of each image; then layers attend within each view and among all views."""
 
 from collections.abc import Collection
 
@@ -11,18 +11,18 @@ from toolkit.models.vit import Block, Dinov2, normalized, places_of_view, rope_o
 
 REGISTERS = 4
 SPECIAL = 1 + REGISTERS
-"""Number of tokens of a view before its patches: one camera token, then the registers. (The encoder's own tokens
-before the patches are as many: a class token and its registers.)"""
+"""Number of tokens of a view before its patches: one camera token, then the registers. (The encoder has the same number
+of tokens before its patches: a class token and registers of its own.)"""
 _EPS = 1e-5
 
 
 class PatchEncoder(Dinov2):
-    """DINOv2 with registers (Darcet et al., ICLR 2024), of which only the patch tokens are used."""
+    """DINOv2 with registers (Darcet et al., ICLR 2024). Returns only the patch tokens."""
 
     def __init__(self, dim: int, depth: int, num_heads: int, grid: int) -> None:
         super().__init__(dim, depth, num_heads, grid)
         self.register_tokens = nn.Parameter(torch.empty(1, REGISTERS, dim))
-        self.mask_token = nn.Parameter(torch.empty(1, dim))  # only used in training, but in the checkpoint
+        self.mask_token = nn.Parameter(torch.empty(1, dim))  # in the checkpoint, but used in training only
 
     def forward(self, images: Tensor) -> Tensor:
         """Return the patch tokens (N, P, C), row by row, of images (N, 3, H, W) in [0, 1]."""
@@ -41,7 +41,7 @@ class Aggregator(nn.Module):
         super().__init__()
         self.head_dim = dim // num_heads
         self.patch_embed = PatchEncoder(dim, encoder_depth, encoder_num_heads, grid)
-        # One token for the first view, whose frame is the world, and one for all others.
+        # One token for the first view, whose frame is the world, and one for all other views.
         self.camera_token = nn.Parameter(torch.empty(1, 2, 1, dim))
         self.register_token = nn.Parameter(torch.empty(1, 2, REGISTERS, dim))
         self.frame_blocks = nn.ModuleList([Block(dim, num_heads, _EPS, _EPS) for _ in range(depth)])
@@ -50,12 +50,12 @@ class Aggregator(nn.Module):
     def forward(
         self, patch_tokens: Tensor, rows: int, columns: int, layers: Collection[int], cameras_only: bool = False
     ) -> dict[int, LayerTokens]:
-        """Return the tokens after each of some layers.
+        """Return the tokens after the given layers.
 
         Args:
-            patch_tokens: (B, S, rows * columns, C) of `patch_embed`.
-            rows, columns: of patches.
-            layers: numbers of these layers, from 0.
+            patch_tokens: (B, S, rows * columns, C) from `patch_embed`.
+            rows, columns: rows and columns of patches.
+            layers: numbers of the layers whose tokens to return, from 0.
             cameras_only: compute and return only the camera tokens of the last of them, T = 1.
 
         Returns:

@@ -1,4 +1,4 @@
-"""VGGT's heads: one for cameras, and dense ones for depth or points, with a confidence for each pixel."""
+"""VGGT's heads: one for cameras, and dense ones for depth or points and their confidence."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,7 @@ _POSE = 9
 
 
 class CameraHead(nn.Module):
-    """Predicts cameras from the camera tokens, in steps that each correct the pose encoding."""
+    """Predicts cameras from the camera tokens. Each of several steps corrects the pose encoding."""
 
     def __init__(self, dim: int, depth: int, num_heads: int) -> None:
         super().__init__()
@@ -29,10 +29,10 @@ class CameraHead(nn.Module):
         self.pose_branch = Mlp(dim, dim // 2, _POSE)
 
     def forward(self, tokens: LayerTokens) -> list[Tensor]:
-        """Return the pose encoding (B, S, 9) after each step, for the tokens of the last layer.
+        """Return the pose encodings (B, S, 9) after each step, for the tokens of the last layer.
 
-        Each step starts from the camera tokens, shifted, scaled and gated by the encoding so far (Peebles and Xie,
-        ICCV 2023). Returned fields of view are clamped to 0; the next step gets the raw ones.
+        Each step starts from the camera tokens, shifted, scaled and gated by the current encoding (Peebles and Xie,
+        ICCV 2023). Negative fields of view are returned as 0, but passed to the next step unchanged.
         """
         within, among = tokens
         camera = self.token_norm(torch.cat([within[:, :, 0], among[:, :, 0]], dim=-1).float())
@@ -52,7 +52,7 @@ class CameraHead(nn.Module):
 
 
 class Scratch(dpt.Scratch):
-    """Fuses the maps and enlarges them to the image."""
+    """Fuses the maps and enlarges the result to the image."""
 
     def __init__(self, channels: Sequence[int], features: int, out: int, overwrites: bool) -> None:
         super().__init__(channels, features, overwrites)
@@ -62,7 +62,7 @@ class Scratch(dpt.Scratch):
         )
 
     def forward(self, maps: Sequence[Tensor], size: Sequence[int]) -> Tensor:
-        """Return (N, out, H, W), size = (H, W), of maps from fine to coarse, (N, channels[level], h, w)."""
+        """Return (N, out, H, W), size = (H, W), for maps (N, channels[level], h, w), given from fine to coarse."""
         x = super().forward(maps, [2 * side for side in maps[0].shape[2:]])
         x = resize(self.output_conv1(x), size)
         output: Tensor = self.output_conv2(add_position(x, size[1] / size[0]))
@@ -70,11 +70,11 @@ class Scratch(dpt.Scratch):
 
 
 class DenseHead(dpt.DenseHead):
-    """A map of depth or points, and a confidence."""
+    """Predicts a map of depth or points, and its confidence."""
 
     def __init__(self, dim: int, out: int, channels: Sequence[int], features: int, overwrites: bool = True) -> None:
-        """`features` is the number of channels of the fused maps; `overwrites` is of `dpt.ResidualUnit`; the others as
-        for `dpt.DenseHead`."""
+        """`features` is the number of channels of the fused map; for `overwrites`, see `dpt.ResidualUnit`; for the
+        other arguments, `dpt.DenseHead`."""
         super().__init__(dim, channels, PATCH, out, Scratch(channels, features, out, overwrites))
 
     def decode(self, maps: Sequence[Tensor], size: tuple[int, int]) -> Tensor:

@@ -19,9 +19,9 @@ HEADS = ("camera", "depth", "point")
 
 
 class VGGT(MultiView):
-    """The network: a few photographs in, their cameras and depth out. The defaults are the official sizes.
+    """The network: predicts cameras, depth and points of a few photographs. The defaults are the official sizes.
 
-    It never holds the track head.
+    It omits the official track head.
     """
 
     title = "VGGT"
@@ -47,13 +47,13 @@ class VGGT(MultiView):
     ) -> None:
         """
         Args:
-            heads: the heads to hold, of `HEADS`.
-            compute_dtype: float32 or bfloat16, of the trunk's matrix products and attention. Sums, norms and heads
+            heads: the heads to create, of `HEADS`.
+            compute_dtype: float32 or bfloat16, for the trunk's matrix products and attention. Sums, norms and heads
                 are float32.
-            dim, depth, num_heads: of the trunk; each of `depth` layers has two blocks.
-            encoder_depth, encoder_num_heads: of the patch encoder, which has the same `dim`.
-            grid: rows and columns of patches that the position embedding was trained for.
-            camera_depth, camera_num_heads: of the camera head.
+            dim, depth, num_heads: sizes of the trunk; each of the `depth` layers has two blocks.
+            encoder_depth, encoder_num_heads: sizes of the patch encoder, which has the same `dim`.
+            grid: rows and columns of patches for which the position embedding was trained.
+            camera_depth, camera_num_heads: sizes of the camera head.
             dense_layers: the four layers that the dense heads read.
             dense_channels, dense_features: channels of the dense heads.
 
@@ -75,23 +75,23 @@ class VGGT(MultiView):
     def forward(
         self, images: Tensor, heads: Sequence[str] | None = None, patch_tokens: Tensor | None = None
     ) -> dict[str, Any]:
-        """Return what the heads predict, under the official names, float32.
+        """Return the predictions of the heads under the official names, float32.
 
         Args:
             images: (B, S, 3, H, W) or (S, 3, H, W), RGB in [0, 1], sides multiples of 14: S views of each of B
-                scenes; the first view is the frame of the cameras. `load_images` makes such images.
-            heads: which of the held heads to compute; None: all.
-            patch_tokens: (B, S, P, C), or (S, P, C) like the images, of `encode`, if already computed. Then only the
-                shape of `images` is read: `torch.empty(shape, device="meta")` will do.
+                scenes; the frame of the first view is the world. `load_images` makes such images.
+            heads: the heads to compute, of those that this network has; None: all.
+            patch_tokens: (B, S, P, C), or (S, P, C) like the images, from `encode`, if already computed. Then only
+                the shape of `images` is read: `torch.empty(shape, device="meta")` will do.
 
         Returns:
             For "camera": `pose_enc` (B, S, 9), see `cameras_from_pose_encoding`, and `pose_enc_list`, the encoding
             after each step of the head. For "depth": `depth` (B, S, H, W, 1), along the camera's z, and `depth_conf`
             (B, S, H, W), at least 1. For "point": `world_points` (B, S, H, W, 3) and `world_points_conf` (B, S, H, W).
-            Cameras, depth and points share one scale, which is not meters. B = 1 for images with four axes.
+            Cameras, depth and points share one scale, which is not metric. B = 1 for images with four axes.
 
         Raises:
-            ValueError: wrong shape, or a head that is not held.
+            ValueError: wrong shape, or a head that this network does not have.
         """
         size, heads, patch_tokens = self._checked(images, heads, patch_tokens)
         rows, columns = size[0] // PATCH, size[1] // PATCH

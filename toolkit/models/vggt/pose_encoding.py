@@ -1,8 +1,8 @@
 """Cameras from VGGT's pose encoding, and points from depth.
 
 The encoding of a camera has nine numbers: translation and quaternion (x, y, z, w, of any length) of `cam_from_world`,
-then the vertical and the horizontal field of view in radians. The principal point is the image's center. "World" is
-VGGT's own frame, close to that of the first view, in an arbitrary unit.
+then the vertical and horizontal field of view in radians. The principal point is the image's center. "World" is VGGT's
+frame, close to that of the first view, in an arbitrary unit.
 """
 
 import numpy as np
@@ -14,10 +14,10 @@ from toolkit.geometry import Floats, quaternion_to_rotation
 def cameras_from_pose_encoding(pose_enc: ArrayLike, size: tuple[int, int]) -> tuple[Floats, Floats]:
     """Return `cam_from_world` (..., 3, 4) and intrinsics K (..., 3, 3), pixels, of pose encodings (..., 9).
 
-    A field of view of 0, to which the network clamps negative ones, gives an infinite focal length.
+    A field of view of 0 gives an infinite focal length; the network returns 0 for negative fields of view.
 
     Args:
-        pose_enc: (..., 9), numbers or a tensor on the CPU.
+        pose_enc: (..., 9), an array or a tensor on the CPU.
         size: (H, W) of the images.
 
     Raises:
@@ -39,8 +39,8 @@ def cameras_from_pose_encoding(pose_enc: ArrayLike, size: tuple[int, int]) -> tu
 def unproject_depth(depth: ArrayLike, cam_from_world: ArrayLike, intrinsics: ArrayLike) -> Floats:
     """Return the world point of each pixel of depth maps, (S, H, W, 3).
 
-    As in the official code, the center of the first pixel is (0, 0) here, not (0.5, 0.5) as elsewhere in this toolkit:
-    for cameras of that convention, subtract 0.5 from their principal points first.
+    As in the official code, the center of the top-left pixel is (0, 0) here. Elsewhere in this toolkit it is (0.5,
+    0.5): subtract 0.5 from the principal points of such cameras first.
 
     Args:
         depth: (S, H, W) or (S, H, W, 1), along the camera's z.
@@ -54,5 +54,5 @@ def unproject_depth(depth: ArrayLike, cam_from_world: ArrayLike, intrinsics: Arr
     focal, center = K[:, None, None, [0, 1], [0, 1]], K[:, None, None, :2, 2]
     rays = (np.stack([u, v], axis=-1) - center) / focal
     in_camera = np.concatenate([rays * z[..., None], z[..., None]], axis=-1)
-    # Row vectors times R: this applies the inverse rotation.
+    # Multiplying row vectors by R applies the inverse rotation.
     return np.einsum("shwi,sij->shwj", in_camera - pose[:, None, None, :3, 3], pose[:, :3, :3])

@@ -1,4 +1,4 @@
-"""Images in the form that VGGT takes."""
+"""Loads images for VGGT."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +15,7 @@ MODES = ("crop", "pad")
 def resized_size(width: int, height: int, mode: str) -> tuple[int, int]:
     """Return the width and height to which `load_images` resizes an image, before it crops or pads."""
     longest = width if mode == "crop" else max(width, height)
-    # Computed in the order of the official code: near a half, another order rounds differently.
+    # Keep the official order of operations: near one half, another order rounds differently.
     new_width = SIDE if longest == width else round(width * (SIDE / height) / PATCH) * PATCH
     new_height = SIDE if longest != width else round(height * (SIDE / width) / PATCH) * PATCH
     return new_width, new_height
@@ -24,9 +24,9 @@ def resized_size(width: int, height: int, mode: str) -> tuple[int, int]:
 def load_images(sources: Sequence[Source], mode: str = "crop") -> Views:
     """Load images as the official loader does.
 
-    Transparent pixels become white. Images are resized (bicubic, by Pillow) in proportion, to multiples of 14:
-    "crop" makes the width 518 and keeps the middle 518 rows where there are more; "pad" makes the longer side 518 and
-    adds white up to 518 x 518. Smaller images then get a white border. EXIF orientation is not applied.
+    Transparent pixels become white. Resizes images (bicubic, by Pillow) in proportion, to multiples of 14: "crop"
+    makes the width 518 and keeps at most the 518 middle rows; "pad" makes the longer side 518 and adds white up to
+    518 x 518. Smaller images then get a white border. Does not apply the EXIF orientation.
 
     Args:
         sources: paths, Pillow images or arrays.
