@@ -554,7 +554,7 @@ def test_what_does_not_fit_after_all_is_halved(
     caplog.clear()
     for found, other in zip(predictor.predict(groups), two, strict=True):
         assert_only_first(found, other, 2)
-    assert "going on with the first 2 views" in caplog.text
+    assert "continuing with the first 2 views" in caplog.text
     assert shapes[:4] == [(2, 4), (1, 4), (4, 2), (2, 2)]
     assert shapes[4:] == [(1, 2)] * 6
 

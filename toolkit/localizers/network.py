@@ -379,7 +379,7 @@ class NetworkPredictor:
                         f"{size[1]} x {size[0]} pixels. Use dtype_compute: bfloat16, or compute_device: cpu."
                     ) from error
             self._most_views[size] = max(_LEAST_VIEWS, views // 2)
-            log.warning("going on with the first %d views of each group", self._most_views[size])
+            log.warning("continuing with the first %d views of each group", self._most_views[size])
 
     def _network(self, size: Size) -> "Callable[..., Tensor]":
         """Return the network as a function of tokens (B, S, P, C) and input cameras, if any, for images (H, W)."""
