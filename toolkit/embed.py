@@ -5,6 +5,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import islice
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
-from toolkit.capture.images import default_workers, prefetch, read_image
+from toolkit.capture.images import default_workers, one_thread, prefetch, read_image
 from toolkit.capture.turning import turn_image
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import WEIGHTS, Embedder, create_embedder, resolve_model
@@ -359,7 +360,9 @@ def _embed_into(
     # Copy the next batch to the device while one is embedded.
     inputs_of_batches = (list(islice(inputs, len(part.rows[rows]))) for rows in slices)
     stacked = prefetch(stack, inputs_of_batches, workers=1, ahead=0)
-    with tqdm(total=len(part.rows), initial=len(part.rows) - len(left), desc=label, unit="image") as bar:
+    bar = tqdm(total=len(part.rows), initial=len(part.rows) - len(left), desc=label, unit="image")
+    # Features are described in a thread a core; a network has its own threads.
+    with bar, one_thread() if store is not None else nullcontext():
         for (group, *_), (batch, unreadable) in zip(todo, stacked, strict=True):
             vectors = embedder.embed(batch)
             if vectors.shape != (len(batch), embedder.dim):
@@ -384,14 +387,14 @@ def _inputs(
 ) -> Iterator[tuple[int, Any | str]]:
     """Yield the row and the input (features or a prepared image) of each image; a str is why it has none."""
     session = part.session
-    if store is not None:
-        for row in part.rows.tolist():
-            name = session.image_name(row)
-            yield row, store[name] if name in store else store.failed.get(name, "no local features were extracted")
-        return
 
-    def read(item: tuple[int, int]) -> tuple[int, NDArray[np.uint8] | str]:
+    def read(item: tuple[int, int]) -> tuple[int, Any | str]:
         row, turns = item
+        if store is not None:
+            name = session.image_name(row)
+            if name not in store:
+                return row, store.failed.get(name, "no local features were extracted")
+            return row, embedder.prepare(store[name])
         try:
             image = read_image(session.image_path(row), least_side=embedder.least_side)
         except ImageError as error:

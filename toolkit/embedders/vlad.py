@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from toolkit.capture.images import default_workers, prefetch
 from toolkit.errors import ArtifactError, ToolkitError
 from toolkit.features.features import LocalFeatures
 from toolkit.features.matching import unit_descriptors
@@ -49,19 +50,34 @@ class Vlad:
     def settings(self) -> dict[str, Any]:
         return {"name": self.name, **self._settings.model_dump(), "vocabulary": self._fingerprint}
 
-    def prepare(self, item: LocalFeatures) -> LocalFeatures:
-        return item
+    def prepare(self, item: LocalFeatures | Floats) -> Floats:
+        """Return the VLAD (words * local_dim,) of an image before the projection, of length 1 or 0."""
+        if not isinstance(item, LocalFeatures):
+            return item
+        vector = np.zeros_like(self.centroids)
+        descriptors = _select(item, self._settings)
+        if len(descriptors):
+            local = unit(((descriptors - self.local_mean) @ self.local_projection).astype(np.float32), _SHORTEST)
+            nearest = _assign(local, self.centroids)
+            residuals = unit(local - self.centroids[nearest], _SHORTEST)
+            order = np.argsort(nearest, kind="stable")
+            present, starts = np.unique(nearest[order], return_index=True)
+            vector[present] = unit(np.add.reduceat(residuals[order], starts, axis=0).astype(np.float32), _SHORTEST)
+        flat = vector.reshape(-1)
+        return unit(np.sign(flat) * np.sqrt(np.abs(flat)), _SHORTEST)
 
-    def stack(self, inputs: Sequence[LocalFeatures]) -> Sequence[LocalFeatures]:
-        return inputs
+    def stack(self, inputs: Sequence[LocalFeatures | Floats]) -> Floats:
+        """Return the VLADs of images, (B, words * local_dim)."""
+        return np.array([self.prepare(item) for item in inputs], np.float32).reshape(-1, self.centroids.size)
 
     @threadpool_limits.wrap(limits=1, user_api="blas")  # the products are small: two threads take three times as long
-    def embed(self, inputs: Sequence[LocalFeatures]) -> Floats:
-        """Return the global descriptors (B, dim) of images; zeros for an image without features.
+    def embed(self, inputs: Sequence[LocalFeatures] | Floats) -> Floats:
+        """Return the global descriptors (B, dim) of images, or of a batch from `stack`; zeros without features.
 
         The rows do not have length 1: compare them by dot products, or normalize them for cosines.
         """
-        return self._aggregate(inputs) @ self.projection
+        batch = inputs if isinstance(inputs, np.ndarray) else self.stack(inputs)
+        return batch @ self.projection
 
     @classmethod
     @threadpool_limits.wrap(limits=1, user_api="blas")
@@ -108,7 +124,7 @@ class Vlad:
         words = max(1, min(settings.words, len(local) // 8))
         arrays["centroids"] = _kmeans(local, words, settings.iterations, rng)
         vlad = cls(settings, arrays)
-        vectors = np.concatenate([vlad._aggregate([image]) for image in features()])
+        vectors = np.stack(list(prefetch(vlad.prepare, features(), default_workers())))
         vlad.projection = _principal_projection(vectors, settings)
         return vlad
 
@@ -133,23 +149,6 @@ class Vlad:
         with write_atomic(path) as temporary, open(temporary, "wb") as stream:
             np.savez(stream, allow_pickle=False, settings=settings, **arrays)
         self._fingerprint = file_fingerprint(path)
-
-    def _aggregate(self, images: Sequence[LocalFeatures]) -> Floats:
-        """Return the VLADs (B, words * local_dim) before the projection, of length 1, or 0 without features."""
-        words, size = self.centroids.shape
-        vectors = np.zeros((len(images), words, size), np.float32)
-        for vector, image in zip(vectors, images, strict=True):
-            descriptors = _select(image, self._settings)
-            if not len(descriptors):
-                continue
-            local = unit(((descriptors - self.local_mean) @ self.local_projection).astype(np.float32), _SHORTEST)
-            nearest = _assign(local, self.centroids)
-            residuals = unit(local - self.centroids[nearest], _SHORTEST)
-            order = np.argsort(nearest, kind="stable")
-            present, starts = np.unique(nearest[order], return_index=True)
-            vector[present] = unit(np.add.reduceat(residuals[order], starts, axis=0).astype(np.float32), _SHORTEST)
-        flat = vectors.reshape(len(images), words * size)
-        return unit(np.sign(flat) * np.sqrt(np.abs(flat)), _SHORTEST)
 
 
 def _select(image: LocalFeatures, settings: VladSettings) -> Floats:
