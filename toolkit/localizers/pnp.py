@@ -119,7 +119,7 @@ class PnpLocalizer:
         misfit = find_misfit(
             query,
             geometry.invert(estimate.world_from_rig),
-            matches[self.map.track_lengths(matches.point) > 1],  # a single map observation gives no depth
+            matches[self.map.track_lengths(matches.point) > 1],  # points with one observation are not triangulated
             self.map.points,
             self.settings.ransac_max_error_deg,
             focal_alone=estimate.rival_support > self.settings.ok_rival_support,
