@@ -22,7 +22,7 @@ _CELL = 8
 
 
 class SuperPointExtractor(NetworkExtractor):
-    """Extracts SuperPoint features: keypoints at whole pixels, unit descriptors (256,), on any device."""
+    """Extracts SuperPoint features: keypoints at integer pixels, unit descriptors (256,), on any device."""
 
     color = False
     name = "superpoint"

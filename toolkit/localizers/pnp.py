@@ -296,7 +296,10 @@ class PnpLocalizer:
     def _estimate(
         self, query: RigQuery, matches: Matches, hypotheses: list[_Hypothesis], references: Sequence[References]
     ) -> PoseEstimate:
-        """Return the best hypothesis as an estimate, judged by the matches made without it and by its rivals."""
+        """Return the first hypothesis as an estimate, judged by the matches made without it and by its rivals.
+
+        The other hypotheses must be sorted by support, best first.
+        """
         settings = self.settings
         rig_from_world, guided = hypotheses[0].rig_from_world, hypotheses[0].matches
         inliers = matches[self._inliers(query, rig_from_world, matches)]
@@ -308,7 +311,7 @@ class PnpLocalizer:
                 num_inliers=independent,
                 correspondences=self._rejected(matches),
             )
-        errors = query.errors_px(rig_from_world, guided, self.map.points)
+        errors, rivals = query.errors_px(rig_from_world, guided, self.map.points), self._rivals(hypotheses)
         # Guided matches were searched near the pose, so their errors are small wherever it is. Only those that were
         # also found by descriptors alone measure its accuracy.
         found_twice = guided[np.isin(guided.rows(), inliers.rows())]
@@ -327,8 +330,8 @@ class PnpLocalizer:
             num_inliers=independent,
             num_guided=len(guided),
             rmse_px=float(np.sqrt(np.mean(errors**2))) if len(errors) else float("nan"),
-            rival_support=self._rival_support(hypotheses),
-            rivals=tuple(self._rivals(hypotheses)),
+            rival_support=rivals[0].support if rivals else 0.0,
+            rivals=tuple(rivals),
             coverage=self._coverage(query, inliers),
             agreement=self._agreement(inliers),
             references=tuple(used),
@@ -396,16 +399,10 @@ class PnpLocalizer:
         """Return the correspondences of matches that support no pose."""
         return self._correspondences(matches, np.zeros(len(matches), bool), 0, [])
 
-    def _rival_support(self, hypotheses: list[_Hypothesis]) -> float:
-        """Return the support of the best clearly different pose, relative to that of the best pose."""
-        best, *others = hypotheses
-        rivals = (len(other.matches) for other in others if _differ(best, other))
-        return next(rivals, 0) / max(len(best.matches), 1)
-
     def _rivals(self, hypotheses: list[_Hypothesis]) -> list[Rival]:
-        """Return the poses that clearly differ from the best and from each other, best supported first."""
+        """Return the poses that clearly differ from the best and from each other, with their relative support."""
         kept = hypotheses[:1]
-        for other in sorted(hypotheses[1:], key=lambda hypothesis: -len(hypothesis.matches)):
+        for other in hypotheses[1:]:
             if all(_differ(one, other) for one in kept):
                 kept.append(other)
         support = max(len(hypotheses[0].matches), 1)
