@@ -16,7 +16,7 @@ from toolkit.capture.images import pixels_of, stored_size
 from toolkit.capture.turning import turn_image
 from toolkit.errors import ArtifactError, ImageError
 from toolkit.features.features import KINDS, LocalFeatures, extract_turned
-from toolkit.features.matching import AnyMethod
+from toolkit.features.matching import AnyMethod, LocalMethod
 from toolkit.features.sift import SiftExtractor
 from toolkit.features.stores import as_stored
 from toolkit.localizers.base import PoseEstimate, Prior, Query, RoughPose, View
@@ -95,16 +95,13 @@ def _extract(map_: Map, pictures: Sequence["_Pixels"], turns: Sequence[int]) -> 
     """Return the local features of each picture, one entry per kind of the map; empty if the method uses none."""
     if map_.settings.method == "feed_forward" or not map_.kinds:
         return []
-    upright = [0] * len(pictures)
-    extracted = [
-        [
-            # As a run reads them from its file, which rounds keypoints at the border.
-            as_stored(extract_turned(kind.extractor, [picture.read(kind.extractor.color)], [turn])[0])
-            for picture, turn in zip(pictures, turns if KINDS[kind.name].upright else upright, strict=True)
-        ]
-        for kind in map_.kinds
-    ]
-    return [list(kinds) for kinds in zip(*extracted, strict=True)]
+
+    def extract(picture: _Pixels, turn: int, kind: LocalMethod) -> LocalFeatures:
+        pixels = picture.read(kind.extractor.color)
+        (features,) = extract_turned(kind.extractor, [pixels], [turn if KINDS[kind.name].upright else 0])
+        return as_stored(features)  # a run reads features from its file, which rounds keypoints at the border
+
+    return [[extract(*item, kind) for kind in map_.kinds] for item in zip(pictures, turns, strict=True)]
 
 
 def _embed(
