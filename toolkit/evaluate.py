@@ -1,4 +1,4 @@
-"""The evaluate stage: say how good the poses of a scene are, and where accuracy was lost."""
+"""The evaluate stage: measure how accurate the poses of a scene are, and where accuracy was lost."""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -60,7 +60,7 @@ FIGURES = ("recall", "median_errors", "error_curves", "losses", "reliability", "
 ERROR_COLUMNS = ["map_device", "query_device", "timestamp", "device_id", "image", "status", "num_inliers",
                  "p_correct", "position_std_m", "rotation_error_deg", "translation_error_m"]  # fmt: skip
 DETAILS = ("num_inliers", "p_correct", "position_std_m")
-"""Columns of a pair's table that are compared with its errors."""
+"""Columns copied from a pair's table to the table of errors."""
 _PAIR = ["map_device", "query_device"]
 
 
@@ -81,27 +81,27 @@ def evaluate_scene(
 ) -> Evaluation:
     """Evaluate the poses of all pairs of a scene and write tables and figures.
 
-    A pair whose poses are missing, that has no queries, or none with ground truth, gets a row that says so. Where the
-    unit of the poses is not known, meters are `metrics.UNKNOWN_UNIT`: also in columns that end in `_m`.
+    A pair without poses, without queries or without ground truth gets a row that says so. If the unit of the poses is
+    unknown, lengths are in `metrics.UNKNOWN_UNIT` instead of meters, also in columns that end in `_m`.
 
     Args:
         sessions_root: folder `sessions/` of the capture.
-        poses_dir: folder of `SCENE_map_<M>_query_<Q>.txt`, and `.csv` where there is one.
+        poses_dir: folder of `SCENE_map_<M>_query_<Q>.txt` and, if they exist, `.csv`.
         retrieval_dir: folder of `SCENE_map_<M>_query_<Q>.jsonl`; None skips retrieval recall.
-        out_dir: where `{recall,errors,retrieval,losses,overlap}.csv` and the figures go; None: nowhere.
-        settings: see `EvaluateSettings`; a dict holds what differs from the defaults.
+        out_dir: output folder of `{recall,errors,retrieval,losses,overlap}.csv` and the figures; None writes nothing.
+        settings: see `EvaluateSettings`; a dict holds the settings that differ from the defaults.
         map_device: `all` or one device key; likewise `query_device`.
-        queries: the keyframe list that is asked; all of it is the denominator.
-        at: `device` has one error a query device; `camera` one a camera image of it, as the benchmark's own
-            code evaluates rigs.
+        queries: keyframe list of the queries; recall is a share of all of them.
+        at: `device` computes one error per query device; `camera` one per camera image, as the benchmark's own code
+            evaluates rigs.
         pairs: only these [map device, query device]; None: all.
-        reranked_dir: folder of the reranked references, if queries were localized with those: retrieval recall is
-            then theirs, and overlap is shown before and after.
-        map_dir: folder of the triangulated maps, which say what a reference sees.
+        reranked_dir: folder of the reranked references, if queries were localized with them: retrieval recall is
+            computed from them, and overlap for the references before and after.
+        map_dir: folder of the triangulated maps, which tell the points that a reference sees.
 
     Raises:
-        ToolkitError: an unknown device or `at`, or no pair to evaluate.
-        CaptureError: no pair can be evaluated.
+        ToolkitError: unknown device or `at`, or there is no pair to evaluate.
+        CaptureError: none of the pairs can be evaluated.
     """
     if at not in ("device", "camera"):
         raise ToolkitError(f"Unknown at={at!r}. Known: device, camera.")
@@ -116,17 +116,17 @@ def evaluate_scene(
     unit = "m"
     references_dir = retrieval_dir and (reranked_dir or retrieval_dir)
     for query in capture.devices_with("query", query_device):
-        asked = [map_ for map_ in map_devices if pairs is None or [map_, query] in map(list, pairs)]
-        if not asked:
+        maps = [map_ for map_ in map_devices if pairs is None or [map_, query] in map(list, pairs)]
+        if not maps:
             continue
         reason = ""
         try:
             session = capture[f"{query}_query"]
             keys, truth = _queries_with_truth(session, queries, messages)
-            messages += camera_messages(session, _query_tables(poses_dir, capture.name, asked, query))
+            messages += camera_messages(session, _query_tables(poses_dir, capture.name, maps, query))
         except CaptureError as error:
             reason = str(error)
-        for map_ in asked:
+        for map_ in maps:
             pair = {"map_device": map_, "query_device": query}
             unit, length = length_unit(read_map_record(map_record_path(poses_dir, capture.name, map_)))
             name = pair_name(capture.name, map_, query)
@@ -148,10 +148,10 @@ def evaluate_scene(
                 )
                 rows["retrieval"].append({**pair, **row})
                 if good is None:
-                    messages.append(f"{name}: {row['state']}, so a miss is not put down to retrieval.")
+                    messages.append(f"{name}: {row['state']}, so no miss is attributed to retrieval.")
             results, state = _read_results(Path(poses_dir) / name, keys)
             if results is None:
-                messages.append(f"{name}: {state}; its queries are not counted anywhere.")
+                messages.append(f"{name}: {state}; its queries are not counted.")
                 for kind in ("recall", "losses"):
                     rows[kind].append({**pair, "state": state, "queries": len(keys)})
                 continue
@@ -198,20 +198,20 @@ def evaluate_sequences(
     queries: str = "keyframes_pruned_subsampled",
     pairs: Sequence[Sequence[str]] | None = None,
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Compare the poses of single queries with those that the sequence stage makes of them, by its steps.
+    """Compare the poses of single queries with the poses after each step of the sequence stage.
 
     Args:
-        limits: (degrees, lengths); `rescued` and `broken` count at the last.
-        poses_dir, queries, pairs: as `evaluate_scene` has them.
+        limits: thresholds (degrees, length); `rescued` and `broken` count at the last one.
+        poses_dir, queries, pairs: as for `evaluate_scene`.
 
     Returns:
-        A row a pair and step, see `SequencePair.recalls`; and a row a query that the sequence has rescued or broken,
-        see `SequencePair.changes`. Both are empty where there are no sequences, or no truth.
+        A table with one row per pair and step, see `SequencePair.recalls`; and a table with one row per query that the
+        sequence stage rescued or broke, see `SequencePair.changes`. Both are empty without sequences or ground truth.
     """
     steps, changes = [pd.DataFrame()], [pd.DataFrame()]
     for map_, query in product(map_devices, query_devices):
-        found = SequencePair.find(poses_dir, capture.name, map_, query)
-        if found is None or not (pairs is None or [map_, query] in map(list, pairs)):
+        sequence = SequencePair.find(poses_dir, capture.name, map_, query)
+        if sequence is None or not (pairs is None or [map_, query] in map(list, pairs)):
             continue
         try:
             keys, truth = _queries_with_truth(capture[f"{query}_query"], queries, [])
@@ -219,17 +219,17 @@ def evaluate_sequences(
                 continue
             unit, length = length_unit(read_map_record(map_record_path(poses_dir, capture.name, map_)))
             pair = {"map_device": map_, "query_device": query}
-            steps.append(pd.DataFrame(found.recalls(keys, truth, limits, unit, length)).assign(**pair))
-            changes.append(found.changes(keys, truth, limits[-1], length).assign(**pair))
+            steps.append(pd.DataFrame(sequence.recalls(keys, truth, limits, unit, length)).assign(**pair))
+            changes.append(sequence.changes(keys, truth, limits[-1], length).assign(**pair))
         except (CaptureError, ArtifactError) as error:
-            logger.warning("%s: its sequences are not evaluated. %s", found.stem.name, error)
+            logger.warning("%s: its sequences are not evaluated. %s", sequence.stem.name, error)
     tables = (pd.concat(parts, ignore_index=True) for parts in (steps, changes))
     first, second = (table[[*_PAIR, *table.columns.drop(_PAIR)]] if len(table) else table for table in tables)
     return first, second
 
 
 def _unreadable(capture: Capture, session_id: str) -> str:
-    """Return why a session cannot be read; "" if it can."""
+    """Return why a session cannot be read; empty if it can."""
     try:
         capture[session_id]
     except CaptureError as error:
@@ -238,15 +238,15 @@ def _unreadable(capture: Capture, session_id: str) -> str:
 
 
 def write_evaluation(evaluation: Evaluation, out_dir: str | Path, settings: dict[str, Any]) -> None:
-    """Write the tables as CSV, the figures as PNG, and beside recall.csv how they were made."""
+    """Write the tables as CSV, the figures as PNG, and the settings to the sidecar of recall.csv."""
     out = Path(out_dir)
-    made = [out / f"{name}.csv" for name in ("recall", "errors", "retrieval", "losses", "overlap")]
-    tables = {path: getattr(evaluation, path.stem) for path in made}
+    written = [out / f"{name}.csv" for name in ("recall", "errors", "retrieval", "losses", "overlap")]
+    tables = {path: getattr(evaluation, path.stem) for path in written}
     for path, table in ((out / "sequence.csv", evaluation.sequences), (out / "changes.csv", evaluation.changes)):
         if len(evaluation.sequences):
             tables[path] = table
-            made.append(path)
-        else:  # of an earlier run with sequences
+            written.append(path)
+        else:  # remove a table of an earlier run with sequences
             path.unlink(missing_ok=True)
     for path, table in tables.items():
         with write_atomic(path) as temporary:
@@ -255,10 +255,10 @@ def write_evaluation(evaluation: Evaluation, out_dir: str | Path, settings: dict
     for name in FIGURES:
         if name in figures:
             save_figure(figures[name], out / f"{name}.png")
-            made.append(out / f"{name}.png")
-        else:  # one of an earlier evaluation would mislead
+            written.append(out / f"{name}.png")
+        else:  # a figure of an earlier evaluation would mislead
             (out / f"{name}.png").unlink(missing_ok=True)
-    write_sidecar(out / "recall.csv", settings, made[1:])
+    write_sidecar(out / "recall.csv", settings, written[1:])
     logger.info("Evaluated %d of %d pairs: %s", (evaluation.recall["state"] == "evaluated").sum(),
                 len(evaluation.recall), out / "recall.csv")  # fmt: skip
 
@@ -280,13 +280,13 @@ def _query_tables(poses_dir: str | Path, scene: str, map_devices: Sequence[str],
     """Return the readable tables of a query device's pairs."""
     tables = []
     for map_ in map_devices:
-        with suppress(ArtifactError):  # `_read_results` says so
+        with suppress(ArtifactError):  # `_read_results` reports it
             tables.append(read_query_table(Path(poses_dir) / f"{pair_name(scene, map_, query)}.csv", ["status"]))
     return tables
 
 
 def _read_results(stem: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, str]:
-    """Return `keys` with columns pose (4, 4), status and those of `DETAILS`; and the state of the pair."""
+    """Return `keys` with the columns pose (4, 4), status and `DETAILS` (None without poses), and the pair's state."""
     path, table = stem.with_name(f"{stem.name}.txt"), stem.with_name(f"{stem.name}.csv")
     if not path.is_file():
         return None, "no poses file"
@@ -298,7 +298,7 @@ def _read_results(stem: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, 
     except CaptureError as error:
         return None, f"unreadable poses file ({error})"
     located = is_posed(poses)
-    # A file of another tool has poses only; then a pose is a pose.
+    # Another tool writes only poses; then every pose counts as ok.
     status = np.where(located, "ok", "failed: no pose")
     results = keys.assign(pose=list(poses), status=status, **dict.fromkeys(DETAILS, np.nan))
     columns = ["timestamp", "device_id"]
@@ -314,9 +314,9 @@ def _read_results(stem: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, 
         if name in details:
             results[name] = details[name].astype(float)
     results["status"] = details["status"].fillna(results["status"])
-    listed = int(details["status"].notna().sum())
-    if listed < len(keys):
-        return results, f"stale: {listed} of {len(keys)} queries have a row in {table.name}"
+    num_rows = int(details["status"].notna().sum())
+    if num_rows < len(keys):
+        return results, f"stale: {num_rows} of {len(keys)} queries have a row in {table.name}"
     if np.any(results["status"].str.startswith("failed").to_numpy(bool) == located):
         return results, f"stale: {table.name} and {path.name} differ in which queries have a pose"
     return results, "evaluated"
@@ -333,8 +333,12 @@ def _errors_of(
     unit: str,
     length: float,
 ) -> pd.DataFrame:
-    """Return the rows of the table `errors` of a pair; `good` says which queries have a good reference,
-    `length` what the unit of lengths in it is, in that of the poses."""
+    """Return a pair's rows of the table `errors`.
+
+    Args:
+        good: whether each query has a good reference; None if unknown.
+        length: the unit of lengths in the table, in the unit of the poses.
+    """
     estimated, true = np.stack(results["pose"].to_list()), poses_of(truth, keys)  # type: ignore[arg-type]
     frame = results.drop(columns="pose")
     rows = session.rows_of_keyframes(keys)
@@ -362,7 +366,7 @@ def _errors_of(
 
 
 def _summary(frame: pd.DataFrame, thresholds: Sequence[Threshold], unit: str) -> dict[str, Any]:
-    """Return what the table `recall` says of a pair."""
+    """Return a pair's row of the table `recall`."""
     rotation_deg, translation_m = (frame[name].to_numpy(float) for name in ERROR_COLUMNS[-2:])
     status = frame["status"].str.split(":").str[0]
     shares = recall(rotation_deg, translation_m, thresholds)
@@ -379,7 +383,7 @@ def _summary(frame: pd.DataFrame, thresholds: Sequence[Threshold], unit: str) ->
 
 
 def _losses(frame: pd.DataFrame, thresholds: Sequence[Threshold], unit: str) -> list[dict[str, Any]]:
-    """Return what the table `losses` says of a pair, a row a threshold."""
+    """Return a pair's rows of the table `losses`, one per threshold."""
     rows = []
     for name in (threshold_name(threshold, unit) for threshold in thresholds):
         reasons = {reason: int((frame[f"loss@{name}"] == reason).sum()) for reason in REASONS}
@@ -388,7 +392,7 @@ def _losses(frame: pd.DataFrame, thresholds: Sequence[Threshold], unit: str) -> 
 
 
 def _table(frame: pd.DataFrame, *columns: str) -> pd.DataFrame:
-    """Return the table with the pair, the state and `columns` first, and the pairs of one map together."""
+    """Move the columns of the pair, the state and `columns` to the front, and sort rows by map device."""
     state = ["state"] if "device_id" not in frame else []
     leading = ["map_device", "query_device", *state, *columns]
     frame = frame.reindex(columns=[*leading, *(c for c in frame.columns if c not in leading)])
@@ -408,7 +412,12 @@ def _retrieval_recall(
     limits: tuple[float, float],
     length: float,
 ) -> tuple[dict[str, Any], NDArray[np.bool_] | None]:
-    """Return a row of the retrieval table, and for each query whether it has any good reference."""
+    """Return a pair's row of the table `retrieval`, and whether each query has a good reference (None if unreadable).
+
+    Args:
+        limits: largest distance and angle (degrees) between a query and a good reference.
+        length: unit of the distance, in the unit of the poses.
+    """
     if not path.is_file():
         return {"state": "no retrieval file", "queries": len(keys)}, None
     try:
@@ -428,7 +437,7 @@ def _retrieval_recall(
     near = _is_near(references, cameras[:, None], reach)
     best = np.where(near.any(1), near.argmax(1), np.inf)
     in_map = _near_any(cameras, map_session.world_from_cam(), reach)
-    # A query device has a good reference where any of its cameras has one.
+    # A query device has a good reference if any of its cameras has one.
     frame = index.assign(rank=best, in_map=in_map).groupby(["timestamp", "device_id"], as_index=False)
     by_device = keys.merge(frame.agg(rank=("rank", "min"), in_map=("in_map", "any")), how="left")
     rank = by_device["rank"].fillna(np.inf).to_numpy(float)
@@ -438,14 +447,14 @@ def _retrieval_recall(
 
 
 def _is_near(a: Floats, b: Floats, limits: tuple[float, float]) -> NDArray[np.bool_]:
-    """Return whether cameras a and b, world_from_cam (..., 4, 4), stand and look alike; False for NaN."""
+    """Return whether cameras a and b, world_from_cam (..., 4, 4), are within (distance, degrees); False for NaN."""
     distance = np.linalg.norm(a[..., :3, 3] - b[..., :3, 3], axis=-1)
     cosine = np.sum(a[..., :3, 2] * b[..., :3, 2], axis=-1)
     return (distance <= limits[0]) & (cosine >= np.cos(np.radians(limits[1])))
 
 
 def _near_any(cameras: Floats, map_cameras: Floats, limits: tuple[float, float]) -> NDArray[np.bool_]:
-    """Return which of cameras, world_from_cam (N, 4, 4), have a map camera that stands and looks alike."""
+    """Return which of `cameras`, world_from_cam (N, 4, 4), have a near map camera (`_is_near`)."""
     from scipy.spatial import cKDTree
 
     map_cameras = map_cameras[is_posed(map_cameras)]
@@ -470,46 +479,46 @@ def overlap_table(
     pairs: Sequence[Sequence[str]] | None = None,
     poses_dir: str | Path | None = None,
 ) -> pd.DataFrame:
-    """Return for each pair the share of query images whose first reference overlaps with them in view, by true poses.
+    """Return for each pair the share of query images that overlap with their first reference, judged by true poses.
 
     A reference overlaps with a query image if at least `LEAST_OVERLAP` of the triangulated map points that it observes
-    lie in the image's view (`overlap_in_view`); where no map is triangulated yet, of points laid at 2, 4, 8 and 16 m
-    into the reference's view.
+    lie in the image's view (`overlap_in_view`). Without a triangulated map, points at 2, 4, 8 and 16 m in the
+    reference's view replace the map points.
 
     Args:
         sessions_root, map_dir, map_device, query_device, pairs: as for `evaluate_scene`.
         references: folders of references (`SCENE_map_<M>_query_<Q>.jsonl`) by the names of their columns.
-        poses_dir: folder of the poses, which name the maps that they were found with; None: any map of the device.
+        poses_dir: folder of the poses, which record the maps that were used; None: any map of the device.
 
     Returns:
-        One row a pair: map_device, query_device, state, images (with references and a true pose), points (`map` or
+        One row per pair: map_device, query_device, state, images (with references and a true pose), points (`map` or
         `view`), and for each name `<name>` (share) and `<name>_mean` (mean overlap).
     """
     capture = Capture.from_sessions_root(sessions_root)
     load = lru_cache(maxsize=1)(load_maps)
     rows = []
-    for map_ in capture.devices_with("map", map_device):
-        for query in capture.devices_with("query", query_device):
-            if references and (pairs is None or [map_, query] in map(list, pairs)):
-                name = pair_name(capture.name, map_, query)
-                poses = None if poses_dir is None else Path(poses_dir) / name
-                row: dict[str, Any] = {"map_device": map_, "query_device": query, "state": "evaluated"}
-                rows.append(row)
-                try:
-                    sessions = capture[f"{query}_query"], capture[f"{map_}_map"]
-                except CaptureError as error:
-                    row["state"] = f"{LEFT_OUT}{error}"
-                    continue
-                local_map = load(map_files(map_dir, f"{map_}_map", poses))
-                for column, folder in references.items():
-                    row |= _overlap(Path(folder) / f"{name}.jsonl", column, *sessions, local_map)
+    for map_, query in product(capture.devices_with("map", map_device), capture.devices_with("query", query_device)):
+        if not references or not (pairs is None or [map_, query] in map(list, pairs)):
+            continue
+        name = pair_name(capture.name, map_, query)
+        poses = None if poses_dir is None else Path(poses_dir) / name
+        row: dict[str, Any] = {"map_device": map_, "query_device": query, "state": "evaluated"}
+        rows.append(row)
+        try:
+            sessions = capture[f"{query}_query"], capture[f"{map_}_map"]
+        except CaptureError as error:
+            row["state"] = f"{LEFT_OUT}{error}"
+            continue
+        local_map = load(map_files(map_dir, f"{map_}_map", poses))
+        for column, folder in references.items():
+            row |= _overlap(Path(folder) / f"{name}.jsonl", column, *sessions, local_map)
     return _table(pd.DataFrame(rows), "images", "points")
 
 
 def _overlap(
     path: Path, name: str, session: Session, map_session: Session, local_map: "LocalMap | None"
 ) -> dict[str, Any]:
-    """Return what a file of references adds to a row of the overlap table."""
+    """Return the columns that a file of references adds to a row of the overlap table."""
     if session.ground_truth is None:
         return {"state": "no ground truth"}
     try:

@@ -1,7 +1,7 @@
-"""What the notebooks call, what can be read from them (parameters, folders, counts), and their execution.
+"""Functions that notebooks call, that read their parameters and results, and that execute them.
 
-`start` resolves a notebook's folders, so that each opens and runs alone on the demo capture; `finish` tells
-the pipeline what was done.
+`start` resolves a notebook's folders, so that each notebook runs alone on the demo capture. `finish` hands the counts
+to the pipeline.
 """
 
 import ast
@@ -45,9 +45,9 @@ log = logging.getLogger(__name__)
 
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
 Say = Callable[..., None]
-"""Takes the progress lines of a run; called like `print`."""
+"""Function that prints the progress lines of a run; called like `print`."""
 COUNTS_MIME = "application/vnd.visual-localization.counts+json"
-# What each stage is made from, besides the capture. A stage runs again when one of these has run again.
+# The stages whose results each stage reads, besides the capture. If one of them runs again, so does the stage.
 UPSTREAM: dict[str, tuple[str, ...]] = {
     "explore": (),
     "embed": (),
@@ -60,12 +60,12 @@ UPSTREAM: dict[str, tuple[str, ...]] = {
 }
 
 if TEXT_BARS in os.environ:
-    # Every stage takes its bar from tqdm.auto, and imports it after this module.
+    # Every stage imports its progress bar from tqdm.auto, after this module.
     tqdm.auto.tqdm = tqdm.std.tqdm
 
 
 class Folders:
-    """The resolved folders of a notebook, as attributes; shown as a table."""
+    """The resolved folders of a notebook, as attributes; displayed as a table."""
 
     def __init__(self, folders: dict[str, Path]) -> None:
         self._folders = folders
@@ -83,40 +83,38 @@ class Folders:
 
 
 def start(stage: str, sessions_root: str | None = None, **folders: str | None) -> Folders:
-    """Resolve the folders of a notebook. What is None is the demo's, made now if it is not there yet.
+    """Resolve the folders of a notebook; check its parameters.
 
     Args:
         stage: name of the stage, one of `toolkit.manifest.STAGES`.
-        sessions_root: folder `sessions` of a capture; None: the demo capture, rendered when absent.
+        sessions_root: folder `sessions` of a capture; None: the demo capture, rendered if absent.
         **folders: the notebook's other folders by the names of its parameters; None: below `runs/<scene>/` of
-            the repository. What an earlier stage should have left in such a folder is made when absent.
+            the repository. If such a default folder lacks the results of an earlier stage, that stage runs now.
 
     Raises:
-        ManifestError: papermill was given a parameter that the notebook does not have, or one is of a wrong type.
-        CaptureError: a device asked for has no such session.
+        ManifestError: a parameter is unknown to the notebook, or has a wrong type.
+        CaptureError: a device or list of queries in the parameters has no session in the capture.
     """
     if run_log := os.environ.get(LOG_VARIABLE):
         logging.captureWarnings(True)
         log_to(Path(run_log))
     check_given(stage)
     sessions, root = sessions_or_demo(sessions_root), _root()
-    _check_asked(stage, sessions)
+    _check_devices_and_queries(stage, sessions)
     scene = sessions.parent.name
     files = SceneFiles(root / "runs" / scene, scene)
     defaults = {**stage_folders(files), "out_dir": stage_outputs(files, stage)}
-    _make_upstream(
-        stage, sessions, files, {defaults[name] for name, given in folders.items() if given is None}
-    )
+    _make_upstream(stage, sessions, files, {defaults[name] for name, folder in folders.items() if folder is None})
     resolved = {"sessions_root": sessions}
-    for name, given in folders.items():
-        path = Path(given).expanduser().resolve() if given else defaults[name]
+    for name, folder in folders.items():
+        path = Path(folder).expanduser().resolve() if folder else defaults[name]
         if path is not None:
             resolved[name] = path
     return Folders(resolved)
 
 
 def sessions_or_demo(sessions_root: str | None) -> Path:
-    """Return a folder `sessions`; None: that of the demo capture, rendered when absent."""
+    """Return the folder as an absolute path; None: folder `sessions` of the demo capture, rendered if absent."""
     if sessions_root is not None:
         return Path(sessions_root).expanduser().resolve()
     from toolkit.synthetic import render_capture
@@ -125,11 +123,12 @@ def sessions_or_demo(sessions_root: str | None) -> Path:
 
 
 def own_folder(folder: str | None, scene: str, images: str | None = None) -> Path:
-    """Return a folder for a capture of one's own images, and for what is made of it.
+    """Return the folder for a capture made of the user's own images, and for its results.
 
     Args:
-        folder: that folder; None: `<images>-localized`, beside the folder of images.
-        scene: without images, the folder is `data/<scene>` of the repository.
+        folder: that folder; None: the default.
+        scene: without `images`, the default is `data/<scene>` of the repository.
+        images: folder of images; the default is `<images>-localized` beside it.
     """
     if folder is not None:
         return Path(folder).expanduser().resolve()
@@ -144,14 +143,14 @@ def _root() -> Path:
 
 
 def readable(table: "pd.DataFrame") -> "pd.DataFrame":
-    """Return a stage's table as it fits a page: a row `<query> in <map>`, medians and recall first, no folders.
+    """Return a stage's table in a form that fits a page: rows `<query> in <map>`, medians and recall first, no folders.
 
-    Columns are left out where they say nothing: a `reason` that no row has, `localized`, which is `ok` and
-    `low_confidence`, the state of pairs that are all evaluated. Names are short where their units tell as much.
+    Columns without information are dropped: a `reason` that is always empty, a `state` that is always `evaluated`, and
+    `localized`, the sum of `ok` and `low_confidence`. Column names are shortened where the unit implies the quantity.
     """
-    nothing = {"state": "evaluated", "reason": ""}
-    dull = [name for name, text in nothing.items() if name in table and (table[name] == text).all()]
-    shown = table.drop(columns=["path", "localized", *dull], errors="ignore")
+    trivial = {"state": "evaluated", "reason": ""}
+    dropped = [name for name, text in trivial.items() if name in table and (table[name] == text).all()]
+    shown = table.drop(columns=["path", "localized", *dropped], errors="ignore")
     if "map_device" in shown:
         shown.index = shown.pop("query_device") + " in " + shown.pop("map_device")
     for name in {"still", "recording"} & {*shown}:
@@ -169,11 +168,11 @@ def _short_column(name: str) -> str:
 
 
 def finish(table: "pd.DataFrame | None" = None, **counts: Any) -> None:
-    """Show what a notebook did and hand it to the pipeline, with the peak memory of this process.
+    """Display a notebook's counts and hand them to the pipeline, with the peak memory of this process.
 
     Args:
-        table: of the stage; its rows with a `reason` are what was left out.
-        **counts: what was done.
+        table: the stage's table; rows with a `reason` count as left out.
+        **counts: what the stage did, e.g. `images=120`.
     """
     import resource
 
@@ -196,33 +195,33 @@ def notebook_path(stage: str) -> Path:
     path = next(iter(sorted(NOTEBOOKS.glob(f"[0-9]*_{stage}.ipynb"))), None)
     if path is None:
         raise ManifestError(
-            f"{NOTEBOOKS}: no notebook of the stage {stage}. The pipeline runs from a clone of the repository: "
-            "install it there with `pip install --editable .`."
+            f"{NOTEBOOKS}: no notebook for the stage {stage}. The pipeline needs a clone of the repository: "
+            "install the toolkit there with `pip install --editable .`."
         )
     return path
 
 
 def notebook_parameters(path: Path) -> dict[str, Any]:
-    """Return names and defaults of the cell tagged `parameters`.
+    """Return names and defaults from the cell tagged `parameters`.
 
     Raises:
-        ManifestError: no such cell, or something else than plain literals in it.
+        ManifestError: there is no such cell, or it contains more than `name = literal` lines.
     """
-    # Read as JSON: importing nbformat, for the sake of its validation, takes seconds in each kernel.
+    # Read as JSON, because importing nbformat takes seconds in each kernel.
     for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
         if "parameters" in cell["metadata"].get("tags", []):
             try:
                 return _literals("".join(cell["source"]))
             except (SyntaxError, ValueError) as error:
-                raise ManifestError(f"{path}: parameters are `name = literal` lines only ({error}).") from None
+                raise ManifestError(f"{path}: parameters must be `name = literal` lines only ({error}).") from None
     raise ManifestError(f"{path}: no cell is tagged `parameters`.")
 
 
 def check_parameters(path: Path, parameters: Iterable[str], where: str = "") -> None:
-    """Refuse parameters that the notebook `path` does not have; papermill would only warn.
+    """Refuse parameters that the notebook `path` does not have; papermill would only warn. Messages begin with `where`.
 
     Raises:
-        ManifestError: naming the parameter and the nearest known one.
+        ManifestError: a parameter is unknown; the message names the nearest known one.
     """
     known = notebook_parameters(path)
     for name in parameters:
@@ -231,7 +230,7 @@ def check_parameters(path: Path, parameters: Iterable[str], where: str = "") -> 
 
 
 def stage_folders(files: SceneFiles) -> dict[str, Path]:
-    """Return where the stages meet, by the names of the notebooks' parameters."""
+    """Return the folders through which stages exchange results, by the names of the notebooks' parameters."""
     return {
         "map_feats_root": files.embeddings,
         "out_jsonl": files.retrieval_dir,
@@ -244,7 +243,7 @@ def stage_folders(files: SceneFiles) -> dict[str, Path]:
 
 
 def stage_outputs(files: SceneFiles, stage: str) -> Path | None:
-    """Return the folder of a stage's results; None for one that has only its notebook to show."""
+    """Return the folder of a stage's results; None if the stage writes only its executed notebook."""
     return {
         "embed": files.embeddings,
         "retrieve": files.retrieval_dir,
@@ -256,19 +255,19 @@ def stage_outputs(files: SceneFiles, stage: str) -> Path | None:
     }.get(stage)
 
 
-def _make_upstream(stage: str, sessions: Path, files: SceneFiles, wanted: set[Path | None]) -> None:
-    """Make what earlier stages should have left in the folders `wanted`, where they are empty or absent."""
+def _make_upstream(stage: str, sessions: Path, files: SceneFiles, folders: set[Path | None]) -> None:
+    """Run the earlier stages whose results `stage` needs and whose folder is in `folders` and empty or absent."""
     for name in UPSTREAM[stage]:
         folder = stage_outputs(files, name)
-        if folder is None or name in OPTIONAL or folder not in wanted or (folder.is_dir() and any(folder.iterdir())):
+        if folder is None or name in OPTIONAL or folder not in folders or (folder.is_dir() and any(folder.iterdir())):
             continue
         _make_upstream(name, sessions, files, {stage_outputs(files, earlier) for earlier in UPSTREAM[name]})
-        print(f"{name}: not there yet, made now in {folder}")
+        print(f"{name}: no results yet, running it now into {folder}")
         _run_stage(name, sessions, files)
 
 
 def _run_stage(stage: str, sessions: Path, files: SceneFiles) -> None:
-    """Run a stage that others build on, with its defaults."""
+    """Run `embed`, `retrieve` or `localize` with default settings."""
     if stage == "embed":
         from toolkit.embed import embed_sessions
 
@@ -284,34 +283,34 @@ def _run_stage(stage: str, sessions: Path, files: SceneFiles) -> None:
 
 
 def _user_names() -> dict[str, Any]:
-    """Return the variables of the running notebook; none outside of one."""
+    """Return the variables of the running notebook; {} outside a notebook."""
     ipython = sys.modules.get("IPython")
     shell = ipython.get_ipython() if ipython else None
     return shell.user_ns if shell else {}
 
 
-def check_given(name: str, **words: Iterable[str]) -> None:
-    """Refuse parameters of the running notebook that do not fit, and unknown ones that papermill has injected.
+def check_given(name: str, **choices: Iterable[str]) -> None:
+    """Refuse wrong parameter values in the running notebook, and unknown parameters that papermill has injected.
 
     Args:
-        name: of the notebook, `<number>_<name>.ipynb`.
-        **words: what a parameter may be, where that is one of some words.
+        name: name of the notebook, `<number>_<name>.ipynb`.
+        **choices: the valid words of a parameter, by its name.
 
     Raises:
-        ManifestError: naming the parameter, what was found and what was expected.
+        ManifestError: names the parameter, what was found and what was expected.
     """
     values = _user_names()
     for source in values.get("In", []):
         if source.startswith("# Parameters\n"):
             check_parameters(notebook_path(name), _literals(source))
     check_values(name, values)
-    for key, known in words.items():
+    for key, known in choices.items():
         if key in values and values[key] not in known:
             raise ManifestError(f"{key}: found {values[key]!r}. {nearest(values[key], known)}")
 
 
-def _check_asked(stage: str, sessions: Path) -> None:
-    """Refuse what the running notebook asks for and its capture does not have, before earlier stages are made."""
+def _check_devices_and_queries(stage: str, sessions: Path) -> None:
+    """Refuse parameters of the running notebook that name devices or query lists which the capture does not have."""
     from toolkit.capture import Capture
 
     values, known = _user_names(), notebook_parameters(notebook_path(stage))
@@ -334,16 +333,16 @@ def _check_asked(stage: str, sessions: Path) -> None:
 
 
 def check_names(settings: Settings) -> None:
-    """Refuse embedders, local features, matchers and indices that there are none of, which are texts in the settings.
+    """Refuse unknown names of embedders, local features, matchers and indices.
 
     Raises:
-        ManifestError: naming it, the nearest known one, and all.
+        ManifestError: names the unknown one, the nearest known one, and all known ones.
     """
     if isinstance(settings, EmbedSettings):
         from toolkit.embedders import resolve_name
 
         for name in settings.models:
-            if name != "auto":  # what that stands for is found out when it is needed
+            if name != "auto":  # resolved later, see `resolve_model`
                 resolve_name(name)
     elif isinstance(settings, LocalizeSettings | RerankSettings):
         from toolkit.features.matching import matchers_of
@@ -357,45 +356,45 @@ def check_names(settings: Settings) -> None:
 
 
 def check_values(name: str, values: Mapping[str, Any]) -> None:
-    """Refuse parameters of a wrong type or value, before any work.
+    """Refuse parameters of a wrong type or value.
 
     Args:
-        name: of the notebook, `<number>_<name>.ipynb`; a stage's have settings among them.
-        values: of the notebook's parameters, by their names; others are passed over.
+        name: name of the notebook, `<number>_<name>.ipynb`. Parameters of a stage's notebook include its settings.
+        values: values by name; names that are no parameters of the notebook are ignored.
 
     Raises:
-        ManifestError: naming the parameter, what was found and what was expected.
+        ManifestError: names the parameter, what was found and what was expected.
     """
     path = notebook_path(name)
-    given = {key: (default, values[key]) for key, default in notebook_parameters(path).items() if key in values}
+    parameters = {key: (default, values[key]) for key, default in notebook_parameters(path).items() if key in values}
     if name in STAGES:
         section = type(Manifest(name="x", captures=["x"]).stage(name))
-        settings = given.pop("settings", ({}, {}))[1]
-        named = {key: given.pop(key)[1] for key in list(given) if key in section.model_fields}
+        settings = parameters.pop("settings", ({}, {}))[1]
+        named = {key: parameters.pop(key)[1] for key in list(parameters) if key in section.model_fields}
         check_names(section.of(named, settings))
-    for key, (default, value) in given.items():
+    for key, (default, value) in parameters.items():
         if key == "pairs":
             pairs = value if isinstance(value, list | tuple) else [value]
             fits = value is None or all(isinstance(pair, list | tuple) and len(pair) == 2 for pair in pairs)
-            wanted = 'None or a list such as [["ios", "hl"]]'
+            expected = 'None or a list such as [["ios", "hl"]]'
         elif key == "runs":
             listed = isinstance(value, list | tuple) and all(isinstance(run, str | Path) for run in value)
             fits = value is None or listed
-            wanted = 'None or a list of run folders such as ["../runs/a", "../runs/b"]'
+            expected = 'None or a list of run folders such as ["../runs/a", "../runs/b"]'
         elif key == "inspect":
-            fits, wanted = isinstance(value, int | str), "the number of a query, or the name of an image of it"
+            fits, expected = isinstance(value, int | str), "the number of a query, or the name of one of its images"
         elif default is None:
-            fits, wanted = value is None or isinstance(value, str | Path), "None or the path of a folder, a text"
+            fits, expected = value is None or isinstance(value, str | Path), "None or the path of a folder as text"
         elif type(default) is int:
-            fits, wanted = type(value) is int and value >= 0, f"a whole number, 0 or more, such as {default}"
+            fits, expected = type(value) is int and value >= 0, f"a whole number, 0 or more, such as {default}"
         else:
-            fits, wanted = isinstance(value, type(default)), f"a {type(default).__name__} such as {default!r}"
+            fits, expected = isinstance(value, type(default)), f"a {type(default).__name__} such as {default!r}"
         if not fits:
-            raise ManifestError(f"{key}: found {value!r}, expected {wanted}. It is a parameter of {path.name}.")
+            raise ManifestError(f"{key}: found {value!r}, expected {expected}. It is a parameter of {path.name}.")
 
 
 def _literals(source: str) -> dict[str, Any]:
-    """Return the `name = literal` lines of a cell."""
+    """Return names and values of the `name = literal` lines of a cell; raise ValueError for any other line."""
     values = {}
     for node in ast.parse(source).body:
         target = node.targets[0] if isinstance(node, ast.Assign) and len(node.targets) == 1 else None
@@ -406,27 +405,27 @@ def _literals(source: str) -> dict[str, Any]:
 
 
 class StatusLine:
-    """The line of a running stage; on a terminal it ends in the stage's own progress bar, which it is fed."""
+    """The progress line of a running stage. On a terminal it repeats the progress bar of the kernel."""
 
     def __init__(self, head: str, say: Say) -> None:
         self.head, self.say = head, say
-        # Elsewhere, and for a caller with a `say` of its own, the line is written once.
+        # Not on a terminal, or with another `say`, the line is written only once.
         self.live = say is print and sys.stdout.isatty()
         say(f"{head} ...", end="", flush=True)
         log.info("%s ...", head)
 
     def write(self, text: str) -> None:
-        """Take what the kernel writes to stderr; the last line of it is shown."""
-        shown = [part for part in re.split(r"[\r\n]", text) if part.strip()]
-        if self.live and shown:
+        """Show the last line of what the kernel writes to stderr."""
+        lines = [line for line in re.split(r"[\r\n]", text) if line.strip()]
+        if self.live and lines:
             width = shutil.get_terminal_size().columns - 1
-            self.say(f"\r{f'{self.head} ... {shown[-1].strip()}'[:width]}\033[K", end="", flush=True)
+            self.say(f"\r{f'{self.head} ... {lines[-1].strip()}'[:width]}\033[K", end="", flush=True)
 
     def flush(self) -> None:
-        """Do nothing: every write is shown at once."""
+        """Do nothing: `write` shows its text at once."""
 
     def end(self, text: str) -> None:
-        """Replace the progress by what came of it."""
+        """Replace the progress by the stage's result."""
         self.say(f"\r{self.head}  {text}\033[K" if self.live else f"  {text}")
         log.info("%s  %s", self.head, text)
 
@@ -441,17 +440,16 @@ def execute(
     """Execute the notebook `path` in a fresh kernel and write the executed copy to `output`.
 
     Args:
-        path: the notebook.
-        output: where the executed copy goes, also of a notebook that failed.
-        parameters: replacing those of its parameters cell.
+        output: path of the executed copy, which is also written if a cell fails.
+        parameters: values that replace those of the parameters cell.
         progress: shows what the kernel writes to stderr.
-        kernels: gives the kernel; None: one is started for this notebook.
+        kernels: source of the kernel; None: start one for this notebook.
 
     Returns:
-        The executed notebook, and the highest memory (MB) of this process and the kernel's together.
+        The executed notebook, and the peak memory (MB) of this process and its descendants, the kernel included.
 
     Raises:
-        ManifestError: a parameter that the notebook does not have.
+        ManifestError: the notebook does not have one of the parameters.
         StageError: a cell failed, or the kernel died; `output` shows where.
     """
     check_parameters(path, parameters)
@@ -459,8 +457,8 @@ def execute(
         with Kernels(output.parent) as own:
             return execute(path, output, parameters, progress, own)
     output.parent.mkdir(parents=True, exist_ok=True)
-    memory, kernel = MemoryWatch(), kernels.take()  # it starts meanwhile
-    # papermill takes seconds to import, and a run that reuses everything does not need it.
+    memory, kernel = MemoryWatch(), kernels.take()
+    # Papermill takes seconds to import; the kernel starts meanwhile, and a run that reuses everything skips it.
     import papermill
     from jupyter_client.kernelspec import NoSuchKernel
     from nbclient.exceptions import DeadKernelError
@@ -468,7 +466,7 @@ def execute(
     from papermill.exceptions import PapermillExecutionError
 
     partial = output.with_name(f".{output.stem}.partial.ipynb")
-    answers = False
+    alive = False
     try:
         kernel.started.result()
         notebook = papermill.execute_notebook(
@@ -480,30 +478,30 @@ def execute(
             stderr_file=progress,
             km=kernel.manager,
         )
-        answers = True
+        alive = True
     except PapermillExecutionError as error:
-        answers = True
+        alive = True
         raise _cell_error(error, output) from None
     except (DeadKernelError, RuntimeError, NoSuchKernel) as error:
         raise kernel_error(error, kernel.ended_by, memory.stop(), output) from error
     except KeyboardInterrupt:
-        # Of the tasks that are left behind asyncio would print tracebacks.
+        # Otherwise asyncio prints tracebacks for the tasks that are left behind.
         logging.getLogger("asyncio").setLevel(logging.CRITICAL)
         raise
     finally:
-        kernels.end(kernel, by_force=not answers)
+        kernels.end(kernel, by_force=not alive)
         memory.stop()
         if partial.exists():
             try:
                 _tidy_streams(partial)
                 partial.replace(output)
-            except NotJSONError:  # cut short by what is being raised, as a full disk does
+            except NotJSONError:  # cut short by the error that is being raised, e.g. a full disk
                 partial.unlink()
     return notebook, memory.stop()
 
 
 def _cell_error(error: "PapermillExecutionError", output: Path) -> StageError:
-    """Return what to tell of a failing cell; its traceback goes to the log."""
+    """Return the error for a failing cell, and log its traceback."""
     trace = re.sub(r"\x1b\[[0-9;]*m", "", "\n".join(error.traceback))
     log.debug("The failing cell:\n%s", trace)
     where = f"\nThe executed notebook shows where: {output}"
@@ -516,15 +514,14 @@ def _cell_error(error: "PapermillExecutionError", output: Path) -> StageError:
 
 
 def _tidy_streams(path: Path) -> None:
-    """Join the pieces of each stream of an executed notebook; keep what a terminal would show in the end."""
+    """Join the pieces of each output stream of an executed notebook, and drop text that a carriage return overwrote."""
     import nbformat
 
     content = nbformat.read(path, as_version=4)
     for cell in content.cells:
         outputs: list[Any] = []
         for output in cell.get("outputs", []):
-            joins = output.output_type == "stream" and outputs and outputs[-1].get("name") == output.name
-            if joins:
+            if output.output_type == "stream" and outputs and outputs[-1].get("name") == output.name:
                 outputs[-1].text += output.text
             else:
                 outputs.append(output)
@@ -538,7 +535,7 @@ def _tidy_streams(path: Path) -> None:
 
 
 def work_seconds(notebook: Any) -> float:
-    """Return the seconds in cells after the one tagged `setup`, which imports and resolves."""
+    """Return the seconds spent in cells after the one tagged `setup`, which imports modules and resolves folders."""
     cells = list(notebook.cells)
     setup = [i for i, cell in enumerate(cells) if "setup" in cell.metadata.get("tags", [])]
     later = cells[setup[-1] + 1 :] if setup else cells
@@ -546,7 +543,7 @@ def work_seconds(notebook: Any) -> float:
 
 
 def handed_counts(notebook: Any) -> dict[str, Any]:
-    """Return what the notebook handed to `toolkit.notebook.finish`."""
+    """Return the counts that an executed notebook handed to `finish`; {} without a call."""
     for cell in reversed(notebook.cells):
         for output in cell.get("outputs", []):
             if COUNTS_MIME in output.get("data", {}):

@@ -1,8 +1,8 @@
-"""Run the notebooks of a manifest: in order, resumable, with a record of what was done (`run.json`).
+"""Run the notebooks of a manifest in order, resumable, with a record in `run.json`.
 
-Each notebook is one stage and is executed by papermill in a kernel of its own. A stage whose settings,
-inputs, code and outputs are those of its record under `RUN/SCENE/.stages/` is not executed again; one that is
-executed still reuses what it finds finished.
+Each notebook is one stage; papermill executes it in a kernel of its own. A stage is skipped (`reused`) if its settings,
+inputs, code and outputs match its record under `RUN/SCENE/.stages/`. A stage that does run still reuses the finished
+work that it finds.
 """
 
 import hashlib
@@ -74,19 +74,19 @@ from toolkit.runs.sweep import SweptRun, swept_runs, take_over
 log = logging.getLogger(__name__)
 
 MOST_WARNINGS = 5
-"""Of a stage, on the terminal; `run.log` has all of them."""
+"""Limit of warnings per stage on the terminal; `run.log` has all of them."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """One execution of one notebook."""
+    """One execution of one notebook, for one capture and perhaps only one device or pair of devices."""
 
     stage: str
     files: SceneFiles
     settings: Settings
     parameters: dict[str, Any]
     label: str = ""
-    """Which part of the stage, where it takes several executions; its outputs have it in their path."""
+    """Part of the stage, if the stage takes several executions; part of the paths of its outputs."""
 
     @property
     def name(self) -> str:
@@ -103,27 +103,27 @@ class Job:
 
     @property
     def pair(self) -> dict[str, str]:
-        """Map and query device of a job of one pair; empty for any other job."""
+        """Map and query device if the job is for one pair; else empty."""
         return {name: self.parameters[name] for name in ("map_device", "query_device") if self.label.startswith("map_")}
 
     def makes(self, name: str) -> bool:
-        """Tell whether a file of the stage's folder of results, by its path there, is one of the job's."""
+        """Return whether this job writes a file, given by its path in the stage's folder of results."""
         return self.label in name and (self.stage == "sequence") == of_sequence(name)
 
     def outputs(self) -> str:
-        """Return what identifies the files that the job has made."""
+        """Return a fingerprint of the files that the job has made."""
         folder = stage_outputs(self.files, self.stage)
-        found = tree_fingerprint(folder, self.makes, content=True) if folder else ""
+        results = tree_fingerprint(folder, self.makes, content=True) if folder else ""
         beside = {"retrieve": (self.files.index, "faiss"), "localize": (self.files.maps, "npz")}
         if self.stage not in beside:
-            return found
-        place, kind = beside[self.stage]
+            return results
+        folder, suffix = beside[self.stage]
         device = self.parameters.get("map_device", "all")
-        maps = sorted(place.glob(f"{'*' if device == 'all' else device}_map*.{kind}"))
-        return fingerprint([found, [[path.name, checksum(path)] for path in maps]])
+        maps = sorted(folder.glob(f"{'*' if device == 'all' else device}_map*.{suffix}"))
+        return fingerprint([results, [[path.name, checksum(path)] for path in maps]])
 
     def forget(self) -> None:
-        """Remove the records of what the outputs were made from, so that the stage reuses none of them."""
+        """Remove the fingerprints beside the outputs, so that the stage reuses none of them."""
         folder = stage_outputs(self.files, self.stage)
         if folder:
             for path in folder.rglob("*.meta.json"):
@@ -143,15 +143,15 @@ def run(
 
     Args:
         manifest_path: YAML file, see `toolkit.manifest`.
-        only: run this stage alone, on what earlier stages left.
-        force: execute stages that are up to date, and let them reuse nothing of their own.
-        overrides: `key=value` or `stage.key=value`, replacing what the manifest says.
-        say: takes the progress lines; called like `print`.
-        cluster: whose workers stages use, see `runs.cluster.open_cluster`.
+        only: run only this stage, on the results of earlier stages.
+        force: also execute stages that are up to date, without reuse of their own results.
+        overrides: `key=value` or `stage.key=value`, replace values of the manifest.
+        say: prints progress lines; called like `print`.
+        cluster: cluster whose workers the stages use, see `runs.cluster.open_cluster`.
 
     Raises:
-        ManifestError: before anything runs.
-        StageError: when a notebook fails; `run.json` then says `"status": "failed"`.
+        ManifestError: the manifest or an argument is wrong; nothing has run.
+        StageError: a notebook failed; `run.json` then says `"status": "failed"`.
     """
     if only is not None and only not in STAGES:
         raise ManifestError(f"--only {only}: no such stage. {nearest(only, STAGES)}")
@@ -170,39 +170,39 @@ def sweep(
     say: Say = print,
     **options: Any,
 ) -> tuple[list[Path], list[ToolkitError]]:
-    """Run a manifest with each of some values, in folders `<output_root>/<name>-<key>-<value>`.
+    """Run a manifest once per swept value, in folders `<output_root>/<name>-<key>-<value>`.
 
-    What does not depend on the keys in which two runs differ is taken over from the earlier one, even if that has
-    failed; the first takes it from the plain run of the manifest, if that is there. A capture to render is rendered
-    once, for all of them. A run that fails does not keep the others from running.
+    Each run takes over, from the earlier run with the most values in common, the results that the differing keys do not
+    change, even if that run failed. The first run takes them from the plain run of the manifest, if there is one. A
+    demo capture is rendered once for all runs. If a run fails, the next ones still run.
 
     Args:
-        sweeps: `key=a,b,c`, see `runs.sweep.swept_runs`; several keys are all their combinations.
-        overrides, say, options: as for `run`.
+        sweeps: `key=a,b,c` each, see `runs.sweep.swept_runs`; several keys give all combinations of their values.
+        manifest_path, overrides, say, options: as for `run`.
 
     Returns:
-        The run folders, and the errors that other runs have failed by.
+        The folders of the runs that succeeded, and the errors of the runs that failed.
 
     Raises:
-        ManifestError: before anything runs, also for a value that does not fit.
+        ManifestError: the manifest or a swept value is wrong; nothing has run.
     """
     plain = load_manifest(manifest_path, overrides)
     runs = swept_runs(plain.name, sweeps)
-    for one in runs:  # before hours of work
+    for one in runs:  # find mistakes before hours of work
         _check_stages(load_manifest(manifest_path, [*overrides, *one.overrides, f"name={one.name}"]), manifest_path)
     captures = _captures(plain)
     rendered = ["demo_data=null", f"captures={json.dumps(list(map(str, captures)))}"] if plain.demo_data else []
     root, done, failed = Path(plain.output_root), dict[SweptRun, Path](), dict[SweptRun, ToolkitError]()
     for number, one in enumerate(runs, 1):
         say(f"{one.name} ({number} of {len(runs)}): {', '.join(one.overrides)}")
-        # The run that differs in the fewest keys has most to give, a failed one what it came to.
-        like = max(
+        # The run that differs in the fewest keys has most results to share; among equals, prefer one that succeeded.
+        donor = max(
             [*done, *failed],
             key=lambda other: (len({*other.overrides} & {*one.overrides}), other in done),
             default=SweptRun(plain.name, ()),
         )
-        keys = [override.partition("=")[0] for override in one.overrides if override not in like.overrides]
-        take_over(root / like.name, root / one.name, [capture.name for capture in captures], keys)
+        keys = [override.partition("=")[0] for override in one.overrides if override not in donor.overrides]
+        take_over(root / donor.name, root / one.name, [capture.name for capture in captures], keys)
         try:
             settings = [*overrides, *rendered, *one.overrides, f"name={one.name}"]
             done[one] = run(manifest_path, overrides=settings, say=say, **options)
@@ -242,11 +242,11 @@ def _run(
 
 
 def _check_stages(manifest: Manifest, manifest_path: str | Path) -> None:
-    """Refuse what a stage or its notebook does not know, before hours of work, not after."""
+    """Raise ManifestError for settings that a stage or its notebook does not know."""
     for stage in STAGES:
         path, settings = notebook_path(stage), manifest.stage(stage)
-        given = settings_parameters(settings, notebook_parameters(path))
-        check_parameters(path, given, f"{manifest_path}: {stage}.")
+        parameters = settings_parameters(settings, notebook_parameters(path))
+        check_parameters(path, parameters, f"{manifest_path}: {stage}.")
         try:
             check_names(settings)
         except ManifestError as error:
@@ -263,7 +263,7 @@ def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: boo
     ]
     inputs = {capture.name: tree_fingerprint(capture / "sessions") for capture in captures}
     for job in jobs:
-        # Asked first: to tell whether a job is reusable, all files of its outputs are looked at.
+        # Weights first, because `_reusable` reads all output files of the job.
         if _weights_needed(job.stage, job.settings) and (
             force or not _reusable(job, _inputs_of(job, inputs[job.files.scene]))
         ):
@@ -280,7 +280,7 @@ def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: boo
                 except StageError as error:
                     if not error.of_the_data:
                         raise
-                    failed.append((job, error))  # other captures and pairs may do
+                    failed.append((job, error))  # other captures and pairs may succeed
         last = [row["status"] for row in record.rows if row["stage"] == stages[-1]]
         if failed and not {"done", "reused"} & set(last):
             raise failed[0][1]
@@ -289,7 +289,7 @@ def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: boo
     except BaseException as error:
         record.end(error)
         try:
-            # Also of a run that stopped: the page of an earlier one would say that all is well.
+            # Replace the report of an earlier run, which may say that all is well.
             _write_report(run_dir)
         except Exception as other:
             log.warning("The report of the stopped run could not be written: %s", sentence(other))
@@ -307,23 +307,23 @@ def _run_or_reuse(
     say: Say,
     kernels: Kernels,
 ) -> None:
-    """Execute a job, or say why not, and add its row to the record."""
-    wanted = _inputs_of(job, capture)
+    """Execute a job, reuse its results, or skip it, and add its row to the record."""
+    inputs = _inputs_of(job, capture)
     if cause := next((other for other, _ in failed if _builds_on(job, other)), None):
-        said = f"skipped: {cause.stage} has failed"
-        row = {"stage": job.stage, "scene": job.files.scene, "part": job.label, "status": "skipped", "error": said}
-    elif not force and (reusable := _reusable(job, wanted)):
-        row, said = reusable, "reused"
+        message = f"skipped: {cause.stage} has failed"
+        row = {"stage": job.stage, "scene": job.files.scene, "part": job.label, "status": "skipped", "error": message}
+    elif not force and (reusable := _reusable(job, inputs)):
+        row, message = reusable, "reused"
     else:
-        row, said = _run_job(job, wanted, force, head, record, say, kernels), ""
-    if said:
-        say(f"{head}  {said}")
-        log.info("%s  %s", head, said)
+        row, message = _run_job(job, inputs, force, head, record, say, kernels), ""
+    if message:
+        say(f"{head}  {message}")
+        log.info("%s  %s", head, message)
     record.add(row)
 
 
 def _builds_on(job: Job, other: Job) -> bool:
-    """Tell whether a job makes no sense where another one has failed."""
+    """Return whether a job needs the results of another job."""
     upstream = set(UPSTREAM[job.stage])
     for stage in reversed(STAGES):
         upstream |= set(UPSTREAM[stage]) if stage in upstream else set()
@@ -331,7 +331,7 @@ def _builds_on(job: Job, other: Job) -> bool:
 
 
 def _devices(manifest: Manifest, captures: list[Path]) -> list[str]:
-    """Return the devices that take part."""
+    """Return the devices of the captures that the manifest includes."""
     from toolkit.capture import Capture
 
     present = dict.fromkeys(device for capture in captures for device in Capture.open(capture).devices)
@@ -341,7 +341,7 @@ def _devices(manifest: Manifest, captures: list[Path]) -> list[str]:
 def _not_tolerated(
     manifest: Manifest, failed: list[tuple[Job, StageError]], record: RunLog, devices: list[str]
 ) -> str | None:
-    """Return what of a run that has ended failed beyond what its manifest tolerates; None: nothing."""
+    """Return a description of the failures that exceed the manifest's `tolerate_failed`; None if there are none."""
     lines = [f"{job.stage} {job.name}: {error}" for job, error in failed if not job.label]
     rows = record.all_rows()
     for kind, counts in failures(rows).items():
@@ -350,38 +350,40 @@ def _not_tolerated(
             lines.append(
                 f"{counts['failed']} of {counts['of']} {kind} failed; tolerate_failed.{kind} is {tolerated:g}."
             )
-    lost = [one | {"scene": row["scene"]} for row in rows for one in row.get("left_out", ())]
-    found: dict[str, list[str]] = {}
-    for one in lost:
-        found.setdefault(one["reason"], []).append(f"{one['what']} of {one['scene']}")
-    reasons = [f"{', '.join(dict.fromkeys(whats))}: {reason}" for reason, whats in found.items()]
     if not lines:
         return None
+    lost = [one | {"scene": row["scene"]} for row in rows for one in row.get("left_out", ())]
+    whats: dict[str, list[str]] = {}
+    for one in lost:
+        whats.setdefault(one["reason"], []).append(f"{one['what']} of {one['scene']}")
+    reasons = [f"{', '.join(dict.fromkeys(names))}: {reason}" for reason, names in whats.items()]
     pairs = [(one["map_device"], one["query_device"]) for one in lost if "map_device" in one]
-    ways = [way_out(pairs, devices)] if pairs else []
-    return "\n".join([*lines, *reasons, *ways])
+    advice = [way_out(pairs, devices)] if pairs else []
+    return "\n".join([*lines, *reasons, *advice])
 
 
 def tree_fingerprint(folder: Path, of: Callable[[str], bool] | None = None, content: bool = False) -> str:
-    """Return 16 hex digits for the files below a folder: their paths, sizes, and times of change or their content.
+    """Return a fingerprint, 16 hex digits, of the files below a folder; links are followed.
 
-    With `of`, for those whose paths it is true of. Damage leaves size and time as they are; to read the content takes
-    a second for some gigabytes that the system has in memory.
+    Args:
+        of: selects files by their path below the folder; None: all files.
+        content: hash the content of each file beside its path and size, instead of the time of its last change. This
+            also detects damage, and takes about a second for some gigabytes that are in the page cache.
     """
     rows = []
     for root, folders, names in os.walk(folder, followlinks=True):
         folders.sort()
-        place = os.path.relpath(root, folder)
+        parent = os.path.relpath(root, folder)
         for name in sorted(names):
-            if of is None or of(f"{place}/{name}"):
+            if of is None or of(f"{parent}/{name}"):
                 with suppress(FileNotFoundError):
                     stat = os.stat(file := f"{root}/{name}")  # noqa: PTH116 - a Path for each is 5 times slower
-                    rows.append([place, name, stat.st_size, checksum(file) if content else stat.st_mtime_ns])
+                    rows.append([parent, name, stat.st_size, checksum(file) if content else stat.st_mtime_ns])
     return fingerprint(rows)
 
 
 def _name_embedder(manifest: Manifest, say: Say) -> Manifest:
-    """Return the manifest with the embedder that `auto` stands for; refuses an unknown one."""
+    """Return the manifest with `embed.model: auto` replaced by an embedder's name; refuse an unknown name."""
     settings = manifest.embed
     name = resolve_model(settings.model, settings.checkpoint)
     if name != settings.model:
@@ -390,13 +392,13 @@ def _name_embedder(manifest: Manifest, say: Say) -> Manifest:
 
 
 def _require_weights(stage: str, settings: Settings) -> None:
-    """Find or download the weights that a stage needs, before hours of work and where its progress is seen."""
+    """Find or download the weights of a stage: before hours of work, and where the user sees the progress."""
     for source, checkpoint in _weights_needed(stage, settings):
         check_weights(source, resolve_weights(source, checkpoint))
 
 
 def _weights_needed(stage: str, settings: Settings) -> list[tuple[WeightsSource, str | None]]:
-    """Return the weights of each network that a stage runs with these settings, and the file given for them."""
+    """Return (weights, checkpoint from the settings) of each network that a stage runs with these settings."""
     if isinstance(settings, EmbedSettings):
         return [(EMBEDDER_WEIGHTS[name], settings.checkpoint) for name in settings.models if name in EMBEDDER_WEIGHTS]
     needed: list[tuple[WeightsSource, str | None]] = []
@@ -426,20 +428,20 @@ def _captures(manifest: Manifest) -> list[Path]:
 
 
 def _require_downloads(manifest: Manifest, manifest_path: str | Path) -> None:
-    """Refuse to run on captures that can be downloaded and are not there, or not yet whole."""
+    """Raise ManifestError if a capture has yet to be downloaded, or its download has not finished."""
     fetch = f"python -m toolkit download {manifest_path}"
     for capture in map(Path, manifest.captures):
         if is_unfinished(capture):
-            raise ManifestError(f"{capture}: its download has not ended. Go on with it first: {fetch}")
+            raise ManifestError(f"{capture}: its download is not complete. Continue it first: {fetch}")
         if manifest.dataset and capture.name in manifest.dataset.sources and not (capture / "sessions").is_dir():
             raise ManifestError(
                 f"{capture}: no such capture. Download it first: {fetch}\n"
-                "Or, where you have it already, name its folder in `captures`."
+                "If you already have it, name its folder in `captures`."
             )
 
 
 def _jobs(manifest: Manifest, stage: str, capture: Path, files: SceneFiles, force: bool) -> Iterator[Job]:
-    """Yield the executions that a stage takes: one, unless only some devices or pairs are asked for."""
+    """Yield the jobs of a stage: one, or several if the manifest selects only some devices or pairs."""
     values: dict[str, Any] = {
         **stage_folders(files),
         "sessions_root": capture / "sessions",
@@ -460,10 +462,10 @@ def _jobs(manifest: Manifest, stage: str, capture: Path, files: SceneFiles, forc
 
 
 def settings_parameters(settings: Settings, known: Iterable[str]) -> dict[str, Any]:
-    """Return settings as a notebook takes them: those that its parameters cell names, and a dict of the rest.
+    """Return settings as notebook parameters: one per name in its parameters cell, and a dict `settings` of the rest.
 
     Args:
-        settings: only what was said in them counts.
+        settings: only values that were set count, not defaults.
         known: names of the notebook's parameters.
     """
     named: dict[str, Any] = {}
@@ -482,7 +484,7 @@ def settings_parameters(settings: Settings, known: Iterable[str]) -> dict[str, A
 
 
 def _parts(manifest: Manifest, stage: str, capture: Path) -> list[tuple[str, dict[str, Any]]]:
-    """Return label and choice of devices for each execution of a stage."""
+    """Return (label, parameters that select devices) for each job of a stage."""
     from toolkit.capture import Capture
 
     present = Capture.open(capture).devices
@@ -493,8 +495,8 @@ def _parts(manifest: Manifest, stage: str, capture: Path) -> list[tuple[str, dic
         pairs = [(m, q) for m, q in wanted if m in devices and q in devices]
     if not pairs:
         raise ManifestError(
-            f"{capture}: none of the devices or pairs that the manifest asks for is in this capture, "
-            f"which has {', '.join(present) or 'none'}."
+            f"{capture}: none of the devices or pairs of the manifest is in this capture. "
+            f"Its devices: {', '.join(present) or 'none'}."
         )
     if len(pairs) == len(present) ** 2:
         return [("", {"device": "auto", "map_device": "all", "query_device": "all"})]
@@ -506,8 +508,8 @@ def _parts(manifest: Manifest, stage: str, capture: Path) -> list[tuple[str, dic
 
 
 def _inputs_of(job: Job, capture: str) -> str:
-    """Return what identifies the inputs of a job: parameters, capture, code, and the runs it builds on."""
-    # Reusing or not gives the same results.
+    """Return a fingerprint of a job's inputs: parameters, capture, code, weights, and the stages it builds on."""
+    # `skip_existing` does not change the results.
     parameters = {name: value for name, value in job.parameters.items() if name != "skip_existing"}
     source = hashlib.sha256(notebook_path(job.stage).read_bytes()).hexdigest()
     upstream = [
@@ -519,7 +521,7 @@ def _inputs_of(job: Job, capture: str) -> str:
 
 
 def _files_of(job: Job) -> str | None:
-    """Return what identifies the files of weights and of rough poses that a job reads, None if there are none yet."""
+    """Return a fingerprint of the weights and rough poses that a job reads; None if there are no such files yet."""
     needed = _weights_needed(job.stage, job.settings)
     paths = [path for source, checkpoint in needed if (path := find_weights(source, checkpoint))]
     if isinstance(job.settings, RetrieveSettings) and job.settings.mask.poses:
@@ -529,29 +531,29 @@ def _files_of(job: Job) -> str | None:
 
 @cache
 def _code_fingerprint() -> str:
-    """Return what identifies the toolkit's code; a version number would not tell one commit from the next."""
+    """Return a fingerprint of the toolkit's code, because the version is the same for many commits."""
     sources = sorted(Path(__file__).parent.rglob("*.py"))
     return fingerprint([hashlib.sha256(path.read_bytes()).hexdigest() for path in sources])
 
 
-def _reusable(job: Job, wanted: str) -> dict[str, Any] | None:
-    """Return the row of the execution that made what is there, if it would be the same now."""
+def _reusable(job: Job, inputs: str) -> dict[str, Any] | None:
+    """Return the row of an earlier execution if its inputs, outputs and notebook are still the same; else None."""
     record = read_json(job.record)
-    if record.get("inputs") != wanted or record.get("outputs") != job.outputs() or not read_json(job.notebook):
+    if record.get("inputs") != inputs or record.get("outputs") != job.outputs() or not read_json(job.notebook):
         return None
-    # What was left out is tried again: what mends it, such as a permission, does not always show in a fingerprint.
+    # Left-out pairs are tried again: a repair, such as a changed permission, may not show in a fingerprint.
     return None if record["row"].get("left_out") else {**record["row"], "status": "reused"}
 
 
 def _run_job(
-    job: Job, wanted: str, force: bool, head: str, record: RunLog, say: Say, kernels: Kernels
+    job: Job, inputs: str, force: bool, head: str, record: RunLog, say: Say, kernels: Kernels
 ) -> dict[str, Any]:
     """Execute a job and return its row of `run.json`."""
     line = StatusLine(head, say)
     row: dict[str, Any] = {"stage": job.stage, "scene": job.files.scene, "part": job.label}
     row |= {"notebook": str(job.notebook.relative_to(job.files.run)), "parameters": job.parameters}
     row |= {"asked": 1} if job.pair else {}
-    # No record while the stage runs: what it was killed in, it runs again.
+    # There is no record while the stage runs, so a killed stage runs again.
     job.record.unlink(missing_ok=True)
     if force:
         job.forget()
@@ -564,7 +566,7 @@ def _run_job(
         row |= {"status": status, "seconds": round(time.perf_counter() - started, 2), "error": sentence(error)}
         if job.pair:
             row["left_out"] = [job.pair | {"what": pair_text(job.pair), "reason": sentence(error)}]
-        with suppress(OSError):  # the disk may be what is wrong
+        with suppress(OSError):  # the disk itself may be the cause
             record.add(row)
         raise
     seconds = time.perf_counter() - started
@@ -575,16 +577,16 @@ def _run_job(
     row |= {"status": "done", "seconds": round(seconds, 2), "startup_seconds": round(seconds - work, 2)}
     row |= {"work_seconds": round(work, 2), "peak_memory_mb": round(memory), "counts": counts}
     folder = stage_outputs(job.files, job.stage)
-    # What is to be tried again is not recorded as done.
+    # With unfinished outputs, an empty fingerprint makes the next run execute the stage again.
     outputs = "" if folder and any_unfinished(folder, job.label) else job.outputs()
-    made = {"made": datetime.now(UTC).isoformat(), "inputs": wanted, "outputs": outputs, "row": row}
+    made = {"made": datetime.now(UTC).isoformat(), "inputs": inputs, "outputs": outputs, "row": row}
     write_text(job.record, json.dumps(made, indent=1) + "\n")
     summary = ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in counts.items())
     line.end(f"{summary}{summary and '; '}{work:.1f} s + {seconds - work:.1f} s start-up, {memory:.0f} MB")
     for one in row.get("left_out", ()):
         say(f"  left out: {one['what']}: {one['reason']}")
-    warnings = [one for one in warnings_of_kernels(job.files.run / LOG, logged) if one not in record.told]
-    record.told.update(warnings)
+    warnings = [one for one in warnings_of_kernels(job.files.run / LOG, logged) if one not in record.shown]
+    record.shown.update(warnings)
     for one in warnings[:MOST_WARNINGS]:
         say(f"  warning: {one}")
     if len(warnings) > MOST_WARNINGS:

@@ -1,8 +1,9 @@
-"""The visualize stage: recordings and still pictures of a scene, from the files that other stages left."""
+"""The visualize stage: recordings and still pictures of a scene, from the files of earlier stages."""
 
 import time
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +26,9 @@ from toolkit.show.sequences import SequencePair, draw_sequence
 from toolkit.show.stills import WorstQuery, draw_localization, draw_scene, draw_worst
 
 WORST = 10
-"""Queries of the sheet of the worst, over all pairs."""
+"""Queries on the sheet of the worst queries of all pairs."""
 MAX_FRAMES = 1000
-"""Images of a session's recording at most, unless `every` says otherwise."""
+"""Images of a session's recording, at most, unless the setting `every` is given."""
 
 
 def visualize_scene(
@@ -43,48 +44,46 @@ def visualize_scene(
 ) -> pd.DataFrame:
     """Draw every pair of a scene, and record every pair and session for the rerun viewer.
 
-    Writes `<pair>.png`, the map from above; `<pair>_sequence.png`, the recordings of its queries, where there are
-    poses of sequences; `localization_<pair>_<k>.png`, a query beside its references;
-    `worst_<scene>.png`, the worst queries of all pairs; `<pair>.rrd`, the queries of a pair in their map; and
-    `<scene>_<session>.rrd`, what a session holds.
+    Writes `<pair>.png`, the map from above; `<pair>_sequence.png`, the query recordings, if there are poses of
+    sequences; `localization_<pair>_<k>.png`, a query beside its references; `worst_<scene>.png`, the worst queries of
+    all pairs; `<pair>.rrd`, the queries of a pair in their map; and `<scene>_<session>.rrd`, the recording of a
+    session.
 
     Args:
         sessions_root: folder `sessions` of the capture.
-        poses_dir: folder of the poses, `<pair>.txt`, `<pair>.csv`, and `<pair>.h5` with what the poses rest on.
+        poses_dir: folder of the poses: `<pair>.txt`, `<pair>.csv`, and `<pair>.h5` with the correspondences.
         map_dir: folder of the triangulated maps; a device without one is drawn without points.
-        out_dir: where pictures and recordings go.
-        settings: see `VisualizeSettings`; a dict holds what differs from the defaults. A query session without ground
-            truth shows its cameras where they were localized.
+        out_dir: output folder.
+        settings: see `VisualizeSettings`; a dict holds the settings that differ from the defaults. A query session
+            without ground truth shows its cameras at their estimated poses.
         map_device: `all` or one device key; likewise `query_device`.
         pairs: only these [map device, query device]; None: all.
 
     Returns:
-        One row a pair: map_device, query_device, queries, localized, seconds, still, recording, reason. A pair
+        One row per pair: map_device, query_device, queries, localized, seconds, still, recording, reason. A pair
         that cannot be drawn has zeros and the `reason`.
 
     Raises:
-        ArtifactError: there are no poses at all.
+        ArtifactError: there are no poses of the pairs.
     """
     settings = VisualizeSettings.of(settings)
     capture, out = Capture.from_sessions_root(sessions_root), Path(out_dir)
-    maps = capture.devices_with("map", map_device)
-    asked = [(m, q) for m in maps for q in capture.devices_with("query", query_device)]
-    asked = [
+    chosen = [
         (m, q)
-        for m, q in asked
+        for m, q in product(capture.devices_with("map", map_device), capture.devices_with("query", query_device))
         if (pairs is None or [m, q] in map(list, pairs))
         and (_poses(capture, poses_dir, m, q).is_file() or left_out(poses_dir, pair_name(capture.name, m, q)))
     ]
-    if not asked:
-        raise ArtifactError(f"{poses_dir}: no poses of {capture.name} for the devices asked for. Localize them first.")
+    if not chosen:
+        raise ArtifactError(f"{poses_dir}: no poses of {capture.name} for the chosen devices. Localize them first.")
     table, worst = PairRows(capture.name, out, Path(poses_dir)), []
-    for m, q in tqdm(asked, desc="visualize", unit="pair"):
+    for m, q in tqdm(chosen, desc="visualize", unit="pair"):
         with table.row(m, q) as row:
             table.check_upstream()
             started = time.perf_counter()
             pair = LocalizedPair.open(capture, m, q, poses_dir, map_dir)
-            found = SequencePair.find(poses_dir, capture.name, m, q)
-            worst.append(_draw_pair(capture, pair, found, out, settings))
+            sequences = SequencePair.find(poses_dir, capture.name, m, q)
+            worst.append(_draw_pair(capture, pair, sequences, out, settings))
             row |= {
                 "queries": len(pair.table),
                 "localized": int(is_posed(pair.world_from_rig).sum()),
@@ -105,10 +104,10 @@ def visualize_scene(
         for device, split in sides:
             session, poses = capture[f"{device}_{split}"], None
             if split == "query" and session.ground_truth is None:
-                # The pose in the device's own map is the nearest to a truth that there is.
+                # Without ground truth, poses in the device's own map are the most accurate ones.
                 localized_in = [m for m, q in present if q == device]
-                nearest = device if device in localized_in else localized_in[0]
-                poses = _poses(capture, poses_dir, nearest, device)
+                map_ = device if device in localized_in else localized_in[0]
+                poses = _poses(capture, poses_dir, map_, device)
             record_session(
                 *(capture.path, split, device),
                 keyframes_only=settings.keyframes_only and split == "query",
@@ -126,10 +125,10 @@ def visualize_scene(
 def _draw_pair(
     capture: Capture, pair: LocalizedPair, sequences: SequencePair | None, out: Path, settings: VisualizeSettings
 ) -> pd.DataFrame:
-    """Draw and record a pair; return its worst queries, rows of `Localizations.ranked` with their details."""
+    """Draw and record a pair; return its worst queries as rows of `Localizations.ranked` with their details."""
     m, q = pair.map_session.device, pair.query_session.device
     shown, cloud, map_poses = pair.localizations, sure_points(pair.local_map), pair.map_session.world_from_cam()
-    details_of = lru_cache(2 * WORST)(pair.details)  # the worst are drawn and recorded
+    details_of = lru_cache(2 * WORST)(pair.details)  # the worst queries are needed for the sheet and the recording
     figure = draw_scene(
         *(*cloud, map_poses, shown.estimated, shown.true),
         up=settings.world_up,
@@ -141,24 +140,27 @@ def _draw_pair(
     save_figure(figure, out / f"{pair.name}.png", figure.get_suptitle())
     order = shown.worst_first().tolist()
     chosen = np.unique(np.linspace(0, len(order) - 1, min(settings.samples, len(order))).round().astype(int))
-    for number, k in enumerate((order[place] for place in chosen), start=1):
+    for number, k in enumerate((order[rank] for rank in chosen), start=1):
         title = f"{q} query in the {m} map: {pair.table['status'].iloc[k]}"
         figure = draw_localization(details_of(k), title, pair.unit)
         save_figure(figure, out / f"localization_{pair.name}_{number}.png", figure.get_suptitle())
-    ways: dict[str, list[Floats]] = {}
+    tracks: dict[str, list[Floats]] = {}
     if sequences is None:
         (out / f"{pair.name}_sequence.png").unlink(missing_ok=True)
     else:
         figure = draw_sequence(capture, sequences, m, q, settings.world_up, pair.unit)
         save_figure(figure, out / f"{pair.name}_sequence.png")
-        ways = {"odometry": sequences.laid_odometry(pair.query_session), "frames": sequences.ways()}
+        tracks = {"odometry": sequences.odometry_tracks(pair.query_session), "frames": sequences.tracks()}
     if settings.recordings:
         details = ((k, details_of(k)) for k in sorted(order[: settings.matched_queries]))
-        recording = out / f"{pair.name}.rrd"
-        record_localizations(recording, pair.name, map_poses, *cloud, shown, details, up=settings.world_up, ways=ways)
-    candidates = order[:WORST]
-    rows = shown.ranked.iloc[candidates]
-    rows = rows.assign(unit=pair.unit[0], pair=f"{q} in the {m} map", details=[details_of(k) for k in candidates])
+        record_localizations(
+            *(out / f"{pair.name}.rrd", pair.name, map_poses, *cloud, shown, details),
+            up=settings.world_up,
+            tracks=tracks,
+        )
+    worst = order[:WORST]
+    rows = shown.ranked.iloc[worst]
+    rows = rows.assign(unit=pair.unit[0], pair=f"{q} in the {m} map", details=[details_of(k) for k in worst])
     pair.queries.close()
     return rows
 
@@ -168,15 +170,15 @@ def _poses(capture: Capture, poses_dir: str | Path, map_device: str, query_devic
 
 
 def _draw_worst(path: Path, scene: str, candidates: pd.DataFrame) -> None:
-    """Draw the worst queries of all pairs; the candidates are rows of `Localizations.ranked`."""
+    """Draw the worst queries of all pairs; `candidates` are the rows of `_draw_pair`."""
     shown = []
     for _, row in candidates.iloc[worst_first(candidates)[:WORST]].iterrows():
-        about = [row["status"]]
+        reason = [row["status"]]
         if row["details"].has_matches and pd.notna(row.get("num_matches")):
-            about.append(f"{row['num_matches']:.0f} matches")
+            reason.append(f"{row['num_matches']:.0f} matches")
         if row["details"].has_matches or row.get("num_inliers", 0) > 0:
-            about.append(support_of(row))
+            reason.append(support_of(row))
         errors = row["rotation_error_deg"], row["translation_error_m"]
-        shown.append(WorstQuery(row["pair"], ", ".join(about), row["details"], *errors, row["unit"]))
+        shown.append(WorstQuery(row["pair"], ", ".join(reason), row["details"], *errors, row["unit"]))
     title = f"{scene}: the {len(shown)} worst queries of all pairs"
     save_figure(draw_worst(shown, title), path, title)

@@ -42,7 +42,7 @@ def test_report_answers_in_the_first_screen(browser: "Browser", finished_run: Pa
     context = browser.new_context(viewport={"width": DESK[0], "height": DESK[1]}, java_script_enabled=False)
     page = context.new_page()
     page.goto((finished_run / "report.html").as_uri())
-    for text in ("small", "done", "mean recall at 1°", "Recall at 1°", "queries asked in 9 pairs", "good reference"):
+    for text in ("small", "done", "mean recall at 1°", "Recall at 1°", "queries in 9 pairs", "good reference"):
         box = page.get_by_text(text).first.bounding_box()
         assert box is not None, text
         assert box["y"] + box["height"] <= DESK[1], text

@@ -10,7 +10,7 @@ from tests.localizers.drifting import Drive, drive
 from toolkit import geometry
 from toolkit.localizers.base import PoseEstimate, RoughPose
 from toolkit.localizers.odometry import PosedQueries
-from toolkit.localizers.recording import STEPS, localize_piece, with_answers
+from toolkit.localizers.recording import STEPS, localize_piece, with_relocalized
 from toolkit.manifest import SequenceSettings
 
 pytest.importorskip("gtsam")
@@ -53,7 +53,7 @@ def test_what_failed_or_contradicts_is_asked_again_and_then_counts() -> None:
 
 def test_what_is_found_again_has_no_vote_of_its_own() -> None:
     way = drive(np.random.default_rng(1))
-    every = with_answers(way.queries, {1: answer(way, 1)})
+    every = with_relocalized(way.queries, {1: answer(way, 1)})
     assert every.frames.tolist() == sorted([*way.queries.frames, 1])
     assert every.weights[every.frames == 1].tolist() == [0.0]
     assert not every.trusted[every.frames == 1].any()
@@ -62,16 +62,16 @@ def test_what_is_found_again_has_no_vote_of_its_own() -> None:
 def test_a_pose_that_agrees_replaces_the_first_and_another_stands_beside_it() -> None:
     way = drive(np.random.default_rng(2))
     frame = int(way.queries.frames[3])
-    same = with_answers(way.queries, {frame: answer(way, frame)})
+    same = with_relocalized(way.queries, {frame: answer(way, frame)})
     assert len(same) == len(way.queries)
     np.testing.assert_array_equal(same.world_from_rig[3], way.world_from_rig[frame])
     np.testing.assert_array_equal(same.covariances[3], SURE)
     assert same.weights.tolist() == way.queries.weights.tolist()
     far = replace(answer(way, frame), world_from_rig=geometry.make_pose(np.eye(3), [500.0, 0.0, 0.0]))
-    both = with_answers(way.queries, {frame: far})
+    both = with_relocalized(way.queries, {frame: far})
     assert (both.frames == frame).sum() == 2
     for nothing in (PoseEstimate("failed: too few matches"), PoseEstimate("low_confidence", np.eye(4))):
-        assert len(with_answers(way.queries, {1: nothing})) == len(way.queries)
+        assert len(with_relocalized(way.queries, {1: nothing})) == len(way.queries)
 
 
 def test_an_answer_that_contradicts_the_others_changes_nothing() -> None:

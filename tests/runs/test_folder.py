@@ -25,9 +25,9 @@ def dead() -> int:
 
 
 def test_a_second_run_is_told_who_works_in_the_folder(tmp_path: Path) -> None:
-    with held(tmp_path), pytest.raises(ToolkitError, match=rf"{os.getpid()} on {socket.gethostname()}, since 20"):
-        with held(tmp_path):
-            pass
+    message = rf"{os.getpid()} on {socket.gethostname()}, since 20"
+    with held(tmp_path), pytest.raises(ToolkitError, match=message), held(tmp_path):
+        pass
     with held(tmp_path):
         pass
     assert [path.name for path in tmp_path.iterdir()] == [LOG]

@@ -45,7 +45,7 @@ def test_keys_of_one_last_part_are_told_apart() -> None:
         (["=1,2"], "expected key=value,value"),
         (["retrieve.topk=[1"], "expected key=value,value"),
         (["retrieve.topk=1", "retrieve.topk=2"], "twice"),
-        (["embed.model=[a b],a b"], "one folder"),
+        (["embed.model=[a b],a b"], "the same folder name"),
         ([f"seed={','.join(map(str, range(101)))}"], "found 101 runs"),
     ],
 )
@@ -56,7 +56,8 @@ def test_what_is_no_sweep_is_refused(sweeps: list[str], said: str) -> None:
 
 def test_a_run_takes_over_what_is_made_before_the_swept_stage(tmp_path: Path) -> None:
     donor = SceneFiles(tmp_path / "a", "P")
-    for folder in (donor.embeddings, donor.retrieval_dir, donor.features, donor.maps, donor.poses_dir, donor.evaluation):
+    made_before = donor.embeddings, donor.retrieval_dir, donor.features, donor.maps
+    for folder in (*made_before, donor.poses_dir, donor.evaluation):
         folder.mkdir(parents=True)
         (folder / "made.txt").write_text("a")
         (folder / "made.h5").write_text("a")

@@ -175,7 +175,7 @@ def test_other_queries_are_left_out_and_counted(two: list[Path], tmp_path: Path)
     comparison = compare_runs([two[0], fewer])
     assert len(comparison.queries) == 3
     assert any("a 10, c 3" in text and "the 3 in common" in text for text in comparison.messages)
-    assert any("PLACE: its files are not the same" in text for text in comparison.messages)
+    assert any("PLACE: its files were changed" in text for text in comparison.messages)
     assert rows_of(comparison, LIMITS[0])["recall"].item() == 1
 
 
@@ -197,7 +197,7 @@ def test_the_page_is_one_file_and_says_why_there_is_no_picture(two: list[Path]) 
     two_times = compare_runs(two)
     page = write_comparison(two_times).read_text()
     assert not re.search(r'(src|href)="(?!data:|#)', page), "it needs nothing else"
-    assert "the capture PLACE is not where the run had it" in page
+    assert "the capture PLACE is no longer where the run read it" in page
     assert "localize.pnp.min_inliers" in page
     assert "+10 [" in page
 
@@ -236,7 +236,7 @@ def damage(kind: str, run: Path) -> None:
     ("kind", "said"),
     [
         ("no run", r"No run at .*b: run\.json is missing"),
-        ("torn record", r"run\.json is not whole JSON"),
+        ("torn record", r"run\.json is not valid JSON"),
         ("odd record", r"run\.json: 'stages' is not as a run writes it"),
         ("not evaluated", r"b: not evaluated .*errors\.csv is missing.*python -m toolkit run"),
         ("torn table", r"errors\.csv.*Run the stage"),

@@ -87,7 +87,7 @@ def test_it_shows_what_the_stage_stored(files: SceneFiles, pair: InspectedPair) 
     shown = text_of(one.figure)
     assert one.status in shown
     assert f"\n{one.name.partition('/raw_data/')[2]}\n" in shown
-    assert "true error of position [m]\n0\n" not in shown
+    assert "true position error [m]\n0\n" not in shown
     assert "0.000\n" not in shown
     assert f"{row['num_inliers']}" in shown
     assert picture_of(one).width > 800
@@ -104,7 +104,7 @@ def test_unchanged_settings_give_the_same_pose_and_others_are_shown_beside(pair:
     assert (same.after.rivals, one.rivals) == ((), ())
     strict = one.again({"pnp": {"min_inliers": 5000}})
     assert strict.after.status.startswith("failed: too few inliers")
-    assert "at least 5000 are asked for" in strict.after.reason
+    assert "at least 5000 are required" in strict.after.reason
     assert strict.before is one
     assert strict.table.loc["status"].tolist() == [one.status, strict.after.status]
     assert picture_of(strict).width > 800
@@ -113,8 +113,8 @@ def test_unchanged_settings_give_the_same_pose_and_others_are_shown_beside(pair:
     first = one.references[one.references["rank"] == 1]  # one of each camera of the rig
     assert nearest.after.localized.references == [first["name"][first["score"].idxmax()]]
     alone = text_of(nearest.after.figure)
-    assert "true error of position" in alone
-    assert not any(text in alone for text in ("inliers", "matches by descriptors", "image covered")), "it has none"
+    assert "true position error" in alone
+    assert not any(text in alone for text in ("inliers", "descriptor matches", "image covered")), "it has none"
     with pytest.raises(ManifestError, match=r"max_keypoints|features: found other settings"):
         one.again({"features": {"max_keypoints": 500}})
     with pytest.raises(ManifestError, match="min_inliers"):
@@ -142,9 +142,7 @@ def test_a_failed_query_says_why_and_is_drawn(small_capture: Path, tmp_path: Pat
     one = pair.look(0)
     assert one.pose is None
     assert one.error is None
-    assert one.reason == (
-        "No pose: too few inliers (4 within 0.45 deg) of 9 matches agree on the best one, at least 12 are asked for."
-    )
+    assert one.reason == "No pose: too few inliers (4 within 0.45 deg) among 9 matches; at least 12 are required."
     assert "no pose" in text_of(one.figure)
     assert picture_of(one).width > 800
     assert pair.look(1).reason == "No pose: the retrieval has no references for this query."
@@ -204,7 +202,7 @@ def test_names_and_numbers_that_are_none_are_refused(files: SceneFiles, pair: In
         pair.look(len(pair))
     with pytest.raises(ArtifactError, match=r"expected a number or the name of an image"):
         pair.look(1.5)  # type: ignore[arg-type]
-    with pytest.raises(ArtifactError, match="2 queries have an image whose name ends in"):
+    with pytest.raises(ArtifactError, match="2 queries have an image name that ends in"):
         find_query("b.jpg", {"x/b.jpg": 0, "y/b.jpg": 1, "y/ab.jpg": 2}, 3)
     with pytest.raises(ArtifactError, match=r"no correspondences of queries of 'spt'.*Did you mean .*spot"):
         inspect_query(files.run, files.scene, "ios", "spt", 0)
@@ -224,10 +222,10 @@ def test_a_run_without_correspondences_says_so(files: SceneFiles, tmp_path: Path
 def test_an_estimate_in_doubt_says_why() -> None:
     numbers = {"num_inliers": 20, "num_matches": 80, "inlier_ratio": 0.25, "coverage": 0.2, "p_correct": 0.7}
     words = reason_in_words("low_confidence", "", numbers | {"rival_support": 0.93}, LocalizeSettings())
-    assert "probability of 70% only, ok asks for 99%" in words
-    assert "Another pose has 93% of its support, ok allows 80%" in words
+    assert "probability of 70%; ok requires 99%" in words
+    assert "Another pose has 93% of its support; ok allows 80%" in words
     nearest = reason_in_words("low_confidence", "", {}, LocalizeSettings.of({"method": "nearest"}))
-    assert nearest == "This is the pose of the best reference as it stands, which is never called ok."
+    assert nearest == "This is the unchanged pose of the best reference, which is never called ok."
     fits = "the focal length that fits is 500 px"
     camera = reason_in_words("low_confidence: camera?", fits, numbers, LocalizeSettings())
     assert camera.endswith("The focal length that fits is 500 px.")

@@ -112,7 +112,7 @@ def test_a_network_shows_consistent_and_rejected_references_and_claims_no_matche
     assert [image.name for image in details.references] == images[:2]
     assert [image.name for image in details.rejected] == images[2:]
     figure = draw_localization(details)
-    assert figure.axes[0].get_title() == "query: no matches, the pose rests on the references"
+    assert figure.axes[0].get_title() == "query: no matches, the pose comes from the references"
     captions = [axis.get_title() for axis in figure.axes[1:]]
     assert captions == ["reference 1", "reference 2", *["rejected: contradicts the others"] * 2]
     assert not any(len(xy) for axis in figure.axes for xy in drawn(axis))

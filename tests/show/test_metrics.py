@@ -52,8 +52,8 @@ def test_a_camera_that_does_not_fit_most_of_its_queries_is_named_once():
     second = pd.DataFrame({"status": ["ok", "failed: no match", "ok", "ok"], "focal_px": np.full(4, np.nan)})
     messages = camera_messages(session, [first, second])  # type: ignore[arg-type]
     assert [message.split(":")[0] for message in messages] == ["camera phone/cam", "camera rig/left"]
-    assert "0.900 times those in ios_query/sensors.txt (median of 2 answers)" in messages[0]
-    assert "360 px (median of 2 answers), ios_query/sensors.txt says 400 px" in messages[1]
+    assert "0.900 times those in ios_query/sensors.txt (median of 2 poses)" in messages[0]
+    assert "360 px (median of 2 poses), ios_query/sensors.txt says 400 px" in messages[1]
     assert camera_messages(session, [second.drop(columns="focal_px")]) == []  # type: ignore[arg-type]
     contradicted = "low_confidence: the poses of the map contradict its images"
     # A doubt for another reason, such as the map's poses, names no focal length, be the column of numbers or texts.

@@ -119,9 +119,9 @@ def test_full_run(full):
         "2026-01-02 03:04:05 UTC", "2 min 30 s", "1.23 GB", "45 % mean recall at 1°, 0.1 m", "5 % called ok",
         "Recall at 5°, 0.5 m [%]", "0.031", "1.23", "∞", "no poses file", "In the first 10 [%]", "77",
         "8 m of the query", "12 images embedded", "embed", "numpy 2", "scene_ios.rrd",
-        "4 queries asked in 2 pairs of devices: 1 ok, 2 low confidence, 1 failed.",
+        "4 queries in 2 pairs of devices: 1 ok, 2 low confidence, 1 failed.",
         "Weakest pair at 1°, 0.1 m: ios queries in the ios map, 10 %.",
-        "3.00 m median error of position; 2.50° of rotation",
+        "3.00 m median position error; rotation 2.50°",
         "100 % have a good reference in the first 10",
         "0123456789abcdef", "fedcba9876543210", "model", "too few inliers 1 ios in hl map 1",
     ):  # fmt: skip
@@ -274,7 +274,7 @@ def test_torn_or_missing_run_is_an_error_that_says_so(tmp_path):
     with pytest.raises(ArtifactError, match=r"run.json is missing"):
         write_report(tmp_path)
     (tmp_path / "run.json").write_text('{"name": ')
-    with pytest.raises(ArtifactError, match="not whole JSON"):
+    with pytest.raises(ArtifactError, match="not valid JSON"):
         write_report(tmp_path)
 
 
@@ -287,8 +287,8 @@ def test_what_escalation_gave_and_took():
     })  # fmt: skip
     (sentence,) = report._escalation(statuses)
     assert sentence == (
-        "4 were not sure and escalated to further features: 2 are ok now, 1 of those without a pose found one. "
-        "That took 14 s, 3.50 s a query."
+        "4 were not sure and escalated to further features: 2 are ok now, 1 without a pose got one. "
+        "That took 14 s, 3.50 s per query."
     )
     assert report._escalation(statuses.iloc[:1]) == []
 
@@ -304,7 +304,7 @@ def test_what_is_known_of_a_map_is_said_and_lengths_without_a_unit_are_no_meters
     assert text.index("Before you read the numbers.") < text.index(f"_map_ios: {said}") < text.index("mean recall at")
     assert said not in text[text.index("Not everything could be evaluated.") :]
     assert "45 % mean recall at 1°, 0.1 L" in text
-    assert f"L is a tenth of the median depth that a map shows: 3 in {scene.name}_map_ios" in unescape(text)
+    assert f"L is a tenth of the median scene depth of a map: 3 in {scene.name}_map_ios" in unescape(text)
     assert not re.search(r"\d\s*(cm|m)\b|\[c?m\]", text)
 
 

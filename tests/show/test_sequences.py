@@ -156,7 +156,7 @@ def test_recordings_from_above(place: Path, tmp_path: Path) -> None:
     session = Session(place / "sessions/ios_query")
     truth = session.ground_truth
     assert truth is not None
-    ways = {"laid": pair.laid_odometry(session), "frames": pair.ways()}
+    ways = {"laid": pair.odometry_tracks(session), "frames": pair.tracks()}
     for ends in ways.values():
         way = np.concatenate(ends)
         assert len(way) == len(truth)
@@ -164,7 +164,7 @@ def test_recordings_from_above(place: Path, tmp_path: Path) -> None:
         assert offsets.max() < 0.2
     figure = draw_sequence(Capture.open(place), pair, "ios", "ios")
     texts = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
-    assert "odometry, laid as a whole" in texts
+    assert "odometry, rigidly placed" in texts
     assert any(text.startswith("rescued: ") for text in texts)
     steps = pd.DataFrame(pair.recalls(session.keyframes(), truth, LIMITS, "m", 1.0))
     figure = draw_steps(steps.assign(map_device="ios", query_device="ios"))

@@ -82,7 +82,7 @@ def test_scene_picture(scene, tmp_path):
 def test_no_text_of_a_scene_picture_says_meters_where_the_unit_is_not_known(scene):
     figure = draw_scene(*scene, unit=("L", 3.0))
     texts = [label for axis in figure.axes for label in (axis.get_xlabel(), axis.get_ylabel()) if label]
-    assert "error of position [L]" in texts
+    assert "position error [L]" in texts
     assert not any("[m]" in text for text in texts)
 
 

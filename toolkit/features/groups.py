@@ -1,11 +1,11 @@
-"""HDF5 files of named groups of arrays: added to run by run, safe against a kill.
+"""HDF5 files of named groups of arrays that grow run by run and survive a killed run.
 
-HDF5 itself is not: a file that was open for writing when its writer died cannot be read. So a run writes what it makes
-to hidden parts, each of which is complete or absent, and joins them to the file when it ends; the next run takes up the
-parts that a stopped run left. The record beside the file tells for each group what it was made from.
+HDF5 alone does not: a file cannot be read if its writer died while it was open. So a run writes groups to hidden part
+files, each complete or absent, and joins them to the file at its end. The next run continues with the parts of a
+stopped run. The record beside the file has the fingerprint of the sources of each group.
 
-Each group has a checksum, which is verified when the group is read: a file may be too large to be read at every start.
-What turns out to be damaged is made again, see `heals`.
+Each group has a checksum, which is verified when the group is read, because a file may be too large to read at every
+start. Damaged groups are made again, see `heals`.
 """
 
 import logging
@@ -34,35 +34,36 @@ from toolkit.runs.cluster import current_cluster
 log = logging.getLogger(__name__)
 
 HDF5_ERRORS = (OSError, RuntimeError, LookupError, ValueError, TypeError, OverflowError)
-"""What HDF5 and h5py raise where a file is torn, of another format, or holds what numpy cannot."""
+"""Errors of HDF5 and h5py for files that are torn, of another format, or with content that numpy does not support."""
 CHECKSUM = b"xxh3"
-"""Attribute of a group: XXH3 of its name and its arrays. Files of other tools have none."""
+"""Attribute of a group: XXH3 of its name and arrays. Files of other tools lack it."""
 MOST_BYTES = 1 << 26
+"""Memory limit for the arrays of a group, bytes; a larger file may fill as much memory as its own size."""
 MOST_TEXTS = 1 << 12
-"""Memory for the arrays of a group, bytes: at most this or the size of the file; and texts in an array of them."""
+"""Limit of texts in an array."""
 
 PART_GROUPS = 64
 PART_SECONDS = 5.0
-"""A part is closed after so many groups or seconds, whichever comes first. A kill costs at most one part."""
+"""A part is closed after this many groups or seconds, whichever comes first. A killed run loses at most one part."""
 
 
 @dataclass
 class Index:
-    """What a file or a part holds."""
+    """The content of a file or a part."""
 
     groups: dict[str, str] = field(default_factory=dict)
-    """Name of a group -> fingerprint of what it was made from."""
+    """Name of a group -> fingerprint of its sources."""
     failed: dict[str, list[str]] = field(default_factory=dict)
-    """Name of what could not be made -> the fingerprint of what it should have been made from, and the reason."""
+    """Name of a group that could not be made -> fingerprint of its sources, and the reason."""
     notes: dict[str, Any] = field(default_factory=dict)
     """Name of a group -> its note, any JSON."""
 
     def source_of(self, name: str) -> str | None:
-        """Return what a group was made from, or should have been made from; None: it was not tried."""
+        """Return the fingerprint of the sources of a group that was made or failed; None for any other group."""
         return self.groups[name] if name in self.groups else self.failed.get(name, [None])[0]
 
     def update(self, later: "Index") -> None:
-        """Take over what was made later; it replaces what was there."""
+        """Add the entries of a later index, which replace those of the same names."""
         for name in (*later.groups, *later.failed):
             for entries in (self.groups, self.failed, self.notes):
                 entries.pop(name, None)
@@ -72,19 +73,19 @@ class Index:
 
 
 def read_group(file: h5py.File, name: str) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a group, of this toolkit's files or of another's.
+    """Return the arrays of a group, from a file of this toolkit or of another tool.
 
-    Memory is taken only for what can be in the file: numbers and texts that it has itself, under its own names. A few
-    bytes could ask for more memory than there is, or for the content of other files.
+    Reads only numbers and texts that the file itself contains, and not more than fit into it: a malicious file of a few
+    bytes could declare huge arrays, or link to other files.
 
     Raises:
-        DamagedError: the file has no such group, or it is not what was written.
+        DamagedError: the group is missing, or its content does not match its checksum.
     """
-    # By h5py's lower layer: the upper one takes twice as long, and there are as many groups as pairs of images.
+    # h5py's low-level interface takes half the time, and there are as many groups as pairs of images.
     try:
         group = _open_owned(file.id, name.encode())
         if not isinstance(group, h5py.h5g.GroupID):
-            raise ValueError("it is no group")
+            raise ValueError("it is not a group")
         room, arrays = max(MOST_BYTES, file.id.get_filesize()), dict[str, NDArray[Any]]()
         for key in group:
             item = _open_owned(group, key)
@@ -103,17 +104,17 @@ def read_group(file: h5py.File, name: str) -> dict[str, NDArray[Any]]:
         raise DamagedError(
             Path(file.filename),
             f"{file.filename} is damaged at {name} ({first_line(error)}). If a run made it, run its stage again with "
-            "--force: what is damaged is made again.",
+            "--force: each damaged group is made again.",
         ) from None
     return arrays
 
 
-def _open_owned(place: Any, name: bytes) -> Any:
-    """Return what a file or a group has under a name; refuses links to other places and other files."""
+def _open_owned(parent: Any, name: bytes) -> Any:
+    """Open an object in a file or a group; raise ValueError for links to other groups or files."""
     for prefix in _prefixes(name):
-        if place.links.get_info(prefix).type != h5py.h5l.TYPE_HARD:
+        if parent.links.get_info(prefix).type != h5py.h5l.TYPE_HARD:
             raise ValueError(f"{prefix.decode()} is a link to elsewhere")
-    return h5py.h5o.open(place, name)
+    return h5py.h5o.open(parent, name)
 
 
 def _prefixes(name: bytes) -> Iterator[bytes]:
@@ -126,18 +127,18 @@ def _prefixes(name: bytes) -> Iterator[bytes]:
 
 
 def _bytes_of(item: Any) -> int:
-    """Return the memory that an array of numbers or texts takes; refuses other types, and data that lie elsewhere."""
-    made = item.get_create_plist()
-    if made.get_layout() == h5py.h5d.VIRTUAL or made.get_external_count():
+    """Return the memory of an array, bytes; raise ValueError unless it has numbers or texts within the file itself."""
+    properties = item.get_create_plist()
+    if properties.get_layout() == h5py.h5d.VIRTUAL or properties.get_external_count():
         raise ValueError("its data are in another file")
-    kind, shape = item.dtype, item.shape
+    dtype, shape = item.dtype, item.shape
     count = math.prod(shape or ())
-    if h5py.check_string_dtype(kind) is not None:
+    if h5py.check_string_dtype(dtype) is not None:
         if count > MOST_TEXTS:
             raise ValueError(f"it has {count} texts in an array; expected at most {MOST_TEXTS}")
-    elif shape is None or kind.kind not in "biuf":
-        raise ValueError(f"it has an array of the type {kind}; expected numbers or texts")
-    return int(count * kind.itemsize)
+    elif shape is None or dtype.kind not in "biuf":
+        raise ValueError(f"it has an array of the type {dtype}; expected numbers or texts")
+    return int(count * dtype.itemsize)
 
 
 def _read(item: Any) -> NDArray[Any]:
@@ -147,7 +148,7 @@ def _read(item: Any) -> NDArray[Any]:
 
 
 def group_names_of(file: h5py.File, array: str) -> list[str]:
-    """Return the names of the groups that hold an array of this name, in the order of names; links are not followed."""
+    """Return the names of the groups with an array of this name, in alphabetical order. Links are not followed."""
     names, seen, stack = list[str](), set[Any](), [b""]
     while stack:
         name = stack.pop()
@@ -166,7 +167,7 @@ def group_names_of(file: h5py.File, array: str) -> list[str]:
 
 
 def has_group(file: h5py.File, name: str) -> bool:
-    """Tell whether a file has something under a name, without following links to elsewhere."""
+    """Return whether a file has an object of this name. Links are not followed; a link counts as an object."""
     links = file.id.links
     try:
         for prefix in _prefixes(name.encode()):
@@ -175,12 +176,12 @@ def has_group(file: h5py.File, name: str) -> bool:
             if links.get_info(prefix).type != h5py.h5l.TYPE_HARD:
                 break
     except HDF5_ERRORS:
-        return True  # refused when it is read, as such a link is
+        return True  # `read_group` refuses it later, like a link
     return True
 
 
 def group_checksum(name: str, arrays: Mapping[str, Any]) -> int:
-    """Return the XXH3 of a group, 64 bits; texts count as their UTF-8."""
+    """Return the XXH3 of a group's name and arrays, 64 bits; texts are hashed as UTF-8."""
     digest = xxhash.xxh3_64(name.encode())
     for key in sorted(arrays):
         array = np.asarray(arrays[key])
@@ -196,31 +197,31 @@ def group_checksum(name: str, arrays: Mapping[str, Any]) -> int:
 P = ParamSpec("P")
 Result = TypeVar("Result")
 Item = TypeVar("Item", bound=tuple[Any, ...])
-"""What is to be done for a group: its name, what it is made from, and more."""
+"""Work for one group: its name, the fingerprint of its sources, and further arguments."""
 
 
 def heals(stage: Callable[P, Result]) -> Callable[P, Result]:
-    """Make a stage start again where it meets damaged groups of a file that a run made; it goes on where it was.
+    """Decorate a stage: if it finds damaged groups in a file that a run made, drop them and call the stage again.
 
-    The groups are forgotten, so that the stage makes them again, as if they had never been there.
+    The stage then makes these groups again and reuses the rest. Each file gets one such attempt.
     """
 
     @wraps(stage)
     def run(*args: P.args, **kwargs: P.kwargs) -> Result:
-        met = set[Path]()
+        tried = set[Path]()
         while True:
             try:
                 return stage(*args, **kwargs)
             except DamagedError as error:
-                if error.path in met or not forget_damaged(error.path):
+                if error.path in tried or not forget_damaged(error.path):
                     raise
-                met.add(error.path)
+                tried.add(error.path)
 
     return run
 
 
 def forget_damaged(path: Path) -> bool:
-    """Forget the damaged groups of a file; False if no run made it, so that nothing would make them again."""
+    """Drop the damaged groups of a file. Return False if no run made the file, so that none can make it again."""
     record = read_sidecar(path)
     if record is None or "made_by" not in record:
         return False
@@ -230,9 +231,9 @@ def forget_damaged(path: Path) -> bool:
 
 
 def sweep(path: Path) -> None:
-    """Remove what progress a stage left beside a file that it had written: it was killed before its `discard` ended."""
+    """Remove leftover parts beside a finished file: the stage was killed during its `discard`."""
     if _parts_folder(path).exists():
-        with GroupWriter(path, {}) as writer:  # waits for another process that makes the file again
+        with GroupWriter(path, {}) as writer:  # waits if another process is rewriting the file
             writer.discard()
 
 
@@ -241,33 +242,33 @@ def _parts_folder(path: Path) -> Path:
 
 
 def read_index(path: Path, made_by: Mapping[str, Any]) -> Index | None:
-    """Return what a file holds; None if it is absent, torn, or was made by other settings."""
+    """Return the content of a file; None if it is absent, torn, or made with other settings."""
     record = read_sidecar(path)
     if record is None or fingerprint(record.get("made_by")) != fingerprint(made_by):
         return None
     try:
-        with h5py.File(path, "r"):  # HDF5 notices a file that is shorter than it was
+        with h5py.File(path, "r"):  # HDF5 detects a truncated file
             return Index(record["groups"], record["failed"], record.get("notes", {}))
     except (OSError, KeyError):
         return None
 
 
 def _is_of_another(path: Path, made_by: Mapping[str, Any]) -> bool:
-    """Tell whether a file is whole but made by other settings: it is replaced without a word."""
+    """Return whether the file's record has other settings: such a file is replaced without a warning."""
     record = read_sidecar(path)
     return record is not None and fingerprint(record.get("made_by")) != fingerprint(made_by)
 
 
 class GroupWriter:
-    """Adds groups to a file; a context, whose work stands when `finish` returns.
+    """Context manager that adds groups to a file; the file is complete when `finish` returns.
 
-    One process at a time adds to a file; another that wants to waits, and then goes on from what is there. Others may
-    read it meanwhile: it is replaced, never changed.
+    Only one process at a time adds to a file; a second one waits, and then continues with what the first has made.
+    Processes may read the file meanwhile, because it is replaced, never changed.
 
-    A stage whose result is another kind of file keeps its progress in groups too: it reads them back with `notes` and
-    `read`, writes its file at `path` itself, and calls `discard` instead of `finish`.
+    A stage with another kind of result also keeps its progress in groups: it reads them back with `notes` and `read`,
+    writes its own file at `path`, and calls `discard` instead of `finish`.
 
-    Others may do shares of the work meanwhile: see `spread`.
+    Workers of a cluster can do shares of the work, see `spread`.
     """
 
     def __init__(
@@ -277,13 +278,17 @@ class GroupWriter:
         attributes: Mapping[str, Any] | None = None,
         share: str | None = None,
     ):
-        """Groups made by something else than `made_by`, JSON, are not kept; other readers see the `attributes`.
+        """Open a file to add groups.
 
-        A writer of a `share` writes parts of this name, and knows of no others; one that holds the file takes them.
+        Args:
+            made_by: settings, JSON. Groups made with other settings are dropped.
+            attributes: attributes of the HDF5 file, for other readers.
+            share: prefix of the names of the parts to write, for a writer that does a share of the work. It does not
+                lock the file and sees no other parts. The writer that holds the file finds its parts.
         """
         self.path = path
         self.index: Index
-        """What the file and the complete parts hold."""
+        """Content of the file and the complete parts."""
         self._made_by = made_by
         self._attributes = attributes or {}
         self._folder = _parts_folder(path)
@@ -293,15 +298,12 @@ class GroupWriter:
         self._share = share
         self._whole: Index | None = None
         if share is None:
-            self._hold()
+            self._wait_for_others()
+            self._whole = read_index(path, made_by)
+            if self._whole is None and path.exists() and not _is_of_another(path, made_by):
+                log.warning("%s is torn, or of another version of the toolkit: what it held is made again.", path)
         self._find_parts()
         self._part_closed = time.monotonic()
-
-    def _hold(self) -> None:
-        self._wait_for_others()
-        self._whole = read_index(self.path, self._made_by)
-        if self._whole is None and self.path.exists() and not _is_of_another(self.path, self._made_by):
-            log.warning("%s is torn, or of another version of the toolkit: what it held is made again.", self.path)
 
     def _find_parts(self) -> None:
         self._parts = {}
@@ -315,29 +317,31 @@ class GroupWriter:
         self._index_all()
 
     def left(self, items: Iterable[Item]) -> list[Item]:
-        """Return those of some items that are neither there nor known to fail."""
+        """Return the items whose groups were neither made nor failed from the same sources."""
         return [item for item in items if self.index.source_of(item[0]) != item[1]]
 
     def spread(
         self,
         function: Callable[..., object],
         items: Sequence[Item],
-        others: tuple[Any, ...],
+        arguments: tuple[Any, ...],
         label: str,
         unit: str,
         multiple: int = 1,
         left: Callable[["GroupWriter", Sequence[Item]], list[Item]] | None = None,
     ) -> list[Item]:
-        """Have work done by the workers of the cluster, if there is one, and take what they made.
+        """Let the workers of the cluster, if there is one, do the work, and take over their parts.
 
         Args:
-            function: does a share; called with a writer of its own, the items that this lacks, and the `others`.
-            items: the work; a share has a `multiple` of them.
-            label, unit: of the bar.
-            left: returns those of some items that a writer does not hold; None: `GroupWriter.left`.
+            function: does a share of the work; called as `function(writer, items, *arguments)` with a writer for the
+                share and the items that are not done yet.
+            arguments: further arguments of `function`.
+            label, unit: of the progress bar.
+            multiple: shares have a multiple of this number of items.
+            left: returns the items that a writer has not done yet; None: `GroupWriter.left`.
 
         Returns:
-            The items that are left to do here.
+            The items that are left to do in this process.
         """
         left = left or GroupWriter.left
         cluster = current_cluster() if items else None
@@ -347,7 +351,7 @@ class GroupWriter:
         generation, shares = self._next_number(), cluster.cut(items, multiple)
         own = self.path, self._made_by, self._attributes
         tasks = [
-            ((*own, f"{generation:05d}-{number:05d}-"), share, left, function, others)
+            ((*own, f"{generation:05d}-{number:05d}-"), share, left, function, arguments)
             for number, share in enumerate(shares)
         ]
         cluster.run(_do_share, tasks, [len(share) for share in shares], label, unit)
@@ -355,7 +359,7 @@ class GroupWriter:
         return left(self, items)
 
     def _next_number(self) -> int:
-        # Parts are <number> or, of shares, <number>-<share>-<number>; what was made later comes later.
+        # Names of parts are <number> or, in shares, <number>-<share>-<number>. Later parts have higher numbers.
         digits = slice(-5, None) if self._share else slice(5)
         return max((int(path.stem[digits]) for path in self._parts), default=-1) + 1
 
@@ -366,7 +370,7 @@ class GroupWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         try:
-            self._close_part()  # also after an error: what was added before it is kept
+            self._close_part()  # also after an error, to keep the groups that were added before it
         finally:
             self._locked.close()
 
@@ -378,12 +382,12 @@ class GroupWriter:
         attributes: Mapping[str, Mapping[str, Any]] | None = None,
         note: Any = None,
     ) -> None:
-        """Write a group; it replaces one of the same name.
+        """Write a group, which replaces one of the same name.
 
         Args:
-            made_from: fingerprint of what it was made from, besides what the file was made by.
-            attributes: of some of the arrays.
-            note: about the group, any JSON; `notes` returns it.
+            made_from: fingerprint of its sources, besides the settings `made_by` of the file.
+            attributes: attributes of arrays, by the array's name.
+            note: any JSON about the group; `notes` returns it.
         """
         file, index = self._part()
         if name in index.groups:
@@ -401,22 +405,22 @@ class GroupWriter:
         self._close_if_full(index)
 
     def annotate(self, name: str, note: Any) -> None:
-        """Replace the note of a group that is there, and leave its arrays."""
+        """Replace the note of an existing group, without changing its arrays."""
         _, index = self._part()
         index.notes[name] = note
 
     def fail(self, name: str, made_from: str, reason: str) -> None:
-        """Note why there is no such group."""
+        """Record why a group could not be made."""
         _, index = self._part()
         index.failed[name] = [made_from, reason]
         self._close_if_full(index)
 
     def notes(self) -> dict[str, Any]:
-        """Return the notes of all groups, those of earlier runs first."""
+        """Return the notes of all groups, including those of earlier runs, by the group's name."""
         return self.index.notes | (self._open[2].notes if self._open else {})
 
     def read(self) -> Iterator[tuple[str, dict[str, NDArray[Any]]]]:
-        """Yield name and arrays of the groups that are in parts, in the order of names."""
+        """Yield name and arrays of the groups in the parts, sorted by name."""
         self._close_part()
         part_of = {name: path for path, index in self._parts.items() for name in index.groups}
         for path, names in groupby(sorted(part_of), part_of.__getitem__):
@@ -425,7 +429,7 @@ class GroupWriter:
                     yield name, read_group(file, name)
 
     def finish(self) -> None:
-        """Join all parts to the file; without any group the file is empty."""
+        """Join all parts to the file; without groups, write an empty file."""
         if self._whole is None and not self._parts:
             self._part()
         self._close_part()
@@ -439,7 +443,7 @@ class GroupWriter:
         self._remove_parts()
 
     def drop_damaged(self) -> list[str]:
-        """Read all groups of the file, forget those that are damaged, and return their names."""
+        """Read all groups of the file, drop the damaged ones, and return their names."""
         if self._whole is None:
             return []
         names = list(self._whole.groups)
@@ -479,21 +483,20 @@ class GroupWriter:
                 self.index.update(index)
 
     def discard(self) -> None:
-        """Forget all groups, also those of the file: `finish` replaces it by what is added from now on."""
+        """Drop all groups, including those of the file: `finish` then replaces the file by groups added after this."""
         self._close_part()
         self._whole, self._parts, self.index = None, {}, Index()
         self._remove_parts()
 
     def _remove_parts(self) -> None:
-        # With what a killed run was writing, here and beside the file.
         shutil.rmtree(self._folder, ignore_errors=True)
-        for torn in self.path.parent.glob(f".{self.path.name}.*.partial{self.path.suffix}"):
+        for torn in self.path.parent.glob(f".{self.path.name}.*.partial{self.path.suffix}"):  # of a killed run
             _remove_quietly(torn)
 
     def _join(self) -> None:
         joined = Index() if self._whole is None else self._whole
         parts = dict(self._parts)
-        if self._whole is None:  # a kill before the new record is there must not leave the old one with the new file
+        if self._whole is None:  # if killed before the new record is written, the old one must not stay with the file
             sidecar_path(self.path).unlink(missing_ok=True)
         with write_atomic(self.path) as temporary:
             if self._whole is None:
@@ -519,9 +522,9 @@ class GroupWriter:
         write_sidecar(self.path, {"made_by": self._made_by, **asdict(index)}, checksums=False)
 
     def _wait_for_others(self) -> None:
-        """Hold the file against other writers until the context ends. A killed process holds nothing."""
-        place = self.path.with_name(f".{self.path.name}.lock")
-        lock = FileLock(place)
+        """Lock the file against other writers until the context ends. The lock of a killed process is released."""
+        lock_path = self.path.with_name(f".{self.path.name}.lock")
+        lock = FileLock(lock_path)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             try:
@@ -529,13 +532,13 @@ class GroupWriter:
             except Timeout:
                 log.warning("%s: another process adds to it; waiting until it is done.", self.path)
                 lock.acquire()
-        except OSError:  # a folder that is only read: what is there can be reused, and adding says why it cannot
+        except OSError:  # a read-only folder: its groups can be reused, and `add` will raise
             return
         self._locked.callback(lock.release)
-        self._locked.callback(_remove_quietly, place)  # while it is held: who waits for it sees that it is gone
+        self._locked.callback(_remove_quietly, lock_path)  # before the release: a waiting process sees that it is gone
 
     def _part(self) -> tuple[h5py.File, Index]:
-        """Return the part that is being written, a new one where there is none."""
+        """Return the part that is being written; create one if there is none."""
         if self._open is None:
             path = self._folder / f"{self._share or ''}{self._next_number():05d}.h5"
             temporary = self._writing.enter_context(write_atomic(path))
@@ -561,15 +564,15 @@ class GroupWriter:
 
 
 def _do_share(
-    made_with: tuple[Any, ...],
+    writer_arguments: tuple[Any, ...],
     items: Sequence[Item],
     left: Callable[[GroupWriter, Sequence[Item]], list[Item]],
     function: Callable[..., object],
-    others: tuple[Any, ...],
+    arguments: tuple[Any, ...],
 ) -> None:
-    """Do a share of `GroupWriter.spread`, whose writer is made with these arguments."""
-    with GroupWriter(*made_with) as writer:
-        function(writer, left(writer, items), *others)
+    """Do a share of `GroupWriter.spread` on a worker."""
+    with GroupWriter(*writer_arguments) as writer:
+        function(writer, left(writer, items), *arguments)
 
 
 def _is_whole(file: h5py.File, name: str) -> bool:

@@ -1,13 +1,13 @@
 """Files of local features and of matches, in the layout of hloc (https://github.com/cvg/Hierarchical-Localization).
 
-The features of a session are in one HDF5 file for each kind and settings: a group for each image, under the image's
-name, with `keypoints` (N, 2), `descriptors` (D, N) of unit length, `scores` (N,) and `image_size` (2,), and in addition
-the `scales` (N,) of the keypoints. In the file the center of the top-left pixel is at 0, as an attribute of the file
-says; here, and in `LocalFeatures`, it is at 0.5.
+Each session has one HDF5 file of features per kind and settings. It has one group per image, with the image's name:
+`keypoints` (N, 2), `descriptors` (D, N) of unit length, `scores` (N,), `image_size` (2,) and, beyond hloc, `scales`
+(N,) of the keypoints. In the file, the center of the top-left pixel is at 0, and an attribute of the file says so; here
+and in `LocalFeatures` it is at 0.5.
 
-The matches of two sessions are in one HDF5 file: a group for each pair of images, `<image>/<image>` with `/` in the
-names replaced by `-` (see `group_names` for names that this makes equal), with `matches0` (N,), for each feature of the
-first image the index of the second image's feature or -1, and `matching_scores0` (N,).
+Two sessions have one HDF5 file of matches, with one group per pair of images, `<image>/<image>` with `/` in the names
+replaced by `-` (see `group_names` for names that become equal): `matches0` (N,), for each feature of the first image
+the index of the matching feature of the second image or -1, and `matching_scores0` (N,).
 """
 
 import logging
@@ -38,40 +38,40 @@ from toolkit.geometry import Ints
 log = logging.getLogger(__name__)
 
 PIXEL_CENTER = "top_left_pixel_center"
-"""Attribute of a file of features: where the center of the top-left pixel is."""
+"""Attribute of a file of features: the coordinate of the center of the top-left pixel."""
 SCALE = "scale"
-"""Attribute of the descriptors in a file: they were bytes, divided by this."""
+"""Attribute of descriptors that were bytes: the divisor that made them floats."""
 KEPT_IMAGES = 256
-"""Images whose features `OnDemandFeatures` keeps in memory."""
+"""Number of images whose features `OnDemandFeatures` keeps in memory."""
 _HALF_PIXEL = np.float32(0.5)
-# Files hold bytes as float16, exactly: a byte over a power of two has 8 significant bits, float16 holds 11. A look-up
-# is several times quicker than a product and a conversion.
+# Files store bytes as float16 without loss: a byte over a power of two has 8 significant bits, float16 has 11. A
+# look-up table is several times faster than multiplication and conversion.
 _HALVES = (np.arange(256) / DESCRIPTOR_SCALE).astype(np.float16)
 _BYTES = np.zeros(1 << 16, np.uint8)
 _BYTES[_HALVES.view(np.uint16)] = np.arange(256)
 
 
 _Todo = tuple[str, str, int, int]
-"""An image whose features are to be extracted: name, what they are made from, row of the session, quarter turns."""
+"""An image to extract features from: name, fingerprint of the sources, row of the session, quarter turns."""
 _ToMatch = tuple[str, str, str, str]
-"""A pair to match: group of the file, what the matches are made from, names."""
+"""A pair to match: group in the file, fingerprint of the sources, names of the two images."""
 
 
 def features_path(out: str | Path, session_id: str, settings: Mapping[str, Any]) -> Path:
-    """Return the file of a session's features in the folder of all features, by the extractor's settings."""
+    """Return the file of a session's features by an extractor's settings; `out` is the folder of all features."""
     return Path(out) / session_id / f"{settings['name']}-{fingerprint(settings)}.h5"
 
 
 def as_stored(features: LocalFeatures) -> LocalFeatures:
-    """Return the features as a file gives them back: keypoints next to the image's border lose their last bits."""
+    """Return the features as if read from a file, where keypoints next to the image's border lose their last bits."""
     return _from_arrays(_to_arrays(features), _HALF_PIXEL, features.descriptors.dtype == np.uint8)
 
 
 def _to_arrays(features: LocalFeatures) -> dict[str, NDArray[Any]]:
-    """Return the features of an image as hloc has them."""
+    """Return the features of an image in hloc's layout."""
     descriptors = _transposed(features.descriptors)
     return {
-        # Exact from 0.5 px on, where the difference has no more digits than the number.
+        # The difference is exact for coordinates of at least 0.5 px.
         "keypoints": features.keypoints - _HALF_PIXEL,
         "scales": features.scales,
         "scores": features.scores,
@@ -82,11 +82,14 @@ def _to_arrays(features: LocalFeatures) -> dict[str, NDArray[Any]]:
 
 
 def _from_arrays(arrays: Mapping[str, NDArray[Any]], offset: np.float32, quantized: bool) -> LocalFeatures:
-    """Return the features of an image that a file has; hloc's files may lack scores and scales.
+    """Return the features of an image from the arrays of a file; hloc's files may lack scores and scales.
 
     Args:
-        offset: what makes the center of the top-left pixel 0.5.
-        quantized: the descriptors were bytes.
+        offset: added to keypoints, so that the center of the top-left pixel is at 0.5.
+        quantized: convert descriptors back to bytes.
+
+    Raises:
+        ValueError: shapes or types do not fit the layout.
     """
     keypoints = arrays["keypoints"].astype(np.float32, copy=False) + offset
     descriptors, (width, height) = arrays["descriptors"], arrays["image_size"]
@@ -110,14 +113,14 @@ def _from_arrays(arrays: Mapping[str, NDArray[Any]], offset: np.float32, quantiz
 
 def _transposed(matrix: NDArray[Any]) -> NDArray[Any]:
     """Return a copy (M, N) of a matrix (N, M)."""
-    # OpenCV is ten times quicker at it, but knows no matrix without entries, and no float16 in some versions.
+    # OpenCV is ten times faster, but fails for empty matrices and, in some versions, for float16.
     return cv2.transpose(matrix) if matrix.size and matrix.dtype == np.uint8 else np.ascontiguousarray(matrix.T)
 
 
 class FeatureStore(Mapping[str, LocalFeatures]):
     """Read access to the local features of many images, by image name (`Session.image_name`).
 
-    Safe to use from several threads. The features of an image are read each time they are asked for.
+    Thread-safe. Each access reads the file.
     """
 
     def __init__(
@@ -129,11 +132,11 @@ class FeatureStore(Mapping[str, LocalFeatures]):
     ):
         self.path = path
         self.made_from = dict(made_from)
-        """Name of an image -> fingerprint of what its features were made from."""
+        """Name of an image -> fingerprint of the sources of its features."""
         self.failed = dict(failed or {})
-        """Images that could not be read, with the reason."""
+        """Name of an image that could not be read -> reason."""
         self.settings = dict(settings or {})
-        """Settings of the extractor; empty where they are not known."""
+        """Settings of the extractor; empty if unknown."""
         self._file: h5py.File | None = None
         self._quantized = False
         self._offset = np.float32(0)
@@ -141,11 +144,11 @@ class FeatureStore(Mapping[str, LocalFeatures]):
 
     @classmethod
     def open(cls, path: str | Path) -> "FeatureStore":
-        """Open a file of features, the toolkit's or hloc's, whatever it was made from.
+        """Open a file of features by the toolkit or hloc, without a check whether its images have changed.
 
         Raises:
-            ArtifactError: it is missing, torn, or holds no features. What is damaged in it is a `DamagedError` when
-                it is asked for.
+            ArtifactError: the file is missing, torn, or has no features. Damaged features raise `DamagedError` later,
+                when they are read.
         """
         record = read_sidecar(path)
         if record is not None and "groups" in record:
@@ -164,23 +167,24 @@ class FeatureStore(Mapping[str, LocalFeatures]):
 
     @classmethod
     def of_session(cls, out: str | Path, session_id: str, settings: Mapping[str, Any] | None = None) -> "FeatureStore":
-        """Open all features of a session that were extracted.
+        """Open the file with all extracted features of a session.
 
         Args:
-            settings: of the extractor; None: of SIFT.
+            out: folder of all features.
+            settings: settings of the extractor; None: SIFT.
 
         Raises:
-            ArtifactError: there are none, or the file is torn.
+            ArtifactError: the file is missing or torn.
         """
         return cls.open(features_path(out, session_id, settings or SiftExtractor().settings))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the path: who unpickles it opens the file once, and again when it has changed."""
+        """Pickle only the path. A process opens the file at the first unpickling, and again if it has changed."""
         return _reopened, (self.path, files_fingerprint([self.path]))
 
     @property
     def fingerprint(self) -> str:
-        """16 hex digits that identify the images and settings that the features were made from."""
+        """Fingerprint, 16 hex digits, of the images and settings that the features were made from."""
         return fingerprint([self.settings, self.made_from, sorted(self.failed)])
 
     def __contains__(self, name: object) -> bool:
@@ -207,7 +211,7 @@ class FeatureStore(Mapping[str, LocalFeatures]):
             ) from None
 
     def _open(self, name: str) -> None:
-        """Open the file; what holds for one image holds for all."""
+        """Open the file; read the pixel convention and quantization, the same for all images, at one image."""
         try:
             file = h5py.File(self.path, "r")
             read_group(file, name)  # refuses links to elsewhere
@@ -235,18 +239,18 @@ def extract_session(
     progress: bool = True,
     turns: Ints | None = None,
 ) -> FeatureStore:
-    """Extract the local features of a session's images, or reuse those that were extracted before.
+    """Extract the local features of a session's images, or reuse earlier ones.
 
-    A killed run goes on where it was, but for one part of `GroupWriter`. Memory does not grow with the session.
+    A killed run loses at most one part of `GroupWriter`. Memory does not grow with the session.
 
     Args:
         session: the session; only its camera images are read.
-        out: folder of all features; this session's go to `features_path`.
-        extractor: how to extract; None: SIFT.
-        rows: rows of `session.images` that are needed; None: all.
-        skip_existing: reuse the features of images that have not changed since.
-        turns: for each image of the session, the quarter turns that make it upright, see `capture.upright`; None, or
-            a kind of features that does not need it: images are taken as they are.
+        out: folder of all features; this session's file is `features_path`.
+        extractor: the extractor; None: SIFT.
+        rows: rows of `session.images` to extract; None: all.
+        skip_existing: reuse the features of unchanged images.
+        turns: quarter turns that make each image of the session upright, see `capture.upright`; None: images stay as
+            they are. Ignored for kinds of features that do not need upright images.
 
     Returns:
         The store of the features of these rows. Unreadable images are in its `failed`.
@@ -255,7 +259,7 @@ def extract_session(
     chosen = session.camera_rows if rows is None else np.intersect1d(session.camera_rows, rows)
     row_of: dict[str, int] = {}
     for row in chosen.tolist():
-        row_of.setdefault(session.image_name(row), row)  # a line of images.txt may be there twice
+        row_of.setdefault(session.image_name(row), row)  # images.txt may have an image twice
     if turns is None or not KINDS[extractor.settings["name"]].upright:
         turns = np.zeros(len(session.images), np.int64)
     made_from = {name: _made_from(session, row, int(turns[row])) for name, row in row_of.items()}
@@ -280,8 +284,8 @@ def _extract_into(
     workers: int = 0,
     label: str = "",
 ) -> None:
-    """Add the features of images to a file, or why they have none; the bar has a `label`."""
-    with one_thread():  # the images are the parallel dimension
+    """Extract the features of images into a file, or record why that failed. An empty `label` hides the bar."""
+    with one_thread():  # images are processed in parallel instead
         results = _extract(session, [item[2:] for item in todo], extractor, workers or default_workers())
         bar = tqdm(todo, desc=label, unit="image", disable=not label)
         for (name, source, *_), features in zip(bar, results, strict=True):
@@ -294,13 +298,13 @@ def _extract_into(
 
 
 class OnDemandFeatures:
-    """The features of a session's images, by name: those of its file, else extracted when they are asked for.
+    """The features of a session's images by name: from the session's file, or else extracted at the first access.
 
-    Safe to use from several threads. What was extracted last stays in memory.
+    Thread-safe. Features that were extracted last stay in memory.
     """
 
     def __init__(self, session: Session, out: str | Path, extractor: Extractor, turns: Ints | None = None):
-        """`out` is the folder of all features, `turns` as of `extract_session`."""
+        """For the arguments see `extract_session`."""
         self._session, self._out, self._extractor = session, Path(out), extractor
         self._turns = np.zeros(len(session.images), np.int64) if turns is None else turns
         self._store: FeatureStore | None = None
@@ -318,7 +322,7 @@ class OnDemandFeatures:
         return self._store
 
     def __call__(self, name: str) -> LocalFeatures:
-        """Return the features of an image; none where it cannot be read."""
+        """Return the features of an image; empty if it cannot be read."""
         if self._store is not None and name in self._store:
             return self._store[name]
         with self._lock:
@@ -335,7 +339,7 @@ class OnDemandFeatures:
 
 
 def _made_from(session: Session, row: int, turns: int) -> str:
-    """Identify an image by name, size and time of change of its file, by the size that its camera has, and turns."""
+    """Return a fingerprint of an image: its file's name, size and time of change, its camera's size, and its turns."""
     camera = session.camera(session.images["sensor_id"].iloc[row])
     turned = [turns] if turns else []
     return fingerprint([files_fingerprint([session.image_path(row)]), camera.width, camera.height, *turned])
@@ -344,7 +348,7 @@ def _made_from(session: Session, row: int, turns: int) -> str:
 def _extract(
     session: Session, images: list[tuple[int, int]], extractor: Extractor, workers: int
 ) -> Iterator[LocalFeatures | str]:
-    """Yield the features of each image, given by row and turns, or why it has none."""
+    """Yield for each image, given as (row, turns), its features or the reason why it cannot be read."""
     sensors = session.images["sensor_id"].to_numpy()
 
     def read(row: int) -> NDArray[np.uint8] | str:
@@ -360,16 +364,16 @@ def _extract(
             )
         return image
 
-    def read_and_extract(asked: tuple[int, int]) -> LocalFeatures | str:
-        row, turns = asked
+    def read_and_extract(item: tuple[int, int]) -> LocalFeatures | str:
+        row, turns = item
         image = read(row)
         return image if isinstance(image, str) else extract_turned(extractor, [image], [turns])[0]
 
     if extractor.threaded:
         yield from prefetch(read_and_extract, images, workers)
         return
-    found = prefetch(read, (row for row, _ in images), workers, ahead=2 * extractor.batch_size)
-    turned = zip(found, (turns for _, turns in images), strict=True)
+    pictures = prefetch(read, (row for row, _ in images), workers, ahead=2 * extractor.batch_size)
+    turned = zip(pictures, (turns for _, turns in images), strict=True)
     while batch := list(islice(turned, extractor.batch_size)):
         readable = [(image, turns) for image, turns in batch if not isinstance(image, str)]
         features = iter(extract_turned(extractor, *zip(*readable, strict=True)) if readable else [])
@@ -381,17 +385,14 @@ def matches_path(out: str | Path, session0: str, session1: str, made_by: Mapping
     """Return the file of the matches of two sessions.
 
     Args:
-        made_by: settings of the `features`, each by session, and of the `matcher`.
+        made_by: settings, `features` (a list with those of each session) and `matcher`.
     """
     features, matcher = made_by["features"][0].get("name", "features"), made_by["matcher"]["name"]
     return Path(out) / f"{session0}-{session1}" / f"{features}-{matcher}-{fingerprint(made_by)}.h5"
 
 
 class MatchStore:
-    """Read access to the matches of two sessions' images, in a file of the toolkit or of hloc.
-
-    Safe to use from several threads.
-    """
+    """Thread-safe read access to the matches of two sessions' images, in a file by the toolkit or hloc."""
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
@@ -399,7 +400,7 @@ class MatchStore:
         self._lock = threading.Lock()
 
     def __getitem__(self, names: tuple[str, str]) -> PairMatches:
-        """Return the matches of two images, in whichever order the file has them.
+        """Return the matches of two images, which the file may have in either order.
 
         Raises:
             KeyError: the file does not have the pair.
@@ -433,8 +434,8 @@ class MatchStore:
 def write_matches(
     writer: GroupWriter, group: str, made_from: str, counts: tuple[int, int], matches: PairMatches
 ) -> None:
-    """Add the matches of two images, which have `counts` features, to a file, as a group of `group_names`."""
-    # hloc has 16 bits too; networks that find more features than these hold are rare.
+    """Add the matches of two images to a file, as a group of `group_names`; `counts` are the images' features."""
+    # 16 bits as in hloc; few networks find more features.
     matches0 = np.full(counts[0], -1, np.int16 if max(counts) <= np.iinfo(np.int16).max else np.int32)
     scores = np.zeros(counts[0], np.float16)
     matches0[matches.indices[:, 0]] = matches.indices[:, 1]
@@ -450,16 +451,16 @@ def match_sessions(
     sessions: tuple[str, str],
     skip_existing: bool = True,
 ) -> MatchStore:
-    """Match pairs of images of two sessions, or reuse earlier matches. A killed run goes on where it was.
+    """Match pairs of images of two sessions, or reuse earlier matches. After a kill, the next call continues.
 
     Args:
-        stores: features of the first images and of the second ones.
-        pairs: names of images, the first session's first.
+        stores: features of the first and of the second session.
+        pairs: names of the two images, the first session's first.
         out: folder of all matches, see `matches_path`.
-        skip_existing: reuse the matches of features that have not changed since.
+        skip_existing: reuse the matches of unchanged features.
 
     Returns:
-        The matches of (at least) these pairs; of a pair with an image that has no features there are none.
+        The store of the matches of at least these pairs, without pairs in which an image has no features.
     """
     made_by = {"features": [store.settings for store in stores], "matcher": matcher.settings}
     path = matches_path(out, *sessions, made_by)
@@ -470,9 +471,9 @@ def match_sessions(
             for (name0, name1), group in group_names(readable, writer.index.groups).items()
         ]
         todo = writer.left(todo) if skip_existing else todo
-        others = stores, matcher, f"{matcher.settings['name']} {' '.join(sessions)}"
-        todo = writer.spread(_match_into, todo, others, others[-1], "pair", matcher.batch_size)
-        _match_into(writer, todo, *others)
+        label = f"{matcher.settings['name']} {' '.join(sessions)}"
+        todo = writer.spread(_match_into, todo, (stores, matcher, label), label, "pair", matcher.batch_size)
+        _match_into(writer, todo, stores, matcher, label)
         writer.finish()
     return MatchStore(path)
 
@@ -488,7 +489,7 @@ def _match_into(
     with tqdm(total=len(todo), desc=label, unit="pair", disable=not todo) as bar:
         for start in range(0, len(todo), matcher.batch_size):
             batch = todo[start : start + matcher.batch_size]
-            # One object for each image: the matcher computes once what depends on one image alone.
+            # The same object for each occurrence of an image, so that the matcher prepares it only once.
             first, second = (
                 {name: store[name] for name in {pair[side] for pair in batch}} for side, store in enumerate(stores, 2)
             )
@@ -499,13 +500,13 @@ def _match_into(
 
 
 def group_names(pairs: Iterable[tuple[str, str]], existing: Container[str] = ()) -> dict[tuple[str, str], str]:
-    """Return the groups of pairs of images: hloc's, unless another pair has the same.
+    """Return the name of the group of each pair of images: hloc's name, unless several pairs share it.
 
-    Images whose names differ only in `-` against `/` share hloc's. Their pairs have groups of their own, which readers
-    of hloc's layout do not find.
+    Pairs whose image names differ only in `-` versus `/` share hloc's name. Each of them gets a unique name, which
+    readers of hloc's layout do not find.
 
     Args:
-        existing: groups that the file has.
+        existing: groups in the file; an existing unique name is kept.
     """
     shared = {pair: _shared_group(*pair) for pair in pairs}
     count = Counter(shared.values())

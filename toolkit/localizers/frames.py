@@ -1,4 +1,4 @@
-"""Frames with odometry, localized from Python: a whole recording, or frame by frame as a device moves."""
+"""Python interface to localize frames with odometry: a whole recording, or frame by frame while a device moves."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,7 +24,7 @@ from toolkit.localizers.recording import localize_piece, queries_of
 from toolkit.manifest import SequenceSettings
 
 Pictures = Picture | Sequence[Picture] | None
-"""What a frame shows: a picture, of a rig those of its cameras, or nothing."""
+"""The picture of a frame, one picture per camera of a rig, or None for a frame with odometry only."""
 Cameras = pycolmap.Camera | Sequence[pycolmap.Camera]
 
 
@@ -33,38 +33,38 @@ class LocalizedFrames:
     """The poses of N frames in the map."""
 
     world_from_rig: Floats
-    """(N, 4, 4); of a single camera world_from_cam; NaN where there is none."""
+    """(N, 4, 4), NaN for none; with a single camera, world_from_cam."""
     covariances: Floats
     """(N, 6, 6) of a small motion in the rig's frame: rotation, radians, then translation, meters."""
     status: NDArray[np.object_]
     """(N,) `ok`, `low_confidence: <reason>` or `failed: <reason>`."""
     piece: Ints
-    """(N,) number of the piece of odometry, between losses of tracking."""
+    """(N,) number of the piece of odometry; losses of tracking separate pieces."""
     single: dict[int, PoseEstimate]
-    """What each picture says alone, by the frame."""
+    """Estimate from each picture alone, by frame."""
     again: dict[int, PoseEstimate]
-    """What it says near its predicted pose, where it was in doubt."""
+    """Estimates of doubtful pictures that were localized again near their predicted pose, by frame."""
 
 
 def _localize(
-    place: Map,
+    map_: Map,
     rig_from_cams: NDArray[np.float64] | None,
     turns: Sequence[int] | None,
     picture: Pictures,
     cameras: Cameras,
     near: RoughPose | None = None,
 ) -> PoseEstimate:
-    """Localize what a frame shows, alone or near a pose; one picture that cannot be read does not end a recording."""
+    """Localize the picture of a frame, alone or near a pose. A picture that cannot be read gives `failed`."""
     for camera in cameras if isinstance(cameras, list | tuple) else [cameras]:
         check_camera(camera)
     try:
-        return localize_image(place, picture, cameras, rig_from_cams, turns, near=near)
+        return localize_image(map_, picture, cameras, rig_from_cams, turns, near=near)
     except ImageError as error:
         return PoseEstimate(f"failed: {error}")
 
 
 def localize_sequence(
-    place: Map,
+    map_: Map,
     images: Sequence[Pictures],
     cameras: Cameras | Sequence[Cameras],
     odometry: Odometry,
@@ -72,35 +72,37 @@ def localize_sequence(
     rig_from_cams: NDArray[np.float64] | None = None,
     turns: Sequence[int] | None = None,
 ) -> LocalizedFrames:
-    """Localize the frames of a recording, with and without pictures.
+    """Localize the N frames of a recording, with and without pictures.
 
     Args:
-        place: an open map, see `Map.open`.
-        images: of each of N frames its picture, of a rig its C pictures, or None.
-        cameras: the intrinsics of all pictures, or N, those of each frame; of a rig sequences of C.
-            A phone that focuses has others in each frame.
-        odometry: of the N frames, as the device measured it; tracking may have been lost in between.
-        settings: see `SequenceSettings`; a dict holds what differs from the defaults. If `online`, only frames with a
-            picture have a pose, which rests on what was before them.
-        rig_from_cams, turns: as of `localize_image`.
+        map_: an open map, see `Map.open`.
+        images: for each frame its picture, the C pictures of a rig, or None.
+        cameras: the intrinsics of all pictures, or a list with those of each of the N frames, because they may change
+            when a phone focuses. For a rig, each is a sequence of C.
+        odometry: the device's own poses of the N frames. Losses of tracking are detected.
+        settings: see `SequenceSettings`; a dict holds values that differ from the defaults. If `online`, only frames
+            with a picture get a pose, estimated from the frames before them.
+        rig_from_cams, turns: see `localize_image`.
 
     Raises:
-        ValueError: as many images as poses are expected, and as many cameras, or one.
+        ValueError: the numbers of images and poses differ, or there is neither one camera nor one per image.
         ManifestError: GTSAM is not installed.
-        ImageError: no camera, or none that the pictures can be of. A picture that cannot be read is `failed`.
+        ImageError: a camera is missing, or does not fit the pictures. A picture that cannot be read is `failed`.
     """
     settings = SequenceSettings.of(settings)
     if len(images) != len(odometry):
-        raise ValueError(f"Found {len(images)} images and {len(odometry)} poses: expected one of each for a frame.")
-    given: Any = cameras
-    several = given[0] if isinstance(given, list | tuple) and rig_from_cams is not None else given
-    of_each = list(given) if isinstance(several, list | tuple) else [given] * len(images)
-    if len(of_each) != len(images):
-        raise ValueError(f"Found {len(of_each)} cameras and {len(images)} images: expected one for all, or for each.")
-    localize = partial(_localize, place, rig_from_cams, turns)
-    single = {frame: localize(image, of_each[frame]) for frame, image in enumerate(images) if image is not None}
+        raise ValueError(f"Found {len(images)} images and {len(odometry)} poses: expected one of each per frame.")
+    cams: Any = cameras
+    first = cams[0] if isinstance(cams, list | tuple) and rig_from_cams is not None else cams
+    cams_of_frames = list(cams) if isinstance(first, list | tuple) else [cams] * len(images)
+    if len(cams_of_frames) != len(images):
+        raise ValueError(
+            f"Found {len(cams_of_frames)} cameras and {len(images)} images: expected one for all, or one per image."
+        )
+    localize = partial(_localize, map_, rig_from_cams, turns)
+    single = {frame: localize(image, cams_of_frames[frame]) for frame, image in enumerate(images) if image is not None}
     piece, again = np.zeros(len(odometry), int), dict[int, PoseEstimate]()
-    parts = list[PlacedPiece]()
+    placed = list[PlacedPiece]()
     pieces, queries = odometry.split(settings), queries_of(single)
     if not settings.online:
         settings = with_measured_drift([(odometry.part(rows), queries.part(rows)) for rows in pieces], settings)
@@ -110,28 +112,27 @@ def localize_sequence(
             for part in cut(odometry.part(rows), queries.part(rows), settings)
         ]
     tracks = [(odometry.part(rows), queries.part(rows)) for rows in pieces]
-    gravity = measured_gravity(tracks, lambda: up_of_cameras(place.session.world_from_cam()), settings)
+    gravity = measured_gravity(tracks, lambda: up_of_cameras(map_.session.world_from_cam()), settings)
     for number, rows in enumerate(pieces):
         piece[rows] = number
-        asked = np.array([frame for frame in single if rows.start <= frame < rows.stop], np.int64)
+        frames = np.array([frame for frame in single if rows.start <= frame < rows.stop], np.int64)
 
         def localize_again(todo: Sequence[tuple[int, RoughPose]], start: int = rows.start) -> list[PoseEstimate]:
-            return [localize(images[start + frame], of_each[start + frame], near) for frame, near in todo]
+            return [localize(images[start + frame], cams_of_frames[start + frame], near) for frame, near in todo]
 
         def observe(frame: int, again: PoseEstimate | None, start: int = rows.start) -> Observations:
-            estimate, each = again or single[start + frame], of_each[start + frame]
+            estimate, cams = again or single[start + frame], cams_of_frames[start + frame]
             rig = np.eye(4)[None] if rig_from_cams is None else np.asarray(rig_from_cams, np.float64)
-            cameras = each if isinstance(each, list | tuple) else [each]
-            return Observations.of(estimate.correspondences, cameras, rig)
+            return Observations.of(estimate.correspondences, cams if isinstance(cams, list | tuple) else [cams], rig)
 
-        ask = localize_again if settings.relocalize else None
-        done = localize_piece(*tracks[number], asked - rows.start, settings, ask, gravity, observe)
+        relocalize = localize_again if settings.relocalize else None
+        done = localize_piece(*tracks[number], frames - rows.start, settings, relocalize, gravity, observe)
         again |= {rows.start + frame: estimate for frame, estimate in done.again.items()}
-        parts.append(done.placed)
+        placed.append(done.placed)
     return LocalizedFrames(
-        np.concatenate([np.zeros((0, 4, 4)), *(part.world_from_rig for part in parts)]),
-        np.concatenate([np.zeros((0, 6, 6)), *(part.covariances for part in parts)]),
-        np.concatenate([np.zeros(0, object), *(part.status for part in parts)]),
+        np.concatenate([np.zeros((0, 4, 4)), *(part.world_from_rig for part in placed)]),
+        np.concatenate([np.zeros((0, 6, 6)), *(part.covariances for part in placed)]),
+        np.concatenate([np.zeros(0, object), *(part.status for part in placed)]),
         piece,
         single,
         again,
@@ -139,43 +140,45 @@ def localize_sequence(
 
 
 class SequenceLocalizer:
-    """Tells a moving device where it is now, frame by frame, from the frames before.
+    """Localizes a moving device frame by frame, from the current and earlier frames.
 
-    At a picture, the pose graph of the last `settings.length_s` seconds is solved, all of the piece without a limit: of
-    600 frames that takes some 50 ms, besides the picture. Between pictures odometry leads on from the last solution.
+    Each picture solves the pose graph of the last `settings.length_s` seconds (None: of the whole piece). With 600
+    frames this takes some 50 ms, besides localization of the picture. Between pictures, odometry continues the last
+    solution.
     """
 
     def __init__(
         self,
-        place: Map,
+        map_: Map,
         settings: SequenceSettings | dict[str, Any] | None = None,
         rig_from_cams: NDArray[np.float64] | None = None,
         turns: Sequence[int] | None = None,
     ) -> None:
         """See `localize_sequence`; `settings.length_s` is the window."""
         self.settings = self._drift = SequenceSettings.of({"online": True}, settings)
-        self._localize = partial(_localize, place, rig_from_cams, turns)
+        self._localize = partial(_localize, map_, rig_from_cams, turns)
         self._timestamps, self._poses = list[int](), list[Floats]()
         self._queries = queries_of({})
-        """Of the piece, with those found again."""
+        """Single poses of the current piece, including those found again."""
         self._solved: tuple[int, PlacedPiece] | None = None
+        """Frame of the last picture, and the solution there."""
         self.single: PoseEstimate | None = None
-        """What the picture of the latest frame says alone; None: it had none."""
+        """Estimate from the latest frame's picture alone; None if it had no picture."""
 
     def add(
         self, timestamp: int, odom_from_rig: ArrayLike, image: Pictures = None, cameras: Cameras | None = None
     ) -> PoseEstimate:
-        """Add a frame, and return where it is: `found_by` is `sequence`.
+        """Add a frame and return its pose, with `found_by` = `sequence`.
 
         Args:
-            timestamp: microseconds, later than those before.
-            odom_from_rig: (4, 4) as the device measured it; of a single camera odom_from_cam.
-            image: the frame's picture, or those of a rig.
-            cameras: its intrinsics; of a rig a sequence.
+            timestamp: microseconds, later than the last one.
+            odom_from_rig: (4, 4) pose by the device's odometry; with a single camera, odom_from_cam.
+            image: the frame's picture, or a sequence of pictures of a rig; None: odometry only.
+            cameras: the intrinsics; a sequence for a rig.
 
         Raises:
-            ValueError: the time is not later than the last, or the pose is none.
-            ImageError: no camera, or none that a picture can be of. A picture that cannot be read is `failed`.
+            ValueError: the timestamp is not later than the last one, or the pose is invalid.
+            ImageError: a camera is missing, or does not fit the picture. A picture that cannot be read is `failed`.
             ManifestError: GTSAM is not installed.
         """
         pose = np.asarray(odom_from_rig, np.float64)
@@ -186,30 +189,30 @@ class SequenceLocalizer:
         self._timestamps.append(int(timestamp))
         self._poses.append(pose)
         latest = self._since(-4)
-        if latest.split(self.settings)[-1].start == len(latest) - 1:  # tracking was lost: a new piece
+        if latest.split(self.settings)[-1].start == len(latest) - 1:  # tracking was lost: start a new piece
             del self._timestamps[:-1], self._poses[:-1]
             self._queries, self._solved = queries_of({}), None
         if image is None:
             self.single = None
-            return self._led_on()
-        given: Any = cameras
-        self.single = self._localize(image, given)
+            return self._extrapolate()
+        cams: Any = cameras
+        self.single = self._localize(image, cams)
         self._queries = self._queries.joined(queries_of({len(self._poses) - 1: self.single}))
-        return self._solve(image, given)
+        return self._solve(image, cams)
 
     def _since(self, start: int) -> Odometry:
         return Odometry(np.array(self._timestamps[start:], np.int64), np.stack(self._poses[start:]))
 
-    def _forget(self, start: int) -> None:
-        """Leave out the frames before one."""
+    def _drop_before(self, start: int) -> None:
         del self._timestamps[:start], self._poses[:start]
         self._queries = self._queries.part(slice(start, start + len(self._poses)))
 
     def _solve(self, image: Pictures, cameras: Cameras) -> PoseEstimate:
         if self.settings.length_s is not None:
-            self._forget(int(np.searchsorted(self._timestamps, self._timestamps[-1] - self.settings.length_s * 1e6)))
+            oldest = self._timestamps[-1] - self.settings.length_s * 1e6
+            self._drop_before(int(np.searchsorted(self._timestamps, oldest)))
         self._drift = with_measured_drift([(self._since(0), self._queries)], self.settings)
-        self._forget(cut(self._since(0), self._queries, self._drift)[-1].start)
+        self._drop_before(cut(self._since(0), self._queries, self._drift)[-1].start)
         window = self._since(0)
         offline = self._drift.model_copy(update={"online": False, "length_s": None})
 
@@ -224,20 +227,20 @@ class SequenceLocalizer:
             return PoseEstimate(str(placed.status[-1]), found_by="sequence")
         return self._estimate(placed.world_from_rig[-1], placed.covariances[-1], str(placed.status[-1]))
 
-    def _led_on(self) -> PoseEstimate:
-        """Return the latest pose as odometry leads to it from the last picture."""
+    def _extrapolate(self) -> PoseEstimate:
+        """Return the pose of the latest frame by odometry from the last picture."""
         if self._solved is None:
             return PoseEstimate("failed: no query of this piece has a pose", found_by="sequence")
         last, placed = self._solved
         status = str(placed.status[-1])
         if not np.isfinite(placed.world_from_rig[-1]).all():
             return PoseEstimate(status, found_by="sequence")
-        way = self._since(last).scaled(placed.scale)
-        step = geometry.invert(way.odom_from_rig[0]) @ way.odom_from_rig[-1]
-        turn, shift = way.drift(self._drift, np.array([0]), np.array([len(way) - 1]))
-        shift = np.hypot(shift, self.settings.scale_std * np.linalg.norm(step[:3, 3]))
+        since = self._since(last).scaled(placed.scale)
+        step = geometry.invert(since.odom_from_rig[0]) @ since.odom_from_rig[-1]
+        rotation_std, position_std = since.drift(self._drift, np.array([0]), np.array([len(since) - 1]))
+        position_std = np.hypot(position_std, self.settings.scale_std * np.linalg.norm(step[:3, 3]))
         covariance = carried_over(placed.covariances[-1], geometry.invert(step))
-        covariance += np.diag(np.repeat([turn[0], shift[0]], 3) ** 2)
+        covariance += np.diag(np.repeat([rotation_std[0], position_std[0]], 3) ** 2)
         status = FAR if status == "ok" and not is_sure(covariance[None])[0] else status
         return self._estimate(placed.world_from_rig[-1] @ step, covariance, status)
 

@@ -1,8 +1,8 @@
-"""The poses of a recording that its odometry and the poses of single queries make most probable.
+"""Pose graph: the most probable poses of a piece of odometry, given the poses of single queries in it.
 
-A graph of all poses of a piece of odometry: each step between two is as odometry measured it, up to its drift; the
-pose of a single query is as it was localized, up to its covariance. Solved by GTSAM (F. Dellaert and GTSAM
-Contributors, https://gtsam.org).
+The variables are all poses of the piece. Each odometry step is a relative pose with the covariance of its drift; each
+single query is a pose prior with its own covariance. Solved by GTSAM (F. Dellaert and GTSAM Contributors,
+https://gtsam.org).
 """
 
 from dataclasses import dataclass, replace
@@ -28,14 +28,15 @@ from toolkit.localizers.odometry import (
 from toolkit.manifest import SequenceSettings
 
 MISSING = (
-    "The stage `sequence` needs GTSAM, which is not installed here. To add it, where the toolkit was installed from: "
+    "The stage `sequence` needs GTSAM, which is not installed. To install it, run in the clone of the toolkit: "
     "pip install -e '.[sequence]'"
 )
 _CHI2_999 = 22.46
 """99.9 % quantile of the chi-squared distribution with 6 degrees of freedom."""
 _ROUNDS = 8
+"""Largest number of iterations of solving the graph and choosing the queries that fit."""
 MAX_STD_DEG, MAX_STD_M = 2.25, 0.2
-"""Largest standard deviation, as a length, of an `ok` pose: 5 degrees and 0.5 m are more than 2.2 of them away."""
+"""Largest standard deviation of an `ok` pose, over all axes: 5 degrees and 0.5 m are more than 2.2 times as much."""
 FAR = "low_confidence: odometry is not sure so far from a query"
 
 
@@ -44,45 +45,42 @@ class PlacedPiece:
     """The poses of one piece of odometry in the map."""
 
     world_from_rig: Floats
-    """(N, 4, 4), NaN where no query has a pose."""
+    """(N, 4, 4), NaN for frames without a pose: all frames if no query has a pose, online those without a query."""
     covariances: Floats
     """(N, 6, 6) of a small motion in the rig's frame: rotation, radians, then translation, meters."""
     used: NDArray[np.bool_]
-    """(Q,) whether the poses, or online its own, rest on each query."""
+    """(Q,) whether each query fits the poses; online, whether it fits the pose of its own frame."""
     status: NDArray[np.object_]
-    """(N,) `ok`, `low_confidence: <reason>` or `failed: <reason>`; empty where no pose was asked for."""
+    """(N,) `ok`, `low_confidence: <reason>` or `failed: <reason>`; online empty for frames without a query."""
     scale: float = 1.0
-    """Factor of the odometry's lengths; online that of the last pose."""
+    """Scale factor of the odometry; online that of the last pose."""
 
 
-def place_online(odometry: Odometry, queries: PosedQueries, asked: Ints, settings: SequenceSettings) -> PlacedPiece:
-    """Return the poses of some frames of a piece, each from what was before it alone, at most `settings.length_s`.
-
-    Args:
-        asked: indices of the frames.
+def place_online(odometry: Odometry, queries: PosedQueries, frames: Ints, settings: SequenceSettings) -> PlacedPiece:
+    """Return the poses of some frames of a piece, each only from the last `settings.length_s` seconds before it.
 
     Raises:
         ManifestError: GTSAM is not installed.
     """
     length_us = np.inf if settings.length_s is None else settings.length_s * 1e6
     count = len(odometry)
-    every = PlacedPiece(
+    piece = PlacedPiece(
         np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan), np.zeros(len(queries), bool),
         np.full(count, "", object),
     )  # fmt: skip
-    for frame in asked.tolist():
+    for frame in frames.tolist():
         start = int(np.searchsorted(odometry.timestamps, odometry.timestamps[frame] - length_us))
         within = slice(start, frame + 1)
         past, chosen = odometry.part(within), queries.part(within)
         drifting = with_measured_drift([(past, chosen)], settings)
-        last = cut(past, chosen, drifting)[-1]  # what is after a loss of tracking that the queries tell
+        last = cut(past, chosen, drifting)[-1]  # the part after the last loss of tracking
         past, chosen = past.part(last), chosen.part(last)
         placed = place_piece(past, chosen, drifting)
-        every.world_from_rig[frame], every.covariances[frame] = placed.world_from_rig[-1], placed.covariances[-1]
-        every.status[frame] = placed.status[-1]
-        every.used[queries.frames == frame] = placed.used[chosen.frames == len(past) - 1]
-        every = replace(every, scale=placed.scale)
-    return every
+        piece.world_from_rig[frame], piece.covariances[frame] = placed.world_from_rig[-1], placed.covariances[-1]
+        piece.status[frame] = placed.status[-1]
+        piece.used[queries.frames == frame] = placed.used[chosen.frames == len(past) - 1]
+        piece = replace(piece, scale=placed.scale)
+    return piece
 
 
 def place_piece(
@@ -91,7 +89,7 @@ def place_piece(
     """Return the poses of a piece of odometry, from the poses of single queries in it.
 
     Args:
-        gravity: which direction is up; None: not known.
+        gravity: the up direction in the odometry and the map; None: unknown.
 
     Raises:
         ManifestError: GTSAM is not installed.
@@ -110,7 +108,7 @@ def place_piece(
         moved = odometry.scaled(scale)
         poses, covariances = _optimized(moved, chosen, settings, gravity)
         seen.add(used.tobytes())
-        # Who fits is used, whether it voted for this place or not; who does not fit is not.
+        # Use the queries that fit the solution, whether or not they voted for this placement.
         fit = np.flatnonzero(_chi2(poses, covariances, queries) < _CHI2_999)
         if not len(fit) or fit.tobytes() in seen:
             break
@@ -118,7 +116,7 @@ def place_piece(
     mask = np.isin(np.arange(len(queries)), used)
     status = np.full(count, "ok", object)
     if not best.trusted:
-        # Where odometry contradicts the queries, those that were sure without it do not lose their poses to it.
+        # `ok` queries that do not fit keep their own poses, because odometry may be what is wrong.
         alone = queries.choose(queries.trusted & ~mask)
         reason = "no query of this piece is sure"
         if 2 * len(alone) > np.count_nonzero(queries.trusted):
@@ -133,22 +131,22 @@ def place_piece(
 
 
 def is_sure(covariances: Floats) -> NDArray[np.bool_]:
-    """Return which poses are known well enough to be `ok`, by their covariances (n, 6, 6)."""
+    """Return which poses (n,) are certain enough for `ok`, from their covariances (n, 6, 6)."""
     variances = np.diagonal(covariances, axis1=1, axis2=2)
     turns, shifts = variances[:, :3].sum(axis=1), variances[:, 3:].sum(axis=1)
     return np.asarray((turns <= np.deg2rad(MAX_STD_DEG) ** 2) & (shifts <= MAX_STD_M**2))
 
 
 def _chi2(poses: Floats, covariances: Floats, queries: PosedQueries) -> Floats:
-    """Return how far (Q,) the poses of single queries are off, in their own and the graph's covariance together."""
+    """Return squared Mahalanobis distances (Q,) of single poses to the graph's, under the sum of their covariances."""
     frames = queries.frames
     difference = _logarithm(geometry.invert(poses[frames]) @ queries.world_from_rig)
-    both = floored(queries.covariances) + covariances[frames]
-    return np.asarray(np.einsum("qi,qi->q", difference, np.linalg.solve(both, difference[..., None])[..., 0]))
+    total = floored(queries.covariances) + covariances[frames]
+    return np.asarray(np.einsum("qi,qi->q", difference, np.linalg.solve(total, difference[..., None])[..., 0]))
 
 
 def _logarithm(poses: Floats) -> Floats:
-    """Return small motions (n, 6): rotation vector, radians, then translation."""
+    """Return poses as small motions (n, 6): rotation vector, radians, then translation, meters."""
     angle = np.deg2rad(geometry.rotation_angle_deg(poses[:, :3, :3]))
     axis = np.stack([poses[:, i, j] - poses[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=1)
     return np.concatenate([geometry.unit(axis) * angle[:, None], poses[:, :3, 3]], axis=1)
@@ -157,7 +155,7 @@ def _logarithm(poses: Floats) -> Floats:
 def _optimized(
     odometry: Odometry, queries: PosedQueries, settings: SequenceSettings, gravity: Gravity | None
 ) -> tuple[Floats, Floats]:
-    """Return poses (N, 4, 4) and covariances (N, 6, 6)."""
+    """Solve the pose graph. Return world_from_rig (N, 4, 4) and covariances (N, 6, 6)."""
     gtsam = require_gtsam()
     graph, values = motion_graph(odometry, queries, settings, gravity), gtsam.Values()
     for number, pose in enumerate(first_guess(odometry, queries)):
@@ -172,15 +170,15 @@ def _optimized(
 def motion_graph(
     odometry: Odometry, queries: PosedQueries, settings: SequenceSettings, gravity: Gravity | None
 ) -> Any:
-    """Return GTSAM's graph of N poses: a factor for each step of odometry, for the pose of each query, and for up."""
+    """Return GTSAM's graph of N poses, with factors for odometry steps, poses of queries, and the up direction."""
     gtsam = require_gtsam()
     graph = gtsam.NonlinearFactorGraph()
     steps = geometry.invert(odometry.odom_from_rig[:-1]) @ odometry.odom_from_rig[1:]
     first: Ints = np.arange(len(steps))
     rotation_std, position_std = odometry.drift(settings, first, first + 1)
-    # The scale is not the same all along the way, either.
+    # The scale also varies along the path.
     position_std = np.hypot(position_std, settings.scale_std * np.linalg.norm(steps[:, :3, 3], axis=1))
-    # A device that stands still moves by nothing, but is not known to a billionth.
+    # A device that stands still has no drift; the floor keeps the factors finite.
     rotation_std, position_std = np.maximum(rotation_std, 1e-4), np.maximum(position_std, 1e-3)
     for number, step in enumerate(steps):
         noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([rotation_std[number], position_std[number]], 3))
@@ -191,7 +189,8 @@ def motion_graph(
         noise = gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Gaussian.Covariance(covariance))
         graph.add(gtsam.PriorFactorPose3(frame, gtsam.Pose3(rigid(pose)), noise))
     if gravity is not None:
-        # From the first pose on odometry drifts in tilt, too: the others know no better. A piece may lean by far more.
+        # Only at the first pose, because tilt drifts after it. Robust, because a piece may lean by far more than its
+        # standard deviation.
         noise = gtsam.noiseModel.Isotropic.Sigma(2, np.deg2rad(gravity.std_deg))
         in_rig = odometry.odom_from_rig[0, :3, :3].T @ gravity.in_odometry
         up = gtsam.Unit3(gravity.in_map), gtsam.noiseModel.Robust.Create(kernel, noise), gtsam.Unit3(in_rig)
@@ -200,12 +199,12 @@ def motion_graph(
 
 
 def rigid(pose: Floats) -> Floats:
-    """Return a pose (4, 4) whose rotation is one up to the last digit; files have some of them."""
+    """Return a pose (4, 4) with an exact rotation; rotations in files are rounded."""
     return geometry.pose_from_qt(geometry.qt_from_pose(pose))
 
 
 def require_gtsam() -> Any:
-    """Return the package.
+    """Import and return GTSAM.
 
     Raises:
         ManifestError: it is not installed.

@@ -1,1 +1,1 @@
-"""A run as a whole: its record, its folder, the pairs of devices that it left out."""
+"""Runs: their record, their folder, their kernels, and the pairs of devices that they leave out."""

@@ -1,9 +1,9 @@
-"""Work spread over the workers of a Dask cluster (https://distributed.dask.org), on this machine or on many.
+"""Spread a stage's work over the workers of a Dask cluster (https://distributed.dask.org), on one machine or many.
 
-A stage cuts its work into shares and has them done before it does it itself: each worker writes files of its own, as a
-run that was stopped leaves them (`features.groups.GroupWriter`), and the stage goes on from there. So it gives the same
-results, and a share of a worker that died is done by another, from where it was. All processes see the same files,
-under the same paths.
+A stage cuts its work into shares and submits them before it runs itself. Each worker writes files of its own, the same
+files that a stopped run leaves (`features.groups.GroupWriter`), and the stage then resumes from them. So the results do
+not change, and if a worker dies, another one continues its share. All processes must see the same files under the same
+paths.
 """
 
 import logging
@@ -32,26 +32,27 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 ADDRESS = "TOOLKIT_CLUSTER"
-"""Environment variable: the address of the scheduler whose workers stages use."""
+"""Environment variable with the address of the scheduler whose workers the stages use."""
 MISSING = (
-    "--cluster needs Dask, which is not installed here. To add it, where the toolkit was installed from: "
+    "--cluster needs Dask, which is not installed. To install it, run in the clone of the toolkit: "
     "pip install -e '.[cluster]'"
 )
 SHARES_A_WORKER = 4
-"""Work is cut into about so many shares a worker: all end at about the same time, and little is lost with one."""
+"""Shares per worker: small enough that all workers end at about the same time, and that a lost share costs little."""
 QUEUES = ("HTCondor", "LSF", "Moab", "OAR", "PBS", "SGE", "SLURM")
-"""The schedulers of clusters that `dask-jobqueue` knows, as its classes spell them."""
+"""Queue systems that `dask-jobqueue` supports, spelled as in its class names."""
 _CONNECT_S = 30
+"""Timeout for a scheduler to answer, in seconds."""
 _WAIT_S = 600
-"""Longest time that a scheduler takes to answer, and a worker to start."""
+"""Timeout for a worker to start, in seconds."""
 _CHECK_S = 60
-"""How long nothing may happen before it is asked whether there are workers."""
+"""After this many seconds without a finished share, check that workers are left."""
 _ONE_SHARE = threading.Lock()
-"""Held while a share is done: folder, environment, BLAS's threads, streams and what is made once are a process's."""
+"""Held while a share runs: working folder, environment, BLAS threads, streams and caches belong to the process."""
 
 
 class Cluster:
-    """The workers that a stage can use."""
+    """The Dask workers that a stage can use."""
 
     def __init__(self, client: "Client") -> None:
         self._client = client
@@ -62,28 +63,28 @@ class Cluster:
         return max(1, len(self._client.scheduler_info(n_workers=-1)["workers"]))
 
     def cut(self, items: Sequence[Any], multiple: int = 1) -> list[Sequence[Any]]:
-        """Cut work into shares of successive items, of a multiple of `multiple` but for the last."""
+        """Cut items into shares of successive items. Share lengths are multiples of `multiple`, except for the last."""
         length = -(-len(items) // (SHARES_A_WORKER * self.size * multiple)) * multiple
         return [items[start : start + length] for start in range(0, len(items), length)] if length else []
 
     def run(self, function: Callable[..., None], shares: Sequence[tuple[Any, ...]], sizes: Sequence[int], label: str,
             unit: str) -> None:  # fmt: skip
-        """Call a function of the toolkit for each share on some worker, and return when all are done.
+        """Call a function once per share on the workers, and return when all shares are done.
 
         Args:
-            function: what does a share; it may be called twice for one whose worker died.
-            shares: its arguments.
-            sizes: how many units each share has, for the bar.
-            label, unit: of the bar.
+            function: a function of the toolkit that does one share. If a worker dies, it is called again for its share.
+            shares: arguments of each call.
+            sizes: number of units in each share, for the progress bar.
+            label, unit: of the progress bar.
 
         Raises:
-            ToolkitError: a share killed several workers, or none is left; else what the function raised.
+            ToolkitError: a share killed several workers, or no worker is left. Errors of the function are raised too.
         """
         from distributed import CancelledError, KilledWorker, wait
 
         environment = {name: os.environ[name] for name in (EXTRA_DEVICES, ALLOW_OUTSIDE) if name in os.environ}
         here = os.getcwd()  # noqa: PTH109 - as text
-        # As bytes: a scheduler that reads a share would make what only workers need, such as networks.
+        # Pickled here, so that the scheduler does not unpickle objects that only workers need, such as networks.
         futures = {
             self._client.submit(_run_share, here, environment, pickle.dumps((function, share)), pure=False): size
             for share, size in zip(shares, sizes, strict=True)
@@ -108,10 +109,10 @@ class Cluster:
                 f"{label}: several workers died of one share ({first_line(error)}). Most likely it needs more memory "
                 "than a worker has."
             ) from None
-        except CancelledError as error:  # the client gives up its shares when it loses the scheduler
+        except CancelledError as error:  # the client cancels its shares when it loses the scheduler
             raise ToolkitError(
-                f"{label}: the cluster's scheduler is gone ({first_line(error)}). What was done is kept: the same "
-                "command goes on from here, with or without a cluster."
+                f"{label}: the cluster's scheduler is gone ({first_line(error)}). Finished work is kept: the same "
+                "command continues from here, with or without a cluster."
             ) from None
         finally:
             self._client.cancel(list(futures))
@@ -126,23 +127,22 @@ class Cluster:
 
 
 def _run_share(here: str, environment: Mapping[str, str], pickled: bytes) -> None:
-    """Do a share, a pickled function and its arguments, with the folder and the settings of who asks for it."""
-    with _ONE_SHARE:  # a worker may have several threads: `dask worker` starts one a core
+    """Run one share, a pickled (function, arguments), in the working folder and with the settings of the submitter."""
+    with _ONE_SHARE:  # a worker may have several threads: `dask worker` starts one per core
         os.chdir(here)
-        for name in (EXTRA_DEVICES, ALLOW_OUTSIDE):
+        # Workers must not submit shares to the cluster (ADDRESS): all could end up waiting for each other.
+        for name in (EXTRA_DEVICES, ALLOW_OUTSIDE, ADDRESS):
             os.environ.pop(name, None)
-        # No worker asks other workers: they could all wait for each other.
-        os.environ.pop(ADDRESS, None)
         os.environ.update(environment)
-        # A worker's own threads are the parallel dimension, whatever the environment says: BLAS's would wait for each
-        # other.
+        # The function has threads of its own; BLAS threads on top of them would only wait for each other. Standard
+        # error is dropped because the submitter already shows a progress bar.
         with threadpool_limits(1, "blas"), open(os.devnull, "w") as nowhere, redirect_stderr(nowhere):
             function, share = pickle.loads(pickled)
-            function(*share)  # the one bar is that of who asks
+            function(*share)
 
 
 def current_cluster() -> Cluster | None:
-    """Return the cluster that this process is to use; None: it does its work itself.
+    """Return the cluster that `TOOLKIT_CLUSTER` names; None without one: this process does all work itself.
 
     Raises:
         ToolkitError: the cluster does not answer.
@@ -164,15 +164,15 @@ def _client(address: str) -> "Client":
             "and does it have workers?"
         ) from None
     try:
-        found = set(client.run(_version).values())
+        versions = set(client.run(_version).values())
     except ImportError as error:
         raise ToolkitError(
             f"The workers at {address} cannot import the toolkit ({first_line(error)}). Install it where they run."
         ) from None
-    if found != {__version__}:
+    if versions != {__version__}:
         raise ToolkitError(
-            f"The workers at {address} have the toolkit's version {', '.join(sorted(found))}, this is {__version__}. "
-            "Install the same on all machines."
+            f"The workers at {address} have version {', '.join(sorted(versions))} of the toolkit, this machine has "
+            f"{__version__}. Install the same version on all machines."
         )
     return client
 
@@ -182,21 +182,22 @@ def _version() -> str:
 
 
 @contextmanager
-def open_cluster(asked: str | None, say: Callable[[str], object] = print) -> Iterator[None]:
+def open_cluster(spec: str | None, say: Callable[[str], object] = print) -> Iterator[None]:
     """Let the stages that run in this context, here and in kernels, use a cluster.
 
     Args:
-        asked: `local` or `local:<workers>` starts workers on this machine: one a GPU, else one a core, if their number
-            is not given; `tcp://<host>:<port>` uses those of a scheduler that runs; `slurm:<file>` starts them by a
-            cluster's queue (also pbs, sge, lsf, ...). The YAML file has `jobs`, how many, and what the queue's class of
-            dask-jobqueue takes, e.g. `queue`, `cores`, `memory`, `walltime`. None: no cluster.
-        say: takes the line with the address of the dashboard.
+        spec: `local` or `local:<workers>` starts workers on this machine; without a number one per GPU, or one per core
+            if there is no GPU. `tcp://<host>:<port>` uses the workers of a running scheduler. `slurm:<file>` (also pbs,
+            sge, lsf, ...) starts workers through a queue; the YAML file has `jobs`, the number of workers, and
+            arguments for the queue's class in dask-jobqueue, e.g. `queue`, `cores`, `memory`, `walltime`. None: no
+            cluster.
+        say: prints a line; called once with the number of workers and the address of the dashboard.
 
     Raises:
-        ManifestError: Dask is not installed, or an unknown or faulty cluster is asked for.
+        ManifestError: Dask is not installed, or `spec` is unknown or faulty.
         ToolkitError: no worker started.
     """
-    if asked is None:
+    if spec is None:
         yield
         return
     try:
@@ -204,13 +205,13 @@ def open_cluster(asked: str | None, say: Callable[[str], object] = print) -> Ite
     except ImportError:
         raise ManifestError(MISSING) from None
     with ExitStack() as stack:
-        address, link = _start(asked, stack)
+        address, link = _start(spec, stack)
         before = os.environ.get(ADDRESS)
         os.environ[ADDRESS] = address
         try:
             cluster = current_cluster()
             assert cluster is not None
-            say(f"{cluster.size} workers at {address}; what they do: {link or _client(address).dashboard_link}")
+            say(f"{cluster.size} workers at {address}; dashboard: {link or _client(address).dashboard_link}")
             yield
         finally:
             del os.environ[ADDRESS]
@@ -221,15 +222,15 @@ def open_cluster(asked: str | None, say: Callable[[str], object] = print) -> Ite
                 _client.cache_clear()
 
 
-def _start(asked: str, stack: ExitStack) -> tuple[str, str]:
-    """Return the address of a cluster's scheduler, started if need be, and of its dashboard if that is known."""
-    kind, _, rest = asked.partition(":")
+def _start(spec: str, stack: ExitStack) -> tuple[str, str]:
+    """Start a scheduler if need be. Return its address and that of its dashboard ("" if unknown)."""
+    kind, _, rest = spec.partition(":")
     if kind in ("tcp", "tls"):
         if not re.fullmatch(r"//(\[[\da-fA-F:.%]+\]|[^\[\]:/\s]+):\d{1,5}", rest):
             raise ManifestError(
-                f"--cluster {asked}: expected {kind}://HOST:PORT; the port of Dask's scheduler is 8786 if not told."
+                f"--cluster {spec}: expected {kind}://HOST:PORT; the default port of Dask's scheduler is 8786."
             )
-        return asked, ""
+        return spec, ""
     queue = next((name for name in QUEUES if name.lower() == kind), None)
     if kind == "local" and (not rest or (rest.isdecimal() and int(rest))):
         cluster = stack.enter_context(_local_cluster(int(rest or 0)))
@@ -237,18 +238,18 @@ def _start(asked: str, stack: ExitStack) -> tuple[str, str]:
         cluster = stack.enter_context(_queued_cluster(queue, Path(rest)))
     else:
         queues = ", ".join(f"{name.lower()}:FILE" for name in QUEUES)
-        raise ManifestError(f"--cluster {asked}: expected local, local:WORKERS, tcp://HOST:PORT, or one of {queues}.")
+        raise ManifestError(f"--cluster {spec}: expected local, local:WORKERS, tcp://HOST:PORT, or one of {queues}.")
     return cluster.scheduler_address, cluster.dashboard_link
 
 
 def _local_cluster(count: int) -> Any:
-    """Start workers on this machine, each with its share of the cores, and with a GPU of its own as far as they go."""
+    """Start `count` workers on this machine (0: one per GPU, or per core) that share its cores and GPUs."""
     from distributed import Nanny, Scheduler, SpecCluster
 
-    given = os.environ.get("CUDA_VISIBLE_DEVICES")
-    gpus = given.split(",") if given else [path.name[6:] for path in sorted(Path("/dev").glob("nvidia[0-9]*"))]
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    gpus = visible.split(",") if visible else [path.name[6:] for path in sorted(Path("/dev").glob("nvidia[0-9]*"))]
     count = count or len(gpus) or default_workers()
-    # A worker does one share at a time, with its own threads. What it needs of memory is the toolkit's to bound.
+    # A worker runs one share at a time. The toolkit bounds its own memory, so Dask need not.
     options = {"nthreads": 1, "memory_limit": 0, "silence_logs": logging.ERROR}
     workers = {
         number: {
@@ -266,7 +267,7 @@ def _local_cluster(count: int) -> Any:
 
 
 def _queued_cluster(queue: str, path: Path) -> Any:
-    """Start workers by the queue of a cluster, as a file says."""
+    """Start workers through a queue such as SLURM, with the options in a YAML file."""
     import yaml
 
     try:
@@ -281,7 +282,7 @@ def _queued_cluster(queue: str, path: Path) -> Any:
     except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
         raise ManifestError(f"--cluster: {path} cannot be read ({first_line(error)}).") from None
     except (AttributeError, KeyError, TypeError):
-        raise ManifestError(f"--cluster: {path} has no `jobs: <number>`, the workers to start.") from None
+        raise ManifestError(f"--cluster: {path} has no `jobs: <number>`, the number of workers to start.") from None
     try:
         cluster = getattr(dask_jobqueue, f"{queue}Cluster")(**options)
     except (TypeError, ValueError) as error:

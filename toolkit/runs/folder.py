@@ -1,4 +1,4 @@
-"""The run folder: one run at a time, a log of everything, and nothing left of runs that were killed."""
+"""The run folder: lock it against other runs, log to it, and clean up after killed runs."""
 
 import json
 import logging
@@ -22,17 +22,17 @@ log = logging.getLogger(__name__)
 
 LOG = "run.log"
 LOG_VARIABLE = "TOOLKIT_RUN_LOG"
-"""Tells the kernels of a run where its log is."""
+"""Environment variable with the path of the log, for the kernels of a run."""
 
 
 @contextmanager
 def held(run_dir: Path) -> Iterator[None]:
-    """Hold a run folder against other runs, log to its `run.log`, and clear away what a killed run left in it.
+    """Lock a run folder, log to its `run.log`, and remove the leftovers of a killed run.
 
-    The system itself gives up the lock of a process that ends, however it ends.
+    The operating system releases the lock when the process ends, however it ends.
 
     Raises:
-        ToolkitError: another run holds it; names its process, host and start.
+        ToolkitError: another run holds the lock; the message names its process, host and start.
     """
     run_dir.mkdir(parents=True, exist_ok=True)
     lock, holder = FileLock(run_dir / ".run.lock"), run_dir / ".run.lock.json"
@@ -42,8 +42,8 @@ def held(run_dir: Path) -> Iterator[None]:
         other = read_json(holder)
         who = f"process {other.get('pid', '?')} on {other.get('host', '?')}, since {other.get('since', '?')}"
         raise ToolkitError(
-            f"{run_dir}: another run works in this folder: {who}. Wait until it ends, end it, or give this run "
-            "another place (--set output_root=FOLDER)."
+            f"{run_dir}: another run is using this folder: {who}. Wait until it ends, stop it, or write this run to "
+            "another folder (--set output_root=FOLDER)."
         ) from None
     try:
         me = {"pid": os.getpid(), "host": socket.gethostname()}
@@ -54,7 +54,7 @@ def held(run_dir: Path) -> Iterator[None]:
             _sweep(run_dir)
             yield
     finally:
-        for path in (holder, run_dir / ".run.lock"):  # while it is held
+        for path in (holder, run_dir / ".run.lock"):  # before the release, so that no other run's files are removed
             with suppress(OSError):
                 path.unlink()
         lock.release()
@@ -70,36 +70,37 @@ def _variable(name: str, value: str) -> Iterator[None]:
 
 
 def _sweep(run_dir: Path) -> None:
-    """Remove temporary files and folders of killed runs, and say in their record that they have ended."""
+    """Remove temporary files and folders of killed runs, and mark a record that still says `running` as interrupted."""
     sweep_partials(run_dir)
-    # The executed notebook is written by papermill, under a name without a process.
+    # Papermill writes the executed notebook under a name without a process id, which `sweep_partials` does not know.
     for notebook in run_dir.glob("notebooks/.*.partial.ipynb"):
         notebook.unlink()
     for folder in Path(tempfile.gettempdir()).glob("kernel.*"):
         if is_left_over(folder.name):
-            log.debug("removed %s of a killed run", folder)
+            log.debug("Removed %s of a killed run.", folder)
             shutil.rmtree(folder, ignore_errors=True)
     record = read_json(run_dir / RECORD)
     if record.get("status") == "running":
-        killed = {"status": "interrupted", "error": "The run was killed. The same command goes on from there."}
+        killed = {"status": "interrupted", "error": "The run was killed. The same command continues it."}
         write_text(run_dir / RECORD, json.dumps(record | killed, indent=1) + "\n")
 
 
 def log_to(path: Path) -> ExitStack:
-    """Write to a file, with times, what the toolkit logs, debug messages included, and what others warn of.
+    """Log to a file, with times: all messages of the toolkit, debug included, and warnings of other libraries.
 
-    Warnings appear on the terminal as without it.
+    Warnings still appear on the terminal.
 
     Returns:
-        What ends it when it is closed.
+        Context that ends the logging when it closes.
     """
     root, own, ending = logging.getLogger(), logging.getLogger("toolkit"), ExitStack()
     file = logging.FileHandler(path, encoding="utf-8")
     file.setFormatter(logging.Formatter("%(asctime)s %(process)d %(levelname)s %(name)s: %(message)s"))
-    file.handleError = lambda record: None  # type: ignore[method-assign]  # a full disk is told once, not for each line
+    # A full disk would print a traceback for each line; the run itself fails with the error.
+    file.handleError = lambda record: None  # type: ignore[method-assign]
     handlers: list[logging.Handler] = [file]
     if not root.handlers and logging.lastResort is not None:
-        handlers.append(logging.lastResort)  # what prints warnings where there is no handler
+        handlers.append(logging.lastResort)  # prints warnings; logging skips it as soon as there is another handler
     for handler in handlers:
         root.addHandler(handler)
         ending.callback(root.removeHandler, handler)
@@ -110,9 +111,9 @@ def log_to(path: Path) -> ExitStack:
 
 
 def warnings_of_kernels(path: Path, start: int) -> list[str]:
-    """Return what kernels have warned of in a log after its first `start` bytes, each once.
+    """Return the distinct warnings of other processes (kernels) in a log after its first `start` bytes.
 
-    Warnings of this process are on the terminal already, those of kernels are not.
+    Warnings of this process are already on the terminal.
     """
     try:
         with path.open("rb") as file:
@@ -120,10 +121,10 @@ def warnings_of_kernels(path: Path, start: int) -> list[str]:
             lines = file.read().decode("utf-8", errors="replace").splitlines()
     except OSError:
         return []
-    found = (re.fullmatch(r"\S+ \S+ (\d+) WARNING toolkit\.\S+: (.+)", line) for line in lines)
-    return list(dict.fromkeys(match[2] for match in found if match and int(match[1]) != os.getpid()))
+    matches = (re.fullmatch(r"\S+ \S+ (\d+) WARNING toolkit\.\S+: (.+)", line) for line in lines)
+    return list(dict.fromkeys(match[2] for match in matches if match and int(match[1]) != os.getpid()))
 
 
 def _close(file: logging.FileHandler) -> None:
-    with suppress(OSError):  # a full disk; what stopped the run is the error to tell
+    with suppress(OSError):  # a full disk: report the error that stopped the run, not this one
         file.close()

@@ -1,4 +1,4 @@
-"""The kernels of a run: how they start and end, how much memory they take."""
+"""Start and end the kernels of a run, and measure their memory."""
 
 import asyncio
 import os
@@ -16,18 +16,20 @@ from toolkit.errors import FREE_MEMORY, StageError, first_line
 from toolkit.files import process_tag
 
 TEXT_BARS = "TOOLKIT_TEXT_BARS"
-"""Variable of the environment that is set where no one sees widgets: progress bars are text then."""
+"""Environment variable that makes progress bars text; set in kernels, whose widgets no one sees."""
 _PATIENCE_S = 10.0
+"""Timeout for a kernel or the thread to end."""
 _ARGUMENTS = [
-    # What the kernel has to say of its own shutdown is of no use to anybody.
+    # Hides the kernel's messages about its own shutdown.
     "--log-level=CRITICAL",
-    # What takes long to import, while the notebook before still runs.
-    "--IPKernelApp.exec_lines=__import__('toolkit.notebook'); __import__('toolkit.evaluate'); __import__('matplotlib.backends.backend_agg')",
+    # Slow imports run early, while the previous notebook still runs.
+    "--IPKernelApp.exec_lines=__import__('toolkit.notebook'); __import__('toolkit.evaluate'); "
+    "__import__('matplotlib.backends.backend_agg')",
 ]
 
 
 def kernel_error(error: Exception, ended_by: int | None, memory_mb: float, output: Path) -> StageError:
-    """Return what to tell of a kernel that did not start, or that died."""
+    """Return the error for a kernel that died, or did not start; `ended_by` as of `RunningKernel`."""
     if ended_by == -9:
         text = (
             f"Out of memory, most likely: the system killed the notebook's kernel (signal 9; {memory_mb:.0f} MB were "
@@ -38,34 +40,34 @@ def kernel_error(error: Exception, ended_by: int | None, memory_mb: float, outpu
         text = f"The notebook's kernel died ({by}; {memory_mb:.0f} MB were in use)."
     else:
         text = f"The notebook's kernel did not start or answer ({first_line(error)})."
-    where = f"\nThe executed notebook shows where: {output}"
-    return StageError(text + where)
+    return StageError(f"{text}\nThe executed notebook shows where: {output}")
 
 
 @dataclass(frozen=True)
 class RunningKernel:
-    """A kernel that has been started, or is being."""
+    """A kernel that has started or is starting."""
 
     manager: Any
-    """Of `jupyter_client`."""
+    """`AsyncKernelManager` of `jupyter_client`."""
     folder: tempfile.TemporaryDirectory[str]
-    """Of its connection file and its sockets."""
+    """Folder of the connection file and the sockets."""
     started: Future[None]
+    """Done when the kernel has started."""
     clients: list[Any]
-    """Of `jupyter_client`, that talk with it."""
+    """Clients of `jupyter_client` that are connected to the kernel."""
 
     @property
     def ended_by(self) -> int | None:
-        """Exit status, negative for a signal; None: it has not died."""
+        """Exit status, negative for a signal; None while the kernel lives."""
         process = getattr(self.manager.provisioner, "process", None)
         return None if process is None else process.poll()
 
 
 class Kernels:
-    """Starts the kernels of notebooks, that of the next one while one runs, and ends them in the background."""
+    """Kernels of a run's notebooks. The next kernel starts while a notebook runs; kernels end in the background."""
 
     def __init__(self, cwd: Path, notebooks: int = 1) -> None:
-        """`cwd` is the working folder of the kernels, `notebooks` how many there will be at most."""
+        """`cwd` is the working folder of the kernels, `notebooks` the largest number of notebooks to run."""
         self._cwd, self._left = cwd, notebooks
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
@@ -90,16 +92,16 @@ class Kernels:
         self._thread.join(_PATIENCE_S)
 
     def take(self) -> RunningKernel:
-        """Return a kernel, and begin to start that of the next notebook, if there will be one."""
+        """Return a kernel, and begin to start the kernel of the next notebook if there is one."""
         kernel = self._spare or self._start()
         self._left -= 1
         self._spare = self._start() if self._left > 0 else None
         return kernel
 
     def end(self, kernel: RunningKernel, by_force: bool) -> None:
-        """Begin to end a kernel, if that has not been asked for yet."""
+        """Begin to end a kernel, once."""
         if kernel.folder.name not in self._ended:
-            for client in kernel.clients:  # nbclient leaves them open where the kernel is not its own
+            for client in kernel.clients:  # nbclient closes only the clients of kernels that it started
                 client.stop_channels()
             self._ended[kernel.folder.name] = self._in_thread(_shut_down(kernel, by_force))
 
@@ -107,13 +109,13 @@ class Kernels:
         from jupyter_client.manager import AsyncKernelManager
         from traitlets.config import Config
 
-        # Sockets in the file system: other users of the machine cannot listen in; their paths have to be short.
+        # Sockets in the file system, which other users of the machine cannot open. Their paths have a length limit.
         folder = tempfile.TemporaryDirectory(prefix=f"kernel.{process_tag()}-", ignore_cleanup_errors=True)
         ipc = os.name == "posix" and len(folder.name) < 80
         sockets = {"transport": "ipc", "ip": f"{folder.name}/s"} if ipc else {}
         config = Config({"KernelManager": {"connection_file": f"{folder.name}/kernel.json"} | sockets})
         manager = AsyncKernelManager(kernel_name="python3", config=config)
-        given = {"cwd": str(self._cwd), "env": os.environ | {TEXT_BARS: "1"}, "extra_arguments": _ARGUMENTS}
+        options = {"cwd": str(self._cwd), "env": os.environ | {TEXT_BARS: "1"}, "extra_arguments": _ARGUMENTS}
         connect, clients = manager.client, []
 
         def client(**options: Any) -> Any:
@@ -121,7 +123,7 @@ class Kernels:
             return clients[-1]
 
         manager.client = client  # type: ignore[method-assign]
-        kernel = RunningKernel(manager, folder, self._in_thread(_start_up(manager, given)), clients)
+        kernel = RunningKernel(manager, folder, self._in_thread(_start_up(manager, options)), clients)
         self._started.append(kernel)
         return kernel
 
@@ -129,15 +131,15 @@ class Kernels:
         return asyncio.run_coroutine_threadsafe(work, self._loop)
 
 
-async def _start_up(manager: Any, given: dict[str, Any]) -> None:
-    await manager.start_kernel(**given)
+async def _start_up(manager: Any, options: dict[str, Any]) -> None:
+    await manager.start_kernel(**options)
 
 
 async def _shut_down(kernel: RunningKernel, by_force: bool) -> None:
-    with suppress(Exception):  # what does not start need not end
+    with suppress(Exception):  # a kernel that failed to start need not be ended
         await asyncio.wrap_future(kernel.started)
     if kernel.manager.has_kernel and by_force:
-        # The manager would interrupt it first, of which a kernel that is starting prints a traceback.
+        # The manager's own kill interrupts the kernel first, and a kernel that is starting then prints a traceback.
         await kernel.manager.provisioner.kill()
         await kernel.manager.provisioner.wait()
         await kernel.manager.cleanup_resources()
@@ -146,7 +148,7 @@ async def _shut_down(kernel: RunningKernel, by_force: bool) -> None:
 
 
 def _end_children(folder: str) -> None:
-    """End the kernel whose connection file lies in a folder: one that was starting when the run was interrupted."""
+    """Kill the kernel with its connection file in this folder: it was starting when the run was interrupted."""
     import psutil
 
     for child in psutil.Process().children():
@@ -157,7 +159,7 @@ def _end_children(folder: str) -> None:
 
 
 class MemoryWatch(threading.Thread):
-    """Samples the memory of this process and its children, so that workers of a kernel count as well."""
+    """Sample the memory of this process and all its descendants, so that worker processes of a kernel count too."""
 
     def __init__(self) -> None:
         super().__init__(daemon=True)
@@ -180,7 +182,7 @@ class MemoryWatch(threading.Thread):
             self._peak_mb = max(self._peak_mb, total / 2**20)
 
     def stop(self) -> float:
-        """End the sampling and return the highest sum seen, in MB."""
+        """Stop sampling and return the peak of the sum, in MB."""
         self._ended.set()
         self.join()
         return self._peak_mb

@@ -1,4 +1,4 @@
-"""JupyterLab on copies of the notebooks: what of a copy is saved."""
+"""JupyterLab: keep widgets out of saved notebooks."""
 
 from typing import Any
 
@@ -6,13 +6,13 @@ WIDGET = "application/vnd.jupyter.widget-view+json"
 
 
 def drop_widgets(model: dict[str, Any], **_: Any) -> None:
-    """Remove widgets (progress bars, viewers) from a notebook that is about to be saved; all else stays.
+    """Remove widgets (progress bars, viewers) from a notebook that is about to be saved.
 
-    A file has no widgets, only references to those of a living page: opened again, each would be an `Error displaying
-    widget`. It is called by Jupyter as `ContentsManager.pre_save_hook`, see `notebooks/lab_config.py`.
+    A saved widget is only a reference to a live page: reopened, it shows `Error displaying widget`. Jupyter calls this
+    as `ContentsManager.pre_save_hook`, see `notebooks/lab_config.py`.
 
     Args:
-        model: of Jupyter's contents; `content` of a notebook is that of its file, and is changed.
+        model: Jupyter's contents model; its `content`, the notebook, is changed in place.
     """
     if model.get("type") != "notebook" or not isinstance(model.get("content"), dict):
         return

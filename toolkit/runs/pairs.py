@@ -1,7 +1,7 @@
-"""Pairs of devices that cannot be done: the others are, and each that is left out has its reason.
+"""Leave out pairs of devices that fail because of their data, with a reason, and finish the rest.
 
-The reason stands in the stage's table and in `<pair>.left_out.json` beside the stage's results, where later stages find
-it: what an earlier run left of the pair would not be of this capture.
+The reason is in the stage's table and in `<pair>.left_out.json` beside the stage's results. Later stages read that
+file, so that they do not use results which an earlier run made of the pair from other data.
 """
 
 import json
@@ -20,25 +20,27 @@ from toolkit.files import pair_name, read_json, write_text
 log = logging.getLogger(__name__)
 
 LEFT_OUT = "left out: "
-"""How the state of a pair that could not be done begins in the tables of an evaluation."""
+"""Prefix of the state of a pair that was left out, in the tables of an evaluation."""
 
 
 @dataclass
 class PairRows:
-    """The rows of a stage's table, one a pair of devices."""
+    """The rows of a stage's table, one per pair of devices."""
 
     scene: str
     out_dir: Path
     """Folder of the stage's results."""
     upstream: Path | None = None
-    """Folder of the results that the stage builds on."""
+    """Folder of the results of the stage before."""
     rows: list[dict[str, Any]] = field(default_factory=list)
     errors: list[Exception] = field(default_factory=list)
 
     @contextmanager
     def row(self, map_device: str, query_device: str) -> Iterator[dict[str, Any]]:
-        """Yield the row of a pair, to be filled, or filled further; an error that is of the pair's own data ends there,
-        as its reason."""
+        """Yield the row of a pair, new or existing, for the caller to fill.
+
+        If the body raises an error that the pair's data cause, the row gets it as its `reason`, and the run continues.
+        """
         name = pair_name(self.scene, map_device, query_device)
         note = _note(self.out_dir, name)
         pair: dict[str, Any] = {"map_device": map_device, "query_device": query_device}
@@ -51,7 +53,7 @@ class PairRows:
             row["reason"] = ""
             note.unlink(missing_ok=True)
         except DamagedError:
-            raise  # what is damaged is made again, see `features.groups.heals`
+            raise  # damaged files are rebuilt, see `features.groups.heals`
         except OF_THE_DATA as error:
             log.warning("%s is left out: %s", name, error)
             row.clear()
@@ -60,16 +62,16 @@ class PairRows:
             self.errors.append(error)
 
     def check_upstream(self) -> None:
-        """Raise the reason for which the stage before left out the pair of the last row."""
+        """Raise ArtifactError if the stage before left out the pair of the last row, with its reason."""
         name = pair_name(self.scene, self.rows[-1]["map_device"], self.rows[-1]["query_device"])
         if self.upstream is not None and (reason := left_out(self.upstream, name)):
             raise ArtifactError(reason)
 
     def frame(self) -> pd.DataFrame:
-        """Return the table; a pair that is left out has zeros, and its `reason`, which is empty for the others.
+        """Return the table. `reason` is empty for finished pairs; the other columns of a left-out pair are zero.
 
         Raises:
-            ToolkitError: that of the first pair, where none could be done.
+            ToolkitError: no pair could be done; the error of the first one.
         """
         done = next((row for row in self.rows if not row["reason"]), None)
         if done is None and self.errors:
@@ -79,12 +81,12 @@ class PairRows:
 
 
 def left_out(folder: str | Path, name: str) -> str:
-    """Return why a stage left a pair out, by its folder of results and the pair's name; "" where it did not."""
+    """Return why the stage with this folder of results left out the pair of this name; "" if it did not."""
     return str(read_json(_note(Path(folder), name)).get("reason", ""))
 
 
 def left_out_of(table: pd.DataFrame) -> list[dict[str, Any]]:
-    """Return what was left out by the table of a stage, and why: the rows with a `reason`."""
+    """Return the pairs or sessions that the table of a stage leaves out: `what`, `reason` and the pair's devices."""
     if "reason" not in table:
         return []
     pair = ("map_device", "query_device")
@@ -96,24 +98,24 @@ def left_out_of(table: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def pair_text(row: Mapping[Any, Any]) -> str:
-    """Return what a row is of, for people."""
+    """Return the pair or session of a row as readable text."""
     if "map_device" not in row:
         return str(row.get("session", ""))
     return f"{row['query_device']} queries in the {row['map_device']} map"
 
 
 def way_out(pairs: Iterable[tuple[str, str]], devices: Sequence[str]) -> str:
-    """Return how to leave out for good what was left out.
+    """Return advice on how to exclude failing pairs in the manifest.
 
     Args:
-        pairs: (map device, query device) of what was left out.
-        devices: all that take part.
+        pairs: (map device, query device) of the pairs that were left out.
+        devices: all devices of the run.
     """
     pairs = list(pairs)
     culprits = [device for device in devices if all(device in pair for pair in pairs)]
     rest = [device for device in devices if device not in culprits]
     keys = f"`devices: [{', '.join(rest)}]`" if len(culprits) == 1 and rest else "`devices:`"
-    return f"Mend it, or leave it out for good: {keys} in the manifest, or `pairs:`."
+    return f"Repair the data, or exclude the pair with {keys} or `pairs:` in the manifest."
 
 
 def _note(folder: Path, name: str) -> Path:

@@ -1,4 +1,4 @@
-"""`run.json`: the record of what a run did."""
+"""`run.json`, the record of a run."""
 
 import importlib.metadata
 import json
@@ -24,10 +24,10 @@ _VERSIONS = ("numpy", "pycolmap", "faiss-cpu", "opencv-python-headless", "pandas
 
 @dataclass
 class RunLog:
-    """The content of `run.json`, written anew after every stage.
+    """The content of `run.json`, rewritten after every stage.
 
-    A reused stage keeps the seconds and memory of the execution that made it; `total_seconds` and
-    `work_seconds` are of what this run executed, `peak_memory_mb` is of all its stages.
+    A reused stage keeps the seconds and memory of the run that executed it. `total_seconds` and `work_seconds` count
+    only what this run executed, `peak_memory_mb` covers all stages.
     """
 
     run_dir: Path
@@ -41,22 +41,22 @@ class RunLog:
     error: str | None = None
     exit_code: int | None = None
     rows: list[dict[str, Any]] = field(default_factory=list)
-    told: set[str] = field(default_factory=set)
-    """Warnings that the terminal has had."""
+    shown: set[str] = field(default_factory=set)
+    """Warnings that the terminal has already shown."""
     started: float = field(default_factory=time.perf_counter)
     created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
 
     def add(self, row: dict[str, Any]) -> None:
-        """Add a stage that has ended."""
+        """Add the row of a stage that has ended, and write the record."""
         self.rows.append(row)
         self.write()
 
     def end(self, error: BaseException | None = None, incomplete: str | None = None) -> None:
-        """Write how the run ended; where even that does not fit on a disk no record is left, rather than a wrong one.
+        """Write how the run ended. If the disk is too full for that, remove the record rather than leave a wrong one.
 
         Args:
-            error: what stopped it.
-            incomplete: what failed, of a run that came to its end.
+            error: the error that stopped the run.
+            incomplete: description of the failures, for a run that reached its end.
         """
         self.status, self.error, self.exit_code = ("incomplete", incomplete, 2) if incomplete else ("done", None, 0)
         if error is not None:
@@ -66,13 +66,13 @@ class RunLog:
             self.write()
         except OSError:
             with suppress(OSError):
-                (self.run_dir / RECORD).unlink(missing_ok=True)  # on a full disk, this also makes room
+                (self.run_dir / RECORD).unlink(missing_ok=True)  # frees space for the second try
                 self.write()
             if error is None:
                 raise
 
     def write(self) -> None:
-        """Write `run.json` as things stand."""
+        """Write the current state to `run.json`."""
         rows = self.all_rows()
         work = sum(row.get("work_seconds", 0.0) for row in rows if row["status"] == "done")
         content = {
@@ -97,7 +97,7 @@ class RunLog:
         write_text(self.run_dir / RECORD, json.dumps(content, indent=1) + "\n")
 
     def all_rows(self) -> list[dict[str, Any]]:
-        """Return this run's rows and, for stages that `--only` left alone, those of their records."""
+        """Return this run's rows and, for stages that it did not run (`--only`), the rows in their records."""
         mine = {(row["scene"], row["stage"]) for row in self.rows}
         rows = list(self.rows)
         for scene in self.inputs:
@@ -110,27 +110,27 @@ class RunLog:
 
 
 def failures(rows: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
-    """Return how many images, queries and pairs failed, and of how many, by the rows of the stages of a run."""
-    found = {kind: {"failed": 0, "of": 0} for kind in ("images", "queries", "pairs")}
+    """Return how many images, queries and pairs failed, `{kind: {"failed": n, "of": total}}`, from rows of stages."""
+    totals = {kind: {"failed": 0, "of": 0} for kind in ("images", "queries", "pairs")}
     pairs: dict[tuple[str, str], list[int]] = {}
     for row in rows:
         counts = row.get("counts") or {}
         for kind, stage, name in (("images", "embed", "unreadable"), ("queries", "localize", "failed")):
             if row["stage"] == stage and {kind, name} <= counts.keys():
-                found[kind]["failed"] += counts[name]
-                found[kind]["of"] += counts[kind]
+                totals[kind]["failed"] += counts[name]
+                totals[kind]["of"] += counts[kind]
         of_stage = pairs.setdefault((row["scene"], row["stage"]), [0, 0])
         of_stage[0] += len(row.get("left_out", ()))
         of_stage[1] += row.get("asked", 0)
-    for scene in dict.fromkeys(scene for scene, _ in pairs):  # the same pair fails in every stage
-        failed, asked = max(counts for (of, _), counts in pairs.items() if of == scene)
-        found["pairs"]["failed"] += failed
-        found["pairs"]["of"] += asked
-    return found
+    for scene in dict.fromkeys(scene for scene, _ in pairs):  # a failed pair fails in all later stages: count it once
+        failed, total = max(counts for (of, _), counts in pairs.items() if of == scene)
+        totals["pairs"]["failed"] += failed
+        totals["pairs"]["of"] += total
+    return totals
 
 
 def summary(run_dir: Path) -> dict[str, Any]:
-    """Return what `--json` prints of a run: how it ended, what failed, and what each stage did."""
+    """Return the output of `--json`: how the run ended, what failed, and the result of each stage."""
     record = read_json(run_dir / RECORD)
     kept = ("name", "status", "exit_code", "error", "failed", "created", "total_seconds")
     of_stage = ("scene", "stage", "part", "status", "seconds", "counts", "left_out", "error")

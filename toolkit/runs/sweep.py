@@ -1,4 +1,4 @@
-"""Runs of one manifest with other values of some settings: their names, and what they take over from each other."""
+"""Sweeps: run a manifest with several values of some settings; name the runs and share results between them."""
 
 import os
 import re
@@ -15,7 +15,7 @@ from toolkit.files import SceneFiles
 from toolkit.manifest import STAGES
 
 MOST_RUNS = 100
-"""A sweep of more runs is a mistake, or wants a script of its own."""
+"""Limit of runs in a sweep: more are most likely a mistake."""
 
 
 @dataclass(frozen=True)
@@ -23,40 +23,40 @@ class SweptRun:
     """One run of a sweep."""
 
     name: str
-    """`<manifest>-<key>-<value>`: its folder."""
+    """`<manifest>-<key>-<value>`, the name of the run folder."""
     overrides: tuple[str, ...]
-    """`key=value`, as `--set` has them."""
+    """`key=value` each, in the form of `--set`."""
 
 
 def swept_runs(name: str, sweeps: Sequence[str]) -> list[SweptRun]:
-    """Return the runs of a sweep: one a value or, of several keys, one a combination.
+    """Return the runs of a sweep: one per value or, for several keys, one per combination of values.
 
     Args:
-        name: of the manifest.
-        sweeps: `key=a,b,c` each, the values in YAML: `embed.model=vlad,[megaloc, vlad]` has two.
+        name: name of the manifest.
+        sweeps: `key=a,b,c` each. Values are YAML: `embed.model=vlad,[megaloc, vlad]` has two values.
 
     Raises:
-        ManifestError: a sweep is not of this form, names a key twice, or is of too many runs.
+        ManifestError: a sweep has another form, repeats a key, or has too many runs.
     """
     keys, values = [], []
     for sweep in sweeps:
         key, equals, text = sweep.partition("=")
         try:
-            found = yaml.safe_load(f"[{text}]") if equals and key.strip() else None
+            parsed = yaml.safe_load(f"[{text}]") if equals and key.strip() else None
         except yaml.YAMLError:
-            found = None
-        if not found:
+            parsed = None
+        if not parsed:
             raise ManifestError(
                 f"--sweep {sweep}: expected key=value,value,..., for example localize.pnp.min_inliers=10,20,40."
             )
-        texts = [yaml.safe_dump(value, default_flow_style=True, width=10**6).split("\n")[0] for value in found]
+        texts = [yaml.safe_dump(value, default_flow_style=True, width=10**6).split("\n")[0] for value in parsed]
         keys.append(key.strip())
         values.append(list(dict.fromkeys(texts)))
     if twice := [key for key in keys if keys.count(key) > 1]:
-        raise ManifestError(f"--sweep {twice[0]}: found it twice, expected one list of values a key.")
+        raise ManifestError(f"--sweep {twice[0]}: found it twice, expected one list of values per key.")
     combinations = list(product(*values))
     if len(combinations) > MOST_RUNS:
-        raise ManifestError(f"--sweep: found {len(combinations)} runs, expected {MOST_RUNS} at most. Take fewer values.")
+        raise ManifestError(f"--sweep: found {len(combinations)} runs, expected at most {MOST_RUNS}. Use fewer values.")
     short = [key.rpartition(".")[2] for key in keys]
     labels = short if len(set(short)) == len(short) else keys
     runs = []
@@ -65,25 +65,25 @@ def swept_runs(name: str, sweeps: Sequence[str]) -> list[SweptRun]:
         overrides = tuple(f"{key}={value}" for key, value in zip(keys, chosen, strict=True))
         runs.append(SweptRun("-".join([name, *parts]), overrides))
     if len({run.name for run in runs}) < len(runs):
-        raise ManifestError(f"--sweep {' '.join(sweeps)}: two values would have one folder. Sweep them one by one.")
+        raise ManifestError(f"--sweep {' '.join(sweeps)}: two runs have the same folder name. Sweep one key at a time.")
     return runs
 
 
 def _plain(value: str) -> str:
-    """Return a value as a part of a folder's name."""
+    """Return a value in a form that fits a folder's name."""
     return re.sub(r"[^\w.+-]+", "-", value).strip("-") or "none"
 
 
 def take_over(donor: Path, run_dir: Path, scenes: Iterable[str], keys: Sequence[str]) -> None:
-    """Give a run that is not there yet what another run has made before the stages that the swept keys belong to.
+    """Fill a new run folder with the results of another run that do not depend on the swept keys.
 
-    Features and maps are taken over always. A stage reuses of all this what fits its own settings, and makes the rest
-    again, so that too much does no harm. Files are hard links where they are replaced as a whole, and copies where
-    they are written to (HDF5) or links cannot be made.
+    These are features, maps, and the results of all stages before the first stage with a swept key. Too much does no
+    harm: each stage reuses only what fits its settings. HDF5 files are copied, because stages write to them; all other
+    files are replaced as a whole, so they become hard links, or copies if the disk does not support links.
 
     Args:
         donor: run folder to take from.
-        run_dir: the run folder to fill; one with results is left as it is.
+        run_dir: run folder to fill. Scenes that already have a folder there are skipped.
         scenes: names of the captures.
         keys: the swept keys, `stage.key`.
     """
@@ -95,8 +95,8 @@ def take_over(donor: Path, run_dir: Path, scenes: Iterable[str], keys: Sequence[
             continue
         of_stage = {"embed": "embeddings", "retrieve": "retrieval_dir", "rerank": "reranked_dir"}
         of_stage |= {"localize": "poses_dir", "sequence": "poses_dir"}
-        names = {"features", "maps", "index"} | {name for stage, name in of_stage.items() if STAGES.index(stage) < first}
-        for name in sorted(names):
+        earlier = {name for stage, name in of_stage.items() if STAGES.index(stage) < first}
+        for name in sorted({"features", "maps", "index"} | earlier):
             source: Path = getattr(theirs, name)
             if source.is_dir():
                 shutil.copytree(source, getattr(mine, name), copy_function=_link, ignore=shutil.ignore_patterns(".*"))
@@ -107,6 +107,6 @@ def _link(source: str, target: str) -> None:
         try:
             os.link(source, target)
             return
-        except OSError:  # another disk, or one without links
+        except OSError:  # another disk, or one without hard links
             pass
     shutil.copy2(source, target)

@@ -1,4 +1,4 @@
-"""What is known of how one query was localized: its status in words, numbers, correspondences, pose and rivals."""
+"""The result of localizing one query: status in words, numbers, correspondences, pose and rivals."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,7 +18,7 @@ NUMBERS = (
     "num_inliers", "num_matches", "inlier_ratio", "num_guided", "rmse_px", "coverage", "p_correct", "rival_support",
     "agreement", "position_std_m", "rotation_std_deg", "scale_std",
 )  # fmt: skip
-"""What the table of a pair and an estimate say of a pose, by one name."""
+"""Numbers about a pose: columns of a pair's table, and attributes of an estimate."""
 
 
 @dataclass(frozen=True)
@@ -27,38 +27,38 @@ class Answer:
 
     pair: LocalizedPair
     number: int
-    """Of the query, as the pair's recording counts them."""
+    """Number of the query in the pair."""
     status: str
     """`ok`, `low_confidence...` or `failed: ...`."""
     method: str
-    """How the pose was found, or the method that found none."""
+    """Method that found the pose or, without a pose, that was tried."""
     reason: str
     """Why it has this status, in words."""
     numbers: dict[str, float]
-    """By the names of `NUMBERS`, as far as they are known."""
+    """The known ones of `NUMBERS`."""
     localized: LocalizedQuery
     """Names of images and references, correspondences, rivals."""
     pose: Floats | None
-    """world_from_rig (4, 4); of a single camera world_from_cam. None: there is none."""
+    """world_from_rig (4, 4), or world_from_cam of a camera without a rig; None without a pose."""
     covariance: Floats | None
-    """(6, 6), see `PoseEstimate`; None where it is not known."""
+    """(6, 6), see `PoseEstimate`; None if unknown."""
     settings: LocalizeSettings
-    """That it was localized with."""
+    """Settings that it was localized with."""
     seconds: float
-    """That it took."""
+    """Time that it took."""
     true_pose: Floats | None = None
-    """world_from_rig (4, 4), None where it is not known."""
+    """world_from_rig (4, 4); None if unknown."""
     retrieved: dict[str, tuple[int, float]] = field(default_factory=dict)
-    """Rank, from 1, and score of the references that were retrieved, by name; of a rig's cameras the best rank."""
+    """Rank, from 1, and score of each retrieved reference, by name; for a rig, the best rank among its cameras."""
 
     @property
     def name(self) -> str:
-        """Of its first image."""
+        """Name of its first image."""
         return str(self.pair.localizations.names[self.number])
 
     @property
     def headline(self) -> str:
-        """Which query this is, and its status."""
+        """Number, devices and status of the query."""
         devices = f"{self.pair.query_session.device} in the map of {self.pair.map_session.device}"
         return f"query {self.number} of {devices}: {self.status}"
 
@@ -68,18 +68,18 @@ class Answer:
 
     @property
     def rivals(self) -> Sequence[Rival] | None:
-        """Other poses that matches agree with; None: the run is older than the files that keep them."""
+        """Other poses that some matches support; None: the run is too old to have stored them."""
         return self.localized.rivals
 
     @cached_property
     def details(self) -> QueryDetails:
-        """Its images and references, with what is seen in each."""
-        nowhere = np.full((4, 4), np.nan)
-        return self.pair.details(self.number, self.localized, nowhere if self.pose is None else self.pose)
+        """Its images and references, with their correspondences."""
+        no_pose = np.full((4, 4), np.nan)
+        return self.pair.details(self.number, self.localized, no_pose if self.pose is None else self.pose)
 
     @property
     def error(self) -> tuple[float, float] | None:
-        """Error of rotation, degrees, and position, meters; None without a pose, or where the truth is not known."""
+        """Rotation error, degrees, and position error, meters; None without a pose or ground truth."""
         if self.pose is None or self.true_pose is None:
             return None
         rotation_deg, translation_m = pose_errors(self.pose[None], self.true_pose[None])
@@ -87,27 +87,28 @@ class Answer:
 
     @cached_property
     def matches(self) -> pd.DataFrame:
-        """Counts of the correspondences: a row a kind (`sift/guided`), columns inliers and rejected."""
-        found = self.correspondences
-        counts = pd.DataFrame({"inliers": found.inlier, "rejected": ~found.inlier}, dtype=int)
-        return counts.groupby(pd.Index(found.found_by.astype(object), name="found by")).sum()
+        """Counts of the correspondences: one row per kind (`sift/guided`), columns inliers and rejected."""
+        matches = self.correspondences
+        counts = pd.DataFrame({"inliers": matches.inlier, "rejected": ~matches.inlier}, dtype=int)
+        return counts.groupby(pd.Index(matches.found_by.astype(object), name="found by")).sum()
 
     @cached_property
     def references(self) -> pd.DataFrame:
-        """A row a reference that was retrieved or used, best first.
+        """One row per reference that was retrieved or used, best first.
 
-        Columns: name; rank and score (of the retrieval, of the rig's camera that ranks it highest); used (whether the
-        pose rests on it); rejected (whether it contradicts the others); inliers (correspondences that it sees, of those
-        references whose views were kept; else missing).
+        Columns: name; rank and score of the retrieval (for a rig, of the camera that ranks it highest); used (whether
+        the pose was computed from it); rejected (whether it contradicts the used references); inliers (inliers that it
+        observes; missing if its views were not stored).
         """
-        retrieved, found, used = self.retrieved, self.correspondences, self.localized.references
+        retrieved, matches, used = self.retrieved, self.correspondences, self.localized.references
         names = list(dict.fromkeys([*used, *self.localized.rejected, *retrieved]))
-        kept = set(found.view_reference.tolist())
+        kept = set(matches.view_reference.tolist())
         rows = []
         for name in names:
             rank, score = retrieved.get(name, (None, np.nan))
             number = used.index(name) if name in used else -1
-            inliers = int(found.inlier[found.view_of[found.view_reference == number]].sum()) if number in kept else None
+            seen = matches.view_of[matches.view_reference == number]
+            inliers = int(matches.inlier[seen].sum()) if number in kept else None
             rows.append((name, rank, score, name in used, name in self.localized.rejected, inliers))
         table = pd.DataFrame(rows, columns=["name", "rank", "score", "used", "rejected", "inliers"])
         return table.astype({"rank": "Int64", "inliers": "Int64"})
@@ -119,37 +120,37 @@ class Answer:
 def reason_in_words(
     status: str, stated: str, numbers: Mapping[str, float], settings: LocalizeSettings, method: str = "pnp"
 ) -> str:
-    """Return why a query has its status, for a person.
+    """Return in a sentence why a query has its status.
 
     Args:
-        stated: what the localizer says beyond the status.
-        numbers: by the names of `NUMBERS`.
-        settings: that it was localized with; they hold the limits.
-        method: how the pose was found; of `feed_forward` references agree, not matches.
+        stated: reason that the localizer states besides the status.
+        numbers: the known ones of `NUMBERS`.
+        settings: settings of the localization, which hold the limits.
+        method: method of the pose; for `feed_forward`, inliers are references, not matches.
     """
     kind, _, detail = status.partition(": ")
-    also = f" {stated[0].upper()}{stated[1:]}." if stated else ""
+    more = f" {stated[0].upper()}{stated[1:]}." if stated else ""
     if kind == "failed":
-        return _why_failed(detail, numbers, settings) + also
+        return _why_failed(detail, numbers, settings) + more
     if status == CAMERA:
-        return "The matches contradict the intrinsics that are stated for the camera." + also
+        return "The matches contradict the camera's intrinsics." + more
     if detail:
-        return f"{detail[0].upper()}{detail[1:]}.{also}"
+        return f"{detail[0].upper()}{detail[1:]}.{more}"
     if settings.method == "nearest":
-        return "This is the pose of the best reference as it stands, which is never called ok." + also
+        return "This is the unchanged pose of the best reference, which is never called ok." + more
     if kind == "low_confidence":
-        return " ".join([*_doubts(numbers, settings), *_support(numbers, method)]) + also
-    return " ".join(_support(numbers, method)) + also
+        return " ".join([*_doubts(numbers, settings), *_support(numbers, method)]) + more
+    return " ".join(_support(numbers, method)) + more
 
 
 def _why_failed(detail: str, numbers: Mapping[str, float], settings: LocalizeSettings) -> str:
     count, least = int(numbers.get("num_matches", 0)), settings.pnp.min_inliers
     if detail == "too few matches":
-        return f"No pose: {count} matches with the map are too few to tell one."
+        return f"No pose: {count} matches with the map are too few to compute one."
     if detail == "no consistent pose":
-        return f"No pose: of {count} matches too few agree on any one."
+        return f"No pose: too few of {count} matches agree on any pose."
     if detail.startswith("too few inliers"):
-        return f"No pose: {detail} of {count} matches agree on the best one, at least {least} are asked for."
+        return f"No pose: {detail} among {count} matches; at least {least} are required."
     if detail == "no references":
         return "No pose: the retrieval has no references for this query."
     return f"No pose: {detail}."
@@ -159,16 +160,15 @@ def _doubts(numbers: Mapping[str, float], settings: LocalizeSettings) -> list[st
     doubts, limits = [], settings.pnp
     probability, rival = numbers.get("p_correct", np.nan), numbers.get("rival_support", 0.0)
     if probability < limits.ok_probability:
-        asked = f"{limits.ok_probability:.0%}"
-        doubts.append(f"It is right with a probability of {probability:.0%} only, ok asks for {asked}.")
+        doubts.append(f"It is right with a probability of {probability:.0%}; ok requires {limits.ok_probability:.0%}.")
     if rival > limits.ok_rival_support:
-        doubts.append(f"Another pose has {rival:.0%} of its support, ok allows {limits.ok_rival_support:.0%}.")
+        doubts.append(f"Another pose has {rival:.0%} of its support; ok allows {limits.ok_rival_support:.0%}.")
     return doubts or ["It has too little support to be trusted."]
 
 
 def _support(numbers: Mapping[str, float], method: str) -> list[str]:
     if not numbers.get("num_matches"):
-        return ["The pose rests on the references as a whole, not on matches."]
+        return ["The pose comes from the references as a whole, not from matches."]
     if method.rpartition("/")[2].startswith("feed_forward"):
         return [f"{numbers['num_inliers']:.0f} of {numbers['num_matches']:.0f} references agree on the pose."]
     share, coverage = numbers.get("inlier_ratio", np.nan), numbers.get("coverage", np.nan)

@@ -1,4 +1,4 @@
-"""One of many queries in a notebook: as ordinary output, and with a list to choose another where someone is there."""
+"""Show one of many queries in a notebook, with a list to choose another in an interactive session."""
 
 import difflib
 import os
@@ -17,16 +17,14 @@ T_co = TypeVar("T_co", covariant=True)
 
 
 class Queries(Protocol[T_co]):
-    """Queries to look at."""
-
     names: Sequence[str]
 
     def look(self, query: int | str = 0) -> T_co:
-        """Return one by its number or name."""
+        """Return a query by its number or name."""
 
 
 def shown_name(name: str, most: int = 1000) -> str:
-    """Return an image's name without its session, or what the user calls it; of more than `most` letters the last."""
+    """Return an image's name as the user knows it: without its session, and at most its last `most` letters."""
     name = own_name(name.rpartition("/raw_data/")[2])
     return name if len(name) <= most else f"…{name[1 - most :]}"
 
@@ -35,12 +33,12 @@ def find_query(query: object, images: Mapping[str, int], count: int) -> int:
     """Return the number of a query.
 
     Args:
-        query: its number, the name of an image of it, or the end of the name if no other query's ends so.
-        images: number of the query by the names of all images.
-        count: of the queries.
+        query: its number, the name of one of its images, or a unique end of the name.
+        images: number of the query by the name of each image.
+        count: number of queries.
 
     Raises:
-        ArtifactError: there is none, or several; names the nearest.
+        ArtifactError: no query matches, or several do; names the nearest.
     """
     if isinstance(query, int | np.integer) and not isinstance(query, bool):
         if 0 <= query < count:
@@ -51,24 +49,24 @@ def find_query(query: object, images: Mapping[str, int], count: int) -> int:
     name = image_name(str(query))
     if name in images:
         return images[name]
-    found = {number for known, number in images.items() if known.endswith(f"/{name}")}
-    if len(found) == 1:
-        return found.pop()
-    if found:
-        raise ArtifactError(f"query: {len(found)} queries have an image whose name ends in {name!r}; write more of it.")
+    numbers = {number for image, number in images.items() if image.endswith(f"/{name}")}
+    if len(numbers) == 1:
+        return numbers.pop()
+    if numbers:
+        raise ArtifactError(f"query: {len(numbers)} queries have an image name that ends in {name!r}; give more of it.")
     close = difflib.get_close_matches(name, images, n=1, cutoff=0.0)
-    near = f"The nearest of its {len(images)} images is {close[0]!r}." if close else "The pair has no queries."
-    raise ArtifactError(f"query: no query of the pair has an image {str(query)!r}. {near}")
+    hint = f"The nearest of its {len(images)} images is {close[0]!r}." if close else "The pair has no queries."
+    raise ArtifactError(f"query: no query of the pair has an image {str(query)!r}. {hint}")
 
 
 class Choice(Generic[T]):
-    """What `choose` shows; `shown` is the query that was chosen last, None where there is nothing to look at."""
+    """The query that `choose` shows now (`shown`); None without queries."""
 
     def __init__(self, shown: T | None) -> None:
         self.shown = shown
 
     def attempt(self, ask: Callable[[T], Any]) -> None:
-        """Show what asking about the query gives, or why it gives nothing; a finished notebook does not fail by it."""
+        """Display `ask` of the shown query, or print its error, so that a notebook does not fail."""
         from IPython.display import display
 
         if self.shown is not None:
@@ -79,21 +77,20 @@ class Choice(Generic[T]):
 
 
 def choose(queries: Queries[T], chosen: int | str = 0) -> Choice[T]:
-    """Show a query, and a list to choose another that takes its place; returns what holds the one that is shown.
+    """Show a query, and a list to choose another in its place; return the choice.
 
-    The picture is ordinary output, which a saved notebook keeps; the list is left out where the pipeline runs the
-    notebook.
+    The picture is ordinary output, which a saved notebook keeps. There is no list when the pipeline runs the notebook.
 
     Args:
-        chosen: number or name of the first; a number where there are none shows nothing.
+        chosen: number or name of the first query; ignored if it is a number and there are no queries.
 
     Raises:
-        ArtifactError: no such query.
+        ArtifactError: the query does not exist.
     """
     from IPython.display import display
 
     if not len(queries.names) and isinstance(chosen, int):
-        print("No queries to look at.")
+        print("There are no queries to show.")
         return Choice(None)
     choice: Choice[T] = Choice(queries.look(chosen))
     if TEXT_BARS in os.environ:
@@ -104,8 +101,8 @@ def choose(queries: Queries[T], chosen: int | str = 0) -> Choice[T]:
     number = chosen if isinstance(chosen, int) else getattr(choice.shown, "number", 0)
     options = [(f"{k}: {shown_name(name)}", k) for k, name in enumerate(queries.names)]
     layout = ipywidgets.Layout(width="95%")
-    listed = ipywidgets.Dropdown(options=options, value=number, description="query", layout=layout)
-    display(listed)
+    dropdown = ipywidgets.Dropdown(options=options, value=number, description="query", layout=layout)
+    display(dropdown)
     handle = display(choice.shown, display_id=True)
 
     def show(change: dict[str, Any]) -> None:
@@ -116,5 +113,5 @@ def choose(queries: Queries[T], chosen: int | str = 0) -> Choice[T]:
         else:
             handle.update(choice.shown)
 
-    listed.observe(show, "value")
+    dropdown.observe(show, "value")
     return choice

@@ -1,6 +1,6 @@
-"""Runs against each other: recall with intervals, the queries won and lost, time, memory, and what differs in settings.
+"""Compare runs: recall with intervals, queries won and lost, time, memory, and settings that differ.
 
-Everything is read from what the runs have left; no query is localized again.
+Everything is read from the files of the runs; no query is localized again.
 """
 
 import math
@@ -27,15 +27,15 @@ from toolkit.show.localized import LocalizedPair
 from toolkit.show.metrics import is_below, parse_threshold, unit_of
 from toolkit.show.report import (
     PICTURE_BUDGET,
+    Album,
     Cell,
     Picture,
     Table,
-    _Album,
-    _off_by,
-    _seconds,
-    _threshold,
+    off_by,
     page_template,
     read_run,
+    seconds_text,
+    threshold_text,
 )
 from toolkit.show.stills import draw_localization
 
@@ -44,73 +44,74 @@ if TYPE_CHECKING:
 
 RESAMPLES, SEED = 2000, 0
 INTERVAL = (2.5, 97.5)
-"""Percentiles of the resamples that an interval lies between."""
+"""Percentiles of the resamples that bound an interval."""
 ALL = "all"
-"""Stands for scene and devices where all pairs are counted together."""
+"""Value of the scene and device columns in rows that sum over all pairs."""
 MOST_PICTURES, MOST_ROWS = 4, 20
-"""Queries won or lost that are drawn, and that the page lists."""
+"""Queries won or lost that the page draws, and that it lists."""
 MOST_LETTERS = 32
-"""Of an image's name."""
+"""Length of an image name beyond which the page shows only the file name."""
 QUERY = ["scene", "map_device", "query_device", "timestamp", "device_id"]
 _PAIR = QUERY[:3]
 _ERRORS = ["rotation_error_deg", "translation_error_m"]
 _NEEDED = [*QUERY[1:], "status", *_ERRORS]
-# What every run has of its own, whatever its settings are.
+# Manifest keys that differ between any two runs, so they are not compared.
 _NAMES = ("name", "description", "output_root")
 _COLORS = (VERMILLION, BLUE, GREEN, ORANGE, SKY)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Runs on the queries that they have in common; the first is what the others are compared with."""
+    """Runs compared on the queries that all of them evaluated; the first run is the baseline."""
 
     folders: Sequence[Path]
     names: Sequence[str]
     records: Sequence[Mapping[str, Any]]
-    """What `run.json` of each says."""
+    """Content of each `run.json`."""
     thresholds: Sequence[str]
     """Names, such as `(1deg,0.1m)`."""
     queries: pd.DataFrame
-    """A row a common query and pair: those of `QUERY`; and `status_<i>`, `rotation_error_deg_<i>`,
-    `translation_error_m_<i>` of each run i; image, its name, where the runs are not older than that."""
+    """One row per common query and pair. Columns `QUERY`; `status_<i>`, `rotation_error_deg_<i>` and
+    `translation_error_m_<i>` of each run i; `image`, the image name, unless the runs are too old to have it."""
     recall: pd.DataFrame
-    """A row a pair, threshold and run, and those of all pairs: recall and difference to the first run (0 to 1), each
-    with `_low` and `_high` of its interval; queries, won and lost."""
+    """One row per pair, threshold and run, and the same for all pairs together: recall and its difference to the first
+    run (0 to 1), each with the `_low` and `_high` of its interval; numbers of queries, won and lost."""
     changes: pd.DataFrame
-    """A row a query that a run has won or lost: those of `QUERY`, run (its number), change, at (thresholds)."""
+    """One row per query that a run won or lost. Columns `QUERY`; run (its number), change, at (thresholds)."""
     settings: pd.DataFrame
-    """What differs: key, and a column a run."""
+    """Settings that differ: key, and one column per run."""
     resources: pd.DataFrame
-    """A row a stage, and one of all: stage; `seconds_<i>` and `memory_mb_<i>` of each run i."""
+    """One row per stage, and one for all stages: stage; `seconds_<i>` and `memory_mb_<i>` of each run i."""
     messages: Sequence[str] = field(default_factory=list)
 
     def text(self) -> str:
-        """Return a short table: all pairs together, and how many queries were won and lost."""
+        """Return a short table of all pairs together, with the numbers of queries won and lost."""
         rows = self.recall[self.recall["scene"] == ALL]
         width = max(map(len, self.names))
         lines = [f"{len(self.queries)} queries in {self.queries.groupby(_PAIR).ngroups} pairs, recall in % [95 %]"]
         for threshold, group in rows.groupby("threshold", sort=False):
-            lines.append(f"at {_threshold(str(threshold))}")
+            lines.append(f"at {threshold_text(str(threshold))}")
             for row in group.to_dict("records"):
                 line = f"  {self.names[row['run']]:<{width}}  {_interval(row, 'recall')}"
                 if row["run"]:
                     line += f"   {_interval(row, 'difference')}   {row['won']} won, {row['lost']} lost"
                 lines.append(line)
-        lines.append("time and peak memory; what a run has reused, or taken over from another, costs it none")
+        lines.append("time and peak memory; reused results, also those of another run, count as none")
+        total = self.resources.iloc[-1]
         for i, name in enumerate(self.names):
-            spent = self.resources.iloc[-1]
-            lines.append(f"  {name:<{width}}  {_seconds(spent[f'seconds_{i}'])}, {_memory(spent[f'memory_mb_{i}'])}")
+            seconds, memory = seconds_text(total[f"seconds_{i}"]), _memory(total[f"memory_mb_{i}"])
+            lines.append(f"  {name:<{width}}  {seconds}, {memory}")
         for row in self.settings.to_dict("records"):
             lines.append(f"{row['key']}: " + " | ".join(row[f"run_{i}"] for i in range(len(self.names))))
         return "\n".join([*lines, *(f"Note: {message}" for message in self.messages)])
 
     def summary(self) -> dict[str, Any]:
-        """Return the same for scripts: plain values, with every pair and every query won and lost."""
+        """Return the comparison as plain values for scripts, with every pair and every query won or lost."""
         changes = self.changes.assign(run=[self.names[i] for i in self.changes["run"]])
         recall = self.recall.assign(run=[self.names[i] for i in self.recall["run"]])
         tables = {"recall": recall, "changes": changes, "resources": self.resources}
-        known = {name: table.replace(np.inf, np.nan) for name, table in tables.items()}  # JSON has no infinity
-        plain = {name: table.astype(object).where(table.notna(), None) for name, table in known.items()}
+        finite = {name: table.replace(np.inf, np.nan) for name, table in tables.items()}  # JSON has no infinity
+        plain = {name: table.astype(object).where(table.notna(), None) for name, table in finite.items()}
         return {
             "runs": dict(zip(self.names, map(str, self.folders), strict=True)),
             "queries": len(self.queries),
@@ -118,7 +119,7 @@ class Comparison:
             "settings": self.settings.set_index("key").set_axis(self.names, axis="columns").to_dict("index"),
             "resources": {
                 row["stage"]: {
-                    name: {what: row[f"{what}_{i}"] for what in ("seconds", "memory_mb")}
+                    name: {column: row[f"{column}_{i}"] for column in ("seconds", "memory_mb")}
                     for i, name in enumerate(self.names)
                 }
                 for row in plain["resources"].to_dict("records")
@@ -128,46 +129,49 @@ class Comparison:
 
 
 def compare_runs(run_dirs: Sequence[str | Path], seed: int = SEED, resamples: int = RESAMPLES) -> Comparison:
-    """Compare runs with the first of them, on the queries of each pair that all of them have evaluated.
+    """Compare runs with the first of them, on the queries of each pair that all of them evaluated.
 
-    A query counts as won at a threshold where a run is within it and the first run is not; lost where it is the other
-    way round. Intervals are percentile bootstrap intervals of 95 % (Efron and Tibshirani, An Introduction to the
-    Bootstrap, 1993, chapter 13), paired: every resample takes the same queries of all runs. A query that was
-    localized in several maps is one unit of the resamples, so that its answers do not count as independent. Where all
-    or none are within a threshold, an interval has no width, which says nothing of other queries.
+    A run wins a query at a threshold if it is within the threshold and the first run is not; it loses a query if the
+    first run is within the threshold and it is not. Intervals are paired 95 % percentile bootstrap intervals (Efron
+    and Tibshirani, An Introduction to the Bootstrap, 1993, chapter 13): every resample takes the same queries from all
+    runs. Resamples draw a query that was localized in several maps as one unit, because its poses are not independent.
+    If all or none of the queries are within a threshold, the interval has no width; this proves nothing about other
+    queries.
 
     Args:
         run_dirs: run folders, two or more.
-        seed: of the resamples.
-        resamples: how many.
+        seed: seed of the resamples.
+        resamples: number of resamples.
 
     Raises:
-        ArtifactError: a folder is no run, is not evaluated, has a torn table or no query with ground truth; or the
-            runs have no query in common, or lengths of other units.
+        ArtifactError: a folder is not a run, is not evaluated, has a torn table or no query with ground truth; or the
+            runs have no query in common, or their lengths have different units.
     """
     folders = [] if isinstance(run_dirs, str) else list(map(Path, run_dirs))
     if len(folders) < 2:
-        found = run_dirs if isinstance(run_dirs, str) else [str(folder) for folder in folders]
-        raise ArtifactError(f"compare: found {found!r}, expected a list of two or more run folders.")
+        given = run_dirs if isinstance(run_dirs, str) else [str(folder) for folder in folders]
+        raise ArtifactError(f"compare: found {given!r}, expected a list of two or more run folders.")
     records = [read_run(folder / "run.json") for folder in folders]
     tables = [_read_errors(folder, record) for folder, record in zip(folders, records, strict=True)]
     names, messages = _names(folders), list[str]()
     limits = [_thresholds(table) for table in tables]
     units = [unit_of(*names_of) for names_of in limits]
-    for folder, record, unit, mine in zip(folders, records, units, limits, strict=True):
+    for folder, record, unit, limit in zip(folders, records, units, limits, strict=True):
         if unit != units[0]:
-            found = f"{folder}: found errors in {unit}, expected {units[0]} as in {folders[0]}"
-            raise ArtifactError(f"{found}. Set the same `unit` for both, and run them again.")
+            raise ArtifactError(
+                f"{folder}: found errors in {unit}, expected {units[0]} as in {folders[0]}. Set the same `unit` for "
+                "both, and run them again."
+            )
         if record["status"] not in ("done", ""):
             messages.append(f"{folder.name} is {record['status']}: {record['error'] or 'it has not ended'}")
-        if mine != limits[0]:
-            messages.append(f"{folder.name} was evaluated at other thresholds; those of {names[0]} are counted.")
+        if limit != limits[0]:
+            messages.append(f"{folder.name} was evaluated at other thresholds; those of {names[0]} are used.")
     keys = [*QUERY, *(["sensor_id"] if all("sensor_id" in table for table in tables) else [])]
     for folder, table in zip(folders, tables, strict=True):
         if table.duplicated(keys).any():
             raise ArtifactError(
-                f"{folder}: evaluation/errors.csv has a query twice, expected one row each; was it evaluated a camera "
-                "(at) and the others a device? Evaluate it as the others were."
+                f"{folder}: evaluation/errors.csv has a query twice, expected one row each. Perhaps this run was "
+                "evaluated at each camera and the others at each device; evaluate it with the same `at` as the others."
             )
     queries = tables[0][[*keys, *({"image"} & {*tables[0]})]]
     for table in tables[1:]:
@@ -178,10 +182,10 @@ def compare_runs(run_dirs: Sequence[str | Path], seed: int = SEED, resamples: in
             f"The runs have no query in common ({counts}). Compare runs of the same capture, pairs and queries."
         )
     if any(len(table) > len(queries) for table in tables):
-        messages.append(f"The runs have other queries ({counts}): the {len(queries)} in common are compared.")
+        messages.append(f"The runs have different queries ({counts}); only the {len(queries)} in common are compared.")
     for scene in queries["scene"].unique():
         if len({str(record["inputs"].get(scene)) for record in records}) > 1:
-            messages.append(f"{scene}: its files are not the same, or have been moved or copied, between the runs.")
+            messages.append(f"{scene}: its files were changed, moved or copied between the runs.")
     for i, table in enumerate(tables):
         columns = {name: f"{name}_{i}" for name in ("status", *_ERRORS)}
         queries = queries.merge(table[[*keys, *columns]].rename(columns=columns), on=keys)
@@ -199,33 +203,33 @@ def compare_runs(run_dirs: Sequence[str | Path], seed: int = SEED, resamples: in
 def bootstrap(
     hits: NDArray[np.bool_], unit: Ints, seed: int = SEED, resamples: int = RESAMPLES
 ) -> tuple[Floats, Floats]:
-    """Return the intervals of the recall of each run, and of its difference to the first; (2, R, T) each, 0 to 1.
+    """Return intervals of each run's recall and of its difference to the first run; each (2, R, T), 0 to 1.
 
     Args:
         hits: (Q, R, T), whether each query is within each threshold in each run.
-        unit: (Q,) which queries are drawn together, numbers from 0.
-        seed: of the resamples.
-        resamples: how many.
+        unit: (Q,) numbers from 0; queries of the same number are drawn together.
+        seed: seed of the resamples.
+        resamples: number of resamples.
     """
     count = np.bincount(unit)
     sums = np.zeros((len(count), *hits.shape[1:]))
     np.add.at(sums, unit, hits)
     rng, shares = np.random.default_rng(seed), []
-    # Some at a time: a draw has a weight for each query.
+    # In blocks: each resample has a weight for every unit, which takes memory.
     steps = [*range(0, resamples, max(1, 2_000_000 // len(count))), resamples]
     for start, end in pairwise(steps):
         weights = rng.multinomial(len(count), np.full(len(count), 1 / len(count)), size=end - start)
         shares.append(np.tensordot(weights, sums, 1) / (weights @ count)[:, None, None])
     drawn = np.concatenate(shares)
-    low_high = np.percentile(drawn, INTERVAL, axis=0), np.percentile(drawn - drawn[:, :1], INTERVAL, axis=0)
-    return low_high[0], low_high[1]
+    recall, difference = (np.percentile(shares, INTERVAL, axis=0) for shares in (drawn, drawn - drawn[:, :1]))
+    return recall, difference
 
 
 # Reading
 
 
 def _read_errors(folder: Path, record: Mapping[str, Any]) -> pd.DataFrame:
-    """Return the errors of the queries of all scenes of a run, with a column `scene`."""
+    """Return the errors of all queries with ground truth of all scenes of a run, with a column `scene`."""
     tables, missing = [], []
     for scene in map(str, record["scenes"]):
         path = SceneFiles(folder, scene).evaluation / "errors.csv"
@@ -234,41 +238,41 @@ def _read_errors(folder: Path, record: Mapping[str, Any]) -> pd.DataFrame:
             continue
         require_whole(path, of=path.with_name("recall.csv"))
         try:
-            kinds = {"timestamp": np.int64, "device_id": str, "sensor_id": str, "status": str}
-            table = pd.read_csv(path, dtype={**kinds, **dict.fromkeys(_ERRORS, float)})
+            types = {"timestamp": np.int64, "device_id": str, "sensor_id": str, "status": str}
+            table = pd.read_csv(path, dtype={**types, **dict.fromkeys(_ERRORS, float)})
         except (OSError, ValueError, OverflowError) as error:
             raise ArtifactError(f"{path}: not a table of errors ({error}). Run its stage evaluate again.") from None
         if lacking := [name for name in _NEEDED if name not in table]:
             raise ArtifactError(f"{path}: column {lacking[0]!r} is missing. Run its stage evaluate again.")
         tables.append(table.assign(scene=scene))
     if not tables:
-        found = missing[0] if missing else "no scene in run.json"
         raise ArtifactError(
-            f"{folder}: not evaluated ({found} is missing). Finish the run: python -m toolkit run MANIFEST."
-            if missing else f"{folder}: found {found}, expected the scenes of a run. Run its manifest again."
-        )  # fmt: skip
+            f"{folder}: not evaluated ({missing[0]} is missing). Finish the run: python -m toolkit run MANIFEST."
+            if missing
+            else f"{folder}: found no scene in run.json, expected the scenes of a run. Run its manifest again."
+        )
     errors = pd.concat(tables, ignore_index=True)
     errors = errors[errors[_ERRORS].notna().all(axis=1)]
     if errors.empty:
         raise ArtifactError(
-            f"{folder}: found no query with ground truth, expected some: without true poses there is no recall to "
-            "compare. Give the query sessions their ground truth, and evaluate again."
+            f"{folder}: found no query with ground truth, expected at least one: recall needs true poses. Add ground "
+            "truth to the query sessions and evaluate again."
         )
     return errors
 
 
 def _thresholds(table: pd.DataFrame) -> list[str]:
-    found = [name.removeprefix("loss@") for name in table.columns if name.startswith("loss@")]
-    if not found:
+    thresholds = [name.removeprefix("loss@") for name in table.columns if name.startswith("loss@")]
+    if not thresholds:
         raise ArtifactError("errors.csv: a column `loss@...`, which names a threshold, is missing. Evaluate again.")
-    return found
+    return thresholds
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
-    """Return a short name of each run, different ones."""
+    """Return a short, unique name for each run."""
     paths = [folder.resolve() for folder in folders]
-    twice = {path.name for path in paths if len({other for other in paths if other.name == path.name}) > 1}
-    names = [f"{path.parent.name}/{path.name}" if path.name in twice else path.name for path in paths]
+    ambiguous = {path.name for path in paths if len({other for other in paths if other.name == path.name}) > 1}
+    names = [f"{path.parent.name}/{path.name}" if path.name in ambiguous else path.name for path in paths]
     return [f"{name} ({names[:i].count(name) + 1})" if name in names[:i] else name for i, name in enumerate(names)]
 
 
@@ -278,22 +282,22 @@ def _names(folders: Sequence[Path]) -> list[str]:
 def _hits(queries: pd.DataFrame, runs: int, thresholds: Sequence[str]) -> NDArray[np.bool_]:
     """Return whether each query is within each threshold in each run, (Q, R, T)."""
     errors = [[queries[f"{name}_{i}"].to_numpy(float) for name in _ERRORS] for i in range(runs)]
-    hits = [[is_below(turned, moved, parse_threshold(name)) for name in thresholds] for turned, moved in errors]
+    hits = [[is_below(degrees, meters, parse_threshold(name)) for name in thresholds] for degrees, meters in errors]
     return np.asarray(np.moveaxis(np.array(hits, bool), 2, 0))
 
 
 def _recall(
     queries: pd.DataFrame, hits: NDArray[np.bool_], thresholds: Sequence[str], seed: int, resamples: int
 ) -> pd.DataFrame:
-    places = queries.groupby(_PAIR, sort=False).indices
+    rows_of_pair = queries.groupby(_PAIR, sort=False).indices
     everything = np.arange(len(queries))
     rows: list[dict[str, Any]] = []
-    for pair, chosen in [*places.items(), ((ALL, ALL, ALL), everything)]:
-        mine = hits[chosen]
+    for pair, chosen in [*rows_of_pair.items(), ((ALL, ALL, ALL), everything)]:
+        within, first = hits[chosen], hits[chosen][:, :1]
         unit = queries.iloc[chosen].groupby(["scene", "timestamp", "device_id"], sort=False).ngroup().to_numpy()
-        within, apart = bootstrap(mine, unit, seed, resamples)
-        shares = mine.mean(axis=0)
-        won, lost = ((here & ~there).sum(axis=0) for here, there in ((mine, mine[:, :1]), (mine[:, :1], mine)))
+        recall, difference = bootstrap(within, unit, seed, resamples)
+        shares = within.mean(axis=0)
+        won, lost = (within & ~first).sum(axis=0), (first & ~within).sum(axis=0)
         rows += [
             {
                 **dict(zip(_PAIR, pair, strict=True)),
@@ -301,11 +305,11 @@ def _recall(
                 "run": run,
                 "queries": len(chosen),
                 "recall": shares[run, t],
-                "recall_low": within[0, run, t],
-                "recall_high": within[1, run, t],
+                "recall_low": recall[0, run, t],
+                "recall_high": recall[1, run, t],
                 "difference": shares[run, t] - shares[0, t],
-                "difference_low": apart[0, run, t],
-                "difference_high": apart[1, run, t],
+                "difference_low": difference[0, run, t],
+                "difference_high": difference[1, run, t],
                 "won": int(won[run, t]),
                 "lost": int(lost[run, t]),
             }
@@ -316,7 +320,7 @@ def _recall(
 
 
 def _changes(queries: pd.DataFrame, hits: NDArray[np.bool_], thresholds: Sequence[str]) -> pd.DataFrame:
-    """List what was lost, then what was won; that which changed most thresholds first."""
+    """List for each run the queries lost, then those won; those that changed at the most thresholds first."""
     parts = []
     for run in range(1, hits.shape[1]):
         for change, changed in (("lost", hits[:, 0] & ~hits[:, run]), ("won", ~hits[:, 0] & hits[:, run])):
@@ -328,7 +332,7 @@ def _changes(queries: pd.DataFrame, hits: NDArray[np.bool_], thresholds: Sequenc
 
 
 def _settings(manifests: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Return the settings that are not the same in all runs."""
+    """Return the settings that differ between runs."""
     flat = [dict(_leaves(manifest)) for manifest in manifests]
     keys = [key for key in dict.fromkeys(key for leaves in flat for key in leaves) if key not in _NAMES]
     texts = [[str(leaves[key]) if key in leaves else "–" for leaves in flat] for key in keys]
@@ -350,15 +354,15 @@ def _resources(stages: Sequence[Sequence[Mapping[str, Any]]]) -> pd.DataFrame:
     for name in (*names, ALL):
         line: dict[str, Any] = {"stage": name}
         for i, rows in enumerate(stages):
-            mine = [row for row in rows if name in (ALL, row.get("stage"))]
-            line[f"seconds_{i}"] = sum(_measured(row, "seconds") for row in mine) if mine else math.nan
-            line[f"memory_mb_{i}"] = max((_measured(row, "peak_memory_mb") for row in mine), default=math.nan)
+            stage_rows = [row for row in rows if name in (ALL, row.get("stage"))]
+            line[f"seconds_{i}"] = sum(_measured(row, "seconds") for row in stage_rows) if stage_rows else math.nan
+            line[f"memory_mb_{i}"] = max((_measured(row, "peak_memory_mb") for row in stage_rows), default=math.nan)
         table.append(line)
     return pd.DataFrame(table)
 
 
 def _measured(row: Mapping[str, Any], name: str) -> float:
-    """Return a number of a stage's row; 0 where it says none."""
+    """Return a number from a stage's row; 0 if it has none."""
     value = row.get(name)
     return float(value) if isinstance(value, int | float) and math.isfinite(value) else 0.0
 
@@ -368,7 +372,7 @@ def _measured(row: Mapping[str, Any], name: str) -> float:
 
 @styled
 def draw_differences(comparison: Comparison) -> "Figure":
-    """Draw the difference of recall to the first run, with its interval, for each pair; return the figure."""
+    """Draw for each pair the difference of recall to the first run, with its interval."""
     table = comparison.recall[comparison.recall["run"] > 0]
     pairs = list(dict.fromkeys(map(tuple, table[_PAIR].to_numpy())))
     several = table["scene"].nunique() > 2
@@ -389,11 +393,11 @@ def draw_differences(comparison: Comparison) -> "Figure":
             panel.hlines(y, low, high, color=color, lw=2)
             panel.plot(middle, y, "o", color=color, ms=5, label=comparison.names[run])
         panel.axvline(0, color="0.4", lw=0.8)
-        panel.set(title=f"at {_threshold(threshold)}", xlabel="difference of recall [percentage points]")
+        panel.set(title=f"at {threshold_text(threshold)}", xlabel="difference of recall [percentage points]")
         panel.set_yticks(range(len(pairs)), labels)
     panels[0].invert_yaxis()
     lowest, highest = panels[0].get_xlim()
-    panels[0].set_xlim(min(lowest, -5), max(highest, 5))  # what is hardly a difference looks so
+    panels[0].set_xlim(min(lowest, -5), max(highest, 5))  # small differences should look small
     figure.suptitle(f"Recall minus that of {comparison.names[0]}, with intervals of 95 %")
     if len(runs) > 1:
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
@@ -401,10 +405,10 @@ def draw_differences(comparison: Comparison) -> "Figure":
 
 
 def readable(comparison: Comparison) -> dict[str, pd.DataFrame]:
-    """Return the tables of the page, in words: `recall`, `changes`, `resources` and `settings`; empty, if need be."""
-    recall = {_threshold(name): _frame(_recall_table(comparison, name)) for name in comparison.thresholds}
-    others = {"changes": _changes_table, "resources": _resources_table, "settings": _settings_table}
-    tables = {name: _frame(make(comparison)) for name, make in others.items()}
+    """Return the tables of the page as text: `recall`, `changes`, `resources` and `settings`; some may be empty."""
+    recall = {threshold_text(name): _frame(_recall_table(comparison, name)) for name in comparison.thresholds}
+    makers = {"changes": _changes_table, "resources": _resources_table, "settings": _settings_table}
+    tables = {name: _frame(make(comparison)) for name, make in makers.items()}
     return {"recall": pd.concat(recall, names=["at"]), **tables}
 
 
@@ -416,16 +420,16 @@ def _frame(table: Table | None) -> pd.DataFrame:
 
 
 def draw_change(comparison: Comparison, row: int) -> "list[tuple[str, Figure]]":
-    """Draw a query that was won or lost as the first run and the other have it, from their stored correspondences.
+    """Draw a query that was won or lost, as localized by the first run and by the other, from stored correspondences.
 
     Args:
-        row: of `comparison.changes`.
+        row: row of `comparison.changes`.
 
     Returns:
         A title and a figure for each of the two runs.
 
     Raises:
-        ToolkitError: its capture is not where it was, or a run has not kept what its poses rest on.
+        ToolkitError: the capture has moved, or a run has not kept the correspondences.
     """
     change = comparison.changes.iloc[row]
     drawn = []
@@ -447,20 +451,20 @@ def draw_change(comparison: Comparison, row: int) -> "list[tuple[str, Figure]]":
 
 
 def _capture_of(record: Mapping[str, Any], scene: str, folder: Path) -> Path:
-    """Return the folder of a scene's capture, as a run had it."""
+    """Return the folder of a scene's capture from the record of a run."""
     for row in record["stages"]:
         root = (row.get("parameters") or {}).get("sessions_root")
         if row.get("scene") == scene and root and Path(root).is_dir():
             return Path(root).parent
-    raise ArtifactError(f"{folder}: the capture {scene} is not where the run had it, so its queries cannot be shown.")
+    raise ArtifactError(f"{folder}: the capture {scene} is no longer where the run read it, so no query can be drawn.")
 
 
 def write_comparison(comparison: Comparison, path: str | Path | None = None, pictures: int = MOST_PICTURES) -> Path:
-    """Write the page of a comparison, one file that needs nothing else, and return its path.
+    """Write the page of a comparison, one self-contained file, and return its path.
 
     Args:
         path: HTML file; None: `compare_<names>.html` beside the first run.
-        pictures: queries won or lost that are drawn, of each run against the first; 0 draws none.
+        pictures: number of queries won or lost to draw for each run; 0 draws none.
     """
     if path is None:
         stem = "_".join(name.replace("/", "-") for name in comparison.names)
@@ -469,11 +473,11 @@ def write_comparison(comparison: Comparison, path: str | Path | None = None, pic
         path = comparison.folders[0].resolve().parent / f"compare_{stem}.html"
     names, messages, looks = comparison.names, list(comparison.messages), list[tuple[str, list[Picture]]]()
     with tempfile.TemporaryDirectory() as folder:
-        album = _Album(Path(folder), PICTURE_BUDGET, [])
+        album = Album(Path(folder), PICTURE_BUDGET, [])
 
         def picture(drawn: "Figure", title: str, caption: str = "") -> Picture:
             path = save_figure(drawn, Path(folder) / "picture.png")
-            return replace(album.picture(path, title, caption), path="")  # the file does not stay
+            return replace(album.picture(path, title, caption), path="")  # the file is temporary
 
         caption = "Right of the line a run is better than the first; an interval that crosses it may be chance."
         figure = picture(draw_differences(comparison), "Differences", caption)
@@ -502,12 +506,12 @@ def write_comparison(comparison: Comparison, path: str | Path | None = None, pic
 def draw_changes(
     comparison: Comparison, most: int = MOST_PICTURES
 ) -> "Iterator[tuple[str, list[tuple[str, Figure]]]]":
-    """Draw some of the queries won and lost, from all over them; yield a title, and titles and figures of both runs.
+    """Draw a regular sample of the queries won and lost; yield a title, and the titles and figures of both runs.
 
     Without figures, the title says why that query cannot be drawn.
 
     Args:
-        most: of each run, half of them lost and half won where there are both.
+        most: number of queries of each run; half of them lost and half won, if there are enough of both.
     """
     table = comparison.changes
     for run in range(1, len(comparison.names)):
@@ -517,29 +521,30 @@ def draw_changes(
         for row in [*lost, *_spread(rows[1], most - len(lost))]:
             change = table.loc[row]
             query = f"{change['query_device']} query {_name(change)}"
-            what = f"{change['change']} by {comparison.names[run]} at {_limits(comparison, change['at'])}"
+            outcome = f"{change['change']} by {comparison.names[run]} at {_limits(comparison, change['at'])}"
             try:
-                yield f"{query} in the {change['map_device']} map: {what}", draw_change(comparison, row)
+                yield f"{query} in the {change['map_device']} map: {outcome}", draw_change(comparison, row)
             except (ToolkitError, OSError) as error:
                 yield f"No picture of {query}: {error}", []
 
 
 def _name(change: "pd.Series[Any] | Mapping[str, Any]") -> str:
-    """Return what a query is called: its image's name, of a long one that of the file; or its timestamp."""
+    """Return the name of a query: its image name, shortened to the file name if long; else its timestamp."""
     image = change.get("image")
     name = image if isinstance(image, str) else str(change["timestamp"])
     return name if len(name) <= MOST_LETTERS else f"…/{name.rpartition('/')[2]}"
 
 
 def _spread(rows: Sequence[int], most: int) -> list[int]:
-    """Return some of the rows, from all over them: neighbors are of one pair and alike."""
+    """Return a regular sample of the rows: neighboring rows belong to one pair and look alike."""
     return [rows[k] for k in np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int))]
 
 
 def _limits(comparison: Comparison, at: str) -> str:
     names = at.split("; ")
-    every = len(names) == len(comparison.thresholds) > 1
-    return "every threshold" if every else "; ".join(map(_threshold, names))
+    if len(names) == len(comparison.thresholds) > 1:
+        return "every threshold"
+    return "; ".join(map(threshold_text, names))
 
 
 def _tiles(comparison: Comparison) -> list[tuple[str, str]]:
@@ -547,16 +552,16 @@ def _tiles(comparison: Comparison) -> list[tuple[str, str]]:
     tiles = []
     shown = comparison.thresholds if len(comparison.names) == 2 else comparison.thresholds[:1]
     for row in rows[rows["threshold"].isin(shown)].to_dict("records"):
-        where = f"{comparison.names[row['run']]} at {_threshold(row['threshold'])}"
+        where = f"{comparison.names[row['run']]} at {threshold_text(row['threshold'])}"
         text = f"points of recall [{_bounds(row, 'difference')}], {row['won']} won and {row['lost']} lost: {where}"
         tiles.append((_signed(row["difference"]), text))
     return tiles
 
 
 def _recall_table(comparison: Comparison, threshold: str) -> Table:
-    """List both runs beside each other, or more of them below each other, so that any number fits the page."""
-    below = len(comparison.names) > 2
-    columns = ["map", "query", "queries", *(["run", "recall"] if below else comparison.names)]
+    """List the recall of two runs side by side, or of more runs in one row each, so that any number fits the page."""
+    row_per_run = len(comparison.names) > 2
+    columns = ["map", "query", "queries", *(["run", "recall"] if row_per_run else comparison.names)]
     columns += ["difference", "won", "lost"]
     rows = []
     chosen = comparison.recall[comparison.recall["threshold"] == threshold]
@@ -566,18 +571,18 @@ def _recall_table(comparison: Comparison, threshold: str) -> Table:
         cells = [f"{pair[0]} {pair[1]}" if several else pair[1], pair[2], by_run[0]["queries"]]
         recalls = [Cell(_interval(row, "recall"), 0.9 * row["recall"]) for row in by_run]
         changes = [[_interval(row, "difference"), row["won"], row["lost"]] for row in by_run]
-        changes[0] = [""] * 3  # to itself
-        if below:
+        changes[0] = [""] * 3  # the first run is compared with itself
+        if row_per_run:
             named = zip(comparison.names, recalls, changes, strict=True)
             rows += [[*cells, name, recall, *change] for name, recall, change in named]
         else:
             rows.append([*cells, *recalls, *changes[1]])
-    caption = f"Recall at {_threshold(threshold)} in %, and the differences in percentage points"
+    caption = f"Recall at {threshold_text(threshold)} in %, and its differences in percentage points"
     return Table(caption, columns, rows)
 
 
 def _changes_table(comparison: Comparison) -> Table | None:
-    """List what was won and lost; None where nothing was."""
+    """List the queries won and lost; None if there are none."""
     table, unit = comparison.changes, unit_of(*comparison.thresholds)
     if table.empty:
         return None
@@ -587,7 +592,7 @@ def _changes_table(comparison: Comparison) -> Table | None:
         i = row["run"]
         texts = [comparison.names[i]] if several else []
         texts += [row["change"], _limits(comparison, row["at"]), f"{row['query_device']} in {row['map_device']} map"]
-        texts += [_off_by(row, after=f"_{j}", unit=unit) for j in (0, i)]
+        texts += [off_by(row, after=f"_{j}", unit=unit) for j in (0, i)]
         rows.append([*texts, row[f"status_{i}"].replace("_", " "), _name(row)])
     rest = f"; {MOST_ROWS} of them, all with --json" if len(table) > MOST_ROWS else ""
     counts = table["change"].value_counts()
@@ -608,9 +613,9 @@ def _resources_table(comparison: Comparison) -> Table:
         for i in range(len(comparison.names)):
             seconds = row[f"seconds_{i}"]
             bar = seconds / longest if row["stage"] != ALL and seconds > 0 else None
-            cells += [Cell(_seconds(seconds), bar=bar), _memory(row[f"memory_mb_{i}"])]
+            cells += [Cell(seconds_text(seconds), bar=bar), _memory(row[f"memory_mb_{i}"])]
         rows.append(cells)
-    return Table("Time and peak memory of every stage, start-up of its notebook included", columns, rows)
+    return Table("Time and peak memory of every stage, including the start-up of its notebook", columns, rows)
 
 
 def _settings_table(comparison: Comparison) -> Table | None:

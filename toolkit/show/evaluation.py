@@ -1,4 +1,4 @@
-"""Tables of an evaluation, and their figures."""
+"""The tables of an evaluation and their figures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -24,9 +24,9 @@ from toolkit.show.metrics import (
 from toolkit.show.sequences import draw_steps
 
 BEYOND = 5
-"""Stated deviations beyond which an error is no chance."""
+"""Error, in stated deviations, beyond which the stated deviation is too small: no chance explains it."""
 FEWEST_FOR_MEDIANS = 30
-"""Poses from which on medians of a tenth of them say more than the poses themselves."""
+"""Poses needed to draw the medians of tenths."""
 RELIABILITY_BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, 1.0)
 
 if TYPE_CHECKING:
@@ -35,31 +35,31 @@ if TYPE_CHECKING:
 
 @dataclass
 class Evaluation:
-    """The tables of a scene; rows for every pair, also those that could not be evaluated (column `state`)."""
+    """The tables of a scene. Every pair has a row, also if it could not be evaluated (column `state`)."""
 
     recall: pd.DataFrame
-    """One row a pair: counts, recall, medians over all queries (a missing pose is infinite), `ok_wrong`."""
+    """One row per pair: counts, recall, medians over all queries (a missing pose is infinite), `ok_wrong`."""
     errors: pd.DataFrame
-    """One row a query of a pair: errors, status, inliers, and why it misses each threshold."""
+    """One row per query of a pair: errors, status, inliers, and why it misses each threshold."""
     retrieval: pd.DataFrame
-    """One row a pair: share of queries with a good reference among the first K, and in the map at all."""
+    """One row per pair: share of queries with a good reference among the first K, and anywhere in the map."""
     losses: pd.DataFrame
-    """One row a pair and threshold: queries missed, by reason."""
+    """One row per pair and threshold: queries missed, by reason."""
     overlap: pd.DataFrame
-    """One row a pair: query images, and the share of them whose first reference overlaps with them in view."""
+    """One row per pair: query images, and the share of them that overlap with their first reference in view."""
     thresholds: tuple[Threshold, ...] = THRESHOLDS
     messages: list[str] = field(default_factory=list)
-    """What was not evaluated, and why; empty where all was."""
+    """What was not evaluated, and why."""
     unit: str = "m"
-    """Of lengths: m, or `metrics.UNKNOWN_UNIT`."""
+    """Unit of lengths: m, or `metrics.UNKNOWN_UNIT`."""
     sequences: pd.DataFrame = field(default_factory=pd.DataFrame)
-    """One row a pair and step of the sequence stage: recall, medians, queries rescued and broken; empty without it."""
+    """One row per pair and step of the sequence stage: recall, medians, queries rescued and broken."""
     changes: pd.DataFrame = field(default_factory=pd.DataFrame)
-    """One row a query that the sequence has rescued or broken, with its errors before and after."""
+    """One row per query that the sequence stage rescued or broke, with its errors before and after."""
 
     @property
     def pairs(self) -> pd.DataFrame:
-        """The pairs, with the `reason` of those that had to be left out."""
+        """The pairs, with the `reason` why a pair was left out."""
         state = self.recall["state"].astype(str)
         left_out = state.str.startswith(LEFT_OUT)
         reason = state.str.removeprefix(LEFT_OUT).where(left_out, "")
@@ -68,7 +68,7 @@ class Evaluation:
 
 @styled
 def draw_evaluation(evaluation: Evaluation) -> dict[str, "Figure"]:
-    """Return the figures of an evaluation by name; those for which there is nothing to draw are left out."""
+    """Return the figures of an evaluation by name, except figures without data."""
     figures: dict[str, Figure] = {}
     done = evaluation.recall
     done = done.dropna(subset=["localized"]) if "localized" in done else done.iloc[:0]
@@ -123,10 +123,10 @@ def draw_matrices(
     """Draw map device x query device matrices side by side.
 
     Args:
-        table: one row a pair.
-        columns: for each panel a column's name, title, factor and unit.
-        better: `higher` or `lower`: which values are good, shown light to dark.
-        limits: range of the colors after the factor; None: of the values.
+        table: one row per pair.
+        columns: for each panel the name of a column, its title, factor and unit.
+        better: `higher` or `lower` values are good; chooses the color map.
+        limits: values after the factor at which the colors begin and end; None: 0 and the largest value.
     """
     figure = new_figure(3.1 * len(columns) + 0.4, 3.35)
     maps, queries = (in_order(table[c]) for c in ("map_device", "query_device"))
@@ -137,9 +137,9 @@ def draw_matrices(
             i, j = maps.index(row.map_device), queries.index(row.query_device)
             values[i, j] = factor * float(table.at[row.Index, column])
         finite = values[np.isfinite(values)]
-        # Values that hardly differ stay pale: dark is what stands out among them.
-        widest = max(float(finite.max()), 3 * float(np.median(finite)), 1e-9) if len(finite) else 1.0
-        low, high = limits or (0.0, widest)
+        # At least thrice the median: only values that stand out are dark.
+        largest = max(float(finite.max()), 3 * float(np.median(finite)), 1e-9) if len(finite) else 1.0
+        low, high = limits or (0.0, largest)
         shade = (np.clip(values, low, high) - low) / (high - low)
         axis.imshow(shade, cmap="Blues" if better == "higher" else "Oranges", vmin=-0.08, vmax=1.25)
         for (i, j), value in np.ndenumerate(values):
@@ -162,7 +162,7 @@ def draw_matrices(
 
 @styled
 def draw_error_curves(errors: pd.DataFrame, thresholds: Sequence[Threshold] = THRESHOLDS, unit: str = "m") -> "Figure":
-    """Draw cumulative distributions of the errors: a column a query device, a line a map device.
+    """Draw cumulative distributions of the errors: one column per query device, one curve per map device.
 
     A curve ends at the share of queries that have a pose. Dotted lines are the recall thresholds.
     """
@@ -199,9 +199,9 @@ def draw_error_curves(errors: pd.DataFrame, thresholds: Sequence[Threshold] = TH
 
 @styled
 def draw_reliability(errors: pd.DataFrame, unit: str = "m") -> "Figure":
-    """Draw how often poses are right, within `WRONG`, against how probable the localizer calls it.
+    """Draw the share of right poses (within `WRONG`) against the probability that the localizer states.
 
-    Bars are intervals of 95 % (Wilson, 1927), the number is that of the poses.
+    Bars are 95 % intervals (Wilson, 1927); numbers count the poses.
     """
     errors = errors[errors["p_correct"].notna()]
     right = is_below(errors["rotation_error_deg"].to_numpy(), errors["translation_error_m"].to_numpy(), WRONG)
@@ -210,11 +210,11 @@ def draw_reliability(errors: pd.DataFrame, unit: str = "m") -> "Figure":
     figure = new_figure(5.2, 4.6)
     axis = figure.subplots()
     axis.plot([0, 100], [0, 100], color="0.6", lw=1, ls=":", label="as stated")
-    for number_of_bin in np.unique(bin_of):
-        mine = bin_of == number_of_bin
-        count, share = int(mine.sum()), float(right[mine].mean())
+    for k in np.unique(bin_of):
+        in_bin = bin_of == k
+        count, share = int(in_bin.sum()), float(right[in_bin].mean())
         low, high = wilson_interval(share, count)
-        x = 100 * stated[mine].mean()
+        x = 100 * stated[in_bin].mean()
         axis.errorbar(
             x, 100 * share, [[100 * max(share - low, 0)], [100 * max(high - share, 0)]], fmt="o", color=SKY, capsize=3
         )
@@ -226,16 +226,16 @@ def draw_reliability(errors: pd.DataFrame, unit: str = "m") -> "Figure":
     axis.set(xlabel="stated probability of being right [%]", ylabel="poses that are right [%]")
     axis.legend(frameon=False, fontsize=8, loc="upper left")
     axis.grid(alpha=0.25)
-    figure.suptitle(f"How far stated probabilities hold (right: {_limit(WRONG, unit)})")
+    figure.suptitle(f"Stated and actual probability of being right (right: {_limit(WRONG, unit)})")
     return figure
 
 
 @styled
 def draw_deviations(errors: pd.DataFrame, unit: str = "m") -> "Figure":
-    """Draw how far poses are off against the standard deviation that the localizer states of their position.
+    """Draw the position errors against the standard deviations that the localizer states.
 
-    A line joins the medians of a tenth of the poses each, if there are enough. Where the errors are Gaussian, they lie
-    a little below the stated deviation, and hardly any pose is above the upper line.
+    With enough poses, a line joins the medians of tenths of the poses. If the stated deviations are right and errors
+    are Gaussian, the medians lie a little below the stated deviation, and hardly any pose is above the upper line.
     """
     errors = errors[errors["position_std_m"].gt(0) & np.isfinite(errors["translation_error_m"])]
     stated, actual = (errors[name].to_numpy(float).clip(1e-5) for name in ("position_std_m", "translation_error_m"))
@@ -245,26 +245,26 @@ def draw_deviations(errors: pd.DataFrame, unit: str = "m") -> "Figure":
     low, high = min(stated.min(), actual.min()) / 1.5, max(stated.max(), actual.max()) * 1.5
     axis.plot([low, high], [low, high], color="0.6", lw=1, ls=":", label="error = stated deviation")
     axis.plot([low, high], [BEYOND * low, BEYOND * high], color="0.6", lw=1, ls="--", label=f"{BEYOND} times that")
-    for part, name, color in ((ok, "ok", SKY), (~ok, "low confidence", ORANGE)):
-        if part.any():
-            beyond = float(np.mean(actual[part] > BEYOND * stated[part]))
-            label = f"{name}: {part.sum()}, {percent(beyond)} % above"
-            axis.plot(stated[part], actual[part], "o", ms=3.5, alpha=0.5, mew=0, color=color, label=label)
+    for chosen, name, color in ((ok, "ok", SKY), (~ok, "low confidence", ORANGE)):
+        if chosen.any():
+            beyond = float(np.mean(actual[chosen] > BEYOND * stated[chosen]))
+            label = f"{name}: {chosen.sum()}, {percent(beyond)} % above"
+            axis.plot(stated[chosen], actual[chosen], "o", ms=3.5, alpha=0.5, mew=0, color=color, label=label)
     if len(stated) >= FEWEST_FOR_MEDIANS:
         tenths = np.array_split(np.argsort(stated), 10)
-        middles = np.array([(np.median(stated[part]), np.median(actual[part])) for part in tenths])
-        axis.plot(*middles.T, color="0.15", lw=1.5, marker="o", ms=3, label="median of a tenth of the poses")
+        medians = np.array([(np.median(stated[tenth]), np.median(actual[tenth])) for tenth in tenths])
+        axis.plot(*medians.T, color="0.15", lw=1.5, marker="o", ms=3, label="medians of tenths of the poses")
     axis.set(xscale="log", yscale="log", xlim=(low, high), ylim=(low, high))
     plain_log(axis, "xy")
-    axis.set(xlabel=f"stated standard deviation of the position [{unit}]", ylabel=f"error of the position [{unit}]")
+    axis.set(xlabel=f"stated standard deviation of the position [{unit}]", ylabel=f"position error [{unit}]")
     axis.grid(alpha=0.25)
     axis.legend(frameon=False, fontsize=8, loc="upper left")
-    figure.suptitle("How far stated deviations hold")
+    figure.suptitle("Stated and actual deviation of the position")
     return figure
 
 
 def wilson_interval(share: float, count: int, z: float = 1.96) -> tuple[float, float]:
-    """Return the interval (Wilson, 1927) of a share seen in `count` trials; z: its half width in deviations."""
+    """Return the Wilson interval (1927) of a share observed in `count` trials; `z`: half width, standard deviations."""
     middle = share + z**2 / (2 * count)
     half = z * np.sqrt(share * (1 - share) / count + z**2 / (4 * count**2))
     return float((middle - half) / (1 + z**2 / count)), float((middle + half) / (1 + z**2 / count))
@@ -272,7 +272,7 @@ def wilson_interval(share: float, count: int, z: float = 1.96) -> tuple[float, f
 
 @styled
 def draw_losses(losses: pd.DataFrame) -> "Figure":
-    """Draw for each pair, a panel a threshold, the share of queries missed, by reason."""
+    """Draw the share of missed queries of each pair by reason, one panel per threshold."""
     losses = losses.dropna(subset=["threshold"])
     thresholds = list(dict.fromkeys(losses["threshold"]))
     pairs = list(dict.fromkeys(zip(losses["map_device"], losses["query_device"], strict=True)))

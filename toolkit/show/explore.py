@@ -1,4 +1,4 @@
-"""Tables and figures for the notebooks: what a capture holds, and what the stages made of it."""
+"""Tables and figures for the notebooks: the content of a capture, and the results of the stages."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -30,11 +30,11 @@ MAX_PLACES = 4
 
 
 def describe(capture: Capture, queries: str = "keyframes_pruned_subsampled") -> pd.DataFrame:
-    """Return one row a session: counts of images, posed images, rigs, subsessions and queries asked.
+    """Return one row per session: counts of images, posed images, rigs, subsessions and queries.
 
-    `odometry` tells how many poses that of queries has, over how long, and in how many pieces between losses of
-    tracking (by the defaults of the stage `sequence`); `radio` which scans there are. What makes a session unusable
-    for later stages is its `reason`.
+    `odometry` tells the number of odometry poses, their duration, and the number of pieces between losses of tracking
+    (by the defaults of the stage `sequence`); `radio` lists the kinds of scans. `reason` tells why later stages cannot
+    use a session.
     """
     rows = []
     for name in capture:
@@ -73,10 +73,10 @@ def _odometry(session: Session) -> str:
 
 
 def list_poses(path: str | Path) -> pd.DataFrame:
-    """Return image, status and world_from_device of the queries of a pair, NaN without a pose: as in its files.
+    """Return image, status and world_from_device of the queries of a pair, as in its files; NaN without a pose.
 
     Args:
-        path: of the pair's `.csv`.
+        path: the pair's `.csv`.
     """
     table = read_query_table(Path(path), ["status"])
     poses = Trajectory.read(Path(path).with_suffix(".txt")).lookup(table["timestamp"].to_numpy(), table["device_id"])
@@ -87,7 +87,7 @@ def list_poses(path: str | Path) -> pd.DataFrame:
 
 @styled
 def draw_samples(capture: Capture, count: int = 4) -> "Figure":
-    """Return a figure of `count` images of each session, evenly spread over the recording."""
+    """Draw `count` images of each session, evenly spread over the recording; return the figure."""
     names = [session.id for session in _usable(capture) if len(session)]
     figure = new_figure(2.4 * count, 1.9 * len(names))
     axes = figure.subplots(len(names), count, squeeze=False)
@@ -102,12 +102,12 @@ def draw_samples(capture: Capture, count: int = 4) -> "Figure":
 
 @styled
 def draw_top_view(capture: Capture, up: ArrayLike | None = None, unit: str | None = "m") -> "Figure":
-    """Return a figure of all camera centers seen from above; queries where the truth is known.
+    """Draw all camera centers from above, those of queries only with ground truth; return the figure.
 
     Args:
-        capture: what to draw; cameras far from all others get a panel of their own.
-        up: (3,) direction that is up; None: estimated from how the cameras are held.
-        unit: that of the poses, None if it is not known.
+        capture: the capture; places far apart get panels of their own.
+        up: up direction (3,); None: estimated from the cameras.
+        unit: unit of the poses, None if unknown.
     """
     poses = {session.id: _poses(session) for session in _usable(capture)}
     everything = np.concatenate(list(poses.values()))
@@ -135,13 +135,13 @@ def draw_top_view(capture: Capture, up: ArrayLike | None = None, unit: str | Non
 
 @styled
 def draw_similarity(embeddings: str | Path, limit: int = 300) -> "Figure":
-    """Return a figure of the cosine similarity of a query session's images to another device's map.
+    """Draw the cosine similarity of a query session's images to another device's map; return the figure.
 
-    Of several descriptors the similarities are fused, as they are for retrieval.
+    With several descriptors, the similarities are fused as for retrieval.
 
     Args:
         embeddings: folder of the descriptors, `<device>_<split>/<subsession>/<subsession>.npy`.
-        limit: at most so many images of a session, evenly spread, are shown.
+        limit: largest number of images per session, evenly spread.
     """
     from toolkit.embedders.search import fuse  # loads FAISS
 
@@ -164,7 +164,7 @@ def draw_similarity(embeddings: str | Path, limit: int = 300) -> "Figure":
 
 @styled
 def draw_references(sessions_root: str | Path, jsonl: str | Path, samples: int = 4, references: int = 4) -> "Figure":
-    """Return a figure of some query images of a pair, each beside its first references.
+    """Draw some query images of a pair, each beside its first references; return the figure.
 
     Args:
         jsonl: the retrieval of a pair, `<scene>_map_<M>_query_<Q>.jsonl`.
@@ -178,14 +178,14 @@ def draw_references(sessions_root: str | Path, jsonl: str | Path, samples: int =
 def draw_reranked(
     sessions_root: str | Path, jsonl: str | Path, retrieved: str | Path, samples: int = 4, references: int = 3
 ) -> "Figure":
-    """Return a figure of query images, each with its first references by retrieval and, to their right, reranked.
+    """Draw query images, each with its first references before and (to the right) after reranking; return the figure.
 
-    Queries that another reference leads now come first.
+    The queries drawn are those whose new first reference had the worst retrieval rank.
 
     Args:
         jsonl: the reranked references of a pair, `<scene>_map_<M>_query_<Q>.jsonl`.
-        retrieved: those of the retrieval stage.
-        references: references shown of each, before and after.
+        retrieved: the references of the retrieval stage.
+        references: number of references shown per query, before and after.
     """
     before, after = read_references(retrieved), read_references(jsonl)
     moved = [-row["topk"][0]["retrieval_rank"] if row["topk"] else 0 for row in after]
@@ -196,7 +196,7 @@ def draw_reranked(
 def _draw_rows(
     sessions_root: str | Path, jsonl: str | Path, rows: list[list[dict[str, Any]]], references: int
 ) -> "Figure":
-    """Draw a line a query: its image, then its first references as each of its rows has them."""
+    """Draw one row per query: its image, then its first references in each entry of `rows`."""
     capture = Capture.from_sessions_root(sessions_root)
     map_device, _, query_device = Path(jsonl).stem.rpartition("_map_")[2].partition("_query_")
     if not rows:
@@ -210,8 +210,8 @@ def _draw_rows(
         for axis in line:
             axis.set_axis_off()
         shown = [(line[0], row[0], f"query {query_device}")]
-        for part, query in enumerate(row):
-            for axis, hit in zip(line[1 + part * references :], query["topk"][:references], strict=False):
+        for block, query in enumerate(row):
+            for axis, hit in zip(line[1 + block * references :], query["topk"][:references], strict=False):
                 verified = "retrieval_rank" in hit
                 title = f"{hit['score']} inliers, was {hit['retrieval_rank']}" if verified else f"{hit['score']:.2f}"
                 shown.append((axis, hit, f"{map_device} {title}"))
@@ -223,7 +223,7 @@ def _draw_rows(
 
 @styled
 def draw_statuses(paths: Iterable[str | Path]) -> "Figure":
-    """Return a figure of the inliers of each query, by pair and status.
+    """Draw the number of inliers of each query, by pair and status; return the figure.
 
     Args:
         paths: poses of each pair, `<scene>_map_<M>_query_<Q>.txt` or `.csv`.
@@ -243,7 +243,7 @@ def draw_statuses(paths: Iterable[str | Path]) -> "Figure":
     plot.invert_yaxis()
     plot.set_xscale("log")
     least, most = plot.get_xlim()
-    if least < 0.5:  # of a method without matches, or of queries that failed
+    if least < 0.5:  # there are queries without inliers: failed ones, or those of a method without matches
         plot.set_xlim(0.5, max(most, 10.0))
     plain_log(plot, "x")
     plot.set_xlabel("inliers of a query (log scale; none at the left edge)")
@@ -252,7 +252,7 @@ def draw_statuses(paths: Iterable[str | Path]) -> "Figure":
 
 
 def _descriptors(embeddings: Path, session: str, limit: int) -> list[NDArray[np.float32]]:
-    """Return the unit descriptors of a session, (N <= limit, D) each."""
+    """Return each kind of unit descriptors of a session, (N <= limit, D)."""
     if len(embedding_folders(embeddings)) > 1:
         vectors, _ = open_descriptors(embeddings, session, normalize=True)
         chosen = vectors[:: max(1, -(-len(vectors) // limit))]
@@ -269,6 +269,6 @@ def _usable(capture: Capture) -> list[Session]:
 
 
 def _poses(session: Session) -> Floats:
-    """Return world_from_cam of the images that have one, (n, 4, 4)."""
+    """Return world_from_cam (n, 4, 4) of the images with a pose; of queries the true one."""
     poses = session.world_from_cam(ground_truth=session.split == "query")
     return poses[is_posed(poses)]

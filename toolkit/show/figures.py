@@ -1,8 +1,8 @@
-"""What the figures of all stages share: one style, colors, a figure without global state, files with a caption."""
+"""Common parts of all figures: style, colors, figures without global state, PNG files with a caption."""
 
 import io
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache, partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
@@ -17,23 +17,23 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
     from matplotlib.colors import Colormap, LogNorm
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure, SubFigure
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 STYLE = Path(__file__).with_name("figures.mplstyle")
-# Okabe and Ito's colors, which people with any color vision tell apart.
+# Colors of Okabe and Ito, distinguishable with any color vision.
 BLUE, VERMILLION, GREEN = "#0072B2", "#D55E00", "#009E73"
 ORANGE, SKY, GRAY = "#E69F00", "#56B4E9", "#5A5A5A"
-# One meaning a color, in pictures and recordings alike.
+# Each color has the same meaning in pictures and recordings.
 ESTIMATED, TRUE, MAP = VERMILLION, BLUE, GRAY
 ERROR_RANGE_M = (0.01, 1.0)
-"""Errors of position that the colors of errors tell apart, on a logarithmic scale."""
+"""Range of position errors that error colors distinguish, on a logarithmic scale, meters."""
 
 
 def styled(draw: Callable[P, R]) -> Callable[P, R]:
-    """Make a function draw in the style of all figures, without changing the style of anyone else's."""
+    """Make a function draw in the common style, without changing matplotlib's global style."""
 
     @wraps(draw)
     def in_style(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -46,8 +46,8 @@ def styled(draw: Callable[P, R]) -> Callable[P, R]:
 
 
 def new_figure(width: float, height: float) -> "Figure":
-    """Return an empty figure of a size in inches, laid out so that labels do not collide; notebooks show it."""
-    from matplotlib.figure import Figure  # not pyplot: no state, and nothing is shown twice in a notebook
+    """Return an empty figure, size in inches, with a layout that avoids overlaps; notebooks can display it."""
+    from matplotlib.figure import Figure  # pyplot has global state, and notebooks would show its figures twice
 
     figure = Figure(figsize=(width, height), layout="constrained")
     figure._repr_mimebundle_ = partial(shown, figure)  # type: ignore[attr-defined]
@@ -55,12 +55,12 @@ def new_figure(width: float, height: float) -> "Figure":
 
 
 def shown(figure: "Figure", **_: Any) -> dict[str, bytes]:
-    """Return a figure as notebooks show and keep it, by the kind of picture."""
+    """Return a figure as notebooks display and store it, by MIME type."""
     return as_shown(_png_of(figure))
 
 
 def plain_log(axes: "Axes", sides: str) -> None:
-    """Number logarithmic axes plainly, 0.001 and not 10^-3; `sides`: x, y or xy. Their limits are set before."""
+    """Label logarithmic axes 0.001 instead of 10^-3; `sides`: x, y or xy. Call it after setting their limits."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     for side in sides:
@@ -71,8 +71,16 @@ def plain_log(axes: "Axes", sides: str) -> None:
         axis.set_minor_formatter(NullFormatter())
 
 
+def shared_legend(figure: "Figure | SubFigure", axes: Iterable["Axes"], **style: Any) -> None:
+    """Draw one legend below a figure with the labels of several axes; `style` is passed to `Figure.legend`."""
+    handles: dict[str, Any] = {}
+    for axis in axes:
+        handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", **style)
+
+
 def save_figure(figure: "Figure", path: str | Path, caption: str = "") -> Path:
-    """Write a figure as PNG, the caption kept in the file where the report finds it, and return the path."""
+    """Write a figure as PNG and return the path; the caption is stored in the file for the report."""
     with write_atomic(path) as temporary:
         temporary.write_bytes(_png_of(figure, caption))
     return Path(path)
@@ -83,22 +91,22 @@ def _png_of(figure: "Figure", caption: str = "") -> bytes:
     import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    # To lay a figure out and find its border, `savefig` would draw all of it once more.
+    # Compute layout and border here: `savefig` would draw the whole figure once more for that.
     figure.dpi = mpl.rcParams["savefig.dpi"]
     renderer, engine = FigureCanvasAgg(figure).get_renderer(), figure.get_layout_engine()
     if engine is not None:
         engine.execute(figure)
         figure.set_layout_engine(None)
     border = figure.get_tightbbox(renderer).padded(mpl.rcParams["savefig.pad_inches"])
-    # Software would name the version of matplotlib: the same data shall give the same bytes.
+    # No `Software`, which names the version of matplotlib: equal data should give equal bytes.
     metadata, stream = {"Software": None, "Description": caption}, io.BytesIO()
-    # Of figures, stronger compression takes thrice the time and saves nothing.
+    # Stronger compression takes three times as long and saves nothing on figures.
     figure.savefig(stream, bbox_inches=border, metadata=metadata, pil_kwargs={"compress_level": 2})
     return stream.getvalue()
 
 
 def error_scale() -> "tuple[Colormap, LogNorm]":
-    """Return the colors of errors of position: perceptually uniform, without ends that vanish on white or black."""
+    """Return the color map of position errors: perceptually uniform, visible on white and on black."""
     import matplotlib as mpl
     from matplotlib.colors import ListedColormap, LogNorm
 
@@ -107,7 +115,7 @@ def error_scale() -> "tuple[Colormap, LogNorm]":
 
 
 def error_colors(errors_m: ArrayLike) -> NDArray[np.uint8]:
-    """Return the colors (N, 3) RGB of errors (N,), meters; what is not known, NaN, is sky blue."""
+    """Return the colors (N, 3) RGB of errors (N,), meters; unknown errors, NaN, are sky blue."""
     errors = np.asarray(errors_m, np.float64)
     colors, scale = error_scale()
     finite = np.isfinite(errors)
@@ -118,31 +126,31 @@ def error_colors(errors_m: ArrayLike) -> NDArray[np.uint8]:
 
 
 def error_bar(figure: "Figure", unit: str = "m", **where: Any) -> None:
-    """Draw the legend of errors' colors; `where` goes to matplotlib's `Figure.colorbar`."""
+    """Draw the legend of the error colors; `where` is passed to matplotlib's `Figure.colorbar`."""
     from matplotlib.cm import ScalarMappable
 
     colors, scale = error_scale()
     bar = figure.colorbar(ScalarMappable(scale, colors), extend="both", **where)
-    bar.set_label(f"error of position [{unit}]")
+    bar.set_label(f"position error [{unit}]")
     bar.set_ticks([0.01, 0.1, 1.0], labels=["0.01", "0.1", "1"])
 
 
 @cache
 @styled
 def draw_error_legend(unit: str = "m") -> bytes:
-    """Return the legend of errors' colors, PNG; `unit` is that of the errors."""
+    """Return the legend of the error colors as PNG; `unit`: unit of the errors."""
     figure = new_figure(1.3, 2.4)
     error_bar(figure, unit, cax=figure.subplots())
     return _png_of(figure)
 
 
 def percent(share: float) -> str:
-    """Return a share, 0 to 1, in percent without the sign."""
+    """Format a share, 0 to 1, in percent without the sign."""
     return "–" if math.isnan(share) else f"{100 * share:.1f}".removesuffix(".0")
 
 
 def number(value: float) -> str:
-    """Return an error for a table: two or three digits that count."""
+    """Format an error for a table with about three significant digits."""
     if not math.isfinite(value):
         return "∞" if math.isinf(value) else "–"
     return f"{value:.3f}" if value < 0.1 else f"{value:.2f}" if value < 10 else f"{value:.0f}"

@@ -1,4 +1,4 @@
-"""Recordings in a notebook: the viewer where someone is there to use it; where not, what is worth keeping."""
+"""Show pictures and recordings in a notebook; the viewer only in an interactive session."""
 
 import html
 import io
@@ -13,17 +13,18 @@ from toolkit.show.pictures import as_jpeg
 from toolkit.show.viewer import open_command
 
 ASSETS = "RERUN_NOTEBOOK_ASSET"
-"""Variable of the viewer's package: where the page gets the viewer from. Read when the package is imported."""
+"""Environment variable that tells rerun_notebook where to load the viewer from; read on import."""
 MAX_INLINE_BYTES = 200_000_000
+"""Size of a recording up to which the notebook shows it."""
 MAX_WIDTH = 1400
-"""Of a JPEG, pixels."""
+"""Width of a JPEG, pixels, at most."""
 
 
 def show_picture(path: str | Path) -> Any:
-    """Return a picture for a notebook, small enough to be kept with it: as it is, or as a JPEG if that is smaller.
+    """Return a picture for a notebook: the file as it is, or reduced as a JPEG if that is smaller.
 
     Raises:
-        ArtifactError: there is no such picture, or it cannot be read.
+        ArtifactError: the picture is missing or cannot be read.
     """
     import PIL.Image
     from IPython.display import Image
@@ -33,29 +34,29 @@ def show_picture(path: str | Path) -> Any:
             small = as_jpeg(picture, MAX_WIDTH)
         return Image(data=min(Path(path).read_bytes(), small, key=len))
     except (OSError, SyntaxError, ValueError) as error:
-        raise ArtifactError(f"{path}: no picture can be read here ({error}). Run the cells above again.") from None
+        raise ArtifactError(f"{path}: cannot read the picture ({error}). Run the cells above again.") from None
 
 
 def show_recording(path: str | Path, height: int = 600) -> Any:
     """Show a recording in a notebook: a link, the command that opens it, and the viewer itself.
 
-    The viewer is served by this process and needs no network. It is left out where the pipeline runs the notebook:
-    saved pages do not keep what a viewer shows.
+    This process serves the viewer, so it needs no network. There is no viewer when the pipeline runs the notebook,
+    because saved pages do not store its content.
 
     Args:
-        height: of the viewer, pixels.
+        height: height of the viewer, pixels.
 
     Returns:
-        The viewer's widget, None where it is left out.
+        The viewer's widget; None without a viewer.
 
     Raises:
-        ArtifactError: there is no such recording.
+        ArtifactError: the recording is missing.
     """
     from IPython.display import HTML, display
 
     path = Path(path)
     if not path.is_file():
-        raise ArtifactError(f"{path}: no such recording. Run the notebook's cells above, with recordings = True.")
+        raise ArtifactError(f"{path}: no such recording. Run the cells above with recordings = True.")
     # Relative to the notebook, so that the run folder can be moved.
     link = html.escape(os.path.relpath(path.resolve(), Path.cwd()), quote=True)
     size_mb = path.stat().st_size / 1e6
@@ -68,10 +69,10 @@ def show_recording(path: str | Path, height: int = 600) -> Any:
     if TEXT_BARS in os.environ:
         return None
     if path.stat().st_size > MAX_INLINE_BYTES:
-        display(HTML("<p>It is too large to be shown here; use the command.</p>"))
+        display(HTML("<p>It is too large to show here; use the command.</p>"))
         return None
     os.environ.setdefault(ASSETS, "serve-local")
-    with redirect_stdout(io.StringIO()):  # it tells its address
+    with redirect_stdout(io.StringIO()):  # hide the address that it prints
         import rerun_notebook
 
     viewer = rerun_notebook.Viewer(width="auto", height=height)

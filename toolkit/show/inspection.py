@@ -1,6 +1,6 @@
-"""One query of a finished run under the glass: what the localize stage stored of it, in words, numbers and pictures.
+"""Inspect one query of a finished run: the stored results of the localize stage in words, numbers and pictures.
 
-Nothing here localizes, except `Inspection.again`, which is asked to.
+Nothing here localizes, except `Inspection.again`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,34 +31,33 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WORST = "worst"
-"""Stands for the number of the worst query."""
+"""Alias for the number of the worst query."""
 
 
 @dataclass(frozen=True, repr=False)
 class Inspection(Answer):
-    """One query of a pair, as it was localized. A notebook shows it as its picture."""
+    """One query of a pair, as it was localized. A notebook displays its figure."""
 
     of: "InspectedPair" = field(kw_only=True)
-    """What it was taken from."""
+    """The pair that it belongs to."""
 
     def again(self, changes: Mapping[str, Any] | None = None) -> "Comparison":
         """Localize the query again, from the stored features and references, with some settings changed.
 
         Args:
-            changes: of the settings of the run, such as `{"pnp": {"min_inliers": 30}}`.
+            changes: settings that differ from those of the run, such as `{"pnp": {"min_inliers": 30}}`.
 
         Returns:
-            This, and what comes out now. Nothing is written.
+            This answer and the new one. Nothing is written.
 
         Raises:
-            ManifestError: no such setting, or one that the features or the map were made with.
+            ManifestError: a setting does not exist, or the features or the map depend on it.
             ToolkitError: features, the map or weights of the run are missing.
         """
         return Comparison(self, self.of.localize(self.number, changes or {}), dict(changes or {}))
 
     @cached_property
     def figure(self) -> "Figure":
-        """The picture."""
         return draw_inspection(self)
 
     def _repr_mimebundle_(self, **_: Any) -> dict[str, bytes]:
@@ -67,16 +66,16 @@ class Inspection(Answer):
 
 @dataclass(frozen=True)
 class Comparison:
-    """One query localized twice. A notebook shows it as its picture."""
+    """One query localized twice. A notebook displays its figure."""
 
     before: Inspection
     after: Inspection
     changes: dict[str, Any]
-    """Of the settings."""
+    """Settings that were changed."""
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """What is known of both, columns before and after."""
+        """Status, method, numbers, errors and seconds; columns before and after."""
         columns = {}
         for name, one in (("before", self.before), ("after", self.after)):
             error = dict(zip(("rotation_error_deg", "translation_error_m"), one.error or (), strict=False))
@@ -85,7 +84,7 @@ class Comparison:
 
     @cached_property
     def figure(self) -> "Figure":
-        """The picture: both beside each other."""
+        """Both answers side by side."""
         return draw_comparison(self.before, self.after, self.changes)
 
     def __repr__(self) -> str:
@@ -96,7 +95,7 @@ class Comparison:
 
 
 class InspectedPair:
-    """The queries of one pair of a finished run, to look at one after the other."""
+    """The queries of one pair of a finished run, to inspect one at a time."""
 
     def __init__(
         self,
@@ -110,11 +109,12 @@ class InspectedPair:
         """
         Args:
             map_device, query_device: the pair.
-            poses_dir, features_dir, map_dir: as the localize stage had them; None: beside the poses, as a run has them.
-            sessions_root: `<capture>/sessions`; None: where it was when the pair was localized.
+            poses_dir, features_dir, map_dir: folders of the localize stage; None: the folders of the run that
+                `poses_dir` belongs to.
+            sessions_root: `<capture>/sessions`; None: its path when the pair was localized.
 
         Raises:
-            ArtifactError: no such pair, or its files are missing or torn.
+            ArtifactError: the pair does not exist, or its files are missing or torn.
         """
         pairs = sorted(Path(poses_dir).glob("*_map_*_query_*.h5"))
         names = [path.stem.rpartition("_map_")[2].partition("_query_")[::2] for path in pairs]
@@ -127,14 +127,14 @@ class InspectedPair:
             )
         self.map_device, self.query_device = map_device, query_device
         self._h5 = pairs[names.index((map_device, query_device))]
-        beside = SceneFiles(self._h5.parents[2], self._h5.parents[1].name)
-        self._features_dir, self._map_dir = Path(features_dir or beside.features), Path(map_dir or beside.maps)
-        self.settings, found, _ = how_localized(self._h5)
-        self.retrieval = Path(found[RETRIEVAL]) / f"{self._h5.stem}.jsonl"
-        capture = Capture.from_sessions_root(sessions_root or found[SESSIONS_ROOT])
+        files = SceneFiles(self._h5.parents[2], self._h5.parents[1].name)
+        self._features_dir, self._map_dir = Path(features_dir or files.features), Path(map_dir or files.maps)
+        self.settings, paths, _ = how_localized(self._h5)
+        self.retrieval = Path(paths[RETRIEVAL]) / f"{self._h5.stem}.jsonl"
+        capture = Capture.from_sessions_root(sessions_root or paths[SESSIONS_ROOT])
         self.localized = LocalizedPair.open(capture, map_device, query_device, poses_dir, self._map_dir)
         self.names = self.localized.localizations.names
-        """Of the first image of each query."""
+        """Name of the first image of each query."""
 
     def __len__(self) -> int:
         return len(self.names)
@@ -145,7 +145,7 @@ class InspectedPair:
 
     @cached_property
     def true(self) -> Floats:
-        """world_from_rig (Q, 4, 4); NaN where it is not known."""
+        """True world_from_rig (Q, 4, 4); NaN where unknown."""
         truth, table = self.localized.query_session.ground_truth, self.localized.table
         if truth is None:
             return np.full((len(self), 4, 4), np.nan)
@@ -156,22 +156,22 @@ class InspectedPair:
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """The pair's csv with the errors, NaN where the truth is not known: rotation_error_deg, translation_error_m."""
+        """The pair's csv with `rotation_error_deg` and `translation_error_m`, NaN without ground truth."""
         rotation_deg, translation_m = pose_errors(self.localized.world_from_rig, self.true)
         return self.localized.table.assign(rotation_error_deg=rotation_deg, translation_error_m=translation_m)
 
     def worst_first(self) -> list[int]:
-        """Return the numbers of the queries from the worst to the best, see `metrics.worst_first`."""
+        """Return the numbers of the queries from worst to best, see `metrics.worst_first`."""
         return [int(number) for number in worst_first(self.table)]
 
     def number_of(self, query: int | str) -> int:
         """Return the number of a query.
 
         Args:
-            query: its number, the name of an image of it (or the end of the name, if no other ends so), or `worst`.
+            query: its number, the name of one of its images (or a unique end of the name), or `worst`.
 
         Raises:
-            ArtifactError: there is none, or several; names the nearest.
+            ArtifactError: no query matches, or several do; names the nearest.
         """
         if query == WORST and len(self):
             return self.worst_first()[0]
@@ -180,13 +180,13 @@ class InspectedPair:
         return find_query(query, images, len(self))
 
     def look(self, query: int | str = 0) -> Inspection:
-        """Return a query as the stage left it.
+        """Return a query with the stored results of the localize stage.
 
         Args:
             query: see `number_of`.
 
         Raises:
-            ArtifactError: no such query, or what is stored of it is damaged.
+            ArtifactError: the query does not exist, or its stored results are damaged.
         """
         number = self.number_of(query)
         row = self.localized.table.iloc[number]
@@ -215,9 +215,9 @@ class InspectedPair:
 
     @cached_property
     def _again(self) -> LocalizeAgain:
-        """Opens the map when it is first asked for."""
-        place = Map.of_pair(self._h5, self.map_device, self._features_dir, self._map_dir)
-        return LocalizeAgain(place, self.localized.query_session, self.retrieval)
+        """Cached: opening the map takes time."""
+        map_ = Map.of_pair(self._h5, self.map_device, self._features_dir, self._map_dir)
+        return LocalizeAgain(map_, self.localized.query_session, self.retrieval)
 
     @cached_property
     def _covariances(self) -> dict[tuple[int, str], Floats]:
@@ -227,39 +227,39 @@ class InspectedPair:
 
     def _covariance(self, number: int) -> Floats | None:
         row = self.localized.table.iloc[number]
-        found = self._covariances.get((int(row["timestamp"]), str(row["device_id"])))
-        return found if found is not None and np.isfinite(found).all() else None
+        covariance = self._covariances.get((int(row["timestamp"]), str(row["device_id"])))
+        return covariance if covariance is not None and np.isfinite(covariance).all() else None
 
     @cached_property
     def _topk(self) -> dict[tuple[int, str], list[dict[str, Any]]]:
-        with suppress(ArtifactError):  # the poses are there without the references that they were sought with
+        with suppress(ArtifactError):  # poses can be inspected without the retrieval
             rows = read_references(self.retrieval)
             return {(int(row["timestamp"]), str(row["sensor_id"])): row["topk"] for row in rows}
         return {}
 
     def _retrieved(self, number: int) -> dict[str, tuple[int, float]]:
         images = self.localized.query_session.images.iloc[self.localized.rows[number]]
-        found: dict[str, tuple[int, float]] = {}
+        best: dict[str, tuple[int, float]] = {}
         for key in zip(images["timestamp"].tolist(), images["sensor_id"].astype(str).tolist(), strict=True):
             for rank, hit in enumerate(self._topk.get(key, []), start=1):
                 name = image_name(hit["path"])
-                here = rank, float(hit.get("score", np.nan))
-                found[name] = min(found.get(name, here), here, key=lambda one: (one[0], -one[1]))
-        return dict(sorted(found.items(), key=lambda item: item[1][0]))
+                ranked = rank, float(hit.get("score", np.nan))
+                best[name] = min(best.get(name, ranked), ranked, key=lambda one: (one[0], -one[1]))
+        return dict(sorted(best.items(), key=lambda item: item[1][0]))
 
 
 class WorstQueries:
-    """The queries of several pairs, the worst first, to look at one after the other."""
+    """The queries of several pairs, the worst first, to inspect one at a time."""
 
     def __init__(self, pairs: Sequence[InspectedPair]) -> None:
         self._pairs = list(pairs)
-        tables = [pair.table.assign(pair=at, number=range(len(pair))) for at, pair in enumerate(self._pairs)]
-        nothing = pd.DataFrame({"status": [], "pair": [], "number": []})
-        table = pd.concat(tables, ignore_index=True) if tables else nothing
+        tables = [pair.table.assign(pair=k, number=range(len(pair))) for k, pair in enumerate(self._pairs)]
+        empty = pd.DataFrame({"status": [], "pair": [], "number": []})
+        table = pd.concat(tables, ignore_index=True) if tables else empty
         self.table = table.iloc[worst_first(table)].reset_index(drop=True) if len(table) else table
-        """A row a query: those of `InspectedPair.table`, pair and number."""
-        of_each = zip(self.table["pair"], self.table["number"], strict=True)
-        self.names = [f"{self._pairs[at].label}: {shown_name(self._pairs[at].names[number])}" for at, number in of_each]
+        """One row per query: the columns of `InspectedPair.table`, pair and number."""
+        queries = zip(self.table["pair"], self.table["number"], strict=True)
+        self.names = [f"{self._pairs[k].label}: {shown_name(self._pairs[k].names[number])}" for k, number in queries]
 
     @classmethod
     def of(
@@ -270,17 +270,17 @@ class WorstQueries:
         map_device: str = "all",
         query_device: str = "all",
     ) -> "WorstQueries":
-        """Return those of the pairs in a folder of poses whose correspondences were stored.
+        """Return the queries of all pairs in a folder of poses that have stored correspondences.
 
         Args:
             poses_dir, map_dir, sessions_root: as for `InspectedPair`.
-            map_device, query_device: of the pairs, or `all`.
+            map_device, query_device: devices of the pairs, or `all`.
         """
         pairs = []
         for stem in sorted(path.with_suffix("") for path in Path(poses_dir).glob("*_map_*_query_*.h5")):
             mapped, _, queried = stem.name.rpartition("_map_")[2].partition("_query_")
             if map_device in ("all", mapped) and query_device in ("all", queried):
-                with suppress(ArtifactError):  # a pair that was not finished has no table
+                with suppress(ArtifactError):  # an unfinished pair has no table
                     pairs.append(InspectedPair(mapped, queried, poses_dir, None, map_dir, sessions_root))
         return cls(pairs)
 
@@ -288,7 +288,7 @@ class WorstQueries:
         """Return a query by its rank, 0 for the worst of all.
 
         Raises:
-            ArtifactError: there are not so many.
+            ArtifactError: the rank is out of range.
         """
         if not isinstance(rank, int | np.integer) or not 0 <= rank < len(self.names):
             raise ArtifactError(f"query: found {rank!r}, expected a rank from 0, the worst, to {len(self.names) - 1}.")
@@ -303,16 +303,16 @@ def inspect_query(
     query: str,
     n: int | str = 0,
 ) -> Inspection:
-    """Return one query of a finished run as the localize stage left it.
+    """Return one query of a finished run with the stored results of the localize stage.
 
     Args:
         run: the run folder, `<output_root>/<manifest name>`.
         scene: the capture's name.
         map, query: devices of the pair, such as `ios` and `hl`.
-        n: number of the query, name of an image of it (or its end), or `worst`.
+        n: number of the query, name of one of its images (or a unique end of it), or `worst`.
 
     Raises:
-        ArtifactError: no such run, pair or query (the nearest is named), or its files are missing or torn.
+        ArtifactError: the run, pair or query does not exist (the nearest is named), or files are missing or torn.
     """
     files = SceneFiles(Path(run), scene)
     if not files.poses_dir.is_dir():

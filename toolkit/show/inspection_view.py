@@ -1,4 +1,4 @@
-"""Pictures of one query: beside its references with the matches by kind, in the map from above, in numbers."""
+"""Draw one localized query: beside its references with the matches by kind, in the map from above, and in numbers."""
 
 import json
 import textwrap
@@ -31,100 +31,102 @@ PURPLE = "#CC79A7"
 WAYS = {"guided": GREEN, "descriptors": SKY, "lifted": PURPLE}
 """Colors of inliers, by how they were found."""
 MARKERS = {"sift": "o", "aliked": "^", "superpoint": "s"}
-"""By kind of features."""
+"""Markers, by kind of features."""
 REJECTED = ESTIMATED
 LONGEST_SIDE = 900
-"""Pixels of a photograph that are drawn: no figure shows more."""
+"""Longer side of a drawn image, pixels, at most: no figure shows more detail."""
 LINES = 60
-"""Lines of inliers, and of rejected matches, that are drawn at most: more of them hide the pictures."""
+"""Lines drawn at most for inliers, and for rejected matches: more would hide the images."""
 SURE = 2.4477
-"""Deviations in the plane within which 95 % of a normal distribution lie."""
+"""Radius of the 95 % region of a 2D normal distribution, standard deviations."""
 MAX_POINTS = 20_000
 LABELS = {
-    "num_matches": ("matches by descriptors", "{:.0f}"), "num_inliers": ("of them, inliers", "{:.0f}"),
-    "inlier_ratio": ("their share", "{:.0%}"), "num_guided": ("found again by the pose", "{:.0f}"),
-    "rmse_px": ("error of reprojection [px]", "{:.2f}"), "coverage": ("image covered", "{:.0%}"),
+    "num_matches": ("descriptor matches", "{:.0f}"), "num_inliers": ("inliers among them", "{:.0f}"),
+    "inlier_ratio": ("inlier ratio", "{:.0%}"), "num_guided": ("guided matches", "{:.0f}"),
+    "rmse_px": ("reprojection error [px]", "{:.2f}"), "coverage": ("image covered", "{:.0%}"),
     "p_correct": ("probability of being right", "{:.1%}"), "rival_support": ("support of the best rival", "{:.0%}"),
-    "agreement": ("inliers of a second kind", "{:.0f}"), "position_std_m": ("deviation of position [m]", "{:.2g}"),
-    "rotation_std_deg": ("deviation of rotation [deg]", "{:.2g}"), "scale_std": ("deviation of scale", "{:.1%}"),
+    "agreement": ("inliers of a second kind", "{:.0f}"), "position_std_m": ("std. dev. of position [m]", "{:.2g}"),
+    "rotation_std_deg": ("std. dev. of rotation [deg]", "{:.2g}"), "scale_std": ("std. dev. of scale", "{:.1%}"),
 }  # fmt: skip
-"""Of the numbers: what they are called, and how they are written."""
+"""Label and format of each number."""
 OF_NETWORKS = {
-    "num_matches": ("references shown to it", "{:.0f}"), "num_inliers": ("of them, consistent", "{:.0f}"),
+    "num_matches": ("references given to it", "{:.0f}"), "num_inliers": ("consistent ones", "{:.0f}"),
     "inlier_ratio": ("their share", "{:.0%}"),
 }  # fmt: skip
+"""Labels and formats that differ for poses of a feed-forward network."""
 OF_MATCHES = ("num_guided", "rmse_px", "coverage", "p_correct", "rival_support", "agreement")
-"""What a pose without matches does not have."""
+"""Numbers that a pose without matches does not have."""
 
 
 @styled
-def draw_inspection(one: Answer) -> "Figure":
-    """Draw a query beside its best reference and above the others, in the map from above, and its numbers.
+def draw_inspection(answer: Answer) -> "Figure":
+    """Draw a query beside its best reference, its further references, the map from above, and the query's numbers.
 
-    Lines join what query and reference both see. Inliers are colored by how they were found (`WAYS`), rejected matches
-    are red; the shape of a mark tells the kind of features (`MARKERS`).
+    Lines join the points that the query and its best reference both see. Inliers are colored by how they were found
+    (`WAYS`), rejected matches are red; markers tell the kind of features (`MARKERS`).
     """
     figure = new_figure(11, 9.4)
     above, strip, below = figure.subfigures(3, 1, squeeze=False, height_ratios=[4.0, 2.0, 3.6])[:, 0]
-    details, found = one.details, one.correspondences
+    details, correspondences = answer.details, answer.correspondences
     axis = above.subplots()
     references = details.captioned_references()
-    _draw_joined(axis, one)
-    axis.set_title(_caption(one), fontsize=9)
-    legend = _marks_of(found)
+    _draw_joined(axis, answer)
+    axis.set_title(_caption(answer), fontsize=9)
+    legend = _marks_of(correspondences)
     if legend:
         above.legend(handles=legend, loc="outside lower center", ncols=6, fontsize=8)
-    others = references[1:]
-    of_rig = [(image, f"query, {_camera_name(image)}", True) for image in details.cameras[1:]]
-    counted = details.has_matches
-    more = [(image, text + f": {image.num_inliers} inliers" * counted, agrees) for image, text, agrees in of_rig]
-    panels = np.ravel(strip.subplots(1, max(4, min(6, len(others) + len(more))), squeeze=False))
+    further = [
+        (image, f"query, {_camera_name(image)}" + f": {image.num_inliers} inliers" * details.has_matches, True)
+        for image in details.cameras[1:]
+    ]
+    images = [*references[1:], *further]
+    panels = np.ravel(strip.subplots(1, max(4, min(6, len(images))), squeeze=False))
     for panel in panels:
         panel.set_axis_off()
-    for panel, (image, text, agrees) in zip(panels, [*others, *more], strict=False):
+    for panel, (image, text, agrees) in zip(panels, images, strict=False):
         _draw_photograph(panel, image)
-        _draw_marks(panel, image, found, np.zeros(2), size=4)
+        _draw_marks(panel, image, correspondences, np.zeros(2), size=4)
         panel.set_title(textwrap.fill(text, 30), fontsize=8, color="black" if agrees else REJECTED)
     from_above, near, table = below.subplots(1, 3, width_ratios=[1.15, 1.0, 1.0])
-    _draw_from_above(from_above, [(one, "estimated", ESTIMATED)])
-    _draw_near(near, [(one, "estimated", ESTIMATED)])
-    _draw_table(table, [one])
-    name = shown_name(one.name, 110)
-    figure.suptitle(f"{one.headline}\n{name}\n{textwrap.fill(one.reason, 130)}", fontsize=10)
+    _draw_from_above(from_above, [(answer, "estimated", ESTIMATED)])
+    _draw_near(near, [(answer, "estimated", ESTIMATED)])
+    _draw_table(table, [answer])
+    name = shown_name(answer.name, 110)
+    figure.suptitle(f"{answer.headline}\n{name}\n{textwrap.fill(answer.reason, 130)}", fontsize=10)
     return figure
 
 
 @styled
 def draw_comparison(before: Answer, after: Answer, changes: Mapping[str, Any]) -> "Figure":
-    """Draw a query localized twice: both answers beside each other, in one map from above, and in one table.
+    """Draw a query localized twice: both answers side by side, together in the map from above, and in one table.
 
     Args:
-        changes: of the settings, between the two.
+        changes: settings that were changed for the second answer.
     """
-    ones = [before, after]
+    answers = [before, after]
     figure = new_figure(11, 7.2)
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=[3.3, 3.6])[:, 0]
-    for axis, one, name in zip(above.subplots(1, 2), ones, ("as it was", "again"), strict=True):
-        _draw_joined(axis, one)
-        axis.set_title(f"{name}: {one.status}\n{textwrap.fill(one.reason, 78)}", fontsize=8.5)
-        if legend := _marks_of(one.correspondences):
+    for axis, answer, name in zip(above.subplots(1, 2), answers, ("as it was", "again"), strict=True):
+        _draw_joined(axis, answer)
+        axis.set_title(f"{name}: {answer.status}\n{textwrap.fill(answer.reason, 78)}", fontsize=8.5)
+        if legend := _marks_of(answer.correspondences):
             axis.legend(handles=legend, loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3, fontsize=7.5)
     from_above, near, table = below.subplots(1, 3, width_ratios=[1.0, 0.9, 1.25])
-    named = [(before, "as it was", ESTIMATED), (after, "again", PURPLE)]
-    _draw_from_above(from_above, named)
-    _draw_near(near, named)
-    _draw_table(table, ones)
+    labeled = [(before, "as it was", ESTIMATED), (after, "again", PURPLE)]
+    _draw_from_above(from_above, labeled)
+    _draw_near(near, labeled)
+    _draw_table(table, answers)
     changed = json.dumps(changes)[1:-1] if changes else "no setting changed"
     first = before.headline.rpartition(":")[0]
     figure.suptitle(f"{first}, localized again\n{textwrap.fill(changed, 120)}", fontsize=10)
     return figure
 
 
-def _caption(one: Answer) -> str:
-    """Return what stands above query and best reference."""
-    references = one.details.captioned_references()
-    camera = one.details.cameras[0]
-    of_rig = f" ({_camera_name(camera)})" if len(one.details.cameras) > 1 else ""
+def _caption(answer: Answer) -> str:
+    """Return the title of the panel with the query and its best reference."""
+    references = answer.details.captioned_references()
+    camera = answer.details.cameras[0]
+    of_rig = f" ({_camera_name(camera)})" if len(answer.details.cameras) > 1 else ""
     if len(camera.matches):
         text = f"query{of_rig}: {camera.num_inliers} of {len(camera.matches)} map points agree"
     else:
@@ -136,25 +138,25 @@ def _caption(one: Answer) -> str:
     return f"{text} · {references[0][1]}{joined}"
 
 
-def _draw_joined(axis: "Axes", one: Answer) -> None:
-    """Draw the query's image with the most inliers and its best reference at one height, common points joined."""
-    details, found = one.details, one.correspondences
+def _draw_joined(axis: "Axes", answer: Answer) -> None:
+    """Draw the query image with the most inliers and its best reference at one height, and join common points."""
+    details, correspondences = answer.details, answer.correspondences
     image, references = details.cameras[0], details.captioned_references()[:1]
     width, height = _draw_photograph(axis, image)
-    _draw_marks(axis, image, found, np.zeros(2), size=9)
+    _draw_marks(axis, image, correspondences, np.zeros(2), size=9)
     end = width
     for reference, _, _ in references:
         offset = width * 1.02
         right, scale = _draw_photograph(axis, reference, offset, height)
         end = right
-        _draw_marks(axis, reference, found, np.array([offset, 0.0]), size=9, scale=scale, only=image.matches)
+        _draw_marks(axis, reference, correspondences, np.array([offset, 0.0]), size=9, scale=scale, only=image.matches)
         _, i, j = np.intersect1d(image.matches, reference.matches, return_indices=True)
         ends = reference.pixels[j] * scale + [offset, 0.0]
         lines = np.stack([image.pixels[i], ends], axis=1)
         for agrees in (False, True):
             chosen = np.flatnonzero(image.inlier[i] == agrees)
             chosen = chosen[:: len(chosen) // LINES + 1]
-            colors = [_color(found, int(image.matches[i[k]])) for k in chosen]
+            colors = [_color(correspondences, int(image.matches[i[k]])) for k in chosen]
             axis.add_collection(LineCollection(list(lines[chosen]), colors=colors, linewidths=0.6, alpha=0.7))
     axis.set(xlim=(0, end), ylim=(height, 0), aspect="equal")
     axis.set_axis_off()
@@ -163,10 +165,10 @@ def _draw_joined(axis: "Axes", one: Answer) -> None:
 def _draw_photograph(
     axis: "Axes", image: ShownImage, offset: float = 0.0, height: float | None = None
 ) -> tuple[float, float]:
-    """Draw a photograph in its own pixels; with a `height`, scaled to it and to the right of `offset`.
+    """Draw an image in its own pixels; with a `height`, scaled to it and to the right of `offset`.
 
     Returns:
-        Its width and height; with a `height`, its right edge and the scale of its pixels.
+        Width and height of the image; with a `height`, its right edge and the scale of its pixels.
     """
     picture, rows, columns = _reduced(image.path)
     if height is None:
@@ -178,9 +180,9 @@ def _draw_photograph(
     return right, scale
 
 
-@lru_cache(maxsize=16)  # a query that is localized again is drawn again
+@lru_cache(maxsize=16)  # localizing a query again draws the same images again
 def _reduced(path: Path) -> tuple[NDArray[np.uint8], int, int]:
-    """Return a photograph of at most `LONGEST_SIDE` pixels, and the rows and columns that it has in full."""
+    """Return an image reduced to `LONGEST_SIDE` pixels, and its rows and columns at full size."""
     picture = read_for_display(path)
     rows, columns = picture.shape[:2]
     reduced = LONGEST_SIDE / max(rows, columns)
@@ -193,15 +195,15 @@ def _reduced(path: Path) -> tuple[NDArray[np.uint8], int, int]:
 def _draw_marks(
     axis: "Axes",
     image: ShownImage,
-    found: Correspondences,
+    correspondences: Correspondences,
     offset: Floats,
     size: float,
     scale: float = 1.0,
     only: NDArray[np.int64] | None = None,
 ) -> None:
-    """Mark the correspondences that are seen in an image, by kind; `only`: those of these numbers."""
+    """Mark the correspondences seen in an image, by kind; with `only`, just those numbers."""
     shown = np.ones(len(image.matches), bool) if only is None else np.isin(image.matches, only)
-    kinds, inlier = found.found_by[image.matches], image.inlier
+    kinds, inlier = correspondences.found_by[image.matches], image.inlier
     for agrees in (False, True):
         for kind in sorted(set(kinds.tolist())):
             chosen = shown & (kinds == kind) & (inlier == agrees)
@@ -217,74 +219,74 @@ def _style(kind: str, agrees: bool) -> tuple[str, str]:
     return WAYS.get(way, SKY) if agrees else REJECTED, MARKERS.get(features, "D")
 
 
-def _color(found: Correspondences, match: int) -> str:
-    return _style(str(found.found_by[match]), bool(found.inlier[match]))[0]
+def _color(correspondences: Correspondences, match: int) -> str:
+    return _style(str(correspondences.found_by[match]), bool(correspondences.inlier[match]))[0]
 
 
-def _marks_of(found: Correspondences) -> list[Any]:
-    """Return entries of a legend: the kinds of correspondences, and how many there are of each."""
+def _marks_of(correspondences: Correspondences) -> list[Any]:
+    """Return legend entries: the kinds of correspondences with their counts."""
     from matplotlib.lines import Line2D
 
     marks = []
     for agrees, text in ((True, "inliers"), (False, "rejected")):
-        for kind in sorted(set(found.found_by[found.inlier == agrees].tolist())):
-            count = int(((found.found_by == kind) & (found.inlier == agrees)).sum())
+        for kind in sorted(set(correspondences.found_by[correspondences.inlier == agrees].tolist())):
+            count = int(((correspondences.found_by == kind) & (correspondences.inlier == agrees)).sum())
             color, marker = _style(kind, agrees)
             label = f"{kind.replace('/', ', ')}: {count} {text}"
             marks.append(Line2D([], [], color=color, marker=marker, ls="", ms=5, label=label))
     return marks
 
 
-Named = Sequence[tuple[Answer, str, str]]
-"""Answers with what they are called and their colors."""
+Labeled = Sequence[tuple[Answer, str, str]]
+"""Answers, each with a label and a color."""
 
 
-def _axes_of(one: Answer) -> tuple[Floats, list[str], Floats]:
+def _axes_of(answer: Answer) -> tuple[Floats, list[str], Floats]:
     """Return axes and labels of the map from above, and the posed cameras of the map (N, 4, 4)."""
-    poses = one.pair.map_session.world_from_cam()
+    poses = answer.pair.map_session.world_from_cam()
     poses = poses[is_posed(poses)]
-    up = one.settings.world_up if one.settings.world_up is not None else up_of_cameras(poses)
-    return *ground_axes(up, one.pair.unit[0]), poses
+    up = answer.settings.world_up if answer.settings.world_up is not None else up_of_cameras(poses)
+    return *ground_axes(up, answer.pair.unit[0]), poses
 
 
-def _draw_from_above(axis: "Axes", named: Named) -> None:
-    """Draw the place of the map that the query is in: its points, cameras and references, poses, rivals, the truth."""
-    one = named[0][0]
-    axes, labels, poses = _axes_of(one)
-    unit = one.pair.unit[1]
+def _draw_from_above(axis: "Axes", labeled: Labeled) -> None:
+    """Draw the place of the map around the query from above: map points, cameras, references, poses, rivals, truth."""
+    answer = labeled[0][0]
+    axes, labels, poses = _axes_of(answer)
+    unit = answer.pair.unit[1]
 
     def flat(positions: Floats) -> Floats:
         return np.asarray(positions / unit @ axes.T)
 
-    cameras, references = flat(poses[:, :3, 3]), one.details.references
+    cameras, references = flat(poses[:, :3, 3]), answer.details.references
     seen = np.array([image.world_from_cam for image in references]).reshape(-1, 4, 4)
     seen = seen[is_posed(seen)]
-    shown = _cameras_of(named)
+    shown = _cameras_of(labeled)
     anchor = shown[0][0] if shown else seen[0] if len(seen) else None
-    place, here = places_of(cameras), np.ones(len(cameras), bool)
     if anchor is not None and len(cameras):
+        place = places_of(cameras)
         nearest = int(np.argmin(np.linalg.norm(cameras - flat(anchor[:3, 3]), axis=1)))
-        here = place == place[nearest]
-    low, high = _bounds([cameras[here], flat(seen[:, :3, 3])])
+        cameras = cameras[place == place[nearest]]
+    low, high = _bounds([cameras, flat(seen[:, :3, 3])])
     span = max(float((high - low).max()), 1.0)
-    points, _ = sure_points(one.pair.local_map)
+    points, _ = sure_points(answer.pair.local_map)
     cloud = flat(points[:: len(points) // MAX_POINTS + 1])
     if len(cloud):
-        # What a map sees lies around its cameras; points far out are few and unsure.
+        # The scene lies around the map cameras; the few points far away are unreliable.
         near = ((cloud > low - span) & (cloud < high + span)).all(1)
         if near.any():
             low = np.minimum(low, np.percentile(cloud[near], 2, axis=0))
             high = np.maximum(high, np.percentile(cloud[near], 98, axis=0))
-    rivals = [(rival.world_from_rig @ _rig_from_first(one), rival.support) for rival in named[-1][0].rivals or ()]
-    every = [*(pose for pose, _, _ in shown), *(pose for pose, _ in rivals)]
-    answers = flat(np.array(every).reshape(-1, 4, 4)[:, :3, 3])
-    reached = answers[((answers > low - span) & (answers < high + span)).all(1)]
-    low, high = _bounds([low[None], high[None], reached])
+    rivals = [(rival.world_from_rig @ _rig_from_first(answer), rival.support) for rival in labeled[-1][0].rivals or ()]
+    poses = np.array([*(pose for pose, _, _ in shown), *(pose for pose, _ in rivals)]).reshape(-1, 4, 4)
+    centers = flat(poses[:, :3, 3])
+    near_centers = centers[((centers > low - span) & (centers < high + span)).all(1)]
+    low, high = _bounds([low[None], high[None], near_centers])
     middle, half = (low + high) / 2, 0.55 * max(float((high - low).max()), 1.0)
     outside = []
     draw_dots(axis, cloud, s=1, c="0.75", lw=0, rasterized=True)
-    axis.scatter([], [], s=9, c="0.75", lw=0, label="map points")  # large enough for a legend
-    draw_dots(axis, cameras[here], s=7, c=MAP, lw=0, label="map cameras")
+    axis.scatter([], [], s=9, c="0.75", lw=0, label="map points")  # a larger dot for the legend
+    draw_dots(axis, cameras, s=7, c=MAP, lw=0, label="map cameras")
     length = 0.16 * half
     if len(seen):
         draw_headings(axis, flat(seen[:, :3, 3]), seen, axes, length, colors=ORANGE, linewidths=1.2)
@@ -311,11 +313,11 @@ def _draw_from_above(axis: "Axes", named: Named) -> None:
     axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, fontsize=7.5)
 
 
-def _draw_near(axis: "Axes", named: Named) -> None:
-    """Draw where the answers are, enlarged so that the uncertainty is seen, and the truth where it is known."""
+def _draw_near(axis: "Axes", labeled: Labeled) -> None:
+    """Draw the positions of the answers and the truth, enlarged to show the uncertainty."""
     from matplotlib.patches import Ellipse
 
-    posed = [(one, name, color) for one, name, color in named if one.pose is not None]
+    posed = [(answer, name, color) for answer, name, color in labeled if answer.pose is not None]
     if not posed:
         axis.set_axis_off()
         axis.text(0.5, 0.5, "no pose", ha="center", va="center", color=GRAY)
@@ -325,23 +327,23 @@ def _draw_near(axis: "Axes", named: Named) -> None:
     unit_name, unit = first.pair.unit
     origin = _first_camera(first)[:3, 3]
     reach, ellipses = [], []
-    for pose, _, _ in _cameras_of(named):
+    for pose, _, _ in _cameras_of(labeled):
         reach.append(float(np.abs((pose[:3, 3] - origin) / unit @ axes.T).max()))
-    for one, name, color in posed:
-        if one.covariance is None:
+    for answer, name, color in posed:
+        if answer.covariance is None:
             continue
-        spread = axes @ _position_covariance(one) @ axes.T / unit**2
+        spread = axes @ _position_covariance(answer) @ axes.T / unit**2
         values, vectors = np.linalg.eigh(spread)
         sizes = 2 * SURE * np.sqrt(np.maximum(values, 0))
         reach.append(float(sizes.max()) * 0.55)
-        ellipses.append((one, name, color, sizes, float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))))
+        ellipses.append((answer, name, color, sizes, float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))))
     half = 1.35 * max([value for value in reach if np.isfinite(value)], default=0.0) or 0.01
     small, factor = ("cm", 100.0) if unit_name == "m" and half < 1 else (unit_name, 1.0)
-    for one, name, color, sizes, angle in ellipses:
-        at = (_first_camera(one)[:3, 3] - origin) / unit @ axes.T * factor
+    for answer, name, color, sizes, angle in ellipses:
+        at = (_first_camera(answer)[:3, 3] - origin) / unit @ axes.T * factor
         axis.add_patch(Ellipse((float(at[0]), float(at[1])), factor * sizes[1], factor * sizes[0], angle=angle,
                                facecolor=color, alpha=0.2, label=f"95 % region, {name}"))  # fmt: skip
-    for pose, name, color in _cameras_of(named):
+    for pose, name, color in _cameras_of(labeled):
         _draw_place(axis, (pose[:3, 3] - origin) / unit @ axes.T * factor, name, color, 30)
     half *= factor
     axis.set(xlim=(-half, half), ylim=(-half, half), aspect="equal")
@@ -354,34 +356,34 @@ def _draw_near(axis: "Axes", named: Named) -> None:
 
 
 def _digits(value: float) -> str:
-    """Return a number with two digits that count: an error of a fraction of a millimeter is not 0.000 m."""
+    """Return a number with two significant digits if it is small: an error below a millimeter is not 0.000 m."""
     return np.format_float_positional(value, 2, fractional=False, trim="-") if value < 0.1 else number(value)
 
 
-def _draw_table(axis: "Axes", ones: Sequence[Answer]) -> None:
-    """Write the numbers of answers, a column each; where two differ, they are bold."""
-    rows: list[tuple[str, list[str]]] = [("method", [one.method for one in ones])]
-    by_network = all(one.method.rpartition("/")[2].startswith("feed_forward") for one in ones)
+def _draw_table(axis: "Axes", answers: Sequence[Answer]) -> None:
+    """Write the numbers of the answers, one column each; numbers that differ are bold."""
+    rows: list[tuple[str, list[str]]] = [("method", [answer.method for answer in answers])]
+    by_network = all(answer.method.rpartition("/")[2].startswith("feed_forward") for answer in answers)
     labels = LABELS | OF_NETWORKS if by_network else LABELS
-    without = all(one.pose is not None and not one.numbers.get("num_matches") for one in ones)
+    no_matches = all(answer.pose is not None and not answer.numbers.get("num_matches") for answer in answers)
     for key, (text, form) in labels.items():
-        if (by_network and key in OF_MATCHES) or (without and key in (*OF_MATCHES, *OF_NETWORKS)):
+        if (by_network and key in OF_MATCHES) or (no_matches and key in (*OF_MATCHES, *OF_NETWORKS)):
             continue
-        values = [form.format(one.numbers[key]) if key in one.numbers else "–" for one in ones]
+        values = [form.format(answer.numbers[key]) if key in answer.numbers else "–" for answer in answers]
         if set(values) != {"–"} and not (key == "agreement" and set(values) == {"0"}):
             rows.append((text, values))
-    kept = [one.rivals for one in ones]
-    if any(rivals is None for rivals in kept):
-        rows.append(("other poses", ["not kept" if rivals is None else str(len(rivals)) for rivals in kept]))
-    if any(one.error is not None for one in ones):
-        errors = [one.error or (np.nan, np.nan) for one in ones]
-        unit = ones[0].pair.unit
-        rows.append((f"true error of position [{unit[0]}]", [_digits(distance / unit[1]) for _, distance in errors]))
-        rows.append(("true error of rotation [deg]", [_digits(angle) for angle, _ in errors]))
-    rows.append(("seconds", [f"{one.seconds:.2f}" for one in ones]))
+    rivals = [answer.rivals for answer in answers]
+    if any(poses is None for poses in rivals):
+        rows.append(("other poses", ["not kept" if poses is None else str(len(poses)) for poses in rivals]))
+    if any(answer.error is not None for answer in answers):
+        errors = [answer.error or (np.nan, np.nan) for answer in answers]
+        unit = answers[0].pair.unit
+        rows.append((f"true position error [{unit[0]}]", [_digits(distance / unit[1]) for _, distance in errors]))
+        rows.append(("true rotation error [deg]", [_digits(angle) for angle, _ in errors]))
+    rows.append(("seconds", [f"{answer.seconds:.2f}" for answer in answers]))
     axis.set_axis_off()
-    columns = [1.0] if len(ones) == 1 else [0.74, 1.0]
-    head = [("", ["as it was", "again"])] if len(ones) > 1 else []
+    columns = [1.0] if len(answers) == 1 else [0.74, 1.0]
+    head = [("", ["as it was", "again"])] if len(answers) > 1 else []
     step = min(0.072, 1.0 / (len(rows) + len(head)))
     for line, (text, values) in enumerate([*head, *rows]):
         y = 1.0 - line * step
@@ -391,43 +393,43 @@ def _draw_table(axis: "Axes", ones: Sequence[Answer]) -> None:
             axis.text(x, y, value, fontsize=8, va="top", ha="right", weight=weight, transform=axis.transAxes)
 
 
-def _rig_from_first(one: Answer) -> Floats:
-    """Return rig_from_cam (4, 4) of the image that is drawn."""
-    session, rows = one.pair.query_session, one.pair.rows[one.number]
+def _rig_from_first(answer: Answer) -> Floats:
+    """Return rig_from_cam (4, 4) of the drawn image."""
+    session, rows = answer.pair.query_session, answer.pair.rows[answer.number]
     names = [session.image_name(int(row)) for row in rows]
-    return np.asarray(session.rig_from_cam(rows)[names.index(one.details.cameras[0].name)])
+    return np.asarray(session.rig_from_cam(rows)[names.index(answer.details.cameras[0].name)])
 
 
-def _first_camera(one: Answer) -> Floats:
-    """Return world_from_cam (4, 4) of the image that is drawn; the query has a pose."""
-    assert one.pose is not None
-    return np.asarray(one.pose @ _rig_from_first(one))
+def _first_camera(answer: Answer) -> Floats:
+    """Return world_from_cam (4, 4) of the drawn image of a query with a pose."""
+    assert answer.pose is not None
+    return np.asarray(answer.pose @ _rig_from_first(answer))
 
 
-def _cameras_of(named: Named) -> list[tuple[Floats, str, str]]:
-    """Return world_from_cam, name and color of answers that have a pose, and of the truth if it is known."""
-    # Of a rig, the image that the first answer shows stands for all.
-    rig_from_cam = _rig_from_first(named[0][0])
-    shown = [(one.pose @ rig_from_cam, name, color) for one, name, color in named if one.pose is not None]
-    true = named[0][0].true_pose
+def _cameras_of(labeled: Labeled) -> list[tuple[Floats, str, str]]:
+    """Return world_from_cam, label and color of the answers with a pose, and of the ground truth if known."""
+    # A rig is shown by the camera that the first answer draws.
+    rig_from_cam = _rig_from_first(labeled[0][0])
+    shown = [(answer.pose @ rig_from_cam, name, color) for answer, name, color in labeled if answer.pose is not None]
+    true = labeled[0][0].true_pose
     return [*shown, *([] if true is None else [(true @ rig_from_cam, "true", TRUE)])]
 
 
-def _position_covariance(one: Answer) -> Floats:
-    """Return the covariance (3, 3) of where the drawn camera is, in the world, square meters.
+def _position_covariance(answer: Answer) -> Floats:
+    """Return the covariance (3, 3) of the drawn camera's position in the world, square meters.
 
     A small motion of the rig in its own frame, rotation w and translation t, moves a camera at c by t + w x c.
     """
-    assert one.pose is not None
-    assert one.covariance is not None
-    x, y, z = _rig_from_first(one)[:3, 3]
+    assert answer.pose is not None
+    assert answer.covariance is not None
+    x, y, z = _rig_from_first(answer)[:3, 3]
     lever = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])
-    moves = one.pose[:3, :3] @ np.hstack([lever, np.eye(3)])
-    return np.asarray(moves @ one.covariance @ moves.T)
+    moves = answer.pose[:3, :3] @ np.hstack([lever, np.eye(3)])
+    return np.asarray(moves @ answer.covariance @ moves.T)
 
 
 def _draw_place(axis: "Axes", at: Floats, name: str, color: str, size: float) -> None:
-    """Draw where a camera stands; the truth is a ring, in which an answer is seen."""
+    """Draw the position of a camera; the ground truth is a ring, so that a dot inside stays visible."""
     style: dict[str, Any] = {"s": 70, "facecolors": "none"} if color == TRUE else {"s": size, "facecolors": color}
     draw_dots(axis, at, edgecolors=color, lw=1.3, zorder=5, label=name, **style)
 

@@ -1,4 +1,4 @@
-"""A rerun recording of the queries of one pair in their map: where each is, by what, and how far off."""
+"""Record the queries of one pair in their map for the rerun viewer: poses, references, correspondences, errors."""
 
 import logging
 import time
@@ -24,8 +24,9 @@ logger = logging.getLogger(__name__)
 
 
 QUERY = "query"
-"""The timeline: one steps through the queries, numbered as the rows of the pair's csv."""
+"""Timeline of the query numbers, which are the rows of the pair's csv."""
 MAX_CAMERAS = 4
+"""Images of a query that are shown, at most."""
 WHITE = [255, 255, 255]
 
 
@@ -38,23 +39,23 @@ def record_localizations(
     localizations: Localizations,
     details: Iterable[tuple[int, QueryDetails]] = (),
     up: ArrayLike | None = None,
-    ways: Mapping[str, Sequence[Floats]] | None = None,
+    tracks: Mapping[str, Sequence[Floats]] | None = None,
 ) -> Path:
     """Write a recording of queries in a map, and return its path.
 
     Entities: `world/{points,map_cameras}`, `world/queries/{estimated,true,error,failed}`,
-    `world/recording/{odometry,frames}`; and for the query chosen on
-    the timeline `query`: `world/chosen/camera_<k>`, `world/truth/camera_0`, `world/references/<rank>`,
-    `world/chosen_points`, and a page about it, `about`. Errors are colored by `figures.error_colors`.
+    `world/recording/{odometry,frames}`. For the query chosen on the timeline `query`: `world/chosen/camera_<k>`,
+    `world/truth/camera_0`, `world/references/<rank>`, `world/chosen_points`, and `about`, a page of text. Errors are
+    colored by `figures.error_colors`.
 
     Args:
-        map_poses: world_from_cam (N, 4, 4) of the map's images; NaN rows are passed over.
+        map_poses: world_from_cam (N, 4, 4) of the map's images; NaN rows are skipped.
         points: (P, 3), meters.
         colors: (P, 3) RGB or None.
-        details: number and details of those that can be chosen; taken one at a time.
-        up: direction (3,) that is up; None: estimated from the map's cameras.
-        ways: of the queries' recordings, the places (n, 3) of each piece: `odometry`, laid in the map as a whole, and
-            `frames`, as the sequence stage has found them.
+        details: number and details of the queries that can be chosen; consumed one at a time.
+        up: up direction (3,); None: estimated from the map's cameras.
+        tracks: positions (n, 3) of each piece of the query recordings: `odometry`, rigidly placed in the map, and
+            `frames`, as estimated by the sequence stage.
     """
     import rerun as rr
 
@@ -68,10 +69,10 @@ def record_localizations(
         viewer.log_points(stream, points, colors)
         _log_map_cameras(stream, poses, size)
         _log_overview(stream, localizations)
-        for way, color in (("odometry", ORANGE), ("frames", SKY)):
-            if ways and ways.get(way):
-                lines = rr.LineStrips3D(ways[way], colors=viewer.rgb(color))
-                stream.log(f"world/recording/{way}", lines, static=True)
+        for kind, color in (("odometry", ORANGE), ("frames", SKY)):
+            if tracks and tracks.get(kind):
+                lines = rr.LineStrips3D(tracks[kind], colors=viewer.rgb(color))
+                stream.log(f"world/recording/{kind}", lines, static=True)
         writer = _ChosenWriter(stream, localizations, 2 * size)
         for number, chosen in details:
             writer.write(number, chosen)
@@ -82,11 +83,11 @@ def record_localizations(
 
 
 def _layout(name: str, poses: Floats, up: Floats) -> Any:
-    """Return the viewer's layout: the scene, and beside it the chosen query, its references, and a page about it."""
+    """Return the viewer's layout: the scene, and beside it the chosen query, its references and a text page."""
     import rerun.blueprint as rrb
 
     scene = viewer.scene_view(poses, up, name)
-    # The pictures' marks belong on the pictures; on the image planes in the scene they would hide it.
+    # Show marks only in the 2D views: on the image planes of the 3D scene they would hide it.
     hidden = [f"- /world/chosen/camera_{k}/marks/**" for k in range(MAX_CAMERAS)]
     hidden += [f"- /world/references/{rank}/marks/**" for rank in range(1, REFERENCES + 1)]
     scene.contents = ["+ $origin/**", *hidden]
@@ -121,7 +122,7 @@ def _log_map_cameras(stream: "rr.RecordingStream", poses: Floats, size: float) -
 
 
 def _log_overview(stream: "rr.RecordingStream", queries: Localizations) -> None:
-    """Log all queries: estimates and error lines colored by error, true places, failures at their references."""
+    """Log all queries: estimates and error lines colored by error, true positions, failures at their references."""
     import rerun as rr
 
     located, has_truth = is_posed(queries.estimated), is_posed(queries.true)
@@ -145,15 +146,15 @@ def _log_overview(stream: "rr.RecordingStream", queries: Localizations) -> None:
 
 
 class _ChosenWriter:
-    """Logs one query after the other, each in place of the one before."""
+    """Logs one query at a time; each replaces the one before."""
 
     def __init__(self, stream: "rr.RecordingStream", queries: Localizations, camera_depth_m: float) -> None:
         self._stream, self._queries, self._depth_m = stream, queries, camera_depth_m
         self._sizes: dict[str, tuple[int, int]] = {}
-        """Width and height of the pictures last logged, by entity."""
+        """Width and height of the images last logged, by entity."""
 
     def write(self, number: int, query: QueryDetails) -> None:
-        """Log the query of a row. What it lacks is overwritten by nothing, or the last one's would stay."""
+        """Log a query. Entities that it lacks are cleared, or those of the last query would stay."""
         import rerun as rr
 
         self._stream.set_time(QUERY, sequence=number)
@@ -183,26 +184,26 @@ class _ChosenWriter:
         text += [f"- {image.name}" for image in query.cameras]
         if query.has_matches:
             rejected = sum(len(image.matches) for image in query.cameras) - len(points)
-            text += ["", f"{len(points)} inliers: green where the pose puts a point, white where it was measured. "
+            text += ["", f"{len(points)} inliers: green projections of map points, white measured keypoints. "
                      f"{rejected} rejected matches: orange.", ""]  # fmt: skip
         elif located:
-            text += ["", "No matches: the pose rests on the references as a whole.", ""]
+            text += ["", "No matches: the pose comes from the references as a whole.", ""]
         text += [f"{rank}. {image.name}: {caption}" for rank, (image, caption, _) in enumerate(references, start=1)]
         self._stream.log("about", rr.TextDocument("\n".join(text), media_type="text/markdown"))
 
     def _log_image(self, path: str, image: ShownImage | None, color: str, residuals: bool) -> None:
-        """Log a photograph, or nothing but gray, with its camera, the points measured and where the pose puts them."""
+        """Log an image (None: a gray one) with its camera, keypoints and, for `residuals`, projected points."""
         import rerun as rr
 
         stream = self._stream
         measured, inlier = np.zeros((0, 2)), np.zeros(0, bool)
         predicted, lines = np.zeros((0, 2)), np.zeros((0, 2, 2))
         if image is None:
-            # Of the last one's size: the viewer takes pictures of an entity for frames of a film.
+            # Keep the size of the last image: the viewer treats the images of an entity as frames of a video.
             width, height = self._sizes.get(path, (4, 3))
             blank = np.full((height, width, 3), 60, np.uint8)
             data, _ = viewer.small_jpeg(blank, max(blank.shape))
-            # A camera of any kind, too small to be seen.
+            # Any camera that is too small to see.
             stream.log(path, rr.Pinhole(focal_length=1, width=1, height=1, image_plane_distance=viewer.HIDDEN_M))
         else:
             data, shown = viewer.small_jpeg(read_for_display(image.path), viewer.IMAGE_SIZE)
@@ -230,7 +231,7 @@ class _ChosenWriter:
 
 
 def describe(queries: Localizations, k: int) -> str:
-    """Return a line about a query: name, status, errors, inliers."""
+    """Return one line of text about a query: name, status, errors, inliers."""
     row = queries.ranked.iloc[k]
     parts = [str(queries.names[k]), str(row["status"])]
     if np.isfinite(row["translation_error_m"]):

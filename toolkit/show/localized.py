@@ -1,4 +1,4 @@
-"""The queries of a pair as the localize stage left them: poses, errors, and the correspondences that poses rest on."""
+"""Read the stored results of the localize stage: poses, errors and correspondences of a pair's queries."""
 
 from collections.abc import Sequence
 from contextlib import closing, suppress
@@ -25,17 +25,17 @@ if TYPE_CHECKING:
 
 
 REFERENCES = 4
-"""References shown of a query, at most."""
+"""References shown per query, at most."""
 
 
 def map_files(map_dir: str | Path | None, session_id: str, poses: Path | None = None) -> tuple[Path, ...]:
-    """Return the triangulated maps of a session that are there, one a kind of features.
+    """Return the existing triangulated maps of a session, one per kind of features.
 
     Args:
         map_dir: folder of the maps; None: there are none.
-        session_id: of the map session.
-        poses: poses of a pair, with or without a suffix; the maps are those that the poses were found with. None,
-            or poses that do not tell: every map of the session in the folder.
+        session_id: id of the map session.
+        poses: file of a pair's poses, with or without suffix; only maps used for these poses are returned. None, or
+            poses without a record of their maps: every map of the session in the folder.
     """
     if map_dir is None:
         return ()
@@ -48,7 +48,7 @@ def map_files(map_dir: str | Path | None, session_id: str, poses: Path | None = 
 
 
 def load_maps(paths: Sequence[Path]) -> LocalMap | None:
-    """Return the maps of one session as one; files that are no maps are passed over. None: there is no map."""
+    """Return the maps of one session pooled into one, skipping files that are not maps; None if there is no map."""
     maps = []
     for path in paths:
         with suppress(ArtifactError):
@@ -57,13 +57,13 @@ def load_maps(paths: Sequence[Path]) -> LocalMap | None:
 
 
 MAX_POINTS = 1_000_000
-"""Points of a map that are shown at most: a viewer takes some 30 bytes for each."""
+"""Points of a map that are shown, at most: a viewer needs about 30 bytes for each."""
 
 
 def sure_points(local_map: LocalMap | None) -> tuple[Floats, NDArray[np.uint8] | None]:
-    """Return the points that at least three images see, (P, 3), and their colors (P, 3) RGB; the rest is noisy.
+    """Return the points seen by at least three images, (P, 3), and their colors (P, 3) RGB; other points are noisy.
 
-    Of a large map a regular choice of `MAX_POINTS` at most.
+    A large map is reduced to a regular sample of at most `MAX_POINTS`.
     """
     if local_map is None:
         return np.zeros((0, 3)), None
@@ -74,23 +74,23 @@ def sure_points(local_map: LocalMap | None) -> tuple[Floats, NDArray[np.uint8] |
 
 @dataclass(frozen=True)
 class ShownImage:
-    """A posed photograph, and the correspondences that are seen in it."""
+    """A posed image and its correspondences."""
 
     name: str
     path: Path
     camera: "pycolmap.Camera"
     world_from_cam: Floats
-    """(4, 4); NaN where it is not known."""
+    """(4, 4); NaN if unknown."""
     pixels: Floats = field(default_factory=lambda: np.zeros((0, 2)))
-    """(n, 2) where the points were measured, in the full image."""
+    """(n, 2) measured keypoints, pixels of the full image."""
     points: Floats = field(default_factory=lambda: np.zeros((0, 3)))
-    """(n, 3) the points, meters; projecting them gives what the pose predicts."""
+    """(n, 3) map points, world, meters."""
     matches: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    """(n,) numbers of the correspondences: the same number in two images joins their pixels."""
+    """(n,) numbers of the correspondences; pixels with the same number in two images match."""
     inlier: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
-    """(n,) whether the pose agrees with it."""
+    """(n,) whether each correspondence agrees with the pose."""
     world_from_cam_true: Floats = field(default_factory=lambda: np.full((4, 4), np.nan))
-    """(4, 4); NaN where it is not known."""
+    """(4, 4); NaN if unknown."""
 
     @property
     def num_inliers(self) -> int:
@@ -102,34 +102,31 @@ _OF_A_MATCH = ("pixels", "points", "matches", "inlier")
 
 @dataclass(frozen=True)
 class QueryDetails:
-    """What is shown of one query when it is chosen."""
+    """Images and correspondences of one query."""
 
     cameras: Sequence[ShownImage]
     """Its images, at the estimated pose; the one with the most inliers first."""
     references: Sequence[ShownImage] = ()
-    """Map images that it was localized by, best first."""
+    """Map images that it was localized with, best first."""
     rejected: Sequence[ShownImage] = ()
-    """References that contradict the others."""
+    """References that contradict the references used."""
 
     @property
     def has_matches(self) -> bool:
-        """Whether the pose was sought by matching pixels, not by the references as a whole."""
+        """Whether the method matched keypoints, rather than used the poses of whole references."""
         return any(len(camera.matches) for camera in self.cameras)
 
     def of_first_camera(self) -> "QueryDetails":
-        """Return the first image alone, with what references see of its correspondences."""
+        """Return the first image alone, and references with only its correspondences."""
 
-        def seen(image: ShownImage) -> ShownImage:
-            mine = np.isin(image.matches, self.cameras[0].matches)
-            return replace(image, **{name: getattr(image, name)[mine] for name in _OF_A_MATCH})
+        def reduced(image: ShownImage) -> ShownImage:
+            chosen = np.isin(image.matches, self.cameras[0].matches)
+            return replace(image, **{name: getattr(image, name)[chosen] for name in _OF_A_MATCH})
 
-        return QueryDetails(self.cameras[:1], list(map(seen, self.references)), self.rejected)
+        return QueryDetails(self.cameras[:1], list(map(reduced, self.references)), self.rejected)
 
     def captioned_references(self) -> list[tuple[ShownImage, str, bool]]:
-        """Return at most `REFERENCES` references: the image, what can be said of it, and whether it was not rejected.
-
-        Of the rejected ones, up to two are among them.
-        """
+        """Return at most `REFERENCES` references, up to two of them rejected: image, caption, whether used."""
         agree = [
             (image, f"reference {rank}" + (f": {image.num_inliers} inliers" if self.has_matches else ""), True)
             for rank, image in enumerate(self.references, start=1)
@@ -139,94 +136,94 @@ class QueryDetails:
 
 
 def support_of(row: pd.Series) -> str:
-    """Return what a row of a pair's csv says that its pose rests on, such as `120 inliers`."""
-    by_network = str(row.get("method", "")).rpartition("/")[2].startswith(("feed_forward", "vggt"))  # older runs
+    """Return the support of the pose in a row of a pair's csv as text, such as `120 inliers`."""
+    # Older runs name the method `vggt`.
+    by_network = str(row.get("method", "")).rpartition("/")[2].startswith(("feed_forward", "vggt"))
     return f"{row['num_inliers']:.0f} {'consistent references' if by_network else 'inliers'}"
 
 
 @dataclass(frozen=True)
 class Localizations:
-    """The queries of a pair, one row each; the first image of a rig stands for it."""
+    """The queries of a pair, one row each; a rig is represented by its first image."""
 
     names: Sequence[str]
     table: pd.DataFrame
-    """Columns status and num_inliers, and others of the pair's csv."""
+    """The pair's csv, with at least the columns status and num_inliers."""
     estimated: Floats
-    """world_from_cam (Q, 4, 4), NaN where there is no pose."""
+    """world_from_cam (Q, 4, 4), NaN without a pose."""
     true: Floats
-    """The same, true; NaN where it is not known."""
+    """True world_from_cam (Q, 4, 4), NaN where unknown."""
     nearest_reference: Floats = field(default_factory=lambda: np.zeros((0, 3)))
-    """World position (Q, 3) of the first reference of queries without a pose; NaN where there is none."""
+    """World position (Q, 3) of the first reference of each query without a pose; else NaN."""
     unit: tuple[str, float] = ("m", 1.0)
-    """What lengths are shown in, see `metrics.length_unit`."""
+    """Unit that lengths are shown in, see `metrics.length_unit`."""
     cam_from_rig: Floats = field(default_factory=lambda: np.eye(4))
-    """(Q, 4, 4), or one for all."""
+    """(Q, 4, 4), or one (4, 4) for all."""
 
     @cached_property
     def ranked(self) -> pd.DataFrame:
-        """The table with the errors of the device: `rotation_error_deg`, `translation_error_m` in `unit`.
+        """The table with the errors of the device: `rotation_error_deg`, and `translation_error_m` in `unit`.
 
-        They are those of the evaluation; infinite without a pose.
+        They equal those of the evaluation: infinite without a pose, NaN without ground truth.
         """
         rotation_deg, translation = pose_errors(self.estimated @ self.cam_from_rig, self.true @ self.cam_from_rig)
         return self.table.assign(rotation_error_deg=rotation_deg, translation_error_m=translation / self.unit[1])
 
     def worst_first(self) -> Ints:
-        """Return the rows from the worst to the best (`metrics.worst_first`)."""
+        """Return the rows from worst to best (`metrics.worst_first`)."""
         return worst_first(self.ranked)
 
 
 @dataclass
 class LocalizedPair:
-    """The queries of a pair in their map. What a picture needs of one query is read when it is asked for."""
+    """The queries of a pair in their map. Images and correspondences of a query are read on demand."""
 
     name: str
     map_session: Session
     query_session: Session
     table: pd.DataFrame
-    """The pair's csv: a row for each query that has an image."""
+    """The pair's csv: one row per query with an image."""
     rows: list[Ints]
-    """Rows of the session's images of each query."""
+    """For each query, the rows of its images in the session."""
     world_from_rig: Floats
-    """(Q, 4, 4), NaN where there is no pose."""
+    """(Q, 4, 4), NaN without a pose."""
     queries: LocalizedQueries
     local_map: LocalMap | None
     """The triangulated maps that the run used, pooled."""
     unit: tuple[str, float] = ("m", 1.0)
-    """What lengths are shown in, see `metrics.length_unit`."""
+    """Unit that lengths are shown in, see `metrics.length_unit`."""
 
     @classmethod
     def open(
         cls, capture: Capture, map_device: str, query_device: str, poses_dir: str | Path, map_dir: str | Path | None
     ) -> "LocalizedPair":
-        """Read what the localize stage left of a pair.
+        """Read the stored results of the localize stage for a pair.
 
         Raises:
             ArtifactError: the poses, their table or their correspondences are missing or torn.
         """
         name = pair_name(capture.name, map_device, query_device)
         session, stem = capture[f"{query_device}_query"], Path(poses_dir) / name
-        file, listed = Path(f"{stem}.txt"), Path(f"{stem}.csv")
-        require_whole(file)  # a query whose line is cut off would pass for one without a pose
-        require_whole(listed, of=file)
-        table = read_query_table(listed, ["status"])
+        poses_path, table_path = Path(f"{stem}.txt"), Path(f"{stem}.csv")
+        require_whole(poses_path)  # in a truncated file, missing queries would look like queries without a pose
+        require_whole(table_path, of=poses_path)
+        table = read_query_table(table_path, ["status"])
         rows = session.rows_of_keyframes(table)
         has_image = np.array([len(images) > 0 for images in rows], bool)
         table, rows = table[has_image].reset_index(drop=True), [images for images in rows if len(images)]
-        poses = Trajectory.read(file).lookup(table["timestamp"].to_numpy(), table["device_id"])
+        poses = Trajectory.read(poses_path).lookup(table["timestamp"].to_numpy(), table["device_id"])
         local_map = load_maps(map_files(map_dir, f"{map_device}_map", stem))
         queries = LocalizedQueries(Path(f"{stem}.h5"))
         unit = length_unit(read_map_record(map_record_path(poses_dir, capture.name, map_device)))
         return cls(name, capture[f"{map_device}_map"], session, table, rows, poses, queries, local_map, unit)
 
     def localized(self, k: int) -> LocalizedQuery:
-        """Return what the pose of query k rests on; nothing where the stage could not even begin."""
+        """Return the references and correspondences of query k; empty if the stage could not process it."""
         key = int(self.table["timestamp"].iloc[k]), str(self.table["device_id"].iloc[k])
         return self.queries.get(key, LocalizedQuery())
 
     @cached_property
     def localizations(self) -> Localizations:
-        """All queries."""
         session = self.query_session
         first = np.array([rows[0] for rows in self.rows], np.int64)
         rig_from_cam = session.rig_from_cam(first)
@@ -246,7 +243,7 @@ class LocalizedPair:
         """Return images, correspondences and references of query k.
 
         Args:
-            query, world_from_rig: another answer, its pose (4, 4); None: the one that the stage left.
+            query, world_from_rig: another result for the query, and its pose (4, 4); None: the stored ones.
         """
         session, rows = self.query_session, self.rows[k]
         query = self.localized(k) if query is None else query
@@ -265,19 +262,20 @@ class LocalizedPair:
         )
 
     def _references(self, query: LocalizedQuery, names: Sequence[tuple[int, str]]) -> list[ShownImage]:
-        """Return the first few map images, of (number, name), with what each sees as the reference of that number."""
-        session, found = self.map_session, query.correspondences
-        known = [(number, session.row_of_name[name]) for number, name in names if name in session.row_of_name]
-        poses = session.world_from_cam([row for _, row in known[:REFERENCES]])
+        """Return the first few map images with their correspondences; `names` are (reference number, image name)."""
+        session, correspondences = self.map_session, query.correspondences
+        numbered_rows = [(number, session.row_of_name[name]) for number, name in names if name in session.row_of_name]
+        poses = session.world_from_cam([row for _, row in numbered_rows[:REFERENCES]])
         images = []
-        for (number, row), pose in zip(known, poses, strict=False):
-            views = np.flatnonzero(found.view_reference == number)
-            images.append(_shown_image(session, row, pose, found, found.view_of[views], found.view_pixels[views]))
+        for (number, row), pose in zip(numbered_rows, poses, strict=False):
+            views = np.flatnonzero(correspondences.view_reference == number)
+            matches, pixels = correspondences.view_of[views], correspondences.view_pixels[views]
+            images.append(_shown_image(session, row, pose, correspondences, matches, pixels))
         return images
 
 
 def _shown_image(
-    session: Session, row: int, pose: Floats, found: Correspondences, matches: Ints, pixels: Floats
+    session: Session, row: int, pose: Floats, correspondences: Correspondences, matches: Ints, pixels: Floats
 ) -> ShownImage:
     return ShownImage(
         session.image_name(row),
@@ -285,8 +283,8 @@ def _shown_image(
         session.camera(str(session.images["sensor_id"].iloc[row])),
         pose,
         pixels,
-        found.points[matches],
+        correspondences.points[matches],
         matches,
-        found.inlier[matches],
+        correspondences.inlier[matches],
         session.world_from_cam([row], ground_truth=True)[0],
     )

@@ -1,4 +1,4 @@
-"""How good poses are: errors, recall, why queries are lost, and which queries are the worst."""
+"""Pose errors, recall, reasons of losses, and the order of queries from worst to best."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -18,32 +18,30 @@ Threshold = tuple[float, float]
 
 THRESHOLDS: tuple[Threshold, ...] = ((1, 0.1), (5, 0.5), (5, 1.0))
 WRONG: Threshold = (5, 0.5)
-"""An `ok` pose beyond this is a false promise: downstream users ask for the share of those."""
+"""An `ok` pose with larger errors counts as wrong (`ok_wrong`)."""
 NO_REFERENCE, NO_POSE, WRONG_POSE = REASONS = ("no good reference", "no pose", "wrong pose")
 """Why a query misses a threshold."""
 
-
 UNKNOWN_UNIT = "L"
-"""What stands for the meter where the unit of the poses is not known: a tenth of the median depth of what a map
-shows."""
+"""Replaces the meter if the unit of the poses is unknown: a tenth of the median scene depth of a map."""
 
 
 def length_unit(record: Mapping[str, Any]) -> tuple[str, float]:
     """Return the unit that lengths in a map are shown in, and its length in the unit of the poses.
 
     Args:
-        record: what the localize stage says of the map, see `files.read_map_record`.
+        record: the localize stage's record of the map, see `files.read_map_record`.
     """
     return ("m", 1.0) if record["unit"] or not record["depth"] else (UNKNOWN_UNIT, record["depth"] / 10)
 
 
 def unit_of(*thresholds: str) -> str:
-    """Return the unit of thresholds, by their names or those of their columns; without any it is the meter."""
+    """Return the unit of thresholds from their names or column names; without names, the meter."""
     return UNKNOWN_UNIT if any(name.endswith(f"{UNKNOWN_UNIT})") for name in thresholds) else "m"
 
 
 def small_unit(unit: str) -> tuple[str, float]:
-    """Return the unit that errors are shown in, and how many of it make one `unit`."""
+    """Return the unit that errors are shown in, and the factor from `unit` to it."""
     return ("cm", 100.0) if unit == "m" else (unit, 1.0)
 
 
@@ -52,17 +50,17 @@ def pose_errors(
 ) -> tuple[Floats, Floats]:
     """Return the rotation error, degrees, and the translation error, meters, of each query, (N,) each.
 
-    As the LaMAR benchmark defines them: angle and length of inverse(estimated) @ true. A query without an
-    estimate has infinite errors; one without a true pose, NaN.
+    The LaMAR benchmark defines them: angle and length of inverse(estimated) @ true. A query without an estimate has
+    infinite errors; a query without a true pose, NaN.
 
     Args:
-        estimated: world_from_device of the queries, a trajectory, or (N, 4, 4) with NaN where there is none.
-        truth: the same, true.
-        keys: the queries, columns `timestamp` and `device_id`; needed where a trajectory is given.
+        estimated: world_from_device of the queries: a trajectory, or (N, 4, 4) with NaN for missing poses.
+        truth: true world_from_device, in the same form.
+        keys: the queries, columns `timestamp` and `device_id`; needed for trajectories.
     """
     estimates, truths = poses_of(estimated, keys), poses_of(truth, keys)
     if estimates.shape != truths.shape:
-        raise ValueError(f"Expected one true pose an estimate, got {truths.shape} for {estimates.shape}.")
+        raise ValueError(f"Expected one true pose per estimate, got {truths.shape} for {estimates.shape}.")
     has_truth, has_estimate = is_posed(truths), is_posed(estimates)
     rotation_deg = np.where(has_truth, np.inf, np.nan)
     translation_m = rotation_deg.copy()
@@ -73,11 +71,11 @@ def pose_errors(
 
 
 def poses_of(poses: "Trajectory | Floats", keys: pd.DataFrame | None) -> Floats:
-    """Return world_from_device (N, 4, 4) of queries (columns timestamp, device_id); NaN where there is no pose."""
+    """Return world_from_device (N, 4, 4) of queries (columns timestamp, device_id); NaN without a pose."""
     if isinstance(poses, np.ndarray):
         return poses
     if keys is None:
-        raise ValueError("A trajectory needs `keys`: which queries, columns timestamp and device_id.")
+        raise ValueError("A trajectory needs `keys`: the queries, columns timestamp and device_id.")
     return poses.lookup(keys["timestamp"].to_numpy(np.int64), keys["device_id"].to_numpy(str))
 
 
@@ -89,7 +87,7 @@ def is_posed(poses: Floats) -> NDArray[np.bool_]:
 def recall(rotation_deg: Floats, translation_m: Floats, thresholds: Sequence[Threshold] = THRESHOLDS) -> Floats:
     """Return the share of queries, 0 to 1, with both errors strictly below each (degrees, meters) pair.
 
-    All queries count; one without a pose has infinite errors and is a miss. NaN where there is no query.
+    All queries count; a query without a pose has infinite errors and is a miss. NaN without queries.
     """
     rotation_deg, translation_m = np.asarray(rotation_deg), np.asarray(translation_m)
     if not len(rotation_deg):
@@ -103,7 +101,7 @@ def is_below(rotation_deg: Floats, translation_m: Floats, threshold: Threshold) 
 
 
 def threshold_name(threshold: Threshold, unit: str = "m") -> str:
-    """Return `(1deg,0.1m)`, the name of a threshold in tables."""
+    """Return the name of a threshold in tables, such as `(1deg,0.1m)`."""
     return f"({threshold[0]:g}deg,{threshold[1]:g}{unit})"
 
 
@@ -114,16 +112,16 @@ def parse_threshold(name: str) -> Threshold:
 
 
 def worst_first(queries: pd.DataFrame, threshold: Threshold = THRESHOLDS[0]) -> Ints:
-    """Return the positions of queries in order from the worst to the best.
+    """Return the row positions of queries, ordered from worst to best.
 
-    Failed queries come first. Then, where the truth is known, queries by their error: the larger of the rotation and
-    the translation error, in units of `threshold`. Where it is not known, low confidence comes before ok, then few
-    inliers before many, then a large stated deviation before a small one.
+    Failed queries come first. With ground truth, the others are ordered by their error: the larger of the rotation and
+    the translation error, in units of `threshold`. Without, low confidence comes before ok, then few inliers before
+    many, then a large stated deviation before a small one.
 
     Args:
-        queries: one row a query. Column `status`; and, NaN or absent where not known, `rotation_error_deg`,
+        queries: one row per query. Column `status`; and, NaN or absent if unknown, `rotation_error_deg`,
             `translation_error_m`, `num_inliers` and `position_std_m`.
-        threshold: degrees and meters that weigh alike.
+        threshold: degrees and meters that are equally bad.
     """
 
     def column(name: str, unknown: float) -> Floats:
@@ -135,21 +133,21 @@ def worst_first(queries: pd.DataFrame, threshold: Threshold = THRESHOLDS[0]) -> 
     sure = ~queries["status"].str.startswith("low_confidence").to_numpy(bool)
     rotation, translation = column("rotation_error_deg", -1) / threshold[0], column("translation_error_m", -1)
     error = np.maximum(rotation, translation / threshold[1])
-    # The last key counts most.
+    # lexsort: the last key is the primary one.
     return np.lexsort((-column("position_std_m", np.inf), column("num_inliers", 0), sure, -error, ok))
 
 
 def camera_messages(session: "Session", tables: Sequence[pd.DataFrame]) -> list[str]:
-    """Return a sentence for each camera whose focal length does not fit most of its queries.
+    """Return a message for each camera whose focal length does not fit most of its queries.
 
-    Cameras whose names differ only in a time at the end, as those of a phone that has one for each picture, are one.
+    Cameras whose names differ only in a timestamp at the end count as one: a phone may have one for each picture.
 
     Args:
-        session: of the queries.
+        session: session of the queries.
         tables: `poses/<pair>.csv` of pairs with these queries: timestamp, device_id, status and focal_px.
     """
     posed: dict[str, int] = {}
-    found: dict[str, list[tuple[float, float]]] = {}
+    focals_px: dict[str, list[tuple[float, float]]] = {}
     sensors = session.images["sensor_id"].to_numpy()
     for table in tables:
         focals = (table["focal_px"] if "focal_px" in table else pd.Series("", table.index)).astype(object)
@@ -165,15 +163,15 @@ def camera_messages(session: "Session", tables: Sequence[pd.DataFrame]) -> list[
                 posed[name] = posed.get(name, 0) + 1
                 if focal_px > 0:
                     stated_px = session.camera(sensor_id).mean_focal_length()
-                    found.setdefault(name, []).append((focal_px, stated_px))
+                    focals_px.setdefault(name, []).append((focal_px, stated_px))
     messages = []
-    for name, pairs in found.items():
+    for name, pairs in focals_px.items():
         if len(pairs) < posed[name] / 2:
             continue
         fitted, stated = np.array(pairs).T
-        file, of = f"{session.id}/sensors.txt", f"(median of {len(pairs)} answers)"
-        fits = f"the focal length that fits is {np.median(fitted):.0f} px {of}, {file} says {stated[0]:.0f} px"
+        file, median_of = f"{session.id}/sensors.txt", f"(median of {len(pairs)} poses)"
+        text = f"the focal length that fits is {np.median(fitted):.0f} px {median_of}, {file} says {stated[0]:.0f} px"
         if np.ptp(stated) > 0:
-            fits = f"the focal lengths that fit are {np.median(fitted / stated):.3f} times those in {file} {of}"
-        messages.append(f"camera {name}: {fits}. Correct it and localize again.")
+            text = f"the focal lengths that fit are {np.median(fitted / stated):.3f} times those in {file} {median_of}"
+        messages.append(f"camera {name}: {text}. Correct it and localize again.")
     return messages

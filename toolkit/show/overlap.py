@@ -1,4 +1,4 @@
-"""Do two images show the same? By the points that one sees, and the view of the other."""
+"""Overlap of two images in view: the share of the points seen by one that lie in the view of the other."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -15,20 +15,20 @@ if TYPE_CHECKING:
     from toolkit.localizers.local_map import LocalMap
 
 LEAST_OVERLAP = 0.1
-"""A first reference overlaps with the query if the query sees at least this share of the map points that it sees."""
+"""A reference overlaps with a query if the query sees at least this share of the points that the reference sees."""
 
 
 def overlap_in_view(points: Floats, reference: Floats, world_from_cam: Floats, camera: "pycolmap.Camera") -> float:
-    """Return the share, 0 to 1, of the points that a reference sees which lie in the view of another camera.
+    """Return the share, 0 to 1, of a reference's points that lie in the view of another camera.
 
-    The overlap of two images by sparse points, as M. Dusmanu et al., "D2-Net", CVPR 2019, choose training pairs. A
-    point that the camera would look at from behind (over 90 degrees from the reference's line of sight) is not seen.
+    D2-Net (M. Dusmanu et al., CVPR 2019) selects training pairs by such an overlap of sparse points. A point counts as
+    not seen if the two lines of sight differ by more than 90 degrees, as it would be seen from behind.
 
     Args:
         points: (P, 3) triangulated points that the reference observes, world, meters.
-        reference: (3,) its center.
-        world_from_cam: (4, 4) the other camera's pose.
-        camera: its intrinsics.
+        reference: (3,) center of the reference.
+        world_from_cam: (4, 4) pose of the other camera.
+        camera: intrinsics of the other camera.
     """
     if not len(points):
         return 0.0
@@ -39,7 +39,7 @@ def overlap_in_view(points: Floats, reference: Floats, world_from_cam: Floats, c
 
 
 def seen_by(reference: dict[str, Any], session: Session, local_map: "LocalMap | None") -> Floats:
-    """Return the points (P, 3) that a reference sees, world, meters."""
+    """Return the points (P, 3) that a reference sees, world, meters; without a map, a grid of points in its view."""
     if local_map is not None:
         image = local_map.index_of.get(image_name(str(reference["path"])))
         points = np.zeros(0, np.int64) if image is None else np.unique(local_map.observations(image)[1])

@@ -1,4 +1,4 @@
-"""Pictures made small, for pages and notebooks that hold them."""
+"""Compress pictures for pages and notebooks."""
 
 import io
 from typing import TYPE_CHECKING
@@ -8,7 +8,7 @@ if TYPE_CHECKING:
 
 
 def as_jpeg(picture: "Image", max_width: int) -> bytes:
-    """Return a picture as a JPEG file of at most `max_width` pixels a row, and ten times as many rows."""
+    """Return a picture as a JPEG file, at most `max_width` pixels wide and ten times as high."""
     small = picture.convert("RGB")
     small.thumbnail((max_width, 10 * max_width))
     stream = io.BytesIO()
@@ -17,9 +17,9 @@ def as_jpeg(picture: "Image", max_width: int) -> bytes:
 
 
 def as_shown(png: bytes) -> dict[str, bytes]:
-    """Return a PNG by its kind, as a notebook displays it; a JPEG where that is less than half, as with photographs.
+    """Return a PNG by MIME type for a notebook, as a JPEG if that has less than half its size.
 
-    Lines and text alone are sharper as PNG, and no larger.
+    So photographs become JPEG; lines and text stay PNG, which is sharper and no larger.
     """
     from PIL import Image
 

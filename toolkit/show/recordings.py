@@ -1,4 +1,4 @@
-"""Rerun recordings of sessions to walk around in: images on a timeline, cameras where they stood, points, depth."""
+"""Record sessions for the rerun viewer: images on a timeline, posed cameras, map points, depth maps."""
 
 import logging
 import time
@@ -34,34 +34,34 @@ logger = logging.getLogger(__name__)
 
 
 FRAME, CAPTURE_TIME = "frame", "capture_time"
-"""Timelines: index of the frame in its session, and the timestamp of the files as a duration (microseconds)."""
+"""Timelines: index of the instant in its session, and the timestamp of the files as a duration (microseconds)."""
 MAX_TABS = 12
-"""Subsessions whose cameras have a tab beside the scene."""
+"""Tabs beside the scene, one per subsession; the cameras of further subsessions have none."""
 
 
 @dataclass(frozen=True)
 class SessionRecording:
-    """What a recording of a session holds."""
+    """The content of a session's recording."""
 
     path: Path
     frames: int = 0
-    """Instants recorded: one a device and time."""
+    """Recorded frames: one per device and timestamp."""
     images: int = 0
     unreadable: int = 0
-    """Images and depth maps that could not be read; a gray picture stands in for an image."""
+    """Images and depth maps that could not be read; a gray picture replaces an unreadable image."""
     unposed: int = 0
-    """Images of frames without a pose: shown beside the scene, under `unposed/`."""
+    """Images of frames without a pose, under `unposed/`: shown beside the scene."""
     depth_maps: int = 0
     points: int = 0
     queries: int = 0
-    """Queries drawn in a map."""
+    """Queries drawn in the map."""
     seconds: float = 0.0
     bytes: int = 0
     messages: list[str] = field(default_factory=list)
 
     @property
     def command(self) -> str:
-        """The command that opens it."""
+        """Command that opens the recording."""
         return viewer.open_command(self.path)
 
 
@@ -84,38 +84,37 @@ def record_session(
 ) -> SessionRecording:
     """Record a session for the rerun viewer; memory does not grow with its length.
 
-    Entities, where `<device>` is the rig, and is left out for a camera without one:
+    Entities (`<device>` is the rig; a camera without a rig has no such level):
 
-        world/<subsession>/<device>                    world_from_rig, once a frame
-        world/<subsession>/<device>/<camera>           rig_from_cam and intrinsics, again only where they change
+        world/<subsession>/<device>                    world_from_rig, once per frame
+        world/<subsession>/<device>/<camera>           rig_from_cam and intrinsics, repeated only when they change
         world/<subsession>/<device>/<camera>/image     JPEG
         world/<subsession>/<device>/<camera>_depth/depth    depth map
         world/<subsession>/trajectory, world/points, world/queries/..., unposed/<subsession>/<device>/<camera>
 
-    Sensors and rigs whose ids are made anew each frame share an entity. Timelines: `frame`, the index among all
-    frames of the session, so that a thinned recording has the numbers of the whole; `capture_time`, the
-    timestamp of the files.
+    Sensors and rigs with a new id in each frame share an entity. Timelines: `frame`, the index among all instants of
+    the session, so a thinned recording keeps the numbers of the full one; `capture_time`, the timestamp of the files.
 
     Args:
         split: `map` or `query`.
         device: device key; with `split` it names the session.
-        subsession: `all`, or one.
-        keyframes_only: only frames in the session's keyframe list `queries`.
-        every: every so many frames (after `keyframes_only`).
-        vis_retrieve_queries: with `queries_pose`, join each query with the references that it was localized by; they
-            are read from the `.h5` file beside it.
-        queries_pose: trajectories file, world_from_device of queries. In a query session, cameras stand where it
-            says (else: at the ground truth); in a map session, its poses are drawn in the map.
+        subsession: name of a subsession, or `all`.
+        keyframes_only: record only frames in the session's keyframe list `queries`.
+        every: record every n-th instant (after `keyframes_only`).
+        vis_retrieve_queries: join each query of `queries_pose` with the references that it was localized with, read
+            from the `.h5` file beside `queries_pose`.
+        queries_pose: trajectories file, world_from_device of queries. The cameras of a query session have these poses
+            (None: the ground truth); a map session shows them in the map.
         out: file to write; None: `<scene>_<device>_<split>.rrd` in the working directory.
-        map_dir: folder of triangulated maps: the points of the session's map are shown; of a query session, the
-            points of the map that `queries_pose` is named after. With `queries_pose`, of the maps that it was found
-            with; else of all of the session.
+        map_dir: folder of triangulated maps whose points are shown: those of the map session or, for a query session,
+            of the map that `queries_pose` is named after. With `queries_pose`, only the maps used for those poses;
+            else all maps of the session.
         image_size: longer side of the images shown, pixels; depth maps have half of it.
-        world_up: direction (3,) that is up; None: estimated from the cameras.
+        world_up: up direction (3,); None: estimated from the cameras.
 
     Raises:
         CaptureError: unknown session, subsession or keyframe list.
-        ArtifactError: `vis_retrieve_queries` without the h5 of `queries_pose`, or for another session.
+        ArtifactError: `vis_retrieve_queries` without the h5 of `queries_pose`, or `queries_pose` of another session.
     """
     import rerun as rr
 
@@ -126,7 +125,7 @@ def record_session(
     session = capture[f"{device}_{split}"]
     path = Path(out) if out is not None else Path(f"{capture.name}_{session.id}.rrd")
     if queries_pose is None and vis_retrieve_queries:
-        raise ArtifactError("vis_retrieve_queries shows what `queries_pose` was localized by; give that file too.")
+        raise ArtifactError("vis_retrieve_queries shows the references of `queries_pose`; give that file too.")
     poses = None if queries_pose is None else Path(queries_pose)
     localized = None if poses is None else _QueryPoses.read(poses, capture, session, vis_retrieve_queries)
     map_device = device if split == "map" else "" if localized is None else localized.map_device
@@ -146,7 +145,7 @@ def record_session(
     local_map = load_maps(maps)
     messages = []
     if not len(placed):
-        messages.append(f"{session.id}: no frame has a pose; images are shown without a place.")
+        messages.append(f"{session.id}: no frame has a pose, so images are shown beside the scene.")
     if map_dir is not None and local_map is None:
         messages.append(f"{map_dir}: holds no map for this recording, so no points are shown.")
     counts = Counter(frames=len(plan.frames))
@@ -158,7 +157,7 @@ def record_session(
             counts["points"] = len(points)
         color = viewer.rgb(color_of(session.device))
         for name, tracks in plan.tracks.items():
-            # A line a subsession: recordings joined would draw paths nobody went.
+            # One line per track: joined, they would show paths that nobody took.
             lines = rr.LineStrips3D([track for track in tracks if len(track) > 1], colors=color)
             stream.log(f"world/{viewer.entity(name)}/trajectory", lines, static=True)
         if localized is not None:
@@ -189,39 +188,39 @@ def record_session(
 
 @dataclass(frozen=True)
 class _Shot:
-    """A picture or depth map of a frame: what to read and where it goes; and, once read, what is shown."""
+    """An image or depth map of a frame: where to read it and where to log it; once read, also the data to show."""
 
     slot: str
-    """Name of its camera in the recording, the same from frame to frame."""
+    """Name of its camera in the recording, the same in all frames."""
     camera: "pycolmap.Camera"
     parent_from_sensor: Floats
-    """(4, 4) in the rig; of a camera without one, in the world; NaN where it has no pose."""
+    """rig_from_cam (4, 4); world_from_cam for a camera without a rig. NaN without a pose."""
     path: Path
     is_depth: bool = False
     data: bytes = b""
-    """JPEG, or 16-bit PNG of millimeters; empty where a depth map cannot be read."""
+    """JPEG, or 16-bit PNG in millimeters; empty if a depth map cannot be read."""
     size: tuple[int, int] = (0, 0)
-    """Width and height shown."""
+    """Width and height as shown, pixels."""
     readable: bool = False
 
 
 @dataclass(frozen=True)
 class _Frame:
-    """What one device took at one time."""
+    """The images of one device at one timestamp."""
 
     index: int
-    """Of the instant, among all of the session."""
+    """Index of the instant among all of the session."""
     timestamp: int
     subsession: str
     device: str
-    """Name of the rig in the recording; empty for a camera without one."""
+    """Name of the rig in the recording; empty for a camera without a rig."""
     device_id: str
     world_from_device: Floats
     """(4, 4), NaN without a pose."""
     rows: Ints
-    """Of the session's images."""
+    """Rows of its images in the session."""
     slots: tuple[str, ...]
-    """Names of their cameras in the recording."""
+    """Names of the images' cameras in the recording."""
 
     @property
     def posed(self) -> bool:
@@ -229,21 +228,21 @@ class _Frame:
 
     @property
     def entity(self) -> str:
-        """Path of the device, or of the subsession for a camera without one."""
+        """Path of the device, or of the subsession for a camera without a rig."""
         parts = ["world" if self.posed else "unposed", self.subsession, *([self.device] if self.device else [])]
         return viewer.entity(*parts)
 
 
 @dataclass
 class _Plan:
-    """What is to be recorded of a session, without a picture read yet."""
+    """The frames of a session to record; no image is read yet."""
 
     session: Session
     frames: list[_Frame]
     tracks: dict[str, list[Floats]]
-    """World positions (n, 3) along each device's way, of every subsession shown, thinned or not."""
+    """World positions (n, 3) of each device, by subsession; of all frames, also those that thinning drops."""
     all_poses: Floats
-    """world_from_cam (n, 4, 4) of one camera a frame shown."""
+    """world_from_cam (n, 4, 4) of one camera of each frame in `frames`."""
     depths: dict[tuple[int, str], list[int]]
     """Rows of the session's depth maps by timestamp and device."""
     rig_from_depth: Floats
@@ -262,8 +261,7 @@ class _Plan:
         trajectory = session.ground_truth if session.split == "query" else session.trajectory
         if localized is not None and session.split == "query":
             trajectory = localized.poses
-        groups = table.groupby(["index", "device_slot"], sort=False)
-        first = table.loc[groups.head(1).index]
+        first = table.drop_duplicates(["index", "device_slot"])
         poses = np.full((len(first), 4, 4), np.nan)
         if trajectory is not None:
             poses = trajectory.lookup(first["timestamp"].to_numpy(), first["device_id"].to_numpy(str))
@@ -273,16 +271,16 @@ class _Plan:
             shown = pd.MultiIndex.from_frame(first[["timestamp", "device_id"]].astype(object)).isin(listed)
         kept = np.unique(first["index"].to_numpy()[shown])[::every]
         shown &= np.isin(first["index"], kept)
-        rows_of = groups.indices
-        names = ["index", "timestamp", "subsession", "device_slot", "device_id"]
+        rows_of = table.groupby(["index", "device_slot"], sort=False).indices
         image_rows, slots = table["row"].to_numpy(), table["slot"].to_numpy()
+        columns = first.loc[shown, ["index", "timestamp", "subsession", "device_slot", "device_id"]]
         frames = []
-        for k, values in enumerate(first[names].itertuples(index=False, name=None)):
-            if shown[k]:
-                index, timestamp, name, device, device_id = values
-                own = rows_of[index, device]
-                frames.append(_Frame(index, timestamp, name, device, device_id, poses[k], image_rows[own],
-                                     tuple(slots[own])))  # fmt: skip
+        for values, pose in zip(columns.itertuples(index=False, name=None), poses[shown], strict=True):
+            index, timestamp, name, device, device_id = values
+            rows = rows_of[index, device]
+            frames.append(
+                _Frame(index, timestamp, name, device, device_id, pose, image_rows[rows], tuple(slots[rows]))
+            )
         rows = np.array([frame.rows[0] for frame in frames], np.int64)
         cameras = poses[shown] @ session.rig_from_cam(rows) if len(rows) else np.zeros((0, 4, 4))
         depths: dict[tuple[int, str], list[int]] = {}
@@ -295,7 +293,7 @@ class _Plan:
         return cls(session, frames, _tracks(first, poses), cameras, depths, rig_from_depth)
 
     def shots(self, number: int) -> list[_Shot]:
-        """Return what is to be read for a frame."""
+        """Return the images and depth maps to read for a frame."""
         frame, session = self.frames[number], self.session
         in_rig = frame.device != ""
         sensors, poses = session.images["sensor_id"].iloc[frame.rows].tolist(), session.rig_from_cam(frame.rows)
@@ -314,18 +312,17 @@ class _Plan:
 
 
 def session_tracks(session: Session) -> list[Floats]:
-    """Return the ways of a session's cameras, a list of world positions (n, 3), meters, a subsession and device.
+    """Return the tracks of a session, one per subsession and device: world positions (n, 3), meters.
 
-    Of a rig its first camera's; of a map by the trajectory, of queries by the ground truth.
+    A rig's track is that of its first camera. Maps have the poses of the trajectory, queries those of the ground truth.
     """
-    table = _slots(session)
-    first = table.loc[table.groupby(["index", "device_slot"], sort=False).head(1).index]
-    rows = first["row"].to_numpy()
-    return [t for ts in _tracks(first, session.world_from_cam(rows, session.split == "query")).values() for t in ts]
+    first = _slots(session).drop_duplicates(["index", "device_slot"])
+    poses = session.world_from_cam(first["row"].to_numpy(), session.split == "query")
+    return [track for tracks in _tracks(first, poses).values() for track in tracks]
 
 
 def _tracks(frames: pd.DataFrame, poses: Floats) -> dict[str, list[Floats]]:
-    """Return the positions of frames that have a pose, by subsession, a list a device."""
+    """Return the positions of the frames with a pose, by subsession: one array per device."""
     tracks: dict[str, list[Floats]] = {}
     groups = frames.reset_index(drop=True).groupby(["subsession", "device_slot"], sort=False)
     for (name, _), rows in groups.indices.items():
@@ -335,10 +332,11 @@ def _tracks(frames: pd.DataFrame, poses: Floats) -> dict[str, list[Floats]]:
 
 
 def _slots(session: Session) -> pd.DataFrame:
-    """Return the photographs of a session in order of subsession and time, with names for their cameras and rigs.
+    """Return the images of a session in order of subsession and time, with names for their cameras and rigs.
 
-    Columns row, subsession, timestamp, device_id, index (of the instant), slot, device_slot. An id that is used
-    once in a recording of many instants was made for its frame; the camera is then named by its rank in it.
+    Columns row, subsession, timestamp, device_id, index (of the instant), slot, device_slot. Some captures make new
+    sensor ids for each frame: an id that occurs once in a subsession of several instants. Such a camera is named by its
+    rank in the frame, so that it keeps its name.
     """
     rows = session.camera_rows
     order = {name: rank for rank, name in enumerate(session.subsessions)}
@@ -353,25 +351,25 @@ def _slots(session: Session) -> pd.DataFrame:
     table = table.sort_values(["rank", "subsession", "timestamp", "device_id", "sensor_id"], ignore_index=True)
     instant = ["subsession", "timestamp"]
     table["index"] = table.groupby(instant, sort=False).ngroup()
-    rigs = _names(table, "device_id", instant, "rig")
+    rigs = _stable_names(table, "device_id", instant, "rig")
     table["device_slot"] = rigs.where(table["device_id"] != table["sensor_id"], "")
-    table["slot"] = _names(table, "sensor_id", [*instant, "device_slot"], "camera")
+    table["slot"] = _stable_names(table, "sensor_id", [*instant, "device_slot"], "camera")
     return table
 
 
-def _names(table: pd.DataFrame, column: str, frame: list[str], kind: str) -> pd.Series:
-    """Return a name for each row's id, without the subsession; by rank in its `frame` where ids are made anew."""
+def _stable_names(table: pd.DataFrame, column: str, frame: list[str], kind: str) -> pd.Series:
+    """Return a name for each id in `column`: the id without its subsession, or its rank in the `frame` if it is new."""
     instants = table.groupby("subsession")["timestamp"].transform("nunique")
-    anew = (table.groupby(["subsession", column])["timestamp"].transform("nunique") == 1) & (instants > 1)
-    codes = table[column].astype("category").cat.codes[anew].groupby([table[key][anew] for key in frame])
+    is_new = (table.groupby(["subsession", column])["timestamp"].transform("nunique") == 1) & (instants > 1)
+    codes = table[column].astype("category").cat.codes[is_new].groupby([table[key][is_new] for key in frame])
     ranks = codes.rank("dense").reindex(table.index, fill_value=1)
-    ids = zip(table["subsession"], table[column], ranks, anew, strict=True)
-    names = [f"{kind}_{rank - 1:.0f}" if made else name.removeprefix(f"{sub}/") for sub, name, rank, made in ids]
+    ids = zip(table["subsession"], table[column], ranks, is_new, strict=True)
+    names = [f"{kind}_{rank - 1:.0f}" if new else name.removeprefix(f"{sub}/") for sub, name, rank, new in ids]
     return pd.Series(names, index=table.index, dtype=object)
 
 
 def _load(shot: _Shot, image_size: int) -> _Shot:
-    """Read a picture or depth map and make it small; in a thread."""
+    """Read an image or depth map and reduce it; thread-safe."""
     if shot.is_depth:
         try:
             depth = decode(shot.path, cv2.IMREAD_UNCHANGED)
@@ -381,7 +379,7 @@ def _load(shot: _Shot, image_size: int) -> _Shot:
             return shot
         scale = min(1.0, image_size / 2 / max(depth.shape))
         width, height = (max(1, round(scale * side)) for side in depth.shape[::-1])
-        # Nearest: means across edges would hang in the air.
+        # Nearest: averages across depth edges would float in the air.
         small = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST)
         data = cv2.imencode(".png", small)[1].tobytes()
         return replace(shot, data=data, size=(width, height), readable=True)
@@ -395,23 +393,23 @@ def _load(shot: _Shot, image_size: int) -> _Shot:
 
 
 class _FrameWriter:
-    """Logs frames in order; what has not changed since the last frame is not logged again."""
+    """Logs frames in order; poses and intrinsics that have not changed are not logged again."""
 
     def __init__(self, stream: "rr.RecordingStream", size: float, color: str) -> None:
         self._stream, self._size, self._color = stream, size, color
         self._last: dict[tuple[str, str], tuple[float, ...]] = {}
-        """Numbers last logged, by entity and kind."""
-        self._alive: dict[tuple[str, str], dict[str, _Shot]] = {}
-        """Entities of cameras that show something, and what, by subsession and device."""
-        self._now: _Frame | None = None
+        """Values last logged, by entity and kind."""
+        self._visible: dict[tuple[str, str], dict[str, _Shot]] = {}
+        """Cameras that are shown now: shots by entity, by subsession and device."""
+        self._last_frame: _Frame | None = None
 
     def write(self, frame: _Frame, shots: list[_Shot]) -> Counter[str]:
-        """Log a frame; return how many of what it held."""
+        """Log a frame; return the counts of its images and depth maps by kind."""
         import rerun as rr
 
-        if self._now is not None and self._now.subsession != frame.subsession:
+        if self._last_frame is not None and self._last_frame.subsession != frame.subsession:
             self.finish()
-        self._now = frame
+        self._last_frame = frame
         self._set_time(frame.index, frame.timestamp)
         if frame.posed and frame.device:
             self._stream.log(frame.entity, viewer.transform_of(frame.world_from_device))
@@ -426,8 +424,8 @@ class _FrameWriter:
             if frame.posed:
                 pose = shot.parent_from_sensor
                 self._log_changed(path, "pose", pose, lambda pose=pose: viewer.transform_of(pose))
-            numbers = [*viewer.shown_intrinsics(shot.camera, shot.size).ravel(), *shot.size]
-            self._log_changed(path, "pinhole", numbers, lambda s=shot: self._pinhole(s, self._size))
+            intrinsics = [*viewer.shown_intrinsics(shot.camera, shot.size).ravel(), *shot.size]
+            self._log_changed(path, "pinhole", intrinsics, lambda s=shot: self._pinhole(s, self._size))
             if shot.is_depth:
                 depth = rr.EncodedDepthImage(shot.data, media_type="image/png", meter=DEPTH_SCALE)
                 self._stream.log(f"{path}/depth", depth)
@@ -436,34 +434,36 @@ class _FrameWriter:
                 self._stream.log(f"{path}/image", rr.EncodedImage(contents=shot.data, media_type="image/jpeg"))
                 counts["images"] += 1
                 counts["unposed"] += not frame.posed
-        # What this device showed before and does not now would hang on at its old place.
+        # Hide the device's cameras of the last frame that this frame lacks, or they would stay at their old place.
         device = (frame.subsession, frame.device or frame.slots[0])
-        self._hide({path: last for path, last in self._alive.get(device, {}).items() if path not in shown})
-        self._alive[device] = shown
+        self._hide({path: last for path, last in self._visible.get(device, {}).items() if path not in shown})
+        self._visible[device] = shown
         return counts
 
     def announce(self, frames: list[_Frame]) -> None:
-        """Log cameras that come later, too small to be seen: the viewer complains of pictures without a camera."""
+        """Log cameras that appear later, too small to see: the viewer complains about images without a camera."""
         import rerun as rr
 
         if not frames:
             return
         self._set_time(frames[0].index, min(frame.timestamp for frame in frames))
-        begin: dict[str, int] = {}
+        first_index: dict[str, int] = {}
         for frame in frames:
             for slot in frame.slots if frame.posed else ():
-                begin.setdefault(f"{frame.entity}/{viewer.entity(slot)}", frame.index)
-        for path in [path for path, index in begin.items() if index > frames[0].index]:
-            self._stream.log(path, rr.Pinhole(focal_length=1, width=1, height=1, image_plane_distance=viewer.HIDDEN_M))
+                first_index.setdefault(f"{frame.entity}/{viewer.entity(slot)}", frame.index)
+        for path, index in first_index.items():
+            if index > frames[0].index:
+                hidden = rr.Pinhole(focal_length=1, width=1, height=1, image_plane_distance=viewer.HIDDEN_M)
+                self._stream.log(path, hidden)
 
     def finish(self) -> None:
-        """End a subsession: the instant after its last frame shows none of its cameras."""
-        if self._now is None:
+        """End a subsession: hide all its cameras in the instant after its last frame."""
+        if self._last_frame is None:
             return
-        self._set_time(self._now.index + 1, self._now.timestamp + 1)
-        for shown in self._alive.values():
+        self._set_time(self._last_frame.index + 1, self._last_frame.timestamp + 1)
+        for shown in self._visible.values():
             self._hide(shown)
-        self._alive.clear()
+        self._visible.clear()
 
     def _set_time(self, index: int, timestamp: int) -> None:
         self._stream.set_time(FRAME, sequence=index)
@@ -485,7 +485,7 @@ class _FrameWriter:
 
 
 def _session_layout(plan: _Plan, poses: Floats, up: Floats) -> Any:
-    """Return the viewer's layout: the scene, and beside it the cameras of each subsession."""
+    """Return the viewer's layout: the scene, and beside it a tab for each subsession with its cameras."""
     import rerun.blueprint as rrb
 
     tabs: dict[str, dict[str, str]] = {}
@@ -504,33 +504,33 @@ def _session_layout(plan: _Plan, poses: Floats, up: Floats) -> Any:
 
 @dataclass(frozen=True)
 class _QueryPoses:
-    """Poses of queries from a trajectories file, and what they were localized by."""
+    """Query poses from a trajectories file, and the references that they were localized with."""
 
     poses: Trajectory
     map_device: str
-    """Of the pair that the file is named after; empty where its name says none."""
+    """Map device from the name of the file; empty if the file is not named after a pair."""
     query_device: str
     lines: list[Floats]
-    """Positions (2, 3) of a query and of a reference that it was localized by; none where they are not wanted."""
+    """Positions (2, 3) of a query and of one of its references; empty unless read `with_references`."""
 
     @classmethod
     def read(cls, path: Path, capture: Capture, session: Session, with_references: bool) -> "_QueryPoses":
         poses = Trajectory.read(path)
         prefix = f"{capture.name}_map_"
-        named = path.stem.startswith(prefix) and "_query_" in path.stem
-        map_device, _, query_device = path.stem.removeprefix(prefix).partition("_query_") if named else ("", "", "")
-        of_session = map_device if session.split == "map" else query_device
-        if named and of_session != session.device:
+        is_pair = path.stem.startswith(prefix) and "_query_" in path.stem
+        map_device, _, query_device = path.stem.removeprefix(prefix).partition("_query_") if is_pair else ("", "", "")
+        device = map_device if session.split == "map" else query_device
+        if is_pair and device != session.device:
             raise ArtifactError(
                 f"{path.name} holds {query_device} queries in the {map_device} map, which has nothing to do with "
                 f"session {session.id}. Expected a file for that device."
             )
         if not with_references:
             return cls(poses, map_device, query_device, [])
-        if not named:
+        if not is_pair:
             raise ArtifactError(
-                f"{path}: which references a query was localized by stands in the file of a pair, "
-                f"{prefix}<M>_query_<Q>.h5. Name such a pair's poses, or leave vis_retrieve_queries out."
+                f"{path}: the references of its queries are in the h5 file of a pair, {prefix}<M>_query_<Q>.h5, but "
+                "this file is not named after a pair. Give the poses of a pair, or leave out vis_retrieve_queries."
             )
         queries, map_session = LocalizedQueries(path.with_suffix(".h5")), capture[f"{map_device}_map"]
         centers = map_session.world_from_cam()[:, :3, 3]
@@ -547,7 +547,7 @@ class _QueryPoses:
 
 
 def _log_queries(stream: "rr.RecordingStream", queries: _QueryPoses, session: Session) -> None:
-    """Log where queries are, joined with their references. In a query session, lines only."""
+    """Log the positions of queries (in a map session), and lines from queries to their references."""
     import rerun as rr
 
     poses = queries.poses

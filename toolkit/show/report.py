@@ -1,4 +1,4 @@
-"""The page a person reads after a run: report.html, one file that needs nothing else."""
+"""Write the report of a run: report.html, one self-contained file."""
 
 import base64
 import glob
@@ -32,36 +32,36 @@ from toolkit.show.sequences import CHANGES
 if TYPE_CHECKING:
     from jinja2 import Template
 
-# All pictures of a page together, before base64 makes them a third larger: the page stays below 10 MB.
 PICTURE_BUDGET = 7_000_000
+"""Bytes of all pictures of a page. Base64 makes them a third larger, so the page stays below 10 MB."""
 MAX_WIDTH = 1600
+"""Width of an embedded picture, pixels, at most."""
 WORST, MOST_REASONS = 10, 12
-"""Rows listed of a scene: the worst queries, and the reasons of queries without a pose."""
-# Figures that say more than the page's own tables: a heading, and how to read it.
+"""Rows listed for a scene: the worst queries, and the reasons why queries have no pose."""
 STATUS_COLUMNS = [
     "timestamp", "device_id", "image", "reason", "status", "num_inliers", "position_std_m", "seconds",
     "first_status", "first_seconds",
 ]  # fmt: skip
+# Figures that say more than the page's tables: a heading, and how to read each.
 EVALUATION_FIGURES = {
     "error_curves": (
         "Error curves",
-        "Share of queries [%] with an error of position (top) and rotation (bottom) below x. A curve ends where "
-        "queries have no pose; dotted lines are the thresholds of the tables.",
+        "Share of queries [%] with a position error (top) and a rotation error (bottom) below x. A curve ends at the "
+        "share of queries that have a pose; dotted lines are the thresholds of the tables.",
     ),
     "reliability": (
         "Reliability",
-        "Share of poses that are right against the probability that was stated (p_correct), with intervals of 95 % and "
+        "Share of poses that are right against the stated probability (p_correct), with 95 % intervals and "
         "the number of poses. On the dotted line both agree; ok means 99 % or more.",
     ),
     "deviations": (
         "Stated and actual deviation",
-        "Error of each pose's position against the standard deviation that was stated of it (position_std_m); "
-        "of 30 poses or more, the median of each tenth. Above the dashed line, poses are off by more than five "
-        "deviations.",
+        "Position error of each pose against its stated standard deviation (position_std_m). With 30 poses or more, "
+        "a line joins the median of each tenth. Poses above the dashed line are off by more than five deviations.",
     ),
     "losses": (
         "Where accuracy was lost",
-        "What the misses at each threshold come from, in % of the queries. No good reference: retrieval found no map "
+        "Causes of the misses at each threshold, in % of the queries. No good reference: retrieval found no map "
         "image near the true camera; no pose: too few matches agreed; wrong pose: beyond the threshold.",
     ),
 }
@@ -69,33 +69,29 @@ EVALUATION_FIGURES = {
 
 @dataclass
 class Picture:
-    """A picture in the page."""
-
     data: str
-    """data: URL, or empty where the page has no room left."""
+    """data: URL; empty if the page has no room left."""
     title: str
     caption: str
     path: str
     """Relative to the run folder."""
     wide: bool = False
-    """Too wide to be read when it is scaled to a phone."""
+    """Too wide to be readable when scaled to a phone."""
 
 
 @dataclass
 class Cell:
-    """A cell of a table."""
-
     text: str
     shade: float | None = None
-    """How dark the cell is, 0 to 1, where a number is shown by color as well."""
+    """Darkness of the background, 0 to 1; None: no background."""
     bar: float | None = None
-    """Length of a bar below the text, 0 to 1."""
+    """Length of a bar below the text, 0 to 1; None: no bar."""
     link: str = ""
     """Relative to the run folder."""
 
     @property
     def percent(self) -> int:
-        """The shade in percent."""
+        """Shade in percent."""
         return round(100 * min(max(self.shade or 0.0, 0.0), 1.0))
 
 
@@ -110,7 +106,7 @@ class Matrix:
 
 @dataclass
 class Table:
-    """A plain table; what is no cell in its rows is the text of one."""
+    """A plain table. Values in its rows that are not cells become text cells."""
 
     caption: str
     columns: list[str]
@@ -121,23 +117,23 @@ class Table:
 
 
 def write_report(run_dir: str | Path) -> Path:
-    """Write `report.html` of a run from `run.json`, tables and pictures in its folder, and return its path.
+    """Write `report.html` from the `run.json`, tables and pictures of a run folder, and return its path.
 
-    Pictures are embedded, so that the one file can be mailed; links to poses, notebooks and recordings are relative
-    and work beside them. What is missing is left out, what cannot be read is named. In the folder `visualization`,
-    pictures named `worst*` are shown with the worst queries, `localization*` as samples, `<pair>_sequence*` with the
-    sequences, others as maps; a title is the PNG's `Title` or `Description`.
+    Pictures are embedded, so the file can be mailed alone. Links to poses, notebooks and recordings are relative to
+    the run folder. The report leaves out missing files and names unreadable ones. It shows the pictures in the folder
+    `visualization` by name: `worst*` with the worst queries, `localization*` as samples, `<pair>_sequence*` with the
+    sequences, all remaining ones as maps. A picture's title is the PNG's `Title` or `Description`.
 
     Raises:
-        ArtifactError: there is no `run.json`, or it is torn.
+        ArtifactError: `run.json` is missing or torn.
     """
     run_dir = Path(run_dir)
     run = read_run(run_dir / "run.json")
     left_out: list[str] = []
     scenes = []
     for name in map(str, run["scenes"]):
-        # A share for each scene: the last one is worth its pictures, too.
-        album = _Album(run_dir, PICTURE_BUDGET // len(run["scenes"]), left_out)
+        # Every scene gets an equal share, or the first scenes would leave no room for the last.
+        album = Album(run_dir, PICTURE_BUDGET // len(run["scenes"]), left_out)
         scenes.append(_scene(SceneFiles(run_dir, name), str(run["inputs"].get(name, "")), album))
     page = page_template("report.html.j2").render(
         run=run,
@@ -155,7 +151,7 @@ def write_report(run_dir: str | Path) -> Path:
 
 
 def page_template(name: str) -> "Template":
-    """Return the template of a page, beside this module."""
+    """Load a page template from this module's folder."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     environment = Environment(
@@ -169,26 +165,26 @@ def page_template(name: str) -> "Template":
 
 
 def read_run(path: Path) -> dict[str, Any]:
-    """Return what a `run.json` says, with empty values for what it does not say.
+    """Return the content of a `run.json`, with empty values for missing keys.
 
     Raises:
-        ArtifactError: it is missing, torn, or no record of a run.
+        ArtifactError: the file is missing, torn, or not a record of a run.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ArtifactError(f"No run at {path.parent}: {path.name} is missing. Run a manifest first.") from None
     except ValueError as error:
-        raise ArtifactError(f"{path} is not whole JSON ({error}). Run the manifest again.") from None
+        raise ArtifactError(f"{path} is not valid JSON ({error}). Run the manifest again.") from None
     if not isinstance(content, dict):
         raise ArtifactError(f"{path}: expected a JSON object, found a {type(content).__name__}.")
     empty = {"name": path.parent.name, "created": "", "status": "", "error": None, "total_seconds": None}
     lists: dict[str, Any] = {"manifest": {}, "versions": {}, "machine": {}, "inputs": {}, "scenes": [], "stages": []}
     run = {**empty, "peak_memory_mb": None, "work_seconds": None, "code": "", **lists, **content}
-    odd = [key for key, value in lists.items() if not isinstance(run[key], type(value))]
-    if odd or not all(isinstance(row, dict) for row in run["stages"]):
-        found = odd[0] if odd else "stages"
-        raise ArtifactError(f"{path}: {found!r} is not as a run writes it. Run the manifest again.")
+    wrong = [key for key, value in lists.items() if not isinstance(run[key], type(value))]
+    if wrong or not all(isinstance(row, dict) for row in run["stages"]):
+        key = wrong[0] if wrong else "stages"
+        raise ArtifactError(f"{path}: {key!r} is not as a run writes it. Run the manifest again.")
     run["scenes"] = run["scenes"] or list(dict.fromkeys(row["scene"] for row in run["stages"] if row.get("scene")))
     return run
 
@@ -204,11 +200,11 @@ def _summary(run: dict[str, Any]) -> list[tuple[str, str]]:
     parts = [("started", str(run["created"]).replace("T", " ").replace("+00:00", " UTC"))]
     if run["total_seconds"] is not None:
         work = run["work_seconds"]
-        detail = f" ({_seconds(work)} of work besides the notebooks' start-up)" if work is not None else ""
-        parts.append(("time", _seconds(run["total_seconds"]) + detail))
+        detail = f" ({seconds_text(work)} of work besides the notebooks' start-up)" if work is not None else ""
+        parts.append(("time", seconds_text(run["total_seconds"]) + detail))
     if run["peak_memory_mb"]:
         parts.append(("peak memory", f"{run['peak_memory_mb'] / 1000:.2f} GB"))
-    # Python's version stands among the versions.
+    # The page lists Python's version with the other versions.
     machine = ", ".join(
         f"{value} {key}" if key == "cores" else str(value) for key, value in run["machine"].items() if key != "python"
     )
@@ -233,33 +229,33 @@ def _stages(run: dict[str, Any], run_dir: Path) -> Table:
             row.get("scene") or "",
             Cell(name, link=_link(run_dir, notebook) if notebook.is_file() else ""),
             row.get("status", ""),
-            Cell(_seconds(seconds), bar=float(seconds) / longest if seconds and longest else None),
-            _seconds(work),
+            Cell(seconds_text(seconds), bar=float(seconds) / longest if seconds and longest else None),
+            seconds_text(work),
             Cell(f"{memory:.0f} MB" if memory else "–", bar=float(memory) / largest if memory else None),
             counts,
         ])  # fmt: skip
-    caption = "Time and peak memory of every stage; a name leads to its executed notebook"
+    caption = "Time and peak memory of every stage; names link to the executed notebooks"
     return Table(caption, ["scene", "stage", "status", "time", "of it work", "peak memory", "counts"], rows)
 
 
 def _not_done(run: dict[str, Any]) -> Table | None:
-    """Return what the stages left out, and why."""
-    found: dict[tuple[str, str, str], list[str]] = {}
+    """List the items that stages left out, and why."""
+    stages_of: dict[tuple[str, str, str], list[str]] = {}
     for row in run["stages"]:
-        for one in row.get("left_out") or ():
-            key = str(row.get("scene") or ""), str(one.get("what", "")), str(one.get("reason", ""))
-            found.setdefault(key, []).append(str(row.get("stage", "")))
-    if not found:
+        for item in row.get("left_out") or ():
+            key = str(row.get("scene") or ""), str(item.get("what", "")), str(item.get("reason", ""))
+            stages_of.setdefault(key, []).append(str(row.get("stage", "")))
+    if not stages_of:
         return None
-    rows = [[*key, ", ".join(dict.fromkeys(stages))] for key, stages in found.items()]
+    rows = [[*key, ", ".join(dict.fromkeys(stages))] for key, stages in stages_of.items()]
     return Table("Left out, and why", ["scene", "what", "reason", "stages"], rows)
 
 
 # A scene
 
 
-def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> dict[str, Any]:
-    """Return what the page shows of one scene, by the names that the template has for it."""
+def _scene(files: SceneFiles, fingerprint: str, album: "Album") -> dict[str, Any]:
+    """Return the template variables of one scene."""
     messages: list[str] = []
     tables = ("recall", "errors", "losses", "retrieval", "sequence", "changes")
     recall, errors, losses, retrieval, sequences, changes = (
@@ -277,7 +273,7 @@ def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> dict[str, An
         remarks += [f"{path.stem}: {record['text']}"] if record["text"] else []
         lengths += [f"{length_unit(record)[1]:.3g} in {path.stem}"] if record["depth"] else []
     if unit != "m":
-        depth = f"a tenth of the median depth that a map shows{': ' if lengths else ''}{', '.join(lengths)}"
+        depth = f"a tenth of the median scene depth of a map{': ' if lengths else ''}{', '.join(lengths)}"
         remarks.append(f"The unit of the poses is not known: {unit} is {depth}.")
     verdict, headlines = _verdict(recall, errors, statuses, thresholds)
     matrices, note = _retrieval(retrieval, headlines, unit)
@@ -295,7 +291,7 @@ def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> dict[str, An
         "messages": messages,
         "remarks": remarks,
         "recall": [
-            _matrix(recall, column, f"Recall at {_threshold(column)} [%]", percent, lambda v: 0.9 * v)
+            _matrix(recall, column, f"Recall at {threshold_text(column)} [%]", percent, lambda v: 0.9 * v)
             for column in thresholds
         ],
         "medians": thresholds and [
@@ -311,7 +307,7 @@ def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> dict[str, An
         "worst": _worst(errors if len(errors) else statuses, thresholds),
         "retrieval": matrices,
         "retrieval_note": note,
-        # What fails to be understood without a picture comes first, while there is room.
+        # Pictures of failures come first, while there is room: they are the hardest to understand from tables alone.
         "worst_pictures": [album.picture(path) for path in worst],
         "figures": [album.picture(path, *texts) for path, texts in figures.items() if path.is_file()],
         "steps": _steps(sequences, thresholds) if len(sequences) else None,
@@ -326,7 +322,7 @@ def _scene(files: SceneFiles, fingerprint: str, album: "_Album") -> dict[str, An
 
 
 def _read_table(path: Path, messages: list[str]) -> pd.DataFrame:
-    """Return a table, empty where there is none; what cannot be read is said in `messages`."""
+    """Read a table; empty if the file is missing. An unreadable file adds a line to `messages`."""
     try:
         return pd.read_csv(path, dtype={"device_id": str})
     except (FileNotFoundError, pd.errors.EmptyDataError):
@@ -337,7 +333,7 @@ def _read_table(path: Path, messages: list[str]) -> pd.DataFrame:
 
 
 def _read_statuses(files: SceneFiles, messages: list[str]) -> pd.DataFrame:
-    """Return status and inliers of every query of every pair, also of those without ground truth."""
+    """Return `STATUS_COLUMNS` of every query of every pair, with or without ground truth."""
     tables = []
     for (map_device, query_device), stem in _pairs_of(files).items():
         table = _read_table(stem.with_name(f"{stem.name}.csv"), messages)
@@ -348,7 +344,7 @@ def _read_statuses(files: SceneFiles, messages: list[str]) -> pd.DataFrame:
 
 
 def _pairs_of(files: SceneFiles) -> dict[tuple[str, str], Path]:
-    """Return the path, without suffix, of the results of each pair that has any."""
+    """Return the path of the results, without suffix, of each pair (map device, query device) that has any."""
     pairs = {}
     for path in sorted([*files.poses_dir.glob("*.csv"), *files.poses_dir.glob("*.txt")]):
         devices = re.fullmatch(f"{re.escape(files.scene)}_map_(.+)_query_(.+)", path.stem)
@@ -360,26 +356,26 @@ def _pairs_of(files: SceneFiles) -> dict[tuple[str, str], Path]:
 def _verdict(
     recall: pd.DataFrame, errors: pd.DataFrame, statuses: pd.DataFrame, thresholds: list[str]
 ) -> tuple[list[str], list[tuple[str, str]]]:
-    """Return in a few sentences, and in numbers with what they mean, how good the answers are."""
+    """Summarize the quality of the poses in sentences, and in headlines: a number and its meaning."""
     verdict, headlines = list[str](), list[tuple[str, str]]()
     if len(statuses):
         pairs = len(statuses[["map_device", "query_device"]].drop_duplicates())
         counts = statuses["status"].str.split(":").str[0].value_counts()
         parts = ", ".join(f"{counts.get(s, 0)} {s.replace('_', ' ')}" for s in ("ok", "low_confidence", "failed"))
-        verdict.append(f"{len(statuses)} queries asked in {pairs} pair{'s' * (pairs != 1)} of devices: {parts}.")
+        verdict.append(f"{len(statuses)} queries in {pairs} pair{'s' * (pairs != 1)} of devices: {parts}.")
         verdict += _escalation(statuses)
     done = recall.dropna(subset=thresholds) if thresholds else recall.iloc[:0]
     if not len(done):
         return verdict, headlines
     for column in thresholds:
-        headlines.append((f"{percent(done[column].mean())} %", f"mean recall at {_threshold(column)}"))
+        headlines.append((f"{percent(done[column].mean())} %", f"mean recall at {threshold_text(column)}"))
     if len(errors):
         rotation_deg, translation_m = errors[["rotation_error_deg", "translation_error_m"]].median()
         length = _length(translation_m, unit_of(thresholds[0]))
-        headlines.append((length, f"median error of position; {number(rotation_deg)}° of rotation"))
+        headlines.append((length, f"median position error; rotation {number(rotation_deg)}°"))
     strict = thresholds[0]
     weakest = done.loc[done[strict].idxmin()]
-    share, limit = percent(weakest[strict]), _threshold(strict)
+    share, limit = percent(weakest[strict]), threshold_text(strict)
     if weakest[strict] == done[strict].max():
         verdict.append(f"Every pair has {share} % at {limit}.")
     else:
@@ -393,17 +389,17 @@ def _verdict(
 
 
 def _escalation(statuses: pd.DataFrame) -> list[str]:
-    """Return what asking further kinds of features gave and took, in a sentence; none where none were asked."""
-    asked = statuses[statuses["first_status"].notna()]
-    if not len(asked):
+    """Say in a sentence what escalation to further kinds of features gained and cost; empty without escalation."""
+    escalated = statuses[statuses["first_status"].notna()]
+    if not len(escalated):
         return []
-    sure = (asked["status"] == "ok").sum()
-    posed = (asked["first_status"].str.startswith("failed") & ~asked["status"].str.startswith("failed")).sum()
-    seconds = (asked["seconds"] - asked["first_seconds"]).sum()
-    found = f", {posed} of those without a pose found one" if posed else ""
+    ok = (escalated["status"] == "ok").sum()
+    posed = (escalated["first_status"].str.startswith("failed") & ~escalated["status"].str.startswith("failed")).sum()
+    seconds = (escalated["seconds"] - escalated["first_seconds"]).sum()
+    gained = f", {posed} without a pose got one" if posed else ""
     return [
-        f"{len(asked)} were not sure and escalated to further features: {sure} are ok now{found}. "
-        f"That took {number(seconds)} s, {number(seconds / len(asked))} s a query."
+        f"{len(escalated)} were not sure and escalated to further features: {ok} are ok now{gained}. "
+        f"That took {number(seconds)} s, {number(seconds / len(escalated))} s per query."
     ]
 
 
@@ -421,7 +417,7 @@ def _pairs(recall: pd.DataFrame, thresholds: list[str]) -> Table:
     columns: dict[str, tuple[str, Any]] = {"map_device": ("map", str), "query_device": ("query", str)}
     for name in ("queries", "localized", "ok", "low_confidence", "failed"):
         columns[name] = name.replace("_", " "), lambda count: "–" if pd.isna(count) else f"{count:.0f}"
-    columns |= {name: (f"recall {_threshold(name)}", _share) for name in thresholds}
+    columns |= {name: (f"recall {threshold_text(name)}", _share) for name in thresholds}
     columns["median_rotation_deg"] = "median [°]", number
     small, factor = small_unit(unit_of(*thresholds))
     columns["median_translation_m"] = f"median [{small}]", lambda length: number(factor * length)
@@ -434,7 +430,7 @@ def _pairs(recall: pd.DataFrame, thresholds: list[str]) -> Table:
 
 
 def _steps(sequences: pd.DataFrame, thresholds: list[str]) -> Table:
-    """Return the mean over the pairs of each step of the sequence stage."""
+    """List recall and median errors after each step of the sequence stage, over all pairs."""
     small, factor = small_unit(unit_of(*thresholds))
     rows = []
     for step, pairs in sequences.groupby("step", sort=False):
@@ -442,50 +438,50 @@ def _steps(sequences: pd.DataFrame, thresholds: list[str]) -> Table:
         turned, moved = (float(pairs[f"median_{name}"].median()) for name in ("rotation_deg", "translation_m"))
         queries, rescued, broken = (int(pairs[name].sum()) for name in ("queries", *CHANGES))
         rows.append([step, queries, *shares, number(turned), number(factor * moved), rescued, broken])
-    titles = ["step", "queries", *(f"recall {_threshold(name)}" for name in thresholds)]
+    titles = ["step", "queries", *(f"recall {threshold_text(name)}" for name in thresholds)]
     titles += ["median [°]", f"median [{small}]", *CHANGES]
     caption = "Queries after each step of the sequence stage: mean recall and median error of the pairs"
     return Table(caption, titles, rows)
 
 
 def _changes(changes: pd.DataFrame, unit: str) -> Table:
-    """List queries that a sequence has broken, and rescued."""
+    """List queries that the sequence stage broke or rescued."""
     rows = []
     for row in changes.sort_values("change", kind="stable")[:WORST].to_dict("records"):
-        errors = [_off_by(row, of, unit=unit) for of in ("single_", "")]
+        errors = [off_by(row, of, unit=unit) for of in ("single_", "")]
         query = f"{row['query_device']} in {row['map_device']} map"
         rows.append([query, row["change"], *errors, row["device_id"], row["timestamp"]])
     counts = changes["change"].value_counts()
     caption = ", ".join(f"{counts.get(name, 0)} {name}" for name in CHANGES)
-    caption = f"Queries within the last threshold by their sequence alone, or by their single pose alone: {caption}"
+    caption = f"Queries within the last threshold only with or only without their sequence: {caption}"
     return Table(caption, ["query", "change", "single", "sequence", "device", "timestamp [µs]"], rows)
 
 
 def _losses(losses: pd.DataFrame) -> Table | None:
-    """Sum over the pairs of each map device, and of all."""
+    """List the losses by reason: the sum over the pairs of each map device, and over all pairs."""
     if "threshold" not in losses or losses["threshold"].isna().all():
         return None
     rows = []
     for threshold, group in losses.dropna(subset=["threshold"]).groupby("threshold", sort=False):
-        parts = [(str(m), part) for m, part in group.groupby("map_device", sort=False)]
-        for name, part in [*parts, ("all", group)]:
-            queries = part["queries"].sum()
-            shares = [part[reason].sum() / queries for reason in REASONS]
-            label = _threshold(str(threshold)) if name == parts[0][0] else ""
+        maps = [(str(map_), of_map) for map_, of_map in group.groupby("map_device", sort=False)]
+        for name, pairs in [*maps, ("all", group)]:
+            queries = pairs["queries"].sum()
+            shares = [pairs[reason].sum() / queries for reason in REASONS]
+            label = threshold_text(str(threshold)) if name == maps[0][0] else ""
             cells = [Cell(f"{percent(share)} %", 1.2 * share) for share in shares]
-            rows.append([label, name, f"{queries:.0f}", f"{part['missed'].sum():.0f}", *cells])
-    caption = "Queries missed at each threshold, and the share of all queries that each reason costs"
+            rows.append([label, name, f"{queries:.0f}", f"{pairs['missed'].sum():.0f}", *cells])
+    caption = "Queries missed at each threshold, and the share of all queries lost for each reason"
     return Table(caption, ["threshold", "map", "queries", "missed", *REASONS], rows)
 
 
 def _failures(statuses: pd.DataFrame) -> Table | None:
-    """Count the reasons of queries without a pose."""
+    """Count the queries without a pose by reason."""
     if not len(statuses):
         return None
     failed = statuses[statuses["status"].str.startswith("failed")]
     if not len(failed):
         return None
-    # Numbers in brackets differ from query to query; the reason is the same.
+    # Drop details in parentheses: they differ from query to query for the same reason.
     reasons = failed["status"].str.removeprefix("failed").str.replace(r" \(.*", "", regex=True).str.lstrip(": ")
     groups = sorted(failed.groupby(reasons.rename("reason")), key=lambda item: (-len(item[1]), item[0]))
     rows = []
@@ -499,7 +495,7 @@ def _failures(statuses: pd.DataFrame) -> Table | None:
 
 
 def _worst(queries: pd.DataFrame, thresholds: list[str]) -> Table | None:
-    """List the queries farthest from the truth or, where it is not known, with the least support."""
+    """List the queries with the largest errors or, without ground truth, with the least support."""
     if not len(queries):
         return None
     has_truth = "rotation_error_deg" in queries
@@ -511,32 +507,33 @@ def _worst(queries: pd.DataFrame, thresholds: list[str]) -> Table | None:
         caption += f"translation error / {threshold[1]:g} {unit}"
     else:
         caption = f"The {len(worst)} least supported; there is no ground truth to compare with"
-    named = "image" in worst and bool(worst["image"].notna().all())  # tables of earlier versions have no names
-    reasons = not has_truth and "reason" in worst and bool(worst["reason"].notna().any())
-    columns = ["query", *(["off by", "why"] if has_truth else []), "status", "inliers", *(["why"] if reasons else [])]
-    columns += ["image"] if named else ["device", "timestamp [µs]"]
+    has_names = "image" in worst and bool(worst["image"].notna().all())  # tables of earlier versions have none
+    has_reasons = not has_truth and "reason" in worst and bool(worst["reason"].notna().any())
+    columns = ["query", *(["off by", "why"] if has_truth else []), "status", "inliers"]
+    columns += ["why"] if has_reasons else []
+    columns += ["image"] if has_names else ["device", "timestamp [µs]"]
     rows = []
     for row in worst.to_dict("records"):
         texts = [f"{row['query_device']} in {row['map_device']} map"]
-        texts += [_off_by(row, unit=unit), _why(row)] if has_truth else []
+        texts += [off_by(row, unit=unit), _why(row)] if has_truth else []
         inliers = "–" if pd.isna(row["num_inliers"]) else f"{row['num_inliers']:.0f}"
         texts += [str(row["status"]).replace("_", " "), inliers]
-        texts += [row["reason"] if isinstance(row["reason"], str) else "–"] if reasons else []
-        texts += [_shown_names(row["image"])] if named else [row["device_id"], row["timestamp"]]
+        texts += [row["reason"] if isinstance(row["reason"], str) else "–"] if has_reasons else []
+        texts += [_shown_names(row["image"])] if has_names else [row["device_id"], row["timestamp"]]
         rows.append(texts)
     return Table(caption, columns, rows)
 
 
 def _shown_names(images: str) -> str:
-    """Return the name of a query's image, or that of the first and how many more there are."""
-    first, *others = images.split(";")
-    return first + (f" and {len(others)} more" if others else "")
+    """Return the name of a query's first image, and how many more there are."""
+    first, *more = images.split(";")
+    return first + (f" and {len(more)} more" if more else "")
 
 
 def _why(row: dict[str, Any]) -> str:
-    """Return what a query was lost by, at the widest threshold that it misses."""
+    """Return the reason of the loss at the widest threshold that a query misses."""
     losses = {name: reason for name, reason in row.items() if name.startswith("loss@")}
-    missed = [f"{reason} at {_threshold(name)}" for name, reason in losses.items() if reason in REASONS]
+    missed = [f"{reason} at {threshold_text(name)}" for name, reason in losses.items() if reason in REASONS]
     return missed[-1] if missed else "within every threshold" if losses else ""
 
 
@@ -556,7 +553,7 @@ def _retrieval(retrieval: pd.DataFrame, headlines: list[tuple[str, str]], unit: 
 
 
 def _files(files: SceneFiles) -> Table | None:
-    """Link what a pair has left."""
+    """Link the files of each pair."""
     rows = []
     for (map_device, query_device), stem in _pairs_of(files).items():
         paths = {
@@ -584,7 +581,7 @@ def _linked(run_dir: Path, paths: Iterable[Path]) -> list[Cell]:
 
 
 def _natural(path: Path) -> list[Any]:
-    """Sort key that puts 10 after 9."""
+    """Natural sort key: 10 comes after 9."""
     return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
 
 
@@ -598,13 +595,13 @@ def _length(length: float, unit: str) -> str:
     return f"{number(length)} {unit}" if length < math.inf else "∞"
 
 
-def _off_by(row: Mapping[Any, Any], before: str = "", after: str = "", *, unit: str) -> str:
-    """Return the errors of a query, in columns of such names."""
+def off_by(row: Mapping[Any, Any], before: str = "", after: str = "", *, unit: str) -> str:
+    """Return the errors of a query as text; `before` and `after` complete the names of their columns."""
     angle, length = (row[f"{before}{name}{after}"] for name in ("rotation_error_deg", "translation_error_m"))
     return f"{number(angle)}°, {_length(length, unit)}" if math.isfinite(angle) else "no pose"
 
 
-def _seconds(seconds: float | None) -> str:
+def seconds_text(seconds: float | None) -> str:
     if seconds is None or math.isnan(seconds):
         return "–"
     if seconds < 120:
@@ -612,13 +609,13 @@ def _seconds(seconds: float | None) -> str:
     return f"{int(seconds) // 60} min {int(seconds) % 60} s"
 
 
-def _threshold(name: str) -> str:
+def threshold_text(name: str) -> str:
     degrees, meters = parse_threshold(name)
     return f"{degrees:g}°, {meters:g}\N{NO-BREAK SPACE}{unit_of(name)}"
 
 
-class _Album:
-    """Turns picture files into data URLs until there is no room left."""
+class Album:
+    """Turns picture files into data URLs until `room` bytes are used up."""
 
     def __init__(self, run_dir: Path, room: int, left_out: list[str]) -> None:
         self.run_dir = run_dir
@@ -626,7 +623,7 @@ class _Album:
         self._room = room
 
     def picture(self, path: Path, title: str = "", caption: str = "") -> Picture:
-        """Return a picture for the page; the title is the file's own where none is given."""
+        """Return a picture for the page; without a `title`, it has the one in the file."""
         from PIL import Image
 
         name, link = str(path.relative_to(self.run_dir)), _link(self.run_dir, path)
@@ -638,10 +635,9 @@ class _Album:
                 data, kind = path.read_bytes(), "png"
                 if image.width > MAX_WIDTH or len(data) > 150_000:
                     small = as_jpeg(image, MAX_WIDTH)
-                    # Plots are often smaller as they are.
-                    if len(small) < len(data):
+                    if len(small) < len(data):  # plots are often smaller as PNG
                         data, kind = small, "jpeg"
-        except (OSError, ValueError, SyntaxError) as error:  # the latter two: how Pillow calls some torn PNGs
+        except (OSError, ValueError, SyntaxError) as error:  # Pillow raises the latter two for some torn PNGs
             return Picture("", f"{name} cannot be read: {error}", "", link)
         if len(data) > self._room:
             self.left_out.append(name)

@@ -1,4 +1,4 @@
-"""What retrieval found for one query: its references, how the map's images compare, and where good ones stood."""
+"""Inspect the retrieval of one query: its references, its similarity to map images, and where good references are."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from toolkit.errors import ArtifactError
 from toolkit.files import image_name, read_references
 from toolkit.geometry import Floats, Ints
 from toolkit.show.choice import find_query, shown_name
-from toolkit.show.figures import BLUE, GRAY, GREEN, MAP, ORANGE, TRUE, new_figure, shown, styled
+from toolkit.show.figures import BLUE, GRAY, GREEN, MAP, ORANGE, TRUE, new_figure, shared_legend, shown, styled
 from toolkit.show.localized import load_maps, map_files
 from toolkit.show.metrics import is_posed
 from toolkit.show.overlap import LEAST_OVERLAP, overlap_in_view, seen_by
@@ -29,31 +29,31 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST = 2000
-"""Map images that a query is compared with at most, besides its references: a regular choice."""
+"""Map images that a query is compared with besides its references, at most: a regular sample."""
 IN_STRIP = 10
-"""References in a row of the strip."""
+"""References in the strip per row, at most."""
 
 
 @dataclass(frozen=True)
 class RetrievedQuery:
-    """What was retrieved for one query image. A notebook shows it as its picture."""
+    """The retrieval of one query image. A notebook displays its figure."""
 
     session: Session
     map_session: Session
     number: int
-    """Of the query image, as the file of references counts them."""
+    """Number of the query image: its line in the file of references."""
     row: int
-    """Of the query image in its session."""
+    """Row of the query image in its session."""
     references: pd.DataFrame
-    """A row a reference, best first: rank, score, name, overlap (0 to 1, NaN where it cannot be known)."""
+    """One row per reference, best first: rank, score, name, overlap (0 to 1, NaN if unknown)."""
     images: Ints
-    """(M,) rows of map images in the order that they were taken, subsession by subsession and camera by camera."""
+    """(M,) rows of map images in the order that they were taken, by subsession and camera."""
     similarity: Floats
-    """(M,) of the query to each."""
+    """(M,) similarity of the query to each map image."""
     overlap: Floats
-    """(M,) of each with the query, 0 to 1; NaN where it cannot be known."""
+    """(M,) overlap of each map image with the query, 0 to 1; NaN if unknown."""
     points: str
-    """What overlap was judged by: the points of the `map`, or points laid into the `view`."""
+    """Points that overlap was computed from: `map` points, or a grid of points in the `view` of the map image."""
 
     @property
     def name(self) -> str:
@@ -61,12 +61,11 @@ class RetrievedQuery:
 
     @property
     def is_known(self) -> bool:
-        """Whether the true pose of the query is known, without which overlap is not."""
+        """Whether the overlap is known, that is, the true pose of the query."""
         return bool(np.isfinite(self.overlap).any())
 
     @cached_property
     def figure(self) -> "Figure":
-        """The picture."""
         return draw_retrieved(self)
 
     def __repr__(self) -> str:
@@ -78,7 +77,7 @@ class RetrievedQuery:
 
 
 class RetrievedPair:
-    """The query images of one pair with their references, to look at one after the other."""
+    """The query images of one pair with their references, to inspect one at a time."""
 
     def __init__(
         self,
@@ -93,8 +92,8 @@ class RetrievedPair:
             sessions_root: `<capture>/sessions`.
             jsonl: references of the pair, `<scene>_map_<M>_query_<Q>.jsonl`.
             embeddings: folder of the descriptors.
-            map_dir, poses_dir: folders of the triangulated maps, and of poses, which name their maps; None, or where
-                nothing is there yet: overlap is judged without the points of a map.
+            map_dir, poses_dir: folders of the triangulated maps, and of the poses, which record the maps that were
+                used. None, or without files yet: overlap is computed without map points.
 
         Raises:
             ArtifactError: the references are missing or damaged.
@@ -107,48 +106,48 @@ class RetrievedPair:
         poses = None if poses_dir is None else Path(poses_dir) / jsonl.stem
         self.local_map = load_maps(map_files(map_dir, self.map_session.id, poses))
         self.names = [image_name(line["path"]) for line in self.lines]
-        """Of the query images."""
+        """Names of the query images."""
 
     def look(self, query: int | str = 0) -> RetrievedQuery:
-        """Return what was retrieved for a query image.
+        """Return the retrieval of a query image.
 
-        A map image overlaps with it if at least `LEAST_OVERLAP` of the map points that it observes lie in the query's
-        view, by the query's true pose (`overlap.overlap_in_view`); where no map is triangulated yet, of points laid at
-        2, 4, 8 and 16 m into the map image's view, which walls do not stop. Where the true pose is not known, overlap
-        cannot be known, and is NaN. Similarities are computed from the stored descriptors.
+        A map image overlaps with the query if at least `LEAST_OVERLAP` of the map points that it observes lie in the
+        query's view at the true pose (`overlap.overlap_in_view`). Without a triangulated map, points at 2, 4, 8 and
+        16 m in the map image's view replace the map points; these ignore walls. Without a true pose, overlap is NaN.
+        Similarities are computed from the stored descriptors.
 
         Args:
-            query: its number, or its name or the end of it.
+            query: its number, its name, or a unique end of the name.
 
         Raises:
-            ArtifactError: no such query, or several (the nearest is named), or its descriptors are missing.
+            ArtifactError: no query matches, or several do (the nearest is named), or its descriptors are missing.
         """
         number = find_query(query, {name: number for number, name in enumerate(self.names)}, len(self.names))
         line = self.lines[number]
         if self.names[number] not in self.session.row_of_name:
-            raise ArtifactError(f"{self.names[number]}: the references have this query image, the capture does not.")
+            raise ArtifactError(f"{self.names[number]}: the file of references has this query image, the capture not.")
         row = self.session.row_of_name[self.names[number]]
         names = [image_name(hit["path"]) for hit in line["topk"]]
-        ranked = [self.map_session.row_of_name.get(name, -1) for name in names]
-        images, similarity = self._similarities(row, [rank for rank in ranked if rank >= 0])
+        map_rows = [self.map_session.row_of_name.get(name, -1) for name in names]
+        images, similarity = self._similarities(row, [map_row for map_row in map_rows if map_row >= 0])
         overlap = self._overlaps(row, images)
-        of_row = dict(zip(images.tolist(), overlap.tolist(), strict=True))
+        overlap_of_row = dict(zip(images.tolist(), overlap.tolist(), strict=True))
         scores = [float(hit.get("score", np.nan)) for hit in line["topk"]]
         references = pd.DataFrame({"rank": np.arange(1, len(names) + 1), "score": scores, "name": names})
-        references["overlap"] = [of_row.get(rank, np.nan) for rank in ranked]
+        references["overlap"] = [overlap_of_row.get(map_row, np.nan) for map_row in map_rows]
         points = "view" if self.local_map is None else "map"
         return RetrievedQuery(
             self.session, self.map_session, number, row, references, images, similarity, overlap, points
         )
 
-    def _similarities(self, row: int, needed: Sequence[int]) -> tuple[Ints, Floats]:
-        """Return rows of posed map images in order, and the similarity of a query image to each."""
+    def _similarities(self, row: int, references: Sequence[int]) -> tuple[Ints, Floats]:
+        """Return the rows of posed map images in order, all `references` among them, and the query's similarities."""
         from toolkit.embedders.search import fuse  # loads FAISS
 
         queries, query_table = open_descriptors(self.embeddings, self.session.id, normalize=True)
         vectors, table = open_descriptors(self.embeddings, self.map_session.id, normalize=True)
-        at = np.flatnonzero(query_table["abs_path"].map(image_name) == self.session.image_name(row))
-        if not len(at):
+        query_rows = np.flatnonzero(query_table["abs_path"].map(image_name) == self.session.image_name(row))
+        if not len(query_rows):
             raise ArtifactError(f"{self.embeddings}: {self.session.image_name(row)} has no descriptor. Embed again.")
         row_of_name = self.map_session.row_of_name
         rows = np.array([row_of_name.get(image_name(path), -1) for path in table["abs_path"]], np.int64)
@@ -161,16 +160,16 @@ class RetrievedPair:
         usable = usable[order]
         chosen = np.zeros(len(usable), bool)
         chosen[:: max(1, -(-len(usable) // MOST))] = True
-        usable = usable[chosen | np.isin(rows[usable], needed)]
+        usable = usable[chosen | np.isin(rows[usable], references)]
         cuts = np.cumsum(vectors.dims)[:-1]
-        query = np.split(queries[at[:1]], cuts, axis=1)
+        query = np.split(queries[query_rows[:1]], cuts, axis=1)
         parts = np.split(vectors[np.sort(usable)], cuts, axis=1)
         products = [part @ one[0] for part, one in zip(parts, query, strict=True)]
         values = np.asarray(products[0] if len(products) == 1 else fuse(products), np.float64)
         return rows[usable], values[np.argsort(np.argsort(usable))]
 
     def _overlaps(self, row: int, images: Ints) -> Floats:
-        """Return the overlap of map images with a query image; NaN where its true pose is not known."""
+        """Return the overlap of map images with a query image; NaN without its true pose."""
         pose = self.session.world_from_cam([row], ground_truth=True)[0]
         if not is_posed(pose):
             return np.full(len(images), np.nan)
@@ -184,36 +183,34 @@ class RetrievedPair:
 
 
 @styled
-def draw_retrieved(one: RetrievedQuery) -> "Figure":
-    """Draw the references of a query image as a strip, its similarity along the map, and where good references stood.
+def draw_retrieved(query: RetrievedQuery) -> "Figure":
+    """Draw the references of a query image as a strip, its similarity along the map, and the map from above.
 
-    Where the true pose is known, what overlaps with the query is green, and references that do not are orange.
+    With a true pose, images that overlap with the query are green, and references that do not are orange.
     """
-    count = len(one.references)
+    count = len(query.references)
     columns = min(IN_STRIP, max(count, 4)) // (2 if count > 5 else 1) + (count > 5 and min(IN_STRIP, count) % 2)
     rows = max(1, -(-count // columns))
     figure = new_figure(11, 1.75 * rows + 4.6)
     strip, below = figure.subfigures(2, 1, squeeze=False, height_ratios=[1.75 * rows + 0.3, 4.3])[:, 0]
     grid = strip.add_gridspec(rows, columns + rows)
-    query = strip.add_subplot(grid[:, :rows])
-    _draw_image(query, one.session.image_path(one.row), "query", "black")
-    for k, hit in enumerate(one.references.itertuples()):
+    _draw_image(strip.add_subplot(grid[:, :rows]), query.session.image_path(query.row), "query", "black")
+    for k, hit in enumerate(query.references.itertuples()):
         panel = strip.add_subplot(grid[k // columns, rows + k % columns])
         known, good = np.isfinite(hit.overlap), hit.overlap >= LEAST_OVERLAP
         text = f"{hit.rank}: {hit.score:.2f}" + (f", overlap {hit.overlap:.0%}" if known else "")
         color = (GREEN if good else ORANGE) if known else GRAY
-        row = one.map_session.row_of_name.get(hit.name)
-        _draw_image(panel, None if row is None else one.map_session.image_path(row), text, color)
+        row = query.map_session.row_of_name.get(hit.name)
+        _draw_image(panel, None if row is None else query.map_session.image_path(row), text, color)
     along, above = below.subplots(1, 2, width_ratios=[1.6, 1.0])
-    _draw_along(along, one)
-    _draw_from_above(above, one)
-    handles: dict[str, Any] = {}
-    for axis in (along, above):
-        handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
-    below.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4)
-    by = "the map's points" if one.points == "map" else "points laid into the views"
-    known = f"\ngreen: overlaps with the query by the true pose and {by} ({LEAST_OVERLAP:.0%} of them in view)"
-    figure.suptitle(f"query image {one.number}: {shown_name(one.name)}{known if one.is_known else ''}", fontsize=10)
+    _draw_along(along, query)
+    _draw_from_above(above, query)
+    shared_legend(below, (along, above), ncols=4)
+    points = "the map points" if query.points == "map" else "points laid into the views"
+    title = f"query image {query.number}: {shown_name(query.name)}"
+    if query.is_known:
+        title += f"\ngreen: overlaps with the query by the true pose and {points} ({LEAST_OVERLAP:.0%} of them in view)"
+    figure.suptitle(title, fontsize=10)
     return figure
 
 
@@ -227,58 +224,58 @@ def _draw_image(axis: "Axes", path: Path | None, title: str, color: str) -> None
     axis.spines[:].set(color=color, linewidth=2.5, visible=True)
 
 
-def _parts(one: RetrievedQuery) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which of the images overlap, and which are references."""
-    rows = [one.map_session.row_of_name.get(name, -1) for name in one.references["name"]]
-    return one.overlap >= LEAST_OVERLAP, np.isin(one.images, rows)
+def _overlap_and_retrieved(query: RetrievedQuery) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which of the images overlap with the query, and which are references."""
+    rows = [query.map_session.row_of_name.get(name, -1) for name in query.references["name"]]
+    return query.overlap >= LEAST_OVERLAP, np.isin(query.images, rows)
 
 
-def _draw_along(axis: "Axes", one: RetrievedQuery) -> None:
-    """Draw the similarity of the query to the map's images, in the order that they were taken."""
-    good, retrieved = _parts(one)
-    x = np.arange(len(one.images))
-    if one.is_known:
-        axis.scatter(x[good], one.similarity[good], s=16, c=GREEN, lw=0, zorder=3, label="overlaps with the query")
-    other = "map image" if not one.is_known else "does not overlap"
-    axis.scatter(x[~good], one.similarity[~good], s=9, c="0.6", lw=0, zorder=2, label=other)
-    axis.scatter(x[retrieved], one.similarity[retrieved], s=55, facecolors="none", edgecolors=BLUE, lw=1.2, zorder=4,
+def _draw_along(axis: "Axes", query: RetrievedQuery) -> None:
+    """Draw the similarity of the query to the map images, in the order that they were taken."""
+    good, retrieved = _overlap_and_retrieved(query)
+    x = np.arange(len(query.images))
+    if query.is_known:
+        axis.scatter(x[good], query.similarity[good], s=16, c=GREEN, lw=0, zorder=3, label="overlaps with the query")
+    other = "map image" if not query.is_known else "does not overlap"
+    axis.scatter(x[~good], query.similarity[~good], s=9, c="0.6", lw=0, zorder=2, label=other)
+    axis.scatter(x[retrieved], query.similarity[retrieved], s=55, facecolors="none", edgecolors=BLUE, lw=1.2, zorder=4,
                  label=f"the {int(retrieved.sum())} references")  # fmt: skip
-    recordings = np.asarray(one.map_session.subsession_of(one.images), str)
-    sensors = one.map_session.images["sensor_id"].to_numpy(str)[one.images]
-    # Where each picture has a camera of its own, only recordings are told apart.
+    recordings = np.asarray(query.map_session.subsession_of(query.images), str)
+    sensors = query.map_session.images["sensor_id"].to_numpy(str)[query.images]
+    # Only recordings are separated if each image has a camera of its own.
     tracks = recordings if len(set(sensors)) > len(sensors) / 2 else np.char.add(recordings, sensors)
     cuts = np.flatnonzero(tracks[1:] != tracks[:-1]) + 1
-    for part in np.split(x, cuts):
-        axis.plot(part, one.similarity[part], color="0.8", lw=0.8, zorder=1)
+    for track in np.split(x, cuts):
+        axis.plot(track, query.similarity[track], color="0.8", lw=0.8, zorder=1)
     for k, start in enumerate(cuts - 0.5):
         axis.axvline(start, color="0.7", lw=0.8, ls=":", zorder=0, label=None if k else "next camera or recording")
     axis.set(xlabel="map images, in the order they were taken", ylabel="similarity to the query")
     axis.set_title("similarity along the map", fontsize=9)
 
 
-def _draw_from_above(axis: "Axes", one: RetrievedQuery) -> None:
-    """Draw where the map's images and the references stood, and where the query truly was if that is known."""
-    poses = one.map_session.world_from_cam(one.images)
+def _draw_from_above(axis: "Axes", query: RetrievedQuery) -> None:
+    """Draw the positions of the map images, the references and, if known, the query."""
+    poses = query.map_session.world_from_cam(query.images)
     axes, labels = ground_axes(up_of_cameras(poses))
     places = poses[:, :3, 3] @ axes.T
-    good, retrieved = _parts(one)
-    # Of a map of several places, the one that matters.
-    held = places[good | retrieved] if (good | retrieved).any() else places
-    draw_dots(axis, places[~good], s=9, c="0.6" if one.is_known else MAP, lw=0)
+    good, retrieved = _overlap_and_retrieved(query)
+    # Zoom to the relevant images, as a map may have several places.
+    in_window = places[good | retrieved] if (good | retrieved).any() else places
+    draw_dots(axis, places[~good], s=9, c="0.6" if query.is_known else MAP, lw=0)
     draw_dots(axis, places[good], s=16, c=GREEN, lw=0)
     draw_dots(axis, places[retrieved], s=55, facecolors="none", edgecolors=BLUE, lw=1.2)
-    true = one.session.world_from_cam([one.row], ground_truth=True)
+    true = query.session.world_from_cam([query.row], ground_truth=True)
     if is_posed(true)[0]:
         at = (true[:, :3, 3] @ axes.T)[0]
-        held = np.vstack([held, at])
-        extent = max(float(np.ptp(held, axis=0).max()), 1.0)
+        in_window = np.vstack([in_window, at])
+        extent = max(float(np.ptp(in_window, axis=0).max()), 1.0)
         x, y = np.stack([at, at + 0.07 * extent * axes @ true[0, :3, 2]]).T
         axis.plot(x, y, color=TRUE, lw=1.4)
         axis.scatter([at[0]], [at[1]], s=60, marker="*", c=TRUE, zorder=5, label="the query, true")
-    low, high = held.min(0), held.max(0)
+    low, high = in_window.min(0), in_window.max(0)
     middle, half = (low + high) / 2, 0.7 * max(float((high - low).max()), 1.0)
     outside = int((np.abs(places - middle) > half).any(1).sum())
     axis.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), aspect="equal")
     axis.set(xlabel=labels[0], ylabel=labels[1])
     elsewhere = f"; {outside} map images are elsewhere" if outside else ""
-    axis.set_title(f"where they stood, from above{elsewhere}", fontsize=9)
+    axis.set_title(f"cameras from above{elsewhere}", fontsize=9)

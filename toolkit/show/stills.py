@@ -1,4 +1,4 @@
-"""Still pictures of queries in a map, which need no viewer."""
+"""Draw still pictures of queries in a map."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from toolkit.capture.images import read_for_display
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.geometry import Floats, Ints, make_pose, pose_error, project
 from toolkit.show.choice import shown_name
-from toolkit.show.figures import ESTIMATED, GREEN, MAP, TRUE, error_bar, error_colors, new_figure, styled
+from toolkit.show.figures import ESTIMATED, GREEN, MAP, TRUE, error_bar, error_colors, new_figure, shared_legend, styled
 from toolkit.show.localized import QueryDetails
 from toolkit.show.metrics import is_posed
 from toolkit.show.top_view import draw_dots, draw_headings, ground_axes, places_of
@@ -25,14 +25,14 @@ Window = tuple[tuple[float, float], tuple[float, float]]
 """Limits of x and y, meters."""
 
 MAX_PLACES, MAX_POINTS = 6, 60_000
-"""Of the map from above: panels, those with the most map images, and points in all, a regular choice."""
+"""Limits of the map from above: panels (places with the most map images), and points in all (a regular sample)."""
 MOST_LETTERS = 60
-"""Of an image's name on the sheet of the worst: more would run into the picture beside."""
+"""Letters of an image name on the sheet of the worst queries: more would run into the next picture."""
 
 
 @dataclass(frozen=True)
 class WorstQuery:
-    """A query of the sheet of the worst."""
+    """A query on the sheet of the worst queries."""
 
     pair: str
     reason: str
@@ -40,9 +40,9 @@ class WorstQuery:
     details: QueryDetails
     rotation_deg: float = np.nan
     translation_m: float = np.nan
-    """Its errors; NaN without a pose, or where the truth is not known."""
+    """Its errors; NaN without a pose or ground truth."""
     unit: str = "m"
-    """Of lengths."""
+    """Unit of lengths."""
 
 
 @styled
@@ -58,18 +58,18 @@ def draw_scene(
     query_tracks: Sequence[Floats] = (),
     unit: tuple[str, float] = ("m", 1.0),
 ) -> "Figure":
-    """Draw the map from above with estimated and true queries, one panel a place; return the figure.
+    """Draw the map from above with estimated and true query poses, one panel per place; return the figure.
 
     Args:
         points: (P, 3), meters.
         colors: (P, 3) RGB, or None.
-        map_poses: world_from_cam (N, 4, 4) of the map; NaN rows are passed over.
-        estimated: world_from_cam (Q, 4, 4) of the queries, NaN where there is no pose.
-        true: the same, true; NaN where it is not known.
-        up: direction (3,) that is up; None: estimated from the map's cameras.
-        map_tracks: ways of the map's devices, (n, 3) each, drawn as lines.
-        query_tracks: true ways of the query devices.
-        unit: what lengths are shown in, see `metrics.length_unit`.
+        map_poses: world_from_cam (N, 4, 4) of the map; NaN rows are skipped.
+        estimated: world_from_cam (Q, 4, 4) of the queries, NaN without a pose.
+        true: true world_from_cam (Q, 4, 4) of the queries, NaN where unknown.
+        up: up direction (3,); None: estimated from the map's cameras.
+        map_tracks: tracks of the map devices, (n, 3) each, drawn as lines.
+        query_tracks: true tracks of the query devices.
+        unit: unit that lengths are shown in, see `metrics.length_unit`.
     """
     map_poses = np.asarray(map_poses, np.float64)
     map_poses = map_poses[is_posed(map_poses)]
@@ -97,26 +97,29 @@ def draw_scene(
     for axis in panels[len(shown) :]:
         axis.set_visible(False)
     for axis, p, window in zip(panels, shown, windows, strict=False):
-        near, here, mine = point_place == p, place == p, query_place == p
-        # Thin points on white are muted: bright ones would not be seen.
-        tint = "#9A9A9A" if shades is None else np.clip(shades[near] / 255 * 0.75 + 0.2, 0, 0.75)
-        draw_dots(axis, cloud[near], s=1.2, c=tint, lw=0, rasterized=True)
-        for tracks, color, label in ((map_tracks, MAP, "way of the map's devices"), (query_tracks, TRUE, "true way")):
+        points_here, cameras_here, here = point_place == p, place == p, query_place == p
+        queries, centers = estimated[here], estimated_xy[here]
+        # Darker colors: small bright points would vanish on white.
+        tint = "#9A9A9A" if shades is None else np.clip(shades[points_here] / 255 * 0.75 + 0.2, 0, 0.75)
+        draw_dots(axis, cloud[points_here], s=1.2, c=tint, lw=0, rasterized=True)
+        for tracks, color, label in ((map_tracks, MAP, "map tracks"), (query_tracks, TRUE, "true query tracks")):
             for number, track in enumerate(tracks):
                 axis.plot(*(track @ axes.T).T, color=color, lw=0.7, alpha=0.5, zorder=2,
                           label=None if number else label)  # fmt: skip
         length = 0.035 * np.ptp(window, axis=1).max()
-        draw_headings(axis, cameras[here], map_poses[here], axes, length, colors=MAP, alpha=0.7, linewidths=1.0)
-        draw_dots(axis, cameras[here], s=9, color=MAP, lw=0, zorder=3, label="map cameras" if here.any() else None)
-        _draw_queries(axis, estimated[mine], true[mine], axes, length)
+        style: dict[str, Any] = {"colors": MAP, "alpha": 0.7, "linewidths": 1.0}
+        draw_headings(axis, cameras[cameras_here], map_poses[cameras_here], axes, length, **style)
+        style = {"s": 9, "color": MAP, "lw": 0, "zorder": 3, "label": "map cameras" if cameras_here.any() else None}
+        draw_dots(axis, cameras[cameras_here], **style)
+        _draw_queries(axis, queries, true[here], axes, length)
         axis.set(xlim=window[0], ylim=window[1], aspect="equal", xlabel=labels[0])
         axis.spines[["top", "right"]].set_visible(False)
         axis.grid(alpha=0.2)
         name = f"place {int(p) + 1}: " if len(counts) > 1 else ""
         low, high = np.array(window).T
-        outside = int(((estimated_xy[mine] < low) | (estimated_xy[mine] > high)).any(1).sum())
+        outside = int(((centers < low) | (centers > high)).any(1).sum())
         far = f", {outside} estimated outside the picture" if outside else ""
-        axis.set_title(f"{name}{is_posed(estimated[mine]).sum()} of {mine.sum()} queries have a pose{far}", fontsize=9)
+        axis.set_title(f"{name}{is_posed(queries).sum()} of {len(queries)} queries have a pose{far}", fontsize=9)
         if len(shown) < len(counts) and axis is panels[len(shown) - 1]:
             axis.annotate(f"{len(counts) - len(shown)} smaller places not shown", (1, -0.2), fontsize=8,
                           xycoords="axes fraction", ha="right")  # fmt: skip
@@ -124,33 +127,29 @@ def draw_scene(
         panels[row * columns].set_ylabel(labels[1])
     if (is_posed(estimated) & is_posed(true)).any():
         error_bar(figure, unit[0], ax=list(panels[: len(shown)]), shrink=0.8)
-    handles: dict[str, Any] = {}
-    for axis in panels:
-        handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5, frameon=False,
-                  fontsize=9)  # fmt: skip
+    shared_legend(figure, panels, ncols=5, frameon=False, fontsize=9)
     figure.suptitle(title)
     return figure
 
 
 @styled
 def draw_localization(query: QueryDetails, title: str = "", unit: tuple[str, float] = ("m", 1.0)) -> "Figure":
-    """Draw the first image of a query beside its references, with what its pose rests on; return the figure.
+    """Draw the first image of a query beside its references, with their correspondences; return the figure.
 
-    Green dots are inliers' points as the pose projects them, a white line leads from each to where it was measured;
-    orange dots are measurements that do not agree. The same colors mark the inliers in the references. A pose without
-    matches is shown with the references that it rests on, and those that were rejected.
+    Green dots are the projections of the inliers' map points; a white line joins each to its measured keypoint. Orange
+    dots are keypoints of rejected matches. The references have the same colors. A pose without matches is shown with
+    the references that it was computed from, and those that were rejected.
 
     Args:
-        query: what was localized; its first image is drawn.
-        title: of the figure; the errors are added to it where the true pose is known.
-        unit: what lengths are shown in, see `metrics.length_unit`.
+        query: the query; its first image is drawn.
+        title: title of the figure; if the true pose is known, the errors are appended.
+        unit: unit that lengths are shown in, see `metrics.length_unit`.
     """
     query = query.of_first_camera()
     shown, references = query.cameras[0], query.captioned_references()
     pictures = [read_for_display(image.path) for image in (shown, *(image for image, _, _ in references))]
     height, width = pictures[0].shape[:2]
-    # The query is as high as two rows of references, so that its points can be seen.
+    # The query is as high as two rows of references, to keep its points visible.
     rows = 2 if len(references) > 1 else 1
     columns = -(-len(references) // rows)
     ratio = width / height
@@ -171,7 +170,7 @@ def draw_localization(query: QueryDetails, title: str = "", unit: tuple[str, flo
         draw_dots(axis, _on(projected[inside]), s=11, c=GREEN, edgecolors="white", lw=0.35)
         caption = f"query: {shown.num_inliers} of {len(good)} map points agree"
     else:
-        caption = "query: no matches, the pose rests on the references"
+        caption = "query: no matches, the pose comes from the references"
     axis.set_title(caption, fontsize=9)
     _frame(axis, GREEN if located else ESTIMATED, width, height)
     for k, ((image, text, agrees), picture) in enumerate(zip(references, pictures[1:], strict=True)):
@@ -191,7 +190,7 @@ def draw_localization(query: QueryDetails, title: str = "", unit: tuple[str, flo
 
 @styled
 def draw_worst(queries: Sequence[WorstQuery], title: str = "The worst queries") -> "Figure":
-    """Draw queries, the worst first, each beside its best reference with their common matches joined."""
+    """Draw queries, the worst first, each beside its best reference with lines between common points."""
     columns = 2 if len(queries) > 1 else 1
     rows = max(1, -(-len(queries) // columns))
     figure = new_figure(6.0 * columns, 2.75 * rows + 0.8)
@@ -202,8 +201,8 @@ def draw_worst(queries: Sequence[WorstQuery], title: str = "The worst queries") 
         panels[0].text(0.5, 0.5, "no queries", ha="center")
     for rank, (axis, query) in enumerate(zip(panels, queries, strict=False), start=1):
         _draw_side_by_side(axis, query.details)
-        known = np.isfinite(query.translation_m)
-        off = f"off by {query.rotation_deg:.2g}°, {_length(query.translation_m, query.unit)}; " if known else ""
+        has_error = np.isfinite(query.translation_m)
+        off = f"off by {query.rotation_deg:.2g}°, {_length(query.translation_m, query.unit)}; " if has_error else ""
         name = shown_name(query.details.cameras[0].name, MOST_LETTERS)
         axis.set_title(f"{rank}. {query.pair}: {off}{query.reason}\n{name}", fontsize=8, loc="left", wrap=True)
     legend = "left: query, right: its best reference; lines: inliers (green) and rejected matches (orange) of both"
@@ -212,7 +211,7 @@ def draw_worst(queries: Sequence[WorstQuery], title: str = "The worst queries") 
 
 
 def _draw_side_by_side(axis: "Axes", query: QueryDetails) -> None:
-    """Draw a query and its best reference at one height, and join the points that both see."""
+    """Draw a query and its best reference at one height, and join common points."""
     image, references = query.cameras[0], query.captioned_references()[:1]
     left = read_for_display(image.path)
     height, width = left.shape[:2]
@@ -227,7 +226,7 @@ def _draw_side_by_side(axis: "Axes", query: QueryDetails) -> None:
         lines = np.stack([image.pixels[i], reference.pixels[j] * scale + [offset, 0.0]], axis=1)
         for agrees, color in ((False, ESTIMATED), (True, GREEN)):
             joined = lines[image.inlier[i] == agrees]
-            step = len(joined) // 80 + 1  # more lines than this hide the pictures
+            step = len(joined) // 80 + 1  # more lines would hide the images
             axis.add_collection(LineCollection(list(joined[::step]), colors=color, linewidths=0.5, alpha=0.8))
             draw_dots(axis, joined.reshape(-1, 2), s=4, c=color, lw=0)
         if not image.inlier[i].any():
@@ -238,7 +237,7 @@ def _draw_side_by_side(axis: "Axes", query: QueryDetails) -> None:
 
 
 def _on(pixels: Floats) -> Floats:
-    """Return pixels as imshow counts them: it has the center of the top-left pixel at (0, 0)."""
+    """Convert pixels to those of imshow, where the center of the top-left pixel is (0, 0)."""
     return pixels - 0.5
 
 
@@ -252,12 +251,12 @@ def _length(length: float, unit: str) -> str:
 
 
 def _in(unit: tuple[str, float], poses: Floats) -> Floats:
-    """Return poses with lengths in a unit."""
+    """Convert the translation of poses to a unit."""
     return make_pose(poses[..., :3, :3], poses[..., :3, 3] / unit[1])
 
 
 def _nearest(positions: Floats, cameras: Floats, place: Ints) -> Ints:
-    """Return the place of the nearest camera; -1 where the position is not known."""
+    """Return the place of the camera nearest to each position; -1 for an unknown position."""
     from scipy.spatial import cKDTree
 
     nearest = np.full(len(positions), -1, np.int64)
@@ -268,14 +267,14 @@ def _nearest(positions: Floats, cameras: Floats, place: Ints) -> Ints:
 
 
 def _window(cloud: Floats, cameras: Floats, queries: Floats) -> Window:
-    """Return x and y limits that hold the cameras and queries, and all but the farthest of the points."""
+    """Return x and y limits that contain the cameras and queries, and all but the farthest points."""
     parts = [cameras, queries[np.isfinite(queries).all(1)]]
     if len(cloud):
         parts.append(np.percentile(cloud, [3, 97], axis=0))
-    held = np.concatenate(parts) if sum(map(len, parts)) else np.zeros((1, 2))
-    low, high = held.min(0), held.max(0)
+    contained = np.concatenate(parts) if sum(map(len, parts)) else np.zeros((1, 2))
+    low, high = contained.min(0), contained.max(0)
     half = (high - low) / 2 * 1.08 + 0.5
-    # A street is long and thin; a panel should not be.
+    # Limit the aspect ratio: the panel of a street would be long and thin.
     half = np.maximum(half, half.max() / 2.2)
     middle = (low + high) / 2
     (x0, y0), (x1, y1) = middle - half, middle + half
@@ -294,9 +293,9 @@ def _draw_queries(axis: "Axes", estimated: Floats, true: Floats, axes: Floats, l
     draw_headings(axis, estimated_xy[has_estimate], estimated[has_estimate], axes, length, **style)
     for chosen, places, label, style in (
         (both, true_xy, "query, true", {"s": 52, "facecolors": "none", "edgecolors": TRUE, "lw": 1.2, "zorder": 5}),
-        (lost, true_xy, "query without a pose, where it truly was",
+        (lost, true_xy, "query without a pose, true",
          {"s": 42, "marker": "x", "color": ESTIMATED, "lw": 1.8, "zorder": 6}),
-        (has_estimate, estimated_xy, "query, estimated; a line leads to its true place",
+        (has_estimate, estimated_xy, "query, estimated; a line joins it to its true position",
          {"s": 16, "c": mine, "lw": 0, "zorder": 5}),
     ):  # fmt: skip
         if chosen.any():

@@ -1,4 +1,4 @@
-"""Seeing a map from above: which way is right and up in the picture, and which places lie apart."""
+"""Draw a map from above: axes of the ground plane, places that lie apart, dots and viewing directions."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -12,13 +12,13 @@ if TYPE_CHECKING:
 
 
 def ground_axes(up: ArrayLike, unit: str | None = "m") -> tuple[Floats, list[str]]:
-    """Return the right and the upward axis of a map seen from above, (2, 3), and their labels.
+    """Return the right and the upward axis of a picture from above, (2, 3), and their labels.
 
-    They are world axes where the world stands upright, so the picture's numbers are coordinates.
+    If `up` is a world axis, the two are world axes, so the picture shows world coordinates.
 
     Args:
-        up: direction (3,) that is up.
-        unit: that of the numbers, None if it is not known.
+        up: up direction (3,).
+        unit: unit of the coordinates, None if unknown.
     """
     up = np.asarray(up, np.float64) / np.linalg.norm(up)
     axis = int(np.argmax(np.abs(up)))
@@ -35,9 +35,9 @@ def ground_axes(up: ArrayLike, unit: str | None = "m") -> tuple[Floats, list[str
 
 
 def places_of(positions: Floats) -> Ints:
-    """Return the number of the place, (N,) counted from 0 in order of appearance, of positions (N, 2 or 3).
+    """Cluster positions (N, 2 or 3) into places; return place numbers (N,), from 0 in order of appearance.
 
-    Places are apart by more than 12 % of the whole extent and by more than five times the usual step to a neighbor.
+    Places are apart by more than 12 % of the whole extent and by more than five times the median step to a neighbor.
     """
     from scipy.cluster.hierarchy import fcluster, linkage
     from scipy.spatial import cKDTree
@@ -45,7 +45,7 @@ def places_of(positions: Floats) -> Ints:
     if len(positions) < 2:
         return np.zeros(len(positions), np.int64)
     extent = float(np.linalg.norm(np.ptp(positions, axis=0)))
-    # Positions on one spot (the cameras of a rig) say nothing about steps; a thousand spots are plenty.
+    # Merge positions on one spot (cameras of a rig), which would bias the step; about a thousand spots suffice.
     spots = np.unique(np.round(positions / max(extent / 400, 1e-9)), axis=0) * max(extent / 400, 1e-9)
     spots = spots[:: len(spots) // 1500 + 1]
     if len(spots) < 2:
@@ -58,7 +58,7 @@ def places_of(positions: Floats) -> Ints:
 
 
 def draw_headings(axis: "Axes", positions: Floats, poses: Floats, axes: Floats, length: float, **style: Any) -> None:
-    """Draw a line in the direction that each camera (N, 4, 4) looks, from its place (N, 2) in the picture."""
+    """Draw the viewing direction of each camera (N, 4, 4) as a line from its position (N, 2) in the picture."""
     from matplotlib.collections import LineCollection
 
     ends = positions + length * poses[:, :3, 2] @ axes.T
@@ -66,5 +66,5 @@ def draw_headings(axis: "Axes", positions: Floats, poses: Floats, axes: Floats, 
 
 
 def draw_dots(axis: "Axes", xy: Floats, **style: Any) -> None:
-    """Draw places, (N, 2) or one, (2,); `style` goes to matplotlib's `scatter`."""
+    """Draw positions, (N, 2) or one, (2,); `style` is passed to matplotlib's `scatter`."""
     axis.scatter(*np.reshape(xy, (-1, 2)).T, **style)

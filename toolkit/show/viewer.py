@@ -1,4 +1,4 @@
-"""What all recordings for the rerun viewer share: files, pictures made small, cameras, layout, opening a file."""
+"""Common parts of recordings for the rerun viewer: files, reduced images, cameras, layout."""
 
 import subprocess
 import sys
@@ -25,24 +25,24 @@ Image = NDArray[np.uint8]
 APPLICATION = "visual-localization"
 POINT_COLOR = GRAY
 IMAGE_SIZE, JPEG_QUALITY = 480, 75
-"""Longer side of the images shown, pixels, and how well they are kept, 1 to 100."""
+"""Longer side of the images shown, pixels, and their JPEG quality, 1 to 100."""
 HIDDEN_M = 1e-3
-"""Depth of a camera that is not there now: too small to be seen."""
+"""Image plane distance of a hidden camera, meters: too small to see."""
 
 
 @contextmanager
 def open_recording(out: str | Path, name: str, blueprint: Any) -> "Iterator[rr.RecordingStream]":
-    """Yield a stream whose entries go to the file `out`, which stands whole when the block ends, or not at all."""
+    """Yield a stream that writes to the file `out`; after an error in the block, `out` is not written."""
     import rerun as rr
 
     with write_atomic(out) as temporary:
-        # A fixed id: opened again after another run, it replaces the old one in the viewer.
+        # A fixed id, so that a recording replaces an older one of the same name in the viewer.
         stream = rr.RecordingStream(APPLICATION, recording_id=name)
-        # Only the timelines that mean something; the time of writing would make every file differ.
+        # Without the time of writing, which would make every file differ.
         stream.set_log_time_enabled(False)
         stream.set_log_tick_enabled(False)
         try:
-            # Before the first entry: batches are handed to the file as they fill.
+            # Call save before logging, so that entries go to the file at once instead of filling memory.
             stream.save(temporary, default_blueprint=blueprint)
             stream.send_recording_name(name)
             yield stream
@@ -57,7 +57,7 @@ def open_command(path: str | Path) -> str:
 
 
 def spawn_viewer(path: str | Path) -> None:
-    """Open a recording in a viewer of its own, which stays when this process ends."""
+    """Open a recording in a separate viewer process, which outlives this process."""
     subprocess.Popen(
         [sys.executable, "-m", "rerun_cli", str(path)],
         stdout=subprocess.DEVNULL,
@@ -67,14 +67,14 @@ def spawn_viewer(path: str | Path) -> None:
 
 
 def entity(*parts: str) -> str:
-    """Return the path of an entity; parts may hold any character."""
+    """Return the path of an entity; parts may contain any character."""
     import rerun as rr
 
     return "/".join(rr.escape_entity_path_part(part) for part in parts)
 
 
 def small_jpeg(image: Image, size: int) -> tuple[bytes, tuple[int, int]]:
-    """Return an image, (H, W, 3) RGB or (H, W), reduced to `size` pixels on its longer side, as JPEG; and (w, h)."""
+    """Reduce an image, (H, W, 3) RGB or (H, W), to a longer side of `size` pixels; return a JPEG and (w, h)."""
     scale = min(1.0, size / max(image.shape[:2]))
     width, height = (max(1, round(scale * side)) for side in image.shape[1::-1])
     small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA) if scale < 1 else image
@@ -84,16 +84,16 @@ def small_jpeg(image: Image, size: int) -> tuple[bytes, tuple[int, int]]:
 
 
 def shown_intrinsics(camera: "pycolmap.Camera", shown: tuple[int, int]) -> Floats:
-    """Return the matrix (3, 3) of a camera for its image at another size (w, h), pixels.
+    """Return the calibration matrix (3, 3) of a camera for its image at another size (w, h), pixels.
 
-    The top-left corner of the image is (0, 0) at every size, so the matrix scales by rows. Distortion is left out:
-    the viewer draws pinholes, and at this size it hardly shows.
+    The top-left corner of the image is (0, 0) at every size, so scaling multiplies the rows of the matrix. Distortion
+    is ignored: the viewer draws pinhole cameras, and at this size it is hardly visible.
     """
     return np.diag([shown[0] / camera.width, shown[1] / camera.height, 1.0]) @ camera.calibration_matrix()
 
 
 def pinhole_of(camera: "pycolmap.Camera", shown: tuple[int, int], depth_m: float, color: str) -> "rr.Pinhole":
-    """Return a pinhole for the image of a camera at the size shown, drawn `depth_m` deep."""
+    """Return a pinhole camera for an image at the size shown (w, h), with the image plane at `depth_m`."""
     import rerun as rr
 
     return rr.Pinhole(
@@ -115,7 +115,7 @@ def transform_of(parent_from_child: ArrayLike) -> "rr.Transform3D":
 
 
 def world_axes(up: Floats) -> Any:
-    """Return the viewer's coordinates for the world axis that is nearest to `up`."""
+    """Return the viewer's coordinate system whose up axis is the world axis nearest to `up`."""
     import rerun as rr
 
     axis = int(np.argmax(np.abs(up)))
@@ -123,7 +123,7 @@ def world_axes(up: Floats) -> Any:
 
 
 def scene_view(poses: Floats, up: Floats, name: str) -> Any:
-    """Return the view of the 3D scene: from behind and above the place with the most cameras (N, 4, 4)."""
+    """Return the 3D view, seen from behind and above the place with the most cameras (N, 4, 4)."""
     import rerun.blueprint as rrb
 
     eye = None
@@ -139,7 +139,7 @@ def scene_view(poses: Floats, up: Floats, name: str) -> Any:
 
 
 def camera_depth_m(centers: Floats) -> float:
-    """Return how deep to draw the cameras at (N, 3): about half the usual step between neighbors."""
+    """Return the image plane distance to draw cameras at (N, 3) with: half the median distance between neighbors."""
     from scipy.spatial import cKDTree
 
     spots = np.unique(np.round(centers, 2), axis=0)
@@ -157,5 +157,5 @@ def log_points(stream: "rr.RecordingStream", points: ArrayLike, colors: NDArray[
 
 
 def rgb(color: str) -> list[int]:
-    """Return the three numbers of `#rrggbb`."""
+    """Return the red, green and blue values of `#rrggbb`."""
     return [int(color[k : k + 2], 16) for k in (1, 3, 5)]

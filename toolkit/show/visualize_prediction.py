@@ -1,4 +1,4 @@
-"""Show what a network said of one query: references, aligned cameras, depth, and what was left out."""
+"""Draw a network's prediction for one query: references, aligned cameras and depth."""
 
 import textwrap
 from pathlib import Path
@@ -28,24 +28,24 @@ def draw_prediction(
     camera: int | None = None,
     up: ArrayLike | None = None,
 ) -> "Figure":
-    """Draw one query image with its references, and where its network's cameras lie in the map; return the figure.
+    """Draw one query image with its references, and the predicted cameras in the map; return the figure.
 
     Args:
-        query, answer: of one query device.
-        camera: which of its images; None: the first with the most consistent references.
-        up: direction (3,) that is up; None: estimated from the map's cameras.
+        query, answer: a query device and its answer.
+        camera: number of its image to draw; None: the first with the most consistent references.
+        up: up direction (3,); None: estimated from the map's cameras.
     """
     if camera is None:
-        counts = [0 if part.alignment is None else part.alignment.num_inliers for part in answer.cameras]
+        counts = [0 if result.alignment is None else result.alignment.num_inliers for result in answer.cameras]
         camera = int(np.argmax(counts)) if counts else 0
-    part = answer.cameras[camera] if answer.cameras else CameraAnswer(np.zeros(0, np.int64))
-    views = [query.views[camera], *(localizer.view(int(index)) for index in part.references)]
-    kept = np.zeros(len(part.references), bool) if part.alignment is None else part.alignment.inliers
+    result = answer.cameras[camera] if answer.cameras else CameraAnswer(np.zeros(0, np.int64))
+    views = [query.views[camera], *(localizer.view(int(index)) for index in result.references)]
+    kept = np.zeros(len(result.references), bool) if result.alignment is None else result.alignment.inliers
     columns = 3
     rows = -(-len(views) // columns)
     figure = new_figure(14, max(5.5, 3.6 * rows))
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[1.0, 1.25])[0]
-    _draw_from_above(left.subplots(), localizer, part, kept, up)
+    _draw_from_above(left.subplots(), localizer, result, kept, up)
     panels = right.subplots(2 * rows, columns, squeeze=False)
     for axis in panels.flat:
         axis.set_axis_off()
@@ -55,37 +55,37 @@ def draw_prediction(
         if number:
             label = f"reference {number}: {'consistent' if kept[number - 1] else 'left out'}"
             color = GREEN if kept[number - 1] else VERMILLION
-        _draw_view(panels[row, column], panels[row + 1, column], view, number, part, label, color)
+        _draw_view(panels[row, column], panels[row + 1, column], view, number, result, label, color)
     simulated = localizer.predictor.simulated
     title = f"{'SIMULATED, no result: ' if simulated else ''}{localizer.predictor.name} on {views[0].name}"
     estimate = answer.estimate
     scale = f"scale known to {estimate.scale_std:.1%}" if np.isfinite(estimate.scale_std) else "scale unknown"
-    about = f"{estimate.status}; {scale}" if estimate.world_from_rig is not None else estimate.status
-    more = "" if part.reason in about else f"; {part.reason}"  # a failed query's status says it
-    reasons = textwrap.fill(about + more, 150)
-    figure.suptitle(f"{title}\n{reasons}", fontsize=10, fontweight="bold" if simulated else None)
+    status = f"{estimate.status}; {scale}" if estimate.world_from_rig is not None else estimate.status
+    reason = "" if result.reason in status else f"; {result.reason}"  # the status of a failed query contains it
+    text = textwrap.fill(status + reason, 150)
+    figure.suptitle(f"{title}\n{text}", fontsize=10, fontweight="bold" if simulated else None)
     return figure
 
 
 def _draw_view(
-    photograph: "Axes", depth: "Axes", view: View, number: int, part: CameraAnswer, label: str, color: str
+    photograph: "Axes", depth: "Axes", view: View, number: int, result: CameraAnswer, label: str, color: str
 ) -> None:
     photograph.set_axis_on()
     photograph.set(xticks=[], yticks=[])
     photograph.imshow(read_for_display(view.image) if isinstance(view.image, Path) else view.image, cmap="gray")
     photograph.set_title(label, fontsize=8, color=color)
     photograph.spines[:].set(color=color, linewidth=2.5, visible=True)
-    prediction = part.prediction
+    prediction = result.prediction
     if prediction is None or prediction.depth is None:
         return
-    scale = np.nan if part.alignment is None else part.alignment.world_from_model.scale
-    metric = part.alignment is not None and part.alignment.scale_known
+    scale = np.nan if result.alignment is None else result.alignment.world_from_model.scale
+    metric = result.alignment is not None and result.alignment.scale_known
     values = prediction.depth[number] * (scale if metric else 1.0)
     if not np.isfinite(values).any():
         return
     low, high = np.nanpercentile(values, (5, 95))
     extent = None
-    if prediction.map_from_image is not None:  # in pixels of the photograph
+    if prediction.map_from_image is not None:  # draw in pixels of the photograph
         scale_x, scale_y, offset_x, offset_y = prediction.map_from_image[number]
         height, width = values.shape
         left, right = -offset_x / scale_x, (width - offset_x) / scale_x
@@ -95,48 +95,48 @@ def _draw_view(
 
 
 def _draw_from_above(
-    axis: "Axes", localizer: FeedForwardLocalizer, part: CameraAnswer, kept: NDArray[np.bool_], up: ArrayLike | None
+    axis: "Axes", localizer: FeedForwardLocalizer, result: CameraAnswer, kept: NDArray[np.bool_], up: ArrayLike | None
 ) -> None:
-    local_map, alignment = localizer.map, part.alignment
+    local_map, alignment = localizer.map, result.alignment
     axes, labels = ground_axes(up_of_cameras(local_map.world_from_cams) if up is None else up)
-    places = local_map.world_from_cams[part.references]
-    marked = [places]
-    if alignment is not None and part.prediction is not None and np.isfinite(alignment.rotation_std_deg):
-        finite = np.isfinite(part.prediction.model_from_cams[1:]).all(axis=(1, 2))
-        aligned = alignment.world_from_model.apply_to_pose(part.prediction.model_from_cams[1:])
-        marked.append(aligned[kept])
+    references = local_map.world_from_cams[result.references]
+    drawn = [references]
+    if alignment is not None and result.prediction is not None and np.isfinite(alignment.rotation_std_deg):
+        finite = np.isfinite(result.prediction.model_from_cams[1:]).all(axis=(1, 2))
+        aligned = alignment.world_from_model.apply_to_pose(result.prediction.model_from_cams[1:])
+        drawn.append(aligned[kept])
         for agreed, color, label in ((True, GREEN, "consistent"), (False, VERMILLION, "left out")):
             shown = (kept == agreed) & finite
             _draw_cameras(axis, aligned[shown], axes, color, f"predicted, {label}", "o")
-            for start, end in zip(places[shown, :3, 3] @ axes.T, aligned[shown, :3, 3] @ axes.T, strict=True):
+            for start, end in zip(references[shown, :3, 3] @ axes.T, aligned[shown, :3, 3] @ axes.T, strict=True):
                 axis.plot(*zip(start, end, strict=True), c=color, lw=0.8)
-    if part.world_from_cam is not None:
-        marked.append(part.world_from_cam[None])
-        _draw_cameras(axis, part.world_from_cam[None], axes, "black", "query", "*")
-    _draw_cameras(axis, places, axes, BLUE, "reference in the map", "s")
+    if result.world_from_cam is not None:
+        drawn.append(result.world_from_cam[None])
+        _draw_cameras(axis, result.world_from_cam[None], axes, "black", "query", "*")
+    _draw_cameras(axis, references, axes, BLUE, "reference in the map", "s")
     _draw_cameras(axis, local_map.world_from_cams, axes, GRAY, "map", ".")
-    centers = np.concatenate(marked)[:, :3, 3] @ axes.T
+    centers = np.concatenate(drawn)[:, :3, 3] @ axes.T
     if not len(centers):
         centers = local_map.world_from_cams[:, :3, 3] @ axes.T
-    # A window about what is of interest: a camera left out may be far away.
+    # The window ignores cameras that were left out: they may be far away.
     middle, half = (centers.min(axis=0) + centers.max(axis=0)) / 2, np.ptp(centers, axis=0).max() * 0.75 + 1.0
     cloud = local_map.points @ axes.T
     near = (np.abs(cloud - middle) < half).all(axis=1)
     axis.scatter(cloud[near, 0], cloud[near, 1], s=1, c="#BBBBBB", lw=0, zorder=0, rasterized=True)
     axis.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), aspect="equal")
     axis.set(xlabel=labels[0], ylabel=labels[1])
-    axis.set_title("cameras from above; a line joins a reference's two places", fontsize=9)
+    axis.set_title("cameras from above; lines join true and predicted references", fontsize=9)
     axis.grid(alpha=0.2)
     axis.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=3, frameon=False)
 
 
 def _draw_cameras(axis: "Axes", poses: Floats, axes: Floats, color: str, label: str, marker: str) -> None:
-    """Draw places (N, 4, 4) from above, with a stroke where they look."""
+    """Draw cameras (N, 4, 4) from above, with their viewing directions."""
     if not len(poses):
         return
-    places, looks = poses[:, :3, 3] @ axes.T, poses[:, :3, 2] @ axes.T
+    centers, looks = poses[:, :3, 3] @ axes.T, poses[:, :3, 2] @ axes.T
     size, layer = (14, 1) if marker == "." else (90 if marker == "*" else 60 if marker == "s" else 28, 3)
-    face = "none" if marker == "s" else color  # what lies below stays visible
-    x, y = places.T
+    face = "none" if marker == "s" else color  # a hollow square does not hide a marker below
+    x, y = centers.T
     axis.scatter(x, y, s=size, facecolors=face, edgecolors=color, marker=marker, label=label, zorder=layer)
     axis.quiver(x, y, *looks.T, color=color, width=0.003, scale=18, headwidth=3, zorder=layer)
