@@ -132,7 +132,7 @@ class LightGlueMatcher(Remade):
         dtype, shape, expected = features.descriptors.dtype, features.descriptors.shape, _DESCRIPTOR_LENGTHS[self._kind]
         if dtype == np.uint8 or shape[1:] != (expected,):
             raise ToolkitError(
-                f"These weights of LightGlue are for {self._kind} features, unit vectors (N, {expected}); "
+                f"These weights of LightGlue expect descriptors of {self._kind}, (N, {expected}) unit vectors; "
                 f"found {dtype} {shape}. Use the matcher `mutual` with other features."
             )
 
