@@ -204,11 +204,6 @@ class _Pair:
     def file(self, suffix: str) -> Path:
         return self.stage.folders.out / f"{self.retrieval.stem}.{suffix}"
 
-    def is_current(self, record: dict[str, Any], maps: Sequence[Path]) -> bool:
-        """Tell whether the pair is localized, and the record and files of its maps are still there."""
-        maps_exist = self.map_record.exists() and None not in map(read_sidecar, maps)
-        return maps_exist and is_current(self.file("txt"), record)
-
     def remove_poses(self) -> None:
         """Remove the poses of an earlier run. The `.h5` file stays: from it they can be written again quickly."""
         for poses in (self.file("txt"), sidecar_path(self.file("txt")), self.file("csv")):
@@ -307,9 +302,12 @@ class _Stage(Remade):
         return attributes(self.settings, self.kinds, self.capture, pair.map_device, self.folders.retrieval)
 
     def is_current(self, pair: _Pair) -> bool:
-        """Tell whether the results of a pair are to be reused."""
-        maps = [self.folders.map / name for name in json.loads(self.attributes(pair)[MAPS])]
-        return self.skip_existing and pair.is_current(self.record(pair), maps)
+        """Tell whether to reuse the poses of a pair: they are current, and the files of its map still exist."""
+        if not self.skip_existing:
+            return False
+        record, maps = self.record(pair), [self.folders.map / name for name in json.loads(self.attributes(pair)[MAPS])]
+        maps_exist = pair.map_record.exists() and None not in map(read_sidecar, maps)
+        return maps_exist and is_current(pair.file("txt"), record)
 
     def open_map(self, device: str) -> tuple[Map, Localizer]:
         """Return the map of a device and its localizer; only the last map is kept."""
