@@ -965,7 +965,7 @@ def test_a_learned_embedder_is_given_colors(small_capture: Path, finished: tuple
     np.testing.assert_array_equal(localize_image(place, path, camera).world_from_rig, expected.world_from_rig)
     assert learned.seen[1] == (camera.height // 4, camera.width // 4, 3), "as the stage decodes it"
     place.embedders = [Learned(np.zeros(7, np.float32))]  # type: ignore[misc]
-    with pytest.raises(ArtifactError, match="learned gives 7"):
+    with pytest.raises(ArtifactError, match="expected 7 of learned"):
         localize_image(place, path, camera)
 
 

@@ -1,4 +1,4 @@
-"""The localize stage: references and local features in, one pose a query device out."""
+"""The localize stage: from references and local features to one pose per query device."""
 
 import json
 import logging
@@ -81,11 +81,11 @@ COLUMNS = [
     "references", "seconds", "focal_px", "reason",
 ]  # fmt: skip
 PREDICTION_COLUMNS = ["scale_std", "rejected"]
-"""Further columns of the methods that predict."""
+"""Additional columns of `feed_forward` and `hybrid`."""
 
 ESCALATION_COLUMNS = ["first_status", "first_seconds"]
-"""Further columns where kinds of features are asked only if the pose is not sure: status and seconds before that;
-empty: they were not asked."""
+"""Additional columns if `features.escalation` is set: status and seconds before the escalation features were used;
+empty for a query that did not need them."""
 
 
 @heals
@@ -103,11 +103,11 @@ def localize_pairs(
     skip_existing: bool = True,
     workers: int = 0,
 ) -> pd.DataFrame:
-    """Localize the queries of every pair of devices.
+    """Localize the queries of every pair of map device and query device.
 
-    Writes for each pair `<pair>.txt`, the poses; `<pair>.csv`, how each came about; and `<pair>.h5`, the
-    correspondences that each rests on (`localizers.correspondences`). Of each map, `<scene>_map_<device>.json` says
-    whether its poses are those of its images.
+    For each pair, writes the poses (`<pair>.txt`), a table with the status and quality of each (`<pair>.csv`), and the
+    correspondences that support each pose (`<pair>.h5`, see `localizers.correspondences`). For each map, writes
+    `<scene>_map_<device>.json`, which says whether the map's poses agree with its images.
 
     Args:
         sessions_root: `<capture>/sessions`.
@@ -115,32 +115,32 @@ def localize_pairs(
         out_dir: folder of the poses.
         features_dir: folder of local features, shared with the embed stage.
         map_dir: folder of the triangulated maps, `<device>_map.npz`, and of matches.
-        settings: see `LocalizeSettings`; a dict holds what differs from the defaults.
-        map_device, query_device: `ios`, `hl`, `spot`, or `all` that the capture has.
-        queries: the keyframe list that says which devices are asked for, or `all`.
-        skip_existing: reuse what was made from the same inputs and settings, and go on where a run was killed.
-        workers: threads; 0 takes the number of cores.
+        settings: see `LocalizeSettings`; a dict needs only the settings that differ from the defaults.
+        map_device, query_device: `ios`, `hl`, `spot`, or `all` devices of the capture.
+        queries: the keyframe list to localize, or `all`.
+        skip_existing: reuse results of the same inputs and settings, and resume a killed run.
+        workers: threads; 0: the number of cores.
 
     Returns:
-        One row a pair: map_device, query_device, queries = ok + low_confidence + failed, escalated (those that further
-        features were asked for), map_poses (`consistent` with the map's images, `inconsistent` or `unknown`), seconds,
-        skipped, path, reason. A pair that cannot be done has zeros and the `reason`.
+        One row per pair: map_device, query_device, queries = ok + low_confidence + failed, escalated (queries localized
+        again with the escalation features), map_poses (`consistent` with the map's images, `inconsistent` or
+        `unknown`), seconds, skipped, path, reason. A pair that cannot be localized has zeros and a `reason`.
 
     Raises:
         ManifestError: unknown method, predictor, features or matcher, or a number that is not positive.
-        WeightsError: the network has no weights, before any work is done.
-        CaptureError: unknown device; or no pair can be done, e.g. for want of the list.
-        ArtifactError: no pair can be done; of one, the retrieval is missing.
+        WeightsError: the network has no weights; raised before any work is done.
+        CaptureError: unknown device; or no pair can be localized, for example because the keyframe list is missing.
+        ArtifactError: no pair can be localized, and the retrieval file of one is missing.
     """
     settings = resolve_auto(LocalizeSettings.of(settings))
     folders = _Folders(*map(Path, (sessions_root, retrieval_dir, out_dir, features_dir, map_dir)))
     stage = _Stage(folders, settings, queries, skip_existing, workers or default_workers())
     capture = stage.capture
     table = PairRows(capture.name, folders.out, folders.retrieval)
-    asked: dict[str, list[pd.DataFrame]] = {}
+    query_tables: dict[str, list[pd.DataFrame]] = {}
     devices = capture.devices_with("map", map_device), capture.devices_with("query", query_device)
     next_map = dict(pairwise(devices[0]))
-    # Queries are the parallel dimension, and sums stay in one order.
+    # One BLAS thread: queries already run in parallel, and the order of sums stays fixed.
     with threadpool_limits(1, "blas"), ThreadPoolExecutor(1) as background:
         for mapped, queried in product(*devices):
             pair = _Pair(stage, mapped, queried)
@@ -148,35 +148,35 @@ def localize_pairs(
                 table.check_upstream()
                 started = time.perf_counter()
                 record = stage.record(pair)
-                about = stage.attributes(pair)
+                h5_attributes = stage.attributes(pair)
                 skipped = stage.is_current(pair)
                 unfinished = False
                 if not skipped:
                     run = stage.run(mapped, queried)
                     if mapped in next_map:
                         stage.build_ahead(background, next_map[mapped], devices[1])
-                    localized = run.localize(record, about)
-                    write_text(pair.about_map, json.dumps(run.place.record(), indent=1) + "\n")
+                    localized = run.localize(record, h5_attributes)
+                    write_text(pair.map_record, json.dumps(run.map.record(), indent=1) + "\n")
                     _write_poses(pair, localized, settings)
                     unfinished = any(map(_is_internal, localized))
-                if update_attributes(pair.file("h5"), about) or not skipped:
-                    files = pair.file("csv"), pair.file("h5"), pair.about_map
+                if update_attributes(pair.file("h5"), h5_attributes) or not skipped:
+                    files = pair.file("csv"), pair.file("h5"), pair.map_record
                     write_sidecar(pair.file("txt"), record, files, unfinished=unfinished)
                 rows = read_query_table(pair.file("csv"), ["status"])
-                asked.setdefault(queried, []).append(rows)
+                query_tables.setdefault(queried, []).append(rows)
                 counts = rows["status"].str.split(":").str[0].value_counts()
                 row |= {
                     "queries": int(counts.sum()),
                     **{status: int(counts.get(status, 0)) for status in ("ok", "low_confidence", "failed")},
                     "escalated": int(rows["first_status"].notna().sum()) if settings.features.escalation else 0,
-                    "map_poses": read_map_record(pair.about_map)["verdict"],
+                    "map_poses": read_map_record(pair.map_record)["verdict"],
                     "seconds": round(time.perf_counter() - started, 2),
                     "skipped": skipped,
                     "path": str(pair.file("txt")),
                 }
             if row["reason"]:
                 pair.remove_poses()
-    for queried, tables in asked.items():
+    for queried, tables in query_tables.items():
         for message in camera_messages(capture[f"{queried}_query"], tables):
             log.warning(message)
     frame = table.frame()
@@ -186,7 +186,7 @@ def localize_pairs(
 
 @dataclass(frozen=True)
 class _Pair:
-    """One map device x query device: where its files are, and which queries are asked."""
+    """One pair of map device and query device: its files and its queries."""
 
     stage: "_Stage"
     map_device: str
@@ -198,19 +198,14 @@ class _Pair:
         return self.stage.folders.retrieval / f"{name}.jsonl"
 
     @property
-    def about_map(self) -> Path:
+    def map_record(self) -> Path:
         return map_record_path(self.stage.folders.out, self.stage.capture.name, self.map_device)
 
     def file(self, suffix: str) -> Path:
         return self.stage.folders.out / f"{self.retrieval.stem}.{suffix}"
 
-    def is_current(self, record: dict[str, Any], maps: Sequence[Path]) -> bool:
-        """Tell whether the pair is done; its maps are part of what there is to see of it."""
-        there = self.about_map.exists() and None not in map(read_sidecar, maps)
-        return there and is_current(self.file("txt"), record)
-
     def remove_poses(self) -> None:
-        """Remove poses that an earlier run found; what they rest on is kept, and gives them again without work."""
+        """Remove the poses of an earlier run. The `.h5` file stays: from it they can be written again quickly."""
         for poses in (self.file("txt"), sidecar_path(self.file("txt")), self.file("csv")):
             poses.unlink(missing_ok=True)
 
@@ -224,7 +219,7 @@ class _Pair:
 
 
 class _Folders(NamedTuple):
-    """As `localize_pairs` is given them."""
+    """The folders given to `localize_pairs`."""
 
     sessions: Path
     retrieval: Path
@@ -234,7 +229,7 @@ class _Folders(NamedTuple):
 
 
 class _Stage(Remade):
-    """What all pairs share; a worker opens it once."""
+    """State shared by all pairs; each worker opens it once."""
 
     def __init__(
         self,
@@ -246,8 +241,12 @@ class _Stage(Remade):
         time_ns: int = 0,
         made_by: Mapping[str, Any] | None = None,
     ) -> None:
-        """See `localize_pairs`; `time_ns` tells a worker which maps it opened before others were made, and `made_by`
-        the `networks` of who asks."""
+        """
+        Args:
+            folders, settings, queries, skip_existing, workers: see `localize_pairs`.
+            time_ns: when the work was distributed, so that a worker does not reuse a stage that it opened earlier.
+            made_by: the `networks` of the main process; a worker must have the same.
+        """
         self.folders, self.settings, self.queries = folders, settings, queries
         self.skip_existing, self.workers = skip_existing, workers or default_workers()
         self.capture = Capture.from_sessions_root(folders.sessions)
@@ -259,11 +258,11 @@ class _Stage(Remade):
         self._ahead: dict[str, Future[tuple[Map, Localizer]]] = {}
 
     def record(self, pair: _Pair) -> dict[str, Any]:
-        """Return what the poses of a pair depend on."""
+        """Return everything that the poses of a pair depend on."""
         map_session, keyframes = self.capture[f"{pair.map_device}_map"], pair.keyframes
         settings, predictor = self.settings, self.predictor
         if not pair.retrieval.exists():
-            read_references(pair.retrieval)  # says what is missing
+            read_references(pair.retrieval)  # raises an error that names the missing file
         record: dict[str, Any] = {
             "method": settings.method,
             "pnp": settings.pnp.model_dump() | {"seed": settings.seed},
@@ -299,13 +298,16 @@ class _Stage(Remade):
         return record
 
     def attributes(self, pair: _Pair) -> dict[str, str]:
-        """Return the attributes of a pair's file of correspondences."""
+        """Return the attributes of a pair's `.h5` file."""
         return attributes(self.settings, self.kinds, self.capture, pair.map_device, self.folders.retrieval)
 
     def is_current(self, pair: _Pair) -> bool:
-        """Tell whether a pair is done and may be reused."""
-        maps = [self.folders.map / name for name in json.loads(self.attributes(pair)[MAPS])]
-        return self.skip_existing and pair.is_current(self.record(pair), maps)
+        """Tell whether to reuse the poses of a pair: they are current, and the files of its map still exist."""
+        if not self.skip_existing:
+            return False
+        record, maps = self.record(pair), [self.folders.map / name for name in json.loads(self.attributes(pair)[MAPS])]
+        maps_exist = pair.map_record.exists() and None not in map(read_sidecar, maps)
+        return maps_exist and is_current(pair.file("txt"), record)
 
     def open_map(self, device: str) -> tuple[Map, Localizer]:
         """Return the map of a device and its localizer; only the last map is kept."""
@@ -316,75 +318,75 @@ class _Stage(Remade):
         return self._opened[1:]
 
     def build_ahead(self, background: ThreadPoolExecutor, device: str, query_devices: Sequence[str]) -> None:
-        """Build a map in the background, as one thread does most of it and the queries of another map leave cores idle.
+        """Build the map of a device in the background: that takes one thread, and localizing leaves some cores idle.
 
-        A map in several tiles is not: it takes the memory that there is. Nor is one whose pairs are all done.
+        It does not build a map of several tiles, which needs the memory, nor a map whose pairs are all finished.
         """
         if device in self._ahead or self.settings.map is None or current_cluster() is not None:
             return
-        with suppress(ToolkitError):  # told when the turn of this pair comes
+        with suppress(ToolkitError):  # raised and reported when it is the turn of this pair
             one_tile = len(self.capture[f"{device}_map"].images) <= self.settings.map.tile_images
             if one_tile and not all(self.is_current(_Pair(self, device, query)) for query in query_devices):
                 self._ahead[device] = background.submit(self._open_map, device)
 
     def _open_map(self, device: str) -> tuple[Map, Localizer]:
         folders = self.folders
-        place = Map.build(
+        map_ = Map.build(
             self.capture, device, self.settings, self.kinds, folders.features, folders.map, self.workers,
             self.skip_existing, self.escalation,
         )  # fmt: skip
-        return place, create_localizer(self.settings, place, self.predictor)
+        return map_, create_localizer(self.settings, map_, self.predictor)
 
     def run(self, map_device: str, query_device: str) -> "_PairRun":
-        """Return the queries of a pair on their way."""
+        """Open the map of a pair and the features of its queries."""
         return _PairRun(_Pair(self, map_device, query_device), *self.open_map(map_device))
 
     @property
     def networks(self) -> dict[str, Any]:
-        """What poses depend on that the machine has a part in."""
+        """Settings of the networks, which depend on the machine, and on which the poses depend."""
         made_by = {kind.name: [kind.extractor.settings, kind.matcher.settings] for kind in self.kinds}
         return made_by if self.predictor is None else made_by | {self.predictor.name: self.predictor.settings}
 
     @cached_property
     def of_worker(self) -> Any:
-        """What a worker is to open: it uses what is there, with its own number of threads."""
+        """This stage for a worker, which reuses existing files and has its own number of threads."""
         return _Stage.elsewhere(self.folders, self.settings, self.queries, True, 0, time.time_ns(), self.networks)
 
 
 _Task = tuple[int, Query, list[References], Any, float]
-"""A query's number, the query, its references, what a network says of it, and the seconds that took."""
-_Done = tuple[str, int, dict[str, Any]]
-"""A query's group, its number, and its line of the table."""
+"""Number of a query, the query, its references, the prediction of a network, and the seconds which that took."""
+_Localized = tuple[str, int, dict[str, Any]]
+"""Group of a query in the `.h5` file, its number, and its table row."""
 
 
 class _PairRun:
-    """The queries of a pair on their way through a localizer."""
+    """Localizes the queries of one pair."""
 
-    def __init__(self, pair: _Pair, place: Map, localizer: Localizer) -> None:
-        self.pair, self.place, self.localizer, self.stage = pair, place, localizer, pair.stage
+    def __init__(self, pair: _Pair, map_: Map, localizer: Localizer) -> None:
+        self.pair, self.map, self.localizer, self.stage = pair, map_, localizer, pair.stage
         self.first = localizer.first if isinstance(localizer, EscalatingLocalizer) else localizer
-        """Of queries that are not escalated."""
+        """The localizer without escalation features."""
         keyframes = pair.keyframes
         self.keys = list(zip(keyframes["timestamp"].tolist(), keyframes["device_id"].tolist(), strict=True))
         self.rows = pair.session.rows_of_keyframes(keyframes)
-        """Of each query, the rows of its images."""
+        """For each query, the rows of its images."""
         index_of = {name: index for index, name in enumerate(localizer.image_names)}
         self.references = references_of_images(pair.retrieval, index_of)
-        """Of each query image, by timestamp and sensor."""
+        """References of each query image, by timestamp and sensor."""
         self.stores: list[FeatureStore] = []
         self.matches: list[MatchStore | None] = []
-        if place.settings.method != "feed_forward":
-            for kind in place.kinds:
+        if map_.settings.method != "feed_forward":
+            for kind in map_.kinds:
                 self._add_kind(kind, range(len(self.keys)))
 
     def _add_kind(self, kind: AnyMethod, numbers: Sequence[int]) -> None:
-        """Extract features of the images of queries, and match them with their references where that takes a network.
+        """Extract features of query images, and match them with their references if the matcher is a network.
 
-        Where the map has no points of the kind, the features of the references are extracted, too.
+        If the map has no features of this kind, also extract those of the references.
         """
-        session, place, stage = self.pair.session, self.place, self.stage
+        session, map_, stage = self.pair.session, self.map, self.stage
         rows = np.unique(np.concatenate([*(self.rows[number] for number in numbers), np.zeros(0, np.int64)]))
-        turns = place.turns_of(kind, session)
+        turns = map_.turns_of(kind, session)
         store = extract_session(session, stage.folders.features, kind.extractor, rows, stage.workers, turns=turns)
         images = session.images.iloc[rows]
         keys = zip(images["timestamp"].tolist(), images["sensor_id"].tolist(), strict=True)
@@ -394,55 +396,54 @@ class _PairRun:
             if key in self.references
             for index in self.references[key].images
         ]
-        of_map = next((mapped.features for mapped in place.mapped if mapped.name == kind.name), None)
-        if of_map is None:
+        map_features = next((mapped.features for mapped in map_.mapped if mapped.name == kind.name), None)
+        if map_features is None:
             references = dict.fromkeys(name for _, name in names)
-            of_map = place.on_demand(kind).prepare(references, stage.workers, stage.skip_existing)
+            map_features = map_.on_demand(kind).prepare(references, stage.workers, stage.skip_existing)
         matches = None
-        if isinstance(of_map, FeatureStore) and not isinstance(kind.matcher, MutualMatcher):
-            sessions = session.id, f"{place.device}_map"
-            stores = store, of_map
-            matches = match_sessions(stores, names, kind.matcher, place.map_dir, sessions, stage.skip_existing)
+        if isinstance(map_features, FeatureStore) and not isinstance(kind.matcher, MutualMatcher):
+            sessions = session.id, f"{map_.device}_map"
+            stores = store, map_features
+            matches = match_sessions(stores, names, kind.matcher, map_.map_dir, sessions, stage.skip_existing)
         self.stores.append(store)
         self.matches.append(matches)
 
     def query(self, number: int) -> tuple[Query, list[References]]:
-        """Return a query with the references of its images."""
-        # Local features were turned when they were extracted: only a network that predicts looks at the views.
-        turns = self.place.turns if self.place.settings.predicts else None
+        # Local features were extracted from upright images: only a predictor still needs the turns.
+        turns = self.map.turns if self.map.settings.predicts else None
         rows = self.rows[number]
         return stored_query(self.pair.session, rows, self.references, self.stores, self.matches, turns)
 
-    def localize(self, record: dict[str, Any], about: Mapping[str, str]) -> list[dict[str, Any]]:
-        """Localize the queries that a killed run has not; returns a row for each, in the list's order."""
+    def localize(self, record: dict[str, Any], h5_attributes: Mapping[str, str]) -> list[dict[str, Any]]:
+        """Localize the queries that are not in the file yet; return a row per query, in the keyframe list's order."""
         path = self.pair.file("h5")
         groups = [query_group(*key) for key in self.keys]
-        with GroupWriter(path, record, about) as writer:
+        with GroupWriter(path, record, h5_attributes) as writer:
             if not self.stage.skip_existing:
                 writer.discard()
             writer.drop_damaged()
-            numbers = {group: number for number, group in enumerate(groups)}  # a list may name a query twice
-            # Queries with a fault of the toolkit in them are left to do, and done again.
+            numbers = {group: number for number, group in enumerate(groups)}  # a keyframe list may repeat a query
+            # Queries that fail with an internal error get no row in the file, so the next run repeats them.
             todo = writer.spread(
                 _localize_share, _not_localized(writer, list(numbers.items())), (self.stage.of_worker, *self.devices),
                 self._label, "query", self.first.batch_size, _not_localized,
             )  # fmt: skip
-            again = self.localize_into(writer, todo)  # rows of queries that are not recorded as done
+            faulty = self.localize_into(writer, todo)
             if isinstance(self.localizer, EscalatingLocalizer):
                 rows = writer.notes()
-                done = [(group, number, rows[group]) for group, number in numbers.items() if group in rows]
-                again |= self._escalate(writer, done)
-            # From here until the new poses are there, a kill must not leave poses of one run with a file of another.
+                localized = [(group, number, rows[group]) for group, number in numbers.items() if group in rows]
+                faulty |= self._escalate(writer, localized)
+            # If the run is killed before it writes the new poses, no poses of an earlier run may lie beside this file.
             for poses in (self.pair.file("txt"), sidecar_path(self.pair.file("txt"))):
                 poses.unlink(missing_ok=True)
             writer.finish()
-            rows = writer.notes() | again
+            rows = writer.notes() | faulty
         images = self.pair.session.own_names(self.rows)
         return [rows[group] | {"image": image} for group, image in zip(groups, images, strict=True)]
 
     @property
     def devices(self) -> tuple[str, str]:
-        """Of map and queries."""
+        """Map device and query device."""
         return self.pair.map_device, self.pair.query_device
 
     @property
@@ -453,13 +454,13 @@ class _PairRun:
         """Localize queries, given by group and number, and add them to a file.
 
         Returns:
-            The rows of queries that have a fault of the toolkit in them, by group: they are not recorded as done.
+            The rows, by group, of queries that failed with an internal error; the file does not record them as done.
         """
-        again: dict[str, dict[str, Any]] = {}
+        faulty: dict[str, dict[str, Any]] = {}
         tasks = self._predicted(self.first, [number for _, number in todo])
         for number, row, localized in self._localized(self.first.localize, tasks, len(todo)):
-            self._add(writer, query_group(*self.keys[number]), row, localized, again)
-        return again
+            self._add(writer, query_group(*self.keys[number]), row, localized, faulty)
+        return faulty
 
     def _add(
         self,
@@ -467,23 +468,19 @@ class _PairRun:
         group: str,
         row: dict[str, Any],
         localized: LocalizedQuery,
-        again: dict[str, dict[str, Any]],
+        faulty: dict[str, dict[str, Any]],
     ) -> None:
-        """Record a query as done, unless a fault of the toolkit is in its row."""
+        """Record a query as done, unless it failed with an internal error."""
         if _is_internal(row):
-            again[group] = row
-        writer.add(group, arrays=localized.arrays(), note=None if group in again else row)
+            faulty[group] = row
+        writer.add(group, arrays=localized.arrays(), note=None if group in faulty else row)
 
-    def _escalate(self, writer: GroupWriter, done: Sequence[_Done]) -> dict[str, dict[str, Any]]:
-        """Ask with further features where the rows of queries tell that a pose is not sure.
-
-        Returns:
-            As `localize_into`.
-        """
-        limit = self.place.sure_position_std
+    def _escalate(self, writer: GroupWriter, localized: Sequence[_Localized]) -> dict[str, dict[str, Any]]:
+        """Localize queries without a sure pose again, with the escalation features; returns as `localize_into`."""
+        limit = self.map.sure_position_std
         todo = [
             (group, number, row)
-            for group, number, row in done
+            for group, number, row in localized
             if not (row.get("first_status") or row["misfit"] or is_sure(row["status"], row["position_std_m"], limit))
             and can_gain(*self.query(number))
         ]
@@ -492,59 +489,61 @@ class _PairRun:
         started = time.perf_counter()
         self.add_escalation(todo)
         shared = (time.perf_counter() - started) / len(todo)
-        others = self.stage.of_worker, *self.devices, shared
-        todo = writer.spread(_escalate_share, todo, others, self._label, "query", left=_not_escalated)
+        arguments = self.stage.of_worker, *self.devices, shared
+        todo = writer.spread(_escalate_share, todo, arguments, self._label, "query", left=_not_escalated)
         return self.escalate_into(writer, todo, shared)
 
-    def add_escalation(self, done: Sequence[_Done]) -> None:
-        """Extract and match the further kinds of features of queries."""
-        for kind in self.place.escalation:
-            self._add_kind(kind, [number for _, number, _ in done])
+    def add_escalation(self, localized: Sequence[_Localized]) -> None:
+        """Extract and match the escalation features of queries."""
+        for kind in self.map.escalation:
+            self._add_kind(kind, [number for _, number, _ in localized])
 
-    def escalate_into(self, writer: GroupWriter, done: Sequence[_Done], shared: float) -> dict[str, dict[str, Any]]:
-        """Localize queries with further features, which were extracted, and add those to a file that this helps.
+    def escalate_into(
+        self, writer: GroupWriter, first_results: Sequence[_Localized], shared: float
+    ) -> dict[str, dict[str, Any]]:
+        """Localize queries again with the escalation features, which are extracted; add the better results to a file.
 
         Args:
-            done: those without these features.
-            shared: seconds that their extraction took for each.
+            first_results: the queries with their rows before escalation.
+            shared: seconds per query that the extraction took.
 
         Returns:
             As `localize_into`.
         """
         assert isinstance(self.localizer, EscalatingLocalizer)
-        again: dict[str, dict[str, Any]] = {}
-        first = {number: (group, row) for group, number, row in done}
-        tasks = ((number, *self.query(number), None, shared) for number in first)
-        for number, row, localized in self._localized(self.localizer.escalate, tasks, len(done)):
-            group, before = first[number]
-            both = {
-                "first_status": before["status"],
-                "first_seconds": before["seconds"],
-                "seconds": round(before["seconds"] + row["seconds"], 4),
+        faulty: dict[str, dict[str, Any]] = {}
+        first_rows = {number: (group, row) for group, number, row in first_results}
+        tasks = ((number, *self.query(number), None, shared) for number in first_rows)
+        for number, row, localized in self._localized(self.localizer.escalate, tasks, len(first_results)):
+            group, first_row = first_rows[number]
+            history = {
+                "first_status": first_row["status"],
+                "first_seconds": first_row["seconds"],
+                "seconds": round(first_row["seconds"] + row["seconds"], 4),
             }
-            if _is_internal(row) or is_better(row["status"], before["status"]):
-                self._add(writer, group, row | both, localized, again)
+            if _is_internal(row) or is_better(row["status"], first_row["status"]):
+                self._add(writer, group, row | history, localized, faulty)
             else:
-                writer.annotate(group, before | both)
-        return again
+                writer.annotate(group, first_row | history)
+        return faulty
 
     def _localized(
         self, localize: Callable[..., PoseEstimate], tasks: Iterator[_Task], count: int
     ) -> Iterator[tuple[int, dict[str, Any], LocalizedQuery]]:
         """Yield queries with their rows and correspondences."""
-        answers = prefetch(partial(self._localize, localize), tasks, self.stage.workers)
-        return iter(tqdm(answers, total=count, desc=self._label, unit="query", disable=not count))
+        results = prefetch(partial(self._localize, localize), tasks, self.stage.workers)
+        return iter(tqdm(results, total=count, desc=self._label, unit="query", disable=not count))
 
     def _predicted(self, localizer: Localizer, numbers: Sequence[int]) -> Iterator[_Task]:
-        """Yield queries with what a network says of them, asked for some at a time, and the seconds that took."""
+        """Yield queries with the predictions of a network, which runs on batches of queries."""
         size = localizer.batch_size
-        parts = [numbers[start : start + size] for start in range(0, len(numbers), size)]
-        asked = ([self.query(number) for number in part] for part in [*parts, []])
-        for part, (queries, following) in zip(parts, pairwise(asked), strict=True):
+        batches = [numbers[start : start + size] for start in range(0, len(numbers), size)]
+        loaded = ([self.query(number) for number in batch] for batch in [*batches, []])
+        for batch, (queries, following) in zip(batches, pairwise(loaded), strict=True):
             started = time.perf_counter()
             predictions = localizer.predict(queries, following)
-            seconds = (time.perf_counter() - started) / len(part)
-            for number, query, prediction in zip(part, queries, predictions, strict=True):
+            seconds = (time.perf_counter() - started) / len(batch)
+            for number, query, prediction in zip(batch, queries, predictions, strict=True):
                 yield number, *query, prediction, seconds
 
     def _localize(
@@ -554,14 +553,14 @@ class _PairRun:
         started = time.perf_counter() - seconds
         try:
             if query.views:
-                estimate = self.place.judged(localize(query, references, prediction))
+                estimate = self.map.judged(localize(query, references, prediction))
             else:
                 estimate = PoseEstimate("failed: no images of this device at this time")
         except Exception as error:  # one bad query never ends a run
             estimate = PoseEstimate(f"failed: {reason_of(error, f'localizing {query.views[0].name}')}")
         localized = localized_query(query, estimate, self.localizer.image_names)
         found_by = "" if estimate.world_from_rig is None else estimate.found_by
-        row = _row(self.keys[number], estimate, localized, label(self.place.settings, found_by), started)
+        row = _row(self.keys[number], estimate, localized, label(self.map.settings, found_by), started)
         return number, row, localized
 
 
@@ -572,23 +571,23 @@ def _localize_share(
 
 
 def _not_localized(writer: GroupWriter, todo: Sequence[tuple[str, int]]) -> list[tuple[str, int]]:
-    """Return those of some queries that a file has no row of."""
+    """Return the queries without a row in the file."""
     rows = writer.notes()
     return [item for item in todo if item[0] not in rows]
 
 
 def _escalate_share(
-    writer: GroupWriter, done: Sequence[_Done], stage: _Stage, map_device: str, query_device: str, shared: float
+    writer: GroupWriter, todo: Sequence[_Localized], stage: _Stage, map_device: str, query_device: str, shared: float
 ) -> None:
     run = stage.run(map_device, query_device)
-    run.add_escalation(done)
-    run.escalate_into(writer, done, shared)
+    run.add_escalation(todo)
+    run.escalate_into(writer, todo, shared)
 
 
-def _not_escalated(writer: GroupWriter, done: Sequence[_Done]) -> list[_Done]:
-    """Return those of some queries that a file has no row of that tells of an escalation."""
+def _not_escalated(writer: GroupWriter, todo: Sequence[_Localized]) -> list[_Localized]:
+    """Return the queries whose row in the file does not record an escalation."""
     rows = writer.notes()
-    return [item for item in done if not rows.get(item[0], {}).get("first_status")]
+    return [item for item in todo if not rows.get(item[0], {}).get("first_status")]
 
 
 def _is_internal(row: Mapping[str, Any]) -> bool:
@@ -598,7 +597,7 @@ def _is_internal(row: Mapping[str, Any]) -> bool:
 def _row(
     key: tuple[int, str], estimate: PoseEstimate, localized: LocalizedQuery, method: str, started: float
 ) -> dict[str, Any]:
-    """Return a query's line of the table, with its pose and covariance as JSON."""
+    """Return the table row of a query, with its pose and covariance as lists for JSON."""
     pose = None if estimate.world_from_rig is None else geometry.qt_from_pose(estimate.world_from_rig).tolist()
     covariance = None if estimate.covariance is None else estimate.covariance.ravel().tolist()
     focals = estimate.focals_px if np.isfinite(estimate.focals_px).any() else ()
@@ -633,7 +632,7 @@ def _row(
 
 
 def _write_poses(pair: _Pair, rows: list[dict[str, Any]], settings: LocalizeSettings) -> None:
-    """Write the table and the poses of a pair, the poses last: they stand for a finished pair."""
+    """Write the table and the poses of a pair; the poses last, because their file marks the pair as finished."""
     columns = [*COLUMNS, *(PREDICTION_COLUMNS if settings.predicts else [])]
     columns += ESCALATION_COLUMNS if settings.features.escalation else []
     with write_atomic(pair.file("csv")) as temporary:
@@ -661,22 +660,22 @@ def explain_query(
     queries: str = "keyframes_pruned_subsampled",
     index: int = 0,
 ) -> tuple[FeedForwardLocalizer, Query, FeedForwardAnswer]:
-    """Ask the predictor about one query again, and return all that it says.
+    """Run the predictor on one query again, and return its full output, as `draw_prediction` takes it.
 
     Args:
-        sessions_root, retrieval_dir, features_dir, map_dir, settings, queries: as `localize_pairs` had them.
+        sessions_root, retrieval_dir, features_dir, map_dir, settings, queries: as given to `localize_pairs`.
         map_device, query_device: the pair.
-        index: which of the queries.
+        index: index of the query in the keyframe list.
 
     Returns:
-        The localizer, the query as it was asked, and its answer: what `draw_prediction` takes.
+        The localizer, the query, and the localizer's full output for it.
 
     Raises:
-        ToolkitError: the method asks no network.
-        ArtifactError: the retrieval is missing.
+        ToolkitError: the method does not use a predictor.
+        ArtifactError: the retrieval file is missing.
     """
     if not settings.predicts:
-        raise ToolkitError(f"The method {settings.method} asks no network. Use feed_forward or hybrid.")
+        raise ToolkitError(f"The method {settings.method} does not use a predictor. Use feed_forward or hybrid.")
     settings = resolve_auto(LocalizeSettings.of(settings, {"method": "feed_forward"}))
     folders = _Folders(*map(Path, (sessions_root, retrieval_dir, retrieval_dir, features_dir, map_dir)))
     run = _Stage(folders, settings, queries, skip_existing=True, workers=1).run(map_device, query_device)

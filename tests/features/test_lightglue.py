@@ -141,8 +141,8 @@ def test_pairs_do_not_depend_on_each_other(
     ]
     pairs += [(pairs[0][0], pairs[2][1]), (pairs[0][0], pairs[0][0]), pairs[0]]  # images that are in several pairs
     alone = [matcher.match([pair])[0] for pair in pairs]
-    assert matcher._alone
-    monkeypatch.setattr(matcher, "_alone", by_itself)
+    assert matcher._one_by_one
+    monkeypatch.setattr(matcher, "_one_by_one", by_itself)
     together = matcher.match(pairs)
     assert sum(len(found) > 0 for found in together) >= 8
     for found, expected in zip(together, alone, strict=True):
@@ -164,7 +164,7 @@ def test_what_does_not_fit_is_halved(
     state: State, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     matcher = LightGlueMatcher(state, device="cpu", dtype="float32", batch_size=4)
-    monkeypatch.setattr(matcher, "_alone", False)
+    monkeypatch.setattr(matcher, "_one_by_one", False)
     pairs = [(features(k, 20 + k), features(k + 1, 40 - k)) for k in range(5)]
     expected = matcher.match(pairs)
     assign = matcher._model._assign

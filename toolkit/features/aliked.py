@@ -14,7 +14,7 @@ from toolkit.models.weights import ALIKED, given_or_resolved
 
 
 class AlikedExtractor(NetworkExtractor):
-    """Extracts ALIKED features: keypoints between pixels, unit descriptors (128,), on any device."""
+    """Extracts ALIKED features: keypoints with subpixel positions, unit descriptors (128,), on any device."""
 
     color = True
     name = "aliked"

@@ -27,11 +27,11 @@ _BATCH_ELSEWHERE = 32
 class LightGlueMatcher(Remade):
     """Matches pairs of images of any sizes, with any numbers of learned features, in batches, on any device.
 
-    Every pair goes through all layers with all its features. The network could stop early or drop features where it
-    is confident. Its authors advise against that where accuracy counts.
+    Every pair goes through all layers with all its features. LightGlue can also stop early or drop features when it is
+    confident, but its authors advise against this where accuracy counts.
 
-    On a CPU each thread matches pairs by itself: the matches of a pair do not depend on the others. Elsewhere rounding
-    depends on them.
+    On a CPU, each thread matches one pair at a time, so its matches do not depend on the other pairs. On other devices,
+    rounding depends on the batch.
     """
 
     def __init__(
@@ -45,19 +45,19 @@ class LightGlueMatcher(Remade):
     ) -> None:
         """
         Args:
-            checkpoint: an official file of the authors or of the hub, or its tensors by name; None: from an installed
-                package or a cache, else downloaded.
+            checkpoint: an official file of the authors or of the hub, or its tensors by name; None: take it from an
+                installed package or a cache, or download it.
             device: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
-            dtype: of the matrix products of the layers: `float32`, `bfloat16`, `float16`; `auto`: the fastest on the
-                device. Positions and the assignment are always float32.
-            batch_size: most pairs at a time; None: as suits the device.
-            min_score: least confidence of a match, from 0 to 1.
+            dtype: precision of the layers' matrix products: `float32`, `bfloat16`, `float16`; `auto`: the fastest on
+                the device. Positions and the assignment are always computed in float32.
+            batch_size: largest number of pairs per batch; None: depends on the device.
+            min_score: smallest confidence of a match, from 0 to 1.
             features: kind of the features, `superpoint` or `aliked`.
 
         Raises:
-            WeightsError: no weights, or other ones.
-            ManifestError: no such device, precision, confidence or kind.
-            ToolkitError: no such device on this machine.
+            WeightsError: the weights are missing, or are those of another network.
+            ManifestError: unknown device, precision or kind, or a confidence out of range.
+            ToolkitError: this machine does not have the device.
         """
         if not 0 <= min_score <= 1:
             raise ManifestError(f"lightglue: min_score is {min_score}; expected a confidence from 0 to 1.")
@@ -68,11 +68,11 @@ class LightGlueMatcher(Remade):
         self._device = resolve_device(device)
         self._dtype = precision_of_matches(dtype, self._device)
         self.batch_size = batch_size or _BATCH.get(self._device.type, _BATCH_ELSEWHERE)
-        self._alone = self._device.type == "cpu"
+        self._one_by_one = self._device.type == "cpu"
         source = MATCHER_WEIGHTS["lightglue", features]
         with torch.device("meta"):
             model = LightGlue(_DESCRIPTOR_LENGTHS[features])
-        # The hub's file has a copy of SuperPoint, and the authors' newer code stores thresholds of early stopping.
+        # The hub's file contains a copy of SuperPoint; the authors' newer code stores thresholds for early stopping.
         ignore = ("keypoint_detector.", "confidence_thresholds")
         load_checkpoint(model, given_or_resolved(source, checkpoint), source.model, ignore, official_names)
         self._weights = weights_digest(model)
@@ -91,7 +91,7 @@ class LightGlueMatcher(Remade):
     def match(self, pairs: Sequence[tuple[LocalFeatures, LocalFeatures]]) -> list[PairMatches]:
         """Return the matches of pairs of images, in the order of the first image's features.
 
-        An image that is in several pairs, as the same object, goes through the first half of the first layer once.
+        If several pairs share an image (the same object), it goes through the first half of the first layer only once.
 
         Raises:
             ToolkitError: features of another kind; a confidence is not finite; or not even one pair fits the
@@ -100,27 +100,27 @@ class LightGlueMatcher(Remade):
         for features in (features for pair in pairs for features in pair):
             self._check(features)
         matches = [PairMatches.none() for _ in pairs]
-        # Pairs with similar numbers of features go together, as all are padded to the largest. The largest come first,
-        # so that a batch that does not fit the memory shows at once.
+        # Pairs with similar numbers of features form a batch, as all are padded to the largest. The largest come first,
+        # so that a batch that does not fit the memory fails at the start.
         sizes = [-max(len(a), len(b)) for a, b in pairs]
         order = [number for number in np.argsort(sizes, kind="stable") if all(map(len, pairs[number]))]
         uses = Counter(id(features) for number in order for features in pairs[number])
         encoded: dict[int, Tensor] = {}
         with torch.inference_mode():
             for start in range(0, len(order), self.batch_size):
-                part = order[start : start + self.batch_size]
-                images = [features for number in part for features in pairs[number]]
+                batch = order[start : start + self.batch_size]
+                images = [features for number in batch for features in pairs[number]]
                 self._encode_new(images, encoded)
                 states = [encoded[id(features)] for features in images]
-                for number, result in zip(part, self._match(states), strict=True):
+                for number, result in zip(batch, self._match(states), strict=True):
                     matches[number] = _unpack(result.cpu().numpy())
                 uses.subtract(map(id, images))
                 encoded = {key: value for key, value in encoded.items() if uses[key]}
         return matches
 
     def _match(self, states: Sequence[Tensor]) -> Iterable[Tensor]:
-        """Return what `_forward` finds for pairs of images that follow each other, of what `_encode` makes of them."""
-        if not self._alone:
+        """Return the output of `_forward` for consecutive pairs of images, given by their output of `_encode`."""
+        if not self._one_by_one:
             return self._fitting_pairs(pad_sequence(list(states), batch_first=True).unflatten(0, (-1, 2)))
         return in_single_threads(self._match_one, zip(states[::2], states[1::2], strict=True))
 
@@ -132,14 +132,14 @@ class LightGlueMatcher(Remade):
         dtype, shape, expected = features.descriptors.dtype, features.descriptors.shape, _DESCRIPTOR_LENGTHS[self._kind]
         if dtype == np.uint8 or shape[1:] != (expected,):
             raise ToolkitError(
-                f"These weights of LightGlue are for features of the kind {self._kind}, (N, {expected}) unit vectors; "
+                f"These weights of LightGlue expect descriptors of {self._kind}, (N, {expected}) unit vectors; "
                 f"found {dtype} {shape}. Use the matcher `mutual` with other features."
             )
 
     def _encode_new(self, images: Sequence[LocalFeatures], encoded: dict[int, Tensor]) -> None:
-        """Add, for images that `encoded` lacks, what `_forward` takes, (N, 2 + DIM + 1), by the object's id."""
+        """Add the missing images to `encoded`: by the id of the object, the input (N, 2 + DIM + 1) of `_forward`."""
         new = list({id(features): features for features in images if id(features) not in encoded}.values())
-        if self._alone:
+        if self._one_by_one:
             packed = [torch.from_numpy(_pack(features))[None] for features in new]
             for features, rows in zip(new, in_single_threads(self._encode, packed), strict=True):
                 encoded[id(features)] = rows[0]
@@ -152,17 +152,17 @@ class LightGlueMatcher(Remade):
                 encoded[id(features)] = rows[: len(features)]
 
     def _encode(self, batch: Tensor) -> Tensor:
-        """Return images (B, N, 2 + D + 1), see `_pack`, with what the network makes of descriptors in their place."""
+        """Replace the descriptors of images (B, N, 2 + D + 1), see `_pack`, by the network's initial states."""
         xy, mask = batch[..., :2], _mask(batch)
         states = self._model.encode(xy, batch[..., 2:-1], mask)
         return torch.cat([xy, states, batch[..., -1:]], dim=-1)
 
     def _forward(self, batch: Tensor) -> Tensor:
-        """Return for each feature of the first image its partner, -1 for none, and the confidence, (B, N, 2).
+        """Return for each feature of the first image its partner (-1: none) and the confidence, (B, N, 2).
 
         Args:
-            batch: (B, 2, N, 2 + DIM + 1), of each image the normalized x y, the state of the network, and 1; rows of
-                zeros pad it to N.
+            batch: (B, 2, N, 2 + DIM + 1): for each image of a pair the normalized x y, the state of the network, and 1;
+                padded with rows of zeros.
         """
         return self._forward_pairs(*batch.unbind(1))
 
@@ -173,25 +173,25 @@ class LightGlueMatcher(Remade):
 
 
 def _mask(images: Tensor) -> Tensor | None:
-    """Return which rows of images (B, N, ... + 1) are real, (B, N); None: all."""
+    """Return which rows of images (B, N, ... + 1) are features, not padding, (B, N); None: all."""
     real = images[..., -1].bool()
     return None if bool(real.all()) else real
 
 
 def _pack(features: LocalFeatures) -> NDArray[np.float32]:
     """Return the features of an image as `_encode` takes them, (N, 2 + D + 1): normalized x y, descriptor, and 1."""
-    features = features.turned(features.turns)  # as upright as the network knows images
+    features = features.turned(features.turns)  # the network was trained on upright images
     size = np.array(features.image_size, np.float32)
-    # As in training: pixel centers at whole numbers, the longer side from -1 to 1.
+    # As in training: pixel centers at integers, the longer side from -1 to 1.
     xy = (features.keypoints - 0.5 - size / 2) / (size.max() / 2)
     return np.concatenate([xy, features.descriptors, np.ones((len(xy), 1))], axis=1, dtype=np.float32)
 
 
 def _unpack(result: NDArray[np.float32]) -> PairMatches:
-    """Return the matches in one pair's part of what `_forward` returns."""
+    """Return the matches of one pair, from its output (N, 2) of `_forward`."""
     if not np.isfinite(result).all():
         raise ToolkitError(
-            "LightGlue gave a confidence that is not finite. Its weights may hold NaN: compare the file with the "
+            "LightGlue gave a confidence that is not finite. Its weights may contain NaN: compare the file with the "
             "official one. With float16, numbers may have been too large: use bfloat16 or float32."
         )
     partners = result[:, 0].astype(np.int64)

@@ -1,4 +1,4 @@
-"""Match local features between images: mutual nearest neighbors, networks, and along epipolar lines."""
+"""Match local features between images: mutual nearest neighbors, networks, or along epipolar lines."""
 
 import logging
 from collections.abc import Sequence
@@ -42,9 +42,9 @@ class PairMatches:
     """K matches of the features of two images."""
 
     indices: Ints
-    """(K, 2) indices of the first image's features and of the second's; no feature is matched twice."""
+    """(K, 2) index of the first image's feature, index of the second's; no feature is matched twice."""
     scores: NDArray[np.float32]
-    """(K,) larger is better: cosine similarity of the descriptors, or the confidence of a network."""
+    """(K,) cosine similarity of the descriptors, or confidence of a network; larger is better."""
 
     @classmethod
     def none(cls) -> "PairMatches":
@@ -55,14 +55,14 @@ class PairMatches:
 
 
 class Matcher(Protocol):
-    """What matches the features of images without known poses."""
+    """Matches the features of images without known poses."""
 
     batch_size: int
-    """The number of pairs in a call that is quickest."""
+    """The fastest number of pairs per call."""
 
     @property
     def settings(self) -> dict[str, Any]:
-        """All that the matches depend on besides the features, `name` first; part of their fingerprint."""
+        """Everything that the matches depend on besides the features, `name` first; part of their fingerprint."""
 
     def match(self, pairs: Sequence[tuple[LocalFeatures, LocalFeatures]]) -> list[PairMatches]:
         """Return the matches of pairs of images."""
@@ -72,12 +72,12 @@ MATCHERS: dict[str, str] = {
     "mutual": "toolkit.features.matching:MutualMatcher",
     "lightglue": "toolkit.features.lightglue:LightGlueMatcher",
 }
-"""Name of a matcher -> `module:callable` that makes it, imported when it is needed."""
+"""Name of a matcher -> `module:callable` that makes it; imported when needed."""
 MATCHER_WEIGHTS: dict[tuple[str, str], WeightsSource] = {
     ("lightglue", "superpoint"): LIGHTGLUE,
     ("lightglue", "aliked"): ALIKED_LIGHTGLUE,
 }
-"""The weights of the matchers that need some, by matcher and kind of features."""
+"""Weights of the matchers that are networks, by matcher and kind of features."""
 
 
 def create_matcher(name: str, **options: Any) -> Matcher:
@@ -85,8 +85,8 @@ def create_matcher(name: str, **options: Any) -> Matcher:
 
     Args:
         name: a key of `MATCHERS`.
-        options: arguments of the matcher: `ratio` and `min_score` of `mutual`; `checkpoint`, `device`, `dtype`,
-            `features` and others of a network.
+        options: arguments of the matcher: `ratio` and `min_score` for `mutual`; `checkpoint`, `device`, `dtype`,
+            `features` and others for a network.
 
     Raises:
         ManifestError: unknown matcher.
@@ -99,7 +99,7 @@ def create_matcher(name: str, **options: Any) -> Matcher:
 
 
 def matchers_of(features: Sequence[str], matcher: str | None = None) -> dict[str, str]:
-    """Return the matcher of each kind of features.
+    """Return the matcher of each kind of features: `matcher` if it suits the kind, else the default of the kind.
 
     Raises:
         ManifestError: unknown features, or a matcher that suits none of them.
@@ -107,14 +107,14 @@ def matchers_of(features: Sequence[str], matcher: str | None = None) -> dict[str
     suited = {name: feature_kind(name).matchers for name in features}
     if matcher is not None and matcher not in MATCHERS:
         raise ManifestError(f"Unknown matcher {matcher!r}. {nearest(matcher, MATCHERS)}")
-    if matcher is not None and not any(matcher in known for known in suited.values()):
-        text = "; ".join(f"{name}: {', '.join(known)}" for name, known in suited.items())
+    if matcher is not None and not any(matcher in matchers for matchers in suited.values()):
+        text = "; ".join(f"{name}: {', '.join(matchers)}" for name, matchers in suited.items())
         raise ManifestError(f"The matcher {matcher!r} suits none of the features. Known for {text}.")
-    return {name: matcher if matcher in known else known[0] for name, known in suited.items()}
+    return {name: matcher if matcher in matchers else matchers[0] for name, matchers in suited.items()}
 
 
 def local_weights(settings: LocalizeSettings | RerankSettings) -> list[tuple[WeightsSource, str | None]]:
-    """Return the weights that extractors and matchers of these settings need, and the file that is given for them.
+    """Return the weights that the extractors and matchers of these settings need, and the checkpoint given for each.
 
     Args:
         settings: of the stage, `auto` resolved.
@@ -137,7 +137,7 @@ StageSettings = TypeVar("StageSettings", LocalizeSettings, RerankSettings)
 
 
 def resolve_auto(settings: StageSettings) -> StageSettings:
-    """Return the settings with the kinds of features that `auto` means on this machine; to rerank, it is SIFT."""
+    """Return the settings with `auto` replaced by kinds of features for this machine; for reranking, it means SIFT."""
     if settings.features.kinds != [AUTO]:
         return settings
     kinds = {"kinds": ["sift"]} if isinstance(settings, RerankSettings) else _auto_kinds(settings)
@@ -157,7 +157,7 @@ def _auto_kinds(settings: LocalizeSettings | RerankSettings) -> dict[str, list[s
 
 
 def weights_files(settings: LocalizeSettings) -> list[Path]:
-    """Return the files of all weights that these settings need, downloaded where they are not on the machine.
+    """Return the files of all weights that these settings need; download missing ones.
 
     Raises:
         WeightsError: a download failed.
@@ -166,7 +166,7 @@ def weights_files(settings: LocalizeSettings) -> list[Path]:
 
 
 class MutualMatcher:
-    """Matches mutual nearest neighbors that pass Lowe's ratio test, of any descriptors; see `mutual_matches`."""
+    """Matches mutual nearest neighbors that pass Lowe's ratio test, for any descriptors; see `mutual_matches`."""
 
     batch_size = 1
 
@@ -179,11 +179,11 @@ class MutualMatcher:
         return {"name": "mutual", "ratio": self.ratio, "min_score": self.min_score}
 
     def match(self, pairs: Sequence[tuple[LocalFeatures, LocalFeatures]]) -> list[PairMatches]:
-        """Return the matches of pairs of images; the ratio test is of the first image's features."""
-        matches, first, unit_a = [], None, np.zeros((0, 0), np.float32)
+        """Return the matches of pairs of images; the ratio test applies to the first image's features."""
+        matches, previous, unit_a = [], None, np.zeros((0, 0), np.float32)
         for a, b in pairs:
-            if a is not first:  # mostly one image is matched with several
-                first, unit_a = a, unit_descriptors(a.descriptors)
+            if a is not previous:  # usually one image is matched with several
+                previous, unit_a = a, unit_descriptors(a.descriptors)
             scores = unit_a @ unit_descriptors(b.descriptors).T
             indices = mutual_matches(scores, self.ratio, self.min_score)
             matches.append(PairMatches(indices, scores[indices[:, 0], indices[:, 1]]))
@@ -192,7 +192,7 @@ class MutualMatcher:
 
 @dataclass(frozen=True)
 class LocalMethod:
-    """One kind of local features, with what extracts and matches them."""
+    """One kind of local features, with its extractor and matcher."""
 
     name: str
     """A key of `KINDS`."""
@@ -201,7 +201,7 @@ class LocalMethod:
 
 
 class DeferredMethod:
-    """A `LocalMethod` whose networks are loaded when they are first asked for, which may be never."""
+    """A `LocalMethod` whose networks are loaded at the first use."""
 
     def __init__(self, settings: LocalizeSettings, name: str) -> None:
         self.name = name
@@ -224,7 +224,7 @@ class DeferredMethod:
 def create_local_methods(
     settings: LocalizeSettings | RerankSettings, kinds: Sequence[str] | None = None
 ) -> list[LocalMethod]:
-    """Return kinds of local features, with their networks ready; `mutual` takes the limits of the kind.
+    """Return kinds of local features with extractors and matchers ready; `mutual` uses the limits of the kind.
 
     Args:
         settings: of the stage, `auto` resolved.
@@ -257,18 +257,18 @@ AnyMethod = LocalMethod | DeferredMethod
 
 
 def unit_descriptors(descriptors: Descriptors) -> NDArray[np.float32]:
-    """Return descriptors (N, D) of `LocalFeatures` as float32 of length about 1, ready for dot products."""
+    """Return the descriptors (N, D) of `LocalFeatures` as float32 vectors of length about 1."""
     unit = descriptors.astype(np.float32, copy=False)
     return unit * np.float32(1.0 / DESCRIPTOR_SCALE) if descriptors.dtype == np.uint8 else unit
 
 
 def mutual_matches(scores: NDArray[np.float32], ratio: float = 0.8, min_score: float = -1.0) -> Ints:
-    """Return mutual nearest neighbors whose rows pass Lowe's ratio test, (K, 2) indices of rows and columns.
+    """Return mutual nearest neighbors whose rows pass Lowe's ratio test: indices (K, 2) of rows and columns.
 
     Args:
-        scores: (N, M) cosine similarities; less than -1 where geometry excludes a match.
-        ratio: the nearest must be closer than `ratio` times the second nearest, as Euclidean distance.
-        min_score: least cosine similarity of a match.
+        scores: (N, M) cosine similarities; less than -1 for pairs that geometry excludes.
+        ratio: the Euclidean distance of the nearest neighbor must be below `ratio` times that of the second nearest.
+        min_score: smallest cosine similarity of a match.
     """
     n, m = scores.shape
     if n == 0 or m == 0:
@@ -279,13 +279,13 @@ def mutual_matches(scores: NDArray[np.float32], ratio: float = 0.8, min_score: f
     # |a - b|^2 = 2 - 2 a.b for unit vectors
     keep = np.flatnonzero(((1.0 - top) < ratio**2 * (1.0 - second)) & (top > min_score))
     keep = keep[top[keep] == scores.max(axis=0)[best[keep]]]
-    # Of rows that are equally near to a column, the first.
+    # If several rows are equally near to a column, keep the first.
     keep = keep[np.sort(np.unique(best[keep], return_index=True)[1])]
     return np.stack([keep, best[keep]], axis=1)
 
 
 def _two_best(scores: NDArray[np.float32]) -> tuple[Ints, NDArray[np.float32]]:
-    """Return the best column of each row, (N,), and the second best score, (N,), -1 where there is none."""
+    """Return the best column (N,) and the second best score (N,) of each row; the score is -1 if there is none."""
     best = np.argmax(scores, axis=1)
     if scores.shape[1] == 1:
         return best, np.full(len(scores), -1.0, np.float32)
@@ -308,20 +308,20 @@ def match_along_epipolar_lines(
     ratio: float = 0.9,
     min_score: float = 0.6,
 ) -> Ints:
-    """Return the matches of two images of known poses, (K, 2) indices; none where the cameras share one place.
+    """Return the matches of two images with known poses, indices (K, 2); none if there is no baseline.
 
-    Only features that can show the same point are compared.
-    Each ray lies in an epipolar half-plane, which the baseline bounds. Two rays can meet only if they share it, so rays
-    are sorted by the angle of their half-planes and compared only with their neighbors in that order: some hundredths
-    of all pairs. It works on rays, so for every central camera model.
+    Only features that can show the same point are compared. Each ray lies in an epipolar half-plane, which is bounded
+    by the baseline. Two rays can meet only in a common half-plane. So the rays are sorted by the angle of their
+    half-planes, and compared only with their neighbors in this order, a few percent of all pairs. Working on rays, this
+    applies to any central camera model.
 
     Args:
         descriptors_a, descriptors_b: (N, D), (M, D) unit descriptors.
         rays_a, rays_b: (N, 3), (M, 3) unit rays in the cameras' frames.
         b_from_a: (4, 4) relative pose, meters.
-        max_angle_a, max_angle_b: largest angle of a ray to the other's epipolar plane, radians.
-        ratio: the nearest must be closer than `ratio` times the second nearest of the candidates.
-        min_score: least cosine similarity of a match.
+        max_angle_a, max_angle_b: largest angle between a ray and the other ray's epipolar plane, radians.
+        ratio: Lowe's ratio among the candidates, see `mutual_matches`.
+        min_score: smallest cosine similarity of a match.
     """
     baseline = np.linalg.norm(b_from_a[:3, 3])
     if baseline < 1e-6 or not len(rays_a) or not len(rays_b):
@@ -329,7 +329,7 @@ def match_along_epipolar_lines(
     axis = b_from_a[:3, 3] / baseline  # from b toward a, in b
     turn_a, elevation_a = _about_axis(rays_a @ b_from_a[:3, :3].T, axis)
     turn_b, elevation_b = _about_axis(rays_b, axis)
-    # The same error across the plane is a larger turn close to the epipole.
+    # The same distance from the plane is a larger turn close to the epipole.
     reach_a = np.arcsin(np.minimum(max_angle_a / np.maximum(np.sin(elevation_a), 1e-9), 1.0))
     reach_b = np.arcsin(np.minimum(max_angle_b / np.maximum(np.sin(elevation_b), 1e-9), 1.0))
     order_a = np.argsort(turn_a, kind="stable")
@@ -340,7 +340,7 @@ def match_along_epipolar_lines(
         for order, values in ((order_a, (turn_a, reach_a, elevation_a)), (order_b, (turn_b, reach_b, elevation_b)))
     )
     descriptors_a, descriptors_b = descriptors_a[order_a], descriptors_b[order_b]
-    # Turns wrap around: b's are repeated three times so that every window is one slice.
+    # Turns wrap around, so b's are repeated three times: then every window is one slice.
     wrapped = np.concatenate([turns_b - 2 * np.pi, turns_b, turns_b + 2 * np.pi], dtype=np.float32)
     row_best = np.full(len(rays_a), -1, np.int64)
     column_best = np.full(m, -1, np.int64)
@@ -350,19 +350,19 @@ def match_along_epipolar_lines(
         rows = slice(start, start + 128)
         low = np.searchsorted(wrapped, (turns_a[rows] - reach_a[rows]).min())
         high = np.searchsorted(wrapped, (turns_a[rows] + reach_a[rows]).max())
-        whole = high - low > m
-        if whole:
+        full_circle = high - low > m
+        if full_circle:
             low, high = m, 2 * m
         if high <= low:
             continue
-        inside = low // m == (high - 1) // m
-        columns: slice | Ints = slice(low % m, low % m + high - low) if inside else np.arange(low, high) % m
-        apart = np.abs(turns_a[rows, None] - wrapped[low:high])
-        if whole:
-            apart = np.minimum(apart, np.float32(2 * np.pi) - apart)
-        # In their half-plane the rays meet in front of both cameras only if b's is nearer to the axis.
-        excluded = apart >= reach_a[rows, None]
-        excluded |= apart >= reach_b[columns]
+        contiguous = low // m == (high - 1) // m
+        columns: slice | Ints = slice(low % m, low % m + high - low) if contiguous else np.arange(low, high) % m
+        difference = np.abs(turns_a[rows, None] - wrapped[low:high])
+        if full_circle:
+            difference = np.minimum(difference, np.float32(2 * np.pi) - difference)
+        excluded = difference >= reach_a[rows, None]
+        excluded |= difference >= reach_b[columns]
+        # In a half-plane, the rays meet in front of both cameras only if b's ray is nearer to the axis.
         excluded |= near_b[columns] >= near_a[rows, None]
         scores = descriptors_a[rows] @ descriptors_b[columns].T
         scores[excluded] = -2.0
@@ -381,7 +381,7 @@ def match_along_epipolar_lines(
 
 
 def _about_axis(rays: Floats, axis: Floats) -> tuple[Floats, Floats]:
-    """Return the angles of unit rays (N, 3) about a unit axis and from the axis, radians, each (N,)."""
+    """Return the angles of unit rays (N, 3) around a unit axis and from the axis, radians, each (N,)."""
     helper = np.eye(3)[np.argmin(np.abs(axis))]
     x = np.cross(axis, helper)
     x /= np.linalg.norm(x)

@@ -1,4 +1,4 @@
-"""What extractors that run a network share: sizes, batches, and the way back to the pixels of the photograph."""
+"""Common part of the extractors that run a network: image sizes, batches, and the way back to the image's pixels."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -23,15 +23,15 @@ _BATCH = 16
 class NetworkExtractor(Remade):
     """Extracts features with a network, on any device.
 
-    Images of one size run together. The features of an image do not depend on the others in the batch.
+    Images of equal size run as a batch. The features of an image do not depend on the rest of the batch.
     """
 
     color: bool
     threaded = False
     name: ClassVar[str]
-    """Key of the kind of features."""
+    """Key of the features in `KINDS`."""
     title: ClassVar[str]
-    """Name of the network, for messages."""
+    """Name of the network in messages."""
     defaults: ClassVar[AlikedSettings | SuperPointSettings]
 
     def __init__(
@@ -44,18 +44,18 @@ class NetworkExtractor(Remade):
     ) -> None:
         """
         Args:
-            checkpoint: the official file of the network, or its tensors by name; None: from an installed package or a
-                cache, else downloaded.
+            checkpoint: the official file of the network, or its tensors by name; None: take it from an installed
+                package or a cache, or download it.
             device: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
-            dtype: of the encoder: `float32`, `bfloat16`, `float16`; `auto`: float32 on a CPU, else the fastest on the
-                device. What follows is always float32: positions, scores and descriptors.
-            batch_size: most images at a time; None: as suits the device.
-            settings: None: the `defaults`.
+            dtype: precision of the encoder: `float32`, `bfloat16`, `float16`; `auto`: float32 on a CPU, else the
+                fastest on the device. Positions, scores and descriptors are always computed in float32.
+            batch_size: largest number of images per batch; None: depends on the device.
+            settings: None: `defaults`.
 
         Raises:
-            WeightsError: no weights, or other ones.
-            ManifestError: no such device, precision or setting.
-            ToolkitError: a package is missing, or the device.
+            WeightsError: the weights are missing, or are those of another network.
+            ManifestError: unknown device, precision or setting.
+            ToolkitError: a package or the device is missing.
         """
         self._values: Any = settings or self.defaults
         self._device = resolve_device(device)
@@ -72,20 +72,20 @@ class NetworkExtractor(Remade):
         return {"name": self.name, "weights": self._weights, "dtype_compute": precision, **self._values.model_dump()}
 
     def _batch_on_cpu(self) -> int:
-        return 2  # few images keep it busy; more at once take more memory and no less time
+        return 2  # larger batches take more memory and are not faster
 
     def _load(self, checkpoint: str | Path | Mapping[str, Tensor] | None) -> nn.Module:
         """Return the network with its weights, on the CPU."""
         raise NotImplementedError
 
     def _forward(self, batch: Tensor) -> Tensor:
-        """Return x, y, score and descriptor of keypoints, (B, K, 3 + D), strongest first, then rows of zeros.
+        """Return x, y, score and descriptor of keypoints, (B, K, 3 + D), strongest first, padded with rows of zeros.
 
-        In x and y the center of the top-left pixel is at 0. A row that is not finite stands for an image whose scores
-        are not.
+        In x and y, the center of the top-left pixel is at 0. If the scores of an image are not finite, it has a row
+        that is not finite.
 
         Args:
-            batch: images (B, H, W) or (B, H, W, 3), uint8, as the network sees them.
+            batch: images (B, H, W) or (B, H, W, 3), uint8, in the size of the network's input.
         """
         raise NotImplementedError
 
@@ -93,58 +93,58 @@ class NetworkExtractor(Remade):
         """Return the features of images, (H, W) gray or (H, W, 3) RGB, uint8, of any sizes; float16 descriptors.
 
         Raises:
-            ValueError: another shape or type.
+            ValueError: an image has another shape or type.
             ToolkitError: a response is not finite, or not even one image fits the device's memory.
         """
         prepared = [self._prepare(image) for image in images]
-        of_shape: dict[tuple[int, ...], list[int]] = {}
+        by_shape: dict[tuple[int, ...], list[int]] = {}
         for number, image in enumerate(prepared):
-            of_shape.setdefault(image.shape, []).append(number)
+            by_shape.setdefault(image.shape, []).append(number)
         features: dict[int, LocalFeatures] = {}
-        for shape, numbers in of_shape.items():
+        for shape, numbers in by_shape.items():
             fitting = self._fitting.setdefault(shape, Fitting(self._forward, "images", self._device))
             for start in range(0, len(numbers), self.batch_size):
-                part = numbers[start : start + self.batch_size]
-                batch = torch.from_numpy(np.stack([prepared[number] for number in part]))
+                in_batch = numbers[start : start + self.batch_size]
+                batch = torch.from_numpy(np.stack([prepared[number] for number in in_batch]))
                 with torch.inference_mode():
                     packed = fitting(batch).cpu().numpy()
-                for number, rows in zip(part, packed, strict=True):
+                for number, rows in zip(in_batch, packed, strict=True):
                     features[number] = self._unpack(rows, shape, images[number].shape)
         return [features[number] for number in range(len(images))]
 
     def _prepare(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return an image of the size and with the channels that the network sees."""
+        """Return an image with the size and the channels of the network's input."""
         image = np.asarray(image)
         if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)) or not image.size:
-            raise ValueError(f"an image is {image.dtype} {image.shape}; expected uint8 (H, W) or (H, W, 3) RGB.")
+            raise ValueError(f"found an image {image.dtype} {image.shape}; expected uint8 (H, W) or (H, W, 3) RGB.")
         if image.ndim == 3 and not self.color:
             image = np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), np.uint8)
         height, width = image.shape[:2]
         long_side = max(height, width)
-        least, most = getattr(self._values, "min_long_side", 0), self._values.max_long_side
-        factor = min(max(long_side, least), most) / long_side
+        lower, upper = getattr(self._values, "min_long_side", 0), self._values.max_long_side
+        factor = min(max(long_side, lower), upper) / long_side
         if factor != 1:
             size = (max(1, round(width * factor)), max(1, round(height * factor)))
             interpolation = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
             image = np.asarray(cv2.resize(image, size, interpolation=interpolation), np.uint8)
         return np.repeat(image[:, :, None], 3, axis=2) if self.color and image.ndim == 2 else image
 
-    def _unpack(self, rows: NDArray[np.float32], shown: tuple[int, ...], shape: tuple[int, ...]) -> LocalFeatures:
-        """Return what `_forward` found in an image of shape `shown`, in the pixels of the photograph of `shape`."""
+    def _unpack(self, rows: NDArray[np.float32], resized: tuple[int, ...], shape: tuple[int, ...]) -> LocalFeatures:
+        """Return the features of an image of shape `shape`, from the output of `_forward` for shape `resized`."""
         if not np.isfinite(rows).all():
             raise ToolkitError(
-                f"{self.title} gave a response or a descriptor that is not finite. Its weights may hold NaN: compare "
-                "the file with the official one. With float16, numbers may have been too large: use bfloat16 or "
-                "float32."
+                f"{self.title} gave a response or a descriptor that is not finite. Its weights may contain NaN: "
+                "compare the file with the official one. With float16, numbers may have been too large: use bfloat16 "
+                "or float32."
             )
         rows = rows[rows[:, 2] > 0]
-        (rows_shown, columns_shown), (height, width) = shown[:2], shape[:2]
-        # Pixel centers of the network are at whole numbers; resizing keeps corners, not centers, where they are.
-        keypoints = (rows[:, :2] + 0.5) * np.array([width / columns_shown, height / rows_shown])
+        (resized_height, resized_width), (height, width) = resized[:2], shape[:2]
+        # The network's pixel centers are at integers; resizing maps the corners of the image onto each other.
+        keypoints = (rows[:, :2] + 0.5) * np.array([width / resized_width, height / resized_height])
         return LocalFeatures(
             keypoints.astype(np.float32),
             np.ones(len(rows), np.float32),
             rows[:, 2].copy(),
-            rows[:, 3:].astype(np.float16),  # all of 5,321 mutual matches of ALIKED stay as in float32
+            rows[:, 3:].astype(np.float16),  # gives the same 5,321 mutual matches of ALIKED as float32
             (width, height),
         )

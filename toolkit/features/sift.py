@@ -1,9 +1,9 @@
 """SIFT (Lowe, IJCV 2004) with RootSIFT descriptors (Arandjelovic and Zisserman, CVPR 2012), on whole arrays.
 
-The keypoints of a pyramid level are refined, oriented and described together, which takes 0.6 of the time of OpenCV's
-SIFT. It differs from that one in two choices, both of which give more right matches:
+All keypoints of a pyramid level are refined, oriented and described together, which takes 0.6 of the time of OpenCV's
+SIFT. Two choices differ from OpenCV, and both give more correct matches:
 
-- A keypoint may be up to 0.6 pixels from its pixel, as in VLFeat, so that fewer are lost between two pixels.
+- A keypoint may be up to 0.6 pixels from its pixel, as in VLFeat, so fewer are lost between two pixels.
 - A cell of the descriptor is 4 sigma wide instead of 3.
 """
 
@@ -22,44 +22,44 @@ from toolkit.manifest import SiftSettings
 Floats = NDArray[np.float32]
 
 _FORMAT = 3
-"""Part of the settings: features of another number are not used again."""
+"""Version of the features, part of the settings. Increase when the same settings give other features."""
 _INTERVALS = 3
-"""Levels of an octave at which keypoints are sought."""
+"""Number of levels per octave in which keypoints are detected."""
 _SIGMA = 1.6
-"""Blur of an octave's first level, pixels of the octave ..."""
+"""Blur of the first level of an octave, pixels of the octave."""
 _CAMERA_SIGMA = 0.5
-"""... and of the picture as it was taken, pixels of the picture."""
+"""Assumed blur of the input image, pixels of the image."""
 _BORDER = 5
-"""Keypoints are sought no nearer to the border of an octave, pixels."""
+"""Smallest distance of a keypoint from the border of an octave, pixels of the octave."""
 _EDGE_RATIO = 10.0
-"""Greatest ratio of the principal curvatures; beyond, the keypoint is on an edge."""
-_REACH = 0.6
-"""Greatest distance of a keypoint from its pixel, in x, in y and in levels."""
-_ROUNDS = 5
-"""A keypoint may move to a neighboring pixel so often."""
+"""Largest ratio of the principal curvatures; keypoints with a larger one lie on an edge and are dropped."""
+_MAX_OFFSET = 0.6
+"""Largest distance of a keypoint from its pixel, in x (pixels), y (pixels) and level."""
+_MAX_FITS = 5
+"""Number of times that the parabola is fitted: a keypoint can move to a neighboring pixel between two fits."""
 _BINS = 36
-"""Of the histogram of directions; a keypoint has the directions of all peaks ..."""
+"""Number of bins of the orientation histogram."""
 _PEAK = 0.8
-"""... that are at least so high, of the highest."""
+"""Smallest height, relative to the highest, of a peak in the orientation histogram that gives an orientation."""
 _WINDOW_SIGMA = 1.5
-"""Window of the histogram of directions, in units of the keypoint's sigma."""
+"""Sigma of the Gaussian window of the orientation histogram, in units of the keypoint's sigma."""
 _CELLS = 4
-"""Of the descriptor, in x and in y ..."""
+"""Number of descriptor cells in x and in y."""
 _DIRECTIONS = 8
-"""... each with a histogram of so many directions."""
+"""Number of gradient directions in the histogram of a descriptor cell."""
 _CELL_SIGMAS = 4.0
-"""Width of a cell, in units of the keypoint's sigma."""
-_LARGEST = 0.2
-"""Greatest entry of a descriptor of length 1, before it becomes RootSIFT."""
-_AT_ONCE = 256
-"""Keypoints whose gradients are held in memory at once: they fit into the cache."""
+"""Width of a descriptor cell, in units of the keypoint's sigma."""
+_MAX_ENTRY = 0.2
+"""Limit of the entries of a descriptor of length 1, before it becomes RootSIFT."""
+_CHUNK = 256
+"""Number of keypoints whose gradients are processed at once, so that they fit into the processor's cache."""
 _NEIGHBORS = np.ones((3, 3), np.uint8)
 
 
 def stretch_contrast(gray: NDArray[np.uint8], max_gain: float = 8.0) -> NDArray[np.uint8]:
-    """Return the image with its 1st to 99th percentile spread over the whole range, by a gain of at most `max_gain`.
+    """Stretch the 1st to 99th percentile of an image to the full range, with a gain of at most `max_gain`.
 
-    A SIFT descriptor does not change with gain, but a dark image has no keypoint above a fixed contrast.
+    A gain does not change SIFT descriptors, but a dark image has no keypoints above a fixed contrast threshold.
     """
     low, high = np.percentile(gray[::4, ::4], (1.0, 99.0))
     gain = min(255.0 / max(high - low, 1.0), max_gain)
@@ -68,7 +68,7 @@ def stretch_contrast(gray: NDArray[np.uint8], max_gain: float = 8.0) -> NDArray[
 
 
 class SiftExtractor(Remade):
-    """Extracts RootSIFT features; one instance may be used by several threads."""
+    """Extracts RootSIFT features. Safe to use from several threads."""
 
     color = False
     batch_size = 1
@@ -101,15 +101,15 @@ class SiftExtractor(Remade):
         if not len(keypoints.x):
             return LocalFeatures.none((width, height))
         keypoints = keypoints.take(np.argsort(-keypoints.response, kind="stable")[: settings.max_keypoints])
-        index, angles = _directions(pyramid, keypoints)
+        index, angles = _orientations(pyramid, keypoints)
         keypoints, angles = keypoints.take(index[: settings.max_keypoints]), angles[: settings.max_keypoints]
-        # The first octave is the picture at twice its size, so its first pixel is a quarter of the picture's.
-        pixel = 2.0 ** (keypoints.octave - 1)
+        # The first octave has twice the size of the image, so the center of its first pixel is at 0.25 in the image.
+        pixel_size = 2.0 ** (keypoints.octave - 1)
         scale = np.array([width / size[0], height / size[1]])
-        xy = (np.stack([keypoints.x, keypoints.y], 1) * pixel[:, None] + 0.25) * scale
+        xy = (np.stack([keypoints.x, keypoints.y], 1) * pixel_size[:, None] + 0.25) * scale
         return LocalFeatures(
             xy.astype(np.float32),
-            (keypoints.sigma * pixel * scale.mean()).astype(np.float32),
+            (keypoints.sigma * pixel_size * scale.mean()).astype(np.float32),
             keypoints.response,
             _descriptors(pyramid, keypoints, angles),
             (width, height),
@@ -117,16 +117,16 @@ class SiftExtractor(Remade):
 
 
 class _Keypoints(NamedTuple):
-    """Keypoints, each an array (N,); places and sizes are in pixels of the octave, its first pixel's center at 0."""
+    """N keypoints, as arrays (N,); x, y and sigma in pixels of the octave, the first pixel's center at 0."""
 
     octave: Ints
     level: Ints
-    """Of the octave, the one that has about the keypoint's blur."""
+    """Level of the octave that has about the blur of the keypoint."""
     x: Floats
     y: Floats
     sigma: Floats
     response: Floats
-    """Absolute difference of Gaussians at the keypoint, of gray values from 0 to 1."""
+    """Absolute difference of Gaussians at the keypoint, for gray values from 0 to 1."""
 
     def take(self, part: Ints) -> "_Keypoints":
         columns: list[Any] = [column[part] for column in self]
@@ -134,7 +134,7 @@ class _Keypoints(NamedTuple):
 
 
 def _octaves(image: NDArray[np.uint8]) -> Iterator[Floats]:
-    """Yield the levels (6, H, W) of each octave, ever more blurred; the first is of the picture at twice its size."""
+    """Yield the levels (6, H, W) of each octave, with increasing blur; the first octave has twice the image size."""
     first = cv2.resize(image.astype(np.float32) / 255, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
     first = cv2.GaussianBlur(first, (0, 0), np.sqrt(_SIGMA**2 - (2 * _CAMERA_SIGMA) ** 2))
     blurs = _SIGMA * 2 ** (np.arange(_INTERVALS + 3) / _INTERVALS)
@@ -148,7 +148,6 @@ def _octaves(image: NDArray[np.uint8]) -> Iterator[Floats]:
 
 
 def _detect(pyramid: Sequence[Floats], contrast: float) -> _Keypoints:
-    """Return the keypoints of all octaves."""
     parts = [_Keypoints(*np.zeros((2, 0), np.int64), *np.zeros((4, 0), np.float32))]
     for octave, levels in enumerate(pyramid):
         parts.append(_refined(octave, levels, _extrema(levels, contrast), contrast))
@@ -157,17 +156,17 @@ def _detect(pyramid: Sequence[Floats], contrast: float) -> _Keypoints:
 
 
 def _extrema(levels: Floats, contrast: float) -> Ints:
-    """Return where the differences of levels (flat index) are larger than at all 26 neighbors, or smaller than there.
+    """Return the local extrema of the difference of Gaussians among all 26 neighbors, as flat indices into `levels`.
 
-    Absolute values are compared: at the extremum of a smooth function, its neighbors have the same sign.
+    Absolute values are compared: near the extremum of a smooth function, all values have the same sign.
     """
     differences = np.empty((len(levels) - 1, *levels.shape[1:]), np.float32)
     for below, above, difference in zip(levels[:-1], levels[1:], differences, strict=True):
         cv2.absdiff(below, above, dst=difference)
     _, height, width = differences.shape
     size, flat = height * width, differences.reshape(-1)
-    # The interpolated peak is higher than the pixel, by little.
-    least = 0.8 * contrast / _INTERVALS
+    # The interpolated peak, which must reach the contrast, is a little higher than the pixel.
+    min_difference = 0.8 * contrast / _INTERVALS
     other_levels = np.array(
         [level * size + y * width + x for level in (-1, 1) for y in (-1, 0, 1) for x in (-1, 0, 1) if x or y]
     )
@@ -175,33 +174,33 @@ def _extrema(levels: Floats, contrast: float) -> Ints:
     rows = slice(_BORDER, height - _BORDER)
     for level in range(1, _INTERVALS + 1):
         cv2.dilate(differences[level], _NEIGHBORS, dst=limit)
-        np.maximum(limit, least, out=limit)
+        np.maximum(limit, min_difference, out=limit)
         at = np.flatnonzero(differences[level, rows] >= limit[rows]) + _BORDER * width
         x = at % width
         at = at[(x >= _BORDER) & (x < width - _BORDER)] + level * size
-        at = at[(flat[at] >= flat[at - size]) & (flat[at] >= flat[at + size])]  # few pass, so the rest costs little
+        at = at[(flat[at] >= flat[at - size]) & (flat[at] >= flat[at + size])]  # cheap test first; few pass it
         extrema.append(at[(flat[at] >= flat[at + other_levels[:, None]]).all(axis=0)])
     return np.concatenate(extrema)
 
 
 def _refined(octave: int, levels: Floats, at: Ints, contrast: float) -> _Keypoints:
-    """Return the keypoints at the peaks of parabolas through extrema; of little contrast or on edges there are none."""
+    """Return the keypoints at the peaks of parabolas fitted to extrema, without those of low contrast or on edges."""
     _, height, width = levels.shape
     size, flat = height * width, levels.reshape(-1)
     parts = []
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_FITS):
         offset, peak, on_edge = _parabola(flat, at, width, size)
-        settled = (np.abs(offset) < _REACH).all(axis=0)
+        settled = (np.abs(offset) < _MAX_OFFSET).all(axis=0)
         good = settled & (np.abs(peak) * _INTERVALS >= contrast) & ~on_edge
         parts.append((at[good], offset[:, good], np.abs(peak[good])))
         at, offset = at[~settled], offset[:, ~settled]
-        step = (np.sign(offset) * (np.abs(offset) >= _REACH)).astype(np.int64)
+        step = (np.sign(offset) * (np.abs(offset) >= _MAX_OFFSET)).astype(np.int64)
         level, y, x = np.unravel_index(at, levels.shape) + step[::-1]
         inside = (level >= 1) & (level <= _INTERVALS)
         inside &= (y >= _BORDER) & (y < height - _BORDER) & (x >= _BORDER) & (x < width - _BORDER)
         at = (level * size + y * width + x)[inside]
     at = np.concatenate([part[0] for part in parts])
-    at, first = np.unique(at, return_index=True)  # two may have moved to one place
+    at, first = np.unique(at, return_index=True)  # two extrema may have moved to the same pixel
     offset = np.concatenate([part[1] for part in parts], axis=1)[:, first]
     level, y, x = np.unravel_index(at, levels.shape)
     return _Keypoints(
@@ -215,11 +214,20 @@ def _refined(octave: int, levels: Floats, at: Ints, contrast: float) -> _Keypoin
 
 
 def _parabola(flat: Floats, at: Ints, width: int, size: int) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Return for each extremum the offset (3, N) of the peak in x, y and level, its height, and whether on an edge."""
+    """Fit a parabola to the difference of Gaussians at N extrema.
+
+    Args:
+        flat: the levels of an octave, flattened.
+        at: (N,) flat indices of the extrema.
+        width, size: pixels of a row and of a level.
+
+    Returns:
+        Offsets (3, N) of the peaks in x, y and level, their heights (N,), and whether they are on an edge (N,).
+    """
 
     def value(offset: int) -> Floats:
-        place = at + offset
-        return flat.take(place + size) - flat.take(place)
+        index = at + offset
+        return flat.take(index + size) - flat.take(index)
 
     center = value(0)
     steps = (1, width, size)
@@ -230,21 +238,21 @@ def _parabola(flat: Floats, at: Ints, width: int, size: int) -> tuple[Floats, Fl
         (value(a + b) - value(a - b) - value(b - a) + value(-a - b)) / 4
         for a, b in ((1, width), (1, size), (width, size))
     )
-    # By the adjugate: LAPACK takes ten times as long for matrices of three rows.
+    # Invert the Hessian by its adjugate: LAPACK takes ten times as long for 3 x 3 matrices.
     edge_determinant = xx * yy - xy * xy
     a, b, c = yy * ss - ys * ys, xs * ys - xy * ss, xy * ys - xs * yy
     d, e, f = xx * ss - xs * xs, xy * xs - xx * ys, edge_determinant
     determinant = xx * a + xy * b + xs * c
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         offset = -np.stack([a * gx + b * gy + c * gs, b * gx + d * gy + e * gs, c * gx + e * gy + f * gs]) / determinant
-    offset = np.clip(np.nan_to_num(offset, nan=np.inf), -10, 10)  # singular: it is given up
+    offset = np.clip(np.nan_to_num(offset, nan=np.inf), -10, 10)  # a singular Hessian gives an offset out of range
     peak = center + np.float32(0.5) * (gx * offset[0] + gy * offset[1] + gs * offset[2])
     on_edge = (edge_determinant <= 0) | ((xx + yy) ** 2 * _EDGE_RATIO >= (_EDGE_RATIO + 1) ** 2 * edge_determinant)
     return offset.astype(np.float32, copy=False), np.asarray(peak, np.float32), on_edge
 
 
 class _Grid(NamedTuple):
-    """Places about a keypoint, in units of its sigma, (K, 1), at which gradients are taken."""
+    """K positions around a keypoint at which gradients are sampled, as arrays (K, 1) in units of its sigma."""
 
     x: Floats
     y: Floats
@@ -255,16 +263,18 @@ class _Grid(NamedTuple):
         return cls(x.reshape(-1, 1), y.reshape(-1, 1))
 
     def gradients(self, level: Floats, keypoints: _Keypoints, angles: Floats) -> tuple[Floats, Floats]:
-        """Return magnitude and direction (0 to 2 pi) of a level's gradients about N keypoints, (K, N).
+        """Return magnitude (K, N) and direction (K, N), 0 to 2 pi, of a level's gradients around N keypoints.
 
-        They are those of the nearest pixels; beyond the border, the magnitude is 0.
+        Gradients are those of the nearest pixels; outside the image, the magnitude is 0.
 
         Args:
-            angles: (N,) by which the grid is turned.
+            level: (H, W).
+            keypoints: N keypoints of the level.
+            angles: (N,) rotation of the grid, radians.
         """
         height, width = level.shape
         cos, sin = np.cos(angles) * keypoints.sigma, np.sin(angles) * keypoints.sigma
-        # Plus a half, so that the conversion rounds.
+        # Adding a half makes the conversion to integers round.
         x = self.x * cos - self.y * sin + (keypoints.x + np.float32(0.5))
         y = self.x * sin + self.y * cos + (keypoints.y + np.float32(0.5))
         column, row = x.astype(np.int32), y.astype(np.int32)
@@ -285,20 +295,20 @@ _WINDOW = _Grid.square(np.arange(-4.125, 4.5, 0.75))
 _WINDOW_WEIGHTS = np.exp(-(_WINDOW.x**2 + _WINDOW.y**2) / (2 * _WINDOW_SIGMA**2))
 
 
-def _parts(pyramid: Sequence[Floats], keypoints: _Keypoints) -> Iterator[tuple[Ints, Floats]]:
-    """Yield the indices of some keypoints of one level, and the level, until all had their turn."""
+def _chunks(pyramid: Sequence[Floats], keypoints: _Keypoints) -> Iterator[tuple[Ints, Floats]]:
+    """Yield all keypoints in chunks of one level each: their indices, and the level."""
     group = keypoints.octave * (_INTERVALS + 1) + keypoints.level
-    order = np.lexsort((keypoints.y, group))  # from top to bottom: pixels that are used together are in the cache
-    for of_level in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
-        level = pyramid[keypoints.octave[of_level[0]]][keypoints.level[of_level[0]]]
-        for start in range(0, len(of_level), _AT_ONCE):
-            yield of_level[start : start + _AT_ONCE], level
+    order = np.lexsort((keypoints.y, group))  # from top to bottom, so that neighboring pixels stay in the cache
+    for in_level in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
+        level = pyramid[keypoints.octave[in_level[0]]][keypoints.level[in_level[0]]]
+        for start in range(0, len(in_level), _CHUNK):
+            yield in_level[start : start + _CHUNK], level
 
 
-def _directions(pyramid: Sequence[Floats], keypoints: _Keypoints) -> tuple[Ints, Floats]:
-    """Return the directions of keypoints, radians, and for each the index of its keypoint, ascending."""
+def _orientations(pyramid: Sequence[Floats], keypoints: _Keypoints) -> tuple[Ints, Floats]:
+    """Return the index of the keypoint (M,), ascending, and the angle (M,), radians, of M orientations."""
     histograms = np.zeros((len(keypoints.x), _BINS))
-    for index, level in _parts(pyramid, keypoints):
+    for index, level in _chunks(pyramid, keypoints):
         magnitude, direction = _WINDOW.gradients(level, keypoints.take(index), np.zeros(len(index), np.float32))
         magnitude *= _WINDOW_WEIGHTS
         bins = np.rint(direction * np.float32(_BINS / (2 * np.pi))).astype(np.int64)
@@ -316,8 +326,8 @@ def _directions(pyramid: Sequence[Floats], keypoints: _Keypoints) -> tuple[Ints,
 
 
 def _descriptor_grid() -> tuple[_Grid, Floats]:
-    """Return the places of the descriptor's gradients, and how much each counts for each cell, (16, K)."""
-    along = (np.arange(15) - 7) / 3  # cells: three in a cell, and half a cell more on both sides
+    """Return the grid of the descriptor's K gradients, and the weight (16, K) of each in each cell."""
+    along = (np.arange(15) - 7) / 3  # in cells: three gradients per cell, and half a cell more on both sides
     centers = np.arange(_CELLS) - (_CELLS - 1) / 2
     shares = np.maximum(1 - np.abs(along - centers[:, None]), 0) * np.exp(-((along / _CELLS) ** 2) * 2)
     weights = (shares[:, None, :, None] * shares[None, :, None, :]).reshape(_CELLS**2, -1)
@@ -330,7 +340,7 @@ _DESCRIPTOR, _CELL_WEIGHTS = _descriptor_grid()
 def _descriptors(pyramid: Sequence[Floats], keypoints: _Keypoints, angles: Floats) -> NDArray[np.uint8]:
     """Return RootSIFT descriptors (N, 128)."""
     descriptors = np.empty((len(angles), _CELLS**2 * _DIRECTIONS), np.float32)
-    for index, level in _parts(pyramid, keypoints):
+    for index, level in _chunks(pyramid, keypoints):
         magnitude, direction = _DESCRIPTOR.gradients(level, keypoints.take(index), angles[index])
         direction -= angles[index]
         direction *= np.float32(_DIRECTIONS / (2 * np.pi))
@@ -339,14 +349,14 @@ def _descriptors(pyramid: Sequence[Floats], keypoints: _Keypoints, angles: Float
         upper_share *= magnitude
         magnitude -= upper_share
         bins = lower.astype(np.int64)
-        places = np.arange(bins.size).reshape(bins.shape) * _DIRECTIONS
+        starts = np.arange(bins.size).reshape(bins.shape) * _DIRECTIONS
         by_direction = np.zeros((bins.size * _DIRECTIONS), np.float32)
-        by_direction[places + (bins & 7)] = magnitude
-        by_direction[places + (bins + 1 & 7)] = upper_share
+        by_direction[starts + (bins & 7)] = magnitude
+        by_direction[starts + (bins + 1 & 7)] = upper_share
         cells = _CELL_WEIGHTS @ by_direction.reshape(len(bins), -1)
         descriptors[index] = cells.reshape(_CELLS**2, -1, _DIRECTIONS).transpose(1, 0, 2).reshape(len(index), -1)
     descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-12)
-    np.minimum(descriptors, _LARGEST, out=descriptors)
+    np.minimum(descriptors, _MAX_ENTRY, out=descriptors)
     descriptors /= np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12)
     root = np.sqrt(descriptors, out=descriptors)
     return np.minimum(root * DESCRIPTOR_SCALE + 0.5, 255).astype(np.uint8)

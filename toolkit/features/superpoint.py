@@ -1,7 +1,7 @@
 """SuperPoint (DeTone, Malisiewicz and Rabinovich, CVPR workshops 2018): learned keypoints and descriptors.
 
-The network is that of the package `transformers`, of which only `encoder`, `keypoint_decoder` and
-`descriptor_decoder` are used: its processor would squeeze every photograph to 640 x 480.
+The network comes from the package `transformers`. Only its `encoder`, `keypoint_decoder` and `descriptor_decoder` are
+used, because its image processor would squeeze every photograph to 640 x 480.
 """
 
 from collections.abc import Mapping
@@ -17,12 +17,12 @@ from toolkit.manifest import SuperPointSettings
 from toolkit.models.weights import SUPERPOINT, given_or_resolved, load_checkpoint
 
 DESCRIPTOR_LENGTH = 256
-# Side of the cells of the network's coarsest grid, pixels.
 _CELL = 8
+"""Side of the cells of the network's coarsest grid, pixels."""
 
 
 class SuperPointExtractor(NetworkExtractor):
-    """Extracts SuperPoint features: keypoints at whole pixels, unit descriptors (256,), on any device."""
+    """Extracts SuperPoint features: keypoints at integer pixels, unit descriptors (256,), on any device."""
 
     color = False
     name = "superpoint"
@@ -34,11 +34,11 @@ class SuperPointExtractor(NetworkExtractor):
             import transformers
         except ImportError as error:
             raise ToolkitError(
-                f"{SUPERPOINT.model} needs the package transformers, which cannot be imported ({error}). Install it, "
+                f"{SUPERPOINT.model} needs the package transformers, which cannot be imported ({error}). Install it "
                 "in the folder of this project: python -m pip install --constraint constraints.txt --editable "
-                "'.[learned]'. Or use `sift` features, which need nothing else."
+                "'.[learned]'. Or use `sift` features, which need no other package."
             ) from error
-        # Borders and the number of keypoints are left to `_forward`, which knows where the photograph ends.
+        # `_forward` limits border and number of keypoints, because only it knows the unpadded size of the image.
         config = transformers.SuperPointConfig(
             keypoint_threshold=float(self._values.threshold),
             nms_radius=self._values.nms_radius,
@@ -53,22 +53,22 @@ class SuperPointExtractor(NetworkExtractor):
     def _forward(self, batch: Tensor) -> Tensor:
         settings, model = self._values, self._model
         size = batch.shape[1:]
-        # Whole cells: the last column and row are repeated, so that the image's border is no edge.
+        # Pad to whole cells by repeating the last column and row, so that the border of the image gives no edge.
         pixels = F.pad(batch[:, None].float() / 255, (0, -size[1] % _CELL, 0, -size[0] % _CELL), mode="replicate")
         with torch.autocast(batch.device.type, self._dtype, enabled=self._dtype != torch.float32):
             encoded = model.encoder(pixels).last_hidden_state
-        most = settings.max_keypoints
-        packed = torch.zeros(len(batch), most, 3 + DESCRIPTOR_LENGTH, device=batch.device)
+        limit = settings.max_keypoints
+        packed = torch.zeros(len(batch), limit, 3 + DESCRIPTOR_LENGTH, device=batch.device)
         last = torch.tensor([size[1], size[0]], device=batch.device) - settings.border
         for row, features in zip(packed, encoded.float().split(1), strict=True):
             keypoints, responses = model.keypoint_decoder(features)
             inside = ((keypoints >= settings.border) & (keypoints < last)).all(dim=1)
             keypoints, responses = keypoints[inside], responses[inside]
             responses, order = responses.sort(descending=True, stable=True)
-            keypoints, responses = keypoints[order[:most]], responses[:most]
+            keypoints, responses = keypoints[order[:limit]], responses[:limit]
             if len(keypoints):
                 descriptors = model.descriptor_decoder(features, keypoints.clone())
                 row[: len(keypoints)] = torch.cat([keypoints, responses[:, None], descriptors], dim=1)
             elif not features.isfinite().all():
-                row[0] = torch.nan  # what is not finite is above no threshold
+                row[0] = torch.nan  # no threshold shows that features are not finite, as NaN is above none
         return packed

@@ -1,4 +1,4 @@
-"""Geometric verification: how many matches of two photographs agree with one relative pose of their cameras."""
+"""Geometric verification: count the matches of two images that agree with one relative pose of their cameras."""
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -16,13 +16,13 @@ from toolkit.geometry import Floats, Ints
 from toolkit.manifest import RerankSettings
 
 MAP_IMAGES_KEPT = 256
-"""Map images whose features stay in memory: some 60 MB."""
+"""Number of map images whose features stay in memory, about 60 MB."""
 
 
 class Verifier:
-    """Counts, for a query image and map images, the matches that agree with one relative pose.
+    """Counts the matches of a query image and map images that agree with one relative pose.
 
-    Safe to use from several threads. The features of the map images used last stay in memory.
+    Safe to use from several threads. The features of the most recently used map images stay in memory.
     """
 
     def __init__(self, settings: RerankSettings, matcher: Matcher, store: Mapping[str, LocalFeatures]):
@@ -38,7 +38,7 @@ class Verifier:
         references: Sequence[str],
         cameras: Sequence[pycolmap.Camera],
     ) -> tuple[list[int], list[int]]:
-        """Return the inliers and the matches of a query image with each reference.
+        """Return the numbers of inliers and of matches of a query image with each reference.
 
         Args:
             features, camera: of the query image.
@@ -46,20 +46,20 @@ class Verifier:
         """
         features = self._strongest(features)
         map_features = [self._map_features(name) for name in references]
-        matched = self.matcher.match([(features, other) for other in map_features])
+        all_matches = self.matcher.match([(features, reference) for reference in map_features])
         inliers = [
             verified_matches(
                 camera,
                 features.keypoints[matches.indices[:, 0]],
-                other_camera,
-                other.keypoints[matches.indices[:, 1]],
+                reference_camera,
+                reference.keypoints[matches.indices[:, 1]],
                 matches.scores,
                 self.settings,
                 tests=len(references),
             ).distinct
-            for matches, other, other_camera in zip(matched, map_features, cameras, strict=True)
+            for matches, reference, reference_camera in zip(all_matches, map_features, cameras, strict=True)
         ]
-        return inliers, [len(matches) for matches in matched]
+        return inliers, [len(matches) for matches in all_matches]
 
     def _strongest(self, features: LocalFeatures) -> LocalFeatures:
         return features.take(slice(self.settings.max_features))
@@ -69,11 +69,11 @@ class Verified(NamedTuple):
     """The matches that agree with one essential matrix."""
 
     inliers: Ints
-    """(A,) which they are."""
+    """(A,) indices of these matches."""
     distinct: int
-    """How many there are, if those that share a keypoint count once."""
+    """Their number; those that share a keypoint count once."""
     essential: Floats
-    """(3, 3)."""
+    """(3, 3) the essential matrix."""
 
 
 def verified_matches(
@@ -85,24 +85,26 @@ def verified_matches(
     settings: RerankSettings,
     tests: int = 1,
 ) -> Verified:
-    """Return which matches agree with one essential matrix; none where chance would give as many.
+    """Return the matches that agree with one essential matrix; none if random matches could give as many.
 
-    The essential matrix is that of D. Nister, "An Efficient Solution to the Five-Point Relative Pose Problem", PAMI
-    2004, drawn in the order of the matches' scores (O. Chum, J. Matas, "Matching with PROSAC", CVPR 2005).
+    The essential matrix is estimated from five matches (D. Nister, "An Efficient Solution to the Five-Point Relative
+    Pose Problem", PAMI 2004), sampled by score (O. Chum, J. Matas, "Matching with PROSAC", CVPR 2005).
 
     Args:
-        camera_a, camera_b: intrinsics, with their distortion.
+        camera_a, camera_b: intrinsics, with distortion.
         pixels_a, pixels_b: (K, 2) matched pixels.
-        scores: (K,) how sure the matches are.
-        tests: how many pairs are looked at together; among more, chance does more.
+        scores: (K,) scores of the matches, larger is better.
+        settings: threshold and limits.
+        tests: number of image pairs that are tested together; with more tests, more inliers can arise by chance.
     """
     nothing = Verified(np.zeros(0, np.int64), 0, np.zeros((3, 3)))
-    if len(scores) < 6:  # five always agree
+    if len(scores) < 6:  # five matches always agree
         return nothing
     order = np.argsort(-scores, kind="stable")
     pixels_a, pixels_b = (np.asarray(pixels, np.float64)[order] for pixels in (pixels_a, pixels_b))
     rays_a, rays_b = np.asarray(camera_a.cam_from_img(pixels_a)), np.asarray(camera_b.cam_from_img(pixels_b))
-    finite = np.isfinite(rays_a).all(axis=1) & np.isfinite(rays_b).all(axis=1)  # far out, distortion has no inverse
+    # Far from the image center, some distortion models cannot be inverted.
+    finite = np.isfinite(rays_a).all(axis=1) & np.isfinite(rays_b).all(axis=1)
     if finite.sum() < 6:
         return nothing
     options = cv2.UsacParams()
@@ -126,16 +128,16 @@ def verified_matches(
 
 
 def is_meaningful(inliers: int, matches: int, chance: float, tests: int = 1) -> bool:
-    """Tell whether less than one such agreement is expected among random matches.
+    """Tell whether fewer than one such set of inliers is expected among random matches.
 
-    The number of false alarms of L. Moisan, B. Stival, "A Probabilistic Criterion to Detect Rigid Point Matches Between
-    Two Images and Estimate the Fundamental Matrix", IJCV 2004, for a model of five matches, at a fixed threshold.
+    The expected number follows L. Moisan, B. Stival, "A Probabilistic Criterion to Detect Rigid Point Matches Between
+    Two Images and Estimate the Fundamental Matrix", IJCV 2004, for a model of five matches and a fixed threshold.
 
     Args:
-        inliers: matches that agree with a model.
-        matches: of so many.
+        inliers: number of matches that agree with a model.
+        matches: number of all matches.
         chance: probability that a random match agrees with a model.
-        tests: how many sets of matches are looked at.
+        tests: number of sets of matches that are tested.
     """
     if inliers <= 5:
         return False
@@ -143,13 +145,13 @@ def is_meaningful(inliers: int, matches: int, chance: float, tests: int = 1) -> 
     def log_choose(n: int, k: int) -> float:
         return float(gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1))
 
-    models = 10  # that five matches allow, at most
+    models = 10  # largest number of essential matrices that fit five matches
     ways = np.log(models * (matches - 5)) + log_choose(matches, inliers) + log_choose(inliers, 5)
     return bool(np.log(tests) + ways + (inliers - 5) * np.log(min(chance, 1.0)) < 0)
 
 
 def _chance(camera: pycolmap.Camera, threshold: float) -> float:
-    """Return how much of an image lies within the threshold of a line through it, at most."""
-    # Sampson's error shares a deviation among both images, so that in one of them it may be sqrt(2) times larger.
+    """Return the largest share of an image that lies within the threshold of a line through it."""
+    # Sampson's error is shared by both images, so the distance in one of them can be sqrt(2) times larger.
     band_px = 2 * np.sqrt(2) * threshold * camera.mean_focal_length()
     return float(band_px * np.hypot(camera.width, camera.height) / (camera.width * camera.height))

@@ -1,4 +1,4 @@
-"""The triangulated map as arrays: posed images, points, and which keypoint of which image sees which point."""
+"""The triangulated map as arrays: posed images, points, and observations of points by keypoints."""
 
 import json
 import struct
@@ -23,15 +23,15 @@ from toolkit.geometry import Floats, Ints
 
 _ARRAYS = ("world_from_cams", "points", "colors", "obs_image", "obs_keypoint", "obs_point", "noise_px")
 ORDERS = ("image_starts", "by_point", "point_starts")
-"""Arrays of a file: fields of `LocalMap`, and what else would have to be computed from all of it."""
+"""Arrays of a map file: fields of `LocalMap`, and sorting orders, which would take the whole map to compute."""
 IN_MEMORY = 1 << 26
-"""Bytes of a map that is read when it is opened, so that it may be overwritten meanwhile."""
+"""Largest map file in bytes that is read when it is opened, so that it can be overwritten. Larger ones are mapped."""
 _BLOCK = 1 << 18
-"""Points that are looked at at once."""
+"""Number of points processed at once."""
 OPENGL_AXES = "camera axes as in OpenGL (x right, y up, z backward)"
-"""As a convention that would fit; so it is, too, where axes were turned that should not have been."""
+"""A convention that may fit an inconsistent map. It also fits poses whose axes were converted but should not have."""
 _PADDING = 0xD935
-"""Of an extra field of a zip file that means nothing."""
+"""Header ID of a zip extra field that readers ignore, as `zipalign` uses it."""
 
 
 @dataclass(frozen=True)
@@ -39,34 +39,34 @@ class Consistency:
     """How well the poses of a map agree with its images."""
 
     verdict: str = "unknown"
-    """`consistent`, `inconsistent` or `unknown`: too few matches to tell."""
+    """`consistent`, `inconsistent`, or `unknown` if there are too few matches to tell."""
     pairs: int = 0
-    """Image pairs whose matches were verified without poses ..."""
+    """Number of image pairs whose matches were verified without poses."""
     agreeing: int = 0
-    """... and of these, such as the poses agree with."""
+    """Number of these pairs whose matches agree with the poses."""
     fits: str = ""
-    """Of an inconsistent map: the convention under which the poses would agree; empty: none of those tried."""
+    """For an inconsistent map, the convention with which the poses would agree; empty if none of those tried fits."""
     seen_by_three: float = 0.0
-    """Share of the points that at least three images see."""
+    """Share of the points that at least three images observe."""
     wrong: list[str] = field(default_factory=list)
-    """Images whose poses contradict those of the others."""
+    """Images whose poses contradict those of the other images."""
 
     @property
     def text(self) -> str:
-        """What people should know, in a sentence or two; empty where all is well."""
+        """Warning for the user, one or two sentences; empty if there is none."""
         if self.verdict == "inconsistent":
-            cause = f"They would as: {self.fits}." if self.fits else (
+            cause = f"They would agree with: {self.fits}." if self.fits else (
                 "No usual convention fits: do the poses, names and intrinsics belong to these images?"
             )  # fmt: skip
             if OPENGL_AXES in self.fits:
-                cause += " Of an import: give the other `--axes`, opencv or opengl, to `python -m toolkit import`."
+                cause += " If imported: give the other `--axes`, opencv or opengl, to `python -m toolkit import`."
             return (
-                "the poses of the map contradict its images: of "
-                f"{self.pairs} image pairs whose matches were verified, {self.agreeing} agree with them. {cause}"
+                f"the poses of the map contradict its images: {self.agreeing} of {self.pairs} image pairs with "
+                f"verified matches agree with the poses. {cause}"
             )
         if self.wrong:
-            shown = ", ".join(self.wrong[:8]) + (f" and {len(self.wrong) - 8} more" if len(self.wrong) > 8 else "")
-            return f"{len(self.wrong)} map images have poses that contradict the others: {shown}"
+            names = ", ".join(self.wrong[:8]) + (f" and {len(self.wrong) - 8} more" if len(self.wrong) > 8 else "")
+            return f"{len(self.wrong)} map images have poses that contradict the others: {names}"
         if self.verdict == "unknown":
             agree = f", {self.agreeing} of which agree with them" if self.pairs else ""
             return (
@@ -80,8 +80,8 @@ class Consistency:
 class LocalMap:
     """Posed images and the points triangulated from them, as arrays.
 
-    Observations are sorted by image; observation o says that keypoint `obs_keypoint[o]` of image `obs_image[o]` sees
-    point `obs_point[o]`. A map that was opened has its arrays in the file: memory follows what is looked at.
+    Observations are sorted by image: in observation o, keypoint `obs_keypoint[o]` of image `obs_image[o]` observes
+    point `obs_point[o]`. The arrays of a large map stay in its file and are read only where they are used.
     """
 
     image_names: list[str]
@@ -98,14 +98,14 @@ class LocalMap:
     obs_keypoint: Ints
     obs_point: Ints
     noise_px: NDArray[np.float32]
-    """(P,) standard deviation of the observations of each point, by axis; all of one kind of features have the same."""
+    """(P,) standard deviation of each point's observations per axis; equal for all points of one kind of features."""
     length: float = 1.0
-    """What localizers take as a meter, in the unit of the poses; see `Survey.length`."""
+    """The length that localizers treat as one meter, in the unit of the poses; see `Survey.length`."""
     consistency: Consistency = field(default_factory=Consistency)
 
     @cached_property
     def index_of(self) -> dict[str, int]:
-        """Index of an image by its name."""
+        """Index of each image by its name."""
         return {name: index for index, name in enumerate(self.image_names)}
 
     @cached_property
@@ -118,49 +118,49 @@ class LocalMap:
 
     @cached_property
     def image_starts(self) -> Ints:
-        """(N + 1,) the first observation of each image."""
+        """(N + 1,) index of the first observation of each image."""
         return np.searchsorted(self.obs_image, np.arange(len(self.image_names) + 1))
 
     @cached_property
     def by_point(self) -> Ints:
-        """Observations in the order of their points."""
+        """Indices of the observations, sorted by their points."""
         return np.argsort(self.obs_point, kind="stable")
 
     @cached_property
     def point_starts(self) -> Ints:
-        """(P + 1,) the first observation of each point in `by_point`."""
+        """(P + 1,) index in `by_point` of the first observation of each point."""
         return np.searchsorted(self.obs_point[self.by_point], np.arange(len(self.points) + 1))
 
     def track_lengths(self, points: Ints) -> Ints:
-        """Return how many observations each of n points has, (n,)."""
+        """Return the number of observations (n,) of each of n points."""
         return self.point_starts[points + 1] - self.point_starts[points]
 
     def observations(self, image: int) -> tuple[Ints, Ints]:
-        """Return the keypoints (n,) of an image that see a point, and the points (n,)."""
+        """Return the keypoints (n,) of an image that observe a point, and these points (n,)."""
         part = slice(self.image_starts[image], self.image_starts[image + 1])
         return self.obs_keypoint[part], self.obs_point[part]
 
     def observations_of(self, points: Ints) -> Ints:
-        """Return the observations of points, those of the first point first."""
+        """Return the indices of all observations of points, in the order of the points."""
         counts = self.track_lengths(points)
         within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
         return self.by_point[np.repeat(self.point_starts[points], counts) + within]
 
     def point_covariances(self, points: Ints) -> Floats:
-        """Return the covariance (n, 3, 3) of the places of n points, square meters, as least squares triangulate them.
+        """Return the covariances (n, 3, 3) of n points from least squares triangulation, square meters.
 
-        A point that fewer than two images see has NaN.
+        They are NaN for points that fewer than two images observe.
         """
         which = np.repeat(np.arange(len(points)), self.track_lengths(points))  # the point of each observation
         image = self.obs_image[self.observations_of(points)]
-        # Keypoints of one image at one place (two orientations) are one view.
+        # Two keypoints of one image at one position (two orientations) are one view.
         which, image = np.unique(np.column_stack([which, image]), axis=0).T
         views = np.bincount(which, minlength=len(points))
         in_cams = geometry.transform(self.cams_from_world[image], self.points[points[which], None])[:, 0]
         jacobian = projection_jacobian(in_cams, self.focals_px[image]) @ self.cams_from_world[image, :3, :3]
         information = np.zeros((len(points), 3, 3))
         np.add.at(information, which, np.einsum("oki,okj->oij", jacobian, jacobian))
-        # A little damping, so that two views from one place are uncertain and not an error.
+        # With a little damping, two views from one position give a large covariance instead of a singular matrix.
         information += 1e-9 * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         covariances = np.full((len(points), 3, 3), np.nan)
         noise_px2 = self.noise_px[points].astype(np.float64) ** 2
@@ -168,23 +168,23 @@ class LocalMap:
         return covariances
 
     def images_seeing(self, points: Ints) -> Ints:
-        """Return how many of the given points each image sees, (N,)."""
-        seeing = np.zeros(len(self.image_names), np.int64)
+        """Return how many of the given points each image observes, (N,)."""
+        counts = np.zeros(len(self.image_names), np.int64)
         for start in range(0, len(points), _BLOCK):
             images = self.obs_image[self.observations_of(points[start : start + _BLOCK])]
-            seeing += np.bincount(images, minlength=len(seeing))
-        return seeing
+            counts += np.bincount(images, minlength=len(counts))
+        return counts
 
     def shared_points(self, images: Ints) -> Ints:
-        """Return how many points each two of n images both see, (n, n)."""
+        """Return the number of points that each two of n images share, (n, n)."""
         seen = [np.unique(self.observations(int(image))[1]) for image in images]
         return np.array([[len(np.intersect1d(a, b, assume_unique=True)) for b in seen] for a in seen], np.int64)
 
     def around(self, images: Ints) -> tuple["LocalMap", Ints]:
-        """Return the part of the map that the images, and those that share points with them, see.
+        """Return the part of the map that some images, and all images covisible with them, observe.
 
         Returns:
-            A map of the same images with some of the points, and the index of each of these here.
+            A map of the same images with some of the points, and the indices of these points in this map.
         """
         seen = np.concatenate([np.zeros(0, np.int64), *(self.observations(int(image))[1] for image in images)])
         covisible = np.flatnonzero(self.images_seeing(np.unique(seen)))
@@ -192,20 +192,20 @@ class LocalMap:
         return self.part(points)._sharing(self), points
 
     def part(self, points: Ints) -> "LocalMap":
-        """Return a map of the same images with some of the points, ascending."""
-        there = np.sort(self.observations_of(points))
+        """Return a map of the same images with some of the points, given by ascending index."""
+        kept = np.sort(self.observations_of(points))
         return replace(
             self,
             points=self.points[points],
             colors=self.colors[points],
-            obs_image=self.obs_image[there],
-            obs_keypoint=self.obs_keypoint[there],
-            obs_point=np.searchsorted(points, self.obs_point[there]),
+            obs_image=self.obs_image[kept],
+            obs_keypoint=self.obs_keypoint[kept],
+            obs_point=np.searchsorted(points, self.obs_point[kept]),
             noise_px=self.noise_px[points],
         )
 
     def scaled(self, factor: float) -> "LocalMap":
-        """Return the map with all lengths times a factor."""
+        """Return the map with all lengths multiplied by a factor."""
         if factor == 1.0:
             return self
         poses = geometry.make_pose(self.world_from_cams[:, :3, :3], factor * self.world_from_cams[:, :3, 3])
@@ -213,10 +213,10 @@ class LocalMap:
 
     @classmethod
     def pooled(cls, maps: Sequence["LocalMap"]) -> "LocalMap":
-        """Return one map of maps of one session, each triangulated from another kind of features.
+        """Return one map with the points of several maps of one session, one for each kind of features.
 
-        The points of one map follow those of the map before. A keypoint is one of the kind that its point is of, so
-        the point tells the kind.
+        The points are in the order of the maps, so the index of a point tells its kind. `obs_keypoint` counts the
+        keypoints of that kind.
         """
         if len(maps) == 1:
             return maps[0]
@@ -238,7 +238,7 @@ class LocalMap:
         image = np.concatenate(images)
         point = np.concatenate([one.obs_point + start for one, start in zip(maps, starts[:-1], strict=True)])
         order = np.argsort(image, kind="stable")
-        together = cls(
+        pooled = cls(
             image_names=names,
             cameras=cameras,
             world_from_cams=poses,
@@ -251,21 +251,21 @@ class LocalMap:
             length=first.length,
             consistency=first.consistency,
         )
-        return together._sharing(first) if same else together
+        return pooled._sharing(first) if same else pooled
 
     def judged(self, consistency: Consistency) -> "LocalMap":
         """Return the map with another consistency."""
         return replace(self, consistency=consistency).knowing(
-            **{name: known for name, known in vars(self).items() if name in ORDERS}
+            **{name: order for name, order in vars(self).items() if name in ORDERS}
         )
 
-    def knowing(self, **known: Any) -> "LocalMap":
-        """Return this map, told of the properties that it would compute when they are asked for."""
-        vars(self).update(known)
+    def knowing(self, **properties: Any) -> "LocalMap":
+        """Set cached properties of this map, so that they are not computed; return the map."""
+        vars(self).update(properties)
         return self
 
     def _sharing(self, other: "LocalMap") -> "LocalMap":
-        """Return this map, which takes over what another of the same images knows of them."""
+        """Return this map with the cached image properties of another map of the same images."""
         return self.knowing(**{name: getattr(other, name) for name in ("index_of", "cams_from_world", "focals_px")})
 
     def save(self, path: str | Path) -> None:
@@ -280,8 +280,8 @@ class LocalMap:
         with write_atomic(path) as temporary, open(temporary, "wb") as stream, ZipFile(stream, "w") as archive:
             for name, array in arrays.items():
                 member = ZipInfo(f"{name}.npy")
-                # Arrays that are mapped should start at multiples of 64, as `zipalign` does it: by an extra field after
-                # a header of 30 bytes, the name, and 20 bytes of sizes.
+                # For memory mapping, arrays start at multiples of 64 bytes. As in `zipalign`, an extra field pads them:
+                # it follows a header of 30 bytes, the name, and 20 bytes of sizes.
                 padding = -(stream.tell() + 30 + len(member.filename) + 20 + 4) % 64
                 member.extra = struct.pack("<HH", _PADDING, padding) + bytes(padding)
                 with archive.open(member, "w", force_zip64=True) as out:
@@ -289,7 +289,7 @@ class LocalMap:
 
     @classmethod
     def load(cls, path: str | Path) -> "LocalMap":
-        """Open a map; the arrays of one of more than `IN_MEMORY` bytes stay in the file until they are looked at.
+        """Open a map. The arrays of a map larger than `IN_MEMORY` stay in the file and are read where they are used.
 
         Raises:
             ArtifactError: the file is missing or damaged.
@@ -307,13 +307,13 @@ class LocalMap:
             ).knowing(**{name: arrays[name] for name in ORDERS})
         except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile, struct.error) as error:
             raise ArtifactError(
-                f"The triangulated map {path} cannot be read ({error}). Build it with the localize stage."
+                f"The triangulated map {path} cannot be read ({error}). Build it again with the localize stage."
             ) from None
         return opened
 
 
 def _arrays_of(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of an uncompressed `.npz` file, read-only; those of a large one are mapped from it."""
+    """Return the arrays of an uncompressed `.npz` file, read-only; those of a large file are memory-mapped."""
     arrays: dict[str, NDArray[Any]] = {}
     with open(path, "rb") as stream, ZipFile(stream) as archive:
         small = path.stat().st_size <= IN_MEMORY
@@ -321,7 +321,7 @@ def _arrays_of(path: Path) -> dict[str, NDArray[Any]]:
         for member in archive.infolist():
             if member.compress_type != ZIP_STORED:
                 raise ValueError(f"{member.filename} is compressed")
-            # A local header of 30 bytes, which ends with two lengths; the name; extra fields; then the array's own.
+            # Skip the local header (30 bytes, ending with two lengths), the name, and extra fields.
             stream.seek(member.header_offset + 26)
             stream.seek(sum(struct.unpack("<HH", stream.read(4))), SEEK_CUR)
             version = np.lib.format.read_magic(stream)
@@ -334,5 +334,5 @@ def _arrays_of(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def map_path(map_dir: str | Path, session_id: str, features: str = "sift") -> Path:
-    """Return the file of a session's map of one kind of features; that of SIFT has the session's name alone."""
+    """Return the map file of a session and a kind of features; for SIFT, the name omits the kind."""
     return Path(map_dir) / (f"{session_id}.npz" if features == "sift" else f"{session_id}-{features}.npz")

@@ -1,4 +1,4 @@
-"""The map of one device: its features, its triangulated points, and the localizer that a method asks for it."""
+"""The map of one device: its features, its triangulated points, and its localizer."""
 
 import json
 import logging
@@ -57,19 +57,20 @@ log = logging.getLogger(__name__)
 SETTINGS = "settings"
 SESSIONS_ROOT = "sessions_root"
 ODD_DEPTHS_M = (0.1, 200.0)
-"""A map whose median depth is beyond these may be in another unit."""
+"""Plausible range of a map's median depth, meters; outside, the map may be in another unit."""
 MOST_IN_MEMORY = 1 << 30
-"""Bytes of global descriptors, in float32, that an open map holds; more are read from disk for each search."""
+"""Largest size in bytes of global descriptors (float32) that an open map keeps in memory; larger ones stay on disk."""
 NEAR, NEAR_DEG = 10.0, 60.0
-"""Images of the map may show what a camera sees that is at most so many lengths away, and turned by so much."""
+"""Largest distance (in map lengths, see `Survey.length`) and angle (degrees) between a camera and a map image that may
+show the same scene."""
 RETRIEVAL = "retrieval_dir"
-"""Attributes of `poses/<pair>.h5`: the settings that the pair was localized with, the capture's `sessions`, and the
-folder of the references."""
+"""`SETTINGS`, `SESSIONS_ROOT` and `RETRIEVAL` are attributes of `poses/<pair>.h5`: the settings that the pair was
+localized with, the `sessions` folder of the capture, and the folder of the references."""
 
 
 @dataclass
 class Map:
-    """The map of one device, ready for queries; nothing in it changes."""
+    """The map of one device, ready for queries. It is never changed."""
 
     device: str
     sessions_root: Path
@@ -78,15 +79,15 @@ class Map:
     """Folder of the triangulated maps."""
     settings: LocalizeSettings
     kinds: Sequence[LocalMethod] = ()
-    """How local features are extracted and matched; none for `nearest`."""
+    """Kinds of local features, with extractor and matcher; empty for `nearest`."""
     mapped: Sequence[MappedFeatures] = ()
-    """The map's features of each kind, with their points; none where `settings.map` is null."""
+    """The map's features of each kind, with their points; empty if `settings.map` is null."""
     escalation: Sequence[DeferredMethod] = ()
-    """Further kinds, asked where the pose is not `ok` without them; the map has no points of theirs."""
+    """Additional kinds for queries whose pose is not sure without them; the map has no points of these kinds."""
     features_dir: Path | None = None
     """Folder of all local features."""
     files: SceneFiles | None = None
-    """Of the run that the map is of; None: pictures of no session cannot be localized, as they need its embedder."""
+    """Files of the run; None: images from outside a session cannot be localized, as that needs the run's embedder."""
     reranked: bool = False
     """Whether the run localized with reranked references."""
 
@@ -103,12 +104,12 @@ class Map:
         skip_existing: bool = True,
         escalation: Sequence[DeferredMethod] = (),
     ) -> "Map":
-        """Extract the features of a map session and triangulate its points, or load what is there."""
+        """Extract the features of a map session and triangulate its points, or load existing ones."""
         session, mapped = capture[f"{device}_map"], list[MappedFeatures]()
         root = capture.path / "sessions"
-        place = cls(device, root, map_dir, settings, kinds, mapped, escalation, features_dir)
+        map_ = cls(device, root, map_dir, settings, kinds, mapped, escalation, features_dir)
         for kind in kinds if settings.map is not None else ():
-            turns = place.turns_of(kind, session)
+            turns = map_.turns_of(kind, session)
             store = extract_session(session, features_dir, kind.extractor, workers=workers, turns=turns)
             inputs = fingerprint([session_fingerprint(session), store.fingerprint])
             path = map_path(map_dir, session.id, kind.name)
@@ -118,9 +119,9 @@ class Map:
                 session, store, path, settings.map, settings.seed, skip_existing, inputs, workers, metric
             )
             mapped.append(MappedFeatures(local_map, store, KINDS[kind.name], kind.matcher, kind.name))
-        if mapped and place.remarks:
-            log.warning("%s: %s", session.id, place.remarks)
-        return place
+        if mapped and map_.remarks:
+            log.warning("%s: %s", session.id, map_.remarks)
+        return map_
 
     @classmethod
     def open(cls, run: str | Path, scene: str, device: str) -> "Map":
@@ -132,28 +133,28 @@ class Map:
             device: `ios`, `hl`, `spot`.
 
         Raises:
-            ArtifactError: no such run, scene or device (the known ones are named), or files of the run are missing.
-            WeightsError: the run used a network whose weights are not there any more.
+            ArtifactError: unknown run, scene or device (the message lists the known ones), or missing files of the run.
+            WeightsError: the weights of a network that the run used are missing.
         """
         for value, kind in ((run, str | Path), (scene, str), (device, str)):
             if not isinstance(value, kind):
-                raise ArtifactError(f"Map.open: found {value!r}, expected a run folder, a scene's name and a device's.")
+                raise ArtifactError(f"Map.open: found {value!r}, expected a run folder, a scene name and a device key.")
         files = SceneFiles(Path(run), scene)
         pairs = sorted(files.poses_dir.glob(f"{scene}_map_{device}_query_*.h5"))
         if not pairs:
             raise ArtifactError(f"{_unknown(files, device)} Localize first: python -m toolkit run MANIFEST.")
-        answer = _last_localized(files, pairs)
-        reranked = Path(answer[1][RETRIEVAL]).name == files.reranked_dir.name
-        return replace(cls._stored_in(device, answer, files.features, files.maps), files=files, reranked=reranked)
+        localized = _last_localized(files, pairs)
+        reranked = Path(localized[1][RETRIEVAL]).name == files.reranked_dir.name
+        return replace(cls._stored_in(device, localized, files.features, files.maps), files=files, reranked=reranked)
 
     @classmethod
     def of_pair(cls, poses: str | Path, device: str, features_dir: str | Path, map_dir: str | Path) -> "Map":
-        """Open the map of a finished pair, with the settings that this pair was localized with, wherever its files lie.
+        """Open the map of a finished pair, with the settings that the pair was localized with, from the given files.
 
         Args:
             poses: `poses/<pair>.h5`.
-            device: of the map.
-            features_dir, map_dir: as the pair was localized with.
+            device: the map device.
+            features_dir, map_dir: as given to `localize_pairs`.
 
         Raises:
             ArtifactError, WeightsError: as `open`.
@@ -161,8 +162,8 @@ class Map:
         return cls._stored_in(device, how_localized(Path(poses)), Path(features_dir), Path(map_dir))
 
     @classmethod
-    def _stored_in(cls, device: str, answer: "Localized", features_dir: Path, map_dir: Path) -> "Map":
-        settings, found, names = answer
+    def _stored_in(cls, device: str, localized: "Localized", features_dir: Path, map_dir: Path) -> "Map":
+        settings, h5_attributes, names = localized
         kinds, escalation = create_methods(settings)
         mapped = [
             MappedFeatures(
@@ -174,7 +175,8 @@ class Map:
             )
             for name, kind in zip(names, kinds if settings.map is not None else (), strict=True)
         ]
-        return cls(device, Path(found[SESSIONS_ROOT]), map_dir, settings, kinds, mapped, escalation, features_dir)
+        root = Path(h5_attributes[SESSIONS_ROOT])
+        return cls(device, root, map_dir, settings, kinds, mapped, escalation, features_dir)
 
     @cached_property
     def capture(self) -> Capture:
@@ -187,17 +189,17 @@ class Map:
 
     @cached_property
     def turns(self) -> Turns | None:
-        """What makes the capture's images upright; None where no network asks for it."""
+        """The turns that make the capture's images upright; None if no network needs upright images."""
         return turns_for(self.settings, [*self.kinds, *self.escalation], self.capture)
 
     def turns_of(self, kind: AnyMethod, session: Session) -> NDArray[np.int64] | None:
-        """Return the turns that make a session's images upright for a kind of features; None: it does not need them."""
+        """Return the turns that make a session's images upright; None if this kind of features does not need them."""
         if not KINDS[kind.name].upright or self.turns is None:
             return None
         return self.turns.of(session)
 
     def on_demand(self, kind: AnyMethod) -> OnDemandFeatures:
-        """Return the features of map images of a kind without points."""
+        """Return the map images' features of a kind for which the map has no points."""
         if kind.name not in self._on_demand:
             assert self.features_dir is not None
             turns = self.turns_of(kind, self.session)
@@ -210,22 +212,22 @@ class Map:
 
     @property
     def consistency(self) -> Consistency:
-        """How well the poses of the map agree with its images; unknown where no map is triangulated."""
+        """How well the poses of the map agree with its images; unknown if the map has no points."""
         return self.mapped[0].map.consistency if self.mapped else Consistency()
 
     @property
     def length(self) -> float:
-        """What localizers take as a meter, in the unit of the poses; see `Survey.length`."""
+        """The length that localizers treat as one meter, in the unit of the poses; see `Survey.length`."""
         return self.mapped[0].map.length if self.mapped else 1.0
 
     @cached_property
     def in_lengths(self) -> list[MappedFeatures]:
-        """The map's features with their points in multiples of its length."""
+        """`mapped`, with points and poses divided by the map's length."""
         if self.length == 1.0:
             return list(self.mapped)
         return [
-            MappedFeatures(one.map.scaled(1 / self.length), one.features, one.kind, one.matcher, one.name)
-            for one in self.mapped
+            MappedFeatures(kind.map.scaled(1 / self.length), kind.features, kind.kind, kind.matcher, kind.name)
+            for kind in self.mapped
         ]
 
     @property
@@ -235,27 +237,27 @@ class Map:
 
     @property
     def remarks(self) -> str:
-        """What people should know of the map; empty where all is well, or nothing was triangulated."""
+        """Warnings for the user about the map; empty if there are none, or if the map has no points."""
         if not self.mapped:
             return ""
         parts, depth = [self.consistency.text], self.length * USUAL_DEPTHS_M[int(self.length > 1)]
         plausible = self.consistency.verdict != "inconsistent"
         if plausible and self.settings.unit and self.length != 1 and not ODD_DEPTHS_M[0] < depth < ODD_DEPTHS_M[1]:
-            odd = f"the map shows what is {depth:.3g} m away in the median"
-            mend = "write `unit: null` in the manifest, or import them with their `--unit`"
-            parts.append(f"{odd}: if its poses are not in meters, {mend}")
+            odd = f"the median depth of the map is {depth:.3g} m"
+            fix = "write `unit: null` in the manifest, or import them with their `--unit`"
+            parts.append(f"{odd}: if its poses are not in meters, {fix}")
         return "; ".join(filter(None, parts))
 
     def record(self) -> dict[str, Any]:
-        """Return what is known of the map, as JSON."""
+        """Return the unit, the depth and the consistency of the map, for JSON."""
         depth = self.length * NOMINAL_DEPTH if self.settings.unit is None else None
         return {"unit": self.settings.unit, "depth": depth, "text": self.remarks, **asdict(self.consistency)}
 
     def judged(self, estimate: PoseEstimate) -> PoseEstimate:
-        """Return an estimate as it is, or with low confidence in a map whose poses contradict its images."""
+        """Return the estimate; with low confidence if the map's poses contradict its images."""
         if self.consistency.verdict != "inconsistent" or estimate.world_from_rig is None:
             return estimate
-        # In such a map no camera can be judged.
+        # In such a map, a misfit says nothing about the query's camera.
         reason = "; ".join(filter(None, ["" if estimate.misfit else estimate.reason, self.consistency.text]))
         status = "low_confidence: the poses of the map contradict its images"
         return replace(estimate, status=status, reason=reason, focals_px=())
@@ -267,22 +269,22 @@ class Map:
 
     @cached_property
     def index_of(self) -> dict[str, int]:
-        """Index of a map image, as the localizer counts them, by its name."""
+        """Index of each map image in `localizer.image_names`, by its name."""
         return {name: index for index, name in enumerate(self.localizer.image_names)}
 
     @cached_property
     def embed_settings(self) -> EmbedSettings:
-        """Those of the run."""
+        """Embed settings of the run."""
         return EmbedSettings.of(_read_settings(self._run.embeddings / "settings.json"))
 
     @cached_property
     def retrieve_settings(self) -> RetrieveSettings:
-        """Those of the run."""
+        """Retrieve settings of the run."""
         return RetrieveSettings.of(_read_settings(self._run.retrieval_dir / "settings.json"))
 
     @cached_property
     def embedders(self) -> list[Embedder]:
-        """The embedders that the run was made with."""
+        """The embedders that the run used."""
         settings = self.embed_settings
         folders = embedding_folders(self._run.embeddings).values()
         learned = {
@@ -299,12 +301,12 @@ class Map:
     @property
     def _run(self) -> SceneFiles:
         if self.files is None:
-            raise ArtifactError("This map is of no run, which would tell how to find references. Use Map.open.")
+            raise ArtifactError("This map was not opened from a run, so its embedder is unknown. Use Map.open.")
         return self.files
 
     @cached_property
     def _stored(self) -> tuple[Vectors, NDArray[np.int64]]:
-        """Global descriptors (N, D) of posed map images as they are searched, on disk, and the images' rows (N,)."""
+        """Global descriptors (N, D) of the posed map images, on disk, as they are searched; rows of the images (N,)."""
         normalize = self.retrieve_settings.normalize
         vectors, table = open_descriptors(self._run.embeddings, f"{self.device}_map", normalize)
         rows = np.array([self.session.row_of_name[image_name(path)] for path in table["abs_path"]], np.int64)
@@ -313,15 +315,15 @@ class Map:
 
     @cached_property
     def _descriptors(self) -> tuple[NDArray[np.float32] | Vectors, NDArray[np.int64]]:
-        """The same; those of a large map stay on disk."""
+        """`_stored`, in memory unless the map is large."""
         vectors, rows = self._stored
         small = 4 * vectors.shape[1] * len(vectors) < MOST_IN_MEMORY
         return vectors[:] if small else vectors, rows
 
     @cached_property
     def _index(self) -> VectorIndex | JoinedIndex | None:
-        """What finds candidates among the descriptors, in a run with an index."""
-        settings = self.retrieve_settings.model_copy(update={"faiss_gpu": False})  # what is here may have none
+        """The index of the descriptors, if the run has one."""
+        settings = self.retrieve_settings.model_copy(update={"faiss_gpu": False})  # this machine may have no GPU
         return load_index(self._run.embeddings, f"{self.device}_map", self._stored[0], settings)
 
     def retrieve(
@@ -332,13 +334,15 @@ class Map:
         turns: Sequence[int] = (),
         near: Sequence[RoughPose] = (),
     ) -> list[References]:
-        """Return the references of query images as the run would find them.
+        """Return the references of Q query images, as the run would find them.
 
         Args:
-            described: (Q, D) what each of the `embedders` gave for them.
-            pictures: what returns their pixels, in color if it is given True; of use to a run that reranks.
-            cameras, turns: their intrinsics, and the quarter turns that make them upright; likewise.
-            near: about where they are, of their cameras; empty: anywhere.
+            described: for each of the `embedders`, its global descriptors (Q, D) of the images.
+            pictures: for each image a function that returns its pixels, in color if called with True. Needed only if
+                the run reranks, like `cameras` and `turns`.
+            cameras: intrinsics of the images.
+            turns: quarter turns that make the images upright.
+            near: rough poses of the cameras, to which retrieval is restricted; empty: no restriction.
 
         Raises:
             ArtifactError: the map was embedded by another embedder.
@@ -348,42 +352,47 @@ class Map:
         for embedder, vectors, dim in zip(self.embedders, described, dims, strict=True):
             if vectors.shape[1] != dim:
                 raise ArtifactError(
-                    f"{self._run.embeddings}: the map's descriptors have {dim} dimensions, "
-                    f"{embedder.name} gives {vectors.shape[1]}. Embed again."
+                    f"{self._run.embeddings}: found descriptors of {dim} dimensions for the map, expected "
+                    f"{vectors.shape[1]} of {embedder.name}. Run the embed stage again."
                 )
         query = np.hstack([self._as_searched(vectors) for vectors in described])
         topk = self.retrieve_settings.topk
         allowed = [self._may_show(rows, pose) for pose in near] or [None]
         parts = np.split(query, len(allowed))
-        found = [
+        results = [
             search(part, database, topk, "torch", "cpu", index=self._index, allowed=mask, dims=dims)
             for part, mask in zip(parts, allowed, strict=True)
         ]
-        scores, nearest = (np.concatenate(each) for each in zip(*found, strict=True))
+        all_scores, neighbors = (np.concatenate(arrays) for arrays in zip(*results, strict=True))
         ranked = [
-            (rows[of_query[of_query >= 0]], each[of_query >= 0].astype(np.float64))
-            for of_query, each in zip(nearest, scores, strict=True)
+            (rows[indices[indices >= 0]], scores[indices >= 0].astype(np.float64))
+            for indices, scores in zip(neighbors, all_scores, strict=True)
         ]
         if self.reranked:
-            ranked = [self._rerank(*each) for each in zip(ranked, pictures, cameras, turns, strict=True)]
+            ranked = [self._rerank(*image) for image in zip(ranked, pictures, cameras, turns, strict=True)]
         references = []
         for images, similarities in ranked:
             indices = np.array([self.index_of.get(self.session.image_name(int(row)), -1) for row in images], np.int64)
             references.append(References(indices[indices >= 0], similarities[indices >= 0]))
         return references
 
-    def _may_show(self, rows: NDArray[np.int64], about: RoughPose) -> NDArray[np.bool_] | None:
-        """Return which images (N,) of the map, by their rows, may show what a camera sees; None if that is unknown."""
+    def _may_show(self, rows: NDArray[np.int64], pose: RoughPose) -> NDArray[np.bool_] | None:
+        """Return which map images (N,) may show what a camera at a rough pose sees; None if none may.
+
+        Args:
+            rows: of the map images in the session.
+            pose: of the camera.
+        """
         mask = masks.near(
             self.session.world_from_cam(rows),
-            about.world_from_rig,
-            NEAR * self.length + 3 * about.position_std_m,
-            NEAR_DEG + 3 * about.rotation_std_deg,
+            pose.world_from_rig,
+            NEAR * self.length + 3 * pose.position_std_m,
+            NEAR_DEG + 3 * pose.rotation_std_deg,
         )
         return mask if mask.any() else None
 
     def _as_searched(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return vectors of an embedder as those of the map are when they have been written and read."""
+        """Return descriptors normalized and rounded like those of the map, which were written to a file."""
         if self.embed_settings.normalize:
             vectors = unit(vectors)
         vectors = vectors.astype(self.embed_settings.dtype).astype(np.float32)
@@ -391,7 +400,7 @@ class Map:
 
     @cached_property
     def _verification(self) -> tuple[LocalMethod, Verifier]:
-        """What the rerank stage of the run verified references with."""
+        """Features and verifier of the run's rerank stage."""
         settings = RerankSettings.of(_read_settings(self._run.reranked_dir / "settings.json"))
         (method,) = create_local_methods(settings)
         store = FeatureStore.of_session(self._run.features, f"{self.device}_map", method.extractor.settings)
@@ -404,7 +413,7 @@ class Map:
         camera: pycolmap.Camera,
         turns: int,
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return rows of map images and their inliers in the order of verified matches, as the rerank stage does."""
+        """Return rows of map images and their inlier counts, most inliers first, as the rerank stage does."""
         method, verifier = self._verification
         settings, rows = verifier.settings, ranked[0][: verifier.settings.topn]
         pixels = picture(method.extractor.color)
@@ -423,7 +432,7 @@ class Map:
 
 
 def _unknown(files: SceneFiles, device: str) -> str:
-    """Return which of run, scene and device is unknown, and the known ones."""
+    """Return a message that says which of run, scene and device is unknown, and lists the known ones."""
     run = files.run
     if not run.is_dir():
         return f"{run}: no such run. {nearest(run.name, [path.parent.name for path in run.parent.glob('*/run.json')])}"
@@ -436,7 +445,7 @@ def _unknown(files: SceneFiles, device: str) -> str:
 
 
 Localized = tuple[LocalizeSettings, dict[str, Any], list[str]]
-"""Settings that a pair was localized with, attributes of its file, and the names of its maps."""
+"""Settings that a pair was localized with, attributes of its `.h5` file, and the file names of its maps."""
 
 
 def how_localized(pair: Path) -> Localized:
@@ -446,45 +455,45 @@ def how_localized(pair: Path) -> Localized:
         pair: `poses/<pair>.h5`.
 
     Raises:
-        ArtifactError: it does not tell, or is no such file.
+        ArtifactError: the file is missing, damaged, or lacks the attributes.
     """
     try:
         with h5py.File(pair, "r") as file:
-            found = dict(file.attrs)
-            return LocalizeSettings.of(json.loads(found[SETTINGS])), found, json.loads(found[MAPS])
+            attributes = dict(file.attrs)
+            return LocalizeSettings.of(json.loads(attributes[SETTINGS])), attributes, json.loads(attributes[MAPS])
     except (*HDF5_ERRORS, ToolkitError) as error:
-        raise ArtifactError(f"{pair} does not tell how it was made ({error}). Localize again.") from None
+        raise ArtifactError(f"{pair}: cannot read how it was localized ({error}). Localize again.") from None
 
 
 def _last_localized(files: SceneFiles, pairs: Sequence[Path]) -> Localized:
-    """Return settings, attributes and names of the maps of the last run; pairs that it did not do may have others.
+    """Return how a pair of the last run was localized; pairs of earlier runs may have other settings.
 
-    Times of change do not tell which that is: clocks are set back.
+    The last run is known by its settings file. File times would be unreliable, as clocks can be set back.
     """
     last = None
-    with suppress(ArtifactError):  # of an earlier version
+    with suppress(ArtifactError):  # the run is of a version that wrote no such file
         last = LocalizeSettings.of(_read_settings(files.poses_dir / "settings.json"))
-    answers, unknown = [], ""
+    localized, message = [], ""
     for pair in pairs:
         try:
-            answers.append(how_localized(pair))
+            localized.append(how_localized(pair))
         except ArtifactError as error:
-            unknown = str(error)
-    if not answers:
-        raise ArtifactError(unknown)
-    return next((answer for answer in answers if answer[0] == last), answers[-1])
+            message = str(error)
+    if not localized:
+        raise ArtifactError(message)
+    return next((one for one in localized if one[0] == last), localized[-1])
 
 
 def _read_settings(path: Path) -> dict[str, Any]:
-    """Return the settings that a stage left beside its results.
+    """Return the settings that a stage wrote beside its results.
 
     Raises:
-        ArtifactError: the file is missing or no settings.
+        ArtifactError: the file is missing or damaged.
     """
     try:
         return dict(json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError) as error:
-        raise ArtifactError(f"{path}: the settings of the stage cannot be read ({error}). Run it again.") from None
+        raise ArtifactError(f"{path}: cannot read the settings of the stage ({error}). Run the stage again.") from None
 
 
 def session_fingerprint(session: Session) -> str:
@@ -494,21 +503,21 @@ def session_fingerprint(session: Session) -> str:
 
 
 def turns_for(settings: LocalizeSettings, kinds: Sequence[AnyMethod], capture: Capture) -> Turns | None:
-    """Return what makes images upright, if a network is to see them so."""
+    """Return the turns that make the capture's images upright; None if no network needs upright images."""
     upright = (settings.predicts and settings.predictor.upright) or any(KINDS[kind.name].upright for kind in kinds)
     return upright_turns(capture, settings.world_up) if upright else None
 
 
 def create_localizer(settings: LocalizeSettings, map: Map, predictor: Predictor | None = None) -> Localizer:  # noqa: A002
-    """Return what localizes queries in a map by `settings.method`.
+    """Return the localizer of `settings.method` for a map.
 
     Args:
-        settings: those that the map was built or opened with, or others that need the same features.
+        settings: those of the map, or others that need the same features.
         map: the map.
-        predictor: of `feed_forward` and `hybrid`; None: opened as the settings say.
+        predictor: for `feed_forward` and `hybrid`; None: opened according to the settings.
 
     Raises:
-        ArtifactError: the map is of a run of `nearest` and has no points.
+        ArtifactError: the map was built for `nearest` and has no points.
         WeightsError: the network has no weights.
     """
     if settings.method == "nearest":
@@ -516,8 +525,8 @@ def create_localizer(settings: LocalizeSettings, map: Map, predictor: Predictor 
         return NearestLocalizer(posed.names, posed.world_from_cams)
     if not map.kinds:
         raise ArtifactError(
-            f"The map of {map.device!r} is of a run of the method {map.settings.method!r} and has no points, which the "
-            f"method {settings.method!r} needs. Localize with that method first."
+            f"The map of {map.device!r} was built for the method {map.settings.method!r} and has no points, which the "
+            f"method {settings.method!r} needs. Localize with {settings.method!r} first."
         )
     if settings.map is None:
         return _escalating(_on_demand(settings, map, map.kinds), settings, map)
@@ -540,9 +549,8 @@ def _scaled(localizer: Localizer, map: Map) -> Localizer:  # noqa: A002
 
 
 def _escalating(first: Localizer, settings: LocalizeSettings, map: Map) -> Localizer:  # noqa: A002
-    """Return a localizer that asks further kinds of features where the first is not sure, if there are any; a map
-    that is wrong itself makes no pose sure."""
-    if not map.escalation or map.consistency.verdict == "inconsistent":
+    """Return a localizer that uses the escalation features, if there are any, where `first` gives no sure pose."""
+    if not map.escalation or map.consistency.verdict == "inconsistent":  # no features make up for a wrong map
         return first
     kinds: list[AnyMethod] = [*(map.kinds if settings.map is None else ()), *map.escalation]
     second = _scaled(_on_demand(settings, map, kinds), map)
@@ -554,7 +562,7 @@ def _on_demand(
     map: Map,  # noqa: A002
     kinds: Sequence[AnyMethod],
 ) -> OnDemandLocalizer:
-    """Return what localizes with the points of the map, and with those of kinds that are made for each query."""
+    """Return a localizer with the points of the map, and for the given kinds points triangulated for each query."""
     names = map.mapped[0].map.image_names if map.mapped else None
     return OnDemandLocalizer(
         PosedImages.of_session(map.session, names, map.length),
@@ -567,7 +575,7 @@ def _on_demand(
 
 
 def create_methods(settings: LocalizeSettings) -> tuple[list[LocalMethod], list[DeferredMethod]]:
-    """Return the kinds of features that every query needs, and those that are asked where it is not sure.
+    """Return the kinds of features that every query needs, and those for queries without a sure pose.
 
     Raises:
         WeightsError: a network has no weights.
@@ -581,7 +589,7 @@ def create_methods(settings: LocalizeSettings) -> tuple[list[LocalMethod], list[
 
 
 def label(settings: LocalizeSettings, found_by: str) -> str:
-    """Return what tables say of how a pose was found, or of a method that found none."""
+    """Return the `method` column of a table row: how the pose was found; without a pose, the method of the run."""
     if settings.predicts and settings.predictor.name == "simulated":
         return f"{settings.method}:simulated" + (f"/{found_by}" if found_by else "")
     return found_by or settings.method
@@ -590,12 +598,12 @@ def label(settings: LocalizeSettings, found_by: str) -> str:
 def attributes(
     settings: LocalizeSettings, kinds: Sequence[LocalMethod], capture: Capture, device: str, retrieval_dir: Path
 ) -> dict[str, str]:
-    """Return what `Map.open` reads from the file of correspondences.
+    """Return the attributes of a pair's `.h5` file from which `Map.open` opens the map.
 
     Args:
-        settings, kinds: what the queries were localized with.
+        settings, kinds: those that the queries were localized with.
         capture: the capture.
-        device: of the map.
+        device: the map device.
         retrieval_dir: folder of the references.
     """
     return {
@@ -607,8 +615,7 @@ def attributes(
 
 
 def update_attributes(path: Path, attributes: Mapping[str, str]) -> bool:
-    """Bring the attributes of a file up to date that was made by settings of the same effect, or of a capture that
-    has moved since; tell whether there was need to."""
+    """Update the attributes of a file if equivalent settings made it or its capture moved; tell if any changed."""
     with h5py.File(path, "r") as file:
         current = {name: file.attrs.get(name) for name in attributes} == dict(attributes)
     if not current:

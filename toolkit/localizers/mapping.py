@@ -1,4 +1,4 @@
-"""The map: images with known poses, and points triangulated from matches between them."""
+"""Build a map: choose pairs of posed images, match them, and triangulate points from the matches."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -33,11 +33,11 @@ from toolkit.manifest import MapSettings
 from toolkit.runs.cluster import current_cluster
 
 _ToMatch = tuple[str, str, int, int]
-"""A pair to match: group of the file, what the matches are made from, images."""
+"""A pair to match: group in the match file, fingerprint of the inputs of the matches, indices of the two images."""
 DEPTHS = (2.0, 4.0, 8.0, 16.0)
-"""Depths at which views are compared, "meters"."""
+"""Depths at which the views of two images are compared, in map lengths (meters; see `Survey.length`)."""
 _MAP_FORMAT = 4
-"""Raised when the same settings give another file: maps of before are then built anew."""
+"""Increase when the same settings give another file, so that existing maps are built again."""
 
 
 def select_pairs(
@@ -49,17 +49,17 @@ def select_pairs(
 ) -> Ints:
     """Choose the image pairs of a map that are worth matching, from the poses alone.
 
-    A pair is good if each camera sees what the other sees, under an angle that triangulates well. The depth of each
-    view is not known, so points are laid at several depths into it, and the share is counted that the other camera sees
-    too, weighted by the angle between the two lines of sight.
+    A pair is good if the cameras see the same part of the scene at an angle that triangulates well. The depth of the
+    scene is unknown, so each image is given hypothetical points at several depths. The score of a pair is the share of
+    these points that the other camera sees too, weighted by the triangulation angle.
 
     Args:
         world_from_cams: (N, 4, 4).
         cameras: N cameras.
-        groups: (N,) images of one group (the cameras of one rig at one instant) are never paired: they have
-            next to no baseline.
-        per_image: partners an image.
-        length: in the unit of the poses, of the "meter" that `DEPTHS` are in; see `Survey.length`.
+        groups: (N,) images of one group (the cameras of one rig at one instant) are never paired, because they have
+            almost no baseline.
+        per_image: largest number of partners per image.
+        length: unit of `DEPTHS`, in the unit of the poses; see `Survey.length`.
 
     Returns:
         (P, 2) indices, i < j, sorted.
@@ -75,7 +75,7 @@ def select_pairs(
     pairs = [np.zeros((0, 2), np.int64)]
     steps = np.linspace(0.1, 0.9, 5)
     for i in range(n):
-        # Far away cameras share no view at the depths considered; 200 candidates are plenty for 20 partners.
+        # Distant cameras share no view at these depths; 200 candidates are plenty for 20 partners.
         _, near = tree.query(centers[i], k=min(n, 200), distance_upper_bound=2 * max(DEPTHS))
         near = near[near < n]
         near = near[(groups[near] != groups[i]) & (near != i)]
@@ -89,18 +89,18 @@ def select_pairs(
         to_i = geometry.unit(centers[i] - points)
         to_j = geometry.unit(centers[near][:, None] - points)
         angle_deg = np.degrees(np.arccos(np.clip((to_j * to_i).sum(-1), -1, 1)))
-        # Below 4 degrees depth is poor; beyond 30 descriptors stop matching.
+        # Below 4 degrees, depth is uncertain; beyond 30 degrees, descriptors match less and less.
         weight = np.clip(angle_deg / 4, 0.1, 1) * np.clip((60 - angle_deg) / 30, 0, 1)
         scores = (seen * weight).mean(axis=1)
         order = np.argsort(-scores, kind="stable")[:per_image]
         chosen = near[order[scores[order] > 0.02]]
         pairs.append(np.column_stack([np.minimum(i, chosen), np.maximum(i, chosen)]))
-    every = np.concatenate(pairs)
-    return np.column_stack(np.divmod(np.unique(every[:, 0] * n + every[:, 1]), n))
+    all_pairs = np.concatenate(pairs)
+    return np.column_stack(np.divmod(np.unique(all_pairs[:, 0] * n + all_pairs[:, 1]), n))
 
 
 def instants(session: Session, rows: Ints) -> Ints:
-    """Return a number for each image (N,): those that one rig took at one instant have the same."""
+    """Return a number (N,) per image, equal for images that one rig took at one instant."""
     devices = session.images["timestamp"].astype(str) + " " + session.device_ids
     return np.asarray(np.unique(devices.to_numpy(str)[rows], return_inverse=True)[1], np.int64)
 
@@ -115,15 +115,15 @@ def match_pairs(
     min_score: float = 0.6,
     workers: int = 1,
 ) -> Iterator[PairMatches]:
-    """Match the features of image pairs whose poses are known, along epipolar lines only.
+    """Match the features of image pairs with known poses along epipolar lines.
 
     Args:
-        pairs: (Q, 2) indices of images; in sorted order an image's features are read once or twice.
+        pairs: (Q, 2) indices of images; if they are sorted, an image's features are read only once or twice.
         load: returns the features of an image.
-        cameras, world_from_cams: N images, (N, 4, 4).
-        max_error_px: largest distance of a match to its epipolar line, at either side.
-        ratio: Lowe's ratio, among the candidates along the line.
-        min_score: least cosine similarity of a match.
+        cameras, world_from_cams: cameras and poses (N, 4, 4) of the N images.
+        max_error_px: largest distance of a match from its epipolar line, in both images.
+        ratio: Lowe's ratio among the candidates along the line.
+        min_score: smallest cosine similarity of a match.
         workers: threads.
 
     Yields:
@@ -151,7 +151,7 @@ def match_pairs(
 
 
 def map_settings(settings: MapSettings, seed: int) -> dict[str, Any]:
-    """Return what a map depends on besides what it is made of; part of fingerprints."""
+    """Return everything that a map depends on except its inputs; part of fingerprints."""
     return {**settings.model_dump(), "seed": seed, "format": _MAP_FORMAT}
 
 
@@ -166,20 +166,20 @@ def build_map(
     workers: int = 1,
     metric: bool = True,
 ) -> LocalMap:
-    """Triangulate the map of a session from its poses, or open the one at `path` if it is current.
+    """Triangulate the map of a session with its known poses, or open the one at `path` if it is current.
 
-    A map of more than `settings.tile_images` images is made in tiles. Matches and tiles are kept beside it, so that
-    a killed run goes on there, and one after a change matches only the images that have changed.
+    A map of more than `settings.tile_images` images is built in tiles. Matches and tiles are stored beside it, so a
+    killed run resumes there, and a run after a change matches only the images that changed.
 
     Args:
         session: a map session.
-        features: local features of its images; images that could not be read are left out.
+        features: local features of its images; images without features are left out.
         path: the `.npz` file of the map.
         settings, seed: how to triangulate.
         skip_existing: reuse the file if it was made from the same features, poses and settings.
-        inputs: fingerprint of what the features and poses were made from.
+        inputs: fingerprint of the inputs of the features and poses.
         workers: threads.
-        metric: the poses are in meters; else limits are relative to the depth of the scene.
+        metric: whether the poses are in meters; if not, limits are relative to the depth of the scene.
 
     Raises:
         ArtifactError: no image has both a pose and features.
@@ -187,7 +187,7 @@ def build_map(
     settings = settings or MapSettings()
     map_record = {"map": map_settings(settings, seed), "inputs": inputs, "metric": metric}
     if skip_existing and is_current(path, map_record):
-        with suppress(ArtifactError):  # torn behind our back: build it anew
+        with suppress(ArtifactError):  # the file is damaged: build it again
             return LocalMap.load(path)
     plan = MapPlan(session, features, Path(path), settings, seed, metric)
     for number in range(len(plan.tiles)):
@@ -202,7 +202,7 @@ def _match_share(writer: GroupWriter, todo: Sequence[_ToMatch], plan: "MapPlan")
 
 
 class MapPlan(Remade):
-    """What there is to do for a map: images, pairs of them to match, tiles to triangulate."""
+    """The work of building a map: its images, the pairs to match, and the tiles to triangulate."""
 
     def __init__(
         self,
@@ -214,16 +214,16 @@ class MapPlan(Remade):
         metric: bool = True,
         length: float | None = None,
     ):
-        """See `build_map`; `length` is that of the survey, where it is known."""
+        """See `build_map`; `length` is the survey's length if it is known, which saves the survey."""
         self.session, self.features, self.path, self.settings, self.seed = session, features, path, settings, seed
         names, poses = session.image_names, session.world_from_cam()
         self.rows = np.array(
             [row for row, name in enumerate(names) if name in features and np.isfinite(poses[row]).all()], np.int64
         )
-        """(N,) of the session's images, those of the map."""
+        """(N,) rows of the map images in the session."""
         if not len(self.rows):
             raise ArtifactError(
-                f"Session {session.id} has no image with both a pose and local features; nothing to map."
+                f"Session {session.id} has no image with both a pose and local features: no map can be built."
             )
         self.world_from_cams = poses[self.rows]
         self.names = [names[row] for row in self.rows]
@@ -239,7 +239,7 @@ class MapPlan(Remade):
         order = np.argsort(self._home[self.pairs[:, 0]], kind="stable")
         starts = np.searchsorted(self._home[self.pairs[order, 0]], np.arange(len(self.tiles) + 1))
         self.pairs_of = [self.pairs[np.sort(order[slice(*starts[tile : tile + 2])])] for tile in range(len(self.tiles))]
-        """Of each tile the pairs whose first image is in its core."""
+        """For each tile, the pairs whose first image is in its core."""
         self.matcher: dict[str, Any] = {
             "name": "epipolar",
             "max_error_px": settings.max_epipolar_error_px,
@@ -249,7 +249,7 @@ class MapPlan(Remade):
 
     @cached_property
     def survey(self) -> Survey:
-        """What some pairs of images tell of the poses."""
+        """Survey of the poses, from a sample of image pairs."""
         rig_from_cams = self.session.rig_from_cam(self.rows)
         surveyed = SurveyedImages(
             self.names,
@@ -265,13 +265,12 @@ class MapPlan(Remade):
 
     @cached_property
     def of_worker(self) -> Any:
-        """This plan for a worker, which need not survey."""
-        given = self.session, self.features, self.path, self.settings, self.seed
-        return MapPlan.elsewhere(*given, length=self.length)
+        """This plan for a worker, which gets the length and so needs no survey."""
+        return MapPlan.elsewhere(self.session, self.features, self.path, self.settings, self.seed, length=self.length)
 
     @cached_property
     def _made_from(self) -> list[str]:
-        """Of each image, what its matches depend on."""
+        """For each image, a fingerprint of everything that its matches depend on."""
         return [
             fingerprint([self.features.made_from[name], camera_text(camera), pose.tolist()])
             for name, camera, pose in zip(self.names, self.cameras, self.world_from_cams, strict=True)
@@ -285,7 +284,7 @@ class MapPlan(Remade):
         return matches_path(self.path.parent, self.session.id, self.session.id, self._matches_made_by(number))
 
     def match(self, number: int, skip_existing: bool = True, workers: int = 1) -> None:
-        """Match the pairs of a tile along epipolar lines, but for those whose matches are there."""
+        """Match the pairs of a tile along epipolar lines; skip pairs that are matched already."""
         pairs, names, made_from = self.pairs_of[number].tolist(), self.names, self._made_from
         with GroupWriter(self._matches_path(number), self._matches_made_by(number)) as writer:
             groups = group_names([(names[i], names[j]) for i, j in pairs], writer.index.groups)
@@ -301,11 +300,11 @@ class MapPlan(Remade):
         counts: dict[int, int] = {}
 
         def load(index: int) -> LocalFeatures:
-            found = self.features[self.names[index]]
-            counts[index] = len(found)
-            return found
+            features = self.features[self.names[index]]
+            counts[index] = len(features)
+            return features
 
-        found = match_pairs(
+        all_matches = match_pairs(
             np.array([pair[2:] for pair in todo], np.int64).reshape(-1, 2),
             load,
             self.cameras,
@@ -315,16 +314,16 @@ class MapPlan(Remade):
             self.matcher["min_score"],
             workers,
         )
-        bar = tqdm(found, total=len(todo), desc=label, unit="pair", disable=not label)
+        bar = tqdm(all_matches, total=len(todo), desc=label, unit="pair", disable=not label)
         for (group, source, i, j), matches in zip(todo, bar, strict=True):
             write_matches(writer, group, source, (counts[i], counts[j]), matches)
 
     def tile_path(self, number: int) -> Path:
-        """Return the file of a tile, a map of its own."""
+        """Return the file of a tile, which is a map of its own."""
         return self.path.with_name(f"{self.path.stem}.tiles") / f"{number:05d}.npz"
 
     def triangulate(self, number: int, skip_existing: bool = True) -> None:
-        """Triangulate a tile, whose pairs and those of its neighbors were matched, and write it."""
+        """Triangulate a tile and write it; its pairs and those of its neighbors must be matched."""
         images, path = self.tiles[number].images.tolist(), self.tile_path(number)
         record = {
             "map": map_settings(self.settings, self.seed),
@@ -340,13 +339,13 @@ class MapPlan(Remade):
             write_sidecar(path, record)
 
     def _pairs_in(self, number: int) -> Ints:
-        """Return the pairs that the images of a tile are among themselves."""
+        """Return the pairs whose images are both in a tile."""
         images = self.tiles[number].images
         pairs = np.concatenate([self.pairs_of[tile] for tile in np.unique(self._home[images])])
         return pairs[np.isin(pairs, images).all(axis=1)]
 
     def _triangulated(self, number: int) -> LocalMap:
-        """Return the points that images of the core of a tile see."""
+        """Return the map of a tile, with the points that images of its core see."""
         core, images = self.tiles[number]
         pairs = self._pairs_in(number)
         stores = {tile: MatchStore(self._matches_path(tile)) for tile in np.unique(self._home[images]).tolist()}
@@ -365,11 +364,11 @@ class MapPlan(Remade):
         local_map = replace(local_map, world_from_cams=poses, length=self.length)
         if len(core) == len(images):
             return local_map
-        of_core = np.isin(images[local_map.obs_image], core)
-        return local_map.part(np.unique(local_map.obs_point[of_core]))
+        in_core = np.isin(images[local_map.obs_image], core)
+        return local_map.part(np.unique(local_map.obs_point[in_core]))
 
     def build(self, skip_existing: bool = True) -> None:
-        """Triangulate the map, whose pairs were matched, and write it."""
+        """Triangulate the map and write it; all pairs must be matched."""
         if len(self.tiles) == 1:
             local_map = self._triangulated(0)
             first = np.unique(local_map.obs_point, return_index=True)[1]
@@ -402,8 +401,8 @@ class MapPlan(Remade):
         wanted, which = np.unique(images, return_inverse=True)
 
         def read(image: int) -> NDArray[np.uint8]:
-            at = which == np.searchsorted(wanted, image)
-            xy = self._keypoints(image)[keypoints[at]].astype(np.int64)
+            in_image = which == np.searchsorted(wanted, image)
+            xy = self._keypoints(image)[keypoints[in_image]].astype(np.int64)
             try:
                 pixels = read_image(self.session.image_path(int(self.rows[image])))
             except ImageError:
@@ -412,6 +411,6 @@ class MapPlan(Remade):
             return pixels[np.clip(xy[:, 1], 0, height - 1), np.clip(xy[:, 0], 0, width - 1)]
 
         colors = np.full((len(images), 3), 128, np.uint8)
-        for number, found in enumerate(prefetch(read, wanted.tolist())):
-            colors[which == number] = found
+        for number, image_colors in enumerate(prefetch(read, wanted.tolist())):
+            colors[which == number] = image_colors
         return colors

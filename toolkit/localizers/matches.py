@@ -1,4 +1,4 @@
-"""Match the images of a query with the points of a map: by descriptors alone, and near where a pose puts them."""
+"""Match query images with map points: by descriptors alone, or near the projections of the points at a pose."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,20 +20,20 @@ from toolkit.localizers.rig import Matches, RigQuery
 from toolkit.manifest import PnpSettings
 
 CACHED_IMAGES = 256
-"""Map images whose features are kept in memory."""
+"""Number of map images whose features stay in memory."""
 
 
-KnownMatches = dict[tuple[int, int, int], tuple[Ints, Ints]]
-"""By query image, kind of features and map image: keypoints of the query and map points, each (K,)."""
+MatchCache = dict[tuple[int, int, int], tuple[Ints, Ints]]
+"""(query image, kind of features, map image) -> query keypoints (K,) and the map points (K,) that they match."""
 
 
 @dataclass(frozen=True)
 class MapImage:
-    """The features of a map image that see a point, longest tracks first."""
+    """The features of a map image that observe a map point, longest tracks first."""
 
     features: LocalFeatures
     points: Ints
-    """(N,) the map point that each sees."""
+    """(N,) the map point of each feature."""
 
 
 class MappedFeatures:
@@ -47,16 +47,23 @@ class MappedFeatures:
         matcher: Matcher | None = None,
         name: str = "sift",
     ):
-        """The map was triangulated from these features, by image name; without a matcher, `mutual` suits the kind."""
+        """
+        Args:
+            local_map: the map triangulated from the features.
+            features: features of the map images, by name.
+            kind: entry of the features in `KINDS`.
+            matcher: None: `mutual` with the limits of the kind.
+            name: key of the features in `KINDS`.
+        """
         self.map = local_map
         self.features = features
         self.kind = kind
         self.matcher = matcher or MutualMatcher(kind.ratio, kind.min_score)
         self.name = name
         self.image = lru_cache(CACHED_IMAGES)(self._image)
-        """Returns what `_image` does, and keeps it for those that ask again."""
+        """Cached `_image`."""
         self.keypoints = lru_cache(CACHED_IMAGES)(self._keypoints)
-        """Returns what `_keypoints` does, and keeps it for those that ask again."""
+        """Cached `_keypoints`."""
         self._network = Lock()
 
     def match(
@@ -66,19 +73,23 @@ class MappedFeatures:
         settings: PnpSettings,
         network_matches: NetworkMatches | None = None,
     ) -> list[tuple[Ints, Ints]]:
-        """Match a query image with references; returns for each keypoints of the query and map points, each (K,).
+        """Match a query image with references.
 
         Args:
-            references: indices of this map's images.
-            settings: how many features `mutual` is given.
-            network_matches: matches that a network made before.
+            query: features of the query image.
+            references: indices of images in this map.
+            settings: limit the number of features for `mutual`.
+            network_matches: matches that a network made earlier; None: match now.
+
+        Returns:
+            For each reference, the query keypoints (K,) and the map points (K,) that they match.
         """
         if isinstance(self.matcher, MutualMatcher):
             query = query.take(slice(settings.max_query_features))
             images = [self.image(index, settings.max_map_features) for index in references]
             pairs = self.matcher.match([(query, image.features) for image in images])
             points = [image.points for image in images]
-        else:  # a network looks at a feature among its neighbors, those without a point too
+        else:  # a network needs the context of a feature, so it gets features without a point, too
             names = [self.map.image_names[index] for index in references]
             if network_matches is not None:
                 pairs = [network_matches(name) for name in names]
@@ -86,24 +97,24 @@ class MappedFeatures:
                 with self._network:
                     pairs = self.matcher.match([(query, self.features[name]) for name in names])
             points = [self._point_of_each_feature(index) for index in references]
-        found = []
-        for pair, of_feature in zip(pairs, points, strict=True):
-            keypoint, point = pair.indices[:, 0], of_feature[pair.indices[:, 1]]
-            found.append((keypoint[point >= 0], point[point >= 0]))
-        return found
+        matches = []
+        for pair, point_of_feature in zip(pairs, points, strict=True):
+            keypoint, point = pair.indices[:, 0], point_of_feature[pair.indices[:, 1]]
+            matches.append((keypoint[point >= 0], point[point >= 0]))
+        return matches
 
     def _image(self, index: int, max_features: int) -> MapImage:
-        """Return the features of a map image that see points, those of the longest tracks."""
+        """Return the features of a map image that observe points, at most `max_features`, longest tracks first."""
         keypoint, point = self.map.observations(index)
         order = np.argsort(-self.map.track_lengths(point), kind="stable")[:max_features]
         return MapImage(self.features[self.map.image_names[index]].take(keypoint[order]), point[order])
 
     def _keypoints(self, index: int) -> NDArray[np.float32]:
-        """Return where the features of a map image are, (N, 2) pixels."""
+        """Return the keypoints (N, 2) of a map image, pixels."""
         return self.features[self.map.image_names[index]].keypoints
 
     def _point_of_each_feature(self, index: int) -> Ints:
-        """Return the point that each feature of a map image sees, -1 for none."""
+        """Return the map point (N,) of each feature of a map image, -1 for none."""
         keypoint, point = self.map.observations(index)
         points = np.full(len(self.features[self.map.image_names[index]]), -1, np.int64)
         points[keypoint] = point
@@ -118,35 +129,36 @@ class MappedFeatures:
         radius_deg: float,
         settings: PnpSettings,
     ) -> Iterator["Candidates"]:
-        """Yield, for each query image, its keypoints near where a pose puts map points that look like them.
+        """Yield, for each query image, candidate matches of its keypoints with map points that project near them.
 
         Args:
             query: the query's cameras and features.
-            kind: which of the query's features are of this kind.
+            kind: index of this kind among the query's features.
             rig_from_world: the pose, (4, 4).
-            references: indices of this map's images, whose points are projected.
-            radius_deg: largest distance of a keypoint from the projection.
-            settings: how many features of an image.
+            references: indices of images in this map; their points are projected.
+            radius_deg: largest angle between a keypoint and the projection.
+            settings: limit the number of features of a map image.
         """
         references = [index for index in references if len(self.map.observations(index)[0])]
         if not references:
             return
         images = [self.image(index, settings.max_map_features) for index in references]
-        # A point that several images see is projected once.
+        # Several images may observe a point, which is projected once: `point`, `counts`, `starts` and `in_world` are
+        # per point, `which`, `image_of`, `descriptors`, `depth` and `size` per observation.
         point, which = np.unique(np.concatenate([image.points for image in images]), return_inverse=True)
         by_point, counts = np.argsort(which, kind="stable"), np.bincount(which)
-        starts, places = np.cumsum(counts) - counts, self.map.points[point]
+        starts, in_world = np.cumsum(counts) - counts, self.map.points[point]
         image_of = np.repeat(references, [len(image.points) for image in images])
         descriptors = np.concatenate([image.features.descriptors for image in images])
-        depth = np.einsum("oj,oj->o", self.map.cams_from_world[image_of, 2, :3], places[which])
+        depth = np.einsum("oj,oj->o", self.map.cams_from_world[image_of, 2, :3], in_world[which])
         depth += self.map.cams_from_world[image_of, 2, 3]
-        # Size of the feature on the surface, meters: it looks that large from everywhere.
+        # Size of the feature on the surface, in meters, which does not depend on the camera.
         size = np.concatenate([image.features.scales for image in images]) * depth / self.map.focals_px[image_of]
         for camera, kinds in enumerate(query.features):
             features = kinds[kind]
             radius = np.tan(np.radians(radius_deg)) * query.focals_px[camera]
             cam_from_world = geometry.invert(query.rig_from_cams[camera]) @ rig_from_world
-            in_cam = geometry.transform(cam_from_world, places)
+            in_cam = geometry.transform(cam_from_world, in_world)
             visible = np.flatnonzero(in_view(in_cam[None], query.bounds[camera][None])[0])
             if not len(visible) or not len(features):
                 continue
@@ -155,54 +167,59 @@ class MappedFeatures:
             visible, projected = visible[finite], projected[finite]
             tree = query.trees[camera][kind]
             near = KDTree(projected).sparse_distance_matrix(tree, radius, output_type="ndarray")
-            seen = visible[near["i"]]
-            keypoint = np.repeat(near["j"], counts[seen])
-            within = np.arange(len(keypoint)) - np.repeat(np.cumsum(counts[seen]) - counts[seen], counts[seen])
-            observed = by_point[np.repeat(starts[seen], counts[seen]) + within]
-            expected = size[observed] * query.focals_px[camera] / in_cam[which[observed], 2]
-            octaves = np.abs(np.log2(features.scales[keypoint] / np.maximum(expected, 1e-6)))
+            # Pair each near keypoint with all observations of the point.
+            near_point = visible[near["i"]]
+            count = counts[near_point]
+            keypoint = np.repeat(near["j"], count)
+            within = np.arange(len(keypoint)) - np.repeat(np.cumsum(count) - count, count)
+            observation = by_point[np.repeat(starts[near_point], count) + within]
+            expected_px = size[observation] * query.focals_px[camera] / in_cam[which[observation], 2]
+            octaves = np.abs(np.log2(features.scales[keypoint] / np.maximum(expected_px, 1e-6)))
             similar = octaves < self.kind.scale_octaves
-            observed, keypoint = observed[similar], keypoint[similar]
+            observation, keypoint = observation[similar], keypoint[similar]
             score = np.einsum(
-                "od,od->o", unit_descriptors(descriptors[observed]), query.descriptors(camera, kind)[keypoint]
+                "od,od->o", unit_descriptors(descriptors[observation]), query.descriptors(camera, kind)[keypoint]
             )
-            alike = np.flatnonzero(score > self.kind.guided_min_score)
-            alike = alike[np.lexsort((keypoint[alike], observed[alike], -score[alike]))]
-            keypoint, of_camera = keypoint[alike], np.full(len(alike), camera)
+            good = np.flatnonzero(score > self.kind.guided_min_score)
+            good = good[np.lexsort((keypoint[good], observation[good], -score[good]))]
+            keypoint = keypoint[good]
             pixels = features.keypoints[keypoint].astype(np.float64)
-            yield Candidates(Matches(of_camera, pixels, point[which[observed[alike]]]), keypoint)
+            yield Candidates(Matches(np.full(len(good), camera), pixels, point[which[observation[good]]]), keypoint)
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """K matches of a query image with one kind of features, the most alike first; some may exclude each other."""
+    """K candidate matches of a query image and one kind of features, highest score first.
+
+    A keypoint or a point may be in several of them.
+    """
 
     matches: Matches
     keypoint: Ints
-    """(K,) of the query image."""
+    """(K,) index of the keypoint in the query image."""
 
-    def mutual(self, part: Ints) -> Ints:
-        """Return those of a part, ascending, whose keypoint and point are the most alike to each other."""
-        return part[_is_first(self.keypoint[part]) & _is_first(self.matches.point[part])]
+    def mutual(self, chosen: Ints) -> Ints:
+        """Return the mutual best matches among some candidates, given by ascending index."""
+        return chosen[_is_first(self.keypoint[chosen]) & _is_first(self.matches.point[chosen])]
 
 
 def _unique_columns(numbers: Ints) -> tuple[Ints, ...]:
-    """Return the different columns of integers (R, K), none negative, in ascending order: R arrays."""
+    """Return the unique columns of non-negative integers (R, K), in ascending order, as R arrays."""
     shape = tuple((numbers.max(axis=1, initial=0) + 1).tolist())
-    # One number a column: `np.unique` takes five times as long with an axis.
+    # Each column becomes one number, as `np.unique` takes five times as long with an axis.
     return np.unravel_index(np.unique(np.ravel_multi_index(tuple(numbers), shape)), shape)
 
 
 def _is_first(numbers: Ints) -> NDArray[np.bool_]:
-    """Return which of some numbers, none negative, did not occur before, (K,)."""
+    """Tell for each of K non-negative numbers whether it is the first of its value, (K,)."""
     positions = np.arange(len(numbers))
     first = np.zeros(numbers.max(initial=-1) + 1, np.int64)
-    first[numbers[::-1]] = positions[::-1]  # of several values for one place, the last one stays
+    first[numbers[::-1]] = positions[::-1]  # the last assignment to an index wins: the first position
     return np.asarray(first[numbers] == positions, np.bool_)
 
 
 class Vicinity:
-    """What a query shows near where a pose puts the points of map images: poses nearby choose their matches from it."""
+    """Candidate matches around a pose: keypoints near the projections of map points. Poses close to it reuse them."""
 
     def __init__(
         self,
@@ -215,124 +232,124 @@ class Vicinity:
         """
         Args:
             query: its cameras and features.
-            candidates: all that are within the radius of the projections.
+            candidates: all keypoints within the radius of the projections, per query image and kind of features.
             points: (P, 3) the map points.
             rig_from_world: the pose, (4, 4).
-            radius_deg: of the search.
+            radius_deg: radius of the search.
         """
         self._query, self._candidates, self._points, self._radius_deg = query, candidates, points, radius_deg
-        self._projected = [query.projected(rig_from_world, part.matches, points) for part in candidates]
+        self._projected = [query.projected(rig_from_world, group.matches, points) for group in candidates]
 
     def reaches(self, rig_from_world: Floats, radius_deg: float) -> bool:
-        """Tell whether all that is within a radius of what another pose projects was found."""
+        """Tell whether the candidates include all keypoints within a radius of the projections at another pose."""
         return all(
-            (self._angles_deg(rig_from_world, part, before) <= self._radius_deg - radius_deg).all()
-            for part, before in zip(self._candidates, self._projected, strict=True)
+            (self._angles_deg(rig_from_world, group, projected) <= self._radius_deg - radius_deg).all()
+            for group, projected in zip(self._candidates, self._projected, strict=True)
         )
 
-    def guided(self, rig_from_world: Floats, radius_deg: float, most: int) -> Matches:
-        """Return the matches of a pose.
+    def guided(self, rig_from_world: Floats, radius_deg: float, limit: int) -> Matches:
+        """Return the mutual best matches at a pose.
 
         Args:
             rig_from_world: the pose, (4, 4).
-            radius_deg: largest distance of a keypoint from the projection.
-            most: matches of a camera and a kind at most, the most alike.
+            radius_deg: largest angle between a keypoint and the projection.
+            limit: largest number of matches per camera and kind; those with the highest scores stay.
         """
         chosen = []
-        for part in self._candidates:
-            near = self._angles_deg(rig_from_world, part, part.matches.pixels) <= radius_deg
-            chosen.append(part.matches[part.mutual(np.flatnonzero(near))[:most]])
+        for group in self._candidates:
+            near = self._angles_deg(rig_from_world, group, group.matches.pixels) <= radius_deg
+            chosen.append(group.matches[group.mutual(np.flatnonzero(near))[:limit]])
         return Matches.pooled(chosen)
 
-    def _angles_deg(self, rig_from_world: Floats, part: Candidates, pixels: Floats) -> Floats:
-        """Return how far a pose puts the points of candidates from pixels (K, 2), as angles (K,)."""
-        offsets = self._query.projected(rig_from_world, part.matches, self._points) - pixels
-        return np.degrees(np.arctan(np.linalg.norm(offsets, axis=1) / self._query.focals_px[part.matches.camera]))
+    def _angles_deg(self, rig_from_world: Floats, group: Candidates, pixels: Floats) -> Floats:
+        """Return the angles (K,) between the projections of the candidates' points at a pose and pixels (K, 2)."""
+        offsets = self._query.projected(rig_from_world, group.matches, self._points) - pixels
+        return np.degrees(np.arctan(np.linalg.norm(offsets, axis=1) / self._query.focals_px[group.matches.camera]))
 
 
 class MapMatcher:
-    """Matches queries with a map of one or several kinds of features; the matches of all kinds are pooled."""
+    """Matches queries with a map of several kinds of features. Each kind is matched alone; the matches are pooled."""
 
     def __init__(self, mapped: Sequence[MappedFeatures], settings: PnpSettings) -> None:
         self.mapped = list(mapped)
         self.settings = settings
         self.map = LocalMap.pooled([features.map for features in mapped])
-        """The points of all kinds, one kind after the other."""
+        """The map with the points of all kinds, one kind after the other."""
         self._first_point = np.cumsum([0, *(len(features.map.points) for features in mapped)])
         self._index_in = [
             None
             if features.map.image_names is self.map.image_names
             else [features.map.index_of.get(name, -1) for name in self.map.image_names]
             for features in mapped
-        ]  # of each kind, the index of each image, None: the same; -1: that kind has it not
+        ]  # for each kind, the index of each image in that kind's map, -1 if it is not there; None: the same indices
 
     def by_descriptors(
         self,
         query: RigQuery,
         references: Sequence[References],
         network_matches: Sequence[Sequence[NetworkMatches | None]] = (),
-        known: KnownMatches | None = None,
+        cache: MatchCache | None = None,
     ) -> Matches:
-        """Match each query image with its references by descriptors, those of each kind alone.
+        """Match each query image with its references by descriptors alone.
 
         Args:
             query: its cameras and features.
-            references: of each query image.
-            network_matches: those that networks made before, of each query image and kind.
-            known: those of the query that were made before; the others are added.
+            references: references of each query image.
+            network_matches: matches that networks made earlier, for each query image and kind.
+            cache: earlier matches of this query; new ones are added.
         """
-        parts, known = [], KnownMatches() if known is None else known
+        matches, cache = [], MatchCache() if cache is None else cache
         for kind, features in enumerate(self.mapped):
             columns = [np.zeros((3, 0), np.int64)]
             for camera, retrieved in enumerate(references):
-                before = network_matches[camera][kind] if network_matches else None
+                made_earlier = network_matches[camera][kind] if network_matches else None
                 images = self._of_kind(kind, retrieved.images)
-                new = [image for image in images if (camera, kind, image) not in known]
-                found = features.match(query.features[camera][kind], new, self.settings, before)
-                known |= {(camera, kind, image): part for image, part in zip(new, found, strict=True)}
-                for keypoint, point in (known[camera, kind, image] for image in images):
+                new = [image for image in images if (camera, kind, image) not in cache]
+                made_now = features.match(query.features[camera][kind], new, self.settings, made_earlier)
+                cache |= {(camera, kind, image): pairs for image, pairs in zip(new, made_now, strict=True)}
+                for keypoint, point in (cache[camera, kind, image] for image in images):
                     columns.append(np.stack([np.full(len(point), camera), keypoint, point + self._first_point[kind]]))
             camera_index, keypoint, point = _unique_columns(np.concatenate(columns, axis=1))
-            parts.append(Matches(camera_index, query.pixels(camera_index, keypoint, kind), point))
-        return Matches.pooled(parts)
+            matches.append(Matches(camera_index, query.pixels(camera_index, keypoint, kind), point))
+        return Matches.pooled(matches)
 
     def vicinity(self, query: RigQuery, rig_from_world: Floats, images: Ints, radius_deg: float) -> Vicinity:
-        """Return what is near where the pose puts the points of map images, those of each kind alone."""
+        """Return the candidate matches around a pose with the points of map images."""
         candidates = [
-            replace(part, matches=replace(part.matches, point=part.matches.point + int(self._first_point[kind])))
+            replace(group, matches=replace(group.matches, point=group.matches.point + int(self._first_point[kind])))
             for kind, features in enumerate(self.mapped)
-            for part in features.candidates(
+            for group in features.candidates(
                 query, kind, rig_from_world, self._of_kind(kind, images), radius_deg, self.settings
             )
         ]
         return Vicinity(query, candidates, self.map.points, rig_from_world, radius_deg)
 
     def covisible(self, points: Ints) -> Ints:
-        """Return the map images that see the most of the points, in a fixed order."""
-        seen = self.map.images_seeing(points)
-        some = np.flatnonzero(seen)
-        return some[np.argsort(-seen[some], kind="stable")[: self.settings.guided_images]]
+        """Return the map images that observe the most of some points, most first, at most `guided_images`."""
+        counts = self.map.images_seeing(points)
+        images = np.flatnonzero(counts)
+        return images[np.argsort(-counts[images], kind="stable")[: self.settings.guided_images]]
 
     def kind_names(self, points: Ints) -> NDArray[np.str_]:
-        """Return the name of the kind of features that each point is of."""
+        """Return the name of the kind of features of each point."""
         names = np.array([features.name for features in self.mapped])
         return names[np.searchsorted(self._first_point, points, side="right") - 1]
 
     def keypoints(self, image: int, points: Ints) -> tuple[Ints, Floats]:
-        """Return which of the points a map image sees, as indices into `points`, and where, (n, 2) pixels."""
+        """Return which points a map image observes, as indices (n,) into `points`, and its keypoints (n, 2), pixels."""
         keypoint, observed = self.map.observations(image)
         seen, first = np.unique(observed, return_index=True)
-        at = np.flatnonzero(np.isin(points, seen))  # several cameras of a rig may see the same point
-        where = first[np.searchsorted(seen, points[at])]
+        at = np.flatnonzero(np.isin(points, seen))  # `points` may repeat a point that several cameras of a rig see
+        observation = first[np.searchsorted(seen, points[at])]
         pixels = np.zeros((len(at), 2))
         kinds = np.searchsorted(self._first_point, points[at], side="right") - 1
         for kind in np.unique(kinds):
-            of_kind = self._of_kind(int(kind), [image])[0]
-            pixels[kinds == kind] = self.mapped[kind].keypoints(of_kind)[keypoint[where[kinds == kind]]]
+            index = self._of_kind(int(kind), [image])[0]
+            pixels[kinds == kind] = self.mapped[kind].keypoints(index)[keypoint[observation[kinds == kind]]]
         return at, pixels
 
     def _of_kind(self, kind: int, images: Ints | Sequence[int]) -> list[int]:
-        """Return the indices of images in the map of one kind; those that it does not have are left out."""
+        """Return the indices of images in the map of one kind; images that it does not have are left out."""
         index_in = self._index_in[kind]
         if index_in is None:
             return [int(image) for image in images]

@@ -1,8 +1,8 @@
-"""Points that are triangulated for one query, from its references alone: no map of such features is needed before.
+"""Localize with points that are triangulated for each query from its references, without a map of such features.
 
-The poses of the references are known. So their features are matched along epipolar lines. And where two references
-show the same keypoint of the query, that is a match of the two as well, if it agrees with their poses: what a network
-matches with a dark photograph, it need not find along a line.
+The poses of the references are known, so their features are matched along epipolar lines. In addition, if the same
+query keypoint matches in two references, their two keypoints match each other, provided that they agree with the poses.
+A network can match features with a dark query image that the search along epipolar lines does not match.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -28,7 +28,7 @@ from toolkit.localizers.triangulation import triangulate
 from toolkit.manifest import MapSettings, PnpSettings
 
 FeatureSource = Callable[[str], LocalFeatures]
-"""Returns the features of a map image, by its name; none where it cannot be read."""
+"""Returns the features of a map image, given by name; no features if the image cannot be read."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +40,11 @@ class PosedImages:
     world_from_cams: Floats
     """(N, 4, 4)."""
     instants: Ints
-    """(N,) images that one rig took at one instant have the same number; they are not paired."""
+    """(N,) equal numbers for images that one rig took at one instant; these are never paired."""
 
     @classmethod
     def of_session(cls, session: Session, names: list[str] | None = None, length: float = 1.0) -> "PosedImages":
-        """Return images of a session, by name; None: all camera images with a pose. Lengths are divided by `length`."""
+        """Return images of a session, by name; None: all images with a pose. Positions are divided by `length`."""
         if names is None:
             rows = session.camera_rows
             rows = rows[np.isfinite(session.world_from_cam(rows)).reshape(-1, 16).all(axis=1)]
@@ -58,7 +58,7 @@ class PosedImages:
 
 
 class OnDemandLocalizer:
-    """Localizes with maps of some kinds of features, and with points of other kinds that are made for each query.
+    """Localizes with triangulated maps of some kinds of features, and for other kinds with points made for each query.
 
     Safe to use from several threads.
     """
@@ -76,11 +76,11 @@ class OnDemandLocalizer:
     ) -> None:
         """
         Args:
-            posed: the map's images; those of `mapped`, in their order.
-            mapped: kinds of features with triangulated points. A query's features are of these, then of `on_demand`.
-            on_demand: the other kinds.
+            posed: the map's images, in the order of `mapped`.
+            mapped: kinds of features with triangulated points. Queries have features of these kinds first.
+            on_demand: kinds of features without points, which follow in the queries, and the source of map features.
             map_settings: how points are triangulated.
-            settings, seed: as of `PnpLocalizer`.
+            settings, seed: as for `PnpLocalizer`.
         """
         self.posed, self.mapped, self.on_demand = posed, list(mapped), list(on_demand)
         self._map_settings, self._settings = map_settings or MapSettings(), settings or PnpSettings()
@@ -89,29 +89,31 @@ class OnDemandLocalizer:
         self.image_names = posed.names
 
     def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[None]:
-        """Return nothing for each query: no network is asked for cameras."""
+        """Return None for each query: this method needs no prediction."""
         return [None] * len(queries)
 
     def localize(
         self, query: Query, references: Sequence[References], prediction: None = None, priors: Sequence[Prior] = ()
     ) -> PoseEstimate:
         """Return one pose for the cameras of a rig, or for a single camera; see `Localizer`."""
-        images = np.unique(np.concatenate([np.zeros(0, np.int64), *(part.images for part in references)]))
-        mapped, point_index, before = [], [], 0
+        images = np.unique(np.concatenate([np.zeros(0, np.int64), *(retrieved.images for retrieved in references)]))
+        mapped, point_index, first_point = [], [], 0
         for whole in self.mapped:
             part, points = whole.map.around(images)
             mapped.append(MappedFeatures(part, whole.features, whole.kind, whole.matcher, whole.name))
-            point_index.append(before + points)
-            before += len(whole.map.points)
-        given = query.network_matches or [[None] * (len(self.mapped) + len(self.on_demand)) for _ in query.views]
-        matches = [list(of_camera[: len(self.mapped)]) for of_camera in given]
+            point_index.append(first_point + points)
+            first_point += len(whole.map.points)
+        network_matches = query.network_matches or [
+            [None] * (len(self.mapped) + len(self.on_demand)) for _ in query.views
+        ]
+        matches = [list(of_camera[: len(self.mapped)]) for of_camera in network_matches]
         for number, (method, source) in enumerate(self.on_demand, start=len(self.mapped)):
             features = {self.posed.names[index]: source(self.posed.names[index]) for index in images}
-            found = self._match(query, references, features, method, number)
-            made = self.triangulate(images, features, found, KINDS[method.name].epipolar_min_score)
-            mapped.append(MappedFeatures(made, features, KINDS[method.name], method.matcher, method.name))
-            point_index.append(np.full(len(made.points), -1))  # they are in no file
-            for of_camera, of_kind in zip(matches, found, strict=True):
+            new_matches = self._match(query, references, features, method, number)
+            local_map = self.triangulate(images, features, new_matches, KINDS[method.name].epipolar_min_score)
+            mapped.append(MappedFeatures(local_map, features, KINDS[method.name], method.matcher, method.name))
+            point_index.append(np.full(len(local_map.points), -1))  # these points are in no map file
+            for of_camera, of_kind in zip(matches, new_matches, strict=True):
                 of_camera.append(of_kind.__getitem__)
         estimate = PnpLocalizer(mapped, self._settings, self._seed).localize(
             replace(query, network_matches=matches), references, None, priors
@@ -128,24 +130,24 @@ class OnDemandLocalizer:
         method: AnyMethod,
         number: int,
     ) -> list[dict[str, PairMatches]]:
-        """Return for each query image its matches with its references of one kind, that with the given number."""
+        """Return for each query image its matches with its references, by name, of the kind with the given number."""
         pairs: list[tuple[int, str]] = []
         to_match: list[tuple[LocalFeatures, LocalFeatures]] = []
-        found: list[dict[str, PairMatches]] = [{} for _ in query.views]
-        for camera, (of_image, retrieved) in enumerate(zip(query.features, references, strict=True)):
+        matches: list[dict[str, PairMatches]] = [{} for _ in query.views]
+        for camera, (query_features, retrieved) in enumerate(zip(query.features, references, strict=True)):
             names = [self.posed.names[index] for index in retrieved.images]
-            before: NetworkMatches | None = query.network_matches[camera][number] if query.network_matches else None
-            if before is not None:
-                # What could not be read has no matches, not even none.
-                found[camera] = {name: before(name) if len(features[name]) else PairMatches.none() for name in names}
-            elif not isinstance(of_image, str):
+            stored: NetworkMatches | None = query.network_matches[camera][number] if query.network_matches else None
+            if stored is not None:
+                # Matches with an unreadable reference are not stored.
+                matches[camera] = {name: stored(name) if len(features[name]) else PairMatches.none() for name in names}
+            elif not isinstance(query_features, str):
                 pairs += [(camera, name) for name in names]
-                to_match += [(of_image[number], features[name]) for name in names]
+                to_match += [(query_features[number], features[name]) for name in names]
         with self._network:
-            matched = method.matcher.match(to_match)
-        for (camera, name), matches in zip(pairs, matched, strict=True):
-            found[camera][name] = matches
-        return found
+            new_matches = method.matcher.match(to_match)
+        for (camera, name), pair_matches in zip(pairs, new_matches, strict=True):
+            matches[camera][name] = pair_matches
+        return matches
 
     def triangulate(
         self,
@@ -154,13 +156,13 @@ class OnDemandLocalizer:
         query_matches: Sequence[Mapping[str, PairMatches]],
         min_score: float,
     ) -> LocalMap:
-        """Return a map of all images with the points that some of them see.
+        """Triangulate the points that some of the images see; return a map of all images with these points.
 
         Args:
-            images: (n,) indices, ascending.
-            features: of them, by name.
-            query_matches: of each query image its matches with some of them, by name.
-            min_score: least cosine similarity of a match along an epipolar line.
+            images: (n,) indices of these images, ascending.
+            features: their features, by name.
+            query_matches: for each query image, its matches with some of these images, by name.
+            min_score: smallest cosine similarity of a match along an epipolar line.
         """
         posed, settings = self.posed, self._map_settings
         names = [posed.names[index] for index in images]
@@ -170,54 +172,56 @@ class OnDemandLocalizer:
         along_lines = match_pairs(
             pairs, loaded.__getitem__, cameras, poses, settings.max_epipolar_error_px, settings.ratio, min_score
         )
-        matches = {(int(i), int(j)): found.indices for (i, j), found in zip(pairs, along_lines, strict=True)}
-        place = {name: index for index, name in enumerate(names)}
+        matches = {(int(i), int(j)): pair.indices for (i, j), pair in zip(pairs, along_lines, strict=True)}
+        number_of = {name: number for number, name in enumerate(names)}
         for of_image in query_matches:
-            seen = sorted((place[name], found.indices) for name, found in of_image.items() if name in place)
-            for (i, of_i), (j, of_j) in combinations(seen, 2):
+            matched = sorted((number_of[name], pair.indices) for name, pair in of_image.items() if name in number_of)
+            for (i, with_i), (j, with_j) in combinations(matched, 2):
                 if posed.instants[images[i]] == posed.instants[images[j]]:
                     continue
-                _, at_i, at_j = np.intersect1d(of_i[:, 0], of_j[:, 0], assume_unique=True, return_indices=True)
-                through = np.column_stack([of_i[at_i, 1], of_j[at_j, 1]])
+                _, at_i, at_j = np.intersect1d(with_i[:, 0], with_j[:, 0], assume_unique=True, return_indices=True)
+                through_query = np.column_stack([with_i[at_i, 1], with_j[at_j, 1]])
                 errors = [
                     _epipolar_errors_px(
                         (cameras[a], cameras[b]),
                         geometry.invert(poses[b]) @ poses[a],
-                        loaded[a].keypoints[through[:, first]],
-                        loaded[b].keypoints[through[:, 1 - first]],
+                        loaded[a].keypoints[through_query[:, first]],
+                        loaded[b].keypoints[through_query[:, 1 - first]],
                     )
                     for a, b, first in ((i, j, 0), (j, i, 1))
                 ]
-                before = matches.get((i, j), np.zeros((0, 2), np.int64))
-                # A keypoint has one partner in an image: the one that was found first.
+                earlier = matches.get((i, j), np.zeros((0, 2), np.int64))
+                # A keypoint has one partner in an image: the first one found.
                 new = np.max(errors, axis=0) < settings.max_epipolar_error_px
-                new &= ~np.isin(through[:, 0], before[:, 0]) & ~np.isin(through[:, 1], before[:, 1])
-                matches[i, j] = np.concatenate([before, through[new]])
+                new &= ~np.isin(through_query[:, 0], earlier[:, 0]) & ~np.isin(through_query[:, 1], earlier[:, 1])
+                matches[i, j] = np.concatenate([earlier, through_query[new]])
         ordered = sorted(matches)
-        made = triangulate(
+        local_map = triangulate(
             names,
             cameras,
             poses,
-            [of_image.keypoints for of_image in loaded],
+            [image_features.keypoints for image_features in loaded],
             np.array(ordered, np.int64).reshape(-1, 2),
             [matches[pair] for pair in ordered],
             settings,
             self._seed,
         )
         return replace(
-            made,
+            local_map,
             image_names=posed.names,
             cameras=posed.cameras,
             world_from_cams=posed.world_from_cams,
-            obs_image=images[made.obs_image],
+            obs_image=images[local_map.obs_image],
         )
 
 
 def _epipolar_errors_px(
     cameras: tuple[pycolmap.Camera, pycolmap.Camera], b_from_a: Floats, pixels_a: Floats, pixels_b: Floats
 ) -> Floats:
-    """Return how far pixels (K, 2) of image b are from the epipolar lines of pixels of image a, pixels; inf where both
-    cameras share one place."""
+    """Return the distances (K,) of pixels (K, 2) of image b from the epipolar lines of pixels of image a, pixels.
+
+    They are inf if there is no baseline.
+    """
     baseline = b_from_a[:3, 3]
     normals = np.cross(baseline, rays_of(cameras[0], pixels_a) @ b_from_a[:3, :3].T)
     lengths = np.linalg.norm(normals, axis=1)

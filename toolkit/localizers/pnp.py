@@ -1,10 +1,12 @@
 """Localize by matching a query's features to triangulated map points, and PnP for single cameras and rigs.
 
-Several kinds of features can be used together: their matches are pooled, and a pose is sought that explains them all.
+It takes two steps:
 
-In two steps. First, descriptors alone: the query against its retrieved references, then LO-RANSAC. Then, with that
-pose, the points of all covisible map images are projected into the query and matched only near where they should be,
-which finds several times as many and makes the pose more precise.
+1. Match the query with its retrieved references by descriptors alone, and find a pose by LO-RANSAC.
+2. Project the points of all covisible map images into the query at this pose, and match them only with keypoints near
+   their projections (guided matches). This finds several times as many matches, and refines the pose.
+
+Several kinds of features can be used together: one pose is estimated from the pooled matches of all kinds.
 """
 
 from collections.abc import Sequence
@@ -18,21 +20,21 @@ from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import CAMERA, NetworkMatches, PoseEstimate, Prior, Query, QueryInput, References, agree
 from toolkit.localizers.confidence import EVIDENCE, probability_right
 from toolkit.localizers.correspondences import Correspondences, Rival
-from toolkit.localizers.matches import KnownMatches, MapMatcher, MappedFeatures, Vicinity
+from toolkit.localizers.matches import MapMatcher, MappedFeatures, MatchCache, Vicinity
 from toolkit.localizers.misfit import find_misfit
 from toolkit.localizers.rig import Matches, RigQuery, least_squares_covariance
 from toolkit.manifest import PnpSettings
 
 FIRST_REFERENCES = {2: 200, 4: 100}
-"""How many references of an image are matched first, and the independent inliers with which the pose that these give is
-the one to start from. With fewer inliers, the next number of references is tried, and at last all."""
+"""Number of references per image to match first -> independent inliers that the resulting pose needs to be accepted.
+With fewer inliers, the next number of references is tried, and finally all."""
 VIEWS = 4
-"""References of an estimate whose keypoints are kept with its correspondences, those that see the most of them."""
+"""Number of references whose keypoints are stored with the correspondences: those that observe the most of them."""
 
 
 @dataclass(frozen=True)
 class _Hypothesis:
-    """A pose and the guided matches that it rests on."""
+    """A pose and the guided matches that support it."""
 
     rig_from_world: Floats
     matches: Matches
@@ -43,7 +45,7 @@ class _Hypothesis:
 
 
 class PnpLocalizer:
-    """Localizes queries in one map by matching, with one or several kinds of its features together.
+    """Localizes queries in one map by matching and PnP, with one or several kinds of features.
 
     Safe to use from several threads; the map is never changed.
     """
@@ -61,7 +63,7 @@ class PnpLocalizer:
         return self.map.image_names
 
     def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[None]:
-        """Return nothing for each query: no network is asked."""
+        """Return None for each query: this method needs no prediction."""
         return [None] * len(queries)
 
     def localize(
@@ -69,20 +71,12 @@ class PnpLocalizer:
     ) -> PoseEstimate:
         """Return one pose for the cameras of a rig, or for a single camera; see `Localizer`.
 
-        Images without features are left out. Priors are hypotheses too: one wins if clearly more guided matches support
-        it; one that confirms an `ok` pose changes nothing.
+        Images without features are left out. A prior is one more hypothesis: it wins if clearly more guided matches
+        support it. A prior that agrees with an `ok` pose changes nothing.
         """
         usable = [index for index, features in enumerate(query.features) if not isinstance(features, str)]
         if len(usable) < len(query.features):
-            missing = "; ".join(features for features in query.features if isinstance(features, str))
-            if not usable:
-                return PoseEstimate(f"failed: no readable image ({missing})")
-            estimate = self.localize(query.part(usable), [references[index] for index in usable], None, priors)
-            used = replace(estimate.correspondences, camera=np.array(usable, np.int64)[estimate.correspondences.camera])
-            focals_px = np.full(len(query.features), np.nan)
-            focals_px[usable] = estimate.focals_px or np.nan
-            reason = "; ".join(filter(None, [estimate.reason, missing]))
-            return replace(estimate, correspondences=used, focals_px=tuple(focals_px.tolist()), reason=reason)
+            return self._localize_part(query, usable, references, priors)
         if not any(len(retrieved.images) for retrieved in references):
             return PoseEstimate("failed: no references")
         rig = RigQuery(
@@ -90,8 +84,8 @@ class PnpLocalizer:
             np.asarray(query.rig_from_cams, np.float64),
             [features for features in query.features if not isinstance(features, str)],
         )
-        matches, best, start = self._first_pose(rig, references, query.network_matches)
-        hypotheses = [] if start is None else self._hypotheses(rig, start, best, matches, references)
+        matches, first_matches, start = self._first_pose(rig, references, query.network_matches)
+        hypotheses = [] if start is None else self._hypotheses(rig, start, first_matches, matches, references)
         if hypotheses:
             estimate = self._estimate(rig, matches, hypotheses, references)
         else:
@@ -101,17 +95,31 @@ class PnpLocalizer:
             estimate = self._compare(rig, matches, hypotheses, estimate, references, prior)
         return self._with_misfit(rig, matches, estimate)
 
-    def _with_misfit(self, query: RigQuery, matches: Matches, estimate: PoseEstimate) -> PoseEstimate:
-        """Return the estimate, doubted where matches made without the pose contradict the cameras.
+    def _localize_part(
+        self, query: Query, usable: Sequence[int], references: Sequence[References], priors: Sequence[Prior]
+    ) -> PoseEstimate:
+        """Return the estimate from the images with features alone; `usable` are their indices."""
+        missing = "; ".join(features for features in query.features if isinstance(features, str))
+        if not usable:
+            return PoseEstimate(f"failed: no readable image ({missing})")
+        estimate = self.localize(query.part(usable), [references[index] for index in usable], None, priors)
+        used = replace(estimate.correspondences, camera=np.array(usable, np.int64)[estimate.correspondences.camera])
+        focals_px = np.full(len(query.features), np.nan)
+        focals_px[usable] = estimate.focals_px or np.nan
+        reason = "; ".join(filter(None, [estimate.reason, missing]))
+        return replace(estimate, correspondences=used, focals_px=tuple(focals_px.tolist()), reason=reason)
 
-        The pose stays that of the stated intrinsics; its covariance then reaches to where those that fit would put it.
+    def _with_misfit(self, query: RigQuery, matches: Matches, estimate: PoseEstimate) -> PoseEstimate:
+        """Return the estimate, with a warning if matches made without the pose contradict the query's intrinsics.
+
+        The pose remains that of the stated intrinsics. Its covariance grows to cover the pose of those that would fit.
         """
         if estimate.world_from_rig is None:
             return estimate
         misfit = find_misfit(
             query,
             geometry.invert(estimate.world_from_rig),
-            matches[self.map.track_lengths(matches.point) > 1],  # the depth of others is not known from the map alone
+            matches[self.map.track_lengths(matches.point) > 1],  # points with one observation are not triangulated
             self.map.points,
             self.settings.ransac_max_error_deg,
             focal_alone=estimate.rival_support > self.settings.ok_rival_support,
@@ -137,12 +145,12 @@ class PnpLocalizer:
         references: Sequence[References],
         prior: Prior,
     ) -> PoseEstimate:
-        """Return the estimate that was found without a prior, or the one found with it if it is better supported."""
+        """Return the estimate found without a prior, or the one found from the prior if it is better supported."""
         if estimate.status == "ok" and agree(estimate.world_from_rig, prior.world_from_rig):
             return estimate  # each confirms the other
-        of_prior = geometry.invert(prior.world_from_rig)
-        vicinity = self.matcher.vicinity(query, of_prior, self._seeing_the_same(prior.images), prior.radius_deg)
-        near = vicinity.guided(of_prior, prior.radius_deg, self.settings.max_guided_matches)
+        rig_from_world = geometry.invert(prior.world_from_rig)
+        vicinity = self.matcher.vicinity(query, rig_from_world, self._covisible(prior.images), prior.radius_deg)
+        near = vicinity.guided(rig_from_world, prior.radius_deg, self.settings.max_guided_matches)
         start = self._ransac(query, near, self.settings.ransac_max_error_deg) if len(near) else None
         if start is None:
             return estimate
@@ -150,11 +158,11 @@ class PnpLocalizer:
         same = bool(hypotheses) and not _differ(hypotheses[0], hypothesis)
         support = len(hypotheses[0].matches) if hypotheses else 0
         support_of_prior = len(hypothesis.matches)
-        clearly_more = support <= self.settings.ok_rival_support * support_of_prior  # a tie is no reason to change
+        clearly_more = support <= self.settings.ok_rival_support * support_of_prior  # a tie keeps the first estimate
         if (support_of_prior >= support and estimate.status != "ok") if same else clearly_more:
-            # Judged by the matches about the prior, which is as independent of the pose as descriptors alone are.
-            seen = [References.of(prior.images.tolist())]
-            with_prior = self._estimate(query, near, [hypothesis, *hypotheses], seen)
+            # The matches near the prior judge the pose: like matches by descriptors, they were made without it.
+            prior_references = [References.of(prior.images.tolist())]
+            with_prior = self._estimate(query, near, [hypothesis, *hypotheses], prior_references)
             lost = estimate.world_from_rig is None
             if with_prior.world_from_rig is not None and (not same or lost or with_prior.status == "ok"):
                 return replace(with_prior, found_by=f"pnp+{prior.source}")
@@ -164,8 +172,8 @@ class PnpLocalizer:
         rivals = sorted([*hypotheses, hypothesis], key=lambda rival: -len(rival.matches))
         return self._estimate(query, matches, rivals, references)
 
-    def _seeing_the_same(self, images: Ints) -> Ints:
-        """Return the map images that see the most of what the given ones see."""
+    def _covisible(self, images: Ints) -> Ints:
+        """Return the map images that observe the most points of the given map images."""
         points = [self.map.observations(int(image))[1] for image in images]
         return self.matcher.covisible(np.unique(np.concatenate([np.zeros(0, np.int64), *points])))
 
@@ -175,43 +183,48 @@ class PnpLocalizer:
         references: Sequence[References],
         network_matches: Sequence[Sequence[NetworkMatches | None]],
     ) -> tuple[Matches, Matches, Floats | None]:
-        """Return matches by descriptors, those among which a pose is sought, and the pose that the most agree with.
+        """Match the query by descriptors and find a first pose by RANSAC.
 
-        The best references have most of the right matches, the further ones mostly wrong ones, which slow RANSAC down.
-        So a pose is sought with the best few, and with more if it has few inliers. If most matches of the best are
-        inliers, further references are matched only if they show another place, which may be a rival.
+        The best references give most of the correct matches; later ones give mostly wrong matches, which slow RANSAC
+        down. So RANSAC runs on the best few references, and on more if the pose has few inliers. If most matches of the
+        best references are inliers, later references are matched only if they show another place, which may be a rival.
+
+        Returns:
+            All matches, the matches given to RANSAC, and the pose rig_from_world (4, 4), or None if there is none.
         """
-        settings, known = self.settings, KnownMatches()
+        settings, cache = self.settings, MatchCache()
         start: Floats | None = None
         for count, enough in FIRST_REFERENCES.items():
-            if all(len(part.images) <= count for part in references):
+            if all(len(retrieved.images) <= count for retrieved in references):
                 break
-            best = [part.take(np.arange(len(part.images)) < count) for part in references]
-            among = self.matcher.by_descriptors(query, best, network_matches, known)
-            start = self._ransac(query, among, settings.ransac_max_error_deg)
-            inliers = among[np.zeros(len(among), bool) if start is None else self._inliers(query, start, among)]
+            best = [retrieved.take(np.arange(len(retrieved.images)) < count) for retrieved in references]
+            first_matches = self.matcher.by_descriptors(query, best, network_matches, cache)
+            start = self._ransac(query, first_matches, settings.ransac_max_error_deg)
+            none = np.zeros(len(first_matches), bool)
+            inliers = first_matches[none if start is None else self._inliers(query, start, first_matches)]
             if self._independent(inliers) < enough:
                 start = None
-            elif len(inliers) > settings.clear_inlier_ratio * len(among):
-                same = self.map.images_seeing(np.unique(inliers.point)) >= settings.min_inliers
+            elif len(inliers) > settings.clear_inlier_ratio * len(first_matches):
+                same_place = self.map.images_seeing(np.unique(inliers.point)) >= settings.min_inliers
                 references = [
-                    part.take((np.arange(len(part.images)) < count) | ~same[part.images]) for part in references
+                    retrieved.take((np.arange(len(retrieved.images)) < count) | ~same_place[retrieved.images])
+                    for retrieved in references
                 ]
                 break
-        matches = self.matcher.by_descriptors(query, references, network_matches, known)
+        matches = self.matcher.by_descriptors(query, references, network_matches, cache)
         if start is not None:
-            return matches, among, start
+            return matches, first_matches, start
         return matches, matches, self._ransac(query, matches, settings.ransac_max_error_deg)
 
     def _hypotheses(
-        self, query: RigQuery, start: Floats, best: Matches, matches: Matches, references: Sequence[References]
+        self, query: RigQuery, start: Floats, first_matches: Matches, matches: Matches, references: Sequence[References]
     ) -> list[_Hypothesis]:
-        """Return refined poses, best supported first; one of them is refined from `start`, RANSAC's pose.
+        """Return refined poses, best supported first; one of them is refined from the first pose `start`.
 
-        Repeated structure (a row of like windows) gives several poses that many descriptors agree with, and
-        RANSAC may take one of them or something in between. So unless the first is clear, others are sought, with a
-        tighter limit, among the matches that the first leaves over and among those of single references, and the
-        guided matches decide: only the right pose puts the rest of the map where it is seen.
+        With repeated structure (a row of similar windows), many descriptors agree with several poses, and RANSAC may
+        find one of them or something in between. So unless the first pose is clear, search for others: with a tighter
+        threshold, among the outliers of the first, and among the matches of single references. The number of guided
+        matches decides: only at the correct pose does the rest of the map project where the query shows it.
         """
         settings = self.settings
         hypotheses = [self._improve(query, start, matches)]
@@ -220,12 +233,12 @@ class PnpLocalizer:
         if share > settings.clear_inlier_ratio:
             return hypotheses
         if share < settings.contested_inlier_ratio:
-            other = self._ransac(query, best, settings.max_error_deg)
+            other = self._ransac(query, first_matches, settings.max_error_deg)
             if other is not None:
                 hypotheses.append(self._improve(query, other, matches))
                 inliers |= self._inliers(query, hypotheses[1].rig_from_world, matches)
         rest = matches[~inliers]
-        # No need to look for less than half of the support.
+        # A pose with less than half of the support is no rival.
         other = self._ransac(query, rest, settings.ransac_max_error_deg, least_inliers=int(inliers.sum() / 2))
         if other is not None:
             support = self._inliers(query, other, rest).sum()
@@ -238,22 +251,21 @@ class PnpLocalizer:
     def _add_by_reference(
         self, query: RigQuery, matches: Matches, references: Sequence[References], hypotheses: list[_Hypothesis]
     ) -> None:
-        """Add the poses that matches with single references agree on, where they are clearly others."""
-        every = dict.fromkeys(int(index) for retrieved in references for index in retrieved.images)
-        shown = {index: np.isin(matches.point, self.map.observations(index)[1]) for index in every}
-        best = sorted(shown, key=lambda index: -int(shown[index].sum()))
+        """Add clearly different poses, found from the matches with single references."""
+        images = dict.fromkeys(int(index) for retrieved in references for index in retrieved.images)
+        seen_in = {index: np.isin(matches.point, self.map.observations(index)[1]) for index in images}
+        best = sorted(seen_in, key=lambda index: -int(seen_in[index].sum()))
         for index in best[: self.settings.contested_references]:
-            start = self._ransac(query, matches[shown[index]], self.settings.ransac_max_error_deg, least_inliers=5)
+            start = self._ransac(query, matches[seen_in[index]], self.settings.ransac_max_error_deg, least_inliers=5)
             if start is not None and not any(
                 agree(hypothesis.world_from_rig, geometry.invert(start)) for hypothesis in hypotheses
             ):
                 hypotheses.append(self._improve(query, start, matches))
 
     def _independent(self, inliers: Matches) -> int:
-        """Return how many of the matches are independent evidence."""
-        # A point matched in several ways, or several points on one keypoint, are one piece of it.
-        places = inliers.pixels.astype(np.float32).view(np.uint64)[:, 0]  # x and y as one number
-        keypoints = sum(len(np.unique(places[inliers.camera == camera])) for camera in np.unique(inliers.camera))
+        """Return the number of independent inliers: those that share a point or a keypoint count once."""
+        xy = inliers.pixels.astype(np.float32).view(np.uint64)[:, 0]  # x and y as one number
+        keypoints = sum(len(np.unique(xy[inliers.camera == camera])) for camera in np.unique(inliers.camera))
         return min(len(np.unique(inliers.point)), keypoints)
 
     def _inliers(self, query: RigQuery, rig_from_world: Floats, matches: Matches) -> NDArray[np.bool_]:
@@ -261,30 +273,33 @@ class PnpLocalizer:
         return errors < self.settings.ransac_max_error_deg
 
     def _improve(self, query: RigQuery, rig_from_world: Floats, matches: Matches) -> _Hypothesis:
-        """Match again around a pose and refine it, as long as that finds support."""
+        """Alternate between guided matching around the pose and refinement, while enough matches support it."""
         settings = self.settings
         best = _Hypothesis(rig_from_world, matches[self._inliers(query, rig_from_world, matches)])
-        least = max(4, 0.5 * len(np.unique(best.matches.point)))
+        min_matches = max(4, 0.5 * len(np.unique(best.matches.point)))
         vicinity: Vicinity | None = None
         for radius in settings.guided_radii_deg:
             pose = best.rig_from_world
             if vicinity is None or not vicinity.reaches(pose, radius):
                 images = self.matcher.covisible(np.unique(best.matches.point))
                 vicinity = self.matcher.vicinity(query, pose, images, radius)
-            near = vicinity.guided(pose, radius, settings.max_guided_matches)
-            if len(near) < least:
+            guided = vicinity.guided(pose, radius, settings.max_guided_matches)
+            if len(guided) < min_matches:
                 break
-            refined = query.refine(pose, near, self.map.points)
-            near = near[query.errors_deg(refined, near, self.map.points) < settings.max_error_deg]
-            if len(near) < least:
+            refined = query.refine(pose, guided, self.map.points)
+            guided = guided[query.errors_deg(refined, guided, self.map.points) < settings.max_error_deg]
+            if len(guided) < min_matches:
                 break
-            best = _Hypothesis(query.refine(refined, near, self.map.points), near)
+            best = _Hypothesis(query.refine(refined, guided, self.map.points), guided)
         return best
 
     def _estimate(
         self, query: RigQuery, matches: Matches, hypotheses: list[_Hypothesis], references: Sequence[References]
     ) -> PoseEstimate:
-        """Judge the best pose by the matches that were made without it, and by its rivals."""
+        """Return the first hypothesis as an estimate, judged by the matches made without it and by its rivals.
+
+        The other hypotheses must be sorted by support, best first.
+        """
         settings = self.settings
         rig_from_world, guided = hypotheses[0].rig_from_world, hypotheses[0].matches
         inliers = matches[self._inliers(query, rig_from_world, matches)]
@@ -296,17 +311,17 @@ class PnpLocalizer:
                 num_inliers=independent,
                 correspondences=self._rejected(matches),
             )
-        errors = query.errors_px(rig_from_world, guided, self.map.points)
-        # Guided matches were sought around the pose, so their errors are small wherever it is. The covariance rests on
-        # those that descriptors alone found, too.
+        errors, rivals = query.errors_px(rig_from_world, guided, self.map.points), self._rivals(hypotheses)
+        # Guided matches were searched near the pose, so their errors are small wherever it is. Only those that were
+        # also found by descriptors alone measure its accuracy.
         found_twice = guided[np.isin(guided.rows(), inliers.rows())]
-        others = matches[~np.isin(matches.rows(), guided.rows())]
-        others_agree = query.errors_deg(rig_from_world, others, self.map.points) < settings.max_error_deg
-        every = Matches.pooled([guided, others])
-        agreeing = np.concatenate([np.ones(len(guided), bool), others_agree])
+        unguided = matches[~np.isin(matches.rows(), guided.rows())]
+        unguided_agree = query.errors_deg(rig_from_world, unguided, self.map.points) < settings.max_error_deg
+        all_matches = Matches.pooled([guided, unguided])
+        agreeing = np.concatenate([np.ones(len(guided), bool), unguided_agree])
         images = np.unique(np.concatenate([retrieved.images for retrieved in references]))
-        seen = self.map.images_seeing(np.unique(every.point[agreeing]))[images]
-        shown = [int(images[index]) for index in np.argsort(-seen, kind="stable") if seen[index]]
+        seen = self.map.images_seeing(np.unique(all_matches.point[agreeing]))[images]
+        used = [int(images[index]) for index in np.argsort(-seen, kind="stable") if seen[index]]
         estimate = PoseEstimate(
             status="ok",
             world_from_rig=geometry.invert(rig_from_world),
@@ -315,12 +330,12 @@ class PnpLocalizer:
             num_inliers=independent,
             num_guided=len(guided),
             rmse_px=float(np.sqrt(np.mean(errors**2))) if len(errors) else float("nan"),
-            rival_support=self._rival_support(hypotheses),
-            rivals=tuple(self._rivals(hypotheses)),
+            rival_support=rivals[0].support if rivals else 0.0,
+            rivals=tuple(rivals),
             coverage=self._coverage(query, inliers),
             agreement=self._agreement(inliers),
-            references=tuple(shown),
-            correspondences=self._correspondences(every, agreeing, len(guided), shown),
+            references=tuple(used),
+            correspondences=self._correspondences(all_matches, agreeing, len(guided), used),
         )
         evidence = {name: getattr(estimate, name) for name in EVIDENCE}
         estimate = replace(estimate, p_correct=float(probability_right(evidence)))
@@ -328,12 +343,12 @@ class PnpLocalizer:
         return estimate if certain else replace(estimate, status="low_confidence")
 
     def _agreement(self, inliers: Matches) -> int:
-        """Return the number of points matched by the second best kind of features."""
+        """Return the number of inlier points of the kind of features that has the second most."""
         counts = np.unique(self.matcher.kind_names(np.unique(inliers.point)), return_counts=True)[1]
         return int(np.sort(counts)[-2]) if len(counts) > 1 else 0
 
     def _coverage(self, query: RigQuery, inliers: Matches) -> float:
-        """Return the share of the cells of a 4 x 4 grid over each query image in which an inlier lies."""
+        """Return the share of cells with an inlier, in a 4 x 4 grid over each query image."""
         sizes = np.array([(camera.width, camera.height) for camera in query.cameras])
         cells = np.clip(4 * inliers.pixels / sizes[inliers.camera], 0, 3).astype(np.int64)
         return len(np.unique(np.column_stack([inliers.camera, cells]), axis=0)) / (16 * len(sizes))
@@ -341,12 +356,13 @@ class PnpLocalizer:
     def _correspondences(
         self, matches: Matches, inlier: NDArray[np.bool_], guided: int, references: Sequence[int]
     ) -> Correspondences:
-        """Return matches as correspondences, with the places where the first references show their points.
+        """Return K matches as correspondences, with the keypoints of the first `VIEWS` references.
 
         Args:
+            matches: guided matches first.
             inlier: (K,) whether the pose agrees.
-            guided: how many of them, the first, were found near where a pose puts their points.
-            references: map images, those that see the most of the inliers first.
+            guided: number of guided matches.
+            references: map images, those that observe the most inliers first.
         """
         views = [(rank, *self.matcher.keypoints(i, matches.point)) for rank, i in enumerate(references[:VIEWS])]
         found_by = np.repeat(["/guided", "/descriptors"], [guided, len(matches) - guided])
@@ -363,37 +379,31 @@ class PnpLocalizer:
         )
 
     def _covariance(self, query: RigQuery, rig_from_world: Floats, matches: Matches) -> Floats | None:
-        """Return the covariance (6, 6) of a pose that rests on matches; None where it is not defined."""
+        """Return the covariance (6, 6) of a pose estimated from matches; None if it is undefined."""
         of_pose, of_point = query.jacobians(rig_from_world, matches, self.map.points)
         errors = query.errors_px(rig_from_world, matches, self.map.points)
         return least_squares_covariance(of_pose, errors, self._noise_of_points(query, matches, of_point))
 
     def _noise_of_points(self, query: RigQuery, matches: Matches, of_point: Floats) -> Floats:
-        """Return the covariance (K, 2, 2) of projections that comes from their points, square pixels; NaN if unknown.
+        """Return the covariance (K, 2, 2) of projections due to the noise of their points, square pixels; NaN: unknown.
 
-        `of_point` (K, 2, 3) is how the projections of the K matches move with their points.
+        `of_point` (K, 2, 3) are the derivatives of the K projections by their points.
         """
         noise = of_point @ self.map.point_covariances(matches.point) @ of_point.transpose(0, 2, 1)
-        # A match counts only where its point is seen near where it should be: no more of the point's noise is in it.
+        # Inliers have errors below the threshold, so the noise of their points cannot be larger.
         limit_px = np.tan(np.radians(self.settings.max_error_deg)) * query.focals_px[matches.camera]
         share = limit_px**2 / np.maximum(np.trace(noise, axis1=1, axis2=2), 1e-12)
         return np.asarray(noise * np.minimum(share, 1)[:, None, None], np.float64)
 
     def _rejected(self, matches: Matches) -> Correspondences:
-        """Return matches that support no pose."""
+        """Return the correspondences of matches that support no pose."""
         return self._correspondences(matches, np.zeros(len(matches), bool), 0, [])
 
-    def _rival_support(self, hypotheses: list[_Hypothesis]) -> float:
-        """Return the support of the best pose that is another one, relative to the best pose's."""
-        first, *others = hypotheses
-        rivals = (len(other.matches) for other in others if _differ(first, other))
-        return next(rivals, 0) / max(len(first.matches), 1)
-
     def _rivals(self, hypotheses: list[_Hypothesis]) -> list[Rival]:
-        """Return poses that are other ones than the best and than each other, best supported first."""
+        """Return the poses that clearly differ from the best and from each other, with their relative support."""
         kept = hypotheses[:1]
-        for other in sorted(hypotheses[1:], key=lambda hypothesis: -len(hypothesis.matches)):
-            if all(_differ(known, other) for known in kept):
+        for other in hypotheses[1:]:
+            if all(_differ(one, other) for one in kept):
                 kept.append(other)
         support = max(len(hypotheses[0].matches), 1)
         return [Rival(other.world_from_rig, len(other.matches) / support) for other in kept[1:]]

@@ -1,4 +1,4 @@
-"""The geometry of a query: one camera, or several that are rigidly mounted together, and matches with map points."""
+"""Geometry of a query: its camera, or the cameras of its rig, and their matches with map points."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,29 +20,29 @@ from toolkit.manifest import PnpSettings
 
 RANSAC_CONFIDENCE = 0.999
 POSELIB_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
-"""COLMAP's names of the lenses that PoseLib 2.0.5 can refine with; of others it leaves the pose as it is."""
+"""COLMAP's names of the camera models that PoseLib 2.0.5 can refine with. With others it returns the pose unchanged."""
 
-# PoseLib's solver for rigs draws from the C library's generator, which all threads share: without a seed of its own, or
-# two at once, equal seeds would give poses that are unequal in their last digits. Other libraries draw from it, too
-# (ZeroMQ in a kernel): hence a pose is rounded to what no draw changes, and refinement starts from equals.
+# PoseLib's solver for rigs uses the random generator of the C library, which all threads share. So that equal seeds
+# give equal poses, it is seeded before each call, and only one call runs at a time. Other libraries (ZeroMQ in a
+# notebook) may still draw from it and change the last digits: so the pose is rounded before it is refined.
 _RIG_RANSAC = Lock()
 _DECIMALS = 9
 
 
 @dataclass(frozen=True)
 class Matches:
-    """K matches of query pixels to map points."""
+    """K matches of query keypoints with map points."""
 
     camera: Ints
     """(K,) index of the query image."""
     pixels: Floats
-    """(K, 2) in it."""
+    """(K, 2) keypoints in that image."""
     point: Ints
     """(K,) index of the map point."""
 
     @classmethod
     def pooled(cls, parts: "Sequence[Matches]") -> "Matches":
-        """Return the matches of all parts."""
+        """Return the matches of all parts, in order."""
         return cls(
             np.concatenate([np.zeros(0, np.int64), *(part.camera for part in parts)]),
             np.concatenate([np.zeros((0, 2)), *(part.pixels for part in parts)]),
@@ -50,7 +50,7 @@ class Matches:
         )
 
     def rows(self) -> NDArray[np.void]:
-        """Return the matches (K,) as values that can be compared."""
+        """Return the matches (K,) as values that can be tested for equality."""
         rows = np.ascontiguousarray(np.column_stack([self.camera, self.point, self.pixels]))
         return rows.view([("", rows.dtype)] * rows.shape[1])[:, 0]
 
@@ -62,7 +62,7 @@ class Matches:
 
 
 class RigQuery:
-    """The cameras of a query device and their features: projections, errors and poses from matches.
+    """The cameras of a query and their features; computes poses, projections and errors of matches.
 
     A single camera is a rig of one.
     """
@@ -70,8 +70,8 @@ class RigQuery:
     def __init__(self, cameras: list[pycolmap.Camera], rig_from_cams: Floats, features: list[list[LocalFeatures]]):
         self.cameras = cameras
         self.rig_from_cams = rig_from_cams
-        self.features = features  # of each camera, of each kind
-        self._places = [_poselib(pose) for pose in geometry.invert(rig_from_cams)]
+        self.features = features  # [camera][kind]
+        self._cams_from_rig = [_poselib(pose) for pose in geometry.invert(rig_from_cams)]
         self.focals_px = np.array([camera.mean_focal_length() for camera in cameras])
         self.bounds = np.stack([view_bounds(camera) for camera in cameras])
         self._descriptors: dict[tuple[int, int], NDArray[np.float32]] = {}
@@ -80,13 +80,13 @@ class RigQuery:
         ]
 
     def descriptors(self, camera: int, kind: int) -> NDArray[np.float32]:
-        """Return the descriptors (N, D) of an image's features of one kind, ready for dot products."""
+        """Return the unit descriptors (N, D) of an image's features of one kind, float32."""
         if (camera, kind) not in self._descriptors:
             self._descriptors[camera, kind] = unit_descriptors(self.features[camera][kind].descriptors)
         return self._descriptors[camera, kind]
 
     def pixels(self, camera: Ints, keypoint: Ints, kind: int) -> Floats:
-        """Return the places (K, 2) of keypoints of one kind."""
+        """Return the pixels (K, 2) of keypoints of one kind, given by camera (K,) and index (K,)."""
         pixels = np.zeros((len(camera), 2))
         for index, kinds in enumerate(self.features):
             pixels[camera == index] = kinds[kind].keypoints[keypoint[camera == index]]
@@ -101,15 +101,17 @@ class RigQuery:
         seed: int,
         least_inliers: int = 0,
     ) -> Floats | None:
-        """Return the pose rig_from_world (4, 4) that the most matches agree with, by LO-RANSAC (PoseLib), or None.
+        """Return the pose rig_from_world (4, 4) with the most inliers, by LO-RANSAC (PoseLib), or None.
 
-        Errors are those on the plane at depth 1, where no lens bends anything, times one focal length.
+        Errors are measured on the undistorted image plane at depth 1, times the mean focal length.
 
         Args:
             matches: K matches.
             points: (P, 3) the map points.
-            max_error_deg: largest error of an inlier, as an angle.
-            least_inliers: a pose with fewer may be missed.
+            max_error_deg: inlier threshold, as an angle.
+            settings: limits of RANSAC.
+            seed: of the random generators.
+            least_inliers: RANSAC may miss poses with fewer inliers, which saves time.
         """
         if len(np.unique(matches.point)) < 4:
             return None
@@ -120,7 +122,7 @@ class RigQuery:
             least_inliers = least_inliers * settings.max_ransac_matches // len(matches)
             matches = matches[kept]
         least_share = np.clip(least_inliers / len(matches), 1e-3, 0.99)
-        trials = np.log(1 - RANSAC_CONFIDENCE) / np.log1p(-(least_share**3))  # to draw three inliers once
+        trials = np.log(1 - RANSAC_CONFIDENCE) / np.log1p(-(least_share**3))  # to draw one sample of three inliers
         options = {
             "success_prob": RANSAC_CONFIDENCE,
             "dyn_num_trials_mult": 1.0,
@@ -129,59 +131,63 @@ class RigQuery:
             "seed": seed,
             "max_reproj_error": float(np.tan(np.radians(max_error_deg)) * self.focals_px.mean()),
         }
-        plane, seen, cameras = self._by_camera(matches, points, flat=True)
-        if sum(map(len, seen)) < 4:
+        pixels, xyz, cameras = self._by_camera(matches, points, undistort=True)
+        if sum(map(len, xyz)) < 4:
             return None
         if len(self.cameras) == 1:
-            found, info = poselib.estimate_absolute_pose(plane[0], seen[0], cameras[0], options)
+            pose, info = poselib.estimate_absolute_pose(pixels[0], xyz[0], cameras[0], options)
         else:
             with _RIG_RANSAC:
-                pycolmap.set_random_seed(seed)  # that of the C library, too
-                found, info = poselib.estimate_generalized_absolute_pose(plane, seen, self._places, cameras, options)
-        if info["num_inliers"] < 4 or not np.isfinite(found.Rt).all():
+                pycolmap.set_random_seed(seed)  # seeds the C library, too
+                pose, info = poselib.estimate_generalized_absolute_pose(
+                    pixels, xyz, self._cams_from_rig, cameras, options
+                )
+        if info["num_inliers"] < 4 or not np.isfinite(pose.Rt).all():
             return None
         if len(self.cameras) == 1:
-            return np.asarray(self.rig_from_cams[0] @ _matrix(found.Rt), np.float64)
-        rotation = geometry.quaternion_to_rotation(np.round(found.q, _DECIMALS))
-        return geometry.make_pose(rotation, np.round(found.t, _DECIMALS - 3))
+            return np.asarray(self.rig_from_cams[0] @ _matrix(pose.Rt), np.float64)
+        rotation = geometry.quaternion_to_rotation(np.round(pose.q, _DECIMALS))
+        return geometry.make_pose(rotation, np.round(pose.t, _DECIMALS - 3))
 
     def _by_camera(
-        self, matches: Matches, points: Floats, flat: bool
+        self, matches: Matches, points: Floats, undistort: bool
     ) -> tuple[list[Floats], list[Floats], list[dict[str, Any]]]:
         """Return pixels (n, 2) and points (n, 3) of the matches of each camera, and the cameras, as PoseLib takes them.
 
         Args:
-            flat: pixels are those of pinhole cameras of the mean focal length, not of the lenses.
+            undistort: return pixels of pinhole cameras with the mean focal length of the rig, not of the actual lenses.
         """
         focal_px = float(self.focals_px.mean())
-        pixels, seen, cameras = [], [], []
+        pixels, xyz, cameras = [], [], []
         for index, camera in enumerate(self.cameras):
             part = matches.camera == index
-            xy, place = matches.pixels[part], points[matches.point[part]]
+            xy, in_world = matches.pixels[part], points[matches.point[part]]
             model, params = camera.model.name, camera.params.tolist()
-            if flat or model not in POSELIB_MODELS:
+            if undistort or model not in POSELIB_MODELS:
                 xy = focal_px * np.asarray(camera.cam_from_img(xy)).reshape(-1, 2)
                 finite = np.isfinite(xy).all(axis=1)
-                xy, place = xy[finite], place[finite]
+                xy, in_world = xy[finite], in_world[finite]
                 model, params = "SIMPLE_PINHOLE", [focal_px, 0.0, 0.0]
             pixels.append(xy)
-            seen.append(place)
+            xyz.append(in_world)
             cameras.append({"model": model, "width": camera.width, "height": camera.height, "params": params})
-        return pixels, seen, cameras
+        return pixels, xyz, cameras
 
     def refine(self, rig_from_world: Floats, matches: Matches, points: Floats) -> Floats:
-        """Return rig_from_world (4, 4) of the least reprojection error of matches to points (P, 3), by PoseLib.
+        """Return rig_from_world (4, 4) that minimizes the reprojection errors of matches, by PoseLib.
 
-        The loss is Cauchy's, 1 px. Where PoseLib does not know the model of a lens, errors are those of `ransac`.
+        The loss is Cauchy's with a scale of 1 px. For camera models that PoseLib does not know, errors are measured as
+        in `ransac`. `points` (P, 3) are the map points.
         """
-        pixels, seen, cameras = self._by_camera(matches, points, flat=False)
+        pixels, xyz, cameras = self._by_camera(matches, points, undistort=False)
+        loss = {"loss_type": "CAUCHY", "loss_scale": 1.0}
         refined, _ = poselib.refine_generalized_absolute_pose(
-            pixels, seen, _poselib(rig_from_world), self._places, cameras, {"loss_type": "CAUCHY", "loss_scale": 1.0}
+            pixels, xyz, _poselib(rig_from_world), self._cams_from_rig, cameras, loss
         )
         return _matrix(refined.Rt)
 
     def projected(self, rig_from_world: Floats, matches: Matches, points: Floats) -> Floats:
-        """Return where a pose puts the points of matches in their images (K, 2), pixels; inf behind a camera."""
+        """Return the projections (K, 2) of the matched points in their images, pixels; inf behind a camera."""
         pixels = np.full((len(matches), 2), np.inf)
         for index, camera in enumerate(self.cameras):
             part = np.flatnonzero(matches.camera == index)
@@ -195,7 +201,7 @@ class RigQuery:
         return pixels
 
     def errors_px(self, rig_from_world: Floats, matches: Matches, points: Floats) -> Floats:
-        """Return the reprojection errors (K,) of matches to points (P, 3), inf behind a camera."""
+        """Return the reprojection errors (K,) of matches with points (P, 3), pixels; inf behind a camera."""
         return np.asarray(
             np.linalg.norm(self.projected(rig_from_world, matches, points) - matches.pixels, axis=1), np.float64
         )
@@ -206,11 +212,12 @@ class RigQuery:
         return np.degrees(np.arctan(errors / self.focals_px[matches.camera]))
 
     def jacobians(self, rig_from_world: Floats, matches: Matches, points: Floats) -> tuple[Floats, Floats]:
-        """Return how the projections of matches move, in pixels.
+        """Return the derivatives of the projections of K matches, in pixels.
 
-        With a small motion d of the rig: (K, 2, 6), d = rotation (radians), translation (meters) in the rig's frame,
-        world_from_rig @ Exp(d), as the benchmark's covariances have it; with a motion of the point in the world:
-        (K, 2, 3).
+        Returns:
+            The derivatives by a small motion d of the rig, (K, 2, 6): rotation (radians) and translation (meters) in
+            the rig's frame, world_from_rig @ Exp(d), as in the benchmark's covariances; and by a motion of the point in
+            the world, (K, 2, 3).
         """
         of_pose, of_point = np.zeros((len(matches), 2, 6)), np.zeros((len(matches), 2, 3))
         for index in np.unique(matches.camera):
@@ -218,7 +225,7 @@ class RigQuery:
             cam_from_rig = geometry.invert(self.rig_from_cams[index])
             in_rig = geometry.transform(rig_from_world, points[matches.point[part]])
             in_cam = geometry.transform(cam_from_rig, in_rig)
-            # A motion d of the rig moves a point in it by -(rotation x point) - translation.
+            # A motion d of the rig moves a point in its frame by -(rotation x point) - translation.
             x, y, z = in_rig.T
             zero = np.zeros_like(x)
             skew = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
@@ -230,33 +237,33 @@ class RigQuery:
 
 
 def least_squares_covariance(
-    of_unknowns: Floats, errors_px: Floats, noise_px2: Floats, known: Floats | None = None
+    jacobian: Floats, errors_px: Floats, noise_px2: Floats, prior_information: Floats | None = None
 ) -> Floats | None:
-    """Return the covariance (U, U) of unknowns that least squares found from K projections; None where undefined.
+    """Return the covariance (U, U) of a least squares estimate of U unknowns from K projections; None if undefined.
 
-    The sandwich N^-1 M N^-1 (Huber 1967): N is how well unit noise would determine the unknowns, M the noise that there
-    is: the spread of the errors, and `noise_px2`. The spread holds a part of the latter already; that it counts twice
-    stands for what is not known, as the errors of the map's poses.
+    It is the sandwich N^-1 M N^-1 (Huber 1967): N is the information of the projections for unit noise, M is computed
+    from the actual noise, the spread of the errors plus `noise_px2`. The spread already contains part of `noise_px2`;
+    counting it twice makes up for noise that is not modeled, such as the errors of the map's poses.
 
     Args:
-        of_unknowns: (K, 2, U), how projections move with the unknowns.
-        errors_px: (K,).
-        noise_px2: (K, 2, 2), covariance of each projection that comes from its point; not finite: the point tells
-            nothing.
-        known: (U, U), information on the unknowns from elsewhere.
+        jacobian: (K, 2, U), derivatives of the projections by the unknowns.
+        errors_px: (K,) reprojection errors.
+        noise_px2: (K, 2, 2), covariance of each projection due to its point, square pixels. Projections whose
+            covariance is not finite are left out.
+        prior_information: (U, U), information on the unknowns from other sources.
     """
-    told = np.isfinite(noise_px2).all(axis=(1, 2))
-    of_unknowns, errors_px, noise_px2 = of_unknowns[told], errors_px[told], noise_px2[told]
+    valid = np.isfinite(noise_px2).all(axis=(1, 2))
+    jacobian, errors_px, noise_px2 = jacobian[valid], errors_px[valid], noise_px2[valid]
     if len(errors_px) < 4:
         return None
-    # Two coordinates a point, six parameters of the pose.
+    # Two coordinates per point, six parameters of the pose.
     variance = float((errors_px**2).sum()) / max(2 * len(errors_px) - 6, 1)
-    known = np.zeros((of_unknowns.shape[2],) * 2) if known is None else known
-    information = np.einsum("oki,okj->ij", of_unknowns, of_unknowns) + variance * known
+    prior = np.zeros((jacobian.shape[2],) * 2) if prior_information is None else prior_information
+    information = np.einsum("oki,okj->ij", jacobian, jacobian) + variance * prior
     if not np.isfinite(information).all() or np.linalg.cond(information) > 1e14:
         return None
     noise = noise_px2 + variance * np.eye(2)
-    middle = np.einsum("oki,okl,olj->ij", of_unknowns, noise, of_unknowns) + variance**2 * known
+    middle = np.einsum("oki,okl,olj->ij", jacobian, noise, jacobian) + variance**2 * prior
     inverse = np.linalg.inv(information)
     return np.asarray(inverse @ middle @ inverse, np.float64)
 

@@ -24,23 +24,24 @@ def triangulate(
     settings: MapSettings | None = None,
     seed: int = 0,
 ) -> LocalMap:
-    """Triangulate points from matches between images with known poses, which stay as they are.
+    """Triangulate points from matches between images with known poses, which are kept fixed.
 
-    COLMAP's triangulator builds the tracks; the points are then refined here, all at once: with fixed poses each
-    is a problem of its own, which a bundle adjuster does not exploit (16 s against 0.3 s for 65,000 points).
+    COLMAP's triangulator builds the tracks. The points are then refined here, all at once: with fixed poses, each point
+    is an independent problem, which a bundle adjuster does not exploit (16 s against 0.3 s for 65,000 points).
 
     Args:
-        names, cameras, world_from_cams: N images, (N, 4, 4).
-        keypoints: for each image (n, 2), pixels.
-        pairs: (Q, 2) pairs of images.
-        matches: for each pair (K, 2) indices of keypoints.
+        names, cameras, world_from_cams: names, cameras and poses (N, 4, 4) of N images.
+        keypoints: for each image, keypoints (n, 2), pixels.
+        pairs: (Q, 2) indices of the images of each pair.
+        matches: for each pair, indices (K, 2) of matched keypoints.
+        settings, seed: of the triangulation.
 
     Returns:
-        The map, its points not yet colored.
+        The map; its points are gray.
     """
     settings = settings or MapSettings()
+    # A function of its own, so that the memory that COLMAP takes, about 2 MB per image, is free afterward.
     tracks = _tracks(names, cameras, world_from_cams, keypoints, pairs, matches, settings, seed)
-    # What COLMAP took, some 2 MB an image, is free now.
     refined = refine_points(*tracks, cameras, world_from_cams, keypoints, settings)
     points, observations = refined.points, refined.observations
     return LocalMap(
@@ -66,7 +67,7 @@ def _tracks(
     settings: MapSettings,
     seed: int,
 ) -> tuple[Floats, Ints]:
-    """Return points (P, 3) as COLMAP triangulates them, and sorted observations (n, 3): image, keypoint, point."""
+    """Return points (P, 3) triangulated by COLMAP, and their observations (n, 3), sorted: image, keypoint, point."""
     graph = pycolmap.CorrespondenceGraph()
     reconstruction = pycolmap.Reconstruction()
     for index, (name, camera, cam_from_world, xy) in enumerate(
@@ -77,16 +78,16 @@ def _tracks(
         image = pycolmap.Image(name=name, camera_id=index, image_id=index, keypoints=np.asarray(xy, np.float64))
         reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(cam_from_world[:3]))
         graph.add_image(index, len(xy))
-    for (i, j), found in zip(pairs, matches, strict=True):
-        if len(found):
+    for (i, j), indices in zip(pairs, matches, strict=True):
+        if len(indices):
             two_view = pycolmap.TwoViewGeometry()
-            # COLMAP silently ignores matches whose configuration is not set
+            # COLMAP silently ignores matches without a configuration.
             two_view.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
-            two_view.inlier_matches = found.astype(np.uint32)
+            two_view.inlier_matches = indices.astype(np.uint32)
             graph.add_two_view_geometry(int(i) + 1, int(j) + 1, two_view)
     graph.finalize()
-    observed = pycolmap.ObservationManager(reconstruction, graph)
-    triangulator = pycolmap.IncrementalTriangulator(graph, reconstruction, observed)
+    observations = pycolmap.ObservationManager(reconstruction, graph)
+    triangulator = pycolmap.IncrementalTriangulator(graph, reconstruction, observations)
     options = pycolmap.IncrementalTriangulatorOptions()
     options.random_seed = seed
     options.ignore_two_view_tracks = False
@@ -95,33 +96,33 @@ def _tracks(
         triangulator.triangulate_image(options, index)
     triangulator.complete_all_tracks(options)
     triangulator.merge_all_tracks(options)
-    observed.filter_all_points3D(settings.max_reprojection_error_px, settings.min_triangulation_angle_deg)
-    places = {number: point.xyz for number, point in reconstruction.points3D.items()}
-    ids = np.array(sorted(places), np.uint64)
+    observations.filter_all_points3D(settings.max_reprojection_error_px, settings.min_triangulation_angle_deg)
+    xyz = {number: point.xyz for number, point in reconstruction.points3D.items()}
+    ids = np.array(sorted(xyz), np.uint64)
     rows = [np.zeros((0, 3), np.int64)]
     for index in range(len(names)):
         image = reconstruction.image(index + 1)
         seen = np.array(image.get_observation_point2D_idxs(), np.int64)
         points = np.array([point.point3D_id for point in image.get_observation_points2D()], np.uint64)
         rows.append(np.column_stack([np.full(len(seen), index), seen, np.searchsorted(ids, points)]))
-    return np.array([places[number] for number in sorted(places)]).reshape(-1, 3), np.concatenate(rows)
+    return np.array([xyz[number] for number in sorted(xyz)]).reshape(-1, 3), np.concatenate(rows)
 
 
 class RefinedPoints(NamedTuple):
-    """Points at the places that their observations agree with best."""
+    """Points that minimize the reprojection errors of their observations."""
 
     points: Floats
-    """(P, 3)."""
+    """(P, 3) in the world."""
     observations: Ints
     """(n, 3) image, keypoint and point."""
     error2: float
-    """Sum of the squared errors of the observations, square pixels ..."""
+    """Sum of the squared reprojection errors of the observations, square pixels."""
     freedom: int
-    """... and its degrees of freedom."""
+    """Degrees of freedom of `error2`."""
 
     @property
     def noise_px(self) -> float:
-        """Standard deviation of the errors, by axis."""
+        """Standard deviation of the reprojection errors per axis, pixels."""
         return float(np.sqrt(self.error2 / self.freedom)) if self.freedom else 1.0
 
 
@@ -136,15 +137,17 @@ def refine_points(
 ) -> RefinedPoints:
     """Minimize the reprojection errors of each point under a Cauchy loss of 1 px, by Gauss-Newton on all at once.
 
-    Errors are measured on the undistorted image plane, times the focal length. Observations beyond the limit are
-    dropped, and then points that fewer than two images see.
+    Errors are measured on the undistorted image plane, times the focal length. Observations with a larger error than
+    `settings.max_reprojection_error_px` are then dropped, and points that fewer than two images observe.
 
     Args:
         points: (P, 3).
         observations: (n, 3) image, keypoint and point, sorted by image.
-        cameras, world_from_cams, keypoints: of the images.
+        cameras, world_from_cams, keypoints: of the images, as for `triangulate`.
+        settings: holds the limit.
+        iterations: number of Gauss-Newton steps.
     """
-    if not len(observations):  # of a tile, earlier ones may have taken all
+    if not len(observations):  # earlier tiles may have taken all points of a tile
         return RefinedPoints(points[:0], observations, 0.0, 0)
     cams_from_world = geometry.invert(world_from_cams)
     image, keypoint, _ = observations.T
@@ -167,18 +170,18 @@ def refine_points(
         error, in_cam, _ = residuals(points, observations)
         jacobian = projection_jacobian(in_cam, focal) @ rotation
         weight = 1.0 / (1.0 + (error**2).sum(1))
-        weighted = (weight[:, None, None] * jacobian).transpose(0, 2, 1)  # an einsum of three takes four times as long
+        weighted = (weight[:, None, None] * jacobian).transpose(0, 2, 1)  # one einsum of all three is 4 times slower
         hessian = (weighted @ jacobian).reshape(-1, 9)
         gradient = (weighted @ error[:, :, None])[:, :, 0]
         H = np.stack([np.bincount(observations[:, 2], h, count) for h in hessian.T], -1).reshape(-1, 3, 3)
         g = np.stack([np.bincount(observations[:, 2], d, count) for d in gradient.T], -1)
-        # A little damping keeps points with a poor depth from jumping.
+        # A little damping keeps points with an uncertain depth from jumping.
         H += 1e-6 * np.trace(H, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
         points = points - np.linalg.solve(H, g[..., None])[..., 0]
     error, _, in_front = residuals(points, observations)
     good = in_front & ((error**2).sum(1) < settings.max_reprojection_error_px**2)
     kept = observations[good]
-    # Keypoints of one image at one place (two orientations) are one view.
+    # Two keypoints of one image at one position (two orientations) are one view.
     views = np.unique(kept[:, 0] * count + kept[:, 2]) % count
     seen = np.bincount(views, minlength=count) >= 2
     seen &= np.isfinite(points).all(axis=1)
@@ -186,6 +189,6 @@ def refine_points(
     used = seen[kept[:, 2]]
     kept = kept[used]
     kept[:, 2] = new_index[kept[:, 2]]
-    # Two coordinates an observation, three parameters a point.
+    # Two coordinates per observation, three parameters per point.
     freedom = max(2 * len(kept) - 3 * int(seen.sum()), 1)
     return RefinedPoints(points[seen], kept, float((error[good][used] ** 2).sum()), freedom)
