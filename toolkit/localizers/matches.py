@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from toolkit import geometry
 from toolkit.capture.cameras import in_view
-from toolkit.features.features import KINDS, FeatureKind, LocalFeatures
+from toolkit.features.features import KINDS, Descriptors, FeatureKind, LocalFeatures
 from toolkit.features.matching import Matcher, MutualMatcher, unit_descriptors
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import NetworkMatches, References
@@ -177,14 +177,24 @@ class MappedFeatures:
             octaves = np.abs(np.log2(features.scales[keypoint] / np.maximum(expected_px, 1e-6)))
             similar = octaves < self.kind.scale_octaves
             observation, keypoint = observation[similar], keypoint[similar]
-            score = np.einsum(
-                "od,od->o", unit_descriptors(descriptors[observation]), query.descriptors(camera, kind)[keypoint]
-            )
+            score = _similarities(descriptors, observation, query.descriptors(camera, kind), keypoint)
             good = np.flatnonzero(score > self.kind.guided_min_score)
             good = good[np.lexsort((keypoint[good], observation[good], -score[good]))]
             keypoint = keypoint[good]
             pixels = features.keypoints[keypoint].astype(np.float64)
             yield Candidates(Matches(np.full(len(good), camera), pixels, point[which[observation[good]]]), keypoint)
+
+
+def _similarities(
+    descriptors: Descriptors, rows: Ints, unit_rows: NDArray[np.float32], other_rows: Ints
+) -> NDArray[np.float32]:
+    """Return the cosine similarities (K,) of K pairs: a row of `descriptors` and a row of unit descriptors each."""
+    scores = np.empty(len(rows), np.float32)
+    for start in range(0, len(rows), 512):  # both sides of so many pairs fit into the cache
+        pairs = slice(start, start + 512)
+        ours, theirs = unit_descriptors(descriptors[rows[pairs]]), unit_rows[other_rows[pairs]]
+        scores[pairs] = np.einsum("kd,kd->k", ours, theirs)
+    return scores
 
 
 @dataclass(frozen=True)
