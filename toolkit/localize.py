@@ -149,7 +149,7 @@ def localize_pairs(
                 started = time.perf_counter()
                 record = stage.record(pair)
                 h5_attributes = stage.attributes(pair)
-                skipped = stage.is_current(pair)
+                skipped = stage.is_current(pair, record)
                 unfinished = False
                 if not skipped:
                     run = stage.run(mapped, queried)
@@ -301,11 +301,11 @@ class _Stage(Remade):
         """Return the attributes of a pair's `.h5` file."""
         return attributes(self.settings, self.kinds, self.capture, pair.map_device, self.folders.retrieval)
 
-    def is_current(self, pair: _Pair) -> bool:
-        """Tell whether to reuse the poses of a pair: they are current, and the files of its map still exist."""
+    def is_current(self, pair: _Pair, record: dict[str, Any]) -> bool:
+        """Tell whether to reuse the poses of a pair: they fit its record, and the files of its map still exist."""
         if not self.skip_existing:
             return False
-        record, maps = self.record(pair), [self.folders.map / name for name in json.loads(self.attributes(pair)[MAPS])]
+        maps = [self.folders.map / name for name in json.loads(self.attributes(pair)[MAPS])]
         maps_exist = pair.map_record.exists() and None not in map(read_sidecar, maps)
         return maps_exist and is_current(pair.file("txt"), record)
 
@@ -326,7 +326,8 @@ class _Stage(Remade):
             return
         with suppress(ToolkitError):  # raised and reported when it is the turn of this pair
             one_tile = len(self.capture[f"{device}_map"].images) <= self.settings.map.tile_images
-            if one_tile and not all(self.is_current(_Pair(self, device, query)) for query in query_devices):
+            pairs = [_Pair(self, device, query) for query in query_devices]
+            if one_tile and not all(self.is_current(pair, self.record(pair)) for pair in pairs):
                 self._ahead[device] = background.submit(self._open_map, device)
 
     def _open_map(self, device: str) -> tuple[Map, Localizer]:

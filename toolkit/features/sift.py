@@ -1,7 +1,7 @@
 """SIFT (Lowe, IJCV 2004) with RootSIFT descriptors (Arandjelovic and Zisserman, CVPR 2012), on whole arrays.
 
-All keypoints of a pyramid level are refined, oriented and described together, which takes 0.6 of the time of OpenCV's
-SIFT. Two choices differ from OpenCV, and both give more correct matches:
+All keypoints of a pyramid level are refined, oriented and described together, which takes about two thirds of the time
+of OpenCV's SIFT. Two choices differ from OpenCV, and both give more correct matches:
 
 - A keypoint may be up to 0.6 pixels from its pixel, as in VLFeat, so fewer are lost between two pixels.
 - A cell of the descriptor is 4 sigma wide instead of 3.
