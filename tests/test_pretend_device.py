@@ -113,7 +113,7 @@ def test_what_is_kept_gives_way_to_the_network(
     monkeypatch.setattr(predictor._model, part, fails)
     for found, other in zip(predictor.predict(groups), expected, strict=True):
         assert_same(found, other)
-    assert "the CPU holds them" in caplog.text
+    assert "the CPU will hold them" in caplog.text
 
 
 def test_omega(device: None) -> None:
