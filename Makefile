@@ -22,7 +22,7 @@ demo: $(INSTALLED)  ## render a small capture, localize all nine pairs, write a 
 run: $(INSTALLED)  ## run RUN_MANIFEST=data_manifests/<yours>.yaml
 	$(BIN)/python -m toolkit run $(RUN_MANIFEST)
 
-test: $(INSTALLED)  ## run the default tests, 2 to 3 minutes on 2 idle cores
+test: $(INSTALLED)  ## run the default tests, 4 to 8 minutes on 2 idle cores
 	$(PYTEST)
 
 test-slow: $(INSTALLED)  ## run the slow tests: whole runs, and accuracy on real captures if present

@@ -179,6 +179,7 @@ def test_scene_tables(scene, tmp_path):
         assert (tmp_path / "out" / f"{name}.png").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_nothing_lost_leaves_no_figure_of_losses(scene, tmp_path):
     evaluate_ios(scene, out=tmp_path)
     assert (tmp_path / "losses.png").is_file()

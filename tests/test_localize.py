@@ -872,6 +872,7 @@ def test_an_unusable_session_stops_its_own_pairs_alone(capture: Path, run: Scene
     assert run.poses_txt("ios", "hl").read_bytes() == poses
 
 
+@pytest.mark.slow
 def test_the_next_map_is_built_while_queries_are_localized_in_this_one(
     capture: Path, run: SceneFiles, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -1225,6 +1226,7 @@ def test_several_features_are_pooled_in_one_pose(
     assert np.median(distance_m) < 0.01
 
 
+@pytest.mark.slow
 def test_what_a_network_has_matched_is_kept(small_capture: Path, run: SceneFiles, other_kind: None) -> None:
     first = run_stage(small_capture, run, query_device="ios", features=["other"])
     assert first["ok"].sum() > 0

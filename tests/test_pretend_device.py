@@ -91,6 +91,7 @@ def test_vggt(device: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert not any(isinstance(kept, PretendTensor) for kept in poor._cache._kept.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", ["encode", "forward"])
 def test_what_is_kept_gives_way_to_the_network(
     device: None, part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture

@@ -174,6 +174,7 @@ def test_other_errors_are_bugs() -> None:
     assert exit_code(FileNotFoundError(errno.ENOENT, "No such file or directory", "x")) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="needs signals")
 def test_a_killed_kernel_is_told_as_out_of_memory_and_leaves_nothing(place: Path) -> None:
     mine = f"kernel.{os.getpid()}-*"  # others may be at work

@@ -161,6 +161,7 @@ def test_a_model_with_an_empty_file_is_refused(model: Path, tmp_path: Path) -> N
         import_colmap(tmp_path / "binary", tmp_path / "photos", tmp_path / "PLACE")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="needs limits of memory")
 def test_a_model_with_a_count_that_fills_the_memory_is_refused_before_it_does(model: Path, tmp_path: Path) -> None:
     (tmp_path / "binary").mkdir()

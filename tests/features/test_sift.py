@@ -246,13 +246,10 @@ def test_pictures_of_odd_sizes(width: int, height: int) -> None:
 
 
 def test_a_contrast_of_nothing_keeps_every_extremum() -> None:
-    few, many = (
-        SiftExtractor(SiftSettings(contrast_threshold=contrast, max_keypoints=100_000)).extract([textured(7)])[0]
-        for contrast in (0.05, 0.0)
-    )
+    image, flat = textured(7), np.full((64, 64), 9, np.uint8)
+    settings = SiftSettings(min_long_side=0, contrast_threshold=0.05, max_keypoints=100_000)
+    every = SiftExtractor(settings.model_copy(update={"contrast_threshold": 0.0}))
+    (few,), (many, none) = SiftExtractor(settings).extract([image]), every.extract([image, flat])
     assert 0 < len(few) < len(many)
     assert few.scores.min() * 3 >= 0.05
-    assert (
-        SiftExtractor(SiftSettings(contrast_threshold=0.0)).extract([np.full((64, 64), 9, np.uint8)])[0].scores.size
-        == 0
-    )
+    assert len(none) == 0

@@ -388,6 +388,7 @@ def test_groups_do_not_change_each_other(make: Make, photographs: Photographs, m
     assert together[-1].model_from_cams.shape == (0, 4, 4)
 
 
+@pytest.mark.slow
 def test_map_images_are_encoded_once(make: Make, photographs: Photographs, monkeypatch: pytest.MonkeyPatch) -> None:
     references = [photographs.view() for _ in range(4)]
     groups = [[photographs.view(in_map=False), *references[start : start + 3]] for start in (0, 1, 0)]
@@ -539,6 +540,7 @@ def short_of_memory(predictor: NetworkPredictor, monkeypatch: pytest.MonkeyPatch
     return shapes
 
 
+@pytest.mark.slow
 def test_what_does_not_fit_after_all_is_halved(
     make: Make, photographs: Photographs, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
