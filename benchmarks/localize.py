@@ -10,7 +10,7 @@ toolkit's weights, and gets the toolkit's retrieved references for nothing. Wall
 others use the machine; CPU seconds mean more. Without a capture, a small one is rendered.
 
 With --plain, the toolkit is compared with itself: SIFT and one RANSAC a query, with no guided matching and no search
-for rivals. Both localize on the same features and maps, which are made before and not counted.
+for rivals. Features and maps are the same, and count for both as they were measured once.
 """
 
 import argparse
@@ -37,8 +37,8 @@ STAGES = {
     "local features": ["local features"],
     "global descriptors": ["global descriptors"],
     "retrieve": ["retrieve"],
-    # The toolkit builds the next map while it localizes in one.
-    "map and localize": ["map", "map: match", "map: triangulate", "localize", "localize: match", "localize: pose"],
+    "map": ["map", "map: match", "map: triangulate"],
+    "localize": ["localize", "localize: match", "localize: pose"],
     "imports, not in the total": ["imports"],
 }
 LIMITS = ((1, 0.1), (5, 0.5), (5, 1))
@@ -82,10 +82,10 @@ def run_toolkit(
 
     imported = _clocks()
     files = SceneFiles(run, sessions_root.parent.name)
-    features = _time_features(embed, localize, map_module, stores)
+    inner = _time_parts(embed, localize, map_module, stores)
     started = _clocks()
     table = embed.embed_sessions(sessions_root, files.embeddings, features_dir=files.features)
-    embedded, first_features = _clocks(), features.copy()
+    embedded, features = _clocks(), inner["features"]
     retrieve.retrieve_pairs(sessions_root, files.embeddings, out_jsonl=files.retrieval_dir, queries=queries)
     retrieved = _clocks()
     localized_pairs = localize.localize_pairs(
@@ -101,10 +101,11 @@ def run_toolkit(
     localized = _clocks()
     stages = {
         "imports": imported - start,
-        "local features": features,
-        "global descriptors": embedded - started - first_features,
+        "local features": inner["features"],
+        "global descriptors": embedded - started - features,
         "retrieve": retrieved - embedded,
-        "localize": localized - retrieved - (features - first_features),
+        "map": inner["map"],
+        "localize": localized - retrieved - inner["map"] - (inner["features"] - features),
     }
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     maps = [LocalMap.load(path) for path in sorted(files.maps.glob("*.npz"))]
@@ -122,23 +123,25 @@ def run_toolkit(
     }
 
 
-def _time_features(*stages: Any) -> NDArray[np.float64]:
-    """Time the extraction of features in stages, which else run as they are; returns its clocks, which go on."""
-    total = np.zeros(2)
+def _time_parts(*stages: Any) -> dict[str, NDArray[np.float64]]:
+    """Time what stages call, to tell their parts apart; else they run as they are."""
+    inner = {"features": np.zeros(2), "map": np.zeros(2)}
 
-    def timed(extract: Callable[..., Any]) -> Callable[..., Any]:
+    def timed(function: Callable[..., Any], part: str) -> Callable[..., Any]:
         def call(*args: Any, **kwargs: Any) -> Any:
             began = _clocks()
             try:
-                return extract(*args, **kwargs)
+                return function(*args, **kwargs)
             finally:
-                total[:] += _clocks() - began
+                inner[part] = inner[part] + _clocks() - began
 
         return call
 
     for stage in stages:
-        stage.extract_session = timed(partial(stage.extract_session, progress=False))
-    return total
+        stage.extract_session = timed(partial(stage.extract_session, progress=False), "features")
+        if hasattr(stage, "build_map"):
+            stage.build_map = timed(stage.build_map, "map")
+    return inner
 
 
 def _clocks() -> NDArray[np.float64]:
@@ -163,29 +166,27 @@ def measure_toolkit(
 PLAIN: dict[str, Any] = {"features": ["sift"], "pnp": {"guided_radii_deg": (), "clear_inlier_ratio": 0.0}}
 
 
-def localize_again(
-    sessions_root: Path, run: Path, poses_dir: Path, settings: dict[str, Any], queries: str, threads: int
-) -> list[float]:
-    """Localize in the maps of a finished run; returns wall and CPU seconds."""
+def localize_plainly(sessions_root: Path, run: Path, queries: str, threads: int) -> list[float]:
+    """Localize in a finished run's maps with the plain setting; returns wall and CPU seconds."""
     from toolkit import localize
     from toolkit.files import SceneFiles
+    from toolkit.localizers import map as map_module
 
     files = SceneFiles(run, sessions_root.parent.name)
+    inner = _time_parts(localize, map_module)
     started = _clocks()
-    folders = (files.retrieval_dir, poses_dir, files.features, files.maps)
-    localize.localize_pairs(sessions_root, *folders, settings, queries=queries, workers=threads)
-    return [float(value) for value in _clocks() - started]
+    folders = (files.retrieval_dir, run / "plain_poses", files.features, files.maps)
+    localize.localize_pairs(sessions_root, *folders, PLAIN, queries=queries, workers=threads)
+    return [float(value) for value in _clocks() - started - inner["features"] - inner["map"]]
 
 
-def measure_again(
-    ours: Measurement, sessions_root: Path, run: Path, name: str, settings: dict[str, Any], queries: str, threads: int
-) -> Measurement:
-    """Measure localization with some settings in a process of its own, on the features and maps of a run."""
-    before, poses_dir = os.getloadavg()[0], run / name
-    seconds, cpu = in_own_process(localize_again, sessions_root, run, poses_dir, settings, queries, threads)
-    measured = replace(ours, seconds={"localize": seconds}, cpu={"localize": cpu})
+def measure_plain(ours: Measurement, sessions_root: Path, run: Path, queries: str, threads: int) -> Measurement:
+    """Measure the plain setting in a process of its own, on the features and maps of a run of the toolkit."""
+    before = os.getloadavg()[0]
+    seconds, cpu = in_own_process(localize_plainly, sessions_root, run, queries, threads)
+    measured = replace(ours, seconds=ours.seconds | {"localize": seconds}, cpu=ours.cpu | {"localize": cpu})
     measured = replace(measured, load=[before, os.getloadavg()[0]])
-    measured.pairs = accuracy(sessions_root, poses_dir, queries)
+    measured.pairs = accuracy(sessions_root, run / "plain_poses", queries)
     return measured
 
 
@@ -399,7 +400,6 @@ def main() -> None:
 
     checkout = str(Path(options.hloc).resolve()) if options.hloc else ""
     kind = options.hloc_features
-    label = "plain" if options.plain else {"sift": "hloc + SIFT", "aliked": "hloc + ALIKED + LightGlue"}[kind]
     if checkout and subprocess.run([options.hloc_python, str(HLOC_WORKER), checkout, kind], check=False).returncode:
         sys.exit(1)
     ours: list[Measurement] = []
@@ -419,22 +419,18 @@ def main() -> None:
             sys.exit(str(error))
         for turn in range(options.repeat):
             run = Path(folder) / f"run{turn}"
-            made = measure_toolkit(sessions_root, run, options.queries, options.threads, options.features)
-            if options.plain:
-                asked = (options.queries, options.threads)
-                defaults = {"features": list(options.features)}
-                ours.append(measure_again(made, sessions_root, run, "again", defaults, *asked))
-                theirs.append(measure_again(made, sessions_root, run, "plain", PLAIN, *asked))
-            else:
-                ours.append(made)
+            ours.append(measure_toolkit(sessions_root, run, options.queries, options.threads, options.features))
             print(f"toolkit {ours[-1].total:.1f} s", file=sys.stderr)
             if checkout:
                 arguments = (sessions_root, run, options.queries, options.threads, options.hloc_map_pairs)
                 theirs.append(measure_hloc(checkout, options.hloc_python, kind, *arguments))
-            if theirs:
-                print(f"{label} {theirs[-1].total:.1f} s", file=sys.stderr)
+                print(f"hloc {theirs[-1].total:.1f} s", file=sys.stderr)
+            elif options.plain:
+                theirs.append(measure_plain(ours[-1], sessions_root, run, options.queries, options.threads))
+                print(f"plain {theirs[-1].total:.1f} s", file=sys.stderr)
     best = min(ours, key=lambda measured: measured.total)
     other = min(theirs, key=lambda measured: measured.total) if theirs else None
+    label = "plain" if options.plain else {"sift": "hloc + SIFT", "aliked": "hloc + ALIKED + LightGlue"}[kind]
     text = markdown(sessions_root.parent.name, options.threads, best, other, label)
     results = {"toolkit": vars(best) | {"total": best.total}}
     if other:

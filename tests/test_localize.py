@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from threading import Event
 from types import SimpleNamespace
 from typing import Any, Literal
 
@@ -870,46 +869,6 @@ def test_an_unusable_session_stops_its_own_pairs_alone(capture: Path, run: Scene
     table = run_stage(capture, run).set_index("query_device")
     assert (table["reason"] == "").all()
     assert run.poses_txt("ios", "hl").read_bytes() == poses
-
-
-@pytest.mark.slow
-def test_the_next_map_is_built_while_queries_are_localized_in_this_one(
-    capture: Path, run: SceneFiles, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    retrieve_pairs(capture / "sessions", run.embeddings, run.retrieval_dir, query_device="ios", queries=LIST)
-    build, localize_queries = Map.build, localize._PairRun.localize
-    built: list[str] = []
-    hl_is_built = Event()
-
-    def recorded(capture: Capture, device: str, *args: object) -> Map:
-        map_ = build(capture, device, *args)
-        built.append(device)
-        if device == "hl":
-            hl_is_built.set()
-        return map_
-
-    def after_the_next_map(pair_run: localize._PairRun, *args: object) -> object:
-        assert pair_run.devices != ("ios", "ios") or hl_is_built.wait(timeout=120)
-        return localize_queries(pair_run, *args)
-
-    monkeypatch.setattr(Map, "build", recorded)
-    monkeypatch.setattr(localize._PairRun, "localize", after_the_next_map)
-    asked = {"map_device": "all", "query_device": "ios"}
-    table = run_stage(capture, run, **asked)
-    assert table["reason"].tolist() == ["", "", ""]
-    assert built == ["ios", "hl", "spot"]
-    poses = run.poses_txt("ios", "ios").read_bytes()
-    built.clear()
-    run.poses_txt("ios", "ios").unlink()
-    assert run_stage(capture, run, **asked)["skipped"].tolist() == [False, True, True]
-    assert built == ["ios"]  # nobody needs the others
-    assert run.poses_txt("ios", "ios").read_bytes() == poses
-    # What is wrong with the next map is told in its own row.
-    (capture / "sessions" / "hl_map" / "trajectories.txt").write_text("# no image has a pose\n")
-    run.poses_txt("ios", "ios").unlink()
-    reasons = run_stage(capture, run, **asked).set_index("map_device")["reason"]
-    assert reasons.drop("hl").tolist() == ["", ""]
-    assert "hl_map has no image with both a pose and local features" in reasons["hl"]
 
 
 def test_a_pair_that_retrieval_left_out_has_its_reason(small_capture: Path, run: SceneFiles) -> None:

@@ -4,8 +4,6 @@ import json
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import pairwise, product
@@ -67,7 +65,6 @@ from toolkit.localizers.picture import localize_image
 from toolkit.localizers.predictors import open_predictor
 from toolkit.localizers.queries import localized_query, references_of_images, stored_query
 from toolkit.manifest import LocalizeSettings
-from toolkit.runs.cluster import current_cluster
 from toolkit.runs.pairs import PairRows
 from toolkit.show.metrics import camera_messages
 
@@ -138,11 +135,10 @@ def localize_pairs(
     capture = stage.capture
     table = PairRows(capture.name, folders.out, folders.retrieval)
     query_tables: dict[str, list[pd.DataFrame]] = {}
-    devices = capture.devices_with("map", map_device), capture.devices_with("query", query_device)
-    next_map = dict(pairwise(devices[0]))
+    devices = product(capture.devices_with("map", map_device), capture.devices_with("query", query_device))
     # One BLAS thread: queries already run in parallel, and the order of sums stays fixed.
-    with threadpool_limits(1, "blas"), ThreadPoolExecutor(1) as background:
-        for mapped, queried in product(*devices):
+    with threadpool_limits(1, "blas"):
+        for mapped, queried in devices:
             pair = _Pair(stage, mapped, queried)
             with table.row(mapped, queried) as row:
                 table.check_upstream()
@@ -153,8 +149,6 @@ def localize_pairs(
                 unfinished = False
                 if not skipped:
                     run = stage.run(mapped, queried)
-                    if mapped in next_map:
-                        stage.build_ahead(background, next_map[mapped], devices[1])
                     localized = run.localize(record, h5_attributes)
                     write_text(pair.map_record, json.dumps(run.map.record(), indent=1) + "\n")
                     _write_poses(pair, localized, settings)
@@ -255,7 +249,6 @@ class _Stage(Remade):
         if made_by is not None:
             require_same(made_by, self.networks)
         self._opened: tuple[str, Map, Localizer] | None = None
-        self._ahead: dict[str, Future[tuple[Map, Localizer]]] = {}
 
     def record(self, pair: _Pair) -> dict[str, Any]:
         """Return everything that the poses of a pair depend on."""
@@ -313,22 +306,8 @@ class _Stage(Remade):
         """Return the map of a device and its localizer; only the last map is kept."""
         if self._opened is None or self._opened[0] != device:
             self._opened = None
-            ahead = self._ahead.pop(device, None)
-            self._opened = (device, *(self._open_map(device) if ahead is None else ahead.result()))
+            self._opened = (device, *self._open_map(device))
         return self._opened[1:]
-
-    def build_ahead(self, background: ThreadPoolExecutor, device: str, query_devices: Sequence[str]) -> None:
-        """Build the map of a device in the background: that takes one thread, and localizing leaves some cores idle.
-
-        It does not build a map of several tiles, which needs the memory, nor a map whose pairs are all finished.
-        """
-        if device in self._ahead or self.settings.map is None or current_cluster() is not None:
-            return
-        with suppress(ToolkitError):  # raised and reported when it is the turn of this pair
-            one_tile = len(self.capture[f"{device}_map"].images) <= self.settings.map.tile_images
-            pairs = [_Pair(self, device, query) for query in query_devices]
-            if one_tile and not all(self.is_current(pair, self.record(pair)) for pair in pairs):
-                self._ahead[device] = background.submit(self._open_map, device)
 
     def _open_map(self, device: str) -> tuple[Map, Localizer]:
         folders = self.folders

@@ -166,7 +166,8 @@ def _extrema(levels: Floats, contrast: float) -> Ints:
     _, height, width = differences.shape
     size, flat = height * width, differences.reshape(-1)
     # The interpolated peak, which must reach the contrast, is a little higher than the pixel.
-    min_difference = 0.8 * contrast / _INTERVALS
+    # Flat areas, in which all pixels are equal, have none at any contrast.
+    min_difference = max(0.8 * contrast / _INTERVALS, 1e-6)
     other_levels = np.array(
         [level * size + y * width + x for level in (-1, 1) for y in (-1, 0, 1) for x in (-1, 0, 1) if x or y]
     )
