@@ -26,8 +26,8 @@ from toolkit.localizers.rig import Matches, RigQuery, least_squares_covariance
 from toolkit.manifest import PnpSettings
 
 FIRST_REFERENCES = {2: 200, 4: 100}
-"""Number of references per image to match first -> independent inliers that their pose needs to be kept. The next number,
-and finally all references, are matched if the pose has fewer, or if too few of the matches are inliers."""
+"""Number of references per image to match first -> independent inliers that their pose needs to be kept. The next
+number, and finally all references, are matched if the pose has fewer, or if too few of the matches are inliers."""
 VIEWS = 4
 """Number of references whose keypoints are stored with the correspondences: those that observe the most of them."""
 
