@@ -156,7 +156,7 @@ class VladSettings(Settings):
     """Number of visual words; fewer if the map has too few descriptors."""
     local_dim: Positive = 64
     """Dimensions of the local descriptors after PCA whitening."""
-    min_scale_px: float = 1.6
+    min_scale_px: float = 2.25
     """Smallest scale of a keypoint: the standard deviation of its blob, in pixels of the stored image.
     Finer keypoints are the first to change with blur, noise and camera resolution."""
     min_features: Natural = 300
