@@ -14,7 +14,7 @@ from toolkit.features.features import LocalFeatures
 SETTINGS = VladSettings(words=16, local_dim=16, min_features=20, sample_descriptors=3000)
 
 
-def features_of(descriptors: np.ndarray, scale: float = 2.0) -> LocalFeatures:
+def features_of(descriptors: np.ndarray, scale: float = SETTINGS.min_scale_px) -> LocalFeatures:
     count = len(descriptors)
     root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
     quantized = np.clip(np.round(root * 512), 0, 255).astype(np.uint8)
