@@ -5,7 +5,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -144,8 +144,8 @@ def localize_pairs(
                 table.check_upstream()
                 started = time.perf_counter()
                 record = stage.record(pair)
-                h5_attributes = stage.attributes(pair)
-                skipped = stage.is_current(pair, record)
+                h5_attributes = attributes(settings, stage.kinds, capture, mapped, folders.retrieval)
+                skipped = stage.is_current(pair, record, h5_attributes)
                 unfinished = False
                 if not skipped:
                     run = stage.run(mapped, queried)
@@ -248,7 +248,7 @@ class _Stage(Remade):
         self.predictor = open_predictor(settings, self.capture, folders.map) if settings.predicts else None
         if made_by is not None:
             require_same(made_by, self.networks)
-        self._opened: tuple[str, Map, Localizer] | None = None
+        self.open_map = lru_cache(maxsize=1)(self._open_map)
 
     def record(self, pair: _Pair) -> dict[str, Any]:
         """Return everything that the poses of a pair depend on."""
@@ -290,24 +290,13 @@ class _Stage(Remade):
             }
         return record
 
-    def attributes(self, pair: _Pair) -> dict[str, str]:
-        """Return the attributes of a pair's `.h5` file."""
-        return attributes(self.settings, self.kinds, self.capture, pair.map_device, self.folders.retrieval)
-
-    def is_current(self, pair: _Pair, record: dict[str, Any]) -> bool:
+    def is_current(self, pair: _Pair, record: dict[str, Any], h5_attributes: Mapping[str, str]) -> bool:
         """Tell whether to reuse the poses of a pair: they fit its record, and the files of its map still exist."""
         if not self.skip_existing:
             return False
-        maps = [self.folders.map / name for name in json.loads(self.attributes(pair)[MAPS])]
+        maps = [self.folders.map / name for name in json.loads(h5_attributes[MAPS])]
         maps_exist = pair.map_record.exists() and None not in map(read_sidecar, maps)
         return maps_exist and is_current(pair.file("txt"), record)
-
-    def open_map(self, device: str) -> tuple[Map, Localizer]:
-        """Return the map of a device and its localizer; only the last map is kept."""
-        if self._opened is None or self._opened[0] != device:
-            self._opened = None
-            self._opened = (device, *self._open_map(device))
-        return self._opened[1:]
 
     def _open_map(self, device: str) -> tuple[Map, Localizer]:
         folders = self.folders
