@@ -297,6 +297,14 @@ def _two_best(scores: NDArray[np.float32]) -> tuple[Ints, NDArray[np.float32]]:
     return best, second
 
 
+_BLOCK = 64
+"""Number of rays that are compared with the same rays of the other image."""
+_BLOCKS_AT_ONCE = 8
+"""Number of blocks that are processed at once."""
+_FAR_REACH = 0.1
+"""Reach of a ray, radians, from which it is compared apart."""
+
+
 def match_along_epipolar_lines(
     descriptors_a: NDArray[np.float32],
     descriptors_b: NDArray[np.float32],
@@ -332,52 +340,52 @@ def match_along_epipolar_lines(
     # The same distance from the plane is a larger turn close to the epipole.
     reach_a = np.arcsin(np.minimum(max_angle_a / np.maximum(np.sin(elevation_a), 1e-9), 1.0))
     reach_b = np.arcsin(np.minimum(max_angle_b / np.maximum(np.sin(elevation_b), 1e-9), 1.0))
-    order_a = np.argsort(turn_a, kind="stable")
+    # Close to the epipole, rays reach far: they are in blocks of their own.
+    order_a = np.lexsort((turn_a, reach_a > _FAR_REACH))
     order_b = np.argsort(turn_b, kind="stable")
-    m = len(order_b)
-    (turns_a, reach_a, near_a), (turns_b, reach_b, near_b) = (
-        np.stack(values)[:, order].astype(np.float32)
-        for order, values in ((order_a, (turn_a, reach_a, elevation_a)), (order_b, (turn_b, reach_b, elevation_b)))
+    n, m, blocks = len(order_a), len(order_b), -(-len(order_a) // _BLOCK)
+    rows = np.minimum(np.arange(blocks * _BLOCK), n - 1)  # the last block is filled up with copies of the last ray
+    turns_a, reach_a, limit_a = (
+        values[order_a[rows]].astype(np.float32).reshape(blocks, _BLOCK, 1)
+        for values in (turn_a, reach_a, elevation_a + (max_angle_a + max_angle_b))
     )
-    descriptors_a, descriptors_b = descriptors_a[order_a], descriptors_b[order_b]
+    reach_a.reshape(-1)[n:] = 0  # the copies match nothing
+    turns_b, reach_b, near_b = np.stack([turn_b, reach_b, elevation_b])[:, order_b].astype(np.float32)
+    blocks_a, descriptors_b = descriptors_a[order_a[rows]].reshape(blocks, _BLOCK, -1), descriptors_b[order_b]
     # Turns wrap around, so b's are repeated three times: then every window is one slice.
     wrapped = np.concatenate([turns_b - 2 * np.pi, turns_b, turns_b + 2 * np.pi], dtype=np.float32)
-    row_best = np.full(len(rays_a), -1, np.int64)
-    column_best = np.full(m, -1, np.int64)
-    column_score = np.full(m, -2.0, np.float32)
-    near_a = near_a + np.float32(max_angle_a + max_angle_b)
-    for start in range(0, len(order_a), 128):
-        rows = slice(start, start + 128)
-        low = np.searchsorted(wrapped, (turns_a[rows] - reach_a[rows]).min())
-        high = np.searchsorted(wrapped, (turns_a[rows] + reach_a[rows]).max())
-        full_circle = high - low > m
-        if full_circle:
-            low, high = m, 2 * m
-        if high <= low:
-            continue
-        contiguous = low // m == (high - 1) // m
-        columns: slice | Ints = slice(low % m, low % m + high - low) if contiguous else np.arange(low, high) % m
-        difference = np.abs(turns_a[rows, None] - wrapped[low:high])
-        if full_circle:
-            difference = np.minimum(difference, np.float32(2 * np.pi) - difference)
-        excluded = difference >= reach_a[rows, None]
-        excluded |= difference >= reach_b[columns]
+    low = np.searchsorted(wrapped, (turns_a - reach_a).min(axis=(1, 2)))
+    high = np.searchsorted(wrapped, (turns_a + reach_a).max(axis=(1, 2)))
+    row_best, row_score = np.full(blocks * _BLOCK, -1, np.int64), np.zeros(blocks * _BLOCK, np.float32)
+    column_score = np.full(3 * m, -2.0, np.float32)
+    # Several blocks at once, as threads wait for each other at every call of numpy.
+    for start in range(0, blocks, _BLOCKS_AT_ONCE):
+        part = slice(start, start + _BLOCKS_AT_ONCE)
+        width = max(int((high[part] - low[part]).max()), 1)
+        columns = np.minimum(low[part], 3 * m - width)[:, None] + np.arange(width)
+        in_b = columns % m
+        reach = np.minimum(reach_a[part], reach_b[in_b][:, None])
+        excluded = np.abs(turns_a[part] - wrapped[columns][:, None]) >= reach
         # In a half-plane, the rays meet in front of both cameras only if b's ray is nearer to the axis.
-        excluded |= near_b[columns] >= near_a[rows, None]
-        scores = descriptors_a[rows] @ descriptors_b[columns].T
+        excluded |= near_b[in_b][:, None] >= limit_a[part]
+        scores = blocks_a[part] @ descriptors_b[in_b].transpose(0, 2, 1)
         scores[excluded] = -2.0
+        for first, top in zip(columns[:, 0].tolist(), scores.max(axis=1), strict=True):
+            window = column_score[first : first + width]
+            np.maximum(window, top, out=window)
+        scores = scores.reshape(-1, width)
         best, second = _two_best(scores)
         top = scores[np.arange(len(scores)), best]
         good = np.flatnonzero((top > min_score) & ((1.0 - top) < ratio**2 * (1.0 - second)))
-        number_b = order_b[columns]
-        row_best[order_a[rows][good]] = number_b[best[good]]
-        winning = scores.max(axis=0)
-        better = np.flatnonzero(winning > column_score[number_b])
-        column_best[number_b[better]] = order_a[rows][np.argmax(scores[:, better], axis=0)]
-        column_score[number_b[better]] = winning[better]
+        row_best[start * _BLOCK + good] = in_b[good // _BLOCK, best[good]]
+        row_score[start * _BLOCK + good] = top[good]
+    row_best, column_score = row_best[:n], column_score.reshape(3, m).max(axis=0)
     matched = np.flatnonzero(row_best >= 0)
-    matched = matched[column_best[row_best[matched]] == matched]
-    return np.stack([matched, row_best[matched]], axis=1)
+    matched = matched[row_score[matched] == column_score[row_best[matched]]]
+    # If several rows are equally near to a column, keep the first.
+    matched = matched[np.unique(row_best[matched], return_index=True)[1]]
+    indices = np.stack([order_a[matched], order_b[row_best[matched]]], axis=1)
+    return indices[np.argsort(indices[:, 0])]
 
 
 def _about_axis(rays: Floats, axis: Floats) -> tuple[Floats, Floats]:
