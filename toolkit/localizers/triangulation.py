@@ -9,9 +9,15 @@ from numpy.typing import NDArray
 
 from toolkit import geometry
 from toolkit.capture.cameras import projection_jacobian, rays_of
+from toolkit.capture.images import default_workers, prefetch
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.local_map import LocalMap
 from toolkit.manifest import MapSettings
+
+_CHUNK = 2048
+"""Number of points that are refined at once, so that their observations fit into the processor's cache."""
+_LEAST_DEPTH = 1e-3
+"""Smallest depth of a point in front of a camera, map lengths."""
 
 
 def triangulate(
@@ -126,6 +132,43 @@ class RefinedPoints(NamedTuple):
         return float(np.sqrt(self.error2 / self.freedom)) if self.freedom else 1.0
 
 
+class _Projections(NamedTuple):
+    """n keypoints, to which points are to project."""
+
+    rotation: Floats
+    """(n, 3, 3) from the world to the keypoint's camera."""
+    translation: Floats
+    """(n, 3)"""
+    focal: Floats
+    """(n,) pixels."""
+    plane: Floats
+    """(n, 2) the keypoints on the undistorted image plane at depth 1."""
+
+    def errors(self, points: Floats, point: Ints) -> tuple[Floats, Floats]:
+        """Return the errors (n, 2), pixels, of points (P, 3) of index `point` (n,), and the points in the cameras."""
+        in_cam = np.einsum("oij,oj->oi", self.rotation, points[point]) + self.translation
+        z = np.maximum(in_cam[:, 2], _LEAST_DEPTH)
+        return (in_cam[:, :2] / z[:, None] - self.plane) * self.focal[:, None], in_cam
+
+    def refine(self, points: Floats, point: Ints, iterations: int) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+        """Return the points after Gauss-Newton steps, their errors, and whether they are in front of the cameras."""
+        count = len(points)
+        for _ in range(iterations):
+            error, in_cam = self.errors(points, point)
+            jacobian = projection_jacobian(in_cam, self.focal) @ self.rotation
+            weight = 1.0 / (1.0 + (error**2).sum(1))
+            weighted = (weight[:, None, None] * jacobian).transpose(0, 2, 1)  # one einsum of all three is slower
+            hessian = (weighted @ jacobian).reshape(-1, 9)
+            gradient = (weighted @ error[:, :, None])[:, :, 0]
+            H = np.stack([np.bincount(point, h, count) for h in hessian.T], -1).reshape(-1, 3, 3)
+            g = np.stack([np.bincount(point, d, count) for d in gradient.T], -1)
+            # A little damping keeps points with an uncertain depth from jumping.
+            H += 1e-6 * np.trace(H, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
+            points = points - np.linalg.solve(H, g[..., None])[..., 0]
+        error, in_cam = self.errors(points, point)
+        return points, error, in_cam[:, 2] > _LEAST_DEPTH
+
+
 def refine_points(
     points: Floats,
     observations: Ints,
@@ -159,26 +202,22 @@ def refine_points(
         rays = rays_of(camera, keypoints[index][keypoint[part]])
         plane[part] = rays[:, :2] / np.maximum(rays[:, 2:], 1e-3)
     rotation, translation = cams_from_world[image, :3, :3], cams_from_world[image, :3, 3]
+    order = np.argsort(observations[:, 2], kind="stable")
+    firsts = range(0, len(points), _CHUNK)
+    ends = np.searchsorted(observations[order, 2], [*firsts[1:], len(points)])
 
-    def residuals(xyz: Floats, obs: Ints) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-        in_cam = np.einsum("oij,oj->oi", rotation, xyz[obs[:, 2]]) + translation
-        z = np.maximum(in_cam[:, 2], 1e-3)
-        return (in_cam[:, :2] / z[:, None] - plane) * focal[:, None], in_cam, in_cam[:, 2] > 1e-3
+    def refine(number: int) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+        part = order[ends[number - 1] if number else 0 : ends[number]]
+        chunk = points[firsts[number] : firsts[number] + _CHUNK]
+        projections = _Projections(rotation[part], translation[part], focal[part], plane[part])
+        return projections.refine(chunk, observations[part, 2] - firsts[number], iterations)
 
+    refined = list(prefetch(refine, range(len(firsts)), default_workers()))
+    points = np.concatenate([chunk for chunk, _, _ in refined])
+    error, in_front = np.empty_like(plane), np.empty(len(plane), bool)
+    error[order] = np.concatenate([errors for _, errors, _ in refined])
+    in_front[order] = np.concatenate([front for _, _, front in refined])
     count = len(points)
-    for _ in range(iterations):
-        error, in_cam, _ = residuals(points, observations)
-        jacobian = projection_jacobian(in_cam, focal) @ rotation
-        weight = 1.0 / (1.0 + (error**2).sum(1))
-        weighted = (weight[:, None, None] * jacobian).transpose(0, 2, 1)  # one einsum of all three is 4 times slower
-        hessian = (weighted @ jacobian).reshape(-1, 9)
-        gradient = (weighted @ error[:, :, None])[:, :, 0]
-        H = np.stack([np.bincount(observations[:, 2], h, count) for h in hessian.T], -1).reshape(-1, 3, 3)
-        g = np.stack([np.bincount(observations[:, 2], d, count) for d in gradient.T], -1)
-        # A little damping keeps points with an uncertain depth from jumping.
-        H += 1e-6 * np.trace(H, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
-        points = points - np.linalg.solve(H, g[..., None])[..., 0]
-    error, _, in_front = residuals(points, observations)
     good = in_front & ((error**2).sum(1) < settings.max_reprojection_error_px**2)
     kept = observations[good]
     # Two keypoints of one image at one position (two orientations) are one view.
