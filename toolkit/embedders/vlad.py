@@ -7,6 +7,7 @@ result is projected to the principal directions of the map images.
 
 import json
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 from zipfile import BadZipFile
@@ -26,6 +27,8 @@ from toolkit.manifest import VladSettings
 Floats = NDArray[np.float32]
 
 _SHORTEST = 1e-9  # shorter vectors are rounding errors, and are not normalized
+_CHUNK = 8192
+"""Number of local descriptors that are assigned at once. Fixed, so that the result does not depend on the threads."""
 
 
 class Vlad:
@@ -168,8 +171,9 @@ def _assign(points: Floats, centroids: Floats) -> NDArray[np.intp]:
 def _kmeans(points: Floats, words: int, iterations: int, rng: np.random.Generator) -> Floats:
     """Return centroids (words, D) by Lloyd's algorithm, starting from random points."""
     centroids = points[np.sort(rng.permutation(len(points))[:words])].copy()
+    chunks = np.split(points, range(_CHUNK, len(points), _CHUNK))
     for _ in range(iterations):
-        nearest = _assign(points, centroids)
+        nearest = np.concatenate(list(prefetch(partial(_assign, centroids=centroids), chunks, default_workers())))
         order = np.argsort(nearest, kind="stable")
         present, starts, counts = np.unique(nearest[order], return_index=True, return_counts=True)
         centroids[present] = np.add.reduceat(points[order], starts, axis=0) / counts[:, None]
