@@ -46,8 +46,16 @@ def quaternions_in_another_order(poses: Floats) -> Floats:
     return geometry.make_pose(geometry.quaternion_to_rotation(quaternions), poses[:, :3, 3])
 
 
-def shuffled(poses: Floats) -> Floats:
-    return poses[np.random.default_rng(0).permutation(len(poses))]
+def shuffled(poses: Floats, seed: int = 0) -> Floats:
+    return poses[np.random.default_rng(seed).permutation(len(poses))]
+
+
+def coarse(poses: Floats) -> Floats:
+    """Poses that are off by 3 degrees and some centimeters, each in another direction."""
+    rng = np.random.default_rng(0)
+    axes = geometry.unit(rng.normal(size=(len(poses), 3)))
+    turns = Rotation.from_rotvec(np.radians(3) * axes).as_matrix()
+    return geometry.make_pose(poses[:, :3, :3] @ turns, poses[:, :3, 3] + 0.03 * rng.normal(size=(len(poses), 3)))
 
 
 def upright_otherwise(poses: Floats) -> Floats:
@@ -118,6 +126,22 @@ def test_the_convention_that_would_fit_is_found(
     assert bool(found.fits) == bool(fits)
     assert found.text
     assert ("the other `--axes`" in found.text) == ("OpenGL" in fits), "where an import has turned them, they are not"
+
+
+@pytest.mark.parametrize("seed", range(1, 5))
+@pytest.mark.parametrize("device", ["ios", "spot"])
+def test_shuffled_poses_of_a_small_room_are_inconsistent(
+    small_capture: Path, small_features: Path, device: str, seed: int
+) -> None:
+    """There, a wrong pose is rarely far from an epipolar line, but the images are turned otherwise."""
+    found = consistency_of(survey_of(small_capture, small_features, device, lambda poses: shuffled(poses, seed)))
+    assert found.verdict == "inconsistent"
+
+
+def test_coarse_poses_are_consistent(small_capture: Path, small_features: Path) -> None:
+    found = consistency_of(survey_of(small_capture, small_features, "ios", coarse))
+    assert found.agreeing < 0.5 * found.pairs
+    assert found.verdict == "consistent"
 
 
 def test_a_few_images_tell_nothing(small_capture: Path, small_features: Path) -> None:

@@ -19,6 +19,7 @@ from scipy.spatial import KDTree
 
 from toolkit import geometry
 from toolkit.capture.cameras import rays_of
+from toolkit.capture.images import default_workers, prefetch
 from toolkit.features.features import LocalFeatures
 from toolkit.features.matching import MutualMatcher
 from toolkit.features.verification import verified_matches
@@ -47,6 +48,8 @@ CLEAR = 0.75
 """Share of agreeing pairs from which no further convention is tried."""
 COARSE_DEG = 3.0
 """Largest median error of correct but coarse poses."""
+COARSE_ROTATION_DEG = 10.0
+"""Largest median error of their relative rotations."""
 NOISE = 20.0
 """Error of an image, in multiples of the median error, from which its pose is wrong; but at least 0.3 degrees."""
 WEAK = 0.3
@@ -113,7 +116,8 @@ class Survey:
 
     def verify(self, pairs: Iterable[tuple[int, int]]) -> list[VerifiedPair]:
         """Return the covisible ones of pairs of images, by their matches alone."""
-        verified = (self._verified(min(pair), max(pair)) for pair in dict.fromkeys(pairs))
+        ordered = dict.fromkeys((min(pair), max(pair)) for pair in pairs)
+        verified = prefetch(lambda pair: self._verified(*pair), ordered, default_workers())
         return [pair for pair in verified if pair is not None]
 
     def _verify(self, i: int, j: int) -> VerifiedPair | None:
@@ -170,7 +174,9 @@ class Survey:
         if share < CLEAR:
             fits = _fitting_convention(self.images, self.sample, share)
             # If no convention fits better, the poses may just be coarse.
-            if fits or (share < 0.5 and np.median(self._errors_deg(self.sample)) > COARSE_DEG):
+            coarse = np.median(self._errors_deg(self.sample)) <= COARSE_DEG
+            coarse &= np.median(self._rotation_errors_deg(self.sample)) <= COARSE_ROTATION_DEG
+            if fits or (share < 0.5 and not coarse):
                 return replace(result, verdict="inconsistent", fits=fits)
         return replace(result, verdict="consistent", wrong=self._wrong_images(local_map))
 
@@ -178,6 +184,13 @@ class Survey:
         """Return, per pair, the median angle between matches and their epipolar planes."""
         poses = self.images.world_from_cams
         return [float(np.median(_compare(pair, _relative(poses, pair))[0])) for pair in pairs]
+
+    def _rotation_errors_deg(self, pairs: Sequence[VerifiedPair]) -> Floats:
+        """Return, per pair, the angle between the relative rotations of the poses and of the matches."""
+        poses = self.images.world_from_cams
+        stated = np.array([_relative(poses, pair)[:3, :3] for pair in pairs])
+        matched = np.array([pair.j_from_i[:3, :3] for pair in pairs])
+        return geometry.rotation_angle_deg(np.swapaxes(stated, 1, 2) @ matched)
 
     def _wrong_images(self, local_map: LocalMap) -> list[str]:
         """Return the names of images with few points in the map whose matches contradict their poses."""
