@@ -46,7 +46,7 @@ test-browser: $(INSTALLED)  ## test the report and the notebooks' viewer in a br
 test-rest: $(INSTALLED)  ## run the browser tests and the slow tests together; they share a finished run
 	@$(BIN)/python -m pip install $(PIP_ARGS) --quiet --constraint constraints.txt --editable '.[dev,fuzz]' || \
 	  echo "The fuzzers cannot be installed here: their tests are skipped."
-	$(PYTEST) -m "browser or slow" -rs
+	$(PYTEST) --no-loadscope-reorder -m "browser or slow" -rs
 
 docs-setup: $(INSTALLED)  ## install the tools that build the documentation (pip)
 	@$(BIN)/python -m pip install $(PIP_ARGS) --quiet --constraint constraints.txt --editable '.[dev,docs]' || \

@@ -4,6 +4,7 @@ What takes long to make is made once, also where pytest-xdist has several worker
 """
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -19,6 +20,13 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     # The workers share the cores: one thread each, here (before torch is imported) and in what a test starts.
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(name, "1")
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put modules of few tests first: among the slow tests, these take longest, and would leave a worker alone."""
+    counts = Counter(item.path for item in items)
+    items.sort(key=lambda item: counts[item.path])
 
 
 @pytest.fixture(scope="session")
