@@ -58,6 +58,7 @@ def files(tmp_path: Path) -> SceneFiles:
     return SceneFiles(tmp_path / "run", "TINY")
 
 
+@pytest.mark.slow
 def test_no_queries_are_a_pair_without_rows(capture: Path, files: SceneFiles) -> None:
     (capture / "sessions" / "ios_query" / KEYFRAMES).write_text("")
     row = run_stages(capture, files)

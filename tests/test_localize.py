@@ -994,7 +994,7 @@ ESCALATES = {"features": {"kinds": ["sift"], "escalation": ["other"]}, "pnp": {"
         {"method": "pnp"},
         {"method": "nearest"},
         pytest.param({"method": "feed_forward"}, marks=pytest.mark.slow),
-        {"method": "hybrid"},
+        pytest.param({"method": "hybrid"}, marks=pytest.mark.slow),
         pytest.param({"map": None}, marks=pytest.mark.slow),
         pytest.param(ESCALATES, marks=pytest.mark.slow),
         pytest.param({**ESCALATES, "method": "hybrid"}, marks=pytest.mark.slow),
@@ -1229,6 +1229,7 @@ def with_poses(capture: Path, change: Callable[[np.ndarray], np.ndarray], *files
         Trajectory(before.timestamps, ids, poses).write(path)
 
 
+@pytest.mark.slow
 def test_no_pose_is_ok_in_a_map_that_contradicts_its_images(
     capture: Path, run: SceneFiles, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -70,6 +70,7 @@ def test_megaloc(device: None) -> None:
     np.testing.assert_allclose(there.embed(there.stack(images)), here.embed(images), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_vggt(device: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(VGGT, "from_checkpoint", lambda _, heads, compute_dtype: tiny(heads, compute_dtype))
     checkpoint = tmp_path / "model.pt"

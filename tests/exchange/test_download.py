@@ -790,6 +790,7 @@ def hub_of(capture: Path) -> Files:
     return published
 
 
+@pytest.mark.slow
 def test_the_challenge_is_downloaded_and_opens(
     hub: FakeHub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_capture: Path
 ) -> None:

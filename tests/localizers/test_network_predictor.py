@@ -199,7 +199,10 @@ def create(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Create:
     return make_predictor
 
 
-@pytest.mark.parametrize("sizes", [[(370, 280), (370, 280)], [(370, 280), (280, 370), (500, 100)]])
+@pytest.mark.parametrize(
+    "sizes",
+    [[(370, 280), (370, 280)], pytest.param([(370, 280), (280, 370), (500, 100)], marks=pytest.mark.slow)],
+)
 @pytest.mark.parametrize("name", ["vggt-omega", "da3-base"])
 def test_other_rows(create: Create, photographs: Photographs, name: str, sizes: list[tuple[int, int]]) -> None:
     predictor, row = create(name), ROWS[name]
@@ -237,6 +240,7 @@ def of_the_map(group: list[View]) -> list[View]:
     return [group[0], *(replace(view, world_from_cam=pose) for view, pose in zip(group[1:], poses[1:], strict=True))]
 
 
+@pytest.mark.slow
 def test_every_other_reference_is_told(create: Create, photographs: Photographs) -> None:
     """A group of two shapes, of which one cannot be read and one of fewer references, which is told nothing."""
     predictor, plain = create("da3-base", conditioned=True), create("da3-base")
@@ -343,6 +347,7 @@ def test_nothing_of_a_portrait_photograph_is_cut(
     assert load_images([group[0].image], "crop").offset[0, 1] < -800, "that is what the other way would cut"
 
 
+@pytest.mark.slow
 def test_a_map_image_in_groups_of_other_sizes(make: Make, photographs: Photographs) -> None:
     """Its encoding in one group is of no use in the other."""
     reference = photographs.view()

@@ -514,6 +514,7 @@ def test_the_same_answer_in_whatever_order_threads_come(room: World) -> None:
         assert [answers[index] for index in range(6)] == alone
 
 
+@pytest.mark.slow
 def test_a_rigs_pose_does_not_depend_on_who_else_draws_numbers(room: World) -> None:
     """PoseLib draws from the C library's generator, as ZeroMQ does in a kernel."""
     asked, draw, done = rig_asked(room, outliers=0.5), ctypes.CDLL(None).rand, Event()

@@ -32,7 +32,10 @@ def official(golden: ModuleType) -> MegaLoc:
     return MegaLoc.from_checkpoint(golden.state("megaloc"))
 
 
-@pytest.mark.parametrize("case", ["a", "b", "c"])
+SLOW_CASES = [pytest.param(case, marks=pytest.mark.slow) for case in "bc"]
+
+
+@pytest.mark.parametrize("case", ["a", *SLOW_CASES])
 def test_official_numbers(golden: ModuleType, official: MegaLoc, case: str) -> None:
     images = golden.case_images("megaloc", golden.info("megaloc")["cases"][case])
     seen: dict[str, torch.Tensor] = {}

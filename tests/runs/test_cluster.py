@@ -212,6 +212,7 @@ def test_poses_are_those_of_one_process(
     assert found["cluster"] == found["alone"]
 
 
+@pytest.mark.slow
 def test_what_no_worker_did_is_done_here(small_capture: Path, tmp_path: Path, here: Here) -> None:
     here.run = lambda *args: None  # type: ignore[method-assign]
     session = Capture.open(small_capture)["ios_map"]

@@ -9,6 +9,7 @@ import pytest
 from toolkit.notebook import execute
 
 
+@pytest.mark.slow
 def test_nothing_is_left_open(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Clients that are left open say so when they are collected, in the middle of a run's output."""
     parameters = nbformat.v4.new_code_cell("number = 1", metadata={"tags": ["parameters"]})
