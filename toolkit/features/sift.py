@@ -1,6 +1,6 @@
 """SIFT (Lowe, IJCV 2004) with RootSIFT descriptors (Arandjelovic and Zisserman, CVPR 2012), on whole arrays.
 
-All keypoints of an image are refined, oriented and described together, which takes less than half of the time of
+All keypoints of an image are refined, oriented and described together, which takes less than two thirds of the time of
 OpenCV's SIFT. Two choices differ from OpenCV, and both give more correct matches:
 
 - A keypoint may be up to 0.6 pixels from its pixel, as in VLFeat, so fewer are lost between two pixels.
