@@ -21,8 +21,8 @@ from tests.show.test_recordings import read_back
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name != "posix", reason="needs fork and SIGKILL")]
 
 STAGES = ("embed", "retrieve", "rerank", "localize", "evaluate", "visualize")
-SIGNALS = [signal.SIGKILL] * int(os.environ.get("KILLED_ROUNDS", "2")) + [signal.SIGTERM]
-"""A round each, in which every stage is stopped once; `KILLED_ROUNDS=5` for 30 kills, before a release."""
+SIGNALS = [signal.SIGKILL] * 5 + [signal.SIGTERM]
+"""A round each, in which every stage is stopped once: 30 kills, and 6 friendly requests."""
 
 
 class Runs:
@@ -107,7 +107,7 @@ def products(run: Path) -> dict[str, object]:
     return found
 
 
-def test_kills_at_random_moments_leave_the_same_files(runs: Runs, tmp_path: Path) -> None:
+def test_thirty_kills_at_random_moments_leave_the_same_files(runs: Runs, tmp_path: Path) -> None:
     run, rng = tmp_path / "run", random.Random(0)
     whole = runs.run()
     assert whole["status"] == 0, runs.log.read_text()
@@ -115,7 +115,7 @@ def test_kills_at_random_moments_leave_the_same_files(runs: Runs, tmp_path: Path
     assert len(expected) > 20
     stops = 0
     for number, how in enumerate(chain(SIGNALS, repeat(signal.SIGKILL))):
-        if number >= len(SIGNALS) and stops >= len(SIGNALS) * len(STAGES):
+        if number >= len(SIGNALS) and stops >= 36:
             break
         run.rename(tmp_path / f"whole-{number}")
         for stage in STAGES:
