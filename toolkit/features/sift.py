@@ -159,10 +159,11 @@ class _Pyramid:
             for level in range(available, len(_BLURS)):
                 _blur(levels[level - 1], _BLURS[level - 1], _BLURS[level], levels[level])
 
-    def locate(self, octave: Ints, at: Ints) -> Ints:
-        """Return level, y and x (3, N) of N indices into `values`, (N,), whose octaves are (N,)."""
+    def locate(self, at: Ints) -> tuple[Ints, Ints]:
+        """Return the octaves (N,), and levels, y and x (3, N), of N indices into `values`, (N,)."""
+        octave = np.searchsorted(self.starts, at, side="right") - 1
         level, in_level = np.divmod(at - self.starts[octave], self.sizes[octave])
-        return np.stack([level, *np.divmod(in_level, self.widths[octave])])
+        return octave, np.stack([level, *np.divmod(in_level, self.widths[octave])])
 
 
 def _blur(image: Floats, sigma: float, wanted_sigma: float, out: Floats) -> None:
@@ -184,7 +185,7 @@ class _Keypoints(NamedTuple):
     response: Floats
     """Absolute difference of Gaussians at the keypoint, for gray values from 0 to 1."""
 
-    def take(self, part: Ints | slice) -> "_Keypoints":
+    def take(self, part: Ints) -> "_Keypoints":
         columns: list[Any] = [column[part] for column in self]
         return _Keypoints(*columns)
 
@@ -226,33 +227,30 @@ def _extrema(levels: Floats, contrast: float) -> Ints:
 def _detect(pyramid: _Pyramid, contrast: float) -> _Keypoints:
     """Return the keypoints at the peaks of parabolas fitted to extrema, without those of low contrast or on edges."""
     extrema = [_extrema(levels, contrast) for levels in pyramid.octaves]
-    octave = np.repeat(np.arange(len(extrema)), [len(indices) for indices in extrema])
-    at = np.concatenate(extrema) + pyramid.starts[octave]
+    at = np.concatenate([start + indices for start, indices in zip(pyramid.starts, extrema, strict=True)])
     parts = []
     for _ in range(_MAX_FITS):
-        offset, peak, on_edge = _parabola(pyramid.values, at, pyramid.widths[octave], pyramid.sizes[octave])
+        octave, position = pyramid.locate(at)
+        width, height = pyramid.widths[octave], pyramid.heights[octave]
+        offset, peak, on_edge = _parabola(pyramid.values, at, width, pyramid.sizes[octave])
         settled = (np.abs(offset) < _MAX_OFFSET).all(axis=0)
         good = settled & (np.abs(peak) * _INTERVALS >= contrast) & ~on_edge
-        parts.append((octave[good], at[good], offset[:, good], np.abs(peak[good])))
-        octave, at, offset = octave[~settled], at[~settled], offset[:, ~settled]
+        parts.append((at[good], offset[:, good], np.abs(peak[good])))
         step = (np.sign(offset) * (np.abs(offset) >= _MAX_OFFSET)).astype(np.int64)
-        level, y, x = pyramid.locate(octave, at) + step[::-1]
-        width, height = pyramid.widths[octave], pyramid.heights[octave]
+        level, y, x = position + step[::-1]
         inside = (level >= 1) & (level <= _INTERVALS)
         inside &= (y >= _BORDER) & (y < height - _BORDER) & (x >= _BORDER) & (x < width - _BORDER)
-        at = (pyramid.starts[octave] + (level * height + y) * width + x)[inside]
-        octave = octave[inside]
-    at, first = np.unique(np.concatenate([part[1] for part in parts]), return_index=True)  # two may have moved to one
-    octave = np.concatenate([part[0] for part in parts])[first]
-    offset = np.concatenate([part[2] for part in parts], axis=1)[:, first]
-    level, y, x = pyramid.locate(octave, at)
+        at = (pyramid.starts[octave] + (level * height + y) * width + x)[inside & ~settled]
+    at, first = np.unique(np.concatenate([part[0] for part in parts]), return_index=True)  # two may have moved to one
+    offset = np.concatenate([part[1] for part in parts], axis=1)[:, first]
+    octave, (level, y, x) = pyramid.locate(at)
     return _Keypoints(
         octave,
         level,
         (x + offset[0]).astype(np.float32),
         (y + offset[1]).astype(np.float32),
         (_SIGMA * 2 ** ((level + offset[2]) / _INTERVALS)).astype(np.float32),
-        np.concatenate([part[3] for part in parts])[first],
+        np.concatenate([part[2] for part in parts])[first],
     )
 
 

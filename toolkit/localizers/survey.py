@@ -174,9 +174,11 @@ class Survey:
         if share < CLEAR:
             fits = _fitting_convention(self.images, self.sample, share)
             # If no convention fits better, the poses may just be coarse.
-            coarse = np.median(self._errors_deg(self.sample)) <= COARSE_DEG
-            coarse &= np.median(self._rotation_errors_deg(self.sample)) <= COARSE_ROTATION_DEG
-            if fits or (share < 0.5 and not coarse):
+            too_coarse = (
+                np.median(self._errors_deg(self.sample)) > COARSE_DEG
+                or np.median(self._rotation_errors_deg(self.sample)) > COARSE_ROTATION_DEG
+            )
+            if fits or (share < 0.5 and too_coarse):
                 return replace(result, verdict="inconsistent", fits=fits)
         return replace(result, verdict="consistent", wrong=self._wrong_images(local_map))
 

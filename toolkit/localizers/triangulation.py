@@ -204,10 +204,10 @@ def refine_points(
     rotation, translation = cams_from_world[image, :3, :3], cams_from_world[image, :3, 3]
     order = np.argsort(observations[:, 2], kind="stable")
     firsts = range(0, len(points), _CHUNK)
-    ends = np.searchsorted(observations[order, 2], [*firsts[1:], len(points)])
+    bounds = np.searchsorted(observations[order, 2], [*firsts, len(points)])
 
     def refine(number: int) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-        part = order[ends[number - 1] if number else 0 : ends[number]]
+        part = order[bounds[number] : bounds[number + 1]]
         chunk = points[firsts[number] : firsts[number] + _CHUNK]
         projections = _Projections(rotation[part], translation[part], focal[part], plane[part])
         return projections.refine(chunk, observations[part, 2] - firsts[number], iterations)
