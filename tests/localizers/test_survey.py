@@ -79,7 +79,7 @@ def survey_of(capture: Path, features: Path, device: str, change: Change, count:
         instants(session, rows),
         sensors,
     )
-    return Survey(images, lambda index: store[names[index]], KINDS["sift"].min_score, KINDS["sift"].ratio)
+    return Survey(images, lambda index: store[names[index]], KINDS["sift"])
 
 
 def consistency_of(survey: Survey) -> Consistency:

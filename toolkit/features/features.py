@@ -1,6 +1,6 @@
 """Local features of images, and the kinds that can be extracted. `stores` keeps them in files."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pkgutil import resolve_name
 from typing import Any, Protocol
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from toolkit.capture.turning import turn_image, turn_points
 from toolkit.errors import ManifestError
+from toolkit.features.rootsift import rootsift_64
 from toolkit.geometry import Ints
 from toolkit.manifest import AUTO, FeaturesSettings, checkpoint_of, nearest
 
@@ -80,6 +81,10 @@ class Extractor(Protocol):
         """Return the features of uint8 images of any sizes."""
 
 
+Shorten = Callable[[NDArray[np.float32]], NDArray[np.float32]]
+"""Unit descriptors (N, D) -> shorter unit vectors."""
+
+
 @dataclass(frozen=True)
 class FeatureKind:
     """How one kind of local features is extracted and matched. Scores are cosine similarities of descriptors."""
@@ -100,6 +105,8 @@ class FeatureKind:
     """Largest difference between the size of a keypoint and the size that the map predicts, in octaves."""
     upright: bool = True
     """Whether the features were learned from upright photographs, so that images are turned upright for them."""
+    shorten: Shorten | None = None
+    """Makes unit descriptors (N, D) shorter for `mutual`, which compares all with all; None: they stay as they are."""
 
 
 KINDS: dict[str, FeatureKind] = {
@@ -107,7 +114,7 @@ KINDS: dict[str, FeatureKind] = {
     # the geometry restricts the candidates, the higher the minimum score must be.
     "sift": FeatureKind(
         "toolkit.features.sift:SiftExtractor", ("mutual",), 0.85, -1.0, epipolar_min_score=0.6,
-        guided_min_score=0.75, scale_octaves=1.0, upright=False,
+        guided_min_score=0.75, scale_octaves=1.0, upright=False, shorten=rootsift_64,
     ),
     # Scores of unrelated patches scatter around 0, and similar patches are common: the usual test is a distance below
     # 0.7 (hloc's NN-superpoint), a cosine of 1 - 0.7^2 / 2, without a ratio test. All keypoints have the same size.

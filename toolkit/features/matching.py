@@ -17,7 +17,9 @@ from toolkit.features.features import (
     KINDS,
     Descriptors,
     Extractor,
+    FeatureKind,
     LocalFeatures,
+    Shorten,
     create_extractor,
     feature_kind,
 )  # fmt: skip
@@ -170,24 +172,41 @@ class MutualMatcher:
 
     batch_size = 1
 
-    def __init__(self, ratio: float = 0.8, min_score: float = -1.0):
+    def __init__(self, ratio: float = 0.8, min_score: float = -1.0, shorten: Shorten | None = None):
+        """See `FeatureKind` for the arguments."""
         self.ratio = ratio
         self.min_score = min_score
+        self.shorten = shorten
+
+    @classmethod
+    def of(cls, kind: FeatureKind) -> "MutualMatcher":
+        """Return the matcher of a kind of features."""
+        return cls(kind.ratio, kind.min_score, kind.shorten)
 
     @property
     def settings(self) -> dict[str, Any]:
-        return {"name": "mutual", "ratio": self.ratio, "min_score": self.min_score}
+        shorten = {"shorten": self.shorten.__name__} if self.shorten else {}
+        return {"name": "mutual", "ratio": self.ratio, "min_score": self.min_score, **shorten}
 
     def match(self, pairs: Sequence[tuple[LocalFeatures, LocalFeatures]]) -> list[PairMatches]:
         """Return the matches of pairs of images; the ratio test applies to the first image's features."""
-        matches, previous, unit_a = [], None, np.zeros((0, 0), np.float32)
+        matches, previous, vectors_a = [], None, np.zeros((0, 0), np.float32)
         for a, b in pairs:
             if a is not previous:  # usually one image is matched with several
-                previous, unit_a = a, unit_descriptors(a.descriptors)
-            scores = unit_a @ unit_descriptors(b.descriptors).T
-            indices = mutual_matches(scores, self.ratio, self.min_score)
-            matches.append(PairMatches(indices, scores[indices[:, 0], indices[:, 1]]))
+                previous, vectors_a = a, self.vectors(a.descriptors)
+            matches.append(self.match_vectors(vectors_a, self.vectors(b.descriptors)))
         return matches
+
+    def vectors(self, descriptors: Descriptors) -> NDArray[np.float32]:
+        """Return the unit vectors (N, D) that are compared."""
+        unit = unit_descriptors(descriptors)
+        return self.shorten(unit) if self.shorten else unit
+
+    def match_vectors(self, a: NDArray[np.float32], b: NDArray[np.float32]) -> PairMatches:
+        """Return the matches of two images, given by the `vectors` of each."""
+        scores = a @ b.T
+        indices = mutual_matches(scores, self.ratio, self.min_score)
+        return PairMatches(indices, scores[indices[:, 0], indices[:, 1]])
 
 
 @dataclass(frozen=True)
@@ -239,7 +258,7 @@ def create_local_methods(
     for name in settings.features.kinds if kinds is None else kinds:
         extractor = create_extractor(name, settings.features, device, dtype)
         if matchers[name] == "mutual":
-            methods.append(LocalMethod(name, extractor, MutualMatcher(KINDS[name].ratio, KINDS[name].min_score)))
+            methods.append(LocalMethod(name, extractor, MutualMatcher.of(KINDS[name])))
         else:
             network = create_matcher(
                 matchers[name],

@@ -259,9 +259,8 @@ class MapPlan(Remade):
             self.groups,
             self.session.images["sensor_id"].to_numpy()[self.rows].tolist(),
         )
-        kind = self.kind
         with threadpool_limits(1, "blas"):
-            return Survey(surveyed, lambda index: self.features[self.names[index]], kind.min_score, kind.ratio)
+            return Survey(surveyed, lambda index: self.features[self.names[index]], self.kind)
 
     @cached_property
     def of_worker(self) -> Any:

@@ -58,10 +58,12 @@ class MappedFeatures:
         self.map = local_map
         self.features = features
         self.kind = kind
-        self.matcher = matcher or MutualMatcher(kind.ratio, kind.min_score)
+        self.matcher = matcher or MutualMatcher.of(kind)
         self.name = name
         self.image = lru_cache(CACHED_IMAGES)(self._image)
         """Cached `_image`."""
+        self.vectors = lru_cache(CACHED_IMAGES)(self._vectors)
+        """Cached `_vectors`."""
         self.keypoints = lru_cache(CACHED_IMAGES)(self._keypoints)
         """Cached `_keypoints`."""
         self._network = Lock()
@@ -85,10 +87,10 @@ class MappedFeatures:
             For each reference, the query keypoints (K,) and the map points (K,) that they match.
         """
         if isinstance(self.matcher, MutualMatcher):
-            query = query.take(slice(settings.max_query_features))
-            images = [self.image(index, settings.max_map_features) for index in references]
-            pairs = self.matcher.match([(query, image.features) for image in images])
-            points = [image.points for image in images]
+            vectors = self.matcher.vectors(query.descriptors[: settings.max_query_features])
+            limit = settings.max_map_features
+            pairs = [self.matcher.match_vectors(vectors, self.vectors(index, limit)) for index in references]
+            points = [self.image(index, limit).points for index in references]
         else:  # a network needs the context of a feature, so it gets features without a point, too
             names = [self.map.image_names[index] for index in references]
             if network_matches is not None:
@@ -108,6 +110,11 @@ class MappedFeatures:
         keypoint, point = self.map.observations(index)
         order = np.argsort(-self.map.track_lengths(point), kind="stable")[:max_features]
         return MapImage(self.features[self.map.image_names[index]].take(keypoint[order]), point[order])
+
+    def _vectors(self, index: int, max_features: int) -> NDArray[np.float32]:
+        """Return the vectors that `mutual` compares, one per feature of `_image`."""
+        assert isinstance(self.matcher, MutualMatcher)
+        return self.matcher.vectors(self.image(index, max_features).features.descriptors)
 
     def _keypoints(self, index: int) -> NDArray[np.float32]:
         """Return the keypoints (N, 2) of a map image, pixels."""

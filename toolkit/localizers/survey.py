@@ -20,7 +20,7 @@ from scipy.spatial import KDTree
 from toolkit import geometry
 from toolkit.capture.cameras import rays_of
 from toolkit.capture.images import default_workers, prefetch
-from toolkit.features.features import LocalFeatures
+from toolkit.features.features import FeatureKind, LocalFeatures
 from toolkit.features.matching import MutualMatcher
 from toolkit.features.verification import verified_matches
 from toolkit.geometry import Floats, Ints
@@ -98,17 +98,15 @@ class VerifiedPair(NamedTuple):
 class Survey:
     """Matches a sample of the map images without their poses, and compares the matches with the poses."""
 
-    def __init__(
-        self, images: SurveyedImages, load: Callable[[int], LocalFeatures], min_score: float, ratio: float = 0.8
-    ):
+    def __init__(self, images: SurveyedImages, load: Callable[[int], LocalFeatures], kind: FeatureKind):
         """
         Args:
             images: all images of the map.
             load: returns the features of an image, by index.
-            min_score, ratio: limits of descriptor matching, see `MutualMatcher`.
+            kind: entry of the features in `KINDS`.
         """
         self.images = images
-        self._matcher = MutualMatcher(ratio, min_score)
+        self._matcher = MutualMatcher.of(kind)
         self._load = lru_cache(maxsize=64)(lambda index: load(index).take(slice(MAX_FEATURES)))
         self._verified = lru_cache(maxsize=None)(self._verify)
         self.sample = self.verify(_sampled_pairs(images))

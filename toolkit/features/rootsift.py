@@ -1,0 +1,51 @@
+"""Shorten RootSIFT descriptors to half of their length without losing matches.
+
+A descriptor is a 4 x 4 x 8 array: rows and columns of cells, and directions. Its cosine transform over rows and columns
+and Fourier transform over directions decorrelate it nearly as well as principal components, and need no training. The
+64 components with the largest standard deviation are kept. Each is divided by the square root of its standard
+deviation, which is between plain and whitened components: so the few strong components do not outweigh the many others.
+For 378 pairs of query and reference (STRECHA, STRECHA_HARD), matches of the shortened descriptors are as many, right
+ones and wrong ones, as those of the full ones under the same ratio test.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import dct
+
+LENGTH = 64
+"""Length of a shortened descriptor."""
+# Measured on 20 photographs of other places and things; on STRECHA_HARD, by night, 4 % different.
+_DEVIATIONS = np.array([
+    [[74, 140, 116, 152, 105, 49, 40, 56], [95, 124, 67, 95, 72, 41, 33, 30],
+     [54, 107, 44, 68, 44, 36, 25, 24], [29, 94, 24, 36, 29, 23, 18, 16]],
+    [[71, 57, 108, 91, 78, 32, 35, 26], [51, 65, 72, 51, 54, 26, 27, 19],
+     [30, 63, 52, 42, 42, 22, 24, 16], [21, 47, 27, 23, 25, 15, 16, 11]],
+    [[48, 36, 87, 50, 41, 25, 25, 18], [33, 42, 65, 38, 35, 21, 21, 15],
+     [27, 42, 46, 28, 29, 18, 17, 14], [16, 46, 25, 19, 20, 14, 12, 11]],
+    [[25, 19, 60, 30, 30, 16, 19, 13], [19, 21, 47, 22, 23, 14, 15, 11],
+     [16, 21, 41, 19, 22, 12, 14, 10], [14, 18, 21, 12, 16, 11, 10, 9]],
+]) / 1000  # fmt: skip
+"""Standard deviations of the components: frequency along the first and the second axis of the cells, and directions
+(mean; cosine and sine of one, two and three periods; cosine of four)."""
+
+
+def _components() -> NDArray[np.float32]:
+    """Return the matrix (128, `LENGTH`) from descriptors to weighted components."""
+    along_cells = dct(np.eye(4), axis=0, norm="ortho")
+    angles = 2 * np.pi * np.arange(8) / 8
+    waves = [wave(periods * angles) for periods in (1, 2, 3) for wave in (np.cos, np.sin)]
+    directions = np.stack([np.ones(8), *waves, np.cos(4 * angles)])
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    components = np.einsum("ai,bj,ck->abcijk", along_cells, along_cells, directions).reshape(128, 128)
+    kept = np.argsort(-_DEVIATIONS, axis=None, kind="stable")[:LENGTH]
+    return (components[kept] / np.sqrt(_DEVIATIONS.reshape(-1)[kept, None])).T.astype(np.float32)
+
+
+_COMPONENTS = _components()
+
+
+def rootsift_64(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return RootSIFT descriptors (N, 128) as unit vectors (N, `LENGTH`)."""
+    shortened = descriptors @ _COMPONENTS
+    norms = np.sqrt(np.einsum("nd,nd->n", shortened, shortened))
+    return shortened / np.maximum(norms, np.float32(1e-12))[:, None]
