@@ -106,7 +106,7 @@ class FeatureKind:
     upright: bool = True
     """Whether the features were learned from upright photographs, so that images are turned upright for them."""
     shorten: Shorten | None = None
-    """Makes unit descriptors (N, D) shorter for `mutual`, which compares all with all; None: they stay as they are."""
+    """Makes unit descriptors (N, D) shorter before they are compared; None: they are compared as they are."""
 
 
 KINDS: dict[str, FeatureKind] = {

@@ -190,21 +190,16 @@ class MutualMatcher:
 
     def match(self, pairs: Sequence[tuple[LocalFeatures, LocalFeatures]]) -> list[PairMatches]:
         """Return the matches of pairs of images; the ratio test applies to the first image's features."""
-        matches, previous, vectors_a = [], None, np.zeros((0, 0), np.float32)
+        matches, previous, unit_a = [], None, np.zeros((0, 0), np.float32)
         for a, b in pairs:
             if a is not previous:  # usually one image is matched with several
-                previous, vectors_a = a, self.vectors(a.descriptors)
-            matches.append(self.match_vectors(vectors_a, self.vectors(b.descriptors)))
+                previous, unit_a = a, unit_descriptors(a.descriptors, self.shorten)
+            matches.append(self.match_unit(unit_a, unit_descriptors(b.descriptors, self.shorten)))
         return matches
 
-    def vectors(self, descriptors: Descriptors) -> NDArray[np.float32]:
-        """Return the unit vectors (N, D) that are compared."""
-        unit = unit_descriptors(descriptors)
-        return self.shorten(unit) if self.shorten else unit
-
-    def match_vectors(self, a: NDArray[np.float32], b: NDArray[np.float32]) -> PairMatches:
-        """Return the matches of two images, given by the `vectors` of each."""
-        scores = a @ b.T
+    def match_unit(self, unit_a: NDArray[np.float32], unit_b: NDArray[np.float32]) -> PairMatches:
+        """Return the matches of two images, given by their `unit_descriptors`."""
+        scores = unit_a @ unit_b.T
         indices = mutual_matches(scores, self.ratio, self.min_score)
         return PairMatches(indices, scores[indices[:, 0], indices[:, 1]])
 
@@ -275,10 +270,16 @@ def create_local_methods(
 AnyMethod = LocalMethod | DeferredMethod
 
 
-def unit_descriptors(descriptors: Descriptors) -> NDArray[np.float32]:
-    """Return the descriptors (N, D) of `LocalFeatures` as float32 vectors of length about 1."""
+def unit_descriptors(descriptors: Descriptors, shorten: Shorten | None = None) -> NDArray[np.float32]:
+    """Return the descriptors (N, D) of `LocalFeatures` as float32 vectors of length about 1.
+
+    Args:
+        shorten: see `FeatureKind`.
+    """
     unit = descriptors.astype(np.float32, copy=False)
-    return unit * np.float32(1.0 / DESCRIPTOR_SCALE) if descriptors.dtype == np.uint8 else unit
+    if descriptors.dtype == np.uint8:
+        unit = unit * np.float32(1.0 / DESCRIPTOR_SCALE)
+    return shorten(unit) if shorten else unit
 
 
 def mutual_matches(scores: NDArray[np.float32], ratio: float = 0.8, min_score: float = -1.0) -> Ints:

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from toolkit import geometry
 from toolkit.capture.cameras import in_view
-from toolkit.features.features import KINDS, Descriptors, FeatureKind, LocalFeatures
+from toolkit.features.features import KINDS, FeatureKind, LocalFeatures
 from toolkit.features.matching import Matcher, MutualMatcher, unit_descriptors
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import NetworkMatches, References
@@ -31,9 +31,12 @@ MatchCache = dict[tuple[int, int, int], tuple[Ints, Ints]]
 class MapImage:
     """The features of a map image that observe a map point, longest tracks first."""
 
-    features: LocalFeatures
     points: Ints
     """(N,) the map point of each feature."""
+    scales: NDArray[np.float32]
+    """(N,) see `LocalFeatures`."""
+    unit: NDArray[np.float32]
+    """(N, D) see `unit_descriptors`."""
 
 
 class MappedFeatures:
@@ -62,15 +65,15 @@ class MappedFeatures:
         self.name = name
         self.image = lru_cache(CACHED_IMAGES)(self._image)
         """Cached `_image`."""
-        self.vectors = lru_cache(CACHED_IMAGES)(self._vectors)
-        """Cached `_vectors`."""
         self.keypoints = lru_cache(CACHED_IMAGES)(self._keypoints)
         """Cached `_keypoints`."""
         self._network = Lock()
 
     def match(
         self,
-        query: LocalFeatures,
+        query: RigQuery,
+        camera: int,
+        kind: int,
         references: Sequence[int],
         settings: PnpSettings,
         network_matches: NetworkMatches | None = None,
@@ -78,7 +81,8 @@ class MappedFeatures:
         """Match a query image with references.
 
         Args:
-            query: features of the query image.
+            query: the query's cameras and features.
+            camera, kind: indices of a query image, and of this kind among its features.
             references: indices of images in this map.
             settings: limit the number of features for `mutual`.
             network_matches: matches that a network made earlier; None: match now.
@@ -87,17 +91,17 @@ class MappedFeatures:
             For each reference, the query keypoints (K,) and the map points (K,) that they match.
         """
         if isinstance(self.matcher, MutualMatcher):
-            vectors = self.matcher.vectors(query.descriptors[: settings.max_query_features])
-            limit = settings.max_map_features
-            pairs = [self.matcher.match_vectors(vectors, self.vectors(index, limit)) for index in references]
-            points = [self.image(index, limit).points for index in references]
+            unit = query.unit_descriptors(camera, kind, self.kind.shorten)[: settings.max_query_features]
+            images = [self.image(index, settings.max_map_features) for index in references]
+            pairs = [self.matcher.match_unit(unit, image.unit) for image in images]
+            points = [image.points for image in images]
         else:  # a network needs the context of a feature, so it gets features without a point, too
             names = [self.map.image_names[index] for index in references]
             if network_matches is not None:
                 pairs = [network_matches(name) for name in names]
             else:
                 with self._network:
-                    pairs = self.matcher.match([(query, self.features[name]) for name in names])
+                    pairs = self.matcher.match([(query.features[camera][kind], self.features[name]) for name in names])
             points = [self._point_of_each_feature(index) for index in references]
         matches = []
         for pair, point_of_feature in zip(pairs, points, strict=True):
@@ -109,12 +113,8 @@ class MappedFeatures:
         """Return the features of a map image that observe points, at most `max_features`, longest tracks first."""
         keypoint, point = self.map.observations(index)
         order = np.argsort(-self.map.track_lengths(point), kind="stable")[:max_features]
-        return MapImage(self.features[self.map.image_names[index]].take(keypoint[order]), point[order])
-
-    def _vectors(self, index: int, max_features: int) -> NDArray[np.float32]:
-        """Return the vectors that `mutual` compares, one per feature of `_image`."""
-        assert isinstance(self.matcher, MutualMatcher)
-        return self.matcher.vectors(self.image(index, max_features).features.descriptors)
+        features = self.features[self.map.image_names[index]].take(keypoint[order])
+        return MapImage(point[order], features.scales, unit_descriptors(features.descriptors, self.kind.shorten))
 
     def _keypoints(self, index: int) -> NDArray[np.float32]:
         """Return the keypoints (N, 2) of a map image, pixels."""
@@ -156,11 +156,11 @@ class MappedFeatures:
         by_point, counts = np.argsort(which, kind="stable"), np.bincount(which)
         starts, in_world = np.cumsum(counts) - counts, self.map.points[point]
         image_of = np.repeat(references, [len(image.points) for image in images])
-        descriptors = np.concatenate([image.features.descriptors for image in images])
+        unit = np.concatenate([image.unit for image in images])
         depth = np.einsum("oj,oj->o", self.map.cams_from_world[image_of, 2, :3], in_world[which])
         depth += self.map.cams_from_world[image_of, 2, 3]
         # Size of the feature on the surface, in meters, which does not depend on the camera.
-        size = np.concatenate([image.features.scales for image in images]) * depth / self.map.focals_px[image_of]
+        size = np.concatenate([image.scales for image in images]) * depth / self.map.focals_px[image_of]
         for camera, kinds in enumerate(query.features):
             features = kinds[kind]
             radius = np.tan(np.radians(radius_deg)) * query.focals_px[camera]
@@ -184,7 +184,7 @@ class MappedFeatures:
             octaves = np.abs(np.log2(features.scales[keypoint] / np.maximum(expected_px, 1e-6)))
             similar = octaves < self.kind.scale_octaves
             observation, keypoint = observation[similar], keypoint[similar]
-            score = _similarities(descriptors, observation, query.descriptors(camera, kind), keypoint)
+            score = _similarities(unit, observation, query.unit_descriptors(camera, kind, self.kind.shorten), keypoint)
             good = np.flatnonzero(score > self.kind.guided_min_score)
             good = good[np.lexsort((keypoint[good], observation[good], -score[good]))]
             keypoint = keypoint[good]
@@ -193,14 +193,13 @@ class MappedFeatures:
 
 
 def _similarities(
-    descriptors: Descriptors, rows: Ints, unit_rows: NDArray[np.float32], other_rows: Ints
+    unit_a: NDArray[np.float32], rows_a: Ints, unit_b: NDArray[np.float32], rows_b: Ints
 ) -> NDArray[np.float32]:
-    """Return the cosine similarities (K,) of K pairs: a row of `descriptors` and a row of unit descriptors each."""
-    scores = np.empty(len(rows), np.float32)
-    for start in range(0, len(rows), 512):  # both sides of so many pairs fit into the cache
+    """Return the cosine similarities (K,) of K pairs of rows of unit descriptors."""
+    scores = np.empty(len(rows_a), np.float32)
+    for start in range(0, len(rows_a), 512):  # both sides of so many pairs fit into the cache
         pairs = slice(start, start + 512)
-        ours, theirs = unit_descriptors(descriptors[rows[pairs]]), unit_rows[other_rows[pairs]]
-        scores[pairs] = np.einsum("kd,kd->k", ours, theirs)
+        scores[pairs] = np.einsum("kd,kd->k", unit_a[rows_a[pairs]], unit_b[rows_b[pairs]])
     return scores
 
 
@@ -322,7 +321,7 @@ class MapMatcher:
                 made_earlier = network_matches[camera][kind] if network_matches else None
                 images = self._of_kind(kind, retrieved.images)
                 new = [image for image in images if (camera, kind, image) not in cache]
-                made_now = features.match(query.features[camera][kind], new, self.settings, made_earlier)
+                made_now = features.match(query, camera, kind, new, self.settings, made_earlier)
                 cache |= {(camera, kind, image): pairs for image, pairs in zip(new, made_now, strict=True)}
                 for keypoint, point in (cache[camera, kind, image] for image in images):
                     columns.append(np.stack([np.full(len(point), camera), keypoint, point + self._first_point[kind]]))

@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 
 from toolkit import geometry
 from toolkit.capture.cameras import projection_jacobian, view_bounds
-from toolkit.features.features import LocalFeatures
+from toolkit.features.features import LocalFeatures, Shorten
 from toolkit.features.matching import unit_descriptors
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import PnpSettings
@@ -74,16 +74,16 @@ class RigQuery:
         self._cams_from_rig = [_poselib(pose) for pose in geometry.invert(rig_from_cams)]
         self.focals_px = np.array([camera.mean_focal_length() for camera in cameras])
         self.bounds = np.stack([view_bounds(camera) for camera in cameras])
-        self._descriptors: dict[tuple[int, int], NDArray[np.float32]] = {}
+        self._unit: dict[tuple[int, int], NDArray[np.float32]] = {}
         self.trees = [
             [KDTree(f.keypoints) if len(f) else KDTree(np.zeros((1, 2)) - 1e9) for f in kinds] for kinds in features
         ]
 
-    def descriptors(self, camera: int, kind: int) -> NDArray[np.float32]:
-        """Return the unit descriptors (N, D) of an image's features of one kind, float32."""
-        if (camera, kind) not in self._descriptors:
-            self._descriptors[camera, kind] = unit_descriptors(self.features[camera][kind].descriptors)
-        return self._descriptors[camera, kind]
+    def unit_descriptors(self, camera: int, kind: int, shorten: Shorten | None) -> NDArray[np.float32]:
+        """Return the `unit_descriptors` (N, D) of an image's features of one kind."""
+        if (camera, kind) not in self._unit:
+            self._unit[camera, kind] = unit_descriptors(self.features[camera][kind].descriptors, shorten)
+        return self._unit[camera, kind]
 
     def pixels(self, camera: Ints, keypoint: Ints, kind: int) -> Floats:
         """Return the pixels (K, 2) of keypoints of one kind, given by camera (K,) and index (K,)."""
