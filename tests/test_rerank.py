@@ -298,7 +298,7 @@ def test_a_network_matches_all_references_of_a_query_at_once(
 ) -> None:
     """What stands in for a network finds the same matches, so the order is that of `mutual`."""
     batches: list[int] = []
-    matcher = MutualMatcher(KINDS["sift"].ratio)
+    matcher = MutualMatcher.of(KINDS["sift"])
 
     class Network:
         batch_size = 8

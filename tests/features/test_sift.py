@@ -8,9 +8,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from toolkit.features.features import DESCRIPTOR_SCALE, LocalFeatures
+from toolkit.features.features import DESCRIPTOR_SCALE, KINDS, LocalFeatures
 from toolkit.features.matching import mutual_matches, unit_descriptors
 from toolkit.features.sift import SiftExtractor, SiftSettings, stretch_contrast
+
+Described = tuple[NDArray[np.float32], NDArray[np.float32]]
+"""Keypoints (N, 2) and unit descriptors (N, D)."""
 
 
 def textured(seed: int, width: int = 320, height: int = 240) -> NDArray[np.uint8]:
@@ -212,12 +215,24 @@ def test_a_picture_of_twice_the_size_has_the_same_descriptors() -> None:
     assert 1.9 < np.median(ratios) < 2.1
 
 
-def test_more_matches_of_two_views_are_right_than_with_opencv() -> None:
-    """A view from the side: half as wide, with noise of its own."""
-    image = textured(6, 640, 480)
+def views_from_the_side(seed: int = 6) -> list[NDArray[np.uint8]]:
+    """Return a picture, and the same half as wide, each with noise of its own."""
+    image = textured(seed, 640, 480)
     rng = np.random.default_rng(0)
     side = cv2.resize(image, (352, 480), interpolation=cv2.INTER_AREA)
-    views = [np.clip(view + rng.normal(0, 6, view.shape), 0, 255).astype(np.uint8) for view in (image, side)]
+    return [np.clip(view + rng.normal(0, 6, view.shape), 0, 255).astype(np.uint8) for view in (image, side)]
+
+
+def right_and_wrong(a: Described, b: Described) -> tuple[int, int]:
+    """Return the numbers of right and wrong matches of `views_from_the_side`, each a pair of keypoints and vectors."""
+    matches = mutual_matches(a[1] @ b[1].T, ratio=0.85)
+    apart = a[0][matches[:, 0]] * [0.55, 1.0] - b[0][matches[:, 1]]
+    right = int((np.linalg.norm(apart, axis=1) < 2).sum())
+    return right, len(matches) - right
+
+
+def test_more_matches_of_two_views_are_right_than_with_opencv() -> None:
+    views = views_from_the_side()
     sift = cv2.SIFT.create(nfeatures=3072, contrastThreshold=0.01, enable_precise_upscale=True)
     theirs = []
     for view in views:
@@ -225,12 +240,19 @@ def test_more_matches_of_two_views_are_right_than_with_opencv() -> None:
         root = np.sqrt(descriptors / descriptors.sum(axis=1, keepdims=True))
         theirs.append((points_of(keypoints) + 0.5, root.astype(np.float32)))
     ours = [(found.keypoints, unit_descriptors(found.descriptors)) for found in SiftExtractor().extract(views)]
-    right = []
-    for (a, of_a), (b, of_b) in (ours, theirs):
-        matches = mutual_matches(of_a @ of_b.T, ratio=0.85)
-        apart = a[matches[:, 0]] * [0.55, 1.0] - b[matches[:, 1]]
-        right.append(int((np.linalg.norm(apart, axis=1) < 2).sum()))
-    assert right[0] > right[1] > 50
+    assert right_and_wrong(*ours)[0] > right_and_wrong(*theirs)[0] > 50
+
+
+def test_shortened_descriptors_match_as_well_as_full_ones() -> None:
+    counts = np.zeros((2, 2), int)
+    for seed in (6, 7, 8):
+        found = SiftExtractor().extract(views_from_the_side(seed))
+        for row, shorten in enumerate([None, KINDS["sift"].shorten]):
+            a, b = [(one.keypoints, unit_descriptors(one.descriptors, shorten)) for one in found]
+            counts[row] += right_and_wrong(a, b)
+    (right, wrong), (short_right, short_wrong) = counts.tolist()
+    assert short_right >= right > 500
+    assert short_wrong <= 1.1 * wrong
 
 
 @pytest.mark.parametrize(("width", "height"), [(13, 700), (700, 13), (31, 33), (5, 5), (641, 479)])

@@ -660,7 +660,7 @@ def other_kind(world: World, seed: int) -> World:
     return other
 
 
-SINGLE_SCALE = replace(KINDS["sift"], scale_octaves=float("inf"))
+SINGLE_SCALE = replace(KINDS["sift"], scale_octaves=float("inf"), shorten=None)
 
 
 def test_several_kinds_of_features_give_one_pose_with_the_matches_of_all(room: World) -> None:
