@@ -85,6 +85,11 @@ Shorten = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 """Unit descriptors (N, D) -> shorter unit vectors."""
 
 
+def shorten_settings(shorten: Shorten | None) -> dict[str, str]:
+    """Return how descriptors are shortened, for the fingerprint of their matches."""
+    return {} if shorten is None else {"shorten": shorten.__name__}
+
+
 @dataclass(frozen=True)
 class FeatureKind:
     """How one kind of local features is extracted and matched. Scores are cosine similarities of descriptors."""

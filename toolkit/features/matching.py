@@ -22,6 +22,7 @@ from toolkit.features.features import (
     Shorten,
     create_extractor,
     feature_kind,
+    shorten_settings,
 )  # fmt: skip
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import AUTO, LocalizeSettings, RerankSettings, checkpoint_of, nearest
@@ -185,8 +186,8 @@ class MutualMatcher:
 
     @property
     def settings(self) -> dict[str, Any]:
-        shorten = {"shorten": self.shorten.__name__} if self.shorten else {}
-        return {"name": "mutual", "ratio": self.ratio, "min_score": self.min_score, **shorten}
+        limits = {"ratio": self.ratio, "min_score": self.min_score}
+        return {"name": "mutual", **limits, **shorten_settings(self.shorten)}
 
     def match(self, pairs: Sequence[tuple[LocalFeatures, LocalFeatures]]) -> list[PairMatches]:
         """Return the matches of pairs of images; the ratio test applies to the first image's features."""

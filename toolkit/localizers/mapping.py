@@ -19,7 +19,7 @@ from toolkit.capture import Session
 from toolkit.capture.cameras import camera_text, in_view, rays_of, view_bounds
 from toolkit.capture.images import default_workers, prefetch, read_image
 from toolkit.errors import ArtifactError, ImageError
-from toolkit.features.features import LocalFeatures, feature_kind
+from toolkit.features.features import KINDS, FeatureKind, LocalFeatures, feature_kind, shorten_settings
 from toolkit.features.groups import GroupWriter
 from toolkit.features.matching import PairMatches, match_along_epipolar_lines, unit_descriptors
 from toolkit.features.stores import FeatureStore, MatchStore, group_names, matches_path, write_matches
@@ -112,7 +112,7 @@ def match_pairs(
     world_from_cams: Floats,
     max_error_px: float = 4.0,
     ratio: float = 0.9,
-    min_score: float = 0.6,
+    kind: FeatureKind = KINDS["sift"],
     workers: int = 1,
 ) -> Iterator[PairMatches]:
     """Match the features of image pairs with known poses along epipolar lines.
@@ -123,7 +123,7 @@ def match_pairs(
         cameras, world_from_cams: cameras and poses (N, 4, 4) of the N images.
         max_error_px: largest distance of a match from its epipolar line, in both images.
         ratio: Lowe's ratio among the candidates along the line.
-        min_score: smallest cosine similarity of a match.
+        kind: entry of the features in `KINDS`.
         workers: threads.
 
     Yields:
@@ -131,10 +131,10 @@ def match_pairs(
     """
     cams_from_world = geometry.invert(world_from_cams)
 
-    @lru_cache(maxsize=128)  # 1.6 MB an image: memory does not grow with the map
+    @lru_cache(maxsize=128)  # at most 1.6 MB an image: memory does not grow with the map
     def prepare(index: int) -> tuple[NDArray[np.float32], Floats]:
         features = load(index)
-        return unit_descriptors(features.descriptors), rays_of(cameras[index], features.keypoints)
+        return unit_descriptors(features.descriptors, kind.shorten), rays_of(cameras[index], features.keypoints)
 
     def match(pair: Ints) -> PairMatches:
         i, j = int(pair[0]), int(pair[1])
@@ -142,7 +142,7 @@ def match_pairs(
         angle_i, angle_j = (max_error_px / cameras[index].mean_focal_length() for index in (i, j))
         j_from_i = cams_from_world[j] @ world_from_cams[i]
         indices = match_along_epipolar_lines(
-            descriptors_i, descriptors_j, rays_i, rays_j, j_from_i, angle_i, angle_j, ratio, min_score
+            descriptors_i, descriptors_j, rays_i, rays_j, j_from_i, angle_i, angle_j, ratio, kind.epipolar_min_score
         )
         scores = np.einsum("kd,kd->k", descriptors_i[indices[:, 0]], descriptors_j[indices[:, 1]])
         return PairMatches(indices, scores)
@@ -245,6 +245,7 @@ class MapPlan(Remade):
             "max_error_px": settings.max_epipolar_error_px,
             "ratio": settings.ratio,
             "min_score": self.kind.epipolar_min_score,
+            **shorten_settings(self.kind.shorten),
         }
 
     @cached_property
@@ -310,7 +311,7 @@ class MapPlan(Remade):
             self.world_from_cams,
             self.matcher["max_error_px"],
             self.matcher["ratio"],
-            self.matcher["min_score"],
+            self.kind,
             workers,
         )
         bar = tqdm(all_matches, total=len(todo), desc=label, unit="pair", disable=not label)

@@ -16,7 +16,7 @@ import pycolmap
 from toolkit import geometry
 from toolkit.capture import Session
 from toolkit.capture.cameras import rays_of
-from toolkit.features.features import KINDS, LocalFeatures
+from toolkit.features.features import KINDS, FeatureKind, LocalFeatures
 from toolkit.features.matching import AnyMethod, PairMatches
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import NetworkMatches, PoseEstimate, Prior, Query, QueryInput, References
@@ -110,7 +110,7 @@ class OnDemandLocalizer:
         for number, (method, source) in enumerate(self.on_demand, start=len(self.mapped)):
             features = {self.posed.names[index]: source(self.posed.names[index]) for index in images}
             new_matches = self._match(query, references, features, method, number)
-            local_map = self.triangulate(images, features, new_matches, KINDS[method.name].epipolar_min_score)
+            local_map = self.triangulate(images, features, new_matches, KINDS[method.name])
             mapped.append(MappedFeatures(local_map, features, KINDS[method.name], method.matcher, method.name))
             point_index.append(np.full(len(local_map.points), -1))  # these points are in no map file
             for of_camera, of_kind in zip(matches, new_matches, strict=True):
@@ -154,7 +154,7 @@ class OnDemandLocalizer:
         images: Ints,
         features: Mapping[str, LocalFeatures],
         query_matches: Sequence[Mapping[str, PairMatches]],
-        min_score: float,
+        kind: FeatureKind,
     ) -> LocalMap:
         """Triangulate the points that some of the images see; return a map of all images with these points.
 
@@ -162,7 +162,7 @@ class OnDemandLocalizer:
             images: (n,) indices of these images, ascending.
             features: their features, by name.
             query_matches: for each query image, its matches with some of these images, by name.
-            min_score: smallest cosine similarity of a match along an epipolar line.
+            kind: entry of the features in `KINDS`.
         """
         posed, settings = self.posed, self._map_settings
         names = [posed.names[index] for index in images]
@@ -170,7 +170,7 @@ class OnDemandLocalizer:
         loaded = [features[name] for name in names]
         pairs = select_pairs(poses, cameras, posed.instants[images], settings.pairs_per_image)
         along_lines = match_pairs(
-            pairs, loaded.__getitem__, cameras, poses, settings.max_epipolar_error_px, settings.ratio, min_score
+            pairs, loaded.__getitem__, cameras, poses, settings.max_epipolar_error_px, settings.ratio, kind
         )
         matches = {(int(i), int(j)): pair.indices for (i, j), pair in zip(pairs, along_lines, strict=True)}
         number_of = {name: number for number, name in enumerate(names)}
