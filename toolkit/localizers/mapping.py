@@ -240,6 +240,9 @@ class MapPlan(Remade):
         starts = np.searchsorted(self._home[self.pairs[order, 0]], np.arange(len(self.tiles) + 1))
         self.pairs_of = [self.pairs[np.sort(order[slice(*starts[tile : tile + 2])])] for tile in range(len(self.tiles))]
         """For each tile, the pairs whose first image is in its core."""
+        # What was matched here need not be read again. A map of several tiles may be larger than the memory.
+        self._matched: dict[tuple[int, int], Ints] = {}
+        self._keypoints_of: dict[int, NDArray[np.float32]] = {}
         self.matcher: dict[str, Any] = {
             "name": "epipolar",
             "max_error_px": settings.max_epipolar_error_px,
@@ -302,6 +305,8 @@ class MapPlan(Remade):
         def load(index: int) -> LocalFeatures:
             features = self.features[self.names[index]]
             counts[index] = len(features)
+            if len(self.tiles) == 1:
+                self._keypoints_of[index] = features.keypoints
             return features
 
         all_matches = match_pairs(
@@ -317,6 +322,8 @@ class MapPlan(Remade):
         bar = tqdm(all_matches, total=len(todo), desc=label, unit="pair", disable=not label)
         for (group, source, i, j), matches in zip(todo, bar, strict=True):
             write_matches(writer, group, source, (counts[i], counts[j]), matches)
+            if len(self.tiles) == 1:
+                self._matched[i, j] = matches.indices
 
     def tile_path(self, number: int) -> Path:
         """Return the file of a tile, which is a map of its own."""
@@ -349,7 +356,12 @@ class MapPlan(Remade):
         core, images = self.tiles[number]
         pairs = self._pairs_in(number)
         stores = {tile: MatchStore(self._matches_path(tile)) for tile in np.unique(self._home[images]).tolist()}
-        matches = [stores[self._home[i]][self.names[i], self.names[j]].indices for i, j in pairs]
+
+        def matches_of(i: int, j: int) -> Ints:
+            if (i, j) in self._matched:
+                return self._matched[i, j]
+            return stores[self._home[i]][self.names[i], self.names[j]].indices
+
         poses = self.world_from_cams[images]
         local_map = triangulate(
             [self.names[image] for image in images],
@@ -357,7 +369,7 @@ class MapPlan(Remade):
             geometry.make_pose(poses[:, :3, :3], poses[:, :3, 3] / self.length),
             [self._keypoints(image) for image in images],
             np.searchsorted(images, pairs),
-            matches,
+            [matches_of(i, j) for i, j in pairs.tolist()],
             self.settings,
             self.seed,
         ).scaled(self.length)
@@ -394,7 +406,8 @@ class MapPlan(Remade):
         local_map.judged(self.survey.consistency(local_map)).save(self.path)
 
     def _keypoints(self, image: int) -> NDArray[np.float32]:
-        return self.features[self.names[image]].keypoints
+        kept = self._keypoints_of.get(image)
+        return self.features[self.names[image]].keypoints if kept is None else kept
 
     def _colors(self, images: Ints, keypoints: Ints) -> NDArray[np.uint8]:
         """Return the colors (n, 3) at n keypoints of images; gray where an image cannot be read."""

@@ -186,7 +186,7 @@ class MappedFeatures:
             observation, keypoint = observation[similar], keypoint[similar]
             score = _similarities(unit, observation, query.unit_descriptors(camera, kind, self.kind.shorten), keypoint)
             good = np.flatnonzero(score > self.kind.guided_min_score)
-            good = good[np.lexsort((keypoint[good], observation[good], -score[good]))]
+            good = good[np.lexsort((observation[good] * len(features) + keypoint[good], -score[good]))]
             keypoint = keypoint[good]
             pixels = features.keypoints[keypoint].astype(np.float64)
             yield Candidates(Matches(np.full(len(good), camera), pixels, point[which[observation[good]]]), keypoint)
