@@ -369,6 +369,7 @@ def test_a_rolled_camera_is_described_as_an_upright_one(
     assert ranked["turned"] == ranked["as they are"]
 
 
+@pytest.mark.slow
 def test_a_subsession_that_is_gone_leaves_no_embeddings(tiny: Path, tmp_path: Path) -> None:
     out = tmp_path / "e"
     embed_sessions(tiny / "sessions", out, device="ios")
@@ -390,6 +391,7 @@ def test_a_session_that_lost_its_images_leaves_no_embeddings(tiny: Path, tmp_pat
         load_embeddings(out / "ios_query")
 
 
+@pytest.mark.slow
 def test_corrected_intrinsics_are_followed(tiny: Path, tmp_path: Path) -> None:
     sensors = tiny / "sessions" / "ios_map" / "sensors.txt"
     right = sensors.read_text()
@@ -401,6 +403,7 @@ def test_corrected_intrinsics_are_followed(tiny: Path, tmp_path: Path) -> None:
     assert embed_sessions(tiny / "sessions", tmp_path / "e", device="ios").iloc[0]["embedded"] == 6
 
 
+@pytest.mark.slow
 def test_a_torn_matrix_is_made_anew(tiny: Path, tmp_path: Path) -> None:
     embed_sessions(tiny / "sessions", tmp_path / "e", device="ios")
     path = tmp_path / "e" / "ios_map" / "ios_a" / "ios_a.npy"
@@ -438,6 +441,7 @@ def test_an_unusable_session_stops_no_other(tmp_path: Path) -> None:
         embed_sessions(capture / "sessions", tmp_path / "embeddings", device="hl")
 
 
+@pytest.mark.slow
 def test_a_session_without_a_readable_image_stops_no_other(tmp_path: Path) -> None:
     capture = write_tiny_capture(tmp_path / "TINY")
     for session in ("hl_map", "ios_query"):

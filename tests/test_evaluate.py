@@ -327,6 +327,7 @@ def test_overlap_is_judged_by_the_maps_that_the_poses_were_found_with(scene, tmp
     assert row["retrieved"] == 0.25  # the point lies before the first query's camera; the others stand 10 m aside
 
 
+@pytest.mark.slow
 def test_an_unusable_session_or_pair_is_a_row_with_the_reason(scene, tmp_path):
     sessions, poses, references = scene
     (sessions / "hl_query" / "images.txt").write_text("a line\n")

@@ -573,7 +573,8 @@ def test_progress_of_another_question_is_not_taken_over(small_capture: Path, run
     assert len(calls) == 3
 
 
-@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 2])
 def test_equal_seeds_give_equal_files(
     small_capture: Path, run: SceneFiles, finished: tuple[SceneFiles, pd.DataFrame], workers: int
 ) -> None:
@@ -847,6 +848,7 @@ def test_an_unknown_run_scene_or_device_is_told_with_the_known_ones(
         localize_image(None, "a.jpg", None)
 
 
+@pytest.mark.slow
 def test_the_settings_of_the_last_run_count_whatever_the_clock_says(small_capture: Path, run: SceneFiles) -> None:
     run_stage(small_capture, run, query_device="hl", seed=1)
     run_stage(small_capture, run, query_device="ios", seed=2)
@@ -1249,6 +1251,7 @@ def test_no_pose_is_ok_in_a_map_that_contradicts_its_images(
     assert picture.status != "ok"
 
 
+@pytest.mark.slow
 def test_a_map_does_not_hang_on_the_unit_of_length(
     capture: Path, run: SceneFiles, finished: tuple[SceneFiles, pd.DataFrame]
 ) -> None:

@@ -283,6 +283,7 @@ def test_reranking_is_switched_on_by_its_section(place: Path, monkeypatch: pytes
         pipeline.run(place / "run.yaml", only="rerank")
 
 
+@pytest.mark.slow
 def test_a_failing_cell_stops_with_its_message_and_the_notebook(
     place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

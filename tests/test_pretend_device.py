@@ -126,6 +126,7 @@ def test_omega(device: None) -> None:
         torch.testing.assert_close(found.cpu(), expected[name], atol=1e-5, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_da3(device: None) -> None:
     model, images = da3.tiny(), torch.rand(2, 4, 3, 42, 56, generator=torch.Generator().manual_seed(0))
     poses, K = cameras("pretend", 8, 42, 56)
@@ -155,6 +156,7 @@ def test_extractors(device: None, make: object) -> None:
         np.testing.assert_allclose(found.descriptors, expected.descriptors, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_lightglue(device: None, state: dict[str, torch.Tensor]) -> None:
     pairs = [(features(1, 60), features(2, 50)), (features(1, 60), features(3, 80))]
     here, there = (LightGlueMatcher(state, device=name, dtype="float32") for name in ("cpu", "pretend"))

@@ -343,6 +343,7 @@ def test_an_image_without_features_is_named(small_capture: Path, files: SceneFil
     assert found[1]["reason"] == ""
 
 
+@pytest.mark.slow
 def test_sessions_may_have_the_names_of_lamar(small_capture: Path, files: SceneFiles, tmp_path: Path) -> None:
     capture = Path(shutil.copytree(small_capture, tmp_path / "data" / small_capture.name))
     (capture / "sessions" / "hl_query").rename(capture / "sessions" / "query_hololens")

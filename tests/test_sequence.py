@@ -123,6 +123,7 @@ def test_a_pair_without_queries_has_failed_frames_alone(place: Path, tmp_path: P
     assert done["frames"] == done["failed"] == len(truth)
 
 
+@pytest.mark.slow
 def test_ground_truth_is_not_taken_for_odometry_in_silence(
     place: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

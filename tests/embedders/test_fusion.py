@@ -214,6 +214,7 @@ def test_links_are_copies_where_the_disk_has_none(place: Path, monkeypatch: pyte
     assert not one.samefile(other)
 
 
+@pytest.mark.slow
 def test_retrieval_ranks_by_the_fused_similarity(place: Path) -> None:
     sessions, out = place / "TINY" / "sessions", place / "embeddings"
     before = retrieve_pairs(sessions, out, settings={"topk": 5})

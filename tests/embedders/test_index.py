@@ -230,6 +230,7 @@ def test_there_are_as_many_candidates_as_references(place: Path, tmp_path: Path)
     assert (search(queries(place), stored(place), 5, index=index)[1] >= 0).all()
 
 
+@pytest.mark.slow
 def test_an_index_that_is_not_asked_for_loads_no_torch() -> None:
     code = "import sys, toolkit.retrieve, toolkit.localizers.map; sys.exit('torch' in sys.modules)"
     root = Path(index_module.__file__).parents[2]

@@ -128,7 +128,8 @@ def test_the_order_of_the_images_does_not_count(matcher: LightGlueMatcher) -> No
     assert {*map(tuple, forth.indices.tolist())} == {(i, j) for j, i in back.indices.tolist()}
 
 
-@pytest.mark.parametrize("by_itself", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.slow
+@pytest.mark.parametrize("by_itself", [True, False])
 def test_pairs_do_not_depend_on_each_other(
     matcher: LightGlueMatcher, monkeypatch: pytest.MonkeyPatch, by_itself: bool
 ) -> None:

@@ -382,10 +382,11 @@ def test_wrong_parameters_are_refused(run: SceneFiles, small_capture: Path, wron
         run_stage(small_capture, run, **wrong)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "more"),
     [
-        pytest.param("feed_forward", {"predictor": {"batch_size": 1}}, marks=pytest.mark.slow),
+        ("feed_forward", {"predictor": {"batch_size": 1}}),
         ("hybrid", {"predictor": {"batch_size": 3}, "workers": 2}),
     ],
 )
@@ -485,6 +486,7 @@ def test_other_noise_references_or_weights_make_poses_anew(run: SceneFiles, smal
     assert not skipped(method="hybrid")
 
 
+@pytest.mark.slow
 def test_a_prediction_is_drawn_and_labeled(world: World, tmp_path: Path) -> None:
     queries, _ = world.queries("spot")
     localizer = world.localizer(world.predictor(wrong_references=0.3, seed=2))

@@ -271,6 +271,7 @@ def test_every_other_reference_is_told(create: Create, photographs: Photographs)
         assert np.allclose(again.model_from_cams, untold.model_from_cams, atol=1e-4, equal_nan=True) is not told
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turns", [1, 2, 3])
 def test_a_rolled_camera_is_told_as_it_is_shown(create: Create, photographs: Photographs, turns: int) -> None:
     """Photographs stored upright, and stored after turns, with their cameras: the network is told the same."""
@@ -381,6 +382,7 @@ def test_a_blob_is_where_the_map_says(
     np.testing.assert_allclose(at, scale * center + offset, atol=0.05)
 
 
+@pytest.mark.slow
 def test_groups_do_not_change_each_other(make: Make, photographs: Photographs, monkeypatch: pytest.MonkeyPatch) -> None:
     groups = [photographs.group(*sizes) for sizes in ([WIDE] * 3, [HIGHER] * 2, [WIDE] * 3, [WIDE] * 2, [WIDE] * 3)]
     predictor = make(batch_size=2)
@@ -486,6 +488,7 @@ def test_what_was_decoded_in_vain_is_forgotten(make: Make, photographs: Photogra
 # Memory
 
 
+@pytest.mark.slow
 def test_smaller_batches_where_memory_is_short(
     make: Make, photographs: Photographs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -610,6 +613,7 @@ def test_what_does_not_compile_says_so_at_the_start(
 # What is wrong with files
 
 
+@pytest.mark.slow
 def test_a_reference_that_cannot_be_read_is_left_out(
     make: Make, photographs: Photographs, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -718,6 +722,7 @@ def test_a_file_of_another_network_is_refused_when_loaded(
         predictor.predict([photographs.group(WIDE, WIDE)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turns", [1, 2, 3])
 @pytest.mark.parametrize("size", [WIDE, PORTRAIT])
 def test_a_rolled_camera_is_shown_upright_and_answered_as_it_is(

@@ -499,6 +499,7 @@ def test_more_noise_is_more_uncertainty(room: World) -> None:
     assert 2 < stds[1] / stds[0] < 6
 
 
+@pytest.mark.slow
 def test_the_same_answer_in_whatever_order_threads_come(room: World) -> None:
     poses = [facing(x, 0.1, 0.3, yaw_deg=-5 * x) for x in np.linspace(-1.5, 1.5, 6)]
     queries = [room.look(PINHOLE, pose, outliers=0.5) for pose in poses]

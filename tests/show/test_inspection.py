@@ -93,6 +93,7 @@ def test_it_shows_what_the_stage_stored(files: SceneFiles, pair: InspectedPair) 
     assert picture_of(one).width > 800
 
 
+@pytest.mark.slow
 def test_unchanged_settings_give_the_same_pose_and_others_are_shown_beside(pair: InspectedPair) -> None:
     one = pair.look(0)
     same = one.again()

@@ -98,6 +98,7 @@ def test_online_poses_know_the_past_alone(place: Path, tmp_path: Path) -> None:
     assert not (before.loc["graph"] == after.loc["graph"]).all(axis=None)
 
 
+@pytest.mark.slow
 def test_drift_and_a_loss_that_later_queries_tell_change_no_online_pose(place: Path, tmp_path: Path) -> None:
     stem = tmp_path / "poses" / pair_name(place.name, "ios", "ios")
     drive_through(tmp_path, place, drive(np.random.default_rng(0), frames=24))
