@@ -573,8 +573,7 @@ def test_progress_of_another_question_is_not_taken_over(small_capture: Path, run
     assert len(calls) == 3
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_equal_seeds_give_equal_files(
     small_capture: Path, run: SceneFiles, finished: tuple[SceneFiles, pd.DataFrame], workers: int
 ) -> None:

@@ -200,9 +200,13 @@ def test_a_kernel_that_dies_at_its_start_is_told(place: Path, monkeypatch: pytes
     assert record_of(place)["status"] == "failed"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("raised", "code"), [("MemoryError()", 1), ("OSError(28, 'No space', 'a')", 1), ("1 / 0", 3)]
+    ("raised", "code"),
+    [
+        pytest.param("MemoryError()", 1, marks=pytest.mark.slow),
+        pytest.param("OSError(28, 'No space', 'a')", 1, marks=pytest.mark.slow),
+        ("1 / 0", 3),
+    ],
 )
 def test_an_error_in_a_cell_has_its_exit_code(place: Path, raised: str, code: int) -> None:
     code_cell = raised if "/" in raised else f"raise {raised}"
@@ -214,9 +218,8 @@ def test_an_error_in_a_cell_has_its_exit_code(place: Path, raised: str, code: in
     assert "Traceback (most recent call last)" in (place / "runs/run" / LOG).read_text()
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="needs signals")
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
 def test_a_signal_ends_the_run_its_kernels_and_sockets(place: Path, number: signal.Signals) -> None:
     code = "from pathlib import Path\nimport time, os\nPath(out_jsonl).parent.mkdir(parents=True, exist_ok=True)\n"
     code += "Path(out_jsonl).write_text(str(os.getpid()))\ntime.sleep(600)"

@@ -17,6 +17,8 @@ def test_shortened_descriptors_have_length_1_and_none_at_all_stays_zero() -> Non
     np.testing.assert_allclose(np.linalg.norm(shortened, axis=1), 1, atol=1e-6)
     np.testing.assert_array_equal(rootsift_64(np.zeros((2, 128), np.float32)), np.zeros((2, LENGTH), np.float32))
     assert rootsift_64(np.zeros((0, 128), np.float32)).shape == (0, LENGTH)
+    of_another_kind = np.ones((2, 256), np.float32)
+    assert rootsift_64(of_another_kind) is of_another_kind
 
 
 def test_the_components_are_orthogonal_waves_over_cells_and_directions() -> None:

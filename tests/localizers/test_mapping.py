@@ -15,6 +15,7 @@ from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory, write_session
 from toolkit.capture.cameras import in_view, rays_of, view_bounds
 from toolkit.errors import ArtifactError
+from toolkit.features.features import KINDS
 from toolkit.features.sift import SiftExtractor, SiftSettings
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import sidecar_path
@@ -379,6 +380,12 @@ def test_a_current_map_is_loaded_and_another_is_built(
         built.clear()
         build_map(session, store, path, **({"settings": quick} | more))
         assert built
+    built.clear()
+    build_map(session, store, path, quick, inputs="b")
+    monkeypatch.setitem(KINDS, "sift", replace(KINDS["sift"], shorten=None))
+    again = build_map(session, store, path, quick, inputs="b")
+    assert len(built) == 2, "descriptors are compared in another way"
+    assert len(again.points) != len(first.points)
 
 
 def test_after_a_change_only_the_pairs_of_the_changed_image_are_matched(

@@ -115,8 +115,8 @@ class FeatureKind:
 
 
 KINDS: dict[str, FeatureKind] = {
-    # RootSIFT has no negative entries: unrelated patches already score about 0.5, so the ratio test decides. The less
-    # the geometry restricts the candidates, the higher the minimum score must be.
+    # RootSIFT has no negative entries: unrelated patches already score about 0.7 (shortened, too), so the ratio test
+    # decides. The less the geometry restricts the candidates, the higher the minimum score must be.
     "sift": FeatureKind(
         "toolkit.features.sift:SiftExtractor", ("mutual",), 0.85, -1.0, epipolar_min_score=0.6,
         guided_min_score=0.75, scale_octaves=1.0, upright=False, shorten=rootsift_64,

@@ -36,7 +36,7 @@ _ToMatch = tuple[str, str, int, int]
 """A pair to match: group in the match file, fingerprint of the inputs of the matches, indices of the two images."""
 DEPTHS = (2.0, 4.0, 8.0, 16.0)
 """Depths at which the views of two images are compared, in map lengths (meters; see `Survey.length`)."""
-_MAP_FORMAT = 4
+_MAP_FORMAT = 5
 """Increase when the same settings give another file, so that existing maps are built again."""
 
 
@@ -131,7 +131,7 @@ def match_pairs(
     """
     cams_from_world = geometry.invert(world_from_cams)
 
-    @lru_cache(maxsize=128)  # at most 1.6 MB an image: memory does not grow with the map
+    @lru_cache(maxsize=128)  # about 1 MB of SIFT an image: memory does not grow with the map
     def prepare(index: int) -> tuple[NDArray[np.float32], Floats]:
         features = load(index)
         return unit_descriptors(features.descriptors, kind.shorten), rays_of(cameras[index], features.keypoints)
@@ -153,6 +153,22 @@ def match_pairs(
 def map_settings(settings: MapSettings, seed: int) -> dict[str, Any]:
     """Return everything that a map depends on except its inputs; part of fingerprints."""
     return {**settings.model_dump(), "seed": seed, "format": _MAP_FORMAT}
+
+
+def _matcher_settings(settings: MapSettings, kind: FeatureKind) -> dict[str, Any]:
+    """Return everything that the matches of map images depend on besides features and poses."""
+    return {
+        "name": "epipolar",
+        "max_error_px": settings.max_epipolar_error_px,
+        "ratio": settings.ratio,
+        "min_score": kind.epipolar_min_score,
+        **shorten_settings(kind.shorten),
+    }
+
+
+def _kind_of(features: FeatureStore) -> FeatureKind:
+    """Return the kind of stored features; other tools do not record it."""
+    return feature_kind(features.settings.get("name", "sift"))
 
 
 def build_map(
@@ -185,7 +201,12 @@ def build_map(
         ArtifactError: no image has both a pose and features.
     """
     settings = settings or MapSettings()
-    map_record = {"map": map_settings(settings, seed), "inputs": inputs, "metric": metric}
+    map_record = {
+        "map": map_settings(settings, seed),
+        "matcher": _matcher_settings(settings, _kind_of(features)),
+        "inputs": inputs,
+        "metric": metric,
+    }
     if skip_existing and is_current(path, map_record):
         with suppress(ArtifactError):  # the file is damaged: build it again
             return LocalMap.load(path)
@@ -229,7 +250,7 @@ class MapPlan(Remade):
         self.names = [names[row] for row in self.rows]
         sensor_ids = session.images["sensor_id"].to_numpy()[self.rows]
         self.cameras = [session.camera(sensor) for sensor in sensor_ids]
-        self.kind, self.groups = feature_kind(features.settings.get("name", "sift")), instants(session, self.rows)
+        self.kind, self.groups = _kind_of(features), instants(session, self.rows)
         self.length = self.survey.length(metric) if length is None else length
         pairs_per_image = settings.pairs_per_image
         self.pairs = select_pairs(self.world_from_cams, self.cameras, self.groups, pairs_per_image, self.length)
@@ -240,16 +261,10 @@ class MapPlan(Remade):
         starts = np.searchsorted(self._home[self.pairs[order, 0]], np.arange(len(self.tiles) + 1))
         self.pairs_of = [self.pairs[np.sort(order[slice(*starts[tile : tile + 2])])] for tile in range(len(self.tiles))]
         """For each tile, the pairs whose first image is in its core."""
-        # What was matched here need not be read again. A map of several tiles may be larger than the memory.
+        # What was just matched is not read again. Only for a map of one tile: those of several may not fit into memory.
         self._matched: dict[tuple[int, int], Ints] = {}
         self._keypoints_of: dict[int, NDArray[np.float32]] = {}
-        self.matcher: dict[str, Any] = {
-            "name": "epipolar",
-            "max_error_px": settings.max_epipolar_error_px,
-            "ratio": settings.ratio,
-            "min_score": self.kind.epipolar_min_score,
-            **shorten_settings(self.kind.shorten),
-        }
+        self.matcher = _matcher_settings(settings, self.kind)
 
     @cached_property
     def survey(self) -> Survey:
@@ -295,17 +310,19 @@ class MapPlan(Remade):
             todo = writer.left(todo) if skip_existing else todo
             label = f"match {self.session.id}" + (f" {number + 1}/{len(self.tiles)}" if len(self.tiles) > 1 else "")
             todo = writer.spread(_match_share, todo, (self.of_worker,), label, "pair")
-            self.match_into(writer, todo, workers, label if todo else "")
+            self.match_into(writer, todo, workers, label if todo else "", keep=len(self.tiles) == 1)
             writer.finish()
 
-    def match_into(self, writer: GroupWriter, todo: Sequence[_ToMatch], workers: int, label: str) -> None:
-        """Add the matches of pairs to a file."""
+    def match_into(
+        self, writer: GroupWriter, todo: Sequence[_ToMatch], workers: int, label: str, keep: bool = False
+    ) -> None:
+        """Add the matches of pairs to a file; `keep` them in memory, too."""
         counts: dict[int, int] = {}
 
         def load(index: int) -> LocalFeatures:
             features = self.features[self.names[index]]
             counts[index] = len(features)
-            if len(self.tiles) == 1:
+            if keep:
                 self._keypoints_of[index] = features.keypoints
             return features
 
@@ -322,7 +339,7 @@ class MapPlan(Remade):
         bar = tqdm(all_matches, total=len(todo), desc=label, unit="pair", disable=not label)
         for (group, source, i, j), matches in zip(todo, bar, strict=True):
             write_matches(writer, group, source, (counts[i], counts[j]), matches)
-            if len(self.tiles) == 1:
+            if keep:
                 self._matched[i, j] = matches.indices
 
     def tile_path(self, number: int) -> Path:

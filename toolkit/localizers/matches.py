@@ -55,7 +55,7 @@ class MappedFeatures:
             local_map: the map triangulated from the features.
             features: features of the map images, by name.
             kind: entry of the features in `KINDS`.
-            matcher: None: `mutual` with the limits of the kind.
+            matcher: None: `mutual` with the limits of the kind. Any `mutual` compares descriptors as the kind says.
             name: key of the features in `KINDS`.
         """
         self.map = local_map
@@ -151,7 +151,7 @@ class MappedFeatures:
             return
         images = [self.image(index, settings.max_map_features) for index in references]
         # Several images may observe a point, which is projected once: `point`, `counts`, `starts` and `in_world` are
-        # per point, `which`, `image_of`, `descriptors`, `depth` and `size` per observation.
+        # per point, `which`, `image_of`, `unit`, `depth` and `size` per observation.
         point, which = np.unique(np.concatenate([image.points for image in images]), return_inverse=True)
         by_point, counts = np.argsort(which, kind="stable"), np.bincount(which)
         starts, in_world = np.cumsum(counts) - counts, self.map.points[point]

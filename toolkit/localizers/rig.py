@@ -80,7 +80,7 @@ class RigQuery:
         ]
 
     def unit_descriptors(self, camera: int, kind: int, shorten: Shorten | None) -> NDArray[np.float32]:
-        """Return the `unit_descriptors` (N, D) of an image's features of one kind."""
+        """Return the `unit_descriptors` (N, D) of an image's features of one kind; `shorten` belongs to the kind."""
         if (camera, kind) not in self._unit:
             self._unit[camera, kind] = unit_descriptors(self.features[camera][kind].descriptors, shorten)
         return self._unit[camera, kind]
