@@ -54,7 +54,7 @@ def runs(tmp_path: Path, made_once: Any) -> Iterator[Runs]:
     def make(folder: Path) -> None:
         render_capture(folder / "TINY", rooms=1, frames=3, seed=0, progress=False)
 
-    capture = made_once("tiny", make) / "TINY"
+    capture = made_once("killed", make) / "TINY"
     manifest = tmp_path / "run.yaml"
     # SIFT alone: networks do not work in forked processes.
     manifest.write_text(
