@@ -10,7 +10,8 @@ With the same ratio test, shortened and full descriptors give equally many right
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import dct
+
+from toolkit.geometry import unit
 
 LENGTH = 64
 """Length of a shortened descriptor."""
@@ -31,11 +32,10 @@ _DEVIATIONS = np.array([
 
 def _components() -> NDArray[np.float32]:
     """Return the matrix (128, `LENGTH`) from descriptors to weighted components."""
-    along_cells = dct(np.eye(4), axis=0, norm="ortho")
+    along_cells = unit(np.cos(np.pi / 4 * np.outer(np.arange(4), np.arange(4) + 0.5)))
     angles = 2 * np.pi * np.arange(8) / 8
     waves = [wave(periods * angles) for periods in (1, 2, 3) for wave in (np.cos, np.sin)]
-    directions = np.stack([np.ones(8), *waves, np.cos(4 * angles)])
-    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    directions = unit(np.stack([np.ones(8), *waves, np.cos(4 * angles)]))
     components = np.einsum("ai,bj,ck->abcijk", along_cells, along_cells, directions).reshape(128, 128)
     kept = np.argsort(-_DEVIATIONS, axis=None, kind="stable")[:LENGTH]
     return (components[kept] / np.sqrt(_DEVIATIONS.reshape(-1)[kept, None])).T.astype(np.float32)
@@ -53,5 +53,5 @@ def rootsift_64(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
     if descriptors.shape[1] != len(_COMPONENTS):
         return descriptors
     shortened = descriptors @ _COMPONENTS
-    norms = np.sqrt(np.einsum("nd,nd->n", shortened, shortened))
+    norms = np.sqrt(np.einsum("nd,nd->n", shortened, shortened))  # 0.8 of the time of `geometry.unit`
     return shortened / np.maximum(norms, np.float32(1e-12))[:, None]
