@@ -456,9 +456,8 @@ def execute(
     if kernels is None:
         with Kernels(output.parent) as own:
             return execute(path, output, parameters, progress, own)
-    output.parent.mkdir(parents=True, exist_ok=True)
     memory, kernel = MemoryWatch(), kernels.take()
-    # Papermill takes seconds to import; the kernel starts meanwhile, and a run that reuses everything skips it.
+    # Imported here because that takes seconds, which a run that reuses everything does not need.
     import papermill
     from jupyter_client.kernelspec import NoSuchKernel
     from nbclient.exceptions import DeadKernelError

@@ -229,9 +229,9 @@ def _run(
         run_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ManifestError(f"output_root: {run_dir} cannot be made ({error.strerror}). Choose another.") from None
-    with held(run_dir), open_cluster(cluster, say):
+    with held(run_dir), open_cluster(cluster, say), Kernels(run_dir / "notebooks") as kernels:
         try:
-            _run_stages(manifest, stages, run_dir, force, say)
+            _run_stages(manifest, stages, run_dir, force, say, kernels)
         except BaseException as error:
             log.debug("stopped", exc_info=error)
             if exit_code(error) != 3 or isinstance(error, StageError):
@@ -253,8 +253,10 @@ def _check_stages(manifest: Manifest, manifest_path: str | Path) -> None:
             raise ManifestError(f"{manifest_path}: {stage}: {error}") from None
 
 
-def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: bool, say: Say) -> None:
-    captures = _captures(manifest)
+def _run_stages(
+    manifest: Manifest, stages: list[str], run_dir: Path, force: bool, say: Say, kernels: Kernels
+) -> None:
+    captures = _captures(manifest, kernels)
     jobs = [
         job
         for capture in captures
@@ -272,15 +274,15 @@ def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: boo
     try:
         record.write()
         failed: list[tuple[Job, StageError]] = []
-        with Kernels(run_dir / "notebooks", len(jobs)) as kernels:
-            for i, job in enumerate(jobs, 1):
-                head = f"[{i}/{len(jobs)}] {job.stage:<9} {job.name}"
-                try:
-                    _run_or_reuse(job, inputs[job.files.scene], failed, force, head, record, say, kernels)
-                except StageError as error:
-                    if not error.of_the_data:
-                        raise
-                    failed.append((job, error))  # other captures and pairs may succeed
+        kernels.left = len(jobs)
+        for i, job in enumerate(jobs, 1):
+            head = f"[{i}/{len(jobs)}] {job.stage:<9} {job.name}"
+            try:
+                _run_or_reuse(job, inputs[job.files.scene], failed, force, head, record, say, kernels)
+            except StageError as error:
+                if not error.of_the_data:
+                    raise
+                failed.append((job, error))  # other captures and pairs may succeed
         last = [row["status"] for row in record.rows if row["stage"] == stages[-1]]
         if failed and not {"done", "reused"} & set(last):
             raise failed[0][1]
@@ -418,11 +420,14 @@ def _weights_needed(stage: str, settings: Settings) -> list[tuple[WeightsSource,
     return needed
 
 
-def _captures(manifest: Manifest) -> list[Path]:
+def _captures(manifest: Manifest, kernels: Kernels | None = None) -> list[Path]:
+    """Return the folders of the captures; render that of `demo_data`, while a kernel starts."""
     if manifest.demo_data is not None:
         from toolkit.synthetic import render_capture
 
         folder = Path(manifest.output_root).parent / "data" / manifest.name
+        if kernels is not None and not folder.exists():
+            kernels.prepare()
         return [render_capture(folder, **manifest.demo_data.model_dump())]
     return [Path(capture) for capture in manifest.captures]
 

@@ -66,9 +66,10 @@ class RunningKernel:
 class Kernels:
     """Kernels of a run's notebooks. The next kernel starts while a notebook runs; kernels end in the background."""
 
-    def __init__(self, cwd: Path, notebooks: int = 1) -> None:
-        """`cwd` is the working folder of the kernels, `notebooks` the largest number of notebooks to run."""
-        self._cwd, self._left = cwd, notebooks
+    def __init__(self, cwd: Path) -> None:
+        """`cwd` is the working folder of the kernels; it is created with the first one."""
+        self._cwd, self.left = cwd, 1
+        """Largest number of notebooks that are still to run."""
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
         self._thread.start()
@@ -91,11 +92,16 @@ class Kernels:
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(_PATIENCE_S)
 
+    def prepare(self) -> None:
+        """Begin to start the kernel of the next notebook if there is one."""
+        if self._spare is None and self.left > 0:
+            self._spare = self._start()
+
     def take(self) -> RunningKernel:
         """Return a kernel, and begin to start the kernel of the next notebook if there is one."""
-        kernel = self._spare or self._start()
-        self._left -= 1
-        self._spare = self._start() if self._left > 0 else None
+        kernel, self._spare = self._spare or self._start(), None
+        self.left -= 1
+        self.prepare()
         return kernel
 
     def end(self, kernel: RunningKernel, by_force: bool) -> None:
@@ -109,6 +115,7 @@ class Kernels:
         from jupyter_client.manager import AsyncKernelManager
         from traitlets.config import Config
 
+        self._cwd.mkdir(parents=True, exist_ok=True)
         # Sockets in the file system, which other users of the machine cannot open. Their paths have a length limit.
         folder = tempfile.TemporaryDirectory(prefix=f"kernel.{process_tag()}-", ignore_cleanup_errors=True)
         ipc = os.name == "posix" and len(folder.name) < 80
@@ -133,6 +140,7 @@ class Kernels:
 
 async def _start_up(manager: Any, options: dict[str, Any]) -> None:
     await manager.start_kernel(**options)
+    import papermill  # noqa: F401  # takes seconds, and is needed as soon as the kernel is
 
 
 async def _shut_down(kernel: RunningKernel, by_force: bool) -> None:
