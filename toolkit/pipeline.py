@@ -253,9 +253,7 @@ def _check_stages(manifest: Manifest, manifest_path: str | Path) -> None:
             raise ManifestError(f"{manifest_path}: {stage}: {error}") from None
 
 
-def _run_stages(
-    manifest: Manifest, stages: list[str], run_dir: Path, force: bool, say: Say, kernels: Kernels
-) -> None:
+def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: bool, say: Say, kernels: Kernels) -> None:
     captures = _captures(manifest, kernels)
     jobs = [
         job

@@ -68,8 +68,9 @@ class Kernels:
 
     def __init__(self, cwd: Path) -> None:
         """`cwd` is the working folder of the kernels; it is created with the first one."""
-        self._cwd, self.left = cwd, 1
-        """Largest number of notebooks that are still to run."""
+        self._cwd = cwd
+        self.left = 1
+        """Largest number of notebooks that are still to run; no kernel is started for more."""
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
         self._thread.start()
