@@ -22,9 +22,10 @@ _PATIENCE_S = 10.0
 _ARGUMENTS = [
     # Hides the kernel's messages about its own shutdown.
     "--log-level=CRITICAL",
-    # Slow imports run early, while the previous notebook still runs.
-    "--IPKernelApp.exec_lines=__import__('toolkit.notebook'); __import__('toolkit.evaluate'); "
-    "__import__('matplotlib.backends.backend_agg')",
+    # Slow imports run early, while the previous notebook still runs. The garbage collector ignores what they leave: it
+    # would search these 200,000 objects again and again (15 % of the imports' time, 5 % of that of drawing).
+    "--IPKernelApp.exec_lines=import gc; gc.disable(); __import__('toolkit.notebook'); __import__('toolkit.evaluate'); "
+    "__import__('matplotlib.backends.backend_agg'); gc.freeze(); gc.enable(); del gc",
 ]
 
 

@@ -3,6 +3,7 @@
 import logging
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +28,8 @@ QUERY = "query"
 """Timeline of the query numbers, which are the rows of the pair's csv."""
 MAX_CAMERAS = 4
 """Images of a query that are shown, at most."""
+KEPT_JPEGS = 256
+"""References that are encoded once though several queries show them."""
 WHITE = [255, 255, 255]
 
 
@@ -152,6 +155,7 @@ class _ChosenWriter:
         self._stream, self._queries, self._depth_m = stream, queries, camera_depth_m
         self._sizes: dict[str, tuple[int, int]] = {}
         """Width and height of the images last logged, by entity."""
+        self._jpeg_of = lru_cache(KEPT_JPEGS)(_jpeg_of)
 
     def write(self, number: int, query: QueryDetails) -> None:
         """Log a query. Entities that it lacks are cleared, or those of the last query would stay."""
@@ -206,7 +210,7 @@ class _ChosenWriter:
             # Any camera that is too small to see.
             stream.log(path, rr.Pinhole(focal_length=1, width=1, height=1, image_plane_distance=viewer.HIDDEN_M))
         else:
-            data, shown = viewer.small_jpeg(read_for_display(image.path), viewer.IMAGE_SIZE)
+            data, shown = self._jpeg_of(image.path)
             self._sizes[path] = shown
             located = bool(is_posed(image.world_from_cam))
             if located:
@@ -228,6 +232,10 @@ class _ChosenWriter:
             dots = rr.Points2D(marks, colors=shade, radii=rr.Radius.ui_points(radius))
             stream.log(f"{path}/marks/{name}", dots)
         stream.log(f"{path}/marks/residuals", rr.LineStrips2D(lines.astype(np.float32), colors=WHITE))
+
+
+def _jpeg_of(path: Path) -> tuple[bytes, tuple[int, int]]:
+    return viewer.small_jpeg(read_for_display(path), viewer.IMAGE_SIZE)
 
 
 def describe(queries: Localizations, k: int) -> str:
