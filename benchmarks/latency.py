@@ -111,6 +111,7 @@ def markdown(results: dict[str, dict[str, Any]]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--capture", type=Path, help="capture folder, with sessions/ in it; default: render one")
+    parser.add_argument("--scale", type=float, default=1.0, help="size of a rendered phone's images, 1 is 960 x 720")
     parser.add_argument("--map", default="ios", help="map device (default: %(default)s)")
     parser.add_argument("--query", default="ios", help="query device (default: %(default)s)")
     parser.add_argument("--pictures", type=int, default=12, help="how many, at most (default: %(default)s)")
@@ -131,7 +132,9 @@ def main() -> None:
         capture = options.capture
         if capture is None:
             from toolkit.synthetic import render_capture
+            from toolkit.synthetic.devices import DEVICES, scaled
 
+            DEVICES["ios"] = scaled(DEVICES["ios"], options.scale)
             capture = render_capture(Path(folder) / "RENDERED", rooms=2, frames=12, seed=0, progress=False)
         capture = part_of_capture(capture.resolve(), options.map, options.query, Path(folder) / "part")
         sessions_root, run, results = capture / "sessions", Path(folder) / "run", {}

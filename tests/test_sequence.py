@@ -25,7 +25,7 @@ from toolkit.retrieve import retrieve_pairs
 from toolkit.sequence import COLUMNS, sequence_pairs
 from toolkit.synthetic import capture as rendering
 from toolkit.synthetic import render_capture
-from toolkit.synthetic.devices import DEVICES, halved
+from toolkit.synthetic.devices import DEVICES, scaled
 from toolkit.synthetic.recording import PICTURE_S, RATE_HZ, tracked
 from toolkit.synthetic.scene import Scene, build_room
 
@@ -306,7 +306,7 @@ def alike(tmp_path_factory: pytest.TempPathFactory) -> Alike:
     folder = tmp_path_factory.mktemp("alike")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rendering, "build_room", coarse_room)
-        patch.setattr(rendering, "DEVICES", {"ios": halved(DEVICES["ios"])})
+        patch.setattr(rendering, "DEVICES", {"ios": scaled(DEVICES["ios"], 0.5)})
         capture = render_capture(
             folder / "ALIKE", 3, 16, seed=3, progress=False, alike=True, seconds=120, losses=1, radio=True
         )

@@ -22,7 +22,7 @@ from toolkit.geometry import invert, make_pose, rotation_angle_deg, transform
 from toolkit.synthetic import capture as capture_writing
 from toolkit.synthetic import render_capture, render_street, textures
 from toolkit.synthetic.capture import World
-from toolkit.synthetic.devices import DEVICES, Sensor, halved, looking, walk_street, walks
+from toolkit.synthetic.devices import DEVICES, Sensor, looking, scaled, walk_street, walks
 from toolkit.synthetic.light import paint
 from toolkit.synthetic.recording import Emitter, emitters_of, odometry_of, received, scans
 from toolkit.synthetic.render import Rays, render
@@ -348,7 +348,7 @@ def render_bare(out: Path, *given: int, **more: Any) -> Path:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(capture_writing, "build_room", bare_room)
-        patch.setattr(capture_writing, "DEVICES", {"ios": halved(DEVICES["ios"])})
+        patch.setattr(capture_writing, "DEVICES", {"ios": scaled(DEVICES["ios"], 0.5)})
         return render_capture(out, *given, progress=False, **more)
 
 

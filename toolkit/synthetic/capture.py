@@ -23,7 +23,7 @@ import numpy as np
 from toolkit.errors import CaptureError
 from toolkit.files import write_folder
 from toolkit.geometry import Floats, invert, pose_from_qt
-from toolkit.synthetic.devices import DEVICES, Device, Sensor, halved, walk_street, walks
+from toolkit.synthetic.devices import DEVICES, Device, Sensor, scaled, walk_street, walks
 from toolkit.synthetic.light import paint
 from toolkit.synthetic.recording import PICTURE_S, RADIOS, RATE_HZ, emitters_of, every_frame, scans, tracked
 from toolkit.synthetic.render import Rays, render
@@ -55,7 +55,7 @@ class World:
     @property
     def devices(self) -> dict[str, Device]:
         """The recording devices. A street has only a phone with small images, to render many images fast."""
-        return {"ios": halved(DEVICES["ios"])} if self.street else DEVICES
+        return {"ios": scaled(DEVICES["ios"], 0.5)} if self.street else DEVICES
 
     @property
     def hours(self) -> int:

@@ -79,10 +79,14 @@ DEVICES = {
 }  # fmt: skip
 
 
-def halved(device: Device) -> Device:
-    """Return a device with pinhole cameras whose images have half the width and height."""
+def scaled(device: Device, scale: float) -> Device:
+    """Return a device with pinhole cameras whose images have `scale` times the width and height."""
     sensors = (
-        replace(sensor, size=(sensor.size[0] // 2, sensor.size[1] // 2), params=tuple(p / 2 for p in sensor.params))
+        replace(
+            sensor,
+            size=(round(scale * sensor.size[0]), round(scale * sensor.size[1])),
+            params=tuple(scale * param for param in sensor.params),
+        )
         for sensor in device.sensors
     )
     return replace(device, sensors=tuple(sensors))
