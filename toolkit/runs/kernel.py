@@ -25,7 +25,7 @@ _ARGUMENTS = [
     # Slow imports run early, while the previous notebook still runs. The garbage collector ignores what they leave: it
     # would search these 200,000 objects again and again (15 % of the imports' time, 5 % of that of drawing).
     "--IPKernelApp.exec_lines=import gc; gc.disable(); __import__('toolkit.notebook'); __import__('toolkit.evaluate'); "
-    "__import__('matplotlib.backends.backend_agg'); gc.freeze(); gc.enable(); del gc",
+    "__import__('matplotlib.figure'); __import__('matplotlib.backends.backend_agg'); gc.freeze(); gc.enable(); del gc",
 ]
 
 
