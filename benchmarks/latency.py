@@ -110,8 +110,9 @@ def markdown(results: dict[str, dict[str, Any]]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--capture", type=Path, help="capture folder, with sessions/ in it; default: render one")
-    parser.add_argument("--scale", type=float, default=1.0, help="size of a rendered phone's images, 1 is 960 x 720")
+    source = parser.add_mutually_exclusive_group()
+    source.add_argument("--capture", type=Path, help="capture folder, with sessions/ in it; default: render one")
+    source.add_argument("--scale", type=float, default=1.0, help="size of a rendered phone's images, 1 is 960 x 720")
     parser.add_argument("--map", default="ios", help="map device (default: %(default)s)")
     parser.add_argument("--query", default="ios", help="query device (default: %(default)s)")
     parser.add_argument("--pictures", type=int, default=12, help="how many, at most (default: %(default)s)")
