@@ -10,8 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.localizers.test_mapping import PINHOLE, assert_equal, looking_at
+from tests.queries import ask
 from toolkit import geometry
 from toolkit.capture import Capture, Session
+from toolkit.features.features import LocalFeatures
 from toolkit.features.sift import SiftExtractor, SiftSettings
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import sweep_partials, temporary_folder
@@ -180,6 +182,20 @@ def test_tiles_without_points_are_joined(tmp_path: Path) -> None:
     assert nothing.points.shape == (0, 3)
     nothing.save(tmp_path / "map.npz")
     assert_equal(LocalMap.load(tmp_path / "map.npz"), nothing)
+
+
+def test_a_query_in_a_tiled_map_without_points_has_too_few_matches(tmp_path: Path) -> None:
+    """A tripod: many images, no baseline, no points."""
+    street = Street(count=4)
+    pixels = street.keypoints[0][:50]
+    street.keypoints = [keypoints[:0] for keypoints in street.keypoints]
+    street.point_of = [points[:0] for points in street.point_of]
+    street.join(street.plan(2), tmp_path / "join").save(tmp_path / "map.npz")
+    opened = LocalMap.load(tmp_path / "map.npz")
+    assert_equal(opened, street.triangulate(np.arange(4)))  # the map in one piece
+    features = LocalFeatures(pixels, *np.ones((2, 50), np.float32), np.eye(50, 128, dtype=np.float16), (640, 480))
+    localizer = PnpLocalizer([MappedFeatures(opened, dict.fromkeys(street.names, features))])
+    assert ask(localizer, [street.camera], np.eye(4)[None], [features], [range(4)]).status == "failed: too few matches"
 
 
 # -------------------------------------------------------------------------------------------------------- photographs

@@ -201,8 +201,9 @@ def _written(
     num_points, num_observations = counts.sum(axis=0).tolist()
 
     def array(name: str, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
-        # An empty array cannot be memory-mapped.
-        return np.lib.format.open_memmap(folder / f"{name}.npy", "w+", dtype, shape) if shape[0] else np.zeros(shape)
+        if not shape[0]:  # an empty array cannot be memory-mapped
+            return np.zeros(shape, dtype)
+        return np.lib.format.open_memmap(folder / f"{name}.npy", "w+", dtype, shape)
 
     points, colors = array("points", (num_points, 3), np.float64), array("colors", (num_points, 3), np.uint8)
     noise = array("noise_px", (num_points,), np.float32)
