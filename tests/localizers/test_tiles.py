@@ -316,6 +316,15 @@ def test_a_map_is_the_same_mapped_or_read(tmp_path: Path, monkeypatch: pytest.Mo
         LocalMap.load(tmp_path / "map.npz")
 
 
+def test_a_scaled_map_is_not_sorted_again(tmp_path: Path) -> None:
+    Street(count=3).triangulate(np.arange(3)).save(tmp_path / "map.npz")
+    opened = LocalMap.load(tmp_path / "map.npz")
+    scaled = opened.scaled(0.5)
+    assert scaled.length == 0.5
+    for name in ORDERS:
+        assert getattr(scaled, name) is getattr(opened, name)
+
+
 def test_what_a_killed_join_left_is_swept(tmp_path: Path) -> None:
     with temporary_folder(tmp_path / "ios_map.npz") as folder:
         (folder / "0.npz").write_bytes(b"")

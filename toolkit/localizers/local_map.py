@@ -209,7 +209,8 @@ class LocalMap:
         if factor == 1.0:
             return self
         poses = geometry.make_pose(self.world_from_cams[:, :3, :3], factor * self.world_from_cams[:, :3, 3])
-        return replace(self, world_from_cams=poses, points=factor * self.points, length=factor * self.length)
+        scaled = replace(self, world_from_cams=poses, points=factor * self.points, length=factor * self.length)
+        return scaled._ordered_as(self)
 
     @classmethod
     def pooled(cls, maps: Sequence["LocalMap"]) -> "LocalMap":
@@ -255,14 +256,16 @@ class LocalMap:
 
     def judged(self, consistency: Consistency) -> "LocalMap":
         """Return the map with another consistency."""
-        return replace(self, consistency=consistency).knowing(
-            **{name: order for name, order in vars(self).items() if name in ORDERS}
-        )
+        return replace(self, consistency=consistency)._ordered_as(self)
 
     def knowing(self, **properties: Any) -> "LocalMap":
         """Set cached properties of this map, so that they are not computed; return the map."""
         vars(self).update(properties)
         return self
+
+    def _ordered_as(self, other: "LocalMap") -> "LocalMap":
+        """Return this map with the sorting orders that another map of the same observations has."""
+        return self.knowing(**{name: order for name, order in vars(other).items() if name in ORDERS})
 
     def _sharing(self, other: "LocalMap") -> "LocalMap":
         """Return this map with the cached image properties of another map of the same images."""
