@@ -39,9 +39,10 @@ from toolkit.files import SceneFiles, image_name, map_record_path, read_map_reco
 from toolkit.localize import COLUMNS, Map, localize_image, localize_pairs
 from toolkit.localizers import create_localizer, predictors
 from toolkit.localizers import map as maps
-from toolkit.localizers.base import PoseEstimate, Query, RoughPose, View
+from toolkit.localizers.base import PoseEstimate, Prior, Query, RoughPose, View
 from toolkit.localizers.correspondences import LocalizedQueries
 from toolkit.localizers.local_map import LocalMap
+from toolkit.localizers.matches import MappedFeatures
 from toolkit.localizers.picture import pixels_from
 from toolkit.localizers.pnp import PnpLocalizer
 from toolkit.localizers.prediction import Prediction
@@ -1308,6 +1309,21 @@ def test_a_picture_is_localized_near_a_rough_pose(
     away = geometry.make_pose(found[:3, :3], [1e6, 0.0, 0.0])
     nowhere = localize_image(place, path, camera, near=RoughPose(away, 1.0, 0.05))
     assert nowhere.status == "ok"  # no image of the map is there: all are searched
+
+
+@pytest.mark.parametrize(("length", "radius_deg"), [(1.0, 1.0), (0.1, 3.8183), (0.01, 6.0)])
+def test_a_rough_pose_is_as_rough_as_the_map_is_small(
+    opened: Map, monkeypatch: pytest.MonkeyPatch, length: float, radius_deg: float
+) -> None:
+    """1 cm at a depth of 3 m, 0.3 m and 3 cm; two standard deviations, from 1 to 6 degrees."""
+    mapped = opened.mapped[0]
+    place = replace(opened, mapped=[MappedFeatures(replace(mapped.map, length=length), mapped.features)])
+    priors: list[Prior] = []
+    answer = SimpleNamespace(localize=lambda *asked: priors.extend(asked[3]) or PoseEstimate("ok"), image_names=[])
+    place.localizer = answer  # type: ignore[misc, assignment]
+    camera = pycolmap.Camera(model="PINHOLE", width=10, height=20, params=[10, 10, 5, 10])
+    localize_image(place, np.zeros((20, 10), np.uint8), camera, near=RoughPose(np.eye(4), 0.0, 0.01))
+    assert [prior.radius_deg for prior in priors] == [pytest.approx(radius_deg, abs=1e-4)]
 
 
 def test_a_query_that_failed_is_localized_again_where_odometry_leads(

@@ -18,7 +18,8 @@ from toolkit.localizers.correspondences import Correspondences, Rival
 SEARCH_DEG = (1.0, 6.0)
 """Smallest and largest radius of the search for keypoints around the projections of a prior pose, degrees."""
 NEARBY_M = 3.0
-"""Assumed depth of the scene, to turn the uncertainty of a position into an angle."""
+"""Assumed depth of the scene, in map lengths (see `Survey.length`), to turn the uncertainty of a position into an
+angle."""
 CONFIRMED = (5.0, 0.5)  # degrees, meters: two poses within both confirm each other
 
 CAMERA = "low_confidence: camera?"
@@ -195,7 +196,10 @@ class Prior:
     def about(
         cls, world_from_rig: Floats, images: Ints, rotation_std_deg: float, position_std_m: float, source: str
     ) -> "Prior":
-        """Return a prior whose search radius covers two standard deviations, within `SEARCH_DEG`."""
+        """Return a prior whose search radius covers two standard deviations, within `SEARCH_DEG`.
+
+        `position_std_m` is in map lengths.
+        """
         spread_deg = rotation_std_deg + np.degrees(np.arctan(position_std_m / NEARBY_M))
         return cls(world_from_rig, images, float(np.clip(2 * spread_deg, *SEARCH_DEG)), source)
 

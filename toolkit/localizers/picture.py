@@ -87,7 +87,8 @@ def localize_image(
     if near is None:
         return place.judged(place.localizer.localize(query, references))
     images = np.unique(np.concatenate([retrieved.images for retrieved in references]))
-    prior = Prior.about(near.world_from_rig, images, near.rotation_std_deg, near.position_std_m, "near")
+    position_std = near.position_std_m / place.length  # the depth that it is compared with is in map lengths
+    prior = Prior.about(near.world_from_rig, images, near.rotation_std_deg, position_std, "near")
     return place.judged(place.localizer.localize(query, references, None, [prior]))
 
 
