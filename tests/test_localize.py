@@ -41,6 +41,7 @@ from toolkit.localizers import create_localizer, predictors
 from toolkit.localizers import map as maps
 from toolkit.localizers.base import PoseEstimate, Prior, Query, RoughPose, View
 from toolkit.localizers.correspondences import LocalizedQueries
+from toolkit.localizers.escalation import EscalatingLocalizer
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.matches import MappedFeatures
 from toolkit.localizers.picture import pixels_from
@@ -1309,6 +1310,17 @@ def test_a_picture_is_localized_near_a_rough_pose(
     away = geometry.make_pose(found[:3, :3], [1e6, 0.0, 0.0])
     nowhere = localize_image(place, path, camera, near=RoughPose(away, 1.0, 0.05))
     assert nowhere.status == "ok"  # no image of the map is there: all are searched
+
+
+def test_further_features_know_the_images_of_every_kind(opened: Map) -> None:
+    all_, first = opened.mapped[0], opened.mapped[0].map.image_names[0]
+    none = all_.map.part(np.zeros(0, np.int64))
+    rest: dict[str, Any] = {name: getattr(none, name)[1:] for name in ("image_names", "cameras", "world_from_cams")}
+    further: Any = SimpleNamespace(name="aliked")
+    place = replace(opened, mapped=[MappedFeatures(replace(none, **rest), {}), all_], escalation=[further])
+    localizer = create_localizer(opened.settings, place)
+    assert isinstance(localizer, EscalatingLocalizer)
+    assert localizer.second.image_names == localizer.first.image_names == [*rest["image_names"], first]
 
 
 @pytest.mark.parametrize(("length", "radius_deg"), [(1.0, 1.0), (0.1, 3.8183), (0.01, 6.0)])

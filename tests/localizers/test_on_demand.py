@@ -86,6 +86,22 @@ class Scene:
             SIZE,
         )
 
+    def mapped(self, images: Sequence[int], name: str = "sift", far: int = 0) -> MappedFeatures:
+        """Return the map of some of the images, whose first points, far away, none of them sees."""
+        names, count = [self.names[image] for image in images], far + POINTS
+        whole = LocalMap(
+            image_names=names,
+            cameras=[CAMERA] * len(names),
+            world_from_cams=MAP_POSES[list(images)],
+            points=np.concatenate([np.full((far, 3), 100.0), self.points]),
+            colors=np.zeros((count, 3), np.uint8),
+            obs_image=np.repeat(np.arange(len(names)), POINTS),
+            obs_keypoint=np.concatenate([np.argsort(self.features[name].scores) for name in names]),
+            obs_point=np.tile(np.arange(far, count), len(names)),
+            noise_px=np.full(count, 0.3, np.float32),
+        )
+        return MappedFeatures(whole, self.features, matcher=ByPoint(), name=name)
+
     def localizer(
         self,
         mapped: Sequence[MappedFeatures] = (),
@@ -178,20 +194,8 @@ def test_references_of_one_query_image_only() -> None:
 def test_points_of_the_map_keep_their_index() -> None:
     """The map has points that the references do not see; those that they see are named as in the whole map."""
     scene = Scene()
-    far = np.full((50, 3), 100.0)
-    keypoint = np.concatenate([np.argsort(scene.features[name].scores) for name in scene.names])
-    whole = LocalMap(
-        image_names=scene.names,
-        cameras=[CAMERA] * len(scene.names),
-        world_from_cams=MAP_POSES,
-        points=np.concatenate([far, scene.points]),
-        colors=np.zeros((50 + POINTS, 3), np.uint8),
-        obs_image=np.repeat(np.arange(len(MAP_POSES)), POINTS),
-        obs_keypoint=keypoint,
-        obs_point=np.tile(50 + np.arange(POINTS), len(MAP_POSES)),
-        noise_px=np.full(50 + POINTS, 0.3, np.float32),
-    )
-    mapped = MappedFeatures(whole, scene.features, matcher=ByPoint())
+    mapped = scene.mapped(range(len(MAP_POSES)), far=50)
+    whole = mapped.map
     both = replace(scene.query, features=[[*scene.query.features[0], *scene.query.features[0]]])
     estimate = scene.localizer([mapped]).localize(both, scene.references)
     assert_right(estimate)
@@ -202,6 +206,22 @@ def test_points_of_the_map_keep_their_index() -> None:
         whole.points[index[kinds == "sift"]], estimate.correspondences.points[kinds == "sift"]
     )
     assert (kinds == "sift").sum() > 200
+
+
+@pytest.mark.parametrize(("references", "of_second"), [([4, 5], True), ([0, 1], False)])
+def test_a_kind_may_have_other_images(references: list[int], of_second: bool) -> None:
+    """Only the last two images have features of the second kind."""
+    scene = Scene()
+    mapped = [scene.mapped(range(len(MAP_POSES))), scene.mapped([4, 5], "superpoint")]
+    query = replace(scene.query, features=[scene.query.features[0] * 3])  # type: ignore[list-item]
+    estimate = scene.localizer(mapped).localize(query, [References.of(references)])
+    assert_right(estimate)
+    used = estimate.correspondences
+    kinds = np.array([name.split("/")[0] for name in used.found_by])
+    assert set(kinds) == {"sift", "aliked"} | ({"superpoint"} if of_second else set())
+    for number, kind in enumerate(["sift", "superpoint"]):
+        index = used.point_index[kinds == kind] - number * POINTS
+        np.testing.assert_array_equal(scene.points[index], used.points[kinds == kind])
 
 
 class Scripted:

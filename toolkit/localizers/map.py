@@ -553,7 +553,7 @@ def _escalating(first: Localizer, settings: LocalizeSettings, map: Map) -> Local
     if not map.escalation or map.consistency.verdict == "inconsistent":  # no features make up for a wrong map
         return first
     kinds: list[AnyMethod] = [*(map.kinds if settings.map is None else ()), *map.escalation]
-    second = _scaled(_on_demand(settings, map, kinds), map)
+    second = _scaled(_on_demand(settings, map, kinds, first.image_names), map)
     return EscalatingLocalizer(first, second, map.escalation, map.sure_position_std)
 
 
@@ -561,9 +561,12 @@ def _on_demand(
     settings: LocalizeSettings,
     map: Map,  # noqa: A002
     kinds: Sequence[AnyMethod],
+    names: list[str] | None = None,
 ) -> OnDemandLocalizer:
-    """Return a localizer with the points of the map, and for the given kinds points triangulated for each query."""
-    names = map.mapped[0].map.image_names if map.mapped else None
+    """Return a localizer with the points of the map, and for the given kinds points triangulated for each query.
+
+    `names` are the names of its images; None: all map images with a pose.
+    """
     return OnDemandLocalizer(
         PosedImages.of_session(map.session, names, map.length),
         map.in_lengths,

@@ -76,7 +76,7 @@ class OnDemandLocalizer:
     ) -> None:
         """
         Args:
-            posed: the map's images, in the order of `mapped`.
+            posed: the images of all kinds, in the order of `LocalMap.pooled`.
             mapped: kinds of features with triangulated points. Queries have features of these kinds first.
             on_demand: kinds of features without points, which follow in the queries, and the source of map features.
             map_settings: how points are triangulated.
@@ -97,9 +97,11 @@ class OnDemandLocalizer:
     ) -> PoseEstimate:
         """Return one pose for the cameras of a rig, or for a single camera; see `Localizer`."""
         images = np.unique(np.concatenate([np.zeros(0, np.int64), *(retrieved.images for retrieved in references)]))
+        names = [self.posed.names[index] for index in images]
         mapped, point_index, first_point = [], [], 0
         for whole in self.mapped:
-            part, points = whole.map.around(images)
+            index_of = whole.map.index_of  # a kind may lack images whose features could not be extracted
+            part, points = whole.map.around(np.array([index_of[name] for name in names if name in index_of], np.int64))
             mapped.append(MappedFeatures(part, whole.features, whole.kind, whole.matcher, whole.name))
             point_index.append(first_point + points)
             first_point += len(whole.map.points)
@@ -108,7 +110,7 @@ class OnDemandLocalizer:
         ]
         matches = [list(of_camera[: len(self.mapped)]) for of_camera in network_matches]
         for number, (method, source) in enumerate(self.on_demand, start=len(self.mapped)):
-            features = {self.posed.names[index]: source(self.posed.names[index]) for index in images}
+            features = {name: source(name) for name in names}
             new_matches = self._match(query, references, features, method, number)
             local_map = self.triangulate(images, features, new_matches, KINDS[method.name])
             mapped.append(MappedFeatures(local_map, features, KINDS[method.name], method.matcher, method.name))
