@@ -1,6 +1,5 @@
 """Localize without matching: align a network's predicted cameras of the query and its references to the map."""
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -21,8 +20,6 @@ from toolkit.localizers.prediction import Prediction, Predictor
 from toolkit.localizers.references import select_references
 from toolkit.localizers.robust import AlignmentError
 from toolkit.manifest import PredictorSettings
-
-log = logging.getLogger(__name__)
 
 FOCAL_TOLERANCE = 0.2
 """Difference between the log focal length ratios (predicted over stated) of query and references above which the stated
