@@ -21,6 +21,12 @@ if TYPE_CHECKING:
 
 Size = tuple[int, int]
 HEADS = ("camera", "depth")
+_KEPT = 32
+"""Bytes per token value that any network keeps of the layers for the depth head, see `Memory`."""
+_DENSE_FRAMES = 8
+"""Frames that the depth head processes at once; one on a CPU."""
+_RESULT_PIXEL = 24
+"""Bytes per pixel of the result."""
 
 
 @dataclass(frozen=True)
@@ -47,16 +53,10 @@ class Memory:
 
     trunk: int
     """Bytes per token value inside a block."""
-    kept: int
-    """Bytes per token value that are kept of the layers for the depth head."""
     dense_pixel: int
     """Bytes per pixel of a frame in the depth head."""
     dense: int
     """Bytes of the depth head that do not depend on the number of pixels."""
-    dense_frames: int
-    """Frames that the depth head processes at once; one on a CPU."""
-    result_pixel: int
-    """Bytes per pixel of the result."""
 
 
 class Architecture(ABC):
@@ -138,9 +138,9 @@ def estimate_bytes(
     (height, width), memory, frames = size, architecture.memory, groups * views
     patches = (height // architecture.patch) * (width // architecture.patch)
     numbers = frames * (architecture.special_tokens + patches) * channels
-    together = 1 if on_cpu else min(frames, memory.dense_frames)
+    together = 1 if on_cpu else min(frames, _DENSE_FRAMES)
     dense = memory.dense_pixel * height * width * together + memory.dense
-    return memory.kept * numbers + max(memory.trunk * numbers, dense) + memory.result_pixel * frames * height * width
+    return _KEPT * numbers + max(memory.trunk * numbers, dense) + _RESULT_PIXEL * frames * height * width
 
 
 class VggtArchitecture(Architecture):
@@ -157,7 +157,7 @@ class VggtArchitecture(Architecture):
     weights = weights.VGGT
     patch = 14
     special_tokens = 5
-    memory = Memory(trunk=42, kept=32, dense_pixel=1500, dense=32 << 20, dense_frames=8, result_pixel=24)
+    memory = Memory(trunk=42, dense_pixel=1500, dense=32 << 20)
     _side = 518
 
     def lay_out(self, sizes: Sequence[Size]) -> Layout:
@@ -182,7 +182,7 @@ class OmegaArchitecture(Architecture):
     weights = weights.VGGT_OMEGA
     patch = 16
     special_tokens = 17
-    memory = Memory(trunk=42, kept=32, dense_pixel=630, dense=0, dense_frames=8, result_pixel=24)
+    memory = Memory(trunk=42, dense_pixel=630, dense=0)
 
     def lay_out(self, sizes: Sequence[Size]) -> Layout:
         from toolkit.models.omega.preprocess import cropped_size, resized_size
@@ -229,8 +229,8 @@ class Da3Architecture(Architecture):
         return network
 
 
-_DA3_BASE = Memory(trunk=44, kept=32, dense_pixel=750, dense=0, dense_frames=8, result_pixel=24)
-_DA3_SMALL = Memory(trunk=44, kept=32, dense_pixel=505, dense=0, dense_frames=8, result_pixel=24)
+_DA3_BASE = Memory(trunk=44, dense_pixel=750, dense=0)
+_DA3_SMALL = Memory(trunk=44, dense_pixel=505, dense=0)
 ARCHITECTURES: dict[str, Architecture] = {
     architecture.name: architecture
     for architecture in (
