@@ -246,6 +246,16 @@ class Localizer(Protocol):
         """
 
 
+class WithoutNetwork:
+    """The part of a `Localizer` that is the same for all methods without a network."""
+
+    batch_size = 1
+
+    def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[None]:
+        """Return None for each query: this method needs no prediction."""
+        return [None] * len(queries)
+
+
 class ScaledLocalizer:
     """Localizes in a map whose unit of length is not the meter that the limits of the inner localizer assume."""
 

@@ -4,22 +4,16 @@ from collections.abc import Sequence
 
 from toolkit import geometry
 from toolkit.geometry import Floats
-from toolkit.localizers.base import PoseEstimate, Prior, Query, QueryInput, References
+from toolkit.localizers.base import PoseEstimate, Prior, Query, References, WithoutNetwork
 
 
-class NearestLocalizer:
+class NearestLocalizer(WithoutNetwork):
     """Gives the query image with the best retrieval score the pose of its first reference."""
-
-    batch_size = 1
 
     def __init__(self, image_names: list[str], world_from_cams: Floats) -> None:
         """`world_from_cams` (N, 4, 4) are the poses of the N map images."""
         self.image_names = image_names
         self.world_from_cams = world_from_cams
-
-    def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[None]:
-        """Return None for each query: this method uses no network."""
-        return [None] * len(queries)
 
     def localize(
         self, query: Query, references: Sequence[References], prediction: None = None, priors: Sequence[Prior] = ()

@@ -19,7 +19,7 @@ from toolkit.capture.cameras import rays_of
 from toolkit.features.features import KINDS, FeatureKind, LocalFeatures
 from toolkit.features.matching import AnyMethod, PairMatches
 from toolkit.geometry import Floats, Ints
-from toolkit.localizers.base import NetworkMatches, PoseEstimate, Prior, Query, QueryInput, References
+from toolkit.localizers.base import NetworkMatches, PoseEstimate, Prior, Query, References, WithoutNetwork
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.mapping import instants, match_pairs, select_pairs
 from toolkit.localizers.matches import MappedFeatures
@@ -57,13 +57,11 @@ class PosedImages:
         return cls(names, cameras, poses, instants(session, rows))
 
 
-class OnDemandLocalizer:
+class OnDemandLocalizer(WithoutNetwork):
     """Localizes with triangulated maps of some kinds of features, and for other kinds with points made for each query.
 
     Safe to use from several threads.
     """
-
-    batch_size = 1
 
     def __init__(
         self,
@@ -87,10 +85,6 @@ class OnDemandLocalizer:
         self._seed = seed
         self._network = Lock()
         self.image_names = posed.names
-
-    def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[None]:
-        """Return None for each query: this method needs no prediction."""
-        return [None] * len(queries)
 
     def localize(
         self, query: Query, references: Sequence[References], prediction: None = None, priors: Sequence[Prior] = ()

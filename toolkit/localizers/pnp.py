@@ -17,7 +17,16 @@ from numpy.typing import NDArray
 
 from toolkit import geometry
 from toolkit.geometry import Floats, Ints
-from toolkit.localizers.base import CAMERA, NetworkMatches, PoseEstimate, Prior, Query, QueryInput, References, agree
+from toolkit.localizers.base import (
+    CAMERA,
+    NetworkMatches,
+    PoseEstimate,
+    Prior,
+    Query,
+    References,
+    WithoutNetwork,
+    agree,
+)
 from toolkit.localizers.confidence import EVIDENCE, probability_right
 from toolkit.localizers.correspondences import Correspondences, Rival
 from toolkit.localizers.matches import MapMatcher, MappedFeatures, MatchCache, Vicinity
@@ -44,13 +53,11 @@ class _Hypothesis:
         return geometry.invert(self.rig_from_world)
 
 
-class PnpLocalizer:
+class PnpLocalizer(WithoutNetwork):
     """Localizes queries in one map by matching and PnP, with one or several kinds of features.
 
     Safe to use from several threads; the map is never changed.
     """
-
-    batch_size = 1
 
     def __init__(self, mapped: Sequence[MappedFeatures], settings: PnpSettings | None = None, seed: int = 0):
         self.settings = settings or PnpSettings()
@@ -61,10 +68,6 @@ class PnpLocalizer:
     @property
     def image_names(self) -> list[str]:
         return self.map.image_names
-
-    def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[None]:
-        """Return None for each query: this method needs no prediction."""
-        return [None] * len(queries)
 
     def localize(
         self, query: Query, references: Sequence[References], prediction: None = None, priors: Sequence[Prior] = ()
