@@ -133,6 +133,13 @@ def test_pose_error_of_many_and_of_missing_poses() -> None:
     np.testing.assert_allclose(geometry.pose_error(true, estimated)[0][[0, 2]], rotation_deg[[0, 2]], atol=1e-9)
 
 
+@pytest.mark.parametrize("angle_deg", [0.0, 1e-6, 90.0, 179.9999, 180.0])
+def test_a_motion_is_the_rotation_vector_and_the_translation_of_its_pose(angle_deg: float) -> None:
+    vector, shift = np.radians(angle_deg) * np.array([0.6, 0.0, 0.8]), [1.0, -2.0, 3.0]
+    motion = geometry.small_motions(geometry.make_pose([Rotation.from_rotvec(vector).as_matrix()], shift))
+    np.testing.assert_allclose(motion, [[*vector, *shift]], atol=1e-12)
+
+
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_unit_vectors_keep_their_type_and_zero_stays_zero(dtype: type) -> None:
     unit = geometry.unit(np.array([[[3, 4], [0, 0]]], dtype))

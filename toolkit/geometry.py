@@ -126,6 +126,16 @@ def pose_error(world_from_estimated: ArrayLike, world_from_true: ArrayLike) -> t
     return rotation_angle_deg(estimated_from_true[..., :3, :3]), distance_m
 
 
+def small_motions(poses: Floats) -> Floats:
+    """Return rotation vectors, radians, and translations (n, 6) of poses (n, 4, 4): SO(3) x R^3.
+
+    For small poses, this is equal to the logarithm of SE(3) to first order.
+    """
+    from scipy.spatial.transform import Rotation
+
+    return np.hstack([Rotation.from_matrix(poses[:, :3, :3]).as_rotvec(), poses[:, :3, 3]])
+
+
 def project(points: Floats, camera: "pycolmap.Camera", world_from_cam: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the pixels (n, 2) of world points (n, 3), NaN behind the camera, and which are valid, (n,) bool."""
     in_cam = transform(invert(world_from_cam), points)

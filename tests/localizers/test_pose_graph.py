@@ -9,7 +9,7 @@ from tests.localizers.drifting import drive
 from toolkit import geometry
 from toolkit.errors import ManifestError
 from toolkit.localizers.odometry import Odometry, PosedQueries, with_measured_drift
-from toolkit.localizers.pose_graph import FAR, _logarithm, place_online, place_piece
+from toolkit.localizers.pose_graph import FAR, place_online, place_piece
 from toolkit.manifest import SequenceSettings
 
 pytest.importorskip("gtsam")
@@ -41,7 +41,7 @@ def test_the_stated_covariance_is_as_large_as_the_errors() -> None:
     for seed in range(12):
         way = drive(np.random.default_rng(seed), every=5)
         placed = place_piece(way.odometry, way.queries, SETTINGS)
-        error = _logarithm(geometry.invert(placed.world_from_rig) @ way.world_from_rig)
+        error = geometry.small_motions(geometry.invert(placed.world_from_rig) @ way.world_from_rig)
         chi2.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(placed.covariances), error))
     assert 4.0 < np.mean(chi2) < 8.0  # 6 degrees of freedom
 

@@ -140,16 +140,9 @@ def is_sure(covariances: Floats) -> NDArray[np.bool_]:
 def _chi2(poses: Floats, covariances: Floats, queries: PosedQueries) -> Floats:
     """Return squared Mahalanobis distances (Q,) of single poses to the graph's, under the sum of their covariances."""
     frames = queries.frames
-    difference = _logarithm(geometry.invert(poses[frames]) @ queries.world_from_rig)
+    difference = geometry.small_motions(geometry.invert(poses[frames]) @ queries.world_from_rig)
     total = floored(queries.covariances) + covariances[frames]
     return np.asarray(np.einsum("qi,qi->q", difference, np.linalg.solve(total, difference[..., None])[..., 0]))
-
-
-def _logarithm(poses: Floats) -> Floats:
-    """Return poses as small motions (n, 6): rotation vector, radians, then translation, meters."""
-    angle = np.deg2rad(geometry.rotation_angle_deg(poses[:, :3, :3]))
-    axis = np.stack([poses[:, i, j] - poses[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=1)
-    return np.concatenate([geometry.unit(axis) * angle[:, None], poses[:, :3, 3]], axis=1)
 
 
 def _optimized(

@@ -70,10 +70,11 @@ def _mean(poses: Floats, information: Floats) -> tuple[Floats, Floats, Bools]:
         return np.sqrt(np.einsum("hi,hij,hj->h", errors, information, errors) / 6 / _TOO_SMALL**2)
 
     # The geodesic median among the hypotheses; distances beyond the gate count as equal.
-    costs = [np.minimum(distances(_log(geometry.invert(start) @ poses)), _GATE).sum() for start in poses]
+    motions = (geometry.small_motions(geometry.invert(start) @ poses) for start in poses)
+    costs = [np.minimum(distances(errors), _GATE).sum() for errors in motions]
     mean = poses[int(np.argmax(np.array(costs) < min(costs) + 1e-12))]
     for _ in range(30):
-        errors = _log(geometry.invert(mean) @ poses)
+        errors = geometry.small_motions(geometry.invert(mean) @ poses)
         distance = distances(errors)
         inside = distance <= _GATE
         if not inside.any():
@@ -87,11 +88,6 @@ def _mean(poses: Floats, information: Floats) -> tuple[Floats, Floats, Bools]:
     free = 6 * (int(inside.sum()) - 1)
     squared = np.einsum("h,hi,hij,hj->", share, errors, information, errors)
     return mean, np.linalg.inv(joint) * max(1.0, squared / free if free else 1.0), inside
-
-
-def _log(poses: Floats) -> Floats:
-    """Return rotation vectors and translations (H, 6) of small poses: SO(3) x R^3, equal to SE(3) to first order."""
-    return np.hstack([Rotation.from_matrix(poses[:, :3, :3]).as_rotvec(), poses[:, :3, 3]])
 
 
 def _information(covariances: ArrayLike, count: int) -> Floats:
