@@ -179,8 +179,7 @@ class _LiftedLocalizer(PnpLocalizer):
     """Localizes in a lifted map. Its covariance includes the uncertain depth scale of each lifted image."""
 
     def __init__(self, lifted_map: LiftedMap, mapped: MappedFeatures, settings: PnpSettings, seed: int) -> None:
-        features = MappedFeatures(lifted_map.local_map, mapped.features, mapped.kind, mapped.matcher, mapped.name)
-        super().__init__([features], settings, seed)
+        super().__init__([mapped.with_map(lifted_map.local_map)], settings, seed)
         self._lifted_map = lifted_map
 
     def _covariance(self, query: RigQuery, rig_from_world: Floats, matches: Matches) -> Floats | None:

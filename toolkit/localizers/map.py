@@ -223,12 +223,7 @@ class Map:
     @cached_property
     def in_lengths(self) -> list[MappedFeatures]:
         """`mapped`, with points and poses divided by the map's length."""
-        if self.length == 1.0:
-            return list(self.mapped)
-        return [
-            MappedFeatures(kind.map.scaled(1 / self.length), kind.features, kind.kind, kind.matcher, kind.name)
-            for kind in self.mapped
-        ]
+        return [kind.with_map(kind.map.scaled(1 / self.length)) for kind in self.mapped]
 
     @property
     def sure_position_std(self) -> float:

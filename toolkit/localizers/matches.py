@@ -69,6 +69,10 @@ class MappedFeatures:
         """Cached `_keypoints`."""
         self._network = Lock()
 
+    def with_map(self, local_map: LocalMap) -> "MappedFeatures":
+        """Return the same features with another map of their images."""
+        return MappedFeatures(local_map, self.features, self.kind, self.matcher, self.name)
+
     def match(
         self,
         query: RigQuery,

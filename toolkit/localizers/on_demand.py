@@ -96,7 +96,7 @@ class OnDemandLocalizer(WithoutNetwork):
         for whole in self.mapped:
             index_of = whole.map.index_of  # a kind may lack images whose features could not be extracted
             part, points = whole.map.around(np.array([index_of[name] for name in names if name in index_of], np.int64))
-            mapped.append(MappedFeatures(part, whole.features, whole.kind, whole.matcher, whole.name))
+            mapped.append(whole.with_map(part))
             point_index.append(first_point + points)
             first_point += len(whole.map.points)
         network_matches = query.network_matches or [
