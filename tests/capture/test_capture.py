@@ -189,6 +189,8 @@ def test_files_as_programs_write_them(tmp_path: Path) -> None:
     assert rows_of(session, 1, "s/cam 1/ä?") == [0]
     assert rows_of(session, 1, "tof") == [], "a depth map is no photograph"
     assert session.camera("tof").width == 64
+    assert session.cameras([2, 0]) == [session.camera("tof"), session.camera("s/cam 1/ä?")]
+    assert session.cameras([]) == []
     assert session.camera_rows.tolist() == [0, 1]
     assert session.trajectory.covariances is None
     assert session.trajectory.qt[0, 4] == 10

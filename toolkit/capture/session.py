@@ -334,6 +334,10 @@ class Session:
                 raise CaptureError(f"{self._sensor_table.where(row)}: sensor {sensor_id!r}: {error}") from None
         return self._cameras[sensor_id]
 
+    def cameras(self, rows: Rows = None) -> "list[pycolmap.Camera]":
+        """Return the intrinsics of images; see `camera`."""
+        return [self.camera(sensor) for sensor in self.images["sensor_id"].to_numpy()[_selection(rows)]]
+
     # Subsessions and keyframes
 
     @cached_property

@@ -201,7 +201,7 @@ def export_table(session: Session, out: str | Path, ground_truth: bool = False) 
     table = session.images.iloc[rows][["path"]].rename(columns={"path": "image"}).reset_index(drop=True)
     if posed.any():
         table[list(POSE_NAMES)] = qt_from_pose(poses)
-    cameras = [session.camera(str(sensor)) for sensor in session.images["sensor_id"].iloc[rows]]
+    cameras = session.cameras(rows)
     table["model"] = [camera.model.name for camera in cameras]
     table["width"], table["height"] = [c.width for c in cameras], [c.height for c in cameras]
     table["params"] = [" ".join(repr(float(value)) for value in camera.params) for camera in cameras]

@@ -420,7 +420,7 @@ class Map:
             features,
             camera,
             [self.session.image_name(int(rows[index])) for index in readable],
-            [self.session.camera(self.session.images["sensor_id"].iloc[int(rows[index])]) for index in readable],
+            self.session.cameras(rows[readable]),
         )
         order = np.argsort(-inliers, kind="stable")[: settings.topk]
         return rows[order], inliers[order]

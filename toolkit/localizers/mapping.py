@@ -248,8 +248,7 @@ class MapPlan(Remade):
             )
         self.world_from_cams = poses[self.rows]
         self.names = [names[row] for row in self.rows]
-        sensor_ids = session.images["sensor_id"].to_numpy()[self.rows]
-        self.cameras = [session.camera(sensor) for sensor in sensor_ids]
+        self.cameras = session.cameras(self.rows)
         self.kind, self.groups = _kind_of(features), instants(session, self.rows)
         self.length = self.survey.length(metric) if length is None else length
         pairs_per_image = settings.pairs_per_image

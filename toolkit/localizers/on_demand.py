@@ -51,10 +51,9 @@ class PosedImages:
             names = [session.image_name(int(row)) for row in rows]
         else:
             rows = np.array([session.row_of_name[name] for name in names], np.int64)
-        cameras = [session.camera(sensor) for sensor in session.images["sensor_id"].to_numpy()[rows]]
         poses = session.world_from_cam(rows)
         poses[:, :3, 3] /= length
-        return cls(names, cameras, poses, instants(session, rows))
+        return cls(names, session.cameras(rows), poses, instants(session, rows))
 
 
 class OnDemandLocalizer(WithoutNetwork):
