@@ -178,7 +178,7 @@ def test_a_finished_run_leaves_no_partial_files(finished: tuple[SceneFiles, pd.D
     names = {path.name for path in finished[0].poses_dir.iterdir()}
     stems = [finished[0].poses_txt("ios", device).stem for device in DEVICES]
     ends = ".txt", ".csv", ".h5", ".txt.meta.json", ".h5.meta.json"
-    of_the_map = {f"{finished[0].scene}_map_ios.json", "settings.json"}
+    of_the_map = {f"{finished[0].scene}_map_ios.json", f"{finished[0].scene}_map_ios.json.meta.json", "settings.json"}
     assert names == {stem + end for stem in stems for end in ends} | of_the_map
 
 
@@ -1270,6 +1270,20 @@ def test_a_map_does_not_hang_on_the_unit_of_length(
     assert set(statuses[0]) == {"ok"}
     assert_allclose(poses[1], poses[0], atol=1e-4)
     assert_allclose(poses[0][:, :3, 3], Trajectory.read(finished[0].poses_txt("ios", "ios")).qt[:, 4:], atol=0.05)
+
+
+def test_pairs_of_a_map_do_not_call_its_record_damaged(
+    small_capture: Path, finished: tuple[SceneFiles, pd.DataFrame], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    run = SceneFiles(tmp_path / "run", finished[0].scene)
+    shutil.copytree(finished[0].root, run.root)
+    run_stage(small_capture, run, query_device="spot", unit=None)
+    table = run_stage(small_capture, run)
+    assert "damaged" not in caplog.text
+    assert table["skipped"].tolist() == [False, True, False]
+    assert read_map_record(map_record_path(run.poses_dir, run.scene, "ios"))["unit"] == "m"
+    for device in DEVICES:
+        assert run.poses_txt("ios", device).read_bytes() == finished[0].poses_txt("ios", device).read_bytes()
 
 
 def test_errors_without_a_unit_are_relative_to_the_depth(capture: Path, run: SceneFiles) -> None:

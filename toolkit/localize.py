@@ -151,11 +151,11 @@ def localize_pairs(
                     run = stage.run(mapped, queried)
                     localized = run.localize(record, h5_attributes)
                     write_text(pair.map_record, json.dumps(run.map.record(), indent=1) + "\n")
+                    write_sidecar(pair.map_record, stage.made_from(h5_attributes))
                     _write_poses(pair, localized, settings)
                     unfinished = any(map(_is_internal, localized))
                 if update_attributes(pair.file("h5"), h5_attributes) or not skipped:
-                    files = pair.file("csv"), pair.file("h5"), pair.map_record
-                    write_sidecar(pair.file("txt"), record, files, unfinished=unfinished)
+                    write_sidecar(pair.file("txt"), record, [pair.file("csv"), pair.file("h5")], unfinished=unfinished)
                 rows = read_query_table(pair.file("csv"), ["status"])
                 query_tables.setdefault(queried, []).append(rows)
                 counts = rows["status"].str.split(":").str[0].value_counts()
@@ -294,9 +294,14 @@ class _Stage(Remade):
         """Tell whether to reuse the poses of a pair: they fit its record, and the files of its map still exist."""
         if not self.skip_existing:
             return False
-        maps = [self.folders.map / name for name in json.loads(h5_attributes[MAPS])]
-        maps_exist = pair.map_record.exists() and None not in map(read_sidecar, maps)
+        made_from = self.made_from(h5_attributes)
+        maps_exist = None not in made_from["maps"] and is_current(pair.map_record, made_from)
         return maps_exist and is_current(pair.file("txt"), record)
+
+    def made_from(self, h5_attributes: Mapping[str, str]) -> dict[str, Any]:
+        """Return everything that the record of a map depends on. All pairs of the map share it, so it has its own."""
+        maps = [self.folders.map / name for name in json.loads(h5_attributes[MAPS])]
+        return {"unit": self.settings.unit, "maps": [read_sidecar(path) for path in maps]}
 
     def _open_map(self, device: str) -> tuple[Map, Localizer]:
         folders = self.folders
