@@ -380,6 +380,10 @@ def test_names_that_the_format_cannot_hold_are_left_out(folder: Path, tmp_path: 
         ("image,qw,qx,qy,qz,tx,ty,tz\na/2.jpg,1,1,0,0,0,0,0\n", r"t\.csv, line 2: "),
         ("image\na/2.jpg\na/2.jpg\n", r"t\.csv, line 3: .*'a/2\.jpg'"),
         ("image\na/2.jpg\n", r"qw, qx, qy, qz, tx, ty, tz"),
+        ("image\none, two.jpg\n", r"t\.csv, line 2: found 2 values, expected 1"),
+        ("image,camera_id\na/2.jpg,1\n\nb/1.jpg,1,2\n", r"t\.csv, line 4: found 3 values, expected 2"),
+        ("image,camera_id,image\na/2.jpg,1,b/1.jpg\n", r"t\.csv: column 'image' occurs 2 times"),
+        ('image,camera_id\na/2.jpg,1\n"b/1.jpg,1\n', r"t\.csv, line 3: "),
         ("", r"t\.csv: "),
     ],
 )
@@ -388,6 +392,16 @@ def test_malformed_tables_are_refused(folder: Path, tmp_path: Path, text: str, m
     with pytest.raises(CaptureError, match=message):
         import_images(folder, tmp_path / "PLACE", split="map", table=tmp_path / "t.csv", camera=CAMERA)
     assert not (tmp_path / "PLACE").exists()
+
+
+@pytest.mark.parametrize("end", [("", ","), (",", ","), (",,", ",,"), (",", "")])
+def test_a_table_may_end_its_lines_with_empty_values(folder: Path, tmp_path: Path, end: tuple[str, str]) -> None:
+    """As spreadsheets export it, which also write a byte order mark."""
+    lines = (f"image,qw,qx,qy,qz,tx,ty,tz{end[0]}", f"a/2.jpg,1,0,0,0,1,2,3{end[1]}", "b/1.jpg,1,0,0,0,4,5,6")
+    (tmp_path / "t.csv").write_text("\r\n".join(lines), encoding="utf-8-sig", newline="")
+    import_images(folder, tmp_path / "PLACE", split="map", table=tmp_path / "t.csv", camera=CAMERA)
+    found = poses_of(Capture.open(tmp_path / "PLACE")["ios_map"])
+    assert {name: pose[:3, 3].tolist() for name, pose in found.items()} == {"a/2.jpg": [1, 2, 3], "b/1.jpg": [4, 5, 6]}
 
 
 def test_wrong_choices_name_the_known_ones_and_nothing_is_overwritten(folder: Path, tmp_path: Path) -> None:

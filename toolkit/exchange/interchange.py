@@ -6,6 +6,8 @@ separated by spaces) give the camera directly. The order of columns is free; unk
 of hloc, `name MODEL width height parameters` per line, is accepted in place of the table.
 """
 
+import csv
+import io
 import json
 import subprocess
 import sys
@@ -356,23 +358,22 @@ def _read_table(path: Path) -> pd.DataFrame:
             f"{path}: not a CSV table. Import a transforms.json with: python -m toolkit import transforms"
         )
     try:
-        first = next((line for line in path.read_text().splitlines() if line.strip()), "").split()
-        if len(first) > 4 and first[1] in pycolmap.CameraModelId.__members__:
-            rows = _read_hloc_list(path)
-        else:
-            rows = pd.read_csv(path, dtype=str, keep_default_na=False, skipinitialspace=True, skip_blank_lines=False)
-    except (OSError, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
+        text = path.read_text(encoding="utf-8-sig")  # spreadsheets write the mark
+    except (OSError, UnicodeDecodeError) as error:
         raise CaptureError(f"{path}: cannot be read as a CSV table ({error}).") from None
-    rows.columns = [name.strip().lstrip("# ") for name in rows.columns]
+    first = next((line for line in text.splitlines() if line.strip()), "").split()
+    of_hloc = len(first) > 4 and first[1] in pycolmap.CameraModelId.__members__
+    rows = _read_hloc_list(text) if of_hloc else _read_csv(path, text)
     columns = ("image", *POSE_NAMES, "camera_id", *_CAMERA_COLUMNS)
-    for name in rows.columns:
+    for name, count in Counter(rows.columns[:-1]).items():
         if name not in columns:
             raise CaptureError(f"{path}: unknown column {name!r}. {nearest(name, columns)}")
+        if count > 1:
+            raise CaptureError(f"{path}: column {name!r} occurs {count} times. Keep one of them.")
     for group in (("image",), POSE_NAMES, _CAMERA_COLUMNS):
         missing = [name for name in group if name not in rows]
         if missing and (group == ("image",) or len(missing) < len(group)):
             raise CaptureError(f"{path}: column {missing[0]!r} is missing; expected {', '.join(group)}.")
-    rows["line"] = rows.index + 2
     rows = rows[rows["image"].str.strip() != ""].assign(image=lambda table: table["image"].str.strip())
     twice = rows["image"].duplicated()
     if twice.any():
@@ -390,12 +391,31 @@ def _read_table(path: Path) -> pd.DataFrame:
     return rows
 
 
-def _read_hloc_list(path: Path) -> pd.DataFrame:
+def _read_csv(path: Path, text: str) -> pd.DataFrame:
+    """Read a CSV table with a header. Empty values beyond its columns, which spreadsheets write, are ignored."""
+    reader = csv.reader(io.StringIO(text), skipinitialspace=True, strict=True)
+    rows: list[list[str | int]] = []
+    try:
+        header = next(reader, [])
+        while header and not header[-1].strip():
+            header.pop()
+        for values in reader:
+            if any(value.strip() for value in values[len(header) :]):
+                raise CaptureError(
+                    f"{path}, line {reader.line_num}: found {len(values)} values, expected {len(header)}, as in the "
+                    "header. A value that contains a comma needs double quotes."
+                )
+            rows.append([*values[: len(header)], *[""] * (len(header) - len(values)), reader.line_num])
+    except csv.Error as error:
+        raise CaptureError(f"{path}, line {reader.line_num}: cannot be read as a CSV table ({error}).") from None
+    return pd.DataFrame(rows, columns=[*header, "line"])
+
+
+def _read_hloc_list(text: str) -> pd.DataFrame:
     """Read hloc's query list, `name MODEL width height parameters` per line without a header, as a table."""
-    lines = [line.split(maxsplit=4) for line in path.read_text().splitlines()]
-    rows = pd.DataFrame([line + [""] * (5 - len(line)) for line in lines], columns=["image", *_CAMERA_COLUMNS])
-    rows.index += -1  # no header: the first row is line 1, not 2 as in `_read_table`
-    return rows
+    lines = [line.split(maxsplit=4) for line in text.splitlines()]
+    rows = [[*line, *[""] * (5 - len(line)), number] for number, line in enumerate(lines, start=1)]
+    return pd.DataFrame(rows, columns=["image", *_CAMERA_COLUMNS, "line"])
 
 
 def _inverse(a_from_b: pycolmap.Rigid3d) -> Floats:
