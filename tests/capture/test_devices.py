@@ -62,6 +62,9 @@ def test_rows_can_be_added_and_replaced_for_a_while() -> None:
             assert len(devices.kinds()) == 3
         assert devices.kinds()[0].label == "phone"  # what the row does not say stays
         assert devices.kinds()[3].label == "Drone"
+    with devices.extra_devices([{"key": "ios", "label": "iPhone"}]):
+        assert devices.kinds()[0].label == "iPhone"
+        assert devices.session_id("query_phone") == "ios_query"
     assert len(devices.kinds()) == 3
     assert devices.color_of("drone").startswith("#")
     assert len({devices.color_of(kind.key) for kind in devices.TABLE}) == 3

@@ -49,7 +49,7 @@ def kinds() -> tuple[DeviceKind, ...]:
         key = row["key"]
         default = rows.get(key) or DeviceKind(key, key, _color_of_other(key))
         label, color = row.get("label") or default.label, row.get("color") or default.color
-        rows[key] = DeviceKind(key, label, color, row.get("sessions") or {})
+        rows[key] = DeviceKind(key, label, color, row.get("sessions") or default.sessions)
     return tuple(rows.values())
 
 
