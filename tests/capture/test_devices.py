@@ -16,7 +16,6 @@ from toolkit.capture.check import check_capture
 from toolkit.embed import embed_sessions
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.evaluate import evaluate_scene
-from toolkit.exchange.submission import collect
 from toolkit.files import SceneFiles
 from toolkit.localize import localize_pairs
 from toolkit.manifest import load_manifest
@@ -117,19 +116,6 @@ def test_check_says_what_is_not_used_and_what_has_no_row(tmp_path: Path) -> None
     ]
     with devices.extra_devices([{"key": "drone"}]):
         assert not [problem for problem in check_capture(tmp_path / "CAB").problems if not problem.file]
-
-
-def test_the_lamar_challenge_has_its_own_names(tmp_path: Path) -> None:
-    """As `lamar/combine_results.py` of cvg/crocodl-benchmark names them."""
-    for name in ("map", "query_phone", "query_hololens"):
-        path = write(tmp_path / "CAB", name)
-        (path / "queries.txt").write_text("1, s/phone\n")
-    files = SceneFiles(tmp_path / "run", "CAB")
-    Trajectory.from_poses([1], ["s/phone"], np.eye(4)[None]).write(files.poses_txt("mixed", "ios"))
-    table = collect([tmp_path / "run"], captures=[tmp_path / "CAB"]).table()
-    names = [f"{scene}_query_{device}.txt" for scene in ("CAB", "HGE", "LIN") for device in ("phone", "hololens")]
-    assert table["file"].tolist() == names
-    assert table["written"].tolist() == [1, 0, 0, 0, 0, 0]
 
 
 def test_a_manifest_adds_a_kind(tmp_path: Path) -> None:

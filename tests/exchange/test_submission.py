@@ -206,6 +206,14 @@ def test_another_scene_has_the_pairs_of_its_capture(tmp_path: Path) -> None:
         collect([tmp_path / "run"], captures=[tmp_path / "moved" / "HOME"])
 
 
+def test_a_scene_of_lamar_is_like_any_other(tmp_path: Path) -> None:
+    """It has the pairs of the sessions that `download` makes, and the zip does not follow LaMAR's combine script."""
+    capture = make_capture(tmp_path / "data", "CAB")
+    make_poses(tmp_path / "run", "CAB", "ios", "ios")
+    table = collect([tmp_path / "run"], captures=[capture], scenes=["CAB"]).table().set_index("file")
+    assert table["written"].sum() == table["written"]["CAB_map_ios_query_ios.txt"] == 3
+
+
 def test_poses_that_nobody_asked_for_are_not_written(run: Path, tmp_path: Path, captures: list[Path]) -> None:
     """As when poses are keyed by a camera where the list asks for its rig."""
     path = captures[0] / "sessions" / "hl_query" / "proc" / f"{LIST}.txt"

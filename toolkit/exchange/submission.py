@@ -1,6 +1,6 @@
-"""Collect and check the poses of finished runs, and write the zip file that a benchmark accepts.
+"""Collect and check the poses of finished runs, and write the zip file that the CroCoDL challenge accepts.
 
-Names and contents follow the benchmarks' own combine scripts: `description.txt`, and for each pair a text file in the
+Names and contents follow the benchmark's own combine script: `description.txt`, and for each pair a text file in the
 trajectories format without covariances. Equal runs and options give equal bytes.
 """
 
@@ -19,50 +19,22 @@ import pandas as pd
 
 from toolkit.capture import COLUMNS, Capture, Trajectory
 from toolkit.capture.check import UNIT_TOLERANCE
+from toolkit.capture.devices import SPLITS
 from toolkit.capture.tables import read_query_table, read_table
 from toolkit.errors import ArtifactError, CaptureError, ManifestError, ToolkitError
-from toolkit.files import SceneFiles, file_fingerprint, read_references, write_atomic, write_sidecar
+from toolkit.files import SceneFiles, file_fingerprint, pair_name, read_references, write_atomic, write_sidecar
 from toolkit.geometry import invert, qt_from_pose, unit
 
 FAILED = ("nearest", "leave-out")
 LEFT_OUT, FILLED = "left out", "nearest"
+SCENES = {"HYDRO": "HYDRO", "SUCCULENT": "SUCCU"}
+"""Captures of the CroCoDL challenge, with their names in its files; it asks for all pairs of `DEVICES`."""
+DEVICES = ["ios", "hl", "spot"]
+QUERIES = "keyframes_pruned_subsampled"
+"""The challenge's list of the query keyframes to be localized."""
 COUNTS = ["asked", "written", "ok", "low_confidence", "filled", "left_out", "not_asked"]
 
 Key = tuple[int, str]
-
-
-@dataclass(frozen=True)
-class Challenge:
-    """The zip file that one benchmark expects."""
-
-    pairs: tuple[tuple[str, str], ...]
-    """Pairs of map and query device."""
-    scenes: dict[str, str] = field(default_factory=dict)
-    """For each capture, its name in file names."""
-    file: str = "{scene}_map_{map}_query_{query}.txt"
-    """Pattern of a pair's file name."""
-    queries: str = "keyframes_pruned_subsampled"
-    """List of the query keyframes to be localized."""
-    devices: dict[str, str] = field(default_factory=dict)
-    """The benchmark's device names that differ from the toolkit's."""
-
-    def file_name(self, scene: str, map_device: str, query_device: str) -> str:
-        """Return the name of a pair's file in the zip."""
-        map_device, query_device = (self.devices.get(key, key) for key in (map_device, query_device))
-        return self.file.format(scene=self.scenes.get(scene, scene), map=map_device, query=query_device)
-
-
-LAMAR = Challenge(
-    pairs=(("mixed", "ios"), ("mixed", "hl")),
-    scenes={"CAB": "CAB", "HGE": "HGE", "LIN": "LIN"},
-    file="{scene}_query_{query}.txt",
-    queries="queries",
-    devices={"ios": "phone", "hl": "hololens"},
-)
-CROCODL = Challenge(
-    pairs=tuple(itertools.product(("ios", "hl", "spot"), ("ios", "hl", "spot"))),
-    scenes={"HYDRO": "HYDRO", "SUCCULENT": "SUCCU"},
-)
 
 
 @dataclass
@@ -164,8 +136,8 @@ def collect(
 ) -> Submission:
     """Collect and check the poses of runs for submission; `.write()` then writes the zip file.
 
-    If the runs contain a scene of a challenge, all scenes and pairs of the challenge are expected, and those without
-    poses are listed as missing. Otherwise the submission has all scenes of the runs with the pairs of their captures.
+    If the runs contain a scene of the challenge, all its scenes and pairs are expected, and those without poses are
+    listed as missing. Otherwise the submission has all scenes of the runs with the pairs of their captures.
 
     Args:
         runs: run folders, `<output_root>/<manifest name>`; scenes and pairs may be distributed over several.
@@ -193,22 +165,18 @@ def collect(
     present = {path.parent.name for folder in folders for path in sorted(folder.glob("*/poses"))}
     if not present:
         raise ManifestError(f"{', '.join(map(str, folders))}: no poses in it. Run the manifest first.")
-    challenge = next((rules for rules in (LAMAR, CROCODL) if present & rules.scenes.keys()), None)
-    expected = challenge.scenes if challenge else {}
+    expected = SCENES if present & SCENES.keys() else {}
     captures_by_scene = Captures(folders, captures, sorted(present.union(scenes, expected)))
     out = Path(out) if out else folders[0] / "submission.zip"
     submission = Submission(_description(description), [], {}, failed, out)
     for scene in scenes or expected or sorted(present):
-        if challenge and scene in expected:
-            rules = challenge
-        else:  # not part of a challenge: all pairs of the capture
-            capture = captures_by_scene[scene]
-            rules = Challenge(tuple(itertools.product(capture.devices_with("map"), capture.devices_with("query"))))
-        for map_device, query_device in rules.pairs:
-            entry = Entry(scene, map_device, query_device, rules.file_name(scene, map_device, query_device))
+        mapped = asked = DEVICES
+        if scene not in expected:  # not part of the challenge: all pairs of the capture
+            mapped, asked = (captures_by_scene[scene].devices_with(split) for split in SPLITS)
+        for pair in itertools.product(mapped, asked):
+            entry = Entry(scene, *pair, f"{pair_name(expected.get(scene, scene), *pair)}.txt")
             submission.entries.append(entry)
-            keyframes = queries or rules.queries
-            _fill_entry(entry, folders, captures_by_scene, keyframes, failed, submission.sources, sequence)
+            _fill_entry(entry, folders, captures_by_scene, queries or QUERIES, failed, submission.sources, sequence)
     total = submission.table()[COUNTS].sum()
     if total["filled"]:
         submission.description += (
