@@ -126,6 +126,19 @@ def test_a_colmap_model_keeps_its_camera_centers_and_rigs(model: Path, tmp_path:
     assert "timestamps: made up" in report.text()
 
 
+def test_a_sensor_of_a_rig_without_a_pose_is_left_out(model: Path, tmp_path: Path) -> None:
+    made = pycolmap.Reconstruction(str(model))
+    camera = pycolmap.Camera.create_from_model_name(4, "PINHOLE", 50.0, *SIZE)
+    made.add_camera(camera)
+    made.rig(7).add_sensor(camera.sensor_id, None)
+    made.write_text(str(model))
+    import_colmap(model, tmp_path / "photos", tmp_path / "PLACE", device="hl")
+    session = Capture.open(tmp_path / "PLACE")["hl_map"]
+    assert session.rigs is not None
+    assert list(session.rigs["sensor_id"]) == ["import/cam_2", "import/cam_3"]
+    assert len(poses_of(session)) == 5
+
+
 def test_images_of_a_model_that_cannot_be_used_are_rows(model: Path, tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     (photos / "phone" / "1.jpg").unlink()

@@ -75,8 +75,10 @@ def import_colmap(
     rigs = {rig_id: rig for rig_id, rig in sorted(reconstruction.rigs.items()) if rig.num_sensors() > 1}
     for rig_id, rig in rigs.items():
         for sensor in sorted(rig.sensor_ids(), key=lambda sensor: sensor.id):
-            if sensor.type == pycolmap.SensorType.CAMERA:
-                rig_from_sensor = np.eye(4) if rig.is_ref_sensor(sensor) else _inverse(rig.sensor_from_rig(sensor))
+            is_reference = rig.is_ref_sensor(sensor)
+            sensor_from_rig = None if is_reference else rig.sensor_from_rig(sensor)  # None: not calibrated, no images
+            if sensor.type == pycolmap.SensorType.CAMERA and (is_reference or sensor_from_rig is not None):
+                rig_from_sensor = np.eye(4) if sensor_from_rig is None else _inverse(sensor_from_rig)
                 draft.rigs.append((f"{SUBSESSION}/rig_{rig_id}", f"{SUBSESSION}/cam_{sensor.id}", rig_from_sensor))
     for _, image in sorted(reconstruction.images.items()):
         if not image.has_pose:
