@@ -719,6 +719,23 @@ def test_one_device_of_lamar(hub: FakeHub, tmp_path: Path, monkeypatch: pytest.M
     assert list(capture["hl_map"].sensors["sensor_id"]) == ["hl_1/cam"]
 
 
+def test_one_device_of_lamar_after_the_other(hub: FakeHub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CAPTURES", str(tmp_path / "captures"))
+    hub.plain["/CAB.zip"] = zipped(lamar_archive())
+    address = f"dataset.sources.CAB.urls=['{hub.url}/CAB.zip']"
+    path = REPOSITORY / "data_manifests" / "lamar-cab.yaml"
+    for sessions in (["ios_map", "ios_query"], ["hl_map", "hl_query"]):
+        download(path, sessions, overrides=[address])
+    hub.paths.clear()
+    download(path, overrides=[address])
+    assert hub.paths == [], "what is there is not fetched again"
+    shutil.rmtree(tmp_path / "captures/CAB/sessions/hl_map")
+    download(path, ["ios_map"], overrides=[address])
+    assert hub.paths == [], "nor because of what was deleted and is not asked for"
+    download(path, overrides=[address])
+    assert hub.paths == ["/CAB.zip"]
+
+
 def test_a_device_that_is_not_in_the_map(tmp_path: Path) -> None:
     for path, body in session("map").items():
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)

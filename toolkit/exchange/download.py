@@ -242,7 +242,10 @@ class _CaptureDownload:
             done[row["path"]] = row
         return done
 
-    def _mark_done(self, file: RemoteFile, **columns: Any) -> None:
+    def _mark_done(self, file: RemoteFile, **columns: list[str]) -> None:
+        before = self.done.get(file.path, {})
+        if before.get("version") == file.version:  # an archive of which other sessions were fetched
+            columns = {name: sorted({*values, *before[name]}) for name, values in columns.items()}
         row = self.done[file.path] = {"path": file.path, "version": file.version, **columns}
         with self.lock, open(self.state / "done.jsonl", "a", encoding="utf-8") as stream:
             stream.write("\n" + json.dumps(row))  # newline first: a kill may have cut off the previous line
@@ -253,8 +256,9 @@ class _CaptureDownload:
         if row.get("version") != file.version:
             return False
         if file.is_archive:
-            folders = [self.folder / name for name in row["folders"]]
-            return set(self._sessions_in(file)) <= set(row["sessions"]) and all(map(Path.is_dir, folders))
+            asked = [name for name in row["folders"] if name.partition("sessions/")[2] in ("", *self.names)]
+            in_place = all((self.folder / name).is_dir() for name in asked)
+            return in_place and set(self._sessions_in(file)) <= set(row["sessions"])
         return _file_size(self.folder / file.path) == file.size
 
     def count_fetched(self, file: RemoteFile) -> int:
