@@ -344,8 +344,19 @@ def test_an_image_of_absurd_size_is_a_row(folder: Path, tmp_path: Path) -> None:
         save(folder / "c.jpg", tags={0xA405: 30})
         report = import_images(folder, tmp_path / f"PLACE-{camera is None}", camera=camera)
         status = report.images.set_index("image")["status"]
-        assert status["absurd.png"].startswith("cannot be read as an image")
+        assert status["absurd.png"] == "cannot be read as an image (30000 x 30000 pixels, more than 268,435,456)"
         assert status["c.jpg"] == "imported"
+
+
+def test_photographs_of_200_megapixels_are_imported(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+    path = save(tmp_path / "photos" / "large.jpg", tags={0xA405: 26})
+    content = path.read_bytes()
+    place = content.index(b"\xff\xc0") + 5  # height and width in the frame header
+    path.write_bytes(content[:place] + struct.pack(">HH", 12240, 16320) + content[place + 4 :])
+    row = import_images(tmp_path / "photos", tmp_path / "PLACE").images.iloc[0]
+    assert row["status"] == "imported"
+    assert row["camera"].startswith("SIMPLE_PINHOLE, 16320, 12240, ")
+    assert not recwarn.list
 
 
 def test_times_are_those_of_the_camera_where_all_have_one(tmp_path: Path) -> None:

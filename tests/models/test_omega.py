@@ -1,10 +1,12 @@
 """VGGT-Omega: what a small network of its kind must do, the official loader, and the official numbers."""
 
+import struct
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
+import PIL.Image
 import pytest
 import torch
 
@@ -278,6 +280,17 @@ def test_wrong_images_are_refused(tmp_path: Path) -> None:
         load_images([])
     with pytest.raises(ValueError, match=r"crop.*balanced.*max_size"):
         load_images([np.zeros((10, 10, 3), np.uint8)], "crop")
+
+
+def test_the_largest_image_is_ours_and_not_that_of_pillow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    PIL.Image.new("RGB", (64, 48)).save(tmp_path / "photo.jpg")
+    monkeypatch.setattr(PIL.Image, "MAX_IMAGE_PIXELS", 100)
+    assert len(load_images([tmp_path / "photo.jpg"]).images) == 1
+    content = (tmp_path / "photo.jpg").read_bytes()
+    place = content.index(b"\xff\xc0") + 5  # height and width in the frame header
+    (tmp_path / "large.jpg").write_bytes(content[:place] + struct.pack(">HH", 14_000, 20_000) + content[place + 4 :])
+    with pytest.raises(ImageError, match=r"large\.jpg \(20000 x 14000 pixels, more than 268,435,456\)"):
+        load_images([tmp_path / "large.jpg"])
 
 
 # The official numbers

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import PIL.Image
 import pycolmap
 
+from toolkit.capture.images import HEADER_ERRORS, open_lazily
 from toolkit.errors import ImageError
 
 # Numbers of the EXIF tags, and the length in millimeters of each value of FocalPlaneResolutionUnit.
@@ -30,15 +30,16 @@ def read_header(path: Path) -> tuple[tuple[int, int], dict[int, Any]]:
     """Return the stored width and height of an image, and its EXIF tags by number.
 
     Raises:
-        ImageError: the file is missing or not an image.
+        ImageError: the file is missing, not an image, or has more than `images.MOST_PIXELS` pixels.
     """
     if not is_file(path):
         raise ImageError(NO_FILE)
     try:
-        with PIL.Image.open(path) as image:
+        with open(path, "rb") as stream:
+            image = open_lazily(stream)
             exif = image.getexif()
             return image.size, {**exif, **exif.get_ifd(_EXIF)}
-    except (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError) as error:
+    except HEADER_ERRORS as error:
         raise ImageError(f"cannot be read as an image ({error})") from None
 
 

@@ -38,7 +38,7 @@ _HEADER_READERS: dict[bytes, Callable[[Any], PIL.Image.Image]] = {
 }
 _REDUCED = {8: cv2.IMREAD_REDUCED_COLOR_8, 4: cv2.IMREAD_REDUCED_COLOR_4, 2: cv2.IMREAD_REDUCED_COLOR_2}
 _CGROUPS = Path("/sys/fs/cgroup")  # file names differ between versions 2 and 1
-_HEADER_ERRORS = (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError)
+HEADER_ERRORS = (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError)
 
 
 def read_file(path: str | Path) -> bytes:
@@ -77,14 +77,22 @@ def stored_size(path: str | Path) -> tuple[int, int]:
     with _open(path) as stream:
         try:
             return _header_size(stream)
-        except _HEADER_ERRORS as error:
+        except HEADER_ERRORS as error:
             raise ImageError(f"Image cannot be decoded ({error}): {path}") from None
 
 
-def _header_size(stream: BinaryIO) -> tuple[int, int]:
+def open_lazily(stream: BinaryIO, most_pixels: float = MOST_PIXELS) -> PIL.Image.Image:
+    """Return an image of which only the header is read yet. Raise one of `HEADER_ERRORS` if it has too many pixels."""
     first = stream.read(8)
     stream.seek(0)
-    return next(read for start, read in _HEADER_READERS.items() if first.startswith(start))(stream).size
+    image = next(read for start, read in _HEADER_READERS.items() if first.startswith(start))(stream)
+    if image.width * image.height > most_pixels:
+        raise ValueError(f"{image.width} x {image.height} pixels, more than {most_pixels:,}")
+    return image
+
+
+def _header_size(stream: BinaryIO) -> tuple[int, int]:
+    return open_lazily(stream, np.inf).size
 
 
 def decode(path: str | Path, flags: int, least_side: int | None = None) -> NDArray[Any]:
@@ -101,7 +109,7 @@ def decode(path: str | Path, flags: int, least_side: int | None = None) -> NDArr
         width, height = _header_size(BytesIO(data))
     except PIL.Image.DecompressionBombError as error:
         raise ImageError(f"Image cannot be decoded ({error}): {path}") from None
-    except _HEADER_ERRORS:
+    except HEADER_ERRORS:
         width = height = 0  # OpenCV decides whether it is an image
     if width * height > MOST_PIXELS:
         raise ImageError(f"Image cannot be decoded ({width} x {height} pixels, more than {MOST_PIXELS:,}): {path}")

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Tensor
 
-from toolkit.capture.images import read_file
+from toolkit.capture.images import HEADER_ERRORS, open_lazily, read_file
 from toolkit.errors import ImageError
 from toolkit.geometry import Floats, Ints
 from toolkit.models.vit import PATCH
@@ -49,10 +49,9 @@ def open_image(source: Source) -> Image.Image:
         image = Image.fromarray(source)
     else:
         try:
-            with Image.open(BytesIO(read_file(source))) as opened:
-                opened.load()
-                image = opened
-        except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+            image = open_lazily(BytesIO(read_file(source)))
+            image.load()
+        except HEADER_ERRORS as error:
             raise ImageError(f"Image cannot be decoded: {source} ({error}); expected a whole image file.") from None
     if image.mode == "RGBA":
         image = Image.alpha_composite(Image.new("RGBA", image.size, (255, 255, 255, 255)), image)
