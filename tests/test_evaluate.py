@@ -202,6 +202,18 @@ def test_median_is_infinite_where_most_have_no_pose(scene):
     assert draw_evaluation(result)
 
 
+def test_a_pose_of_unknown_scale_is_not_drawn_over_its_stated_deviation(scene):
+    """A network knows no scale if its references stand in one place: the deviation of the position is infinite."""
+    path = scene[1] / f"TINY_{IOS}.csv"
+    table = pd.read_csv(path)
+    table.assign(position_std_m=np.inf).to_csv(path, index=False)
+    assert "deviations" not in draw_evaluation(evaluate_ios(scene))
+    table.assign(position_std_m=[0.01, np.inf, np.nan, 0.1]).to_csv(path, index=False)
+    (axis,) = draw_evaluation(evaluate_ios(scene))["deviations"].axes
+    drawn = [line.get_xydata() for line in axis.lines if line.get_alpha()]
+    np.testing.assert_allclose(np.concatenate(drawn), [(0.01, 0.01), (0.1, 0.2)])
+
+
 def test_poses_of_another_tool_need_no_table(scene):
     (scene[1] / f"TINY_{IOS}.csv").unlink()
     (row,) = evaluate_ios(scene).recall.to_dict("records")

@@ -89,7 +89,7 @@ def draw_evaluation(evaluation: Evaluation) -> dict[str, "Figure"]:
         figures["error_curves"] = draw_error_curves(evaluation.errors, evaluation.thresholds, unit)
         if "p_correct" in evaluation.errors and evaluation.errors["p_correct"].notna().any():
             figures["reliability"] = draw_reliability(evaluation.errors, unit)
-        if "position_std_m" in evaluation.errors and evaluation.errors["position_std_m"].gt(0).any():
+        if "position_std_m" in evaluation.errors and _has_deviation(evaluation.errors).any():
             figures["deviations"] = draw_deviations(evaluation.errors, unit)
         if evaluation.losses["missed"].sum():
             figures["losses"] = draw_losses(evaluation.losses)
@@ -237,7 +237,7 @@ def draw_deviations(errors: pd.DataFrame, unit: str = "m") -> "Figure":
     With enough poses, a line joins the medians of tenths of the poses. If the stated deviations are right and errors
     are Gaussian, the medians lie a little below the stated deviation, and hardly any pose is above the upper line.
     """
-    errors = errors[errors["position_std_m"].gt(0) & np.isfinite(errors["translation_error_m"])]
+    errors = errors[_has_deviation(errors)]
     stated, actual = (errors[name].to_numpy(float).clip(1e-5) for name in ("position_std_m", "translation_error_m"))
     ok = (errors["status"] == "ok").to_numpy(bool)
     figure = new_figure(5.2, 4.6)
@@ -261,6 +261,11 @@ def draw_deviations(errors: pd.DataFrame, unit: str = "m") -> "Figure":
     axis.legend(frameon=False, fontsize=8, loc="upper left")
     figure.suptitle("Stated and actual deviation of the position")
     return figure
+
+
+def _has_deviation(errors: pd.DataFrame) -> pd.Series:
+    """Return which rows have an error and a stated deviation; the latter is infinite if the scale is unknown."""
+    return errors["position_std_m"].between(0, np.inf, "neither") & np.isfinite(errors["translation_error_m"])
 
 
 def wilson_interval(share: float, count: int, z: float = 1.96) -> tuple[float, float]:
