@@ -214,6 +214,16 @@ def test_a_pose_of_unknown_scale_is_not_drawn_over_its_stated_deviation(scene):
     np.testing.assert_allclose(np.concatenate(drawn), [(0.01, 0.01), (0.1, 0.2)])
 
 
+def test_the_unit_is_that_of_the_pairs_that_were_evaluated(scene):
+    """Only the map that was localized in has a record of its unknown unit; the last one was left out."""
+    (scene[1] / "TINY_map_ios.json").write_text('{"unit": null, "depth": 30}')
+    (scene[1] / "TINY_map_hl_query_ios.left_out.json").write_text('{"reason": "a dragon"}')
+    result = call(evaluate_scene, *scene, None, query_device="ios", pairs=[["ios", "ios"], ["hl", "ios"]])
+    assert result.unit == "L"
+    assert result.recall["recall@(1deg,0.1L)"].tolist()[0] == 0.5, "0.2 is 0.067 L"
+    assert {"recall", "error_curves"} <= draw_evaluation(result).keys()
+
+
 def test_poses_of_another_tool_need_no_table(scene):
     (scene[1] / f"TINY_{IOS}.csv").unlink()
     (row,) = evaluate_ios(scene).recall.to_dict("records")

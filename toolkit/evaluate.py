@@ -46,6 +46,7 @@ from toolkit.show.metrics import (
     poses_of,
     recall,
     threshold_name,
+    unit_of,
 )
 from toolkit.show.overlap import LEAST_OVERLAP, overlap_in_view, seen_by
 from toolkit.show.sequences import SequencePair
@@ -113,7 +114,6 @@ def evaluate_scene(
     rows: dict[str, list[dict[str, Any]]] = {"recall": [], "retrieval": [], "losses": []}
     errors: list[pd.DataFrame] = []
     messages: list[str] = []
-    unit = "m"
     references_dir = retrieval_dir and (reranked_dir or retrieval_dir)
     for query in capture.devices_with("query", query_device):
         maps = [map_ for map_ in map_devices if pairs is None or [map_, query] in map(list, pairs)]
@@ -176,7 +176,7 @@ def evaluate_scene(
         ),
         limits,
         list(dict.fromkeys(messages)),
-        unit,
+        unit_of(*(name for row in rows["recall"] for name in row)),
         *evaluate_sequences(
             *(capture, poses_dir, limits, map_devices, capture.devices_with("query", query_device), queries, pairs)
         ),
