@@ -136,6 +136,16 @@ def test_the_worst_is_the_worst(small_capture: Path, tmp_path: Path) -> None:
     assert WorstQueries.of(tmp_path).names == []
 
 
+def test_a_session_that_broke_after_a_run_costs_only_its_own_pairs(small_capture: Path, tmp_path: Path) -> None:
+    capture = tmp_path / "capture" / small_capture.name
+    shutil.copytree(small_capture, capture)
+    written(capture, tmp_path, [LocalizedQuery()] * 2)
+    pair = written(capture, tmp_path, [LocalizedQuery()], device="hl")
+    (capture / "sessions" / "hl_query" / "images.txt").write_text("a line\n")
+    worst = WorstQueries.of(pair._h5.parent)
+    assert [name.partition(":")[0] for name in worst.names] == ["ios in the map of ios"] * 2
+
+
 def test_a_failed_query_says_why_and_is_drawn(small_capture: Path, tmp_path: Path) -> None:
     status = ["failed: too few inliers (4 within 0.45 deg)", "failed: no references"]
     counts = {"num_inliers": [4, 0], "num_matches": [9, 0]}

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from toolkit.capture import Capture, Trajectory
-from toolkit.errors import ArtifactError
+from toolkit.errors import OF_THE_DATA, ArtifactError
 from toolkit.files import SceneFiles, image_name, read_references
 from toolkit.geometry import Floats
 from toolkit.localizers.again import LocalizeAgain
@@ -270,7 +270,7 @@ class WorstQueries:
         map_device: str = "all",
         query_device: str = "all",
     ) -> "WorstQueries":
-        """Return the queries of all pairs in a folder of poses that have stored correspondences.
+        """Return the queries of all pairs in a folder of poses that have stored correspondences and can be read.
 
         Args:
             poses_dir, map_dir, sessions_root: as for `InspectedPair`.
@@ -280,7 +280,7 @@ class WorstQueries:
         for stem in sorted(path.with_suffix("") for path in Path(poses_dir).glob("*_map_*_query_*.h5")):
             mapped, _, queried = stem.name.rpartition("_map_")[2].partition("_query_")
             if map_device in ("all", mapped) and query_device in ("all", queried):
-                with suppress(ArtifactError):  # an unfinished pair has no table
+                with suppress(*OF_THE_DATA):  # an unfinished pair has no table, or a session broke after a good run
                     pairs.append(InspectedPair(mapped, queried, poses_dir, None, map_dir, sessions_root))
         return cls(pairs)
 
