@@ -11,7 +11,7 @@ from toolkit.capture import Capture
 from toolkit.errors import ArtifactError, CaptureError
 from toolkit.localizers.correspondences import LocalizedQuery
 from toolkit.show.figures import new_figure
-from toolkit.visualize import visualize_scene
+from toolkit.visualize import sample_pictures, visualize_scene
 
 QUICK = {"session_recordings": False, "matched_queries": 2}
 
@@ -108,3 +108,21 @@ def test_a_pair_that_was_left_out_has_its_reason_and_no_pictures(small_capture, 
     table = visualize_scene(small_capture / "sessions", tmp_path, None, out, QUICK, map_device="ios")
     assert table.set_index("query_device")["reason"].to_dict() == {"ios": "", "hl": "a dragon"}
     assert not any(path.exists() for path in stale)
+
+
+def test_pictures_of_an_earlier_run_go(small_capture, drawn, tmp_path):
+    """Also those with a larger number and the recordings; those of pairs that were not asked for stay."""
+    capture, out = Capture.open(small_capture), tmp_path / "out"
+    write_pair(capture, tmp_path, "ios", "ios", queries_of(capture, "ios", 3))
+    out.mkdir()
+    name = "SMALL_map_ios_query_ios"
+    other = f"localization_{name}_2_1.png"
+    stale = [f"localization_{name}_3.png", f"{name}.rrd", f"{name}_sequence.png", "SMALL_ios_map.rrd"]
+    for path in (*stale, other, f"localization_{name}_12.png"):
+        (out / path).touch()
+    assert [path.stem.rpartition("_")[2] for path in sample_pictures(out, name)] == ["3", "12"]
+    settings = QUICK | {"samples": 2, "recordings": False}
+    visualize_scene(small_capture / "sessions", tmp_path, None, out, settings, pairs=[["ios", "ios"]])
+    assert [path.stem.rpartition("_")[2] for path in sample_pictures(out, name)] == ["1", "2"]
+    assert [path for path in stale if (out / path).exists()] == []
+    assert (out / other).exists(), "of a device called ios_2"

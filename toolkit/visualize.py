@@ -1,5 +1,6 @@
 """The visualize stage: recordings and still pictures of a scene, from the files of earlier stages."""
 
+import re
 import time
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -78,6 +79,8 @@ def visualize_scene(
         raise ArtifactError(f"{poses_dir}: no poses of {capture.name} for the chosen devices. Localize them first.")
     table, worst = PairRows(capture.name, out, Path(poses_dir)), []
     for m, q in tqdm(chosen, desc="visualize", unit="pair"):
+        name = pair_name(capture.name, m, q)
+        _remove_pictures(out, name)  # those of an earlier run would look like results of this one
         with table.row(m, q) as row:
             table.check_upstream()
             started = time.perf_counter()
@@ -92,34 +95,49 @@ def visualize_scene(
                 "recording": str(out / f"{pair.name}.rrd") if settings.recordings else "",
             }
         if row["reason"]:
-            name = pair_name(capture.name, m, q)  # pictures of an earlier run would mislead
-            pictures = (f"{name}.png", f"{name}_sequence.png", f"{name}.rrd", f"localization_{name}_*.png")
-            for stale in (path for pattern in pictures for path in out.glob(pattern)):
-                stale.unlink()
+            _remove_pictures(out, name)
     frame = table.frame()
     present = [(row["map_device"], row["query_device"]) for row in table.rows if not row["reason"]]
     _draw_worst(out / f"worst_{capture.name}.png", capture.name, pd.concat(worst, ignore_index=True))
-    if settings.session_recordings:
-        sides = dict.fromkeys((*((m, "map") for m, _ in present), *((q, "query") for _, q in present)))
-        for device, split in sides:
-            session, poses = capture[f"{device}_{split}"], None
-            if split == "query" and session.ground_truth is None:
-                # Without ground truth, poses in the device's own map are the most accurate ones.
-                localized_in = [m for m, q in present if q == device]
-                map_ = device if device in localized_in else localized_in[0]
-                poses = _poses(capture, poses_dir, map_, device)
-            record_session(
-                *(capture.path, split, device),
-                keyframes_only=settings.keyframes_only and split == "query",
-                every=settings.every or 1 + len(session.images) // MAX_FRAMES,
-                vis_retrieve_queries=poses is not None,
-                queries_pose=poses,
-                out=out / f"{capture.name}_{session.id}.rrd",
-                map_dir=map_dir,
-                world_up=settings.world_up,
-                progress=False,
-            )
+    sides = dict.fromkeys((*((m, "map") for m, _ in present), *((q, "query") for _, q in present)))
+    for device, split in sides:
+        recording, poses = out / f"{capture.name}_{device}_{split}.rrd", None
+        recording.unlink(missing_ok=True)
+        if not settings.session_recordings:
+            continue
+        session = capture[f"{device}_{split}"]
+        if split == "query" and session.ground_truth is None:
+            # Without ground truth, poses in the device's own map are the most accurate ones.
+            localized_in = [m for m, q in present if q == device]
+            map_ = device if device in localized_in else localized_in[0]
+            poses = _poses(capture, poses_dir, map_, device)
+        record_session(
+            *(capture.path, split, device),
+            keyframes_only=settings.keyframes_only and split == "query",
+            every=settings.every or 1 + len(session.images) // MAX_FRAMES,
+            vis_retrieve_queries=poses is not None,
+            queries_pose=poses,
+            out=recording,
+            map_dir=map_dir,
+            world_up=settings.world_up,
+            progress=False,
+        )
     return frame
+
+
+def sample_pictures(out_dir: str | Path, name: str) -> list[Path]:
+    """Return the pictures of single queries of the pair `name`, `localization_<name>_<k>.png`, in order of k."""
+    pattern = re.compile(rf"localization_{re.escape(name)}_(\d+)\.png")
+    found = {
+        int(match[1]): path for path in Path(out_dir).glob("localization_*") if (match := pattern.fullmatch(path.name))
+    }
+    return [found[k] for k in sorted(found)]
+
+
+def _remove_pictures(out: Path, name: str) -> None:
+    """Remove the pictures and the recording of a pair."""
+    for path in (*(out / f"{name}{end}" for end in (".png", "_sequence.png", ".rrd")), *sample_pictures(out, name)):
+        path.unlink(missing_ok=True)
 
 
 def _draw_pair(
@@ -145,9 +163,7 @@ def _draw_pair(
         figure = draw_localization(details_of(k), title, pair.unit)
         save_figure(figure, out / f"localization_{pair.name}_{number}.png", figure.get_suptitle())
     tracks: dict[str, list[Floats]] = {}
-    if sequences is None:
-        (out / f"{pair.name}_sequence.png").unlink(missing_ok=True)
-    else:
+    if sequences is not None:
         figure = draw_sequence(capture, sequences, m, q, settings.world_up, pair.unit)
         save_figure(figure, out / f"{pair.name}_sequence.png")
         tracks = {"odometry": sequences.odometry_tracks(pair.query_session), "frames": sequences.tracks()}
