@@ -126,3 +126,22 @@ def test_pictures_of_an_earlier_run_go(small_capture, drawn, tmp_path):
     assert [path.stem.rpartition("_")[2] for path in sample_pictures(out, name)] == ["1", "2"]
     assert [path for path in stale if (out / path).exists()] == []
     assert (out / other).exists(), "of a device called ios_2"
+
+
+def test_a_recording_of_keyframes_has_those_of_the_list_and_is_thinned_by_their_number(
+    small_capture, drawn, monkeypatch, tmp_path
+):
+    shutil.copytree(small_capture, tmp_path / "SMALL")
+    session = tmp_path / "SMALL" / "sessions" / "hl_query"
+    (session / "proc" / "keyframes_pruned_subsampled.txt").rename(session / "queries.txt")
+    capture = Capture.open(tmp_path / "SMALL")
+    listed = sum(map(len, capture["hl_query"].rows_of_keyframes(capture["hl_query"].keyframes("queries"))))
+    assert 0 < listed + 1 <= len(capture["hl_query"].images)
+    write_pair(capture, tmp_path, "hl", "hl", queries_of(capture, "hl", 1))
+    recorded = []
+    monkeypatch.setattr(visualize, "record_session", lambda *_, **options: recorded.append(options))
+    monkeypatch.setattr(visualize, "MAX_FRAMES", listed + 1)
+    settings = {"keyframes_only": True, "samples": 0, "recordings": False}
+    visualize_scene(capture.path / "sessions", tmp_path, None, tmp_path / "out", settings, queries="queries")
+    assert [(one["keyframes_only"], one["queries"]) for one in recorded] == [(False, "queries"), (True, "queries")]
+    assert recorded[1]["every"] == 1

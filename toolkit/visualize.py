@@ -41,6 +41,7 @@ def visualize_scene(
     *,
     map_device: str = "all",
     query_device: str = "all",
+    queries: str = "keyframes_pruned_subsampled",
     pairs: Sequence[Sequence[str]] | None = None,
 ) -> pd.DataFrame:
     """Draw every pair of a scene, and record every pair and session for the rerun viewer.
@@ -58,6 +59,7 @@ def visualize_scene(
         settings: see `VisualizeSettings`; a dict holds the settings that differ from the defaults. A query session
             without ground truth shows its cameras at their estimated poses.
         map_device: `all` or one device key; likewise `query_device`.
+        queries: keyframe list of the queries, which the setting `keyframes_only` shows.
         pairs: only these [map device, query device]; None: all.
 
     Returns:
@@ -106,6 +108,8 @@ def visualize_scene(
         if not settings.session_recordings:
             continue
         session = capture[f"{device}_{split}"]
+        listed = settings.keyframes_only and split == "query"
+        images = sum(map(len, session.rows_of_keyframes(session.keyframes(queries)))) if listed else len(session.images)
         if split == "query" and session.ground_truth is None:
             # Without ground truth, poses in the device's own map are the most accurate ones.
             localized_in = [m for m, q in present if q == device]
@@ -113,12 +117,13 @@ def visualize_scene(
             poses = _poses(capture, poses_dir, map_, device)
         record_session(
             *(capture.path, split, device),
-            keyframes_only=settings.keyframes_only and split == "query",
-            every=settings.every or 1 + len(session.images) // MAX_FRAMES,
+            keyframes_only=listed,
+            every=settings.every or 1 + images // MAX_FRAMES,
             vis_retrieve_queries=poses is not None,
             queries_pose=poses,
             out=recording,
             map_dir=map_dir,
+            queries=queries,
             world_up=settings.world_up,
             progress=False,
         )
