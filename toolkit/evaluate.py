@@ -501,7 +501,7 @@ def overlap_table(
         if not references or not (pairs is None or [map_, query] in map(list, pairs)):
             continue
         name = pair_name(capture.name, map_, query)
-        poses = None if poses_dir is None else Path(poses_dir) / name
+        h5 = None if poses_dir is None else Path(poses_dir) / f"{name}.h5"
         row: dict[str, Any] = {"map_device": map_, "query_device": query, "state": "evaluated"}
         rows.append(row)
         try:
@@ -509,7 +509,7 @@ def overlap_table(
         except CaptureError as error:
             row["state"] = f"{LEFT_OUT}{error}"
             continue
-        local_map = load(map_files(map_dir, f"{map_}_map", poses))
+        local_map = load(map_files(map_dir, f"{map_}_map", h5))
         for column, folder in references.items():
             row |= _overlap(Path(folder) / f"{name}.jsonl", column, *sessions, local_map)
     return _table(pd.DataFrame(rows), "images", "points")

@@ -1,5 +1,6 @@
 """Each method's pictures show what its poses rest on: its own inliers, points and references."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -169,16 +170,28 @@ def test_maps_are_those_that_the_poses_were_found_with(tmp_path):
     empty = {"points": np.zeros((1, 3)), "colors": np.zeros((1, 3), np.uint8), "noise_px": np.ones(1, np.float32)}
     index = np.zeros(1, np.int64)
     local_map = LocalMap(["a"], [], np.eye(4)[None], obs_image=index, obs_keypoint=index, obs_point=index, **empty)
-    poses = tmp_path / "PLACE_map_ios_query_hl"
+    h5 = tmp_path / "PLACE.v2_map_ios_query_hl.h5"
     for name in ("ios_map.npz", "ios_map-superpoint.npz", "ios_map-other.npz"):
         replace(local_map, cameras=[]).save(tmp_path / name)
     (tmp_path / "ios_map-other.npz").write_bytes(b"no map")
     assert len(map_files(tmp_path, "ios_map")) == 3
     assert map_files(None, "ios_map") == ()
     assert map_files(tmp_path, "hl_map") == ()
-    write_queries(tmp_path / f"{poses.name}.h5", {}, ["ios_map-superpoint.npz", "ios_map-gone.npz"])
-    assert [path.name for path in map_files(tmp_path, "ios_map", poses)] == ["ios_map-superpoint.npz"]
+    write_queries(h5, {}, ["ios_map-superpoint.npz", "ios_map-gone.npz"])
+    assert [path.name for path in map_files(tmp_path, "ios_map", h5)] == ["ios_map-superpoint.npz"]
     assert load_maps([tmp_path / "ios_map-other.npz"]) is None
+
+
+def test_a_scene_with_a_dot_in_its_name_has_its_maps(small_capture, tmp_path):
+    shutil.copytree(small_capture, tmp_path / "HGE.v2")
+    capture, asked = Capture.open(tmp_path / "HGE.v2"), []
+    write_pair(capture, tmp_path, "ios", "ios", [LocalizedQuery()], ["ios_map-other.npz"])
+    for name in ("ios_map.npz", "ios_map-other.npz"):
+        (tmp_path / name).touch()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(localized, "load_maps", asked.extend)
+        LocalizedPair.open(capture, "ios", "ios", tmp_path, tmp_path)
+    assert [path.name for path in asked] == ["ios_map-other.npz"]
 
 
 def test_of_a_large_map_a_regular_choice_of_points_is_shown(monkeypatch):

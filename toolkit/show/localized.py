@@ -28,20 +28,20 @@ REFERENCES = 4
 """References shown per query, at most."""
 
 
-def map_files(map_dir: str | Path | None, session_id: str, poses: Path | None = None) -> tuple[Path, ...]:
+def map_files(map_dir: str | Path | None, session_id: str, h5: Path | None = None) -> tuple[Path, ...]:
     """Return the existing triangulated maps of a session, one per kind of features.
 
     Args:
         map_dir: folder of the maps; None: there are none.
         session_id: id of the map session.
-        poses: file of a pair's poses, with or without suffix; only maps used for these poses are returned. None, or
-            poses without a record of their maps: every map of the session in the folder.
+        h5: file of a pair's correspondences; only maps used for its poses are returned. None, or a file that is missing
+            or does not record the maps: every map of the session in the folder.
     """
     if map_dir is None:
         return ()
-    record, names = None if poses is None else poses.with_name(f"{poses.stem}.h5"), list[str]()
-    if record is not None and record.is_file():
-        with closing(LocalizedQueries(record)) as queries:
+    names = list[str]()
+    if h5 is not None and h5.is_file():
+        with closing(LocalizedQueries(h5)) as queries:
             names = queries.maps
     paths = [Path(map_dir) / name for name in names] or sorted(Path(map_dir).glob(f"{session_id}*.npz"))
     return tuple(path for path in paths if path.is_file())
@@ -212,8 +212,8 @@ class LocalizedPair:
         has_image = np.array([len(images) > 0 for images in rows], bool)
         table, rows = table[has_image].reset_index(drop=True), [images for images in rows if len(images)]
         poses = Trajectory.read(poses_path).lookup(table["timestamp"].to_numpy(), table["device_id"])
-        local_map = load_maps(map_files(map_dir, f"{map_device}_map", stem))
-        queries = LocalizedQueries(Path(f"{stem}.h5"))
+        h5 = Path(f"{stem}.h5")
+        local_map, queries = load_maps(map_files(map_dir, f"{map_device}_map", h5)), LocalizedQueries(h5)
         unit = length_unit(read_map_record(map_record_path(poses_dir, capture.name, map_device)))
         return cls(name, capture[f"{map_device}_map"], session, table, rows, poses, queries, local_map, unit)
 

@@ -129,7 +129,8 @@ def record_session(
     poses = None if queries_pose is None else Path(queries_pose)
     localized = None if poses is None else _QueryPoses.read(poses, capture, session, vis_retrieve_queries)
     map_device = device if split == "map" else "" if localized is None else localized.map_device
-    maps = map_files(map_dir, f"{map_device}_map", poses) if map_device else ()
+    h5 = None if poses is None else poses.with_suffix(".h5")
+    maps = map_files(map_dir, f"{map_device}_map", h5) if map_device else ()
     settings = {
         "images": session.files_fingerprint, "subsession": subsession,
         "session": files_fingerprint([*sorted(session.path.glob("*.txt")), *sorted(session.path.glob("proc/*.txt"))]),

@@ -103,8 +103,8 @@ class RetrievedPair:
         map_device, _, query_device = jsonl.stem.rpartition("_map_")[2].partition("_query_")
         self.session, self.map_session = capture[f"{query_device}_query"], capture[f"{map_device}_map"]
         self.embeddings, self.lines = Path(embeddings), read_references(jsonl, "path")
-        poses = None if poses_dir is None else Path(poses_dir) / jsonl.stem
-        self.local_map = load_maps(map_files(map_dir, self.map_session.id, poses))
+        h5 = None if poses_dir is None else Path(poses_dir) / f"{jsonl.stem}.h5"
+        self.local_map = load_maps(map_files(map_dir, self.map_session.id, h5))
         self.names = [image_name(line["path"]) for line in self.lines]
         """Names of the query images."""
 
