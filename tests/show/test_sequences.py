@@ -10,8 +10,9 @@ from tests.localizers.drifting import drive, small_motion
 from tests.test_sequence import drive_through, localized, place
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
+from toolkit.errors import ArtifactError
 from toolkit.evaluate import evaluate_scene
-from toolkit.files import pair_name
+from toolkit.files import file_fingerprint, pair_name, write_sidecar
 from toolkit.sequence import sequence_pairs
 from toolkit.show.sequences import SequencePair, draw_sequence, draw_steps
 
@@ -61,6 +62,18 @@ def test_which_queries_were_rescued_and_broken(pair: SequencePair) -> None:
     changes = pair.changes(KEYS, at(0, 0, 0, 0), LIMITS[-1], 1.0)
     assert changes[["device_id", "change"]].to_numpy().tolist() == [["a", "broken"], ["b", "rescued"]]
     np.testing.assert_allclose(changes[["single_translation_error_m", "translation_error_m"]], [[0.05, 2], [2, 0.05]])
+
+
+def test_results_from_other_single_poses_or_damaged_ones_are_not_used(pair: SequencePair) -> None:
+    single, sequence, steps = (Path(f"{pair.stem}{end}") for end in (".txt", "_sequence.txt", "_sequence_steps.csv"))
+    write_sidecar(sequence, {"poses": [file_fingerprint(single), "of the table"]}, [steps])
+    found = SequencePair.find(pair.stem.parent, "A", "ios", "hl")
+    assert found is not None
+    steps.write_text(steps.read_text().rpartition("\n")[0])
+    with pytest.raises(ArtifactError, match=r"_sequence_steps\.csv is damaged"):
+        found.steps  # noqa: B018
+    Trajectory.from_poses(np.arange(1), ["a"], at(7)).write(single)
+    assert SequencePair.find(pair.stem.parent, "A", "ios", "hl") is None
 
 
 def sequence_of(place: Path, folder: Path, **settings: object) -> None:

@@ -1,5 +1,6 @@
 """Evaluate and draw the sequence stage: recall after each step, and the query recordings from above."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,7 +15,7 @@ from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.tables import POSE_NAMES, as_strings, read_query_table
 from toolkit.capture.world_up import up_of_cameras
-from toolkit.files import pair_name
+from toolkit.files import file_fingerprint, pair_name, read_json, require_whole, sidecar_path
 from toolkit.geometry import Floats
 from toolkit.show.figures import GREEN, ORANGE, SKY, VERMILLION, new_figure, percent, shared_legend, styled
 from toolkit.show.metrics import (
@@ -33,6 +34,8 @@ from toolkit.show.top_view import ground_axes, places_of
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+log = logging.getLogger(__name__)
+
 MAX_PLACES = 4
 SINGLE, SEQUENCE = "single", "sequence"
 """Names of the first and the last step."""
@@ -50,13 +53,22 @@ class SequencePair:
 
     @classmethod
     def find(cls, poses_dir: str | Path, scene: str, map_device: str, query_device: str) -> "SequencePair | None":
-        """Return the files of a pair; None if the stage wrote none."""
+        """Return the files of a pair; None if the stage wrote none, or made them from other poses of single queries."""
         stem = Path(poses_dir) / pair_name(scene, map_device, query_device)
-        paths = (stem.with_name(f"{stem.name}.txt"), stem.with_name(f"{stem.name}_sequence.txt"))
-        return cls(stem) if all(path.is_file() for path in paths) else None
+        single, sequence = (stem.with_name(f"{stem.name}{end}.txt") for end in ("", "_sequence"))
+        if not (single.is_file() and sequence.is_file()):
+            return None
+        made_from = read_json(sidecar_path(sequence)).get("settings", {}).get("poses", [])
+        if made_from[:1] not in ([], [file_fingerprint(single)]):  # no record: by another tool
+            log.warning("%s is not used: %s has changed since. Run the sequence stage again.", sequence, single.name)
+            return None
+        return cls(stem)
 
     def _path(self, end: str) -> Path:
-        return self.stem.with_name(self.stem.name + end)
+        """Return a file of the pair; raise ArtifactError if it is damaged."""
+        path = self.stem.with_name(self.stem.name + end)
+        require_whole(path, of=None if end == ".txt" else self.stem.with_name(f"{self.stem.name}_sequence.txt"))
+        return path
 
     @cached_property
     def frames(self) -> pd.DataFrame:
