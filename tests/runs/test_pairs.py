@@ -5,8 +5,14 @@ from pathlib import Path
 import pytest
 
 from toolkit.errors import CaptureError, DamagedError, ManifestError
-from toolkit.runs.pairs import PairRows, left_out, left_out_of, way_out
+from toolkit.runs.pairs import PairRows, left_out, left_out_of, pair_devices, way_out
 from toolkit.runs.record import failures
+
+
+def test_the_devices_of_a_file_follow_from_its_name() -> None:
+    for stem in ("A_map_hl_2_query_ios", "A_map_hl_2_query_ios_sequence", "A_map_B_map_hl_2_query_ios"):
+        assert pair_devices(stem) == ("hl_2", "ios")
+    assert pair_devices("A_map_hl") == pair_devices("poses") == ("", "")
 
 
 def test_a_pair_that_cannot_be_done_is_a_row_with_the_reason(tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
 """Recordings read back: they hold the frames, poses and queries that the files say, and nothing else."""
 
+import shutil
+
 import numpy as np
 import pandas as pd
 import pyarrow as pa
@@ -226,6 +228,11 @@ def test_queries_stand_where_a_trajectories_file_says(capture, map_dir, tmp_path
     (dots,) = [row[2] for row in logged(read_back(done.path)["/world/queries/poses"], "Points3D:positions")]
     assert done.queries == 2
     np.testing.assert_allclose(dots, estimated[:, :3, 3], atol=1e-6)
+    # Poses of the sequence stage belong to the same pair.
+    asked["queries_pose"] = shutil.copy(file, tmp_path / "PLACE_map_hl_query_hl_sequence.txt")
+    done = record_session(capture, "query", "hl", out=tmp_path / "sequence.rrd", **asked)
+    assert (done.images, done.points) == (8, 1)
+    assert logged(read_back(done.path)["/world/queries/references"], "LineStrips3D:strips")
     with pytest.raises(ArtifactError, match="nothing to do with session ios_map"):
         record_session(capture, "map", "ios", out=tmp_path / "x.rrd", **asked)
 

@@ -19,6 +19,7 @@ from toolkit.files import image_name, read_references
 from toolkit.geometry import Floats, qt_from_pose, unit
 from toolkit.localizers.odometry import Odometry, recordings_of
 from toolkit.manifest import SequenceSettings
+from toolkit.runs.pairs import pair_devices
 from toolkit.show.figures import GREEN, ORANGE, VERMILLION, new_figure, plain_log, styled
 from toolkit.show.metrics import is_posed
 from toolkit.show.top_view import ground_axes, places_of
@@ -198,7 +199,7 @@ def _draw_rows(
 ) -> "Figure":
     """Draw one row per query: its image, then its first references in each entry of `rows`."""
     capture = Capture.from_sessions_root(sessions_root)
-    map_device, _, query_device = Path(jsonl).stem.rpartition("_map_")[2].partition("_query_")
+    map_device, query_device = pair_devices(Path(jsonl).stem)
     if not rows:
         figure = new_figure(4, 1)
         figure.text(0.5, 0.5, f"no queries of {query_device}", ha="center", va="center")
@@ -228,7 +229,7 @@ def draw_statuses(paths: Iterable[str | Path]) -> "Figure":
     Args:
         paths: poses of each pair, `<scene>_map_<M>_query_<Q>.txt` or `.csv`.
     """
-    tables = {Path(path).stem.rpartition("_map_")[2]: pd.read_csv(Path(path).with_suffix(".csv")) for path in paths}
+    tables = {pair_devices(Path(path).stem): pd.read_csv(Path(path).with_suffix(".csv")) for path in paths}
     figure = new_figure(8, 0.35 * len(tables) + 1.2)
     plot = figure.subplots()
     colors = {"ok": GREEN, "low_confidence": ORANGE, "failed": VERMILLION}
@@ -238,8 +239,7 @@ def draw_statuses(paths: Iterable[str | Path]) -> "Figure":
         heights = np.repeat(np.arange(len(rows)), [len(row) for row in rows])
         label = f"{status.replace('_', ' ')}: {len(inliers)}"
         plot.scatter(np.maximum(inliers, 0.5), heights, s=24, c=color, alpha=0.6, label=label, clip_on=False)
-    pairs = [name.partition("_query_")[::2] for name in tables]
-    plot.set_yticks(range(len(tables)), [f"{queried} in {mapped} map" for mapped, queried in pairs])
+    plot.set_yticks(range(len(tables)), [f"{queried} in {mapped} map" for mapped, queried in tables])
     plot.invert_yaxis()
     plot.set_xscale("log")
     least, most = plot.get_xlim()

@@ -20,6 +20,7 @@ from toolkit.geometry import Floats
 from toolkit.localizers.again import LocalizeAgain
 from toolkit.localizers.map import RETRIEVAL, SESSIONS_ROOT, Map, how_localized, label
 from toolkit.manifest import nearest
+from toolkit.runs.pairs import pair_devices
 from toolkit.show.answers import NUMBERS, Answer, reason_in_words
 from toolkit.show.choice import find_query, shown_name
 from toolkit.show.figures import shown
@@ -117,7 +118,7 @@ class InspectedPair:
             ArtifactError: the pair does not exist, or its files are missing or torn.
         """
         pairs = sorted(Path(poses_dir).glob("*_map_*_query_*.h5"))
-        names = [path.stem.rpartition("_map_")[2].partition("_query_")[::2] for path in pairs]
+        names = [pair_devices(path.stem) for path in pairs]
         if (map_device, query_device) not in names:
             known = [f"{query} in {map_}" for map_, query in names]
             raise ArtifactError(
@@ -277,8 +278,8 @@ class WorstQueries:
             map_device, query_device: devices of the pairs, or `all`.
         """
         pairs = []
-        for stem in sorted(path.with_suffix("") for path in Path(poses_dir).glob("*_map_*_query_*.h5")):
-            mapped, _, queried = stem.name.rpartition("_map_")[2].partition("_query_")
+        for path in sorted(Path(poses_dir).glob("*_map_*_query_*.h5")):
+            mapped, queried = pair_devices(path.stem)
             if map_device in ("all", mapped) and query_device in ("all", queried):
                 with suppress(*OF_THE_DATA):  # an unfinished pair has no table, or a session broke after a good run
                     pairs.append(InspectedPair(mapped, queried, poses_dir, None, map_dir, sessions_root))

@@ -21,6 +21,7 @@ from toolkit.errors import ArtifactError, CaptureError, ImageError
 from toolkit.files import file_fingerprint, files_fingerprint, write_sidecar
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.correspondences import LocalizedQueries, LocalizedQuery
+from toolkit.runs.pairs import pair_devices
 from toolkit.show import viewer
 from toolkit.show.figures import ORANGE
 from toolkit.show.localized import load_maps, map_files, sure_points
@@ -129,8 +130,7 @@ def record_session(
     poses = None if queries_pose is None else Path(queries_pose)
     localized = None if poses is None else _QueryPoses.read(poses, capture, session, vis_retrieve_queries)
     map_device = device if split == "map" else "" if localized is None else localized.map_device
-    h5 = None if poses is None else poses.with_suffix(".h5")
-    maps = map_files(map_dir, f"{map_device}_map", h5) if map_device else ()
+    maps = map_files(map_dir, f"{map_device}_map", localized.h5 if localized else None) if map_device else ()
     settings = {
         "images": session.files_fingerprint, "subsession": subsession,
         "session": files_fingerprint([*sorted(session.path.glob("*.txt")), *sorted(session.path.glob("proc/*.txt"))]),
@@ -511,6 +511,8 @@ class _QueryPoses:
     map_device: str
     """Map device from the name of the file; empty if the file is not named after a pair."""
     query_device: str
+    h5: Path
+    """The pair's correspondences, perhaps missing."""
     lines: list[Floats]
     """Positions (2, 3) of a query and of one of its references; empty unless read `with_references`."""
 
@@ -518,8 +520,9 @@ class _QueryPoses:
     def read(cls, path: Path, capture: Capture, session: Session, with_references: bool) -> "_QueryPoses":
         poses = Trajectory.read(path)
         prefix = f"{capture.name}_map_"
-        is_pair = path.stem.startswith(prefix) and "_query_" in path.stem
-        map_device, _, query_device = path.stem.removeprefix(prefix).partition("_query_") if is_pair else ("", "", "")
+        map_device, query_device = pair_devices(path.stem) if path.stem.startswith(prefix) else ("", "")
+        is_pair = map_device != ""
+        h5 = path.with_name(f"{path.stem.removesuffix('_sequence')}.h5")
         device = map_device if session.split == "map" else query_device
         if is_pair and device != session.device:
             raise ArtifactError(
@@ -527,13 +530,13 @@ class _QueryPoses:
                 f"session {session.id}. Expected a file for that device."
             )
         if not with_references:
-            return cls(poses, map_device, query_device, [])
+            return cls(poses, map_device, query_device, h5, [])
         if not is_pair:
             raise ArtifactError(
                 f"{path}: the references of its queries are in the h5 file of a pair, {prefix}<M>_query_<Q>.h5, but "
                 "this file is not named after a pair. Give the poses of a pair, or leave out vis_retrieve_queries."
             )
-        queries, map_session = LocalizedQueries(path.with_suffix(".h5")), capture[f"{map_device}_map"]
+        queries, map_session = LocalizedQueries(h5), capture[f"{map_device}_map"]
         centers = map_session.world_from_cam()[:, :3, 3]
         center_of = dict(zip(map_session.image_names, centers, strict=True))
         keys = zip(poses.timestamps.tolist(), poses.device_ids.tolist(), strict=True)
@@ -544,7 +547,7 @@ class _QueryPoses:
             if name in center_of
         ]
         queries.close()
-        return cls(poses, map_device, query_device, lines)
+        return cls(poses, map_device, query_device, h5, lines)
 
 
 def _log_queries(stream: "rr.RecordingStream", queries: _QueryPoses, session: Session) -> None:

@@ -15,6 +15,7 @@ import pandas as pd
 
 from toolkit.errors import ArtifactError
 from toolkit.files import SceneFiles, of_sequence, read_json, read_map_record, sidecar_path, write_text
+from toolkit.runs.pairs import pair_devices
 from toolkit.show.figures import number, percent
 from toolkit.show.metrics import (
     REASONS,
@@ -347,9 +348,9 @@ def _pairs_of(files: SceneFiles) -> dict[tuple[str, str], Path]:
     """Return the path of the results, without suffix, of each pair (map device, query device) that has any."""
     pairs = {}
     for path in sorted([*files.poses_dir.glob("*.csv"), *files.poses_dir.glob("*.txt")]):
-        devices = re.fullmatch(f"{re.escape(files.scene)}_map_(.+)_query_(.+)", path.stem)
-        if devices and not of_sequence(path.stem):
-            pairs[devices[1], devices[2]] = path.with_suffix("")
+        devices = pair_devices(path.stem)
+        if all(devices) and not of_sequence(path.stem):
+            pairs[devices] = path.with_suffix("")
     return pairs
 
 

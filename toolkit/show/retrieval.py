@@ -17,6 +17,7 @@ from toolkit.embedders import open_descriptors
 from toolkit.errors import ArtifactError
 from toolkit.files import image_name, read_references
 from toolkit.geometry import Floats, Ints
+from toolkit.runs.pairs import pair_devices
 from toolkit.show.choice import find_query, shown_name
 from toolkit.show.figures import BLUE, GRAY, GREEN, MAP, ORANGE, TRUE, new_figure, shared_legend, shown, styled
 from toolkit.show.localized import load_maps, map_files
@@ -100,7 +101,7 @@ class RetrievedPair:
         """
         capture = Capture.from_sessions_root(sessions_root)
         jsonl = Path(jsonl)
-        map_device, _, query_device = jsonl.stem.rpartition("_map_")[2].partition("_query_")
+        map_device, query_device = pair_devices(jsonl.stem)
         self.session, self.map_session = capture[f"{query_device}_query"], capture[f"{map_device}_map"]
         self.embeddings, self.lines = Path(embeddings), read_references(jsonl, "path")
         h5 = None if poses_dir is None else Path(poses_dir) / f"{jsonl.stem}.h5"
