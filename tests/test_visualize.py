@@ -2,6 +2,7 @@
 
 import shutil
 
+import h5py
 import numpy as np
 import pytest
 
@@ -9,7 +10,7 @@ from tests.localized import instants, some_correspondences, write_pair
 from toolkit import visualize
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError, CaptureError
-from toolkit.localizers.correspondences import LocalizedQuery
+from toolkit.localizers.correspondences import LocalizedQuery, query_group
 from toolkit.show.figures import new_figure
 from toolkit.visualize import sample_pictures, visualize_scene
 
@@ -108,6 +109,18 @@ def test_a_pair_that_was_left_out_has_its_reason_and_no_pictures(small_capture, 
     table = visualize_scene(small_capture / "sessions", tmp_path, None, out, QUICK, map_device="ios")
     assert table.set_index("query_device")["reason"].to_dict() == {"ios": "", "hl": "a dragon"}
     assert not any(path.exists() for path in stale)
+
+
+def test_a_pair_with_a_damaged_query_is_left_out_with_the_reason(small_capture, drawn, tmp_path):
+    capture = Capture.open(small_capture)
+    for device in ("ios", "hl"):
+        stem = write_pair(capture, tmp_path, "ios", device, queries_of(capture, device, 1))
+    with h5py.File(f"{stem}.h5", "a") as file:
+        del file[query_group(*instants(capture["hl_query"]).iloc[0])]["points"]
+    table = visualize_scene(small_capture / "sessions", tmp_path, None, tmp_path / "out", QUICK)
+    reasons = table.set_index("query_device")["reason"]
+    assert reasons["ios"] == ""
+    assert f"{stem.name}.h5" in reasons["hl"]
 
 
 def test_pictures_of_an_earlier_run_go(small_capture, drawn, tmp_path):

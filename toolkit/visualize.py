@@ -3,6 +3,7 @@
 import re
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
@@ -13,7 +14,7 @@ import pandas as pd
 from tqdm.auto import tqdm
 
 from toolkit.capture import Capture
-from toolkit.errors import ArtifactError
+from toolkit.errors import ArtifactError, DamagedError
 from toolkit.files import pair_name
 from toolkit.geometry import Floats
 from toolkit.manifest import VisualizeSettings
@@ -88,7 +89,11 @@ def visualize_scene(
             started = time.perf_counter()
             pair = LocalizedPair.open(capture, m, q, poses_dir, map_dir)
             sequences = SequencePair.find(poses_dir, capture.name, m, q)
-            worst.append(_draw_pair(capture, pair, sequences, out, settings))
+            try:
+                with closing(pair.queries):
+                    worst.append(_draw_pair(capture, pair, sequences, out, settings))
+            except DamagedError as error:
+                raise ArtifactError(str(error)) from None  # the localize stage can make the file again, this one cannot
             row |= {
                 "queries": len(pair.table),
                 "localized": int(is_posed(pair.world_from_rig).sum()),
@@ -181,9 +186,7 @@ def _draw_pair(
         )
     worst = order[:WORST]
     rows = shown.ranked.iloc[worst]
-    rows = rows.assign(unit=pair.unit[0], pair=f"{q} in the {m} map", details=[details_of(k) for k in worst])
-    pair.queries.close()
-    return rows
+    return rows.assign(unit=pair.unit[0], pair=f"{q} in the {m} map", details=[details_of(k) for k in worst])
 
 
 def _poses(capture: Capture, poses_dir: str | Path, map_device: str, query_device: str) -> Path:
