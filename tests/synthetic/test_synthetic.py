@@ -327,6 +327,35 @@ def test_a_complete_capture_is_left_as_it_is_and_an_incomplete_one_is_not(
     assert (out / "demo.json").exists()  # the old one stays until a new one can take its place
 
 
+@pytest.mark.parametrize("listed", [True, False], ids=["files listed", "files counted, as by earlier versions"])
+def test_what_was_added_to_a_rendered_capture_is_kept(tmp_path: Path, listed: bool) -> None:
+    out = render_bare(tmp_path / "C", 1, 2, seed=1)
+    if not listed:
+        settings = json.loads((out / "demo.json").read_text())
+        settings["files"] = sum(path.is_file() for path in out.rglob("*")) - 1
+        (out / "demo.json").write_text(json.dumps(settings))
+    image = next(out.rglob("*.jpg"))
+    (out / "sessions" / ".DS_Store").touch()
+    before = image.stat().st_ino
+    assert render_bare(out, 1, 2, seed=1) == out
+    assert image.stat().st_ino == before, "rendered anew"
+
+    added = out / "sessions" / "drone_query" / "images.txt"
+    added.parent.mkdir()
+    added.write_text("mine")
+    refused = "would delete sessions/drone_query/images.txt" if listed else "would delete sessions/"
+    with pytest.raises(CaptureError, match=refused):
+        render_bare(out, 1, 2, seed=5)
+    if listed:
+        assert render_bare(out, 1, 2, seed=1) == out
+        image.unlink()
+        with pytest.raises(CaptureError, match=refused):
+            render_bare(out, 1, 2, seed=1)
+        shutil.rmtree(added.parent)
+        render_bare(out, 1, 2, seed=1)
+        assert image.exists()
+
+
 def test_a_rendering_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object, **__: object) -> None:
         raise OSError("disk full")

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from toolkit.errors import CaptureError
-from toolkit.files import write_folder
+from toolkit.files import read_json, write_folder
 from toolkit.geometry import Floats, invert, pose_from_qt
 from toolkit.synthetic.devices import DEVICES, Device, Sensor, scaled, walk_street, walks
 from toolkit.synthetic.light import paint
@@ -372,17 +372,18 @@ def _render(out: Path, world: World, settings: dict[str, int], progress: bool) -
     """Render a capture into a temporary folder and move it to `out`, unless it is there already."""
     if _is_complete(out, settings):
         return out
-    if out.exists() and any(out.iterdir()) and not (out / "demo.json").exists():
+    if added := sorted(_files(out) - _rendered(out)[1]):
         raise CaptureError(
-            f"{out} is not empty and has no demo.json, so it is not a rendered capture. Choose another folder."
+            f"{out} has to be rendered anew, which would delete {added[0]}: its demo.json does not list it. Move what "
+            "you have added, delete the folder, or choose another."
         )
     threads = cv2.getNumThreads()
     try:
         cv2.setNumThreads(1)  # the renderer's pool already has one thread per core
         with write_folder(out) as folder:
             _render_sessions(folder, world, progress)
-            count = sum(1 for path in folder.rglob("*") if path.is_file())
-            (folder / "demo.json").write_text(json.dumps({**settings, "files": count}, indent=1) + "\n")
+            record = {**settings, "files": sorted(_files(folder))}
+            (folder / "demo.json").write_text(json.dumps(record, indent=1) + "\n")
             if out.exists() and not _is_complete(out, settings):
                 shutil.rmtree(out)
     except OSError:
@@ -444,10 +445,19 @@ def _render_sessions(out: Path, world: World, progress: bool) -> None:
 
 
 def _is_complete(out: Path, settings: dict[str, int]) -> bool:
-    """Return whether `out` contains the complete capture with these settings."""
-    try:
-        written = json.loads((out / "demo.json").read_text())
-    except (OSError, ValueError):
-        return False
-    count = sum(1 for path in out.rglob("*") if path.is_file()) - 1
-    return bool(written == {**settings, "files": count})
+    """Return whether `out` contains the complete capture with these settings, and perhaps more."""
+    (written, files, count), present = _rendered(out), _files(out)
+    return written == settings and files <= present and count in (None, len(present))
+
+
+def _rendered(out: Path) -> tuple[dict[str, Any], set[str], int | None]:
+    """Return settings, files, and number of files of a rendered capture; earlier versions recorded only the number."""
+    written = read_json(out / "demo.json")
+    files = written.pop("files", None)
+    return (written, set(files), None) if isinstance(files, list) else (written, set(), files)
+
+
+def _files(out: Path) -> set[str]:
+    """Return the files of a capture except demo.json, and except those that macOS adds to every folder it shows."""
+    paths = (path for path in out.rglob("*") if path.is_symlink() or path.is_file())
+    return {path.relative_to(out).as_posix() for path in paths if path.name != ".DS_Store"} - {"demo.json"}
