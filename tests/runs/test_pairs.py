@@ -64,7 +64,7 @@ def test_the_way_out_names_the_device() -> None:
 def test_failures_are_counted_once() -> None:
     lost = [{"what": "", "reason": "x"}]
     rows = [
-        {"scene": "P", "stage": "embed", "counts": {"images": 9, "unreadable": 2}, "asked": 6, "left_out": lost},
+        {"scene": "P", "stage": "embed", "counts": {"images": 9, "unreadable": 2}, "asked": 12, "left_out": lost * 6},
         {"scene": "P", "stage": "retrieve", "asked": 9, "left_out": lost * 5},
         {"scene": "P", "stage": "localize", "counts": {"queries": 7, "failed": 1}, "asked": 9, "left_out": lost * 5},
         {"scene": "Q", "stage": "localize", "counts": {"queries": 3, "failed": 0}, "asked": 4, "left_out": []},
@@ -72,3 +72,4 @@ def test_failures_are_counted_once() -> None:
     assert failures(rows) == {
         "images": {"failed": 2, "of": 9}, "queries": {"failed": 1, "of": 10}, "pairs": {"failed": 5, "of": 13}
     }  # fmt: skip
+    assert failures(rows[:1])["pairs"] == {"failed": 6, "of": 12}, "without pairs, recordings"

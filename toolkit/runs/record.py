@@ -119,11 +119,15 @@ def failures(rows: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
             if row["stage"] == stage and {kind, name} <= counts.keys():
                 totals[kind]["failed"] += counts[name]
                 totals[kind]["of"] += counts[kind]
-        of_stage = pairs.setdefault((row["scene"], row["stage"]), [0, 0])
-        of_stage[0] += len(row.get("left_out", ()))
-        of_stage[1] += row.get("asked", 0)
+        if "asked" in row:
+            of_stage = pairs.setdefault((row["scene"], row["stage"]), [0, 0])
+            of_stage[0] += len(row.get("left_out", ()))
+            of_stage[1] += row["asked"]
     for scene in dict.fromkeys(scene for scene, _ in pairs):  # a failed pair fails in all later stages: count it once
-        failed, total = max(counts for (of, _), counts in pairs.items() if of == scene)
+        of_stages = {stage: counts for (of, stage), counts in pairs.items() if of == scene}
+        if len(of_stages) > 1:
+            of_stages.pop("embed", None)  # its rows are recordings, not pairs
+        failed, total = max(of_stages.values())
         totals["pairs"]["failed"] += failed
         totals["pairs"]["of"] += total
     return totals
