@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -242,6 +243,29 @@ def test_some_pairs_take_an_execution_each(place: Path, go: Callable[..., dict[s
     go("pairs=[[ios, hl], [hl, ios]]", only="retrieve")
     record = json.loads((place / "runs/run/run.json").read_text())
     assert [row["status"] for row in record["stages"]] == ["reused", "reused"]
+
+
+def test_devices_select_pairs_of_sessions_that_exist(place: Path) -> None:
+    spot = place / "P" / "sessions" / "spot_query"
+    spot.mkdir()
+    (spot / "images.txt").touch()
+
+    def labels(stage: str, *overrides: str) -> list[str]:
+        manifest = load_manifest(place / "run.yaml", overrides)
+        files = SceneFiles(place / "runs" / "run", "P")
+        return [job.label for job in pipeline._jobs(manifest, stage, place / "P", files, force=False)]
+
+    assert labels("retrieve", "devices=[ios, spot]") == ["map_ios_query_ios", "map_ios_query_spot"]
+    assert labels("embed", "devices=[ios, spot]") == ["ios_", "spot_"]
+    assert labels("retrieve", "devices=[spot, hl, ios]") == labels("retrieve") == [""]
+    # A pair that is asked for by name gets a row that says what is missing.
+    named = "pairs=[[ios, ios], [spot, ios], [spot, spot], [ios, spot], [hl, hl], [hl, ios]]"
+    assert len(labels("retrieve", named)) == 6
+    with pytest.raises(ManifestError, match=r"Its sessions: .*spot_query"):
+        labels("retrieve", "devices=[spot]")
+    shutil.rmtree(place / "P" / "sessions" / "ios_map")
+    shutil.rmtree(place / "P" / "sessions" / "hl_map")
+    assert labels("embed", "devices=[ios]") == ["ios_"]
 
 
 def test_reranking_is_switched_on_by_its_section(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:

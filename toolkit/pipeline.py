@@ -15,6 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -490,18 +491,20 @@ def _parts(manifest: Manifest, stage: str, capture: Path) -> list[tuple[str, dic
     """Return (label, parameters that select devices) for each job of a stage."""
     from toolkit.capture import Capture
 
-    present = Capture.open(capture).devices
-    devices = present if manifest.devices == "auto" else [d for d in present if d in manifest.devices]
-    pairs = [(m, q) for m in devices for q in devices]
-    if manifest.pairs != "all":
-        wanted = dict.fromkeys((m, q) for m, q in manifest.pairs)
-        pairs = [(m, q) for m, q in wanted if m in devices and q in devices]
+    content = Capture.open(capture)
+    present = content.devices
+    # Without any map or query session, the stages say what is missing.
+    maps, queries = ([d for d in present if f"{d}_{split}" in content] or present for split in ("map", "query"))
+    every = list(product(maps, queries))
+    devices = present if manifest.devices == "auto" else manifest.devices
+    wanted = every if manifest.pairs == "all" else dict.fromkeys((m, q) for m, q in manifest.pairs)
+    pairs = [(m, q) for m, q in wanted if {m, q} <= {*devices} & {*present}]
     if not pairs:
         raise ManifestError(
-            f"{capture}: none of the devices or pairs of the manifest is in this capture. "
-            f"Its devices: {', '.join(present) or 'none'}."
+            f"{capture}: `devices` and `pairs` of the manifest select none of its maps with queries. "
+            f"Its sessions: {', '.join(content)}."
         )
-    if len(pairs) == len(present) ** 2:
+    if set(pairs) == set(every):
         return [("", {"device": "auto", "map_device": "all", "query_device": "all"})]
     if stage == "embed":
         return [(f"{d}_", {"device": d}) for d in present if any(d in pair for pair in pairs)]
