@@ -22,7 +22,14 @@ from safetensors.torch import save_file
 from toolkit import notebook, pipeline
 from toolkit.errors import ManifestError, ToolkitError, WeightsError
 from toolkit.files import SceneFiles, write_sidecar, write_text
-from toolkit.manifest import STAGES, LocalizeSettings, RerankSettings, RetrieveSettings, load_manifest
+from toolkit.manifest import (
+    STAGES,
+    LocalizeSettings,
+    RerankSettings,
+    RetrieveSettings,
+    VisualizeSettings,
+    load_manifest,
+)
 from toolkit.pipeline import StageError
 
 DEFAULT = ("explore", "embed", "retrieve", "localize", "evaluate", "visualize")
@@ -223,6 +230,19 @@ def test_what_the_sequence_stage_writes_is_not_of_localize(place: Path, name: st
     write_text(files.poses_dir / f"{pair}_sequence{name}", "frames")
     assert localize.outputs() == before[0]
     assert sequence.outputs() != before[1]
+    before = localize.outputs(), sequence.outputs()
+    write_text(files.poses_dir / "A_sequence_map_ios.json", "the map")
+    assert localize.outputs() != before[0]
+    assert sequence.outputs() == before[1]
+
+
+def test_a_lost_picture_of_a_recording_makes_visualize_run_again(place: Path) -> None:
+    job = pipeline.Job("visualize", SceneFiles(place / "runs", "P"), VisualizeSettings(), {})
+    picture = job.files.visualization / "P_map_ios_query_hl_sequence.png"
+    write_text(picture, "a recording")
+    before = job.outputs()
+    picture.unlink()
+    assert job.outputs() != before
 
 
 def test_a_stage_with_something_to_try_again_is_not_reused(place: Path, go: Callable[..., dict[str, str]]) -> None:

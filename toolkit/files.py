@@ -360,7 +360,8 @@ def pair_name(scene: str, map_device: str, query_device: str) -> str:
 
 def of_sequence(name: str) -> bool:
     """Tell by its name whether a file is from the sequence stage, which writes beside the poses of single queries."""
-    return "_sequence" in name.rpartition("_query_")[2]
+    _, query, rest = name.rpartition("_query_")
+    return bool(query) and "_sequence" in rest
 
 
 def map_record_path(poses_dir: str | Path, scene: str, map_device: str) -> Path:

@@ -109,7 +109,9 @@ class Job:
 
     def makes(self, name: str) -> bool:
         """Return whether this job writes a file, given by its path in the stage's folder of results."""
-        return self.label in name and (self.stage == "sequence") == of_sequence(name)
+        if self.stage in ("localize", "sequence") and of_sequence(name) != (self.stage == "sequence"):
+            return False
+        return self.label in name
 
     def outputs(self) -> str:
         """Return a fingerprint of the files that the job has made."""
