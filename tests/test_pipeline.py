@@ -245,6 +245,24 @@ def test_a_lost_picture_of_a_recording_makes_visualize_run_again(place: Path) ->
     assert job.outputs() != before
 
 
+@pytest.mark.parametrize(
+    ("stage", "label", "mine", "not_mine"),
+    [
+        ("localize", "map_hl_query_hl", ["{}.left_out.json"], ["P_map_hl_query_hl2.txt", "{}_sequence.txt"]),
+        ("sequence", "map_hl_query_hl", ["{}_sequence_steps.csv"], ["{}.txt", "P_map_hl_query_hl2_sequence.csv"]),
+        ("retrieve", "map_hl_query_hl", ["./{}.jsonl.meta.json"], ["P_map_my-hl_query_hl.jsonl"]),
+        ("embed", "hl_", ["hl_map/hl_1/a.npy", "vlad/hl_query/a/a.npy"], ["my-hl_map/a.npy", "my-hl_map/hl_1/a.npy"]),
+    ],
+)
+def test_a_device_with_the_name_of_another_in_its_own_is_told_apart(
+    stage: str, label: str, mine: list[str], not_mine: list[str]
+) -> None:
+    job = pipeline.Job(stage, SceneFiles(Path("runs"), "P"), LocalizeSettings(), {}, label)
+    for names, expected in ((mine, True), (not_mine, False)):
+        for name in names:
+            assert job.makes(name.format("P_map_hl_query_hl")) == expected, name
+
+
 def test_a_stage_with_something_to_try_again_is_not_reused(place: Path, go: Callable[..., dict[str, str]]) -> None:
     jsonl = place / "runs/run/P/retrieval/P_map_all_query_all.jsonl"
     write_text(jsonl, "10")

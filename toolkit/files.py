@@ -11,7 +11,7 @@ import re
 import secrets
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -224,9 +224,9 @@ def require_whole(path: str | Path, of: str | Path | None = None) -> None:
         )
 
 
-def any_unfinished(folder: str | Path, part: str = "") -> bool:
-    """Tell whether any artifact below a folder with `part` in its path is recorded as unfinished."""
-    records = (path for path in Path(folder).rglob("*.meta.json") if part in path.relative_to(folder).as_posix())
+def any_unfinished(folder: str | Path, of: Callable[[str], bool]) -> bool:
+    """Tell whether any artifact below a folder, selected by its path in the folder, is recorded as unfinished."""
+    records = (path for path in Path(folder).rglob("*.meta.json") if of(path.relative_to(folder).as_posix()))
     return any(_read_record(path.with_name(path.name.removesuffix(".meta.json"))).get("unfinished") for path in records)
 
 

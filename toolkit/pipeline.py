@@ -9,6 +9,7 @@ import hashlib
 import json
 import logging
 import os
+import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
@@ -109,9 +110,12 @@ class Job:
 
     def makes(self, name: str) -> bool:
         """Return whether this job writes a file, given by its path in the stage's folder of results."""
-        if self.stage in ("localize", "sequence") and of_sequence(name) != (self.stage == "sequence"):
+        if self.stage == "embed":  # a folder per session, perhaps below one per model; only sessions have a _
+            return re.match(f"([^_/]+/)?{self.label}", name) is not None
+        pair = name.rpartition("/")[2].removeprefix(f"{self.files.scene}_")
+        if self.stage in ("localize", "sequence") and of_sequence(pair) != (self.stage == "sequence"):
             return False
-        return self.label in name
+        return not self.label or re.match(f"{self.label}(?![a-z0-9-])", pair) is not None
 
     def outputs(self) -> str:
         """Return a fingerprint of the files that the job has made."""
@@ -586,7 +590,7 @@ def _run_job(
     row |= {"work_seconds": round(work, 2), "peak_memory_mb": round(memory), "counts": counts}
     folder = stage_outputs(job.files, job.stage)
     # With unfinished outputs, an empty fingerprint makes the next run execute the stage again.
-    outputs = "" if folder and any_unfinished(folder, job.label) else job.outputs()
+    outputs = "" if folder and any_unfinished(folder, job.makes) else job.outputs()
     made = {"made": datetime.now(UTC).isoformat(), "inputs": inputs, "outputs": outputs, "row": row}
     write_text(job.record, json.dumps(made, indent=1) + "\n")
     summary = ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in counts.items())
