@@ -459,6 +459,26 @@ def test_a_stage_that_was_stopped_is_not_taken_for_the_one_before(
     assert go() == {"embed": "reused", "retrieve": "done"}, "its notebook is not of a whole execution any more"
 
 
+def test_only_results_of_this_manifest_are_listed_as_reused(
+    place: Path, go: Callable[..., dict[str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    def listed() -> list[tuple[str, str, str]]:
+        rows = json.loads((place / "runs/run/run.json").read_text())["stages"]
+        return [(row["stage"], row["part"], row["status"]) for row in rows]
+
+    go("pairs=[[ios, ios]]")
+    go()
+    go(only="embed")
+    assert listed() == [("embed", "", "reused"), ("retrieve", "", "reused")], "not also those of the pair"
+    monkeypatch.setattr(pipeline, "execute", stop)
+    with pytest.raises(KeyboardInterrupt):
+        go("embed.model=auto", force=True)
+    assert listed() == [("embed", "", "interrupted")], "retrieve has the results of former settings"
+
+
 def test_output_that_cannot_be_written_is_said(place: Path) -> None:
     (place / "file").write_text("in the way")
     with pytest.raises(ManifestError, match=r"output_root: .*file/runs"):

@@ -262,12 +262,14 @@ def _check_stages(manifest: Manifest, manifest_path: str | Path) -> None:
 
 def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: bool, say: Say, kernels: Kernels) -> None:
     captures = _captures(manifest, kernels)
-    jobs = [
+    every = [
         job
         for capture in captures
-        for stage in stages
+        for stage in STAGES
+        if stage in manifest.stages
         for job in _jobs(manifest, stage, capture, SceneFiles(run_dir, capture.name), force)
     ]
+    jobs = [job for job in every if job.stage in stages]
     inputs = {capture.name: tree_fingerprint(capture / "sessions") for capture in captures}
     for job in jobs:
         # Weights first, because `_reusable` reads all output files of the job.
@@ -275,7 +277,8 @@ def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: boo
             force or not _reusable(job, _inputs_of(job, inputs[job.files.scene]))
         ):
             _require_weights(job.stage, job.settings)
-    record = RunLog(run_dir, manifest, inputs, _code_fingerprint())
+    earlier = [job.record for job in every if job.stage not in stages]
+    record = RunLog(run_dir, manifest, inputs, _code_fingerprint(), earlier)
     try:
         record.write()
         failed: list[tuple[Job, StageError]] = []

@@ -5,7 +5,7 @@ import json
 import os
 import platform
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -36,6 +36,8 @@ class RunLog:
     """Fingerprint of each scene's capture."""
     code: str
     """Fingerprint of the toolkit's code."""
+    earlier: Sequence[Path] = ()
+    """Records of the jobs that this run leaves out (`--only`); missing if a job has never been finished."""
     status: str = "running"
     """`running`, `done`, `incomplete` (more failed than the manifest tolerates), `failed`, or `interrupted`."""
     error: str | None = None
@@ -98,14 +100,9 @@ class RunLog:
 
     def all_rows(self) -> list[dict[str, Any]]:
         """Return this run's rows and, for stages that it did not run (`--only`), the rows in their records."""
-        mine = {(row["scene"], row["stage"]) for row in self.rows}
-        rows = list(self.rows)
-        for scene in self.inputs:
-            for record in sorted((self.run_dir / scene / ".stages").glob("*.json")):
-                row = read_json(record).get("row")
-                if row and row["stage"] in self.manifest.stages and (scene, row["stage"]) not in mine:
-                    rows.append({**row, "status": "reused"})
+        kept = [row for path in self.earlier if (row := read_json(path).get("row"))]
         scenes = list(self.inputs)
+        rows = [*self.rows, *({**row, "status": "reused"} for row in kept)]
         return sorted(rows, key=lambda row: (scenes.index(row["scene"]), STAGES.index(row["stage"])))
 
 
