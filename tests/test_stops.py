@@ -343,13 +343,14 @@ def test_the_exit_codes_and_the_summary(
     assert command("run", "no.yaml") == 1
 
     parameters = 'sessions_root = None\nout_dir = None\nmodel = "vlad"\nskip_existing = True'
-    counts = "from toolkit import notebook\nnotebook.finish(images=10, unreadable=1)"
+    counts = "from toolkit import notebook\nnotebook.finish(images=100, unreadable=29)"
     write_notebook(here / "notebooks", "embed", parameters, counts)
     code, summary, shown = asked()
     assert (code, summary["status"], summary["exit_code"]) == (2, "incomplete", 2)
-    assert "1 of 10 images" in summary["error"]
+    assert "29 of 100 images" in summary["error"]
     assert asked()[0] == 2, "also where all is reused"
-    assert asked("--set", "tolerate_failed.images=0.1")[0] == 0
+    assert asked("--set", "tolerate_failed.images=0.28")[0] == 2
+    assert asked("--set", "tolerate_failed.images=0.29")[0] == 0, "0.29 * 100 is rounded to less than 29"
 
     monkeypatch.setattr(pipeline, "execute", raising(KeyError("dragon")))
     code, summary, shown = asked("--force")

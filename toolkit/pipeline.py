@@ -356,7 +356,7 @@ def _not_tolerated(
     rows = record.all_rows()
     for kind, counts in failures(rows).items():
         tolerated = getattr(manifest.tolerate_failed, kind)
-        if counts["failed"] > tolerated * counts["of"]:
+        if counts["of"] and counts["failed"] / counts["of"] > tolerated:  # a product would be rounded below the count
             lines.append(
                 f"{counts['failed']} of {counts['of']} {kind} failed; tolerate_failed.{kind} is {tolerated:g}."
             )
