@@ -155,6 +155,22 @@ def test_a_stage_runs_again_only_when_something_has_changed(
     assert go("retrieve.topk=3", only="embed")["embed"] == done
 
 
+def test_no_kernel_is_started_for_what_is_reused(
+    place: Path, go: Callable[..., dict[str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left: list[int] = []
+
+    def execute(*args: Any) -> tuple[Any, float]:
+        left.append(args[4].left)
+        return execute_here(*args)
+
+    monkeypatch.setattr(pipeline, "execute", execute)
+    go()
+    assert left[0] == 2
+    assert go("retrieve.topk=3") == {"embed": "reused", "retrieve": "done"}
+    assert left[2:] == [1]
+
+
 def test_a_sweep_takes_over_what_does_not_depend_on_its_keys(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pipeline, "execute", execute_here)
     said: list[str] = []

@@ -282,8 +282,8 @@ def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: boo
     try:
         record.write()
         failed: list[tuple[Job, StageError]] = []
-        kernels.left = len(jobs)
         for i, job in enumerate(jobs, 1):
+            kernels.left = len(jobs) - i + 1
             head = f"[{i}/{len(jobs)}] {job.stage:<9} {job.name}"
             try:
                 _run_or_reuse(job, inputs[job.files.scene], failed, force, head, record, say, kernels)
