@@ -46,6 +46,8 @@ def test_keys_of_one_last_part_are_told_apart() -> None:
         (["retrieve.topk=[1"], "expected key=value,value"),
         (["retrieve.topk=1", "retrieve.topk=2"], "twice"),
         (["embed.model=[a b],a b"], "the same folder name"),
+        (["retrieve.topk=1,2", "demo_data.seed=0,1"], r"--sweep demo_data\.seed: .* --set demo_data\.seed="),
+        (["captures=[a],[b]"], "--sweep captures: all runs"),
         ([f"seed={','.join(map(str, range(101)))}"], "found 101 runs"),
     ],
 )

@@ -36,7 +36,7 @@ def swept_runs(name: str, sweeps: Sequence[str]) -> list[SweptRun]:
         sweeps: `key=a,b,c` each. Values are YAML: `embed.model=vlad,[megaloc, vlad]` has two values.
 
     Raises:
-        ManifestError: a sweep has another form, repeats a key, or has too many runs.
+        ManifestError: a sweep has another form, repeats a key, changes the captures, or has too many runs.
     """
     keys, values = [], []
     for sweep in sweeps:
@@ -54,6 +54,11 @@ def swept_runs(name: str, sweeps: Sequence[str]) -> list[SweptRun]:
         values.append(list(dict.fromkeys(texts)))
     if twice := [key for key in keys if keys.count(key) > 1]:
         raise ManifestError(f"--sweep {twice[0]}: found it twice, expected one list of values per key.")
+    if other := [key for key in keys if key.partition(".")[0] in ("captures", "demo_data")]:
+        raise ManifestError(
+            f"--sweep {other[0]}: all runs of a sweep have the same captures, so that they can be compared. Run the "
+            f"manifest once per value instead: --set {other[0]}=... --set name=..."
+        )
     combinations = list(product(*values))
     if len(combinations) > MOST_RUNS:
         raise ManifestError(f"--sweep: found {len(combinations)} runs, expected at most {MOST_RUNS}. Use fewer values.")
