@@ -238,6 +238,23 @@ def test_an_address_without_host_or_port_is_refused(asked: str) -> None:
         pass
 
 
+@pytest.mark.parametrize(
+    ("visible", "given"),
+    [("", [None] * 4), ("-1", [None] * 4), ("2,5", ["2", "5"]), ("GPU-ab,-1", ["GPU-ab"]), (None, ["0", "1", "2"])],
+)
+def test_local_workers_use_the_gpus_that_are_visible(
+    monkeypatch: pytest.MonkeyPatch, visible: str | None, given: list[str | None]
+) -> None:
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    if visible is not None:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    monkeypatch.setattr(Path, "glob", lambda folder, pattern: [Path(f"/dev/nvidia{number}") for number in range(3)])
+    monkeypatch.setattr(clusters, "default_workers", lambda: 4)
+    monkeypatch.setattr("distributed.SpecCluster", lambda workers, **_: workers)
+    workers = clusters._local_cluster(0)
+    assert [one["options"]["env"].get("CUDA_VISIBLE_DEVICES") for one in workers.values()] == given
+
+
 def test_without_dask_one_sentence_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ManifestError, match=r"pip install -e '.\[cluster\]'"), open_cluster("local"):

@@ -247,7 +247,10 @@ def _local_cluster(count: int) -> Any:
     from distributed import Nanny, Scheduler, SpecCluster
 
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-    gpus = visible.split(",") if visible else [path.name[6:] for path in sorted(Path("/dev").glob("nvidia[0-9]*"))]
+    if visible is None:
+        gpus = [path.name[6:] for path in sorted(Path("/dev").glob("nvidia[0-9]*"))]
+    else:  # an empty text or -1 hides all GPUs
+        gpus = [name for name in visible.split(",") if name.strip() and not name.strip().startswith("-")]
     count = count or len(gpus) or default_workers()
     # A worker runs one share at a time. The toolkit bounds its own memory, so Dask need not.
     options = {"nthreads": 1, "memory_limit": 0, "silence_logs": logging.ERROR}
