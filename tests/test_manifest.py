@@ -10,7 +10,9 @@ from toolkit.manifest import (
     STAGES,
     LocalizeSettings,
     Manifest,
+    MapSettings,
     MatcherSettings,
+    PredictorSettings,
     Settings,
     describe,
     load_manifest,
@@ -294,6 +296,10 @@ def test_a_plain_value_stands_for_the_field_that_matters(tmp_path: Path) -> None
     assert manifest.localize.features.kinds == ["sift"]
     assert manifest.localize.predictor.name == "simulated"
     assert LocalizeSettings.of({"features": ("sift",)}).features.kinds == ["sift"]
+    section = {"predictor": PredictorSettings(name="da3-small"), "map": MapSettings(tile_images=9)}
+    assert LocalizeSettings.of({"predictor": {"batch_size": 3}}, section) == LocalizeSettings(
+        predictor=PredictorSettings(name="da3-small", batch_size=3), map=MapSettings(tile_images=9)
+    )
 
 
 def test_switching_a_stage_on_keeps_its_settings(tmp_path: Path) -> None:

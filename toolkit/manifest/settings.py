@@ -91,6 +91,7 @@ def expand(model: type[Settings], raw: Mapping[str, Any]) -> dict[str, Any]:
     for key, value in raw.items():
         inner = nested_model(model.model_fields[key].annotation) if key in model.model_fields else None
         if inner and issubclass(inner, Settings):
+            value = value.given() if isinstance(value, Settings) else value
             if isinstance(value, dict):
                 value = expand(inner, value)
             elif inner.shorthand and value is not None:
