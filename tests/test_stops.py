@@ -358,6 +358,18 @@ def test_the_exit_codes_and_the_summary(
     assert "Traceback" not in shown
 
 
+def test_a_sweep_whose_runs_cannot_be_compared_is_done(
+    here: Path, command: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command("run", "run.yaml", "--json", "--sweep", "retrieve.topk=3,5") == 0
+    out, err = capsys.readouterr()
+    runs = {f"run-topk-{k}": str(here / f"runs/run-topk-{k}") for k in (3, 5)}
+    assert json.loads(out)["runs"] == runs
+    assert "Nothing to compare: " in err
+    assert command("run", "run.yaml", "--sweep", "retrieve.topk=3,5") == 0
+    assert "Nothing to compare: " in capsys.readouterr().out
+
+
 def test_one_capture_that_fails_does_not_stop_the_others(here: Path, command: Callable[..., int]) -> None:
     shutil.copytree(here / "P", here / "Q")
     code = "from toolkit.errors import CaptureError\nif '/P/' in out_jsonl:\n    raise CaptureError('a dragon')"

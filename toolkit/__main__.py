@@ -16,7 +16,7 @@ from typing import Annotated, Any
 try:
     import typer
 
-    from toolkit.errors import IncompleteError, ManifestError, ToolkitError, exit_code, sentence
+    from toolkit.errors import ArtifactError, IncompleteError, ManifestError, ToolkitError, exit_code, sentence
 except ModuleNotFoundError as missing:  # users may run `python -m toolkit` with the wrong Python
     raise SystemExit(
         f"Error: {sys.executable} has no package {missing.name}. Use the Python that the toolkit is installed for: "
@@ -440,8 +440,15 @@ def _sweep(
     for result in map(summary, folders):
         if result["exit_code"] != 0:
             errors.append(IncompleteError(f"{result['name']}: {result['error']}"))
+    as_json = as_json and not errors  # if there is an error, stdout has its JSON instead
     if len(folders) > 1:
-        _compare(folders, tell, as_json and not errors)  # if there is an error, stdout has its JSON instead
+        try:
+            _compare(folders, tell, as_json)
+        except ArtifactError as error:  # not evaluated (`--only`), or without ground truth
+            text = f"Nothing to compare: {sentence(error)}"
+            tell(text)
+            if as_json:
+                _print_json({"runs": {folder.name: str(folder) for folder in folders}, "messages": [text]})
     if errors:
         raise errors[0]
 
