@@ -349,6 +349,8 @@ def test_the_exit_codes_and_the_summary(
     assert (code, summary["status"], summary["exit_code"]) == (2, "incomplete", 2)
     assert "29 of 100 images" in summary["error"]
     assert asked()[0] == 2, "also where all is reused"
+    code, summary, shown = asked("--sweep", "retrieve.topk=3,5")
+    assert (code, summary["status"], summary["exit_code"]) == (2, "incomplete", 2)
     assert asked("--set", "tolerate_failed.images=0.28")[0] == 2
     assert asked("--set", "tolerate_failed.images=0.29")[0] == 0, "0.29 * 100 is rounded to less than 29"
 

@@ -112,7 +112,7 @@ def run(
         run_dir = pipeline.run(manifest, only=only, force=force, overrides=overrides or (), say=tell, cluster=cluster)
     except BaseException as error:
         if as_json:
-            status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+            status = {IncompleteError: "incomplete", KeyboardInterrupt: "interrupted"}.get(type(error), "failed")
             outcome = {"status": status, "exit_code": exit_code(error), "error": sentence(error)}
             _print_json(_summary_of_stopped(manifest, overrides or ()) | outcome)
         raise
