@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
+from unittest.mock import Mock
 
 import cv2
 import h5py
@@ -22,7 +23,7 @@ from numpy.testing import assert_allclose
 
 from tests.calls import call
 from tests.other_kind import add_other_kind
-from toolkit import geometry, localize
+from toolkit import geometry, localize, sequence
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import read_image
 from toolkit.capture.tables import POSE_NAMES
@@ -1386,6 +1387,28 @@ def test_a_query_that_failed_is_localized_again_where_odometry_leads(
     again = steps[(steps["step"] == "again") & (steps["timestamp"] == key[0])].iloc[0]
     found = geometry.pose_from_qt(again[list(POSE_NAMES)].to_numpy(float))
     assert geometry.pose_error(found, truth.lookup([key[0]], [key[1]])[0])[1] < 0.02
+
+
+def test_threads_that_localize_again_have_nothing_to_load(
+    small_capture: Path, finished: tuple[SceneFiles, pd.DataFrame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files, session = finished[0], Capture.open(small_capture)["ios_query"]
+    opened: list[Map] = []
+    open_map = Map.open
+    monkeypatch.setattr(Map, "open", lambda *run: opened.append(open_map(*run)) or opened[-1])
+    loaders = "create_localizer", "create_embedder", "open_descriptors", "load_index", "upright_turns"
+
+    def in_threads(localize: Callable[[int], PoseEstimate], numbers: range, _: int) -> list[PoseEstimate]:
+        for name in loaders:
+            monkeypatch.setattr(maps, name, Mock(side_effect=AssertionError(name)))
+        assert all("_method" in vars(kind) for kind in opened[0].escalation)
+        return [localize(number) for number in numbers]
+
+    monkeypatch.setattr(sequence, "prefetch", in_threads)
+    keys, poses = session.keyframes(LIST), session.world_from_cam(ground_truth=True)
+    again = sequence._Relocalizer(files.poses_dir, files.scene, "ios", session)
+    (estimate,) = again(keys, [(0, RoughPose(poses[session.rows_of_keyframes(keys)[0][0]], 1.0, 0.1))])
+    assert estimate.status == "ok"
 
 
 def test_poses_of_no_run_cannot_be_localized_again(

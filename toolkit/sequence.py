@@ -273,7 +273,7 @@ class _Relocalizer:
             todo: frames and their predicted poses.
         """
         session, map_ = self._session, self._map
-        _ = map_.localizer, map_.embedders  # created here, before threads use them
+        map_.load()
         rows_of_each = session.rows_of_keyframes(keys.iloc[[frame for frame, _ in todo]])
 
         def localize(number: int) -> PoseEstimate:

@@ -1,7 +1,9 @@
 """Localizing by predicted cameras, on a rendered capture, with a predictor that knows the truth and blurs it."""
 
 import logging
+import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -307,6 +309,25 @@ def test_what_a_device_refuses_is_no_answer_to_a_query(
     queries, _ = world.queries("ios")
     with pytest.raises(type(error)):
         answers_of(world.localizer(world.predictor(**LOW)), queries)
+
+
+def test_threads_that_localize_ask_the_network_one_after_the_other(world: World) -> None:
+    queries, _ = world.queries("ios")
+    running: list[int] = []
+    together: list[int] = []
+
+    class Slow(SimulatedPredictor):
+        def predict(self, groups: Sequence[Sequence[View]], following: object = ()) -> list[Prediction]:
+            running.append(1)
+            time.sleep(0.02)
+            together.append(len(running))
+            running.pop()
+            return super().predict(groups)
+
+    localizer = world.localizer(Slow(world.sessions, None))
+    with ThreadPoolExecutor(len(queries)) as pool:
+        list(pool.map(lambda query: localizer.localize(*query), queries))
+    assert together == [1] * len(queries)
 
 
 def test_a_rig_goes_on_without_a_camera_that_fails(world: World) -> None:

@@ -1,6 +1,9 @@
 """Devices, precisions, and batches that do not fit."""
 
 import logging
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Self
 from unittest.mock import MagicMock, call
 
@@ -9,7 +12,16 @@ import torch
 
 from toolkit.errors import ManifestError, ToolkitError
 from toolkit.models import compute
-from toolkit.models.compute import Fitting, full_float32, linear, on_device, resolve_device, resolve_precision, upload
+from toolkit.models.compute import (
+    Fitting,
+    full_float32,
+    in_single_threads,
+    linear,
+    on_device,
+    resolve_device,
+    resolve_precision,
+    upload,
+)
 
 
 @pytest.mark.parametrize("name", ["gpu", "cuda:", "cuda:x", "cuda0", "", "CPU", "xpu"])
@@ -174,6 +186,27 @@ def test_a_batch_is_moved_by_the_parts_that_fit() -> None:
 
     Fitting(run, "images", torch.device("meta"))(torch.arange(4))
     assert seen == [(4, "meta"), (2, "meta"), (2, "meta")]
+
+
+@pytest.mark.parametrize(
+    "through",
+    [lambda run: Fitting(run, "images")(torch.arange(1)), lambda run: in_single_threads(run, [torch.arange(1)])],
+    ids=["Fitting", "in_single_threads"],
+)
+def test_networks_of_several_threads_run_one_after_the_other(through: Callable[[Callable], object]) -> None:
+    running: list[int] = []
+    together: list[int] = []
+
+    def run(batch: torch.Tensor) -> torch.Tensor:
+        running.append(1)
+        time.sleep(0.02)
+        together.append(len(running))
+        running.pop()
+        return batch
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda _: through(run), range(4)))
+    assert together == [1] * 4
 
 
 def test_a_layer_in_any_precision() -> None:

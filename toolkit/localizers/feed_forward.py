@@ -20,6 +20,7 @@ from toolkit.localizers.prediction import Prediction, Predictor
 from toolkit.localizers.references import select_references
 from toolkit.localizers.robust import AlignmentError
 from toolkit.manifest import PredictorSettings
+from toolkit.models.compute import RUNNING
 
 FOCAL_TOLERANCE = 0.2
 """Difference between the log focal length ratios (predicted over stated) of query and references above which the stated
@@ -120,8 +121,10 @@ class FeedForwardLocalizer:
 
         Errors are not raised: the status of the estimate becomes `failed: <reason>`.
         """
-        predicted = self.predict([(query, references)])[0] if prediction is None else prediction
-        images = zip(query.views, predicted.references, predicted.predictions, strict=True)
+        if prediction is None:
+            with RUNNING:  # `localize` is thread-safe, `predict` is not
+                (prediction,) = self.predict([(query, references)])
+        images = zip(query.views, prediction.references, prediction.predictions, strict=True)
         cameras = tuple(self._camera_answer(*image) for image in images)
         return FeedForwardAnswer(_combine(query, cameras), cameras)
 

@@ -262,6 +262,14 @@ class Map:
         """The localizer of the map's own settings."""
         return create_localizer(self.settings, self)
 
+    def load(self) -> None:
+        """Load what all queries share, before several threads find it missing: `cached_property` has no lock."""
+        _ = self.localizer, self.index_of, self.embedders, self._descriptors, self._index
+        if self.reranked:
+            _ = self._verification
+        for kind in self.escalation:
+            _ = kind.extractor
+
     @cached_property
     def index_of(self) -> dict[str, int]:
         """Index of each map image in `localizer.image_names`, by its name."""

@@ -5,6 +5,7 @@ import os
 import platform
 import re
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -28,6 +29,9 @@ log = logging.getLogger(__name__)
 DEVICE_NAME = r"auto|cpu|mps|cuda(:\d+)?"
 """Regular expression of device names."""
 PRECISIONS = ("auto", "float32", "bfloat16", "float16")
+RUNNING = threading.RLock()
+"""Held while a network runs. Networks in several threads at once would need memory that each of them counts as free,
+and would restore the settings of torch (`full_float32`, number of threads) that another one has changed."""
 
 
 def resolve_device(name: str = "auto") -> "torch.device":
@@ -155,10 +159,11 @@ def in_single_threads(run: "Callable[[Item], Result]", items: "Iterable[Item]") 
         with torch.inference_mode():  # the mode is per thread
             return run(item)
 
-    threads = torch.get_num_threads()
-    with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        results = list(pool.map(run_one, items))
-    torch.set_num_threads(threads)  # restore it also for threads that start later
+    with RUNNING:
+        threads = torch.get_num_threads()
+        with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            results = list(pool.map(run_one, items))
+        torch.set_num_threads(threads)  # restore it also for threads that start later
     return results
 
 
@@ -244,7 +249,7 @@ def _copy_stream(device: "torch.device") -> "torch.cuda.Stream":
 
 
 class Fitting:
-    """Runs a function on a device; splits batches into smaller ones after one did not fit its memory."""
+    """Runs a function on a device, one at a time; splits batches into smaller ones after one did not fit its memory."""
 
     def __init__(self, run: "Callable[..., torch.Tensor]", what: str, device: "torch.device | None" = None) -> None:
         """
@@ -276,7 +281,7 @@ class Fitting:
         while start < len(batch):
             count = min(self._limit or len(batch), len(batch) - start)
             try:
-                with full_float32(device):
+                with RUNNING, full_float32(device):
                     part = slice(start, start + count)
                     parts.append(self._run(batch[part].to(device), *(other[part] for other in others)))
                 start += count
