@@ -33,7 +33,7 @@ from toolkit.errors import ArtifactError, CaptureError, ImageError, ManifestErro
 from toolkit.evaluate import evaluate_scene
 from toolkit.features import groups
 from toolkit.features.features import KINDS, LocalFeatures
-from toolkit.features.matching import MATCHERS, MutualMatcher, unit_descriptors
+from toolkit.features.matching import MATCHERS, LocalMethod, MutualMatcher, unit_descriptors
 from toolkit.features.sift import SiftExtractor, SiftSettings
 from toolkit.features.stores import extract_session
 from toolkit.files import SceneFiles, image_name, map_record_path, read_map_record, read_references, sidecar_path
@@ -1409,6 +1409,30 @@ def test_threads_that_localize_again_have_nothing_to_load(
     again = sequence._Relocalizer(files.poses_dir, files.scene, "ios", session)
     (estimate,) = again(keys, [(0, RoughPose(poses[session.rows_of_keyframes(keys)[0][0]], 1.0, 0.1))])
     assert estimate.status == "ok"
+
+
+@pytest.mark.parametrize("network", ["embedder", "reranker", "none"])
+def test_a_query_is_localized_again_as_upright_as_the_networks_of_the_run_saw_it(
+    small_capture: Path, finished: tuple[SceneFiles, pd.DataFrame], monkeypatch: pytest.MonkeyPatch, network: str
+) -> None:
+    files, session = finished[0], Capture.open(small_capture)["hl_query"]
+    place = replace(Map.open(files.run, files.scene, "ios"), escalation=[])
+    if network == "embedder":
+        place.embedders = [Learned(np.zeros(1, np.float32))]  # type: ignore[misc]
+    if network == "reranker":
+        place.reranked = True
+        place._verification = LocalMethod("superpoint", Mock(), Mock()), Mock()  # type: ignore[misc]
+    monkeypatch.setattr(Map, "open", lambda *_: place)
+    shown: list[Any] = []
+    monkeypatch.setattr(
+        sequence, "localize_image", lambda *query: shown.append(query[4]) or PoseEstimate("failed: only shown")
+    )
+    keys = session.keyframes(LIST)
+    sequence._Relocalizer(files.poses_dir, files.scene, "ios", session)(keys, [(0, RoughPose(np.eye(4), 1.0, 0.1))])
+    [rows, *_] = session.rows_of_keyframes(keys)
+    turned = [3 if sensor.endswith("/hetrf") else 0 for sensor in session.images["sensor_id"].iloc[rows]]
+    assert any(turned)
+    assert shown == [None if network == "none" else turned]
 
 
 def test_poses_of_no_run_cannot_be_localized_again(

@@ -274,16 +274,17 @@ class _Relocalizer:
         """
         session, map_ = self._session, self._map
         map_.load()
+        turns = None if map_.turns is None else map_.turns.of(session)
         rows_of_each = session.rows_of_keyframes(keys.iloc[[frame for frame, _ in todo]])
 
         def localize(number: int) -> PoseEstimate:
             rows = rows_of_each[number]
-            turns = None if map_.turns is None else map_.turns.of(session, rows).tolist()
             cameras = [session.camera(sensor) for sensor in session.images["sensor_id"].iloc[rows]]
             paths = [session.image_path(int(row)) for row in rows]
             try:
                 poses = session.rig_from_cam(rows)
-                return localize_image(map_, paths, cameras, poses, turns, todo[number][1])
+                turned = None if turns is None else turns[rows].tolist()
+                return localize_image(map_, paths, cameras, poses, turned, todo[number][1])
             except Exception as error:  # one bad query never ends a run
                 return PoseEstimate(f"failed: {reason_of(error, f'localizing {paths[0]} again')}")
 

@@ -189,8 +189,17 @@ class Map:
 
     @cached_property
     def turns(self) -> Turns | None:
-        """The turns that make the capture's images upright; None if no network needs upright images."""
-        return turns_for(self.settings, [*self.kinds, *self.escalation], self.capture)
+        """The turns that make the capture's images upright; None if no network of the run needs upright images."""
+        if (turns := turns_for(self.settings, [*self.kinds, *self.escalation], self.capture)) is not None:
+            return turns
+        reranks = self.reranked and KINDS[self._verification[0].name].upright
+        describes = self.files is not None and any(map(self.shows_upright, self.embedders))
+        return upright_turns(self.capture, self.settings.world_up) if reranks or describes else None
+
+    def shows_upright(self, embedder: Embedder) -> bool:
+        """Tell whether the run turned images upright for one of its embedders."""
+        upright = embedder.upright if self.embed_settings.upright is None else self.embed_settings.upright
+        return upright and embedder.inputs == "images"
 
     def turns_of(self, kind: AnyMethod, session: Session) -> NDArray[np.int64] | None:
         """Return the turns that make a session's images upright; None if this kind of features does not need them."""
@@ -506,7 +515,7 @@ def session_fingerprint(session: Session) -> str:
 
 
 def turns_for(settings: LocalizeSettings, kinds: Sequence[AnyMethod], capture: Capture) -> Turns | None:
-    """Return the turns that make the capture's images upright; None if no network needs upright images."""
+    """Return the turns that make the capture's images upright; None if no network that localizes needs them."""
     upright = (settings.predicts and settings.predictor.upright) or any(KINDS[kind.name].upright for kind in kinds)
     return upright_turns(capture, settings.world_up) if upright else None
 

@@ -119,8 +119,7 @@ def _embed(
             else:
                 inputs = [as_stored(one) for one in sift.extract([picture.read(color=False) for picture in pictures])]
         else:
-            turned = embedder.upright if map_.embed_settings.upright is None else map_.embed_settings.upright
-            side = embedder.least_side
+            turned, side = map_.shows_upright(embedder), embedder.least_side
             inputs = [
                 embedder.prepare(turn_image(picture.read(True, side), turn if turned else 0))
                 for picture, turn in zip(pictures, turns, strict=True)
