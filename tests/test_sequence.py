@@ -4,6 +4,8 @@ import shutil
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pandas as pd
@@ -11,13 +13,14 @@ import pytest
 
 from tests.localized import write_queries
 from tests.localizers.drifting import PLACE, Drive, drive, lost_in_a_gap, small_motion
-from toolkit import geometry
+from toolkit import geometry, sequence
 from toolkit.capture import Session, Trajectory
 from toolkit.capture.tables import as_strings
 from toolkit.embed import embed_sessions
 from toolkit.errors import ManifestError
 from toolkit.files import SceneFiles, pair_name
 from toolkit.localize import localize_pairs
+from toolkit.localizers.base import PoseEstimate
 from toolkit.localizers.correspondences import Correspondences, LocalizedQuery
 from toolkit.localizers.pose_graph import FAR
 from toolkit.localizers.recording import GRAPH_AGAIN
@@ -121,6 +124,27 @@ def test_a_pair_without_queries_has_failed_frames_alone(place: Path, tmp_path: P
     localized(tmp_path, place, truth, np.arange(0))
     done = sequence_pairs(place / "sessions", tmp_path / "poses", map_device="ios", query_device="ios").iloc[0]
     assert done["frames"] == done["failed"] == len(truth)
+
+
+def test_a_query_that_met_a_bug_is_localized_again_by_the_next_run(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    truth = Session(place / "sessions/ios_query").ground_truth
+    assert truth is not None
+    localized(tmp_path, place, truth, np.arange(0, len(truth), 2), "low_confidence")
+    monkeypatch.setattr(sequence._Relocalizer, "_map", SimpleNamespace(load=Mock(), turns=None))
+
+    def skipped(**answer: object) -> bool:
+        monkeypatch.setattr(sequence, "localize_image", Mock(**answer))
+        table = sequence_pairs(place / "sessions", tmp_path / "poses", map_device="ios", query_device="ios")
+        assert table["again"].item() == len(range(0, len(truth), 2))
+        return bool(table["skipped"].item())
+
+    assert not skipped(side_effect=RuntimeError("a bug"))
+    of_network = PoseEstimate("failed: too few matches", reason="internal: ValueError: a bug")
+    assert not skipped(return_value=of_network)
+    assert not skipped(return_value=PoseEstimate("failed: too few matches"))
+    assert skipped()
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import default_workers, prefetch
 from toolkit.capture.tables import POSE_NAMES, KeyIndex, as_strings, read_query_table
 from toolkit.capture.world_up import up_of_cameras
-from toolkit.errors import OF_THE_DATA, ArtifactError, reason_of
+from toolkit.errors import INTERNAL, OF_THE_DATA, ArtifactError, reason_of
 from toolkit.files import (
     SceneFiles,
     file_fingerprint,
@@ -164,7 +164,7 @@ def _place_pair(
             with write_atomic(path) as temporary:
                 rows.to_csv(temporary, index=False)
         trajectory.write(out)
-        write_sidecar(out, record, list(csvs))
+        write_sidecar(out, record, list(csvs), unfinished=again is not None and again.met_a_bug)
     frames = pd.read_csv(out.with_suffix(".csv"), keep_default_na=False)
     status = frames["status"].str.split(":").str[0].value_counts()
     return {
@@ -255,6 +255,8 @@ class _Relocalizer:
     def __init__(self, poses_dir: Path, scene: str, map_device: str, session: Session) -> None:
         self._run, self._scene, self._device, self._session = poses_dir.parent.parent, scene, map_device, session
         self._expected = poses_dir
+        self.met_a_bug = False
+        """Whether a query failed with an internal error, so that the next run must try it again."""
 
     @cached_property
     def _map(self) -> Map:
@@ -289,7 +291,9 @@ class _Relocalizer:
                 return PoseEstimate(f"failed: {reason_of(error, f'localizing {paths[0]} again')}")
 
         with threadpool_limits(1, "blas"):
-            return list(prefetch(localize, range(len(todo)), default_workers()))
+            estimates = list(prefetch(localize, range(len(todo)), default_workers()))
+        self.met_a_bug |= any(INTERNAL in estimate.status + estimate.reason for estimate in estimates)
+        return estimates
 
 
 def _frames(
