@@ -631,6 +631,20 @@ def test_changed_files_of_the_map_make_the_poses_anew(capture: Path, run: SceneF
     assert not run_stage(capture, run, query_device="ios")["skipped"].any()
 
 
+def test_poses_are_made_anew_if_another_map_tells_which_way_up_the_images_are(capture: Path, run: SceneFiles) -> None:
+    def skipped(**settings: object) -> bool:
+        return bool(run_stage(capture, run, query_device="hl", **settings)["skipped"].item())
+
+    predicts = {"method": "feed_forward", "predictor": {"name": "simulated"}}
+    assert [skipped(**predicts), skipped(**predicts)] == [False, True]
+    with_poses(capture, lambda poses: poses @ np.diag([1.0, -1, -1, 1]), "hl_map/trajectories.txt")
+    assert [skipped(**predicts), skipped(**predicts)] == [False, True]
+    as_stored = {**predicts, "predictor": {"name": "simulated", "upright": False}}
+    assert [skipped(**as_stored), skipped(**as_stored)] == [False, True]
+    with_poses(capture, lambda poses: poses @ np.diag([1.0, -1, -1, 1]), "hl_map/trajectories.txt")
+    assert skipped(**as_stored), "nothing is turned"
+
+
 # ---------------------------------------------------------------------------------------- a single picture
 
 

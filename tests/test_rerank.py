@@ -12,8 +12,9 @@ import pycolmap
 import pytest
 
 from tests.calls import call
+from tests.other_kind import add_other_kind
 from toolkit import rerank
-from toolkit.capture import Capture
+from toolkit.capture import Capture, Trajectory
 from toolkit.embed import embed_sessions
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError
 from toolkit.evaluate import overlap_in_view, overlap_table
@@ -251,6 +252,29 @@ def test_a_run_killed_after_the_file_was_written_leaves_no_progress_beside_it(
     assert list(files.reranked_dir.glob(".*"))
     assert run(small_capture, files)["skipped"].tolist() == [True]
     assert not list(files.reranked_dir.glob(".*"))
+
+
+def test_another_map_that_turns_the_images_makes_the_file_anew(
+    small_capture: Path, files: SceneFiles, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add_other_kind(monkeypatch)
+    capture = Path(shutil.copytree(small_capture, tmp_path / "data" / small_capture.name))
+    path = capture / "sessions/hl_map/trajectories.txt"
+
+    def skipped(features: str) -> bool:
+        return bool(run(capture, files, features=features, topn=2, topk=2)["skipped"].item())
+
+    def flip() -> None:
+        poses = Trajectory.read(path)
+        flipped = poses.world_from_device @ np.diag([1.0, -1, -1, 1])
+        Trajectory.from_poses(poses.timestamps, poses.device_ids, flipped).write(path)
+
+    assert [skipped("other"), skipped("other")] == [False, True]
+    flip()
+    assert [skipped("other"), skipped("other")] == [False, True]
+    assert [skipped("sift"), skipped("sift")] == [False, True]
+    flip()
+    assert skipped("sift"), "nothing is turned"
 
 
 def test_a_query_that_fails_keeps_the_order_of_retrieval(

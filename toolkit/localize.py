@@ -19,8 +19,8 @@ from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import default_workers, prefetch
 from toolkit.capture.tables import read_query_table
+from toolkit.capture.upright import Turns
 from toolkit.errors import INTERNAL, ToolkitError, reason_of
-from toolkit.features.features import KINDS
 from toolkit.features.groups import GroupWriter, heals
 from toolkit.features.matching import AnyMethod, MutualMatcher, resolve_auto, weights_files
 from toolkit.features.stores import FeatureStore, MatchStore, extract_session, match_sessions
@@ -57,6 +57,7 @@ from toolkit.localizers.map import (
     create_methods,
     label,
     session_fingerprint,
+    turns_for,
     update_attributes,
 )
 from toolkit.localizers.mapping import map_settings
@@ -250,6 +251,11 @@ class _Stage(Remade):
             require_same(made_by, self.networks)
         self.open_map = lru_cache(maxsize=1)(self._open_map)
 
+    @cached_property
+    def turns(self) -> Turns | None:
+        """The turns that make images upright; None if no network needs upright images."""
+        return turns_for(self.settings, [*self.kinds, *self.escalation], self.capture)
+
     def record(self, pair: _Pair) -> dict[str, Any]:
         """Return everything that the poses of a pair depend on."""
         map_session, keyframes = self.capture[f"{pair.map_device}_map"], pair.keyframes
@@ -276,10 +282,8 @@ class _Stage(Remade):
                 "matcher": settings.matcher.model_dump(exclude={"checkpoint"}),
                 "weights": [file_fingerprint(path) for path in weights_files(settings)],
             }
-        if predictor is not None or any(
-            KINDS[name].upright for name in (*settings.features.kinds, *settings.features.escalation)
-        ):
-            record["world_up"] = settings.world_up
+        if self.turns is not None:  # they follow from all maps of the capture, not only from that of this pair
+            record["turns"] = self.turns.fingerprint([map_session, pair.session])
         if predictor is not None:
             record |= {
                 "predictor": {"name": predictor.name} | predictor.settings,

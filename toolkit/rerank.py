@@ -96,12 +96,12 @@ def rerank_pairs(
                 started = time.perf_counter()
                 sessions = capture[f"{devices[0]}_map"], capture[f"{devices[1]}_query"]
                 name = f"{pair_name(capture.name, *devices)}.jsonl"
-                pair = _Pair(*sessions, Path(retrieval_dir) / name, Path(out_dir) / name, method, settings)
+                pair = _Pair(*sessions, Path(retrieval_dir) / name, Path(out_dir) / name, method, settings, turns)
                 skipped = skip_existing and is_current(pair.path, pair.record)
                 if skipped:
                     sweep(pair.path)
                 else:
-                    pair.rerank(Path(features_dir), workers, skip_existing, turns)
+                    pair.rerank(Path(features_dir), workers, skip_existing)
                 row |= _counts(read_references(pair.path))
                 row |= {"seconds": round(time.perf_counter() - started, 2), "skipped": skipped}
                 row["path"] = str(pair.path)
@@ -121,6 +121,8 @@ class _Pair:
     """The reranked file."""
     method: LocalMethod
     settings: RerankSettings
+    turns: Turns | None
+    """Turns that make images upright for the features; None shows them as stored."""
 
     @cached_property
     def record(self) -> dict[str, Any]:
@@ -135,9 +137,10 @@ class _Pair:
             **self.settings.model_dump(exclude={"features", "matcher", "compute_device", "dtype_compute"}),
             "images": [session.files_fingerprint for session in sessions],
             "sensors": [file_fingerprint(session.path / "sensors.txt") for session in sessions],
+            **({} if self.turns is None else {"turns": self.turns.fingerprint(sessions)}),
         }
 
-    def rerank(self, features_dir: Path, workers: int, skip_existing: bool, turns: Turns | None) -> None:
+    def rerank(self, features_dir: Path, workers: int, skip_existing: bool) -> None:
         """Write the reranked file; reuse the rows that a stopped run finished."""
         queries = read_references(self.retrieval, "path")
         references = [reference for query in queries for reference in query["topk"][: self.settings.topn]]
@@ -148,7 +151,7 @@ class _Pair:
                 self.method.extractor,
                 self._rows(session, images),
                 workers,
-                turns=None if turns is None else turns.of(session),
+                turns=None if self.turns is None else self.turns.of(session),
             )
             for session, images in ((self.map_session, references), (self.query_session, queries))
         ]

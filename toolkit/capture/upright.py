@@ -7,13 +7,10 @@ upright photographs expect upright images. `toolkit.capture.turning` rotates ima
     k = turns.of(capture["hl_query"])
 """
 
-import hashlib
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,6 +19,7 @@ from numpy.typing import ArrayLike
 from toolkit.capture.folder import Capture
 from toolkit.capture.session import Rows, Session
 from toolkit.capture.world_up import WorldUp, estimate_world_up, given_world_up, posed_photographs, sensor_names
+from toolkit.files import fingerprint
 from toolkit.geometry import Floats, Ints, unit
 
 log = logging.getLogger(__name__)
@@ -95,34 +93,9 @@ class Turns:
         selected = codes[rows if rows is None or isinstance(rows, slice) else np.atleast_1d(np.asarray(rows))]
         return turns[selected.reshape(-1)]
 
-    @cached_property
-    def _digest(self) -> str:
-        digest = hashlib.sha256()
-        for kind, table in self._by_name.items():
-            ups = np.round(table.ups, 1) + 0.0 if kind == "role" else np.zeros((len(table.names), 0))
-            for key, turn, up in zip(table.names, table.turns.tolist(), ups.tolist(), strict=True):
-                digest.update(f"{kind} {key} {turn} {up}\n".encode())
-        return digest.hexdigest()[:16]
-
-    def record(self, session: Session | None = None) -> dict[str, Any]:
-        """Return a record of the turns, for fingerprints; the same maps give the same record.
-
-        Args:
-            session: limit the record to this session, so that it changes only if the turns of its images change, and
-                not with other additions to the map.
-        """
-        if session is not None:
-            codes, turns = self._turns_of(session)
-            counts = np.bincount(turns[codes], minlength=4).tolist()
-            ids = pd.factorize(session.images["sensor_id"])[1]
-            lines = sorted(f"{sensor} {turn}\n" for sensor, turn in zip(ids, turns.tolist(), strict=True))
-            return {"images": counts, "digest": hashlib.sha256("".join(lines).encode()).hexdigest()[:16]}
-        by_device, sensors = self._by_name["device"], self._by_name["sensor"]
-        return {
-            "devices": dict(zip(map(str, by_device.names), by_device.turns.tolist(), strict=True)),
-            "sensors": np.bincount(sensors.turns[sensors.turns >= 0], minlength=4).tolist(),
-            "digest": self._digest,
-        }
+    def fingerprint(self, sessions: Sequence[Session]) -> str:
+        """Return 16 hex digits that identify the turns of all images of the sessions."""
+        return fingerprint([self.of(session).tolist() for session in sessions])
 
     def _turns_of(self, session: Session) -> tuple[Ints, Ints]:
         key = session.path.absolute()
