@@ -189,6 +189,14 @@ def test_nothing_to_match(matcher: LightGlueMatcher) -> None:
         assert found.scores.shape == (0,)
 
 
+def test_an_unreadable_image_matches_nothing(matcher: LightGlueMatcher) -> None:
+    """Its features have no descriptors, in the type and length of another kind."""
+    unreadable, pair = LocalFeatures.none((640, 480)), (features(1, 9), features(2, 9))
+    found = matcher.match([(pair[0], unreadable), pair, (unreadable, pair[1])])
+    assert [len(found[0]), len(found[2])] == [0, 0]
+    assert_equal(found[1], matcher.match([pair])[0])
+
+
 def test_positions_are_those_of_training() -> None:
     corners = np.array([[0.5, 0.5], [320.5, 240.5], [640.5, 480.5]], np.float32)
     packed = _pack(replace(features(0, 3), keypoints=corners))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tests.queries import query_of
 from toolkit import geometry
 from toolkit.features.features import LocalFeatures
-from toolkit.features.matching import LocalMethod, PairMatches
+from toolkit.features.matching import LocalMethod, Matcher, MutualMatcher, PairMatches
 from toolkit.localizers.base import PoseEstimate, Prior, Query, References
 from toolkit.localizers.escalation import EscalatingLocalizer
 from toolkit.localizers.local_map import LocalMap
@@ -62,14 +62,14 @@ class ByPoint:
 class Scene:
     """Points in a box, seen by map cameras and by a query camera."""
 
-    def __init__(self, alike: bool = True) -> None:
-        """`alike`: a point has the same descriptor in all map images."""
+    def __init__(self, alike: bool = True, length: int = 128) -> None:
+        """`alike`: a point has the same descriptor in all map images; `length`: of the descriptors."""
         rng = np.random.default_rng(1)
         self.points = rng.uniform((-1.5, -1, -1), (1.5, 1, 1), (POINTS, 3))
         self.names = [f"ios_map/raw_data/{index}.jpg" for index in range(len(MAP_POSES))]
-        common = rng.normal(size=(POINTS, 128))
+        common = rng.normal(size=(POINTS, length))
         self.features = {
-            name: self._seen(pose, common if alike else rng.normal(size=(POINTS, 128)), rng)
+            name: self._seen(pose, common if alike else rng.normal(size=(POINTS, length)), rng)
             for name, pose in zip(self.names, MAP_POSES, strict=True)
         }
         self.query = query_of([CAMERA], np.eye(4)[None], [self._seen(QUERY_POSE, common, rng)])
@@ -108,11 +108,12 @@ class Scene:
         source: Callable[[str], LocalFeatures] | None = None,
         instants: Sequence[int] = range(len(MAP_POSES)),
         wrong: float = 0.0,
+        matcher: Matcher | None = None,
     ) -> OnDemandLocalizer:
         cameras = [CAMERA] * len(self.names)
         names = list(mapped[0].map.image_names) if mapped else self.names
         posed = PosedImages(names, cameras, MAP_POSES, np.array(instants))
-        method: Any = LocalMethod("aliked", SimpleNamespace(), ByPoint(wrong))
+        method: Any = LocalMethod("aliked", SimpleNamespace(), matcher or ByPoint(wrong))
         return OnDemandLocalizer(posed, mapped, [(method, source or self.features.__getitem__)])
 
 
@@ -152,13 +153,16 @@ def test_the_cameras_of_a_rig_make_no_points_together() -> None:
     assert estimate.status == "failed: too few matches"
 
 
-def test_a_reference_without_features_is_left_out() -> None:
-    scene = Scene()
+@pytest.mark.parametrize("length", [128, 256])
+def test_a_reference_without_features_is_left_out(length: int) -> None:
+    """Its descriptors have another type, and another length than those of SuperPoint."""
+    scene = Scene(length=length)
 
     def source(name: str) -> LocalFeatures:
         return LocalFeatures.none(SIZE) if name == scene.names[0] else scene.features[name]
 
-    assert_right(scene.localizer(source=source).localize(scene.query, scene.references))
+    localizer = scene.localizer(source=source, matcher=MutualMatcher())
+    assert_right(localizer.localize(scene.query, scene.references))
 
 
 def test_matches_from_a_file_lack_what_could_not_be_read() -> None:

@@ -97,13 +97,13 @@ class LightGlueMatcher(Remade):
             ToolkitError: features of another kind; a confidence is not finite; or not even one pair fits the
                 device's memory.
         """
-        for features in (features for pair in pairs for features in pair):
-            self._check(features)
         matches = [PairMatches.none() for _ in pairs]
         # Pairs with similar numbers of features form a batch, as all are padded to the largest. The largest come first,
         # so that a batch that does not fit the memory fails at the start.
         sizes = [-max(len(a), len(b)) for a, b in pairs]
         order = [number for number in np.argsort(sizes, kind="stable") if all(map(len, pairs[number]))]
+        for features in (features for number in order for features in pairs[number]):
+            self._check(features)  # an image without features has no kind of its own
         uses = Counter(id(features) for number in order for features in pairs[number])
         encoded: dict[int, Tensor] = {}
         with torch.inference_mode():

@@ -200,6 +200,8 @@ class MutualMatcher:
 
     def match_unit(self, unit_a: NDArray[np.float32], unit_b: NDArray[np.float32]) -> PairMatches:
         """Return the matches of two images, given by their `unit_descriptors`."""
+        if not len(unit_a) or not len(unit_b):  # empty descriptors may have another length
+            return PairMatches.none()
         scores = unit_a @ unit_b.T
         indices = mutual_matches(scores, self.ratio, self.min_score)
         return PairMatches(indices, scores[indices[:, 0], indices[:, 1]])

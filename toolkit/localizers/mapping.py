@@ -144,6 +144,8 @@ def match_pairs(
         indices = match_along_epipolar_lines(
             descriptors_i, descriptors_j, rays_i, rays_j, j_from_i, angle_i, angle_j, ratio, kind.epipolar_min_score
         )
+        if not len(indices):  # empty descriptors may have another length
+            return PairMatches.none()
         scores = np.einsum("kd,kd->k", descriptors_i[indices[:, 0]], descriptors_j[indices[:, 1]])
         return PairMatches(indices, scores)
 
