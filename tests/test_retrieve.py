@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -85,6 +86,25 @@ def test_vectors_on_disk_are_searched_block_by_block(
         scores, indices = search(query, stored, 12, backend)
         np.testing.assert_array_equal(indices, expected[1])
         np.testing.assert_array_equal(scores, expected[0])
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_a_memory_mapped_matrix_is_not_loaded_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dtype: type
+) -> None:
+    rng = np.random.default_rng(0)
+    database, query = rng.normal(size=(20_000, 128)).astype(dtype), rng.normal(size=(5, 128))
+    np.save(tmp_path / "a.npy", database)
+    expected = search(query, database.astype(np.float32), 10)
+    monkeypatch.setattr(search_module, "_BLOCK_BYTES", 1 << 18)
+    search(query, database[:100], 10)  # imports
+    tracemalloc.start()
+    found = search(query, np.load(tmp_path / "a.npy", mmap_mode="r"), 10)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    for array, wanted in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(array, wanted)
+    assert peak < 2 << 20, "the matrix takes 10 MB as float32"
 
 
 def test_several_sets_of_queries_on_disk_are_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -36,7 +36,7 @@ Found = tuple[_Floats, Ints]
 _Best = Callable[[_Floats, int, int], Found]
 """Maps a block of the database, the number of its first row, and n to the n best scores and rows of each query, counted
 from the start of the block."""
-_Vectors = _Floats | Vectors
+_Vectors = NDArray[Any] | Vectors
 
 
 def search(
@@ -56,7 +56,8 @@ def search(
     recomputed in the same way for all backends, so the result does not depend on the backend.
 
     Args:
-        query, database: (Q, D) and (N, D), any float type; `StoredVectors` and `JoinedVectors` stay on disk.
+        query, database: (Q, D) and (N, D), any float type; `StoredVectors`, `JoinedVectors` and memory-mapped arrays
+            stay on disk.
         k: neighbors per query; at most N are returned.
         backend: `faiss` or `torch`.
         compute_device: where torch computes: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
@@ -72,7 +73,7 @@ def search(
         found fewer.
 
     Raises:
-        ValueError: shapes do not fit, k is below 1, or a value is not finite.
+        ValueError: shapes do not fit, k is below 1, or a value that is compared is not finite.
     """
     query, vectors = _matrix(query, "query"), _matrix(database, "database")
     if query.shape[1] != vectors.shape[1]:
@@ -183,7 +184,7 @@ def _rank_candidates(
         rows = rows[rows >= 0]
         if not len(rows):
             continue
-        block, k = vectors[rows], min(scores.shape[1], len(rows))
+        block, k = _read(vectors, rows), min(scores.shape[1], len(rows))
         rough = _fused(vector, block, dims, lambda a, b: b @ a)
         tolerance = _tolerance(np.linalg.norm(block, axis=1).max() * np.linalg.norm(vector), dims)
         near = rough >= np.partition(rough, -k)[-k] - 2 * tolerance
@@ -202,11 +203,14 @@ def _products(query: _Floats, vectors: _Floats, dims: Sequence[int]) -> _Floats:
 def _matrix(values: ArrayLike | Vectors, name: str) -> _Vectors:
     if isinstance(values, Vectors):
         return values
-    matrix = np.ascontiguousarray(values, np.float32)
+    matrix = np.asarray(values)  # stays on disk if it is memory-mapped; converted by the rows that are read
     if matrix.ndim != 2:
         raise ValueError(f"{name} has shape {matrix.shape}; expected two dimensions, one row per vector.")
-    require_finite(matrix, name)
     return matrix
+
+
+def _read(vectors: _Vectors, rows: Ints) -> _Floats:
+    return np.asarray(vectors[rows], np.float32)
 
 
 def _candidates(vectors: _Vectors, best: _Best, queries: int, width: int, size: int) -> tuple[_Floats, Ints, float]:
@@ -250,7 +254,7 @@ def _rescore(
     for start in range(0, len(order), step):
         part = order[start : start + step]
         numbers, where = np.unique(candidates[pending[part], rank[part]], return_inverse=True)
-        exact[pending[part], rank[part]] = _products(query[rows[pending[part]]], vectors[numbers][where], dims)
+        exact[pending[part], rank[part]] = _products(query[rows[pending[part]]], _read(vectors, numbers)[where], dims)
     best = np.lexsort((candidates, -exact), axis=1)[:, : scores.shape[1]]
     scores[rows], indices[rows] = np.take_along_axis(exact, best, 1), np.take_along_axis(candidates, best, 1)
     indices[np.isneginf(scores)] = -1

@@ -124,11 +124,11 @@ def matrix_fingerprints(paths: Sequence[Path]) -> list[Any]:
     ]
 
 
-def blocks(vectors: NDArray[np.float32] | Vectors, size: int) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    """Yield blocks of at most `size` bytes (of float32): the number of the first row, and the rows (n, D)."""
+def blocks(vectors: NDArray[Any] | Vectors, size: int) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    """Yield blocks of at most `size` bytes, as float32: the number of the first row, and the rows (n, D)."""
     step = max(1, size // (4 * max(1, vectors.shape[1])))
     for start in range(0, len(vectors), step):
-        yield start, vectors[start : start + step]
+        yield start, np.ascontiguousarray(vectors[start : start + step], np.float32)
 
 
 def require_finite(matrix: NDArray[np.float32], name: str, first: int | Ints = 0) -> None:
