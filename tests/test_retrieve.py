@@ -78,6 +78,7 @@ def test_vectors_on_disk_are_searched_block_by_block(
     np.testing.assert_array_equal(stored[:], unit(stack) if normalize else stack)
     np.testing.assert_array_equal(stored[np.array([1, 8, 40])], stored[:][[1, 8, 40]])
     np.testing.assert_array_equal(stored[np.array([40, 8, 1, 9, 8])], stored[:][[40, 8, 1, 9, 8]])
+    np.testing.assert_array_equal(stored[np.array([8, 8, 10])], stored[:][[8, 8, 10]])
     np.testing.assert_array_equal(stored.choose(np.array([40, 1]))[:], stored[:][[40, 1]])
     query = np.concatenate([rng.normal(size=(9, dim)), parts[3][5:6], np.zeros((1, dim))])
     expected = search(query, stored[:], 12)

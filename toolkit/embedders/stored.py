@@ -72,7 +72,7 @@ class StoredVectors:
         for path, start, first, last in zip(self.paths, self.starts, cuts, cuts[1:], strict=False):
             if first < last:
                 inside = rows[first:last] - start
-                contiguous = inside[-1] - inside[0] == len(inside) - 1
+                contiguous = (np.diff(inside) == 1).all()
                 # Map the file anew each time: the pages of a lasting mapping would count as this process's memory.
                 matrix = np.load(path, mmap_mode="r")
                 vectors[first:last] = matrix[inside[0] : inside[-1] + 1] if contiguous else matrix[inside]
