@@ -172,6 +172,9 @@ def test_search_limits() -> None:
         search(np.ones(3), np.ones((4, 3)), 1)
     with pytest.raises(ValueError, match="1 masks of 9 rows for 2 queries and 4 rows"):
         search(np.ones((2, 3)), np.ones((4, 3)), 1, allowed=Masks.of([], np.array([-1]), 9))
+    for allowed in (np.ones(3, bool), np.ones((2, 4), bool)):
+        with pytest.raises(ValueError, match=r"allowed has shape .*\(4,\)"):
+            search(np.ones((2, 3)), np.ones((4, 3)), 1, allowed=allowed)
     assert scores.dtype == np.float32
 
 

@@ -88,6 +88,8 @@ def search(
         raise ValueError(
             f"{len(allowed)} masks of {allowed.count} rows for {len(query)} queries and {len(vectors)} rows."
         )
+    if isinstance(allowed, np.ndarray) and allowed.shape != (len(vectors),):
+        raise ValueError(f"allowed has shape {allowed.shape}; expected ({len(vectors)},), one value per database row.")
     if isinstance(allowed, Masks) and index is not None and k:
         for numbers, mask in allowed.distinct():
             queries = query.choose(numbers) if isinstance(query, Vectors) else query[numbers]
