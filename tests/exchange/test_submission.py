@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from toolkit.__main__ import app, main
 from toolkit.capture import Trajectory, write_session
 from toolkit.errors import ArtifactError, CaptureError, ManifestError, ToolkitError
+from toolkit.exchange.export import export_intrinsics
 from toolkit.exchange.submission import collect
 from toolkit.files import SceneFiles
 from toolkit.geometry import make_pose, pose_from_qt
@@ -212,6 +213,20 @@ def test_a_scene_of_lamar_is_like_any_other(tmp_path: Path) -> None:
     make_poses(tmp_path / "run", "CAB", "ios", "ios")
     table = collect([tmp_path / "run"], captures=[capture], scenes=["CAB"]).table().set_index("file")
     assert table["written"].sum() == table["written"]["CAB_map_ios_query_ios.txt"] == 3
+
+
+def test_devices_and_links_are_those_of_the_runs_manifest(tmp_path: Path) -> None:
+    capture = make_capture(tmp_path / "data", "HOME")
+    session = (capture / "sessions" / "hl_query").rename(capture / "sessions" / "q_drone")
+    images = session / "images.txt"
+    images.write_text(images.read_text().replace("s/100.jpg", "../100.jpg"))
+    files = make_poses(tmp_path / "run", "HOME", "ios", "drone")
+    record = {"stages": [{"scene": "HOME", "parameters": {"sessions_root": str(capture / "sessions")}}]}
+    manifest = {"extra_devices": [{"key": "drone", "sessions": {"query": "q_drone"}}], "allow_outside": True}
+    (files.run / "run.json").write_text(json.dumps(record | {"manifest": manifest}))
+    table = collect([files.run]).table().set_index("file")
+    assert table.loc["HOME_map_ios_query_drone.txt", "written"] == 3
+    assert export_intrinsics(files.run, "HOME", "ios", "drone", tmp_path / "queries.txt") == 3
 
 
 def test_poses_that_nobody_asked_for_are_not_written(run: Path, tmp_path: Path, captures: list[Path]) -> None:

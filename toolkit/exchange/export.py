@@ -22,7 +22,7 @@ from toolkit.capture import Session, Trajectory
 from toolkit.capture.cameras import camera_text
 from toolkit.capture.tables import POSE_NAMES, read_query_table
 from toolkit.errors import ArtifactError, ManifestError
-from toolkit.exchange.submission import Captures
+from toolkit.exchange.submission import open_captures
 from toolkit.features.stores import FeatureStore
 from toolkit.files import (
     SceneFiles,
@@ -332,4 +332,5 @@ def _require_poses(path: Path) -> Path:
 
 
 def _session(run: str | Path, scene: str, session_id: str, capture: str | Path | None) -> Session:
-    return Captures([Path(run)], [] if capture is None else [capture], [scene])[scene][session_id]
+    with open_captures([Path(run)], [] if capture is None else [capture], [scene]) as captures:
+        return captures[scene][session_id]

@@ -10,7 +10,8 @@ import os
 import tempfile
 import zipfile
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,7 +20,8 @@ import pandas as pd
 
 from toolkit.capture import COLUMNS, Capture, Trajectory
 from toolkit.capture.check import UNIT_TOLERANCE
-from toolkit.capture.devices import SPLITS
+from toolkit.capture.devices import SPLITS, extra_devices
+from toolkit.capture.names import allow_outside
 from toolkit.capture.tables import read_query_table, read_table
 from toolkit.errors import ArtifactError, CaptureError, ManifestError, ToolkitError
 from toolkit.files import SceneFiles, file_fingerprint, pair_name, read_references, write_atomic, write_sidecar
@@ -166,17 +168,17 @@ def collect(
     if not present:
         raise ManifestError(f"{', '.join(map(str, folders))}: no poses in it. Run the manifest first.")
     expected = SCENES if present & SCENES.keys() else {}
-    captures_by_scene = Captures(folders, captures, sorted(present.union(scenes, expected)))
     out = Path(out) if out else folders[0] / "submission.zip"
     submission = Submission(_description(description), [], {}, failed, out)
-    for scene in scenes or expected or sorted(present):
-        mapped = asked = DEVICES
-        if scene not in expected:  # not part of the challenge: all pairs of the capture
-            mapped, asked = (captures_by_scene[scene].devices_with(split) for split in SPLITS)
-        for pair in itertools.product(mapped, asked):
-            entry = Entry(scene, *pair, f"{pair_name(expected.get(scene, scene), *pair)}.txt")
-            submission.entries.append(entry)
-            _fill_entry(entry, folders, captures_by_scene, queries or QUERIES, failed, submission.sources, sequence)
+    with open_captures(folders, captures, sorted(present.union(scenes, expected))) as captures_by_scene:
+        for scene in scenes or expected or sorted(present):
+            mapped = asked = DEVICES
+            if scene not in expected:  # not part of the challenge: all pairs of the capture
+                mapped, asked = (captures_by_scene[scene].devices_with(split) for split in SPLITS)
+            for pair in itertools.product(mapped, asked):
+                entry = Entry(scene, *pair, f"{pair_name(expected.get(scene, scene), *pair)}.txt")
+                submission.entries.append(entry)
+                _fill_entry(entry, folders, captures_by_scene, queries or QUERIES, failed, submission.sources, sequence)
     total = submission.table()[COUNTS].sum()
     if total["filled"]:
         submission.description += (
@@ -189,25 +191,8 @@ def collect(
 class Captures(dict[str, Capture]):
     """The capture of each scene, opened from the folder given by the user, else from the folder recorded in a run."""
 
-    def __init__(self, runs: Iterable[Path], given: Iterable[str | Path], scenes: Sequence[str]) -> None:
-        """
-        Args:
-            given: capture folders given by the user; each must have the name of one of the `scenes`.
-
-        Raises:
-            ManifestError: a given folder has another name.
-        """
-        self._folders: dict[str, Path] = {}
-        for run in runs:
-            try:
-                rows = json.loads((run / "run.json").read_text(encoding="utf-8"))["stages"]
-                self._folders |= {row["scene"]: Path(row["parameters"]["sessions_root"]).parent for row in rows}
-            except (OSError, ValueError, KeyError, TypeError):
-                continue  # poses of another tool, or stages run by hand: the user must give the captures
-        for path in map(Path, given):
-            if path.resolve().name not in scenes:
-                raise ManifestError(f"{path}: the folder has no scene's name. Expected {', '.join(scenes)}.")
-            self._folders[path.resolve().name] = path.resolve()
+    def __init__(self, folders: Mapping[str, Path]) -> None:
+        self._folders = folders
 
     def __missing__(self, scene: str) -> Capture:
         if scene not in self._folders:
@@ -217,6 +202,34 @@ class Captures(dict[str, Capture]):
         except CaptureError as error:
             raise ManifestError(f"{scene}: {error} Give the folder: --capture PATH/{scene}.") from None
         return self[scene]
+
+
+@contextmanager
+def open_captures(runs: Iterable[Path], given: Iterable[str | Path], scenes: Sequence[str]) -> Iterator[Captures]:
+    """Open the captures of runs, with the kinds of devices and the permission of links in the runs' manifests.
+
+    Args:
+        given: capture folders given by the user; each must have the name of one of the `scenes`.
+
+    Raises:
+        ManifestError: a given folder has another name.
+    """
+    folders: dict[str, Path] = {}
+    devices, outside = list[Mapping[str, object]](), False
+    for run in runs:
+        try:
+            record = json.loads((run / "run.json").read_text(encoding="utf-8"))
+            folders |= {row["scene"]: Path(row["parameters"]["sessions_root"]).parent for row in record["stages"]}
+            devices += record["manifest"].get("extra_devices", [])
+            outside |= record["manifest"].get("allow_outside", False)
+        except (OSError, ValueError, KeyError, TypeError):
+            continue  # poses of another tool, or stages run by hand: the user must give the captures
+    for path in map(Path, given):
+        if path.resolve().name not in scenes:
+            raise ManifestError(f"{path}: the folder has no scene's name. Expected {', '.join(scenes)}.")
+        folders[path.resolve().name] = path.resolve()
+    with extra_devices(devices), allow_outside(outside):
+        yield Captures(folders)
 
 
 def _description(text: str) -> str:
