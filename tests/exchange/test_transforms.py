@@ -156,6 +156,17 @@ def test_every_so_many_frames_become_queries_with_their_truth(tmp_path: Path) ->
     assert queries.odometry is None
 
 
+def test_a_map_without_any_query_left_is_not_written(tmp_path: Path) -> None:
+    """The same command then works once the images are there."""
+    file = write(tmp_path)
+    (tmp_path / "images" / "2.jpg").rename(tmp_path / "images" / "two.jpg")
+    with pytest.raises(CaptureError, match=r"images/2\.jpg: no such file"):
+        import_transforms(file, tmp_path / "PLACE", hold_out=3)
+    assert not (tmp_path / "PLACE").exists()
+    (tmp_path / "images" / "two.jpg").rename(tmp_path / "images" / "2.jpg")
+    assert [len(report.images) for report in import_transforms(file, tmp_path / "PLACE", hold_out=3)] == [2, 1]
+
+
 def test_images_that_cannot_be_used_are_rows(tmp_path: Path) -> None:
     file = write(tmp_path)
     content = json.loads(file.read_text())

@@ -112,8 +112,8 @@ class Draft:
         if world_from_cam is not None:
             self.poses[name] = world_from_cam
 
-    def write(self) -> ImportReport:
-        """Write the session without the images that cannot be used; raise CaptureError if none is left."""
+    def leave_out(self) -> None:
+        """Leave out the images that cannot be used; raise CaptureError if none is left."""
         problems = {image.name: self._problem(image) for image in self.images}
         self.rows += [{"image": name, "status": problem} for name, problem in problems.items() if problem]
         self.images = [image for image in self.images if not problems[image.name]]
@@ -122,6 +122,9 @@ class Draft:
             if self.rows and self.rows[0]["status"] in (NO_FILE, NOT_INSIDE):
                 why += " Names are paths in this folder: correct them in the list, or put the list beside the images."
             raise CaptureError(f"{self.folder}: none of {len(self.rows)} images can be imported.{why}")
+
+    def write(self) -> ImportReport:
+        """Write the session; call `leave_out` before."""
         if turned := sum(image.turned for image in self.images):
             self.notes.append(f"{turned} images have an EXIF orientation, which is ignored: pixels are used as stored")
         times = self._choose_times()
@@ -220,6 +223,13 @@ def start(capture: str | Path, device: str, split: str, folder: Path, placing: s
     if session.exists():
         raise CaptureError(f"{session} exists already. Import into another capture or device, or remove it first.")
     return Draft(session, folder, placing)
+
+
+def write_drafts(*drafts: Draft) -> list[ImportReport]:
+    """Write sessions without the images that cannot be used; raise CaptureError, and write none, if one has none left."""
+    for draft in drafts:
+        draft.leave_out()
+    return [draft.write() for draft in drafts]
 
 
 def list_images(folder: Path) -> pd.DataFrame:

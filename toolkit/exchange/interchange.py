@@ -33,6 +33,7 @@ from toolkit.exchange.drafts import (
     posed_camera,
     require_convention,
     start,
+    write_drafts,
 )
 from toolkit.exchange.transforms import import_transforms
 from toolkit.files import file_fingerprint, files_fingerprint, read_json, write_text
@@ -90,7 +91,7 @@ def import_colmap(
     not_in_model = set(list_images(draft.folder)["image"]) - {image.name for image in draft.images}
     if not_in_model:
         draft.notes.append(f"{len(not_in_model)} images of the folder are not in the model")
-    return draft.write()
+    return write_drafts(draft)[0]
 
 
 def import_images(
@@ -160,7 +161,7 @@ def import_images(
     if truth is not None:
         draft.notes.append(f"ground truth of {len(draft.poses)} of {len(rows)} images: {truth}")
     draft.notes += [f"intrinsics of {count} images: {origin}" for origin, count in origins.items()]
-    return draft.write()
+    return write_drafts(draft)[0]
 
 
 def import_once(

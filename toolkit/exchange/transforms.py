@@ -29,7 +29,7 @@ from toolkit.capture import parse_camera
 from toolkit.capture.exif import is_file, read_header
 from toolkit.capture.tables import FARTHEST_M
 from toolkit.errors import CaptureError, ImageError, ManifestError
-from toolkit.exchange.drafts import IMAGE_SUFFIXES, ImportReport, posed_camera, require_convention, start
+from toolkit.exchange.drafts import IMAGE_SUFFIXES, ImportReport, posed_camera, require_convention, start, write_drafts
 from toolkit.geometry import Floats
 
 PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
@@ -102,7 +102,7 @@ def import_transforms(
                 "tracking or a scanner gave the poses); else set `unit: null` in the manifest, as `python -m toolkit "
                 "new` does"
             )
-    return [draft.write() for draft in drafts]
+    return write_drafts(*drafts)
 
 
 def _read(path: Path) -> dict[str, Any]:
