@@ -349,6 +349,17 @@ def test_overlap_is_judged_by_the_maps_that_the_poses_were_found_with(scene, tmp
     assert row["retrieved"] == 0.25  # the point lies before the first query's camera; the others stand 10 m aside
 
 
+def test_overlap_is_not_that_of_an_earlier_retrieval_nor_of_unknown_cameras(scene):
+    lines = (scene[2] / f"TINY_{IOS}.jsonl").read_text()
+    (scene[2] / f"TINY_{IOS}.jsonl").write_text(lines.replace('{"rank"', '{"sensor_id": "gone", "rank"'))
+    state = evaluate_ios(scene).overlap["state"].item()
+    assert state == f"TINY_{IOS}.jsonl of the retrieved cannot be read (CaptureError)"
+    (scene[2] / f"TINY_{IOS}.left_out.json").write_text('{"reason": "a dragon"}')
+    overlap = evaluate_ios(scene).overlap
+    assert overlap["state"].item() == "left out: a dragon"
+    assert overlap["images"].isna().all()
+
+
 @pytest.mark.slow
 def test_an_unusable_session_or_pair_is_a_row_with_the_reason(scene, tmp_path):
     sessions, poses, references = scene

@@ -509,6 +509,9 @@ def overlap_table(
         except CaptureError as error:
             row["state"] = f"{LEFT_OUT}{error}"
             continue
+        if causes := [cause for folder in references.values() if (cause := left_out(folder, name))]:
+            row["state"] = f"{LEFT_OUT}{causes[0]}"  # the files are those of an earlier run
+            continue
         local_map = load(map_files(map_dir, f"{map_}_map", h5))
         for column, folder in references.items():
             row |= _overlap(Path(folder) / f"{name}.jsonl", column, *sessions, local_map)
@@ -532,7 +535,7 @@ def _overlap(
                 seen = seen_by(first[0], map_session, local_map) if first else np.zeros((0, 3))
                 center = np.array(first[0]["Tws"])[:3, 3] if first else np.zeros(3)
                 shares.append(overlap_in_view(seen, center, camera, session.camera(line["sensor_id"])))
-    except (ArtifactError, OSError, ValueError, KeyError, TypeError) as error:
+    except (ArtifactError, CaptureError, OSError, ValueError, KeyError, TypeError) as error:
         return {"state": f"{path.name} of the {name} cannot be read ({type(error).__name__})"}
     row: dict[str, Any] = {"images": len(shares), "points": "view" if local_map is None else "map"}
     if shares:
