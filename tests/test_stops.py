@@ -430,6 +430,8 @@ def test_what_builds_on_a_failed_stage_is_skipped(here: Path) -> None:
         ("evaluate", {"pairs": [["ios"]]}, "pairs"),
         ("embed", {"batch_size": 0.5}, "batch_size"),
         ("own_images", {"device": 5}, "device: found 5, expected a str such as 'ios'"),
+        ("own_images", {"unit_m": "cm"}, "unit_m: found 'cm', expected None or a number such as 1.0"),
+        ("own_images", {"unit_m": True}, "unit_m: found True"),
         ("compare", {"runs": "../runs/a"}, "runs: found '../runs/a', expected None or a list of run folders"),
         ("compare", {"runs": [5]}, r"runs: found \[5\]"),
         ("compare", {"pictures": "two"}, "pictures: found 'two', expected a whole number, 0 or more"),
@@ -439,6 +441,11 @@ def test_what_builds_on_a_failed_stage_is_skipped(here: Path) -> None:
 def test_notebook_parameters_of_a_wrong_type_are_named(stage: str, values: dict[str, Any], named: str) -> None:
     with pytest.raises(ManifestError, match=named):
         notebook.check_values(stage, values)
+
+
+@pytest.mark.parametrize("unit", [None, 1, 0.01])
+def test_the_unit_of_poses_may_be_a_whole_number_or_unknown(unit: float | None) -> None:
+    notebook.check_values("own_images", {"unit_m": unit})
 
 
 @pytest.mark.parametrize("name", [*STAGES, "own_images", "compare"])

@@ -387,6 +387,10 @@ def check_values(name: str, values: Mapping[str, Any]) -> None:
             fits, expected = value is None or isinstance(value, str | Path), "None or the path of a folder as text"
         elif type(default) is int:
             fits, expected = type(value) is int and value >= 0, f"a whole number, 0 or more, such as {default}"
+        elif type(default) is float:
+            optional = key == "unit_m"  # None: unknown
+            fits = type(value) in (int, float) or (optional and value is None)
+            expected = f"{'None or ' if optional else ''}a number such as {default}"
         else:
             fits, expected = isinstance(value, type(default)), f"a {type(default).__name__} such as {default!r}"
         if not fits:
