@@ -3,10 +3,10 @@
     python benchmarks/vggt.py [--official CHECKOUT] [--checkpoint FILE] [--views 6] [--size 294x518] [--threads 2]
 
 On equal terms, both compute all encodings and the same heads: the camera head alone, and those of camera, depth and
-points, as the official forward has them. A last row is what localization computes: one new query is encoded, its
-references' encodings are kept from earlier queries, and the camera head alone runs. Both get the same images and
-weights on the same cores, one right after the other, each in a process of its own; the difference between their outputs
-shows that they did the same work. The official code runs in float32 on a CPU. Wall
+points, as the official forward has them. A last row keeps encodings, as localization does: one new query is encoded,
+its references' encodings are from earlier queries, and the camera head alone runs (in localization, that of depth,
+too). Both get the same images and weights on the same cores, one right after the other, each in a process of its own;
+the difference between their outputs shows that they did the same work. The official code runs in float32 on a CPU. Wall
 seconds mean little while others use the machine; CPU seconds mean more. Peak memory is what is held at most above the
 weights and the input. Without a checkpoint, weights are random (4.4 GB in the folder for temporary files).
 """
