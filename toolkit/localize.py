@@ -19,7 +19,7 @@ from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import default_workers, prefetch
 from toolkit.capture.tables import read_query_table
-from toolkit.capture.upright import Turns
+from toolkit.capture.upright import Turns, upright_turns
 from toolkit.errors import INTERNAL, ToolkitError, reason_of
 from toolkit.features.groups import GroupWriter, heals
 from toolkit.features.matching import AnyMethod, MutualMatcher, resolve_auto, weights_files
@@ -56,8 +56,8 @@ from toolkit.localizers.map import (
     create_localizer,
     create_methods,
     label,
+    needs_upright,
     session_fingerprint,
-    turns_for,
     update_attributes,
 )
 from toolkit.localizers.mapping import map_settings
@@ -254,7 +254,8 @@ class _Stage(Remade):
     @cached_property
     def turns(self) -> Turns | None:
         """The turns that make images upright; None if no network needs upright images."""
-        return turns_for(self.settings, [*self.kinds, *self.escalation], self.capture)
+        upright = needs_upright(self.settings, [*self.kinds, *self.escalation])
+        return upright_turns(self.capture, self.settings.world_up) if upright else None
 
     def record(self, pair: _Pair) -> dict[str, Any]:
         """Return everything that the poses of a pair depend on."""

@@ -9,8 +9,9 @@ from typing import Any
 from threadpoolctl import threadpool_limits
 
 from toolkit.capture import Session
-from toolkit.errors import ManifestError
-from toolkit.features.stores import FeatureStore
+from toolkit.capture.upright import Turns
+from toolkit.errors import ArtifactError, ManifestError
+from toolkit.features.stores import FeatureStore, features_path
 from toolkit.geometry import Ints
 from toolkit.localizers.base import Localizer, PoseEstimate
 from toolkit.localizers.correspondences import LocalizedQuery
@@ -20,6 +21,8 @@ from toolkit.manifest import LocalizeSettings
 
 MADE_BEFORE = ("features", "matcher", "map", "unit", "world_up")
 """Settings that the stored features and map points depend on, so they cannot change."""
+WITHOUT_FEATURES = ("feed_forward", "nearest")
+"""Methods that need no features of the queries."""
 
 
 class LocalizeAgain:
@@ -56,25 +59,31 @@ class LocalizeAgain:
         Raises:
             ToolkitError: features, references or weights are missing, or the run has no map for the method.
         """
-        localizer, references_of_image = self._localizer(settings.model_dump_json())
-        turns = self.map.turns if settings.predicts else None
+        localizer, references_of_image, turns = self._localizer(settings.model_dump_json())
+        stores = [] if settings.method in WITHOUT_FEATURES else self._stores
         started = time.perf_counter()
-        query, references = stored_query(self.session, rows, references_of_image, self._stores, (), turns)
+        query, references = stored_query(self.session, rows, references_of_image, stores, (), turns)
         with threadpool_limits(1, "blas"):  # the same order of sums, and so the same result, as in a run
             estimate = self.map.judged(localizer.localize(query, references))
         seconds = time.perf_counter() - started
         return estimate, localized_query(query, estimate, localizer.image_names), seconds
 
-    def _create(self, settings_json: str) -> tuple[Localizer, ReferencesOfImage]:
+    def _create(self, settings_json: str) -> tuple[Localizer, ReferencesOfImage, Turns | None]:
         settings = LocalizeSettings.model_validate_json(settings_json)
         localizer = self.map.localizer if settings == self.map.settings else create_localizer(settings, self.map)
         index_of = {name: index for index, name in enumerate(localizer.image_names)}
-        return localizer, references_of_images(self.retrieval, index_of)
+        return localizer, references_of_images(self.retrieval, index_of), self.map.turns_for(settings)
 
     @cached_property
     def _stores(self) -> list[FeatureStore]:
-        """Features of the queries; [] for the method `feed_forward`, which has none."""
-        if self.map.settings.method == "feed_forward" or self.map.features_dir is None:
+        """Features of the queries."""
+        if self.map.features_dir is None:
             return []
         folder, session = self.map.features_dir, self.session.id
-        return [FeatureStore.of_session(folder, session, kind.extractor.settings) for kind in self.map.kinds]
+        paths = [features_path(folder, session, kind.extractor.settings) for kind in self.map.kinds]
+        if missing := [path for path in paths if not path.exists()]:
+            raise ArtifactError(
+                f"{missing[0]}: no features of the queries. A run with the method `feed_forward` extracts none. To "
+                "change its method: python -m toolkit run MANIFEST --set localize.method=hybrid"
+            )
+        return [FeatureStore.open(path) for path in paths]

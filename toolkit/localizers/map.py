@@ -190,11 +190,26 @@ class Map:
     @cached_property
     def turns(self) -> Turns | None:
         """The turns that make the capture's images upright; None if no network of the run needs upright images."""
-        if (turns := turns_for(self.settings, [*self.kinds, *self.escalation], self.capture)) is not None:
+        if (turns := self.turns_for(self.settings)) is not None:
             return turns
         reranks = self.reranked and KINDS[self._verification[0].name].upright
         describes = self.files is not None and any(map(self.shows_upright, self.embedders))
-        return upright_turns(self.capture, self.settings.world_up) if reranks or describes else None
+        return self._upright if reranks or describes else None
+
+    def turns_for(self, settings: LocalizeSettings) -> Turns | None:
+        """Return the turns for a localizer in this map; None if it needs no upright images.
+
+        Args:
+            settings: those of the map, or others that need the same features.
+        """
+        if not needs_upright(settings, [*self.kinds, *self.escalation]):
+            return None
+        same = settings.world_up == self.settings.world_up
+        return self._upright if same else upright_turns(self.capture, settings.world_up)
+
+    @cached_property
+    def _upright(self) -> Turns:
+        return upright_turns(self.capture, self.settings.world_up)
 
     def shows_upright(self, embedder: Embedder) -> bool:
         """Tell whether the run turned images upright for one of its embedders."""
@@ -203,9 +218,7 @@ class Map:
 
     def turns_of(self, kind: AnyMethod, session: Session) -> NDArray[np.int64] | None:
         """Return the turns that make a session's images upright; None if this kind of features does not need them."""
-        if not KINDS[kind.name].upright or self.turns is None:
-            return None
-        return self.turns.of(session)
+        return self._upright.of(session) if KINDS[kind.name].upright else None
 
     def on_demand(self, kind: AnyMethod) -> OnDemandFeatures:
         """Return the map images' features of a kind for which the map has no points."""
@@ -514,10 +527,9 @@ def session_fingerprint(session: Session) -> str:
     return fingerprint([file_fingerprint(session.path / name) for name in files if (session.path / name).exists()])
 
 
-def turns_for(settings: LocalizeSettings, kinds: Sequence[AnyMethod], capture: Capture) -> Turns | None:
-    """Return the turns that make the capture's images upright; None if no network that localizes needs them."""
-    upright = (settings.predicts and settings.predictor.upright) or any(KINDS[kind.name].upright for kind in kinds)
-    return upright_turns(capture, settings.world_up) if upright else None
+def needs_upright(settings: LocalizeSettings, kinds: Sequence[AnyMethod]) -> bool:
+    """Tell whether a network that localizes needs upright images; `kinds` are the kinds of features."""
+    return (settings.predicts and settings.predictor.upright) or any(KINDS[kind.name].upright for kind in kinds)
 
 
 def create_localizer(settings: LocalizeSettings, map: Map, predictor: Predictor | None = None) -> Localizer:  # noqa: A002
@@ -546,9 +558,7 @@ def create_localizer(settings: LocalizeSettings, map: Map, predictor: Predictor 
     if not settings.predicts:
         return _escalating(_scaled(pnp, map), settings, map)
     predictor = predictor or open_predictor(settings, map.capture, map.map_dir)
-    turns = map.turns if settings == map.settings else turns_for(settings, map.kinds, map.capture)
-    if not settings.predictor.upright:
-        turns = None
+    turns = map.turns_for(settings) if settings.predictor.upright else None
     local_map = map.in_lengths[0].map
     feed_forward = FeedForwardLocalizer(local_map, map.session, predictor, settings.predictor, turns, map.length)
     if settings.method == "feed_forward":
