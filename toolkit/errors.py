@@ -50,6 +50,10 @@ class ImageError(ToolkitError):
     """An image file is missing or cannot be decoded."""
 
 
+class CameraError(ImageError):
+    """A camera, or a camera's pose or turn, is invalid or does not fit the pictures."""
+
+
 class WeightsError(ToolkitError):
     """Weights are missing, cannot be downloaded, are damaged, or belong to another network."""
 

@@ -1,6 +1,7 @@
 """Frames with odometry from Python, at once and one by one; what pictures say is given."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,9 @@ import pytest
 
 from tests.localizers.drifting import Drive, drive, lost_in_a_gap
 from toolkit import geometry
-from toolkit.errors import ImageError
+from toolkit.errors import CameraError, ImageError
+from toolkit.features.matching import LocalMethod, MutualMatcher
+from toolkit.features.sift import SiftExtractor
 from toolkit.localizers import frames
 from toolkit.localizers.base import PoseEstimate, RoughPose
 from toolkit.localizers.frames import LocalizedFrames, SequenceLocalizer, localize_sequence
@@ -17,7 +20,7 @@ from toolkit.localizers.map import Map
 from toolkit.localizers.odometry import Odometry
 from toolkit.localizers.pose_graph import place_piece
 from toolkit.localizers.recording import queries_of
-from toolkit.manifest import SequenceSettings
+from toolkit.manifest import LocalizeSettings, SequenceSettings
 
 pytest.importorskip("gtsam")
 CAMERA = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[500, 500, 320, 240])
@@ -111,10 +114,37 @@ def test_frames_and_cameras_that_do_not_fit_are_refused(answering: Any) -> None:
     with pytest.raises(ValueError, match="3 cameras and 40 images"):
         localize_sequence(PLACE, pictures_of(way), [CAMERA] * 3, way.odometry)
     localize_sequence(PLACE, pictures_of(way), [CAMERA] * 40, way.odometry)
-    with pytest.raises(ImageError, match="camera"):
-        localize_sequence(PLACE, pictures_of(way), "phone", way.odometry)  # type: ignore[arg-type]
-    with pytest.raises(ImageError, match="camera"):
-        SequenceLocalizer(PLACE).add(0, np.eye(4), 0)
+
+
+GRAY = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("picture", "cameras", "rig_from_cams", "message"),
+    [
+        (GRAY, "phone", None, "camera: found 'phone'"),
+        (GRAY, None, None, "camera: found None"),
+        (GRAY[:, 1:], CAMERA, None, "639 x 480 pixels, its camera 640 x 480"),
+        ([GRAY, GRAY], (CAMERA,), np.eye(4)[None], "2 pictures, 1 cameras"),
+        ([GRAY], (CAMERA,), np.diag([2.0, 2, 2, 1])[None], "rig_from_cams: found no pose"),
+    ],
+)
+def test_a_camera_that_does_not_fit_its_picture_is_an_error_unlike_an_unreadable_picture(
+    picture: Any, cameras: Any, rig_from_cams: Any, message: str
+) -> None:
+    sift = LocalMethod("sift", SiftExtractor(), MutualMatcher())
+    place = Map("ios", Path("sessions"), Path("maps"), LocalizeSettings(), [sift])
+    odometry = Odometry(np.zeros(1, np.int64), np.eye(4)[None])
+    with pytest.raises(CameraError, match=message):
+        localize_sequence(place, [picture], cameras, odometry, None, rig_from_cams)
+    with pytest.raises(CameraError, match=message):
+        SequenceLocalizer(place, None, rig_from_cams).add(0, np.eye(4), picture, cameras)
+    done = localize_sequence(place, ["nowhere.jpg"], CAMERA, odometry)
+    assert done.single[0].status == "failed: Image not found: nowhere.jpg"
+    localizer = SequenceLocalizer(place)
+    assert localizer.add(0, np.eye(4), "nowhere.jpg", CAMERA).status.startswith("failed")
+    assert localizer.single is not None
+    assert localizer.single.status == done.single[0].status
 
 
 def test_frame_by_frame_the_latest_pose_rests_on_the_past(answering: Any) -> None:

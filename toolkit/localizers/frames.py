@@ -11,14 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from toolkit import geometry
 from toolkit.capture.world_up import up_of_cameras
-from toolkit.errors import ImageError
+from toolkit.errors import CameraError, ImageError
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import PoseEstimate, RoughPose, carried_over
 from toolkit.localizers.bundle import Observations
 from toolkit.localizers.gravity import measured_gravity
 from toolkit.localizers.map import Map
 from toolkit.localizers.odometry import Odometry, cut, with_measured_drift
-from toolkit.localizers.picture import Picture, check_camera, localize_image
+from toolkit.localizers.picture import Picture, localize_image
 from toolkit.localizers.pose_graph import FAR, PlacedPiece, is_sure
 from toolkit.localizers.recording import localize_piece, queries_of
 from toolkit.manifest import SequenceSettings
@@ -55,10 +55,10 @@ def _localize(
     near: RoughPose | None = None,
 ) -> PoseEstimate:
     """Localize the picture of a frame, alone or near a pose. A picture that cannot be read gives `failed`."""
-    for camera in cameras if isinstance(cameras, list | tuple) else [cameras]:
-        check_camera(camera)
     try:
         return localize_image(map_, picture, cameras, rig_from_cams, turns, near=near)
+    except CameraError:
+        raise
     except ImageError as error:
         return PoseEstimate(f"failed: {error}")
 
@@ -87,7 +87,7 @@ def localize_sequence(
     Raises:
         ValueError: the numbers of images and poses differ, or there is neither one camera nor one per image.
         ManifestError: GTSAM is not installed.
-        ImageError: a camera is missing, or does not fit the pictures. A picture that cannot be read is `failed`.
+        CameraError: a camera is missing, or does not fit the pictures. A picture that cannot be read is `failed`.
     """
     settings = SequenceSettings.of(settings)
     if len(images) != len(odometry):
@@ -178,7 +178,7 @@ class SequenceLocalizer:
 
         Raises:
             ValueError: the timestamp is not later than the last one, or the pose is invalid.
-            ImageError: a camera is missing, or does not fit the picture. A picture that cannot be read is `failed`.
+            CameraError: a camera is missing, or does not fit the picture. A picture that cannot be read is `failed`.
             ManifestError: GTSAM is not installed.
         """
         pose = np.asarray(odom_from_rig, np.float64)

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from toolkit.capture.cameras import camera_text, parse_camera
 from toolkit.capture.images import pixels_of, stored_size
 from toolkit.capture.turning import turn_image
-from toolkit.errors import ArtifactError, ImageError
+from toolkit.errors import ArtifactError, CameraError, ImageError
 from toolkit.features.features import KINDS, LocalFeatures, extract_turned
 from toolkit.features.matching import AnyMethod, LocalMethod
 from toolkit.features.sift import SiftExtractor
@@ -54,7 +54,8 @@ def localize_image(
         `status` gives the reason.
 
     Raises:
-        ImageError: a file cannot be read, or its size is not the camera's; an invalid picture, camera, pose or turn.
+        ImageError: a picture is invalid or cannot be read.
+        CameraError: the size of a picture is not the camera's; an invalid camera, pose or turn. It is an ImageError.
         ArtifactError: files of the run are missing.
     """
     if not isinstance(place, Map):
@@ -62,11 +63,11 @@ def localize_image(
     pictures = list(image) if _are_several(image) else [image]
     cameras: list[Any] = list(camera) if isinstance(camera, list | tuple) else [camera]
     for intrinsics in cameras:
-        check_camera(intrinsics)
+        _check_camera(intrinsics)
     poses = np.eye(4)[None] if rig_from_cams is None else _poses(rig_from_cams)
     quarter_turns = [0] * len(cameras) if turns is None else _turns(turns)
     if not 0 < len(pictures) == len(cameras) == len(poses) == len(quarter_turns):
-        raise ImageError(
+        raise CameraError(
             f"Found {len(pictures)} pictures, {len(cameras)} cameras, {len(poses)} rig_from_cams and "
             f"{len(quarter_turns)} turns: expected the same number of each, and at least one."
         )
@@ -174,21 +175,21 @@ def _are_several(image: Any) -> bool:
     return isinstance(image, list | tuple) and not (image and isinstance(image[0], list | tuple | int | float))
 
 
-def check_camera(camera: Any) -> None:
+def _check_camera(camera: Any) -> None:
     """Check that an object is a camera with valid intrinsics.
 
     Raises:
-        ImageError: it is not.
+        CameraError: it is not.
     """
     if not isinstance(camera, pycolmap.Camera):
-        raise ImageError(
+        raise CameraError(
             f"camera: found {camera!r}, a {type(camera).__name__}; expected a pycolmap.Camera. To make one: "
             "parse_camera('camera', 'PINHOLE, 640, 480, 500, 500, 320, 240') of toolkit.capture."
         )
     try:
         parse_camera("camera", camera_text(camera))
     except ValueError as error:
-        raise ImageError(f"camera: {error}") from None
+        raise CameraError(f"camera: {error}") from None
 
 
 def _poses(rig_from_cams: Any) -> NDArray[np.float64]:
@@ -196,15 +197,15 @@ def _poses(rig_from_cams: Any) -> NDArray[np.float64]:
     try:
         poses = np.asarray(rig_from_cams, np.float64)
     except (ValueError, TypeError):
-        raise ImageError(f"rig_from_cams: found {rig_from_cams!r}, expected (C, 4, 4) numbers.") from None
+        raise CameraError(f"rig_from_cams: found {rig_from_cams!r}, expected (C, 4, 4) numbers.") from None
     if poses.shape[-2:] != (4, 4) or not np.isfinite(poses).all():
-        raise ImageError(f"rig_from_cams: found {poses.shape}, expected (C, 4, 4) finite numbers, one pose per camera.")
+        raise CameraError(f"rig_from_cams: found {poses.shape}, expected (C, 4, 4) finite numbers, a pose per camera.")
     poses = poses.reshape(-1, 4, 4)
     rotations = poses[:, :3, :3]
     deviations = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max(axis=(1, 2))
     deviations = np.maximum(deviations, np.abs(poses[:, 3] - [0, 0, 0, 1]).max(axis=1))
     for number in np.flatnonzero((deviations > _MAX_DEVIATION) | (np.linalg.det(rotations) < 0))[:1].tolist():
-        raise ImageError(
+        raise CameraError(
             f"rig_from_cams: found no pose for picture {number + 1}: {poses[number].tolist()}. Expected a rotation, "
             "which neither scales nor mirrors, a translation, and 0, 0, 0, 1 in the last row."
         )
@@ -215,7 +216,8 @@ def _turns(turns: Any) -> list[int]:
     try:
         return [operator.index(turn) for turn in turns]
     except TypeError:
-        raise ImageError(f"turns: found {turns!r}, expected whole numbers of quarter turns, one per picture.") from None
+        expected = "expected whole numbers of quarter turns, one per picture"
+        raise CameraError(f"turns: found {turns!r}, {expected}.") from None
 
 
 class _Pixels:
@@ -232,7 +234,7 @@ class _Pixels:
             pixels = pixels_of(self.image, not color, least_side)
             width, height = stored_size(self.image) if isinstance(self.image, Path) else pixels.shape[1::-1]
             if (self._camera.width, self._camera.height) != (width, height):
-                raise ImageError(
+                raise CameraError(
                     f"The image is {width} x {height} pixels, its camera {self._camera.width} x "
                     f"{self._camera.height}. Give the intrinsics of the image as it is stored."
                 )
