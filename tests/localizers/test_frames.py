@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pycolmap
@@ -145,6 +146,18 @@ def test_a_camera_that_does_not_fit_its_picture_is_an_error_unlike_an_unreadable
     assert localizer.add(0, np.eye(4), "nowhere.jpg", CAMERA).status.startswith("failed")
     assert localizer.single is not None
     assert localizer.single.status == done.single[0].status
+
+
+def test_a_frame_can_be_added_again_after_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = PoseEstimate("ok", np.eye(4), SURE, p_correct=0.99)
+    monkeypatch.setattr(frames, "localize_image", Mock(side_effect=[CameraError("another size"), found, found]))
+    localizer = SequenceLocalizer(PLACE)
+    with pytest.raises(CameraError, match="another size"):
+        localizer.add(5, np.eye(4), 0, CAMERA)
+    assert localizer.single is None
+    for timestamp in (5, 6):
+        np.testing.assert_allclose(np.asarray(localizer.add(timestamp, np.eye(4), 0, CAMERA).world_from_rig), np.eye(4))
+    assert localizer._queries.frames.tolist() == [0, 1]
 
 
 def test_frame_by_frame_the_latest_pose_rests_on_the_past(answering: Any) -> None:

@@ -186,17 +186,17 @@ class SequenceLocalizer:
             raise ValueError(f"odom_from_rig: found {pose.tolist()}, expected a pose (4, 4) of finite numbers.")
         if self._timestamps and timestamp <= self._timestamps[-1]:
             raise ValueError(f"timestamp: found {timestamp} after {self._timestamps[-1]}, expected a later one.")
+        cams: Any = cameras
+        # Before the frame is added, so that it can be added again after an error.
+        self.single = None if image is None else self._localize(image, cams)
         self._timestamps.append(int(timestamp))
         self._poses.append(pose)
         latest = self._since(-4)
         if latest.split(self.settings)[-1].start == len(latest) - 1:  # tracking was lost: start a new piece
             del self._timestamps[:-1], self._poses[:-1]
             self._queries, self._solved = queries_of({}), None
-        if image is None:
-            self.single = None
+        if self.single is None:
             return self._extrapolate()
-        cams: Any = cameras
-        self.single = self._localize(image, cams)
         self._queries = self._queries.joined(queries_of({len(self._poses) - 1: self.single}))
         return self._solve(image, cams)
 
