@@ -1367,6 +1367,21 @@ def test_a_rough_pose_is_as_rough_as_the_map_is_small(
     assert [prior.radius_deg for prior in priors] == [pytest.approx(radius_deg, abs=1e-4)]
 
 
+def test_a_picture_is_not_compared_with_vectors_of_another_vocabulary(
+    capture: Path, finished: tuple[SceneFiles, pd.DataFrame], tmp_path: Path
+) -> None:
+    files = SceneFiles(tmp_path / "run", finished[0].scene)
+    shutil.copytree(finished[0].root, files.root)
+    place, session = Map.open(files.run, files.scene, "ios"), Capture.open(capture)["ios_query"]
+    path, camera = session.image_path(0), session.camera(session.images["sensor_id"][0])
+    with np.load(files.embeddings / "vlad.npz") as stored:
+        arrays = dict(stored)
+    np.savez(files.embeddings / "vlad.npz", **arrays | {"centroids": 2 * arrays["centroids"]})
+    sidecar_path(files.embeddings / "vlad.npz").unlink()
+    with pytest.raises(ArtifactError, match=r"embeddings/ios_map/.*\.npy was made by another .*vocabulary"):
+        localize_image(place, path, camera)
+
+
 def test_a_query_that_failed_is_localized_again_where_odometry_leads(
     capture: Path, finished: tuple[SceneFiles, pd.DataFrame], tmp_path: Path
 ) -> None:

@@ -1,6 +1,7 @@
 """Search and the retrieve stage."""
 
 import json
+import re
 import shutil
 import tracemalloc
 from pathlib import Path
@@ -275,6 +276,18 @@ def test_only_listed_keyframes(tiny: Path, tmp_path: Path) -> None:
     row = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", **options).iloc[0]
     assert not row["skipped"], "another list is another question"
     assert [record["timestamp"] for record in lines(row["path"])] == ["1000"]
+
+
+def test_vectors_of_two_vocabularies_are_not_compared(tiny: Path, tmp_path: Path) -> None:
+    """One device is embedded again with other settings; the vectors have the same length."""
+    embed_sessions(tiny / "sessions", tmp_path / "embeddings", {"vlad": {"min_scale_px": 3}}, device="ios")
+    table = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings").set_index(["map_device", "query_device"])
+    for pair in (("ios", "hl"), ("hl", "ios")):
+        assert {f"{name}.npy" for name in ("ios_a", "hl_a")} <= {*re.findall(r"\w+\.npy", table["reason"][pair])}, pair
+    assert table["reason"]["ios", "ios"] == table["reason"]["hl", "hl"] == ""
+    (tmp_path / "embeddings/ios_map").rename(tmp_path / "embeddings/hl_map/ios_map")
+    with pytest.raises(ArtifactError, match=r"ios_a\.npy and .*\.npy were made by different"):
+        load_embeddings(tmp_path / "embeddings/hl_map")
 
 
 def test_refused(tiny: Path, tmp_path: Path) -> None:

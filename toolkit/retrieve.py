@@ -21,7 +21,7 @@ from toolkit.capture.tables import SIGNALS
 from toolkit.embedders import Vectors, embedding_folders, load_embeddings, open_descriptors
 from toolkit.embedders.index import EXACT, is_index_current, make_index
 from toolkit.embedders.search import Backend, Found, search
-from toolkit.embedders.stored import matrix_fingerprints
+from toolkit.embedders.stored import matrix_fingerprints, require_same_embedder
 from toolkit.errors import ArtifactError, CaptureError, ManifestError
 from toolkit.files import file_fingerprint, fingerprint, is_current, pair_name, write_atomic, write_sidecar, write_text
 from toolkit.geometry import Ints
@@ -113,6 +113,7 @@ def retrieve_pairs(
                 skipped = skipped and is_index_current(embeddings, database.session.id, database.vectors, settings)
                 if not skipped:
                     _require_same_dimension(query, database)
+                    require_same_embedder(query.vectors, database.vectors)
                     todo[device] = replace(query, masks=masks), path, record
                 row |= query.counts | database.counts | without
                 row |= {"seconds": 0.0, "skipped": skipped, "path": str(path)}

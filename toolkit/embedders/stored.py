@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from toolkit.errors import ArtifactError
-from toolkit.files import file_fingerprint, read_json, require_whole, sidecar_path
+from toolkit.files import file_fingerprint, fingerprint, read_json, require_whole, sidecar_path
 from toolkit.geometry import Ints, unit
 
 log = logging.getLogger(__name__)
@@ -32,6 +32,8 @@ class StoredVectors:
     """The selected rows of the concatenation, in any order."""
     normalize: bool = False
     """Whether to scale vectors to length 1 when reading."""
+    embedder: str = ""
+    """Identifies the embedder, see `embedder_fingerprint`; empty: unknown."""
 
     @classmethod
     def stack(cls, parts: Sequence["StoredVectors"]) -> "StoredVectors":
@@ -41,7 +43,12 @@ class StoredVectors:
             rows.append(part.rows + starts[-1])
             starts += [starts[-1] + start for start in part.starts[1:]]
         paths = tuple(path for part in parts for path in part.paths)
-        return replace(parts[0], paths=paths, starts=tuple(starts), rows=np.concatenate(rows))
+        embedder = next((part.embedder for part in parts if part.embedder), "")
+        return replace(parts[0], paths=paths, starts=tuple(starts), rows=np.concatenate(rows), embedder=embedder)
+
+    @property
+    def each(self) -> tuple["StoredVectors", ...]:
+        return (self,)
 
     @property
     def dims(self) -> tuple[int, ...]:
@@ -93,8 +100,12 @@ class JoinedVectors:
         return cls({name: StoredVectors.stack([joined.parts[name] for joined in parts]) for name in names})
 
     @property
+    def each(self) -> tuple[StoredVectors, ...]:
+        return tuple(self.parts.values())
+
+    @property
     def dims(self) -> tuple[int, ...]:
-        return tuple(part.dim for part in self.parts.values())
+        return tuple(part.dim for part in self.each)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -113,6 +124,24 @@ class JoinedVectors:
 
 
 Vectors = StoredVectors | JoinedVectors
+
+
+def embedder_fingerprint(settings: Mapping[Any, Any]) -> str:
+    """Return a fingerprint of an embedder's settings, weights and vocabulary.
+
+    The precision is left out: it changes the last digits only, and depends on the device.
+    """
+    return fingerprint({name: value for name, value in settings.items() if name != "dtype_compute"})
+
+
+def require_same_embedder(vectors: Vectors, others: Vectors) -> None:
+    """Raise ArtifactError if two sets of vectors are known to come from different embedders or vocabularies."""
+    for ours, theirs in zip(vectors.each, others.each, strict=True):
+        if ours.embedder and theirs.embedder and ours.embedder != theirs.embedder:
+            raise ArtifactError(
+                f"{ours.paths[0]} and {theirs.paths[0]} were made by different embedders or vocabularies, so their "
+                "vectors cannot be compared. Embed all sessions again."
+            )
 
 
 def matrix_fingerprints(paths: Sequence[Path]) -> list[Any]:
@@ -164,7 +193,7 @@ def open_embeddings(folder: str | Path) -> tuple[StoredVectors, pd.DataFrame]:
         raise ArtifactError(
             f"No embeddings in {folder}: run the embed stage first (python -m toolkit run ... --only embed)."
         )
-    paths, tables, starts, dim = list[Path](), [], [0], 0
+    parts, tables, dim = list[StoredVectors](), [], 0
     for manifest in manifests:
         path = manifest.parent / f"{manifest.parent.name}.npy"
         for file in (path, manifest):
@@ -179,15 +208,21 @@ def open_embeddings(folder: str | Path) -> tuple[StoredVectors, pd.DataFrame]:
                 f"{manifest} ({len(table)} rows, {', '.join(table.columns)}) does not fit {path.name} "
                 f"{matrix.shape}; expected columns {', '.join(MANIFEST_COLUMNS)} and one row per vector. Embed again."
             )
-        if paths and matrix.shape[1] != dim:
+        if parts and matrix.shape[1] != dim:
             raise ArtifactError(f"{path} has {matrix.shape[1]} dimensions, {manifests[0].parent} {dim}; embed again.")
         dim = matrix.shape[1]
-        paths.append(path)
-        starts.append(starts[-1] + len(matrix))
+        match read_json(sidecar_path(path)):
+            case {"settings": {"embedder": {**settings}}}:
+                embedder = embedder_fingerprint(settings)
+            case _:  # a matrix of another tool
+                embedder = ""
+        part = StoredVectors((path,), (0, len(matrix)), dim, np.arange(len(matrix)), embedder=embedder)
+        for other in parts:
+            require_same_embedder(part, other)
+        parts.append(part)
         base = folder.parent if manifest.parent == folder else folder
         tables.append(table.assign(subsession=manifest.parent.relative_to(base).as_posix()))
-    vectors = StoredVectors(tuple(paths), tuple(starts), dim, np.arange(starts[-1]))
-    return vectors, pd.concat(tables, ignore_index=True)
+    return StoredVectors.stack(parts), pd.concat(tables, ignore_index=True)
 
 
 def embedding_folders(embeddings: str | Path) -> dict[str, Path]:

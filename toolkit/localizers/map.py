@@ -20,6 +20,7 @@ from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import Embedder, Vectors, create_embedder, embedding_folders, open_descriptors
 from toolkit.embedders.index import JoinedIndex, VectorIndex, load_index
 from toolkit.embedders.search import search
+from toolkit.embedders.stored import embedder_fingerprint
 from toolkit.errors import ArtifactError, ToolkitError
 from toolkit.features.features import KINDS, extract_turned
 from toolkit.features.groups import HDF5_ERRORS
@@ -309,7 +310,11 @@ class Map:
 
     @cached_property
     def embedders(self) -> list[Embedder]:
-        """The embedders that the run used."""
+        """The embedders that the run used.
+
+        Raises:
+            ArtifactError: the map's vectors are from another one.
+        """
         settings = self.embed_settings
         folders = embedding_folders(self._run.embeddings).values()
         learned = {
@@ -318,10 +323,17 @@ class Map:
             "dtype_compute": settings.dtype_compute,
             "image_size": settings.image_size,
         }
-        return [
+        embedders = [
             create_embedder(name, **({"vocabulary": folder / "vlad.npz"} if name == "vlad" else learned))
             for name, folder in zip(settings.models, folders, strict=True)
         ]
+        for embedder, vectors in zip(embedders, self._stored[0].each, strict=True):
+            if vectors.embedder not in ("", embedder_fingerprint(embedder.settings)):
+                raise ArtifactError(
+                    f"{vectors.paths[0]} was made by another embedder or vocabulary than the run's {embedder.name} of "
+                    "now. Run the embed stage again."
+                )
+        return embedders
 
     @property
     def _run(self) -> SceneFiles:
