@@ -226,7 +226,11 @@ def start(capture: str | Path, device: str, split: str, folder: Path, placing: s
 
 
 def write_drafts(*drafts: Draft) -> list[ImportReport]:
-    """Write sessions without the images that cannot be used; raise CaptureError, and write none, if one has none left."""
+    """Write sessions without the images that cannot be used.
+
+    Raises:
+        CaptureError: a session has no image left; none is written.
+    """
     for draft in drafts:
         draft.leave_out()
     return [draft.write() for draft in drafts]
