@@ -53,6 +53,27 @@ def test_a_download_that_is_stopped_keeps_its_part(server: FakeHub, tmp_path: Pa
     assert not (tmp_path / "a.zip").exists()
 
 
+def test_a_connection_may_break_any_number_of_times_if_each_brings_data(
+    server: FakeHub, transfer: Transfer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_CHUNK_BYTES", 1000)
+    server.cuts = list(range(10_000, len(BODY), 10_000))
+    transfer.fetch(RemoteFile("a.zip", f"{server.url}/a.zip", len(BODY), "etag:x"), tmp_path / "part", tmp_path / "a")
+    assert (tmp_path / "a").read_bytes() == BODY
+    assert len(server.requests) == 60
+
+
+def test_a_server_without_ranges_that_always_breaks_is_not_asked_forever(
+    server: FakeHub, transfer: Transfer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each attempt brings data, but never more than the first."""
+    monkeypatch.setattr(module, "_CHUNK_BYTES", 1000)
+    server.ranges, server.cuts = False, [20_000, 10_000] * 100
+    with pytest.raises(DownloadError, match="2 times in a row"):
+        transfer.fetch(RemoteFile("a.zip", f"{server.url}/a.zip", len(BODY), "etag:x"), tmp_path / "p", tmp_path / "a")
+    assert len(server.requests) == 3
+
+
 def test_size_and_version_of_a_file(server: FakeHub, transfer: Transfer) -> None:
     size, version = transfer.describe(f"{server.url}/a.zip")
     assert size == len(BODY)

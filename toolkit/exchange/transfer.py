@@ -27,9 +27,8 @@ NETWORK = (
     "it resumes the download."
 )
 _TIMEOUT_S = (20, 60)  # to connect; between two chunks
-_WAITS_S = (1, 2, 4, 8, 16)  # between attempts that bring no data; an attempt that brings some resets the sequence
+_WAITS_S = (1, 2, 4, 8, 16)  # between attempts that bring no more data; an attempt that brings some resets the sequence
 _MAX_WAIT_S = 330  # the hub's rate limits count requests over five minutes
-_MAX_WAITS = 50
 _CHUNK_BYTES = 1 << 18
 _RANGE_BYTES = 32 << 30  # largest range per request: the hub's content network does not answer requests for 50 GB
 
@@ -116,18 +115,17 @@ class Transfer:
         partial.parent.mkdir(parents=True, exist_ok=True)
         target.parent.mkdir(parents=True, exist_ok=True)
         partial.touch()
-        failures = waits = 0  # failures: attempts in a row that brought no data
+        failures = most = 0  # attempts in a row that brought no more data than those before; largest size so far
         complete = False
         while not complete:
-            size_before = partial.stat().st_size
+            most = max(most, partial.stat().st_size)
             try:
                 complete = self._fetch_more(file, partial)
                 failures = 0
             except _TryAgainError as again:
                 reason, wait_s = again.args
-                failures = 0 if partial.stat().st_size > size_before else failures + 1
-                waits += 1
-                if failures > len(_WAITS_S) or waits > _MAX_WAITS:
+                failures = 0 if partial.stat().st_size > most else failures + 1
+                if failures > len(_WAITS_S):
                     raise DownloadError(
                         f"{file.path}: {file.url}: {reason}, {failures} times in a row.\n{NETWORK}"
                     ) from again
