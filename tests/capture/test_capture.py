@@ -417,6 +417,18 @@ def test_a_covariance_that_is_nan_is_left_out(tmp_path: Path) -> None:
     np.testing.assert_array_equal(Trajectory.read(tmp_path / "t.txt").covariances, covariances)
 
 
+def test_a_covariance_that_is_malformed_is_not_used_and_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """It would be 0 there, which is certain."""
+    numbers = ", ".join(["1"] * 35)
+    lines = [f"{time}, a, 1, 0, 0, 0, 0, 0, 0, {numbers}, {last}" for time, last in enumerate(("1", "O.5", "nan", "2"))]
+    (tmp_path / "t.txt").write_text("\n".join(lines))
+    covariances = Trajectory.read(tmp_path / "t.txt").covariances
+    assert covariances is not None
+    assert covariances[[0, 3], 5, 5].tolist() == [1, 2]
+    assert np.isnan(covariances[1:3]).all()
+    assert "t.txt, line 2: the covariance" in caplog.text
+
+
 def test_rows_without_covariance_are_nan(tmp_path: Path) -> None:
     numbers = ", ".join(map(str, range(36)))
     (tmp_path / "t.txt").write_text(f"1, a, 1, 0, 0, 0, 0, 0, 0\n2, a, 1, 0, 0, 0, 0, 0, 0, {numbers}\n")

@@ -1,5 +1,6 @@
 """Poses of devices over time: read, write and look up by timestamp and device."""
 
+import logging
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,8 @@ from toolkit.capture.tables import (
     write_table,
 )
 from toolkit.geometry import pose_from_qt, qt_from_pose
+
+log = logging.getLogger(__name__)
 
 
 class Trajectory:
@@ -103,17 +106,28 @@ class Trajectory:
 
     @property
     def covariances(self) -> Floats | None:
-        """Pose covariances (N, 6, 6), NaN in rows without one; None without any. Read from the file at first use."""
+        """Pose covariances (N, 6, 6), NaN in rows without one; None without any. Read from the file at first use.
+
+        A covariance with a value that is not a finite number counts as none, with a warning.
+        """
         if self._covariances is None and self._source is not None:
-            extra = read_table(self._source, COLUMNS["trajectories.txt"], extra=True).columns["extra"]
+            table = read_table(self._source, COLUMNS["trajectories.txt"], extra=True)
+            extra = table.columns["extra"]
             rows = np.flatnonzero(pc.equal(pc.count_substring(extra, ","), 35).to_numpy(zero_copy_only=False))
             if len(rows):
                 self._covariances = np.full((len(self), 6, 6), np.nan)
+                malformed = list[int]()
                 for start in range(0, len(rows), 4096):
                     block = rows[start : start + 4096]
                     values = pc.split_pattern(extra.take(pa.array(block)), ",").flatten()
-                    numbers, _ = convert(pc.ascii_trim_whitespace(values), NUMBER)
+                    numbers, wrong = convert(pc.ascii_trim_whitespace(values), NUMBER)
                     self._covariances[block] = numbers.to_numpy().reshape(-1, 6, 6)
+                    malformed += block[wrong.reshape(-1, 36).any(axis=1)].tolist()
+                if malformed:
+                    self._covariances[malformed] = np.nan
+                    more = f", and in {len(malformed) - 1} more lines" if len(malformed) > 1 else ""
+                    log.warning("%s: the covariance has values that are not finite numbers%s; such a covariance is not "
+                                "used.", table.where(malformed[0]), more)  # fmt: skip
             self._source = None
         return self._covariances
 
