@@ -168,6 +168,12 @@ def test_workers_are_the_cores_that_a_container_has(
     assert default_workers() == cores
 
 
+@pytest.mark.parametrize(("text", "workers"), [("0", 1), ("3", 3)])
+def test_workers_are_at_least_one(monkeypatch: pytest.MonkeyPatch, text: str, workers: int) -> None:
+    monkeypatch.setenv(WORKERS, text)
+    assert default_workers() == workers
+
+
 @pytest.mark.parametrize(("workers", "ahead"), [(1, 0), (2, 4), (4, 1)])
 def test_prefetch_keeps_the_order(workers: int, ahead: int) -> None:
     def slow_first(item: int) -> int:

@@ -188,8 +188,8 @@ def default_workers() -> int:
     """
     import psutil
 
-    if os.environ.get(WORKERS, "").isdigit():
-        return int(os.environ[WORKERS])
+    if (workers := os.environ.get(WORKERS, "")).isdecimal():
+        return max(1, int(workers))
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     limits = [cores, psutil.virtual_memory().total / THREAD_BYTES]
     for files in (("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us")):
