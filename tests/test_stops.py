@@ -150,6 +150,13 @@ def _manifest(folder: Path) -> Path:
             "errno = 28, error message = 'No space left on device', buf = 0x1)",
             "The disk is full: /x/z.h5",
         ),
+        ("OSError", str(OSError(28, "No space left on device", "Tom's/b.csv")), "The disk is full: Tom's/b.csv"),
+        (
+            "OSError",
+            "Unable to synchronously create file (unable to open file: name = '/Tom's/y.h5', errno = 28, error message "
+            "= 'No space left on device', flags = 15, o_flags = c2)",
+            "The disk is full: /Tom's/y.h5",
+        ),
         ("PermissionError", "[Errno 13] Permission denied: 'p'", "p cannot be read or written (Permission denied)"),
         ("NotADirectoryError", "[Errno 20] Not a directory: 'file/x'", "file/x cannot be"),
         ("OSError", "[Errno 30] Read-only file system: 'r'", "r cannot be"),

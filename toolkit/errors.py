@@ -128,8 +128,9 @@ def shortage(kind: str, text: str) -> str | None:
     number = int(match[1]) if match else 0
     if number not in _FULL | _NO_PLACE:
         return None
-    names = re.findall(r"name = '([^']+)'", text) or re.findall(r"'([^']+)'", text.partition("]")[2])
-    path, reason = names[-1] if names else "a file", os.strerror(number)
+    # HDF5 writes a path between apostrophes as it is; Python writes one with an apostrophe between quotation marks.
+    names = re.findall(r"name = (')(.+?)',", text) or re.findall(r"""(['"])(.+?)\1""", text.partition("]")[2])
+    path, reason = names[-1][1] if names else "a file", os.strerror(number)
     if number in _FULL:
         return f"The disk is full: {path} cannot be written ({reason}). Free some space, or choose another output_root."
     return f"{path} cannot be read or written ({reason}). Fix that, or choose another folder, e.g. output_root."
