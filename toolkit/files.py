@@ -273,7 +273,7 @@ RUN_FILES = ("notebooks", "report.html", "run.json", "run.log", "submission.csv"
 """Files and folders of a run beside its scenes; no scene can have one of these names."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class SceneFiles:
     """Paths of the files of one scene in a run folder."""
 
@@ -282,45 +282,17 @@ class SceneFiles:
     scene: str
     """Name of the capture folder."""
 
-    @property
-    def root(self) -> Path:
-        return Path(self.run) / self.scene
-
-    @property
-    def embeddings(self) -> Path:
-        return self.root / "embeddings"
-
-    @property
-    def features(self) -> Path:
-        return self.root / "features"
-
-    @property
-    def maps(self) -> Path:
-        return self.root / "map"
-
-    @property
-    def index(self) -> Path:
-        return self.root / "index"
-
-    @property
-    def retrieval_dir(self) -> Path:
-        return self.root / "retrieval"
-
-    @property
-    def reranked_dir(self) -> Path:
-        return self.root / "reranked"
-
-    @property
-    def poses_dir(self) -> Path:
-        return self.root / "poses"
-
-    @property
-    def evaluation(self) -> Path:
-        return self.root / "evaluation"
-
-    @property
-    def visualization(self) -> Path:
-        return self.root / "visualization"
+    def __post_init__(self) -> None:
+        self.root = Path(self.run) / self.scene
+        self.embeddings = self.root / "embeddings"
+        self.features = self.root / "features"
+        self.maps = self.root / "map"
+        self.index = self.root / "index"
+        self.retrieval_dir = self.root / "retrieval"
+        self.reranked_dir = self.root / "reranked"
+        self.poses_dir = self.root / "poses"
+        self.evaluation = self.root / "evaluation"
+        self.visualization = self.root / "visualization"
 
     def retrieval(self, map_device: str, query_device: str) -> Path:
         return self.retrieval_dir / f"{pair_name(self.scene, map_device, query_device)}.jsonl"
