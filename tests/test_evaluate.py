@@ -325,6 +325,10 @@ def test_unknown_choices_are_named(scene):
         evaluate_scene(*scene, None, map_device="spot")
     with pytest.raises(ToolkitError, match="device, camera"):
         evaluate_ios(scene, at="rig")
+    with pytest.raises(ToolkitError, match=r"\[\['ios', 'spto'\]\]"):
+        evaluate_scene(*scene, None, pairs=[["ios", "spto"]])
+    with pytest.raises(ToolkitError, match="thresholds"):
+        evaluate_scene(*scene, None, {"thresholds": []})
 
 
 def test_only_the_pairs_asked_for_are_evaluated(scene):

@@ -1,4 +1,7 @@
+import html
 import os
+import re
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +19,7 @@ from toolkit.show.viewer import open_recording
 def recording(tmp_path, monkeypatch):
     import rerun.blueprint as rrb
 
-    recording = tmp_path / "run" / "vis & more.rrd"
+    recording = tmp_path / "run" / "100 % & more #1.rrd"
     recording.parent.mkdir()
     with open_recording(recording, "name", rrb.Blueprint()):
         pass
@@ -32,8 +35,9 @@ def test_a_saved_page_has_the_link_and_the_command(recording, monkeypatch):
     assert show_recording(recording) is None
     (text,) = shown
     page = text.data
-    assert 'href="../run/vis &amp; more.rrd"' in page
-    assert "<code>rerun " in page
+    assert 'href="../run/100%20%25%20%26%20more%20%231.rrd"' in page
+    (command,) = re.findall("<code>(.*)</code>", page)
+    assert shlex.split(html.unescape(command)) == ["rerun", str(recording)]
 
 
 @pytest.mark.slow

@@ -602,7 +602,7 @@ class LocalizeSettings(Settings):
 class EvaluateSettings(Settings):
     """Evaluation against ground truth."""
 
-    thresholds: list[Threshold] = [[1.0, 0.1], [5.0, 0.5], [5.0, 1.0]]
+    thresholds: Annotated[list[Threshold], Field(min_length=1)] = [[1.0, 0.1], [5.0, 0.5], [5.0, 1.0]]
     """Pose recall is reported at these thresholds: rotation error in degrees, translation error in meters."""
     retrieval_ks: list[Positive] = [1, 5, 10]
     """Retrieval recall is reported for these numbers of references."""

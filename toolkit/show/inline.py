@@ -6,6 +6,7 @@ import os
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from toolkit.errors import ArtifactError
 from toolkit.runs.kernel import TEXT_BARS
@@ -58,7 +59,7 @@ def show_recording(path: str | Path, height: int = 600) -> Any:
     if not path.is_file():
         raise ArtifactError(f"{path}: no such recording. Run the cells above with recordings = True.")
     # Relative to the notebook, so that the run folder can be moved.
-    link = html.escape(os.path.relpath(path.resolve(), Path.cwd()), quote=True)
+    link = quote(os.path.relpath(path.resolve(), Path.cwd()))
     size_mb = path.stat().st_size / 1e6
     display(
         HTML(

@@ -1,5 +1,6 @@
 """Common parts of recordings for the rerun viewer: files, reduced images, cameras, layout."""
 
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -53,7 +54,7 @@ def open_recording(out: str | Path, name: str, blueprint: Any) -> "Iterator[rr.R
 
 def open_command(path: str | Path) -> str:
     """Return the command that opens a recording in the viewer."""
-    return f"rerun {path}"
+    return shlex.join(["rerun", str(path)])
 
 
 def spawn_viewer(path: str | Path) -> None:
