@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from toolkit.capture.folder import Capture
 from toolkit.capture.session import Rows, Session
-from toolkit.capture.world_up import WorldUp, estimate_world_up, given_world_up, posed_photographs, sensor_names
+from toolkit.capture.world_up import WorldUp, estimate_world_up, posed_photographs, sensor_names
 from toolkit.files import fingerprint
 from toolkit.geometry import Floats, Ints, unit
 
@@ -120,7 +120,7 @@ class Turns:
         return codes.astype(np.int64), np.maximum(turns, 0)
 
 
-def quarter_turns(maps: Sequence[Session], world_up: WorldUp | ArrayLike | None = None) -> Turns:
+def quarter_turns(maps: Sequence[Session], world_up: ArrayLike | None = None) -> Turns:
     """Find how each camera is mounted or held, from the poses of a capture's map sessions.
 
     Each image votes for the quarter turns that bring the up direction closest to its top. The weight of the vote is
@@ -128,15 +128,12 @@ def quarter_turns(maps: Sequence[Session], world_up: WorldUp | ArrayLike | None 
 
     Args:
         maps: all map sessions of one capture.
-        world_up: up direction (3,) of the world, any length; None: `estimate_world_up`.
+        world_up: up direction (3,) of the world, any length but 0; None: `estimate_world_up`.
 
     Returns:
         The turns. Without any posed image, no image is turned, and a warning is logged.
-
-    Raises:
-        ManifestError: `world_up` is not three finite numbers, or is zero.
     """
-    up = world_up if world_up is None or isinstance(world_up, WorldUp) else given_world_up(world_up)
+    up = None if world_up is None else WorldUp(np.asarray(world_up) / np.linalg.norm(world_up), True, "given")
     tables = [pd.DataFrame({kind: [] for kind in SHARES}, dtype=object)]
     rotations = [np.zeros((0, 3, 3))]
     for session in maps:

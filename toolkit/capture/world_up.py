@@ -8,7 +8,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from toolkit.capture.session import Session
-from toolkit.errors import CaptureError, ManifestError
+from toolkit.errors import CaptureError
 from toolkit.geometry import Floats, Ints
 
 MAX_IMAGES = 2000  # images used per session
@@ -38,25 +38,6 @@ class WorldUp:
     direction: Floats
     known: bool
     reason: str
-
-
-def given_world_up(direction: ArrayLike) -> WorldUp:
-    """Return the up direction (3,) of a manifest, of any length, as a unit vector.
-
-    Raises:
-        ManifestError: the direction is not three finite numbers, or is zero.
-    """
-    try:
-        up = np.asarray(direction, np.float64)
-    except (TypeError, ValueError):
-        up = np.zeros(0)
-    length = float(np.linalg.norm(up)) if up.shape == (3,) else 0.0
-    if not np.isfinite(length) or length < 1e-9:
-        raise ManifestError(
-            f"Found world_up: {direction!r}; expected three finite numbers, not all zero: the up direction of the "
-            "captures' world, e.g. [0, 0, 1]. Leave it out to have it estimated."
-        )
-    return WorldUp(up / length, True, "given")
 
 
 def estimate_world_up(sessions: Sequence[Session]) -> WorldUp:
