@@ -476,8 +476,8 @@ def test_keyframe_lists(session: Session) -> None:
 
 
 def test_depth_maps(session: Session, tmp_path: Path) -> None:
-    assert session.depth_path(10, "s/depth") == session.path / "raw_data" / "s" / "d" / "10.png"
-    assert session.depth_path(20, "s/depth") is None
+    assert session.depths is not None
+    assert session.depths.to_numpy().tolist() == [[10, "s/depth", "s/d/10.png"]]
     depth = np.array([[0, 1.5], [70, np.nan], [-1, 65.535]], np.float32)
     write_depth(tmp_path / "d.png", depth)
     np.testing.assert_array_equal(read_depth(tmp_path / "d.png"), np.float32([[0, 1.5], [0, 0], [0, 65.535]]))

@@ -125,10 +125,11 @@ def test_two_views_agree_through_depth_and_poses(small_capture: Path) -> None:
         cameras = [session.camera(rows[i].sensor_id) for i in (first, second)]
         images = [cv2.imread(str(session.image_path(i)), cv2.IMREAD_GRAYSCALE) for i in (first, second)]
         depths = []
+        assert session.depths is not None
+        paths = session.depths.set_index(["timestamp", "sensor_id"])["path"]
         for i in (first, second):
-            path = session.depth_path(rows[i].timestamp, rows[i].sensor_id)
-            assert path is not None
-            depths.append(read_depth(path))
+            path = paths[rows[i].timestamp, rows[i].sensor_id]
+            depths.append(read_depth(session.path / "raw_data" / path))
         h, w = images[0].shape
         u, v = np.meshgrid(np.arange(0, w, 5) + 0.5, np.arange(0, h, 5) + 0.5)
         pixels = np.stack([u.ravel(), v.ravel()], -1)

@@ -278,17 +278,6 @@ class Session:
         return files_fingerprint([self.image_path(row) for row in range(len(self.images))])
 
     @cached_property
-    def _depth_index(self) -> KeyIndex | None:
-        return None if self.depths is None else KeyIndex(times_of(self.depths), self.depths["sensor_id"])
-
-    def depth_path(self, timestamp: int, sensor_id: str) -> Path | None:
-        """Return the depth map of a depth sensor at a time, or None."""
-        if self.depths is None or self._depth_index is None:
-            return None
-        (row,) = self._depth_index.find(np.array([timestamp], np.int64), [sensor_id])
-        return None if row < 0 else self.path / RAW_DATA / self.depths["path"].iloc[row]
-
-    @cached_property
     def depths_fingerprint(self) -> str:
         """16 hex digits that identify depths.txt and the depth map files at first use."""
         if self.depths is None:

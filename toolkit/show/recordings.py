@@ -13,7 +13,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 from tqdm.auto import tqdm
 
-from toolkit.capture import DEPTH_SCALE, Capture, Session, Trajectory
+from toolkit.capture import DEPTH_SCALE, RAW_DATA, Capture, Session, Trajectory
 from toolkit.capture.devices import color_of
 from toolkit.capture.images import decode, default_workers, prefetch, read_for_display, read_image
 from toolkit.capture.world_up import up_of_cameras
@@ -304,11 +304,10 @@ class _Plan:
         ]
         slot_of = dict(zip(sensors, frame.slots, strict=True))
         for rank, row in enumerate(self.depths.get((frame.timestamp, frame.device_id), [])):
-            sensor = str(session.depths["sensor_id"].iloc[row])  # type: ignore[index]
-            path = session.depth_path(frame.timestamp, sensor)
-            if path is not None:
-                pose, slot = self.rig_from_depth[row] if in_rig else frame.world_from_device, slot_of.get(sensor, rank)
-                shots.append(_Shot(f"{slot}_depth", session.camera(sensor), pose, path, is_depth=True))
+            sensor, path = session.depths[["sensor_id", "path"]].iloc[row]  # type: ignore[index]
+            pose, slot = self.rig_from_depth[row] if in_rig else frame.world_from_device, slot_of.get(sensor, rank)
+            file = session.path / RAW_DATA / path
+            shots.append(_Shot(f"{slot}_depth", session.camera(sensor), pose, file, is_depth=True))
         return shots
 
 
