@@ -162,8 +162,8 @@ def evaluate_scene(
             rows["recall"].append({**pair, "state": state, **_summary(frame, limits, unit)})
             rows["losses"] += [{**pair, "state": state, **row} for row in _losses(frame, limits, unit)]
     if not rows["recall"]:
-        devices = f"map_device={map_device!r}, query_device={query_device!r}"
-        raise ToolkitError(f"Found pairs={pairs!r}, expected [map device, query device] of {devices} in {capture.path}.")
+        among = f"map_device={map_device!r} and query_device={query_device!r} in {capture.path}"
+        raise ToolkitError(f"Found pairs={pairs!r}, expected [map device, query device] among {among}.")
     if all(row["state"].startswith(LEFT_OUT) for row in rows["recall"]):
         raise CaptureError(messages[0])
     folders = {"retrieved": retrieval_dir, "reranked": reranked_dir}

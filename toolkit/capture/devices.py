@@ -8,9 +8,11 @@ run passes them to its notebooks in an environment variable.
 import json
 import os
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field
+
+from toolkit.files import environment_variable
 
 EXTRA_DEVICES = "TOOLKIT_EXTRA_DEVICES"
 """Environment variable with the rows that a manifest adds, in JSON."""
@@ -53,21 +55,13 @@ def kinds() -> tuple[DeviceKind, ...]:
     return tuple(rows.values())
 
 
-@contextmanager
-def extra_devices(rows: Sequence[Mapping[str, object]]) -> Iterator[None]:
+def extra_devices(rows: Sequence[Mapping[str, object]]) -> AbstractContextManager[None]:
     """Add rows to the table within the context, in this process and in the processes that it starts.
 
     Args:
         rows: mappings with `key` and optionally `label`, `color` and `sessions`, as in `DeviceKind`.
     """
-    before = os.environ.get(EXTRA_DEVICES)
-    os.environ[EXTRA_DEVICES] = json.dumps([dict(row) for row in rows])
-    try:
-        yield
-    finally:
-        del os.environ[EXTRA_DEVICES]
-        if before is not None:
-            os.environ[EXTRA_DEVICES] = before
+    return environment_variable(EXTRA_DEVICES, json.dumps([dict(row) for row in rows]))
 
 
 def table_record() -> list[dict[str, object]]:

@@ -8,8 +8,8 @@ session's folder, which may itself be a link to another disk.
 import os
 import re
 import stat
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from toolkit.errors import CaptureError
+from toolkit.files import environment_variable
 
 ALLOW_OUTSIDE = "TOOLKIT_ALLOW_OUTSIDE"
 """Environment variable; `1` allows images outside of the capture."""
@@ -38,19 +39,9 @@ def outside_allowed() -> bool:
     return os.environ.get(ALLOW_OUTSIDE) == "1"
 
 
-@contextmanager
-def allow_outside(allowed: bool = True) -> Iterator[None]:
+def allow_outside(allowed: bool = True) -> AbstractContextManager[None]:
     """Allow images outside of the capture within the context, in this process and in the processes that it starts."""
-    before = os.environ.get(ALLOW_OUTSIDE)
-    if allowed:
-        os.environ[ALLOW_OUTSIDE] = "1"
-    try:
-        yield
-    finally:
-        if allowed:
-            del os.environ[ALLOW_OUTSIDE]
-            if before is not None:
-                os.environ[ALLOW_OUTSIDE] = before
+    return environment_variable(ALLOW_OUTSIDE, "1") if allowed else nullcontext()
 
 
 def bad_names(names: pa.Array, may_leave: bool = False) -> pa.Array:

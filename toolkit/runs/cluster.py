@@ -25,6 +25,7 @@ from toolkit.capture.devices import EXTRA_DEVICES
 from toolkit.capture.images import WORKERS, default_workers
 from toolkit.capture.names import ALLOW_OUTSIDE
 from toolkit.errors import ManifestError, ToolkitError, first_line
+from toolkit.files import environment_variable
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -206,18 +207,14 @@ def open_cluster(spec: str | None, say: Callable[[str], object] = print) -> Iter
         raise ManifestError(MISSING) from None
     with ExitStack() as stack:
         address, link = _start(spec, stack)
-        before = os.environ.get(ADDRESS)
-        os.environ[ADDRESS] = address
         try:
-            cluster = current_cluster()
-            assert cluster is not None
-            say(f"{cluster.size} workers at {address}; dashboard: {link or _client(address).dashboard_link}")
-            yield
+            with environment_variable(ADDRESS, address):
+                cluster = current_cluster()
+                assert cluster is not None
+                say(f"{cluster.size} workers at {address}; dashboard: {link or _client(address).dashboard_link}")
+                yield
         finally:
-            del os.environ[ADDRESS]
-            if before is not None:
-                os.environ[ADDRESS] = before
-            elif _client.cache_info().currsize:
+            if ADDRESS not in os.environ and _client.cache_info().currsize:
                 _client(address).close()
                 _client.cache_clear()
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from toolkit.errors import ToolkitError
-from toolkit.files import is_left_over, read_json, sweep_partials, write_text
+from toolkit.files import environment_variable, is_left_over, read_json, sweep_partials, write_text
 from toolkit.runs.record import RECORD
 
 log = logging.getLogger(__name__)
@@ -47,7 +47,7 @@ def held(run_dir: Path) -> Iterator[None]:
         ) from None
     try:
         me = {"pid": os.getpid(), "host": socket.gethostname()}
-        with log_to(run_dir / LOG), _variable(LOG_VARIABLE, str((run_dir / LOG).absolute())):
+        with log_to(run_dir / LOG), environment_variable(LOG_VARIABLE, str((run_dir / LOG).absolute())):
             if before := read_json(holder):
                 log.warning("The run of process %s on %s was killed.", before.get("pid"), before.get("host"))
             write_text(holder, json.dumps(me | {"since": datetime.now().isoformat(" ", "seconds")}) + "\n")
@@ -58,15 +58,6 @@ def held(run_dir: Path) -> Iterator[None]:
             with suppress(OSError):
                 path.unlink()
         lock.release()
-
-
-@contextmanager
-def _variable(name: str, value: str) -> Iterator[None]:
-    os.environ[name] = value
-    try:
-        yield
-    finally:
-        del os.environ[name]
 
 
 def _sweep(run_dir: Path) -> None:
