@@ -9,22 +9,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from toolkit.capture.names import require_name
+from toolkit.capture.tables import COLUMNS
 from toolkit.errors import CaptureError
 
 # For each file of a session, the column whose values are `<subsession>/<sensor>` or `<subsession>`.
-_KEY_COLUMNS = {
-    "sensors.txt": 0,
-    "rigs.txt": 0,
-    "images.txt": 1,
-    "depths.txt": 1,
-    "trajectories.txt": 1,
-    "wifi.txt": 1,
-    "bt.txt": 1,
-    "pointclouds.txt": 1,
-    "queries.txt": 1,
-    "proc/alignment_trajectories.txt": 1,
-    "proc/subsessions.txt": 0,
-}
+_KEY_COLUMNS = {file: int(columns[0][0] == "timestamp") for file, columns in COLUMNS.items()}
+_KEY_COLUMNS |= {"pointclouds.txt": 1, "queries.txt": 1}
 
 
 def arrange(sessions: str | Path, names: Mapping[str, str]) -> list[str]:
