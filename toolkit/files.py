@@ -213,11 +213,8 @@ def read_sidecar(path: str | Path) -> dict[str, Any] | None:
 
 def is_current(path: str | Path, settings: dict[str, Any]) -> bool:
     """Tell whether the artifact `path` is undamaged and was made by this version with exactly these settings."""
-    expected = fingerprint(settings)
-    if _read_record(path).get("fingerprint") != expected:  # fast, without reading the artifact
-        return False
-    recorded = read_sidecar(path)
-    return recorded is not None and fingerprint(recorded) == expected
+    same = _read_record(path).get("fingerprint") == fingerprint(settings)  # fast, without reading the artifact
+    return same and read_sidecar(path) is not None
 
 
 def require_whole(path: str | Path, of: str | Path | None = None) -> None:
