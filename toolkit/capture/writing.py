@@ -104,15 +104,13 @@ def read_depth(path: str | Path) -> NDArray[np.float32]:
 
     try:
         depth = decode(path, cv2.IMREAD_UNCHANGED)
+        if depth.dtype != np.uint16 or depth.ndim != 2:
+            raise ImageError(f"{depth.dtype} {depth.shape}")
     except ImageError as error:
         raise CaptureError(
             f"Depth map {path}: no such file, or not a 16-bit image of one channel ({error}). Expected a 16-bit PNG in "
             "millimeters."
         ) from None
-    if depth.dtype != np.uint16 or depth.ndim != 2:
-        raise CaptureError(
-            f"Depth map {path}: not a 16-bit image of one channel. Expected a 16-bit PNG in millimeters."
-        )
     return (depth / np.float32(DEPTH_SCALE)).astype(np.float32)
 
 
