@@ -208,7 +208,6 @@ def test_rows_are_found_by_key(rows: list[tuple[int, str]], data: st.DataObject)
     all_rows = [[i for i, row in enumerate(rows) if row == key] for key in asked]
     assert [found.tolist() for found in index.find_all(*keys)] == all_rows
     assert index.find(*keys).tolist() == [found[0] if found else -1 for found in all_rows]
-    assert index.repeated().tolist() == [i for i, row in enumerate(rows) if row in rows[:i]]
 
 
 @given(

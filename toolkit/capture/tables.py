@@ -408,10 +408,6 @@ class KeyIndex:
         ends = np.where(keys >= 0, ends, starts)
         return [self._order[start:end] for start, end in zip(starts, ends, strict=True)]
 
-    def repeated(self) -> Ints:
-        """Return the rows whose key an earlier row has too, ascending."""
-        return np.sort(self._order[1:][self._sorted[1:] == self._sorted[:-1]])
-
 
 def read_query_table(path: Path, columns: Sequence[str]) -> pd.DataFrame:
     """Read the CSV file of a pair with one row per query: timestamp as int64, device_id and `columns` as text.

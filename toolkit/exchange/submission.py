@@ -293,7 +293,7 @@ def _read_poses(path: Path) -> Trajectory:
     """Read a poses file. Raise ArtifactError for a duplicate key or a quaternion that is not of unit length."""
     table = read_table(path, COLUMNS["trajectories.txt"])
     poses = Trajectory.from_table(table)
-    repeated = poses.index.repeated()
+    repeated = np.flatnonzero(table.frame("timestamp", "device_id").duplicated())
     lengths = np.linalg.norm(poses.qt[:, :4], axis=1)
     wrong = np.flatnonzero(np.abs(lengths - 1) > UNIT_TOLERANCE)
     for rows, problem in ((repeated, "occurs twice"), (wrong, "has a quaternion that is not of length 1")):
