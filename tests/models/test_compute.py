@@ -209,6 +209,24 @@ def test_networks_of_several_threads_run_one_after_the_other(through: Callable[[
     assert together == [1] * 4
 
 
+def test_an_error_does_not_leave_later_threads_with_one_thread_of_torch() -> None:
+    def threads_of_new_thread() -> int:
+        with ThreadPoolExecutor(1) as pool:
+            return pool.submit(torch.get_num_threads).result()
+
+    def fail(_: int) -> int:
+        raise ArithmeticError
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        with pytest.raises(ArithmeticError):
+            in_single_threads(fail, range(2))
+        assert threads_of_new_thread() == 3
+    finally:
+        torch.set_num_threads(before)
+
+
 def test_a_layer_in_any_precision() -> None:
     x, weight, bias = torch.rand(3, 5), torch.rand(4, 5), torch.rand(4)
     for dtype in (torch.float32, torch.bfloat16, torch.float16):

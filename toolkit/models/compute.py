@@ -161,10 +161,11 @@ def in_single_threads(run: "Callable[[Item], Result]", items: "Iterable[Item]") 
 
     with RUNNING:
         threads = torch.get_num_threads()
-        with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            results = list(pool.map(run_one, items))
-        torch.set_num_threads(threads)  # restore it also for threads that start later
-    return results
+        try:
+            with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+                return list(pool.map(run_one, items))
+        finally:
+            torch.set_num_threads(threads)  # restore it also for threads that start later
 
 
 def upload(batch: "torch.Tensor", device: "torch.device") -> "torch.Tensor":
