@@ -68,7 +68,7 @@ def measure(sessions_root: Path, run: Path, mapped: str, asked: str, pictures: i
     times, ok = [], []
     for rows in [members[index] for index in (chosen[escalated.argmax()], *chosen)]:  # the first one needs all networks
         paths = [session.image_path(int(row)) for row in rows]
-        cameras = [session.camera(sensor) for sensor in session.images["sensor_id"].iloc[rows]]
+        cameras = session.cameras(rows)
         turns = None if place.turns is None else place.turns.of(session, rows)
         started = _clocks()
         ok.append(localize_image(place, paths, cameras, session.rig_from_cam(rows), turns).status == "ok")

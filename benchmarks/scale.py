@@ -287,7 +287,7 @@ class Books:
         self.capture = Capture.open(self.capture_dir)
         session = self.capture["ios_map"]
         self.poses = session.world_from_cam()
-        self.cameras = [session.camera(sensor) for sensor in session.images["sensor_id"]]
+        self.cameras = session.cameras()
 
     def select_pairs(self) -> None:
         from toolkit.localizers.mapping import instants, select_pairs

@@ -281,7 +281,7 @@ class _Relocalizer:
 
         def localize(number: int) -> PoseEstimate:
             rows = rows_of_each[number]
-            cameras = [session.camera(sensor) for sensor in session.images["sensor_id"].iloc[rows]]
+            cameras = session.cameras(rows)
             paths = [session.image_path(int(row)) for row in rows]
             try:
                 poses = session.rig_from_cam(rows)
@@ -374,7 +374,7 @@ def _observations(
         rows = np.array([session.row_of_name[name] for name in stored.images], np.int64)
     else:
         return None
-    cameras = [session.camera(sensor) for sensor in session.images["sensor_id"].iloc[rows]]
+    cameras = session.cameras(rows)
     return Observations.of(matches, cameras, session.rig_from_cam(rows))
 
 
