@@ -340,6 +340,16 @@ def pair_name(scene: str, map_device: str, query_device: str) -> str:
     return f"{scene}_map_{map_device}_query_{query_device}"
 
 
+def pair_devices(stem: str) -> tuple[str, str]:
+    """Return map and query device of a file named after a pair, see `pair_name`; two empty ones of another file.
+
+    Args:
+        stem: its name without suffix; files of the sequence stage end in `_sequence`.
+    """
+    devices = re.fullmatch(r".*_map_(.+?)_query_(.+?)(?:_sequence)?", stem)
+    return (devices[1], devices[2]) if devices else ("", "")
+
+
 def of_sequence(name: str) -> bool:
     """Tell by its name whether a file is from the sequence stage, which writes beside the poses of single queries."""
     _, query, rest = name.rpartition("_query_")

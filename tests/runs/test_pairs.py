@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from toolkit.errors import CaptureError, DamagedError, ManifestError
-from toolkit.runs.pairs import PairRows, left_out, left_out_of, pair_devices, way_out
+from toolkit.files import pair_devices
+from toolkit.runs.pairs import PairRows, left_out, left_out_of, way_out
 from toolkit.runs.record import failures
 
 

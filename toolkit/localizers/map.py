@@ -32,6 +32,7 @@ from toolkit.files import (
     file_fingerprint,
     fingerprint,
     image_name,
+    pair_devices,
     read_sidecar,
     write_atomic,
     write_sidecar,
@@ -476,8 +477,7 @@ def _unknown(files: SceneFiles, device: str) -> str:
     scenes = [path.parent.name for path in run.glob("*/poses")]
     if files.scene not in scenes:
         return f"{run}: no poses of the scene {files.scene!r}. {nearest(files.scene, scenes)}"
-    pairs = [path.stem.removeprefix(f"{files.scene}_map_") for path in files.poses_dir.glob("*.h5")]
-    devices = {pair.partition("_query_")[0] for pair in pairs}
+    devices = {pair_devices(path.stem)[0] for path in files.poses_dir.glob("*.h5")}
     return f"{files.poses_dir}: no poses of queries in the map of {device!r}. {nearest(device, devices)}"
 
 

@@ -6,7 +6,6 @@ file, so that they do not use results which an earlier run made of the pair from
 
 import json
 import logging
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -79,16 +78,6 @@ class PairRows:
             raise self.errors[0]
         empty = {name: type(value)() for name, value in (done or {}).items()}
         return pd.DataFrame([empty | row for row in self.rows])
-
-
-def pair_devices(stem: str) -> tuple[str, str]:
-    """Return map and query device of a file named after a pair, see `files.pair_name`; two empty ones of another file.
-
-    Args:
-        stem: its name without suffix; files of the sequence stage end in `_sequence`.
-    """
-    devices = re.fullmatch(r".*_map_(.+?)_query_(.+?)(?:_sequence)?", stem)
-    return (devices[1], devices[2]) if devices else ("", "")
 
 
 def left_out(folder: str | Path, name: str) -> str:

@@ -15,11 +15,10 @@ from toolkit.capture.tables import POSE_NAMES, read_query_table
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.embedders import embedding_folders, open_descriptors
 from toolkit.errors import CaptureError
-from toolkit.files import image_name, read_references
+from toolkit.files import image_name, pair_devices, read_references
 from toolkit.geometry import Floats, qt_from_pose, unit
 from toolkit.localizers.odometry import Odometry, recordings_of
 from toolkit.manifest import SequenceSettings
-from toolkit.runs.pairs import pair_devices
 from toolkit.show.figures import GREEN, ORANGE, VERMILLION, new_figure, plain_log, styled
 from toolkit.show.metrics import is_posed
 from toolkit.show.top_view import ground_axes, places_of

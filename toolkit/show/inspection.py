@@ -15,12 +15,11 @@ import pandas as pd
 
 from toolkit.capture import Capture, Trajectory
 from toolkit.errors import OF_THE_DATA, ArtifactError
-from toolkit.files import SceneFiles, image_name, read_references
+from toolkit.files import SceneFiles, image_name, pair_devices, read_references
 from toolkit.geometry import Floats
 from toolkit.localizers.again import LocalizeAgain
 from toolkit.localizers.map import RETRIEVAL, SESSIONS_ROOT, Map, how_localized, label
 from toolkit.manifest import nearest
-from toolkit.runs.pairs import pair_devices
 from toolkit.show.answers import NUMBERS, Answer, reason_in_words
 from toolkit.show.choice import find_query, shown_name
 from toolkit.show.figures import shown

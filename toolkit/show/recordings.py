@@ -18,10 +18,9 @@ from toolkit.capture.devices import color_of
 from toolkit.capture.images import decode, default_workers, prefetch, read_for_display, read_image
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import ArtifactError, CaptureError, ImageError
-from toolkit.files import file_fingerprint, files_fingerprint, write_sidecar
+from toolkit.files import file_fingerprint, files_fingerprint, pair_devices, write_sidecar
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.correspondences import LocalizedQueries, LocalizedQuery
-from toolkit.runs.pairs import pair_devices
 from toolkit.show import viewer
 from toolkit.show.figures import ORANGE
 from toolkit.show.localized import load_maps, map_files, sure_points

@@ -14,8 +14,7 @@ from urllib.parse import quote
 import pandas as pd
 
 from toolkit.errors import ArtifactError
-from toolkit.files import SceneFiles, of_sequence, read_json, read_map_record, sidecar_path, write_text
-from toolkit.runs.pairs import pair_devices
+from toolkit.files import SceneFiles, of_sequence, pair_devices, read_json, read_map_record, sidecar_path, write_text
 from toolkit.show.figures import number, percent
 from toolkit.show.metrics import (
     REASONS,

@@ -15,9 +15,8 @@ from toolkit.capture.images import read_for_display
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.embedders import open_descriptors
 from toolkit.errors import ArtifactError
-from toolkit.files import image_name, read_references
+from toolkit.files import image_name, pair_devices, read_references
 from toolkit.geometry import Floats, Ints
-from toolkit.runs.pairs import pair_devices
 from toolkit.show.choice import find_query, shown_name
 from toolkit.show.figures import BLUE, GRAY, GREEN, MAP, ORANGE, TRUE, new_figure, shared_legend, shown, styled
 from toolkit.show.localized import load_maps, map_files
