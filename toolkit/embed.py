@@ -21,7 +21,7 @@ from toolkit.capture import Capture, Session
 from toolkit.capture.images import default_workers, one_thread, prefetch, read_image
 from toolkit.capture.turning import turn_image
 from toolkit.capture.upright import Turns, upright_turns
-from toolkit.embedders import WEIGHTS, Embedder, create_embedder, resolve_model
+from toolkit.embedders import WEIGHTS, Embedder, create_embedder, resolve_model, shows_upright
 from toolkit.errors import CaptureError, ImageError, ManifestError, ToolkitError
 from toolkit.features.features import LocalFeatures
 from toolkit.features.groups import GroupWriter, heals, sweep
@@ -229,10 +229,7 @@ def _open_embedder(capture: Capture, settings: EmbedSettings, folders: _Folders,
 
 def _turns(capture: Capture, embedder: Embedder, settings: EmbedSettings) -> Turns | None:
     """Return the turns that make images upright, or None if the embedder takes them as stored."""
-    upright = embedder.upright if settings.upright is None else settings.upright
-    if embedder.inputs == "features" or not upright:
-        return None
-    return upright_turns(capture, settings.world_up)
+    return upright_turns(capture, settings.world_up) if shows_upright(embedder, settings.upright) else None
 
 
 def _session_names(capture: Capture, device: str) -> list[str]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from toolkit.capture import Capture, Session, masks
 from toolkit.capture.upright import Turns, upright_turns
-from toolkit.embedders import Embedder, Vectors, create_embedder, embedding_folders, open_descriptors
+from toolkit.embedders import Embedder, Vectors, create_embedder, embedding_folders, open_descriptors, shows_upright
 from toolkit.embedders.index import JoinedIndex, VectorIndex, load_index
 from toolkit.embedders.search import search
 from toolkit.embedders.stored import embedder_fingerprint
@@ -215,8 +215,7 @@ class Map:
 
     def shows_upright(self, embedder: Embedder) -> bool:
         """Tell whether the run turned images upright for one of its embedders."""
-        upright = embedder.upright if self.embed_settings.upright is None else self.embed_settings.upright
-        return upright and embedder.inputs == "images"
+        return shows_upright(embedder, self.embed_settings.upright)
 
     def turns_of(self, kind: AnyMethod, session: Session) -> NDArray[np.int64] | None:
         """Return the turns that make a session's images upright; None if this kind of features does not need them."""
