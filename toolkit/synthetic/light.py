@@ -60,6 +60,7 @@ def _light(scene: Scene, quad: Quad) -> Image:
     closed[inside] = _blocked(scene, starts[inside], ways[inside])
     lit = (0.62 if scene.outdoor else 0.58) * (1 - 0.65 * closed.reshape(len(points), -1).mean(1))
     offsets = np.array([[0, 0], [0.35, 0.1], [-0.35, -0.1]], np.float32) * (1.5 if scene.outdoor else 1.0)
+    lit_by, ways_to = [], []
     for lamp_at in scene.lamps:
         for dx, dy in offsets:
             way = (lamp_at + np.array([dx, dy, 0]) - points).astype(np.float32)
@@ -68,7 +69,12 @@ def _light(scene: Scene, quad: Quad) -> Image:
             if not cosine.any():
                 continue
             fall = 0.85 / len(scene.lamps) if scene.outdoor else 1.5 / len(scene.lamps) * 6 / (distance**2 + 3.0)
-            lit = lit + fall * cosine / len(offsets) * ~_blocked(scene, points, way)
+            lit_by.append(fall * cosine / len(offsets))
+            ways_to.append(way)
+    if ways_to:  # one call for all lamps, because most rectangles have few points
+        blocked = _blocked(scene, np.tile(points, (len(ways_to), 1)), np.concatenate(ways_to))
+        for light, shadow in zip(lit_by, blocked.reshape(len(ways_to), -1), strict=True):
+            lit = lit + light * ~shadow
     return cv2.GaussianBlur(lit.reshape(rows, columns).astype(np.float32), (3, 3), 0)
 
 
