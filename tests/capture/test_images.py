@@ -225,7 +225,7 @@ def test_prefetch_raises_at_the_turn_of_the_item() -> None:
 def test_a_picture_of_an_unreadable_image_is_a_placeholder(tmp_path: Path) -> None:
     (tmp_path / "empty.jpg").write_bytes(b"")
     for name in ("empty.jpg", "missing.jpg"):
-        shown = read_for_display(tmp_path / name)
+        shown = read_for_display(tmp_path / name, 500)
         assert shown.ndim == 3
         assert shown.std() > 0, "it says so"
 
@@ -299,3 +299,19 @@ def test_one_thread_each_and_then_as_before() -> None:
             assert max(before) == 2
     finally:
         cv2.setNumThreads(cv2_threads)
+
+
+@pytest.mark.parametrize("size", [(960, 720), (720, 960), (641, 480), (100, 80)])
+def test_an_image_is_reduced_for_display_without_a_shift(tmp_path: Path, size: tuple[int, int]) -> None:
+    """A reduced JPEG is decoded smaller first; gradients show a shift or a stretch, which marks would follow."""
+    width, height = size
+    rows, columns = np.mgrid[0:height, 0:width]
+    levels = (columns + 0.5) * 200 / width, (rows + 0.5) * 200 / height, np.full((height, width), 90.0)
+    image = np.dstack(levels).round().astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "a.jpg"), image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 98])
+    shown = read_for_display(tmp_path / "a.jpg", 240)
+    assert max(shown.shape[:2]) == min(240, max(size))
+    assert shown.shape[1] / shown.shape[0] == pytest.approx(width / height, rel=0.01)
+    rows, columns = (np.mgrid[0 : shown.shape[0], 0 : shown.shape[1]] + 0.5).astype(np.float64)
+    np.testing.assert_allclose(shown[..., 0], columns / shown.shape[1] * 200, atol=3)
+    np.testing.assert_allclose(shown[..., 1], rows / shown.shape[0] * 200, atol=3)

@@ -13,6 +13,7 @@ from toolkit.show.localized import QueryDetails, ShownImage
 from toolkit.show.stills import WorstQuery, draw_localization, draw_scene, draw_worst
 
 CAMERA = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=[50, 50, 32, 24])
+HIGH = pycolmap.Camera(model="PINHOLE", width=64, height=96, params=[50, 50, 32, 48])
 
 
 def looking(headings_deg, up_axis=2, roll_deg=0.0, pitch_deg=0.0, step=1.0):
@@ -106,7 +107,7 @@ def images(tmp_path):
     true = make_pose(np.eye(3), [0.02, 0, 0])
     query = ShownImage("q", files[0], CAMERA, np.eye(4), pixels, points, matches, inlier, true)
     seen = [4, 0, 2]
-    reference = ShownImage("r", files[1], CAMERA, np.eye(4), pixels[:3], points[seen], matches[seen], inlier[seen])
+    reference = ShownImage("r", files[1], HIGH, np.eye(4), pixels[:3], points[seen], matches[seen], inlier[seen])
     return query, reference
 
 

@@ -170,10 +170,32 @@ def pixels_of(
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY if gray else cv2.COLOR_GRAY2RGB), np.uint8)
 
 
-def read_for_display(path: str | Path) -> NDArray[np.uint8]:
-    """Return an image, (H, W, 3) RGB; for an unreadable file, a gray one with the text `unreadable`."""
+def shrunk(image: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
+    """Reduce an image, (H, W, 3) or (H, W), to a longer side of at most `longest` pixels, without aliasing."""
+    scale = longest / max(image.shape[:2])
+    size = [max(1, round(scale * side)) for side in image.shape[1::-1]]
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8) if scale < 1 else image
+
+
+def read_shrunk(path: str | Path, longest: int) -> NDArray[np.uint8]:
+    """Return an image, (H, W, 3) RGB, reduced to a longer side of at most `longest` pixels.
+
+    Raises:
+        ImageError: see `read_image`.
+    """
+    width, height = stored_size(path)
+    least_side = longest * min(width, height) // max(width, height)
+    return shrunk(read_image(path, least_side=max(1, least_side)), longest)
+
+
+def read_for_display(path: str | Path, longest: int) -> NDArray[np.uint8]:
+    """Return an image, (H, W, 3) RGB; for an unreadable file, a gray one with the text `unreadable`.
+
+    Args:
+        longest: limit of its longer side, pixels. Matplotlib is slow at reducing images.
+    """
     try:
-        return read_image(path)
+        return read_shrunk(path, longest)
     except ImageError:
         blank = np.full((240, 320, 3), 200, np.uint8)
         cv2.putText(blank, "unreadable", (60, 130), cv2.FONT_HERSHEY_SIMPLEX, 1.1, (90, 90, 90), 2)

@@ -54,6 +54,13 @@ def new_figure(width: float, height: float) -> "Figure":
     return figure
 
 
+def pixels_of(inches: float) -> int:
+    """Convert a length in a figure to pixels of its PNG file; call it in a function that is `styled`."""
+    import matplotlib as mpl
+
+    return math.ceil(inches * mpl.rcParams["savefig.dpi"])
+
+
 def shown(figure: "Figure", **_: Any) -> dict[str, bytes]:
     """Return a figure as notebooks display and store it, by MIME type."""
     return as_shown(_png_of(figure))
@@ -101,7 +108,7 @@ def _png_of(figure: "Figure", caption: str = "") -> bytes:
     # No `Software`, which names the version of matplotlib: equal data should give equal bytes.
     metadata, stream = {"Software": None, "Description": caption}, io.BytesIO()
     # Stronger compression takes three times as long and saves nothing on figures.
-    figure.savefig(stream, bbox_inches=border, metadata=metadata, pil_kwargs={"compress_level": 2})
+    figure.savefig(stream, bbox_inches=border, metadata=metadata, pil_kwargs={"compress_level": 1})
     return stream.getvalue()
 
 

@@ -7,7 +7,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 from matplotlib.collections import LineCollection
 from numpy.typing import NDArray
@@ -56,6 +55,9 @@ OF_NETWORKS = {
 """Labels and formats that differ for poses of a feed-forward network."""
 OF_MATCHES = ("num_guided", "rmse_px", "coverage", "p_correct", "rival_support", "agreement")
 """Numbers that a pose without matches does not have."""
+
+
+_read = lru_cache(maxsize=16)(read_for_display)  # localizing a query again draws the same images again
 
 
 @styled
@@ -170,7 +172,7 @@ def _draw_photograph(
     Returns:
         Width and height of the image; with a `height`, its right edge and the scale of its pixels.
     """
-    picture, rows, columns = _reduced(image.path)
+    picture, rows, columns = _read(image.path, LONGEST_SIDE), image.camera.height, image.camera.width
     if height is None:
         axis.imshow(picture, extent=(0, columns, rows, 0), interpolation="antialiased")
         return float(columns), float(rows)
@@ -178,18 +180,6 @@ def _draw_photograph(
     right = offset + scale * columns
     axis.imshow(picture, extent=(offset, right, height, 0), interpolation="antialiased")
     return right, scale
-
-
-@lru_cache(maxsize=16)  # localizing a query again draws the same images again
-def _reduced(path: Path) -> tuple[NDArray[np.uint8], int, int]:
-    """Return an image reduced to `LONGEST_SIDE` pixels, and its rows and columns at full size."""
-    picture = read_for_display(path)
-    rows, columns = picture.shape[:2]
-    reduced = LONGEST_SIDE / max(rows, columns)
-    if reduced < 1:
-        size = max(1, round(columns * reduced)), max(1, round(rows * reduced))
-        picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
-    return picture, rows, columns
 
 
 def _draw_marks(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from toolkit.capture.images import read_for_display
+from toolkit.capture.images import prefetch, read_for_display
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.geometry import Floats, project
 from toolkit.show import viewer
@@ -77,7 +77,7 @@ def record_localizations(
                 lines = rr.LineStrips3D(tracks[kind], colors=viewer.rgb(color))
                 stream.log(f"world/recording/{kind}", lines, static=True)
         writer = _ChosenWriter(stream, localizations, 2 * size)
-        for number, chosen in details:
+        for number, chosen in prefetch(writer.read, details):
             writer.write(number, chosen)
             count += 1
     logger.info("%s: %d queries, %d of them with details, in %.0f s", out, len(localizations.names), count,
@@ -157,6 +157,12 @@ class _ChosenWriter:
         """Width and height of the images last logged, by entity."""
         self._jpeg_of = lru_cache(KEPT_JPEGS)(_jpeg_of)
 
+    def read(self, numbered: tuple[int, QueryDetails]) -> tuple[int, QueryDetails]:
+        """Read the images of a query ahead, in a thread."""
+        for image in (*numbered[1].cameras, *(image for image, _, _ in numbered[1].captioned_references())):
+            self._jpeg_of(image.path)
+        return numbered
+
     def write(self, number: int, query: QueryDetails) -> None:
         """Log a query. Entities that it lacks are cleared, or those of the last query would stay."""
         import rerun as rr
@@ -235,7 +241,7 @@ class _ChosenWriter:
 
 
 def _jpeg_of(path: Path) -> tuple[bytes, tuple[int, int]]:
-    return viewer.small_jpeg(read_for_display(path), viewer.IMAGE_SIZE)
+    return viewer.small_jpeg(read_for_display(path, viewer.IMAGE_SIZE), viewer.IMAGE_SIZE)
 
 
 def describe(queries: Localizations, k: int) -> str:

@@ -18,7 +18,19 @@ from toolkit.errors import ArtifactError
 from toolkit.files import image_name, pair_devices, read_references
 from toolkit.geometry import Floats, Ints
 from toolkit.show.choice import find_query, shown_name
-from toolkit.show.figures import BLUE, GRAY, GREEN, MAP, ORANGE, TRUE, new_figure, shared_legend, shown, styled
+from toolkit.show.figures import (
+    BLUE,
+    GRAY,
+    GREEN,
+    MAP,
+    ORANGE,
+    TRUE,
+    new_figure,
+    pixels_of,
+    shared_legend,
+    shown,
+    styled,
+)
 from toolkit.show.localized import load_maps, map_files
 from toolkit.show.metrics import is_posed
 from toolkit.show.overlap import LEAST_OVERLAP, overlap_in_view, seen_by
@@ -194,14 +206,14 @@ def draw_retrieved(query: RetrievedQuery) -> "Figure":
     figure = new_figure(11, 1.75 * rows + 4.6)
     strip, below = figure.subfigures(2, 1, squeeze=False, height_ratios=[1.75 * rows + 0.3, 4.3])[:, 0]
     grid = strip.add_gridspec(rows, columns + rows)
-    _draw_image(strip.add_subplot(grid[:, :rows]), query.session.image_path(query.row), "query", "black")
+    _draw_image(strip.add_subplot(grid[:, :rows]), query.session.image_path(query.row), "query", "black", 2.4 * rows)
     for k, hit in enumerate(query.references.itertuples()):
         panel = strip.add_subplot(grid[k // columns, rows + k % columns])
         known, good = np.isfinite(hit.overlap), hit.overlap >= LEAST_OVERLAP
         text = f"{hit.rank}: {hit.score:.2f}" + (f", overlap {hit.overlap:.0%}" if known else "")
         color = (GREEN if good else ORANGE) if known else GRAY
         row = query.map_session.row_of_name.get(hit.name)
-        _draw_image(panel, None if row is None else query.map_session.image_path(row), text, color)
+        _draw_image(panel, None if row is None else query.map_session.image_path(row), text, color, 2.4)
     along, above = below.subplots(1, 2, width_ratios=[1.6, 1.0])
     _draw_along(along, query)
     _draw_from_above(above, query)
@@ -214,10 +226,11 @@ def draw_retrieved(query: RetrievedQuery) -> "Figure":
     return figure
 
 
-def _draw_image(axis: "Axes", path: Path | None, title: str, color: str) -> None:
+def _draw_image(axis: "Axes", path: Path | None, title: str, color: str, width: float) -> None:
+    """Draw an image that is at most `width` inches wide."""
     axis.set(xticks=[], yticks=[])
     if path is not None:
-        axis.imshow(read_for_display(path), interpolation="antialiased")
+        axis.imshow(read_for_display(path, pixels_of(width)), interpolation="antialiased")
     else:
         axis.text(0.5, 0.5, "not in the capture", ha="center", transform=axis.transAxes, fontsize=8)
     axis.set_title(title, fontsize=8, color=color)

@@ -12,8 +12,19 @@ from toolkit.capture.images import read_for_display
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.geometry import Floats, Ints, make_pose, pose_error, project
 from toolkit.show.choice import shown_name
-from toolkit.show.figures import ESTIMATED, GREEN, MAP, TRUE, error_bar, error_colors, new_figure, shared_legend, styled
-from toolkit.show.localized import QueryDetails
+from toolkit.show.figures import (
+    ESTIMATED,
+    GREEN,
+    MAP,
+    TRUE,
+    error_bar,
+    error_colors,
+    new_figure,
+    pixels_of,
+    shared_legend,
+    styled,
+)
+from toolkit.show.localized import QueryDetails, ShownImage
 from toolkit.show.metrics import is_posed
 from toolkit.show.top_view import draw_dots, draw_headings, ground_axes, places_of
 
@@ -147,24 +158,23 @@ def draw_localization(query: QueryDetails, title: str = "", unit: tuple[str, flo
     """
     query = query.of_first_camera()
     shown, references = query.cameras[0], query.captioned_references()
-    pictures = [read_for_display(image.path) for image in (shown, *(image for image, _, _ in references))]
-    height, width = pictures[0].shape[:2]
     # The query is as high as two rows of references, to keep its points visible.
     rows = 2 if len(references) > 1 else 1
     columns = -(-len(references) // rows)
-    ratio = width / height
-    widest = max((picture.shape[1] / picture.shape[0] for picture in pictures[1:]), default=1.0)
+    ratio = shown.camera.width / shown.camera.height
+    widest = max((image.camera.width / image.camera.height for image, _, _ in references), default=1.0)
     figure = new_figure(4.4 * ratio + columns * widest * 4.4 / rows + 0.6, 5.3)
     grid = figure.add_gridspec(rows, 1 + columns, width_ratios=[ratio, *[widest / rows] * columns])
     axis = figure.add_subplot(grid[:, 0])
-    axis.imshow(pictures[0])
+    _draw_photograph(axis, shown, GREEN if is_posed(shown.world_from_cam) else ESTIMATED, 4.4)
     located, good = bool(is_posed(shown.world_from_cam)), shown.inlier
     draw_dots(axis, _on(shown.pixels[~good]), s=7, c=ESTIMATED, alpha=0.5 if located else 1, lw=0)
     if not located:
         caption = "query: not localized" + (f", {len(good)} matches" if len(good) else "")
     elif query.has_matches:
         projected, visible = project(shown.points, shown.camera, shown.world_from_cam)
-        inside = good & visible & (projected >= 0).all(1) & (projected < [width, height]).all(1)
+        size = shown.camera.width, shown.camera.height
+        inside = good & visible & (projected >= 0).all(1) & (projected < size).all(1)
         lines = np.stack([_on(shown.pixels[inside]), _on(projected[inside])], axis=1)
         axis.add_collection(LineCollection(list(lines), colors="white", linewidths=0.8))
         draw_dots(axis, _on(projected[inside]), s=11, c=GREEN, edgecolors="white", lw=0.35)
@@ -172,14 +182,12 @@ def draw_localization(query: QueryDetails, title: str = "", unit: tuple[str, flo
     else:
         caption = "query: no matches, the pose comes from the references"
     axis.set_title(caption, fontsize=9)
-    _frame(axis, GREEN if located else ESTIMATED, width, height)
-    for k, ((image, text, agrees), picture) in enumerate(zip(references, pictures[1:], strict=True)):
+    for k, (image, text, agrees) in enumerate(references):
         panel = figure.add_subplot(grid[k // columns, 1 + k % columns])
-        panel.imshow(picture)
+        _draw_photograph(panel, image, "0.6" if agrees else ESTIMATED, 4.4 / rows)
         panel.set_title(text, fontsize=8)
         draw_dots(panel, _on(image.pixels[~image.inlier]), s=3, c=ESTIMATED, alpha=0.5, lw=0)
         draw_dots(panel, _on(image.pixels[image.inlier]), s=5, c=GREEN, lw=0)
-        _frame(panel, "0.6" if agrees else ESTIMATED, picture.shape[1], picture.shape[0])
     if located and is_posed(shown.world_from_cam_true):
         rotation, distance = pose_error(shown.world_from_cam, shown.world_from_cam_true)
         off = f"{float(rotation):.2g}°, {_length(float(distance) / unit[1], unit[0])}"
@@ -213,15 +221,13 @@ def draw_worst(queries: Sequence[WorstQuery], title: str = "The worst queries") 
 def _draw_side_by_side(axis: "Axes", query: QueryDetails) -> None:
     """Draw a query and its best reference at one height, and join common points."""
     image, references = query.cameras[0], query.captioned_references()[:1]
-    left = read_for_display(image.path)
-    height, width = left.shape[:2]
-    axis.imshow(left, extent=(0, width, height, 0), interpolation="antialiased")
+    width, height = image.camera.width, image.camera.height
+    axis.imshow(_read(image, 2.2), extent=(0, width, height, 0), interpolation="antialiased")
     end = float(width)
     for reference, caption, _ in references:
-        right = read_for_display(reference.path)
-        offset, scale = width * 1.03, height / right.shape[0]
-        end = offset + scale * right.shape[1]
-        axis.imshow(right, extent=(offset, end, height, 0), interpolation="antialiased")
+        offset, scale = width * 1.03, height / reference.camera.height
+        end = offset + scale * reference.camera.width
+        axis.imshow(_read(reference, 2.2), extent=(offset, end, height, 0), interpolation="antialiased")
         _, i, j = np.intersect1d(image.matches, reference.matches, return_indices=True)
         lines = np.stack([image.pixels[i], reference.pixels[j] * scale + [offset, 0.0]], axis=1)
         for agrees, color in ((False, ESTIMATED), (True, GREEN)):
@@ -241,8 +247,17 @@ def _on(pixels: Floats) -> Floats:
     return pixels - 0.5
 
 
-def _frame(axis: "Axes", color: str, width: int, height: int) -> None:
-    axis.set(xticks=[], yticks=[], xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+def _read(image: ShownImage, height: float) -> NDArray[np.uint8]:
+    """Read an image that is drawn `height` inches high."""
+    camera = image.camera
+    return read_for_display(image.path, pixels_of(height * max(1.0, camera.width / camera.height)))
+
+
+def _draw_photograph(axis: "Axes", image: ShownImage, color: str, height: float) -> None:
+    """Draw a framed image, `height` inches high."""
+    extent = (-0.5, image.camera.width - 0.5, image.camera.height - 0.5, -0.5)
+    axis.imshow(_read(image, height), extent=extent)
+    axis.set(xticks=[], yticks=[], xlim=extent[:2], ylim=extent[2:])
     axis.spines[:].set(color=color, linewidth=1.5, visible=True)
 
 

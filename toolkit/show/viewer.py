@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from toolkit.capture.images import shrunk
 from toolkit.files import write_atomic
 from toolkit.geometry import Floats, rotation_to_quaternion
 from toolkit.show.figures import GRAY
@@ -76,12 +77,10 @@ def entity(*parts: str) -> str:
 
 def small_jpeg(image: Image, size: int) -> tuple[bytes, tuple[int, int]]:
     """Reduce an image, (H, W, 3) RGB or (H, W), to a longer side of `size` pixels; return a JPEG and (w, h)."""
-    scale = min(1.0, size / max(image.shape[:2]))
-    width, height = (max(1, round(scale * side)) for side in image.shape[1::-1])
-    small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA) if scale < 1 else image
+    small = shrunk(image, size)
     bgr = np.ascontiguousarray(small[..., ::-1]) if small.ndim == 3 else small
     _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return data.tobytes(), (width, height)
+    return data.tobytes(), (small.shape[1], small.shape[0])
 
 
 def shown_intrinsics(camera: "pycolmap.Camera", shown: tuple[int, int]) -> Floats:
