@@ -33,7 +33,7 @@ from toolkit.synthetic.textures import Image
 if TYPE_CHECKING:
     import pycolmap
 
-FORMAT = 2  # increase it when the same settings produce other bytes
+FORMAT = 3  # increase it when the same settings produce other bytes
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ Each pixel has four samples. The ray of each sample, from the camera model with 
 rectangles; the nearest one gives the color, read from its texture at the mip level of the sample's footprint.
 """
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -138,7 +139,8 @@ def render(quads: list[Quad], world_from_cam: Floats, rays: Rays, gray: bool) ->
         # round the mip level with four offsets, which blends levels. The term with 0.25 blurs slanted surfaces, which
         # would flicker otherwise.
         scale = tw / quad.width / focal / np.sqrt(distance)
-        level = np.log2(scale * z**1.5) + 0.25 * np.log2(np.maximum(z / distance, 1))
+        log_z = np.log2(z)
+        level = 1.5 * log_z + float(np.log2(scale)) + 0.25 * np.maximum(log_z - math.log2(distance), 0)
         level = np.clip((level + offsets[index]).astype(np.int8), 0, LEVELS - 1)
         for i in range(LEVELS):
             rows = np.flatnonzero(level == i)
