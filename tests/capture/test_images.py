@@ -230,6 +230,13 @@ def test_a_picture_of_an_unreadable_image_is_a_placeholder(tmp_path: Path) -> No
         assert shown.std() > 0, "it says so"
 
 
+def test_a_format_whose_header_is_unknown_is_shown(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.hdr"), np.full((30, 40, 3), 0.5, np.float32))
+    with pytest.raises(ImageError):
+        stored_size(tmp_path / "a.hdr")
+    assert read_for_display(tmp_path / "a.hdr", 20).shape == (15, 20, 3)
+
+
 def png_of_zeros(width: int, height: int) -> bytes:
     """Return a PNG of some hundred bytes that claims to have many pixels."""
     header = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)

@@ -95,11 +95,11 @@ def _header_size(stream: BinaryIO) -> tuple[int, int]:
     return open_lazily(stream, np.inf).size
 
 
-def decode(path: str | Path, flags: int, least_side: int | None = None) -> NDArray[Any]:
+def decode(path: str | Path, flags: int, least_side: int | None = None, longest: int | None = None) -> NDArray[Any]:
     """Return the pixels of an image file as OpenCV decodes it with `flags`.
 
     Args:
-        least_side: see `read_image`; adds to `flags`.
+        least_side, longest: see `read_image`; a JPEG is decoded at a smaller size that suffices. Both add to `flags`.
 
     Raises:
         ImageError: see `read_file`; or the file is not an image, is truncated, or has more than `MOST_PIXELS` pixels.
@@ -113,8 +113,11 @@ def decode(path: str | Path, flags: int, least_side: int | None = None) -> NDArr
         width = height = 0  # OpenCV decides whether it is an image
     if width * height > MOST_PIXELS:
         raise ImageError(f"Image cannot be decoded ({width} x {height} pixels, more than {MOST_PIXELS:,}): {path}")
-    if least_side is not None and data.startswith(b"\xff\xd8"):  # reducing saves time only for JPEG
-        flags |= _reduced(width, height, least_side)
+    if data.startswith(b"\xff\xd8"):  # reducing saves time only for JPEG
+        if least_side is not None:
+            flags |= _reduced(width, height, min(width, height) // least_side)
+        elif longest is not None:
+            flags |= _reduced(width, height, max(width, height) // longest)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     except cv2.error as error:
@@ -124,16 +127,18 @@ def decode(path: str | Path, flags: int, least_side: int | None = None) -> NDArr
     return np.asarray(image)
 
 
-def _reduced(width: int, height: int, least_side: int) -> int:
-    """Return the OpenCV flag that decodes a JPEG of this size reduced, see `read_image`; 0 for full size."""
+def _reduced(width: int, height: int, most: int) -> int:
+    """Return the OpenCV flag that decodes a JPEG of this size reduced by at most this factor; 0 for full size."""
     for factor, flag in _REDUCED.items():
         # With a remainder, the last row and column would cover fewer pixels and shift all others.
-        if width % factor == height % factor == 0 and min(width, height) >= factor * least_side:
+        if width % factor == height % factor == 0 and factor <= most:
             return flag
     return 0
 
 
-def read_image(path: str | Path, gray: bool = False, least_side: int | None = None) -> NDArray[np.uint8]:
+def read_image(
+    path: str | Path, gray: bool = False, least_side: int | None = None, longest: int | None = None
+) -> NDArray[np.uint8]:
     """Return an image as stored, (H, W, 3) RGB uint8, or (H, W) if `gray`.
 
     EXIF orientation is ignored, because a capture's intrinsics refer to the stored pixels.
@@ -141,13 +146,16 @@ def read_image(path: str | Path, gray: bool = False, least_side: int | None = No
     Args:
         least_side: decode a color JPEG at 1/8, 1/4 or 1/2 of its size if both sides stay whole numbers and the shorter
             one has at least this many pixels. Saves time for callers that reduce the image anyway. None: full size.
+        longest: reduce the image to a longer side of at most this many pixels, without aliasing. None: do not.
 
     Raises:
         ImageError: the file is missing or cannot be decoded; see `decode`.
     """
     flags = cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR
-    image = decode(path, flags | cv2.IMREAD_IGNORE_ORIENTATION, None if gray else least_side)
-    return np.asarray(image if gray else cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+    sizes = (None, None) if gray else (least_side, longest)
+    image = decode(path, flags | cv2.IMREAD_IGNORE_ORIENTATION, *sizes)
+    image = np.asarray(image if gray else cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+    return image if longest is None else shrunk(image, longest)
 
 
 def pixels_of(
@@ -177,17 +185,6 @@ def shrunk(image: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8) if scale < 1 else image
 
 
-def read_shrunk(path: str | Path, longest: int) -> NDArray[np.uint8]:
-    """Return an image, (H, W, 3) RGB, reduced to a longer side of at most `longest` pixels.
-
-    Raises:
-        ImageError: see `read_image`.
-    """
-    width, height = stored_size(path)
-    least_side = longest * min(width, height) // max(width, height)
-    return shrunk(read_image(path, least_side=max(1, least_side)), longest)
-
-
 def read_for_display(path: str | Path, longest: int) -> NDArray[np.uint8]:
     """Return an image, (H, W, 3) RGB; for an unreadable file, a gray one with the text `unreadable`.
 
@@ -195,7 +192,7 @@ def read_for_display(path: str | Path, longest: int) -> NDArray[np.uint8]:
         longest: limit of its longer side, pixels. Matplotlib is slow at reducing images.
     """
     try:
-        return read_shrunk(path, longest)
+        return read_image(path, longest=longest)
     except ImageError:
         blank = np.full((240, 320, 3), 200, np.uint8)
         cv2.putText(blank, "unreadable", (60, 130), cv2.FONT_HERSHEY_SIMPLEX, 1.1, (90, 90, 90), 2)

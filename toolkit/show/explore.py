@@ -19,7 +19,7 @@ from toolkit.files import image_name, pair_devices, read_references
 from toolkit.geometry import Floats, qt_from_pose, unit
 from toolkit.localizers.odometry import Odometry, recordings_of
 from toolkit.manifest import SequenceSettings
-from toolkit.show.figures import GREEN, ORANGE, VERMILLION, new_figure, pixels_of, plain_log, styled
+from toolkit.show.figures import GREEN, ORANGE, VERMILLION, inches_to_pixels, new_figure, plain_log, styled
 from toolkit.show.metrics import is_posed
 from toolkit.show.top_view import ground_axes, places_of
 
@@ -94,7 +94,7 @@ def draw_samples(capture: Capture, count: int = 4) -> "Figure":
     for line, name in zip(axes, names, strict=True):
         session = capture[name]
         for axis, row in zip(line, np.linspace(0, len(session) - 1, count).round().astype(int), strict=True):
-            axis.imshow(read_for_display(session.image_path(row), pixels_of(2.4)), interpolation="antialiased")
+            axis.imshow(read_for_display(session.image_path(row), inches_to_pixels(2.4)), interpolation="antialiased")
             axis.set(xticks=[], yticks=[])
         line[0].set_ylabel(name)
     return figure
@@ -216,7 +216,7 @@ def _draw_rows(
                 title = f"{hit['score']} inliers, was {hit['retrieval_rank']}" if verified else f"{hit['score']:.2f}"
                 shown.append((axis, hit, f"{map_device} {title}"))
         for axis, entry, title in shown:
-            axis.imshow(read_for_display(capture.image_path(image_name(entry["path"])), pixels_of(2.2)))
+            axis.imshow(read_for_display(capture.image_path(image_name(entry["path"])), inches_to_pixels(2.2)))
             axis.set_title(title, fontsize=8)
     return figure
 

@@ -54,7 +54,7 @@ def new_figure(width: float, height: float) -> "Figure":
     return figure
 
 
-def pixels_of(inches: float) -> int:
+def inches_to_pixels(inches: float) -> int:
     """Convert a length in a figure to pixels of its PNG file; call it in a function that is `styled`."""
     import matplotlib as mpl
 

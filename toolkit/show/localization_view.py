@@ -158,8 +158,9 @@ class _ChosenWriter:
         self._jpeg_of = lru_cache(KEPT_JPEGS)(_jpeg_of)
 
     def read(self, numbered: tuple[int, QueryDetails]) -> tuple[int, QueryDetails]:
-        """Read the images of a query ahead, in a thread."""
-        for image in (*numbered[1].cameras, *(image for image, _, _ in numbered[1].captioned_references())):
+        """Read the images of a query and keep them; return the arguments of `write`; thread-safe."""
+        _, query = numbered
+        for image in (*query.cameras[:MAX_CAMERAS], *(image for image, _, _ in query.captioned_references())):
             self._jpeg_of(image.path)
         return numbered
 

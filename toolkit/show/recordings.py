@@ -15,7 +15,7 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import DEPTH_SCALE, RAW_DATA, Capture, Session, Trajectory
 from toolkit.capture.devices import color_of
-from toolkit.capture.images import decode, default_workers, prefetch, read_for_display, read_shrunk
+from toolkit.capture.images import decode, default_workers, prefetch, read_for_display, read_image
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import ArtifactError, CaptureError, ImageError
 from toolkit.files import file_fingerprint, files_fingerprint, pair_devices, write_sidecar
@@ -383,7 +383,7 @@ def _load(shot: _Shot, image_size: int) -> _Shot:
         data = cv2.imencode(".png", small)[1].tobytes()
         return replace(shot, data=data, size=(width, height), readable=True)
     try:
-        image, readable = read_shrunk(shot.path, image_size), True
+        image, readable = read_image(shot.path, longest=image_size), True
     except ImageError:
         blank = cv2.resize(read_for_display(shot.path, image_size), (shot.camera.width, shot.camera.height))
         image, readable = np.asarray(blank, np.uint8), False

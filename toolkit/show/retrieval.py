@@ -25,8 +25,8 @@ from toolkit.show.figures import (
     MAP,
     ORANGE,
     TRUE,
+    inches_to_pixels,
     new_figure,
-    pixels_of,
     shared_legend,
     shown,
     styled,
@@ -230,7 +230,7 @@ def _draw_image(axis: "Axes", path: Path | None, title: str, color: str, width: 
     """Draw an image that is at most `width` inches wide."""
     axis.set(xticks=[], yticks=[])
     if path is not None:
-        axis.imshow(read_for_display(path, pixels_of(width)), interpolation="antialiased")
+        axis.imshow(read_for_display(path, inches_to_pixels(width)), interpolation="antialiased")
     else:
         axis.text(0.5, 0.5, "not in the capture", ha="center", transform=axis.transAxes, fontsize=8)
     axis.set_title(title, fontsize=8, color=color)

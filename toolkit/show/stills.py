@@ -19,8 +19,8 @@ from toolkit.show.figures import (
     TRUE,
     error_bar,
     error_colors,
+    inches_to_pixels,
     new_figure,
-    pixels_of,
     shared_legend,
     styled,
 )
@@ -166,8 +166,8 @@ def draw_localization(query: QueryDetails, title: str = "", unit: tuple[str, flo
     figure = new_figure(4.4 * ratio + columns * widest * 4.4 / rows + 0.6, 5.3)
     grid = figure.add_gridspec(rows, 1 + columns, width_ratios=[ratio, *[widest / rows] * columns])
     axis = figure.add_subplot(grid[:, 0])
-    _draw_photograph(axis, shown, GREEN if is_posed(shown.world_from_cam) else ESTIMATED, 4.4)
     located, good = bool(is_posed(shown.world_from_cam)), shown.inlier
+    _draw_photograph(axis, shown, GREEN if located else ESTIMATED, 4.4)
     draw_dots(axis, _on(shown.pixels[~good]), s=7, c=ESTIMATED, alpha=0.5 if located else 1, lw=0)
     if not located:
         caption = "query: not localized" + (f", {len(good)} matches" if len(good) else "")
@@ -250,7 +250,7 @@ def _on(pixels: Floats) -> Floats:
 def _read(image: ShownImage, height: float) -> NDArray[np.uint8]:
     """Read an image that is drawn `height` inches high."""
     camera = image.camera
-    return read_for_display(image.path, pixels_of(height * max(1.0, camera.width / camera.height)))
+    return read_for_display(image.path, inches_to_pixels(height * max(1.0, camera.width / camera.height)))
 
 
 def _draw_photograph(axis: "Axes", image: ShownImage, color: str, height: float) -> None:

@@ -12,7 +12,7 @@ from toolkit.capture.world_up import up_of_cameras
 from toolkit.geometry import Floats
 from toolkit.localizers.base import Query, View
 from toolkit.localizers.feed_forward import CameraAnswer, FeedForwardAnswer, FeedForwardLocalizer
-from toolkit.show.figures import BLUE, GRAY, GREEN, VERMILLION, new_figure, pixels_of, styled
+from toolkit.show.figures import BLUE, GRAY, GREEN, VERMILLION, inches_to_pixels, new_figure, styled
 from toolkit.show.top_view import ground_axes
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def _draw_view(
 ) -> None:
     photograph.set_axis_on()
     photograph.set(xticks=[], yticks=[])
-    image = read_for_display(view.image, pixels_of(3)) if isinstance(view.image, Path) else view.image
+    image = read_for_display(view.image, inches_to_pixels(3)) if isinstance(view.image, Path) else view.image
     photograph.imshow(image, cmap="gray")
     photograph.set_title(label, fontsize=8, color=color)
     photograph.spines[:].set(color=color, linewidth=2.5, visible=True)

@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from toolkit.synthetic.scene import Quad, Scene, named_rng
-from toolkit.synthetic.textures import Image
+from toolkit.synthetic.textures import Image, in_color
 
 LEVELS = 6  # mip levels; texture sides are multiples of 2 ** (LEVELS - 1)
 SOLD_OFTEN = ("books", "crate", "door", "drawers", "window")  # materials that look alike in a world with look-alikes
@@ -94,7 +94,7 @@ def paint(scene: Scene, seed: int, index: int, number: int, look_alikes: bool = 
         image = quad.material(rng, h, w, quad.ppm)
     if quad.lit:
         light = cv2.resize(_light(scene, quad), (w, h), interpolation=cv2.INTER_LINEAR)
-        image = cv2.multiply(image, cv2.merge([light] * 3), dtype=cv2.CV_8U)
+        image = cv2.multiply(image, in_color(light), dtype=cv2.CV_8U)
     for pyramid, level in ((quad.color, image), (quad.gray, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))):
         pyramid.append(level)
         for _ in range(LEVELS - 1):

@@ -138,9 +138,9 @@ def render(quads: list[Quad], world_from_cam: Floats, rays: Rays, gray: bool) ->
         # The footprint of a sample on the surface has the area z^3 / (f^2 * distance). The four samples of a pixel
         # round the mip level with four offsets, which blends levels. The term with 0.25 blurs slanted surfaces, which
         # would flicker otherwise.
-        scale = tw / quad.width / focal / np.sqrt(distance)
+        scale = tw / quad.width / focal / math.sqrt(distance)
         log_z = np.log2(z)
-        level = 1.5 * log_z + float(np.log2(scale)) + 0.25 * np.maximum(log_z - math.log2(distance), 0)
+        level = 1.5 * log_z + math.log2(scale) + 0.25 * np.maximum(log_z - math.log2(distance), 0)
         level = np.clip((level + offsets[index]).astype(np.int8), 0, LEVELS - 1)
         for i in range(LEVELS):
             rows = np.flatnonzero(level == i)

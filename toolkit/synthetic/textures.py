@@ -43,7 +43,7 @@ def _noise(rng: Rng, h: int, w: int, cells: tuple[int, ...], stretch: int = 1) -
     return total / len(cells) ** 0.5
 
 
-def _in_color(gray: Image) -> Image:
+def in_color(gray: Image) -> Image:
     """Return an image with three equal channels; numpy is slow if it repeats a value along an axis of three."""
     return cv2.merge([gray] * 3)
 
@@ -125,7 +125,7 @@ def plaster(rng: Rng, h: int, w: int, ppm: float, color: Any = (190, 205, 210), 
 
 def _grain(rng: Rng, image: Image, strength: float) -> Image:
     h, w = image.shape[:2]
-    noisy = image + _in_color(_noise(rng, h, w, (2, 5)) * strength * 255)
+    noisy = image + in_color(_noise(rng, h, w, (2, 5)) * strength * 255)
     return noisy.clip(0, 255, out=noisy).astype(np.uint8)
 
 
@@ -144,7 +144,7 @@ def cells(
     tone = tone * (1 + jitter * rng.standard_normal((rows, columns, 1), dtype=np.float32))
     streaks = 6 if stagger == "random" else 1
     image = np.take(tone.reshape(-1, 3), row[:, None] * columns + column, axis=0)
-    image *= _in_color(1 + 0.07 * _noise(rng, h, w, (3, 9), streaks))
+    image *= in_color(1 + 0.07 * _noise(rng, h, w, (3, 9), streaks))
     gap = max(1, round(0.008 * ppm))
     image[((y % ch) < gap)[:, None] | ((x % cw) < gap)] = joint
     image = image.clip(0, 255, out=image).astype(np.uint8)
