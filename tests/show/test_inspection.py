@@ -1,7 +1,9 @@
 """One query of a run under the glass: it shows what was stored, and localizes again as the run did."""
 
+import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,7 @@ from tests.localized import some_correspondences, write_pair
 from tests.rendered import LIST, write_retrieval
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError, ManifestError
-from toolkit.files import SceneFiles
+from toolkit.files import SceneFiles, map_record_path
 from toolkit.geometry import invert
 from toolkit.localize import localize_pairs
 from toolkit.localizers.correspondences import LocalizedQuery, Rival
@@ -185,7 +187,38 @@ def test_the_ellipse_is_of_the_camera_not_of_the_rig(pair: InspectedPair) -> Non
     at = rig_from_cam[camera][:3, 3]
     places = at + moves[:, 3:] + np.cross(moves[:, :3], at)
     expected = np.cov((places @ one.pose[:3, :3].T).T)
-    np.testing.assert_allclose(_position_covariance(one), expected, atol=0.05 * np.abs(expected).max())
+    covariance = _position_covariance(one, rig_from_cam[camera])
+    np.testing.assert_allclose(covariance, expected, atol=0.05 * np.abs(expected).max())
+
+
+def test_both_answers_are_drawn_at_the_same_camera_of_a_rig(pair: InspectedPair) -> None:
+    from toolkit.show.figures import new_figure
+
+    one = pair.look(0)
+    other = next(image.name for image in one.details.cameras if image.name != one.details.cameras[0].name)
+    found = some_correspondences([one.localized.images.index(other)] * 6, [True] * 6)
+    swapped = replace(one, localized=replace(one.localized, correspondences=found))
+    assert swapped.details.cameras[0].name == other
+    axis = new_figure(4, 4).subplots()
+    _draw_near(axis, [(one, "as it was", "red"), (swapped, "again", "blue")])
+    first, second = axis.patches
+    np.testing.assert_allclose(second.get_center(), first.get_center(), atol=1e-9)
+
+
+def test_lengths_of_an_unknown_unit_are_not_meters(small_capture: Path, tmp_path: Path) -> None:
+    off = [0.0, 0.3, 0.02]
+    pair = written(small_capture, tmp_path, [LocalizedQuery()] * 3, off_m=off, position_std_m=[0.01, 0.2, 0.03])
+    poses = pair._h5.parent
+    map_record_path(poses, small_capture.name, "ios").write_text(json.dumps({"unit": None, "depth": 50.0, "text": ""}))
+    pair = InspectedPair("ios", "ios", poses)
+    one = pair.look("worst")
+    assert one.error[1] == pytest.approx(0.06)
+    assert one.numbers["position_std_m"] == pytest.approx(0.04)
+    assert pair.table["translation_error_m"].tolist() == pytest.approx([0.0, 0.06, 0.004], abs=1e-6)
+    assert pair.table["position_std_m"].tolist() == pytest.approx([0.002, 0.04, 0.006])
+    text = text_of(one.figure)
+    assert "std. dev. of position [L]" in text
+    assert "[m]" not in text
 
 
 def test_what_is_not_known_is_not_shown(files: SceneFiles, small_capture: Path, tmp_path: Path) -> None:

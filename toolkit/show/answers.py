@@ -35,7 +35,7 @@ class Answer:
     reason: str
     """Why it has this status, in words."""
     numbers: dict[str, float]
-    """The known ones of `NUMBERS`."""
+    """The known ones of `NUMBERS`; lengths in `pair.unit`."""
     localized: LocalizedQuery
     """Names of images and references, correspondences, rivals."""
     pose: Floats | None
@@ -79,11 +79,11 @@ class Answer:
 
     @property
     def error(self) -> tuple[float, float] | None:
-        """Rotation error, degrees, and position error, meters; None without a pose or ground truth."""
+        """Rotation error, degrees, and position error in `pair.unit`; None without a pose or ground truth."""
         if self.pose is None or self.true_pose is None:
             return None
-        rotation_deg, translation_m = pose_errors(self.pose[None], self.true_pose[None])
-        return float(rotation_deg[0]), float(translation_m[0])
+        rotation_deg, translation = pose_errors(self.pose[None], self.true_pose[None])
+        return float(rotation_deg[0]), float(translation[0]) / self.pair.unit[1]
 
     @cached_property
     def matches(self) -> pd.DataFrame:

@@ -25,7 +25,7 @@ from toolkit.show.choice import find_query, shown_name
 from toolkit.show.figures import shown
 from toolkit.show.inspection_view import draw_comparison, draw_inspection
 from toolkit.show.localized import LocalizedPair
-from toolkit.show.metrics import is_posed, pose_errors, worst_first
+from toolkit.show.metrics import is_posed, worst_first
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -156,13 +156,12 @@ class InspectedPair:
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """The pair's csv with `rotation_error_deg` and `translation_error_m`, NaN without ground truth."""
-        rotation_deg, translation_m = pose_errors(self.localized.world_from_rig, self.true)
-        return self.localized.table.assign(rotation_error_deg=rotation_deg, translation_error_m=translation_m)
+        """The pair's csv with `rotation_error_deg` and `translation_error_m`, see `Localizations.ranked`."""
+        return self.localized.localizations.ranked
 
     def worst_first(self) -> list[int]:
         """Return the numbers of the queries from worst to best, see `metrics.worst_first`."""
-        return [int(number) for number in worst_first(self.table)]
+        return self.localized.localizations.worst_first().tolist()
 
     def number_of(self, query: int | str) -> int:
         """Return the number of a query.
@@ -191,7 +190,7 @@ class InspectedPair:
         number = self.number_of(query)
         row = self.localized.table.iloc[number]
         pose = self.localized.world_from_rig[number]
-        numbers = {name: float(row[name]) for name in NUMBERS if name in row and pd.notna(row[name])}
+        numbers = self._numbers({name: row[name] for name in NUMBERS if name in row})
         status, stated = str(row["status"]), str(row["reason"]) if pd.notna(row.get("reason")) else ""
         method = str(row["method"])
         return Inspection(
@@ -205,11 +204,11 @@ class InspectedPair:
         settings = self._again.settings(changes)
         estimate, localized, seconds = self._again.localize(self.localized.rows[number], settings)
         method = label(settings, "" if estimate.world_from_rig is None else estimate.found_by)
-        numbers = {name: float(value) for name in NUMBERS if np.isfinite(value := getattr(estimate, name))}
+        numbers = self._numbers({name: getattr(estimate, name) for name in NUMBERS})
         return Inspection(
             self.localized, number, estimate.status, method,
             reason_in_words(estimate.status, estimate.reason, numbers, settings, method), numbers, localized,
-            estimate.world_from_rig, estimate.covariance, settings, seconds, self._true(number),
+            estimate.world_from_rig, _if_finite(estimate.covariance), settings, seconds, self._true(number),
             self._retrieved(number), of=self,
         )  # fmt: skip
 
@@ -227,8 +226,12 @@ class InspectedPair:
 
     def _covariance(self, number: int) -> Floats | None:
         row = self.localized.table.iloc[number]
-        covariance = self._covariances.get((int(row["timestamp"]), str(row["device_id"])))
-        return covariance if covariance is not None and np.isfinite(covariance).all() else None
+        return _if_finite(self._covariances.get((int(row["timestamp"]), str(row["device_id"]))))
+
+    def _numbers(self, values: Mapping[str, Any]) -> dict[str, float]:
+        """Return the known values of `NUMBERS`, lengths converted to the unit that they are shown in."""
+        lengths = {"position_std_m": self.localized.unit[1]}
+        return {name: float(value) / lengths.get(name, 1.0) for name, value in values.items() if np.isfinite(value)}
 
     @cached_property
     def _topk(self) -> dict[tuple[int, str], list[dict[str, Any]]]:
@@ -246,6 +249,10 @@ class InspectedPair:
                 ranked = rank, float(hit.get("score", np.nan))
                 best[name] = min(best.get(name, ranked), ranked, key=lambda one: (one[0], -one[1]))
         return dict(sorted(best.items(), key=lambda item: item[1][0]))
+
+
+def _if_finite(covariance: Floats | None) -> Floats | None:
+    return covariance if covariance is not None and np.isfinite(covariance).all() else None
 
 
 class WorstQueries:

@@ -44,10 +44,10 @@ LABELS = {
     "inlier_ratio": ("inlier ratio", "{:.0%}"), "num_guided": ("guided matches", "{:.0f}"),
     "rmse_px": ("reprojection error [px]", "{:.2f}"), "coverage": ("image covered", "{:.0%}"),
     "p_correct": ("probability of being right", "{:.1%}"), "rival_support": ("support of the best rival", "{:.0%}"),
-    "agreement": ("inliers of a second kind", "{:.0f}"), "position_std_m": ("std. dev. of position [m]", "{:.2g}"),
+    "agreement": ("inliers of a second kind", "{:.0f}"), "position_std_m": ("std. dev. of position [{unit}]", "{:.2g}"),
     "rotation_std_deg": ("std. dev. of rotation [deg]", "{:.2g}"), "scale_std": ("std. dev. of scale", "{:.1%}"),
 }  # fmt: skip
-"""Label and format of each number."""
+"""Label and format of each number; `{unit}` stands for the pair's unit of length."""
 OF_NETWORKS = {
     "num_matches": ("references given to it", "{:.0f}"), "num_inliers": ("consistent ones", "{:.0f}"),
     "inlier_ratio": ("their share", "{:.0%}"),
@@ -312,28 +312,28 @@ def _draw_near(axis: "Axes", labeled: Labeled) -> None:
         axis.set_axis_off()
         axis.text(0.5, 0.5, "no pose", ha="center", va="center", color=GRAY)
         return
-    first = posed[0][0]
-    axes, labels, _ = _axes_of(first)
-    unit_name, unit = first.pair.unit
-    origin = _first_camera(first)[:3, 3]
+    axes, labels, _ = _axes_of(posed[0][0])
+    unit_name, unit = posed[0][0].pair.unit
+    shown, rig_from_cam = _cameras_of(labeled), _rig_from_first(labeled[0][0])
+    origin = shown[0][0][:3, 3]
     reach, ellipses = [], []
-    for pose, _, _ in _cameras_of(labeled):
+    for pose, _, _ in shown:
         reach.append(float(np.abs((pose[:3, 3] - origin) / unit @ axes.T).max()))
-    for answer, name, color in posed:
+    for (pose, _, _), (answer, name, color) in zip(shown, posed, strict=False):  # the truth is shown last
         if answer.covariance is None:
             continue
-        spread = axes @ _position_covariance(answer) @ axes.T / unit**2
+        spread = axes @ _position_covariance(answer, rig_from_cam) @ axes.T / unit**2
         values, vectors = np.linalg.eigh(spread)
         sizes = 2 * SURE * np.sqrt(np.maximum(values, 0))
         reach.append(float(sizes.max()) * 0.55)
-        ellipses.append((answer, name, color, sizes, float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))))
+        ellipses.append((pose, name, color, sizes, float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))))
     half = 1.35 * max([value for value in reach if np.isfinite(value)], default=0.0) or 0.01
     small, factor = ("cm", 100.0) if unit_name == "m" and half < 1 else (unit_name, 1.0)
-    for answer, name, color, sizes, angle in ellipses:
-        at = (_first_camera(answer)[:3, 3] - origin) / unit @ axes.T * factor
+    for pose, name, color, sizes, angle in ellipses:
+        at = (pose[:3, 3] - origin) / unit @ axes.T * factor
         axis.add_patch(Ellipse((float(at[0]), float(at[1])), factor * sizes[1], factor * sizes[0], angle=angle,
                                facecolor=color, alpha=0.2, label=f"95 % region, {name}"))  # fmt: skip
-    for pose, name, color in _cameras_of(labeled):
+    for pose, name, color in shown:
         _draw_place(axis, (pose[:3, 3] - origin) / unit @ axes.T * factor, name, color, 30)
     half *= factor
     axis.set(xlim=(-half, half), ylim=(-half, half), aspect="equal")
@@ -354,21 +354,20 @@ def _draw_table(axis: "Axes", answers: Sequence[Answer]) -> None:
     """Write the numbers of the answers, one column each; numbers that differ are bold."""
     rows: list[tuple[str, list[str]]] = [("method", [answer.method for answer in answers])]
     by_network = all(answer.method.rpartition("/")[2].startswith("feed_forward") for answer in answers)
-    labels = LABELS | OF_NETWORKS if by_network else LABELS
+    labels, unit = LABELS | OF_NETWORKS if by_network else LABELS, answers[0].pair.unit[0]
     no_matches = all(answer.pose is not None and not answer.numbers.get("num_matches") for answer in answers)
     for key, (text, form) in labels.items():
         if (by_network and key in OF_MATCHES) or (no_matches and key in (*OF_MATCHES, *OF_NETWORKS)):
             continue
         values = [form.format(answer.numbers[key]) if key in answer.numbers else "–" for answer in answers]
         if set(values) != {"–"} and not (key == "agreement" and set(values) == {"0"}):
-            rows.append((text, values))
+            rows.append((text.format(unit=unit), values))
     rivals = [answer.rivals for answer in answers]
     if any(poses is None for poses in rivals):
         rows.append(("other poses", ["not kept" if poses is None else str(len(poses)) for poses in rivals]))
     if any(answer.error is not None for answer in answers):
         errors = [answer.error or (np.nan, np.nan) for answer in answers]
-        unit = answers[0].pair.unit
-        rows.append((f"true position error [{unit[0]}]", [_digits(distance / unit[1]) for _, distance in errors]))
+        rows.append((f"true position error [{unit}]", [_digits(distance) for _, distance in errors]))
         rows.append(("true rotation error [deg]", [_digits(angle) for angle, _ in errors]))
     rows.append(("seconds", [f"{answer.seconds:.2f}" for answer in answers]))
     axis.set_axis_off()
@@ -390,12 +389,6 @@ def _rig_from_first(answer: Answer) -> Floats:
     return np.asarray(session.rig_from_cam(rows)[names.index(answer.details.cameras[0].name)])
 
 
-def _first_camera(answer: Answer) -> Floats:
-    """Return world_from_cam (4, 4) of the drawn image of a query with a pose."""
-    assert answer.pose is not None
-    return np.asarray(answer.pose @ _rig_from_first(answer))
-
-
 def _cameras_of(labeled: Labeled) -> list[tuple[Floats, str, str]]:
     """Return world_from_cam, label and color of the answers with a pose, and of the ground truth if known."""
     # A rig is shown by the camera that the first answer draws.
@@ -405,14 +398,14 @@ def _cameras_of(labeled: Labeled) -> list[tuple[Floats, str, str]]:
     return [*shown, *([] if true is None else [(true @ rig_from_cam, "true", TRUE)])]
 
 
-def _position_covariance(answer: Answer) -> Floats:
-    """Return the covariance (3, 3) of the drawn camera's position in the world, square meters.
+def _position_covariance(answer: Answer, rig_from_cam: Floats) -> Floats:
+    """Return the covariance (3, 3) of a camera's position in the world, square meters.
 
     A small motion of the rig in its own frame, rotation w and translation t, moves a camera at c by t + w x c.
     """
     assert answer.pose is not None
     assert answer.covariance is not None
-    x, y, z = _rig_from_first(answer)[:3, 3]
+    x, y, z = rig_from_cam[:3, 3]
     lever = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])
     moves = answer.pose[:3, :3] @ np.hstack([lever, np.eye(3)])
     return np.asarray(moves @ answer.covariance @ moves.T)

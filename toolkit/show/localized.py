@@ -162,12 +162,14 @@ class Localizations:
 
     @cached_property
     def ranked(self) -> pd.DataFrame:
-        """The table with the errors of the device: `rotation_error_deg`, and `translation_error_m` in `unit`.
+        """The table with the errors of the device: `rotation_error_deg`, and `translation_error_m`.
 
-        They equal those of the evaluation: infinite without a pose, NaN without ground truth.
+        They equal those of the evaluation: infinite without a pose, NaN without ground truth. Lengths are in `unit`.
         """
         rotation_deg, translation = pose_errors(self.estimated @ self.cam_from_rig, self.true @ self.cam_from_rig)
-        return self.table.assign(rotation_error_deg=rotation_deg, translation_error_m=translation / self.unit[1])
+        table = self.table.assign(rotation_error_deg=rotation_deg, translation_error_m=translation)
+        lengths = table.columns.intersection(["translation_error_m", "position_std_m"])
+        return table.assign(**table[lengths] / self.unit[1])
 
     def worst_first(self) -> Ints:
         """Return the rows from worst to best (`metrics.worst_first`)."""
