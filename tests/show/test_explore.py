@@ -25,6 +25,16 @@ def test_unusable_sessions_have_a_reason_and_the_others_are_drawn(tmp_path: Path
     assert "[" not in draw_top_view(capture, unit=None).axes[0].get_xlabel()
 
 
+def test_a_capture_without_a_usable_session_says_so(tmp_path: Path) -> None:
+    sessions = write_tiny_capture(tmp_path / "TINY") / "sessions"
+    for session in sessions.iterdir():
+        (session / "images.txt").write_text("a line\n")
+    capture = Capture.open(tmp_path / "TINY")
+    assert describe(capture)["reason"].str.contains("line 1").all()
+    for figure in (draw_samples(capture), draw_top_view(capture)):
+        assert "can be used" in figure.texts[0].get_text()
+
+
 def test_odometry_and_radio_are_told(small_capture: Path, tmp_path: Path) -> None:
     table = describe(Capture.open(small_capture))
     assert table["odometry"]["ios_map"] == table["radio"]["ios_query"] == ""

@@ -89,6 +89,8 @@ def list_poses(path: str | Path) -> pd.DataFrame:
 def draw_samples(capture: Capture, count: int = 4) -> "Figure":
     """Draw `count` images of each session, evenly spread over the recording; return the figure."""
     names = [session.id for session in _usable(capture) if len(session)]
+    if not names:
+        return _empty("no session with images can be used")
     figure = new_figure(2.4 * count, 1.9 * len(names))
     axes = figure.subplots(len(names), count, squeeze=False)
     for line, name in zip(axes, names, strict=True):
@@ -109,7 +111,9 @@ def draw_top_view(capture: Capture, up: ArrayLike | None = None, unit: str | Non
         up: up direction (3,); None: estimated from the cameras.
         unit: unit of the poses, None if unknown.
     """
-    poses = {session.id: _poses(session) for session in _usable(capture)}
+    poses = {session.id: of_session for session in _usable(capture) if len(of_session := _poses(session))}
+    if not poses:
+        return _empty("no session with poses can be used")
     everything = np.concatenate(list(poses.values()))
     axes, labels = ground_axes(up_of_cameras(everything) if up is None else up, unit)
     centers = everything[:, :3, 3] @ axes.T
@@ -120,8 +124,6 @@ def draw_top_view(capture: Capture, up: ArrayLike | None = None, unit: str | Non
     plots = figure.subplots(1, count, squeeze=False)[0]
     for number, plot in enumerate(plots):
         for name in poses:
-            if not len(poses[name]):
-                continue
             x, y = centers[(place == number) & (sessions == name)].T
             marker, size = ("o", 14) if capture[name].split == "map" else ("x", 36)
             plot.scatter(x, y, s=size, c=color_of(capture[name].device), marker=marker, label=name, alpha=0.8)
@@ -261,6 +263,12 @@ def _descriptors(embeddings: Path, session: str, limit: int) -> list[NDArray[np.
     step = max(1, -(-total // limit))
     rows = np.concatenate([np.asarray(part[::step], np.float32) for part in parts])
     return [unit(rows)]
+
+
+def _empty(why: str) -> "Figure":
+    figure = new_figure(5, 1)
+    figure.text(0.5, 0.5, why, ha="center", va="center")
+    return figure
 
 
 def _usable(capture: Capture) -> list[Session]:
