@@ -63,11 +63,11 @@ def test_the_way_out_names_the_device() -> None:
 
 
 def test_failures_are_counted_once() -> None:
-    lost = [{"what": "", "reason": "x"}]
+    lost = [{"what": str(number), "reason": "x"} for number in range(6)]
     rows = [
-        {"scene": "P", "stage": "embed", "counts": {"images": 9, "unreadable": 2}, "asked": 12, "left_out": lost * 6},
-        {"scene": "P", "stage": "retrieve", "asked": 9, "left_out": lost * 5},
-        {"scene": "P", "stage": "localize", "counts": {"queries": 7, "failed": 1}, "asked": 9, "left_out": lost * 5},
+        {"scene": "P", "stage": "embed", "counts": {"images": 9, "unreadable": 2}, "asked": 12, "left_out": lost},
+        {"scene": "P", "stage": "retrieve", "asked": 9, "left_out": lost[:4]},
+        {"scene": "P", "stage": "localize", "counts": {"queries": 7, "failed": 1}, "asked": 9, "left_out": lost[1:5]},
         {"scene": "Q", "stage": "localize", "counts": {"queries": 3, "failed": 0}, "asked": 4, "left_out": []},
     ]
     assert failures(rows) == {

@@ -5,6 +5,7 @@ import json
 import os
 import platform
 import time
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -109,7 +110,8 @@ class RunLog:
 def failures(rows: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
     """Return how many images, queries and pairs failed, `{kind: {"failed": n, "of": total}}`, from rows of stages."""
     totals = {kind: {"failed": 0, "of": 0} for kind in ("images", "queries", "pairs")}
-    pairs: dict[tuple[str, str], list[int]] = {}
+    lost: dict[tuple[str, str], set[str]] = {}
+    asked = Counter[tuple[str, str]]()
     for row in rows:
         counts = row.get("counts") or {}
         for kind, stage, name in (("images", "embed", "unreadable"), ("queries", "localize", "failed")):
@@ -117,16 +119,15 @@ def failures(rows: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
                 totals[kind]["failed"] += counts[name]
                 totals[kind]["of"] += counts[kind]
         if "asked" in row:
-            of_stage = pairs.setdefault((row["scene"], row["stage"]), [0, 0])
-            of_stage[0] += len(row.get("left_out", ()))
-            of_stage[1] += row["asked"]
-    for scene in dict.fromkeys(scene for scene, _ in pairs):  # a failed pair fails in all later stages: count it once
-        of_stages = {stage: counts for (of, stage), counts in pairs.items() if of == scene}
-        if len(of_stages) > 1:
-            of_stages.pop("embed", None)  # its rows are recordings, not pairs
-        failed, total = max(of_stages.values())
-        totals["pairs"]["failed"] += failed
-        totals["pairs"]["of"] += total
+            of_stage = row["scene"], row["stage"]
+            asked[of_stage] += row["asked"]
+            lost.setdefault(of_stage, set()).update(one["what"] for one in row.get("left_out", ()))
+    for scene in dict.fromkeys(scene for scene, _ in asked):
+        of_scene = [(of, stage) for of, stage in asked if of == scene]
+        # The rows of embed are recordings, not pairs. A failed pair fails in all later stages: count it once.
+        of_pairs = [(of, stage) for of, stage in of_scene if stage != "embed"] or of_scene
+        totals["pairs"]["failed"] += len(set[str]().union(*(lost[of_stage] for of_stage in of_pairs)))
+        totals["pairs"]["of"] += max(asked[of_stage] for of_stage in of_pairs)
     return totals
 
 
