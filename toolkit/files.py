@@ -234,6 +234,18 @@ def require_whole(path: str | Path, of: str | Path | None = None) -> None:
         )
 
 
+def require_made_from(sequence: Path, single: Path) -> None:
+    """Refuse sequence poses that were made from other single-query poses than those beside them.
+
+    Raises:
+        ArtifactError: the single-query poses have changed since. Files without a record are accepted, see
+            `require_whole`.
+    """
+    made_from = read_json(sidecar_path(sequence)).get("settings", {}).get("poses", [])
+    if made_from[:1] not in ([], [file_fingerprint(single)]):
+        raise ArtifactError(f"{sequence}: {single.name} has changed since. Run the sequence stage again.")
+
+
 def any_unfinished(folder: str | Path, of: Callable[[str], bool]) -> bool:
     """Tell whether any artifact below a folder, selected by its path in the folder, is recorded as unfinished."""
     records = (path for path in Path(folder).rglob("*.meta.json") if of(path.relative_to(folder).as_posix()))

@@ -15,7 +15,7 @@ from toolkit.capture import Trajectory, write_session
 from toolkit.errors import ArtifactError, CaptureError, ManifestError, ToolkitError
 from toolkit.exchange.export import export_intrinsics
 from toolkit.exchange.submission import collect
-from toolkit.files import SceneFiles
+from toolkit.files import SceneFiles, file_fingerprint, write_sidecar
 from toolkit.geometry import make_pose, pose_from_qt
 
 DEVICES = ("ios", "hl", "spot")
@@ -171,6 +171,13 @@ def test_poses_of_the_sequence_are_taken_where_asked_for(run: Path, tmp_path: Pa
     assert (row["written"], row["low_confidence"], row["not_asked"]) == (3, 3, 1)
     found = poses_in(submission.write(), "HYDRO_map_ios_query_hl.txt", tmp_path)
     np.testing.assert_allclose(found.qt, qt[:0:-1], atol=1e-15)
+    single = files.poses_txt("ios", "hl")
+    record = {"poses": [file_fingerprint(single)]}
+    write_sidecar(files.sequence_txt("ios", "hl"), record)
+    assert collect([run], "Ours.", sequence=True).entries
+    single.write_text(single.read_text() + "# localized again\n")
+    with pytest.raises(ArtifactError, match=single.name):
+        collect([run], "Ours.", sequence=True)
 
 
 def test_missing_pairs_are_reported_and_the_rest_is_written(run: Path) -> None:

@@ -24,7 +24,15 @@ from toolkit.capture.devices import SPLITS, extra_devices
 from toolkit.capture.names import allow_outside
 from toolkit.capture.tables import read_query_table, read_table
 from toolkit.errors import ArtifactError, CaptureError, ManifestError, ToolkitError
-from toolkit.files import SceneFiles, file_fingerprint, pair_name, read_references, write_atomic, write_sidecar
+from toolkit.files import (
+    SceneFiles,
+    file_fingerprint,
+    pair_name,
+    read_references,
+    require_made_from,
+    write_atomic,
+    write_sidecar,
+)
 from toolkit.geometry import invert, qt_from_pose, unit
 
 FAILED = ("nearest", "leave-out")
@@ -154,8 +162,8 @@ def collect(
 
     Raises:
         ManifestError: an unknown value, no such run, or a file that cannot be read as a description.
-        ArtifactError: two runs have the same pair, or a poses file has a duplicate key or a quaternion that is not of
-            unit length.
+        ArtifactError: two runs have the same pair, the poses of a sequence were made from other poses of single
+            queries, or a poses file has a duplicate key or a quaternion that is not of unit length.
         CaptureError: a malformed poses file, or no such keyframe list; names file and line.
     """
     if failed not in FAILED:
@@ -262,6 +270,8 @@ def _fill_entry(
         both = " and ".join(str(path) for _, path in with_poses)
         raise ArtifactError(f"Two runs have poses of the same pair: {both}. Give one of the two runs.")
     files, path = with_poses[0]
+    if sequence and files.poses_txt(*pair).is_file():
+        require_made_from(path, files.poses_txt(*pair))
     keyframes = captures[entry.scene][f"{entry.query_device}_query"].keyframes(queries)
     timestamps, device_ids = keyframes["timestamp"].to_numpy(np.int64), keyframes["device_id"]
     poses = _read_poses(path)

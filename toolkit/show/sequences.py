@@ -15,7 +15,8 @@ from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.tables import POSE_NAMES, as_strings, read_query_table
 from toolkit.capture.world_up import up_of_cameras
-from toolkit.files import file_fingerprint, pair_name, read_json, require_whole, sidecar_path
+from toolkit.errors import ArtifactError
+from toolkit.files import pair_name, require_made_from, require_whole
 from toolkit.geometry import Floats
 from toolkit.show.figures import GREEN, ORANGE, SKY, VERMILLION, new_figure, percent, shared_legend, styled
 from toolkit.show.metrics import (
@@ -58,9 +59,10 @@ class SequencePair:
         single, sequence = (stem.with_name(f"{stem.name}{end}.txt") for end in ("", "_sequence"))
         if not (single.is_file() and sequence.is_file()):
             return None
-        made_from = read_json(sidecar_path(sequence)).get("settings", {}).get("poses", [])
-        if made_from[:1] not in ([], [file_fingerprint(single)]):  # no record: by another tool
-            log.warning("%s is not used: %s has changed since. Run the sequence stage again.", sequence, single.name)
+        try:
+            require_made_from(sequence, single)
+        except ArtifactError as error:
+            log.warning("%s", error)
             return None
         return cls(stem)
 
