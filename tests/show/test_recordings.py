@@ -17,7 +17,7 @@ from toolkit.localizers.local_map import LocalMap
 from toolkit.show.localization_view import record_localizations
 from toolkit.show.localized import Localizations, QueryDetails, ShownImage
 from toolkit.show.recordings import record_session, session_tracks
-from toolkit.show.viewer import shown_intrinsics, small_jpeg, spawn_viewer
+from toolkit.show.viewer import scene_view, shown_intrinsics, small_jpeg, spawn_viewer
 
 START = 93_003_175_602  # microseconds, as captures count them
 
@@ -333,3 +333,10 @@ def test_a_view_without_queries_points_or_map(tmp_path):
     none = np.zeros((0, 4, 4))
     queries = Localizations([], pd.DataFrame({"status": np.array([], str)}), none, none)
     assert record_localizations(tmp_path / "e.rrd", "e", none, np.zeros((0, 3)), None, queries).stat().st_size > 0
+
+
+def test_the_length_of_the_up_direction_does_not_move_the_view() -> None:
+    poses = np.stack([make_pose(rotation(angle), [angle, 0, 0]) for angle in (0.0, 20.0)])
+    up = np.array([0.0, -1.0, 0.0])
+    first, second = (scene_view(poses, scale * up, "view").properties["EyeControls3D"] for scale in (1.0, 5.0))
+    assert first.position.as_arrow_array() == second.position.as_arrow_array()

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.images import shrunk
 from toolkit.files import write_atomic
-from toolkit.geometry import Floats, rotation_to_quaternion
+from toolkit.geometry import Floats, rotation_to_quaternion, unit
 from toolkit.show.figures import GRAY
 from toolkit.show.top_view import places_of
 
@@ -123,10 +123,14 @@ def world_axes(up: Floats) -> Any:
 
 
 def scene_view(poses: Floats, up: Floats, name: str) -> Any:
-    """Return the 3D view, seen from behind and above the place with the most cameras (N, 4, 4)."""
+    """Return the 3D view, seen from behind and above the place with the most cameras (N, 4, 4).
+
+    Args:
+        up: up direction (3,) of any length.
+    """
     import rerun.blueprint as rrb
 
-    eye = None
+    eye, up = None, unit(up)
     if len(poses):
         place = places_of(poses[:, :3, 3])
         here = poses[place == np.bincount(place).argmax()]
