@@ -94,11 +94,12 @@ def create_embedder(name: str, **options: Any) -> Embedder:
     """Create an embedder.
 
     Args:
-        name: a key of `EMBEDDERS`, or `auto`.
+        name: a key of `EMBEDDERS`.
         options: arguments of the embedder: `vocabulary=<file>` for `vlad`; `checkpoint`, `device`, `dtype_compute` and
             `image_size` for `megaloc`.
+
+    Raises:
+        ManifestError: unknown embedder.
     """
-    checkpoint = options.get("checkpoint")
-    file = checkpoint if isinstance(checkpoint, str | Path) else None
-    embedder: Embedder = pkgutil.resolve_name(EMBEDDERS[resolve_name(name, file)])(**options)
+    embedder: Embedder = pkgutil.resolve_name(EMBEDDERS[resolve_name(name)])(**options)
     return embedder

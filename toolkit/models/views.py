@@ -38,7 +38,7 @@ class Views:
 
 
 def open_image(source: Source) -> Image.Image:
-    """Return an RGB image; blends transparent pixels with white. Does not apply the EXIF orientation.
+    """Return an RGB image; blends RGBA with white, as the official loaders do. Does not apply the EXIF orientation.
 
     Raises:
         ImageError: the file is missing or cannot be decoded.

@@ -34,10 +34,10 @@ def resized_size(width: int, height: int, mode: str) -> tuple[int, int]:
 def load_images(sources: Sequence[Source], mode: str = "balanced") -> Views:
     """Load images as the official loader does.
 
-    Transparent pixels become white. Crops images of more than 2 to 1 at their center. Resizes images (bicubic, by
-    Pillow) in proportion, rounded to multiples of 16: "balanced" to about the area of 512 x 512 pixels; "max_size" to
-    a longer side of 512 pixels. Smaller images then get a white border, up to the largest width and height among them.
-    Does not apply the EXIF orientation.
+    Transparent pixels of RGBA images become white. Crops images of more than 2 to 1 at their center. Resizes images
+    (bicubic, by Pillow) in proportion, rounded to multiples of 16: "balanced" to about the area of 512 x 512
+    pixels; "max_size" to a longer side of 512 pixels. Smaller images then get a white border, up to the largest
+    width and height among them. Does not apply the EXIF orientation.
 
     Args:
         sources: paths, Pillow images or arrays.

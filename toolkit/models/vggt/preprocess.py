@@ -24,9 +24,9 @@ def resized_size(width: int, height: int, mode: str) -> tuple[int, int]:
 def load_images(sources: Sequence[Source], mode: str = "crop") -> Views:
     """Load images as the official loader does.
 
-    Transparent pixels become white. Resizes images (bicubic, by Pillow) in proportion, to multiples of 14: "crop"
-    makes the width 518 and keeps at most the 518 middle rows; "pad" makes the longer side 518 and adds white up to
-    518 x 518. Smaller images then get a white border. Does not apply the EXIF orientation.
+    Transparent pixels of RGBA images become white. Resizes images (bicubic, by Pillow) in proportion, to multiples
+    of 14: "crop" makes the width 518 and keeps at most the 518 middle rows; "pad" makes the longer side 518 and
+    adds white up to 518 x 518. Smaller images then get a white border. Does not apply the EXIF orientation.
 
     Args:
         sources: paths, Pillow images or arrays.
