@@ -109,6 +109,9 @@ def test_a_pair_that_was_left_out_has_its_reason_and_no_pictures(small_capture, 
     table = visualize_scene(small_capture / "sessions", tmp_path, None, out, QUICK, map_device="ios")
     assert table.set_index("query_device")["reason"].to_dict() == {"ios": "", "hl": "a dragon"}
     assert not any(path.exists() for path in stale)
+    with pytest.raises(ArtifactError, match="a dragon"):
+        visualize_scene(small_capture / "sessions", tmp_path, None, out, QUICK, map_device="ios", query_device="hl")
+    assert not (out / "worst_SMALL.png").exists(), "it was of the run before"
 
 
 def test_a_pair_with_a_damaged_query_is_left_out_with_the_reason(small_capture, drawn, tmp_path):

@@ -81,6 +81,8 @@ def visualize_scene(
     if not chosen:
         raise ArtifactError(f"{poses_dir}: no poses of {capture.name} for the chosen devices. Localize them first.")
     table, worst = PairRows(capture.name, out, Path(poses_dir)), []
+    sheet = out / f"worst_{capture.name}.png"
+    sheet.unlink(missing_ok=True)
     for m, q in tqdm(chosen, desc="visualize", unit="pair"):
         name = pair_name(capture.name, m, q)
         _remove_pictures(out, name)  # those of an earlier run would look like results of this one
@@ -105,7 +107,7 @@ def visualize_scene(
             _remove_pictures(out, name)
     frame = table.frame()
     present = [(row["map_device"], row["query_device"]) for row in table.rows if not row["reason"]]
-    _draw_worst(out / f"worst_{capture.name}.png", capture.name, pd.concat(worst, ignore_index=True))
+    _draw_worst(sheet, capture.name, pd.concat(worst, ignore_index=True))
     sides = dict.fromkeys((*((m, "map") for m, _ in present), *((q, "query") for _, q in present)))
     for device, split in sides:
         recording, poses = out / f"{capture.name}_{device}_{split}.rrd", None
