@@ -238,12 +238,13 @@ def require_made_from(sequence: Path, single: Path) -> None:
     """Refuse sequence poses that were made from other single-query poses than those beside them.
 
     Raises:
-        ArtifactError: the single-query poses have changed since. Files without a record are accepted, see
-            `require_whole`.
+        ArtifactError: the single-query poses are missing or have changed since. Files without a record are accepted,
+            see `require_whole`.
     """
-    made_from = read_json(sidecar_path(sequence)).get("settings", {}).get("poses", [])
-    if made_from[:1] not in ([], [file_fingerprint(single)]):
-        raise ArtifactError(f"{sequence}: {single.name} has changed since. Run the sequence stage again.")
+    made_from = (_read_record(sequence).get("settings") or {}).get("poses")
+    if made_from and not (single.is_file() and made_from[0] == file_fingerprint(single)):
+        what = "has changed since" if single.is_file() else "is missing, which it was made from"
+        raise ArtifactError(f"{sequence}: {single.name} {what}. Run the localize and the sequence stage again.")
 
 
 def any_unfinished(folder: str | Path, of: Callable[[str], bool]) -> bool:

@@ -178,6 +178,9 @@ def test_poses_of_the_sequence_are_taken_where_asked_for(run: Path, tmp_path: Pa
     single.write_text(single.read_text() + "# localized again\n")
     with pytest.raises(ArtifactError, match=single.name):
         collect([run], "Ours.", sequence=True)
+    single.unlink()  # the localize stage has left the pair out
+    with pytest.raises(ArtifactError, match="is missing"):
+        collect([run], "Ours.", sequence=True)
 
 
 def test_missing_pairs_are_reported_and_the_rest_is_written(run: Path) -> None:

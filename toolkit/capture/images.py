@@ -196,7 +196,7 @@ def read_for_display(path: str | Path, longest: int) -> NDArray[np.uint8]:
     except ImageError:
         blank = np.full((240, 320, 3), 200, np.uint8)
         cv2.putText(blank, "unreadable", (60, 130), cv2.FONT_HERSHEY_SIMPLEX, 1.1, (90, 90, 90), 2)
-        return blank
+        return shrunk(blank, longest)
 
 
 def default_workers() -> int:

@@ -101,5 +101,7 @@ def create_embedder(name: str, **options: Any) -> Embedder:
     Raises:
         ManifestError: unknown embedder.
     """
-    embedder: Embedder = pkgutil.resolve_name(EMBEDDERS[resolve_name(name)])(**options)
+    if name not in EMBEDDERS:
+        raise ManifestError(f"Unknown embedder {name!r}. {nearest(name, list(EMBEDDERS))}")
+    embedder: Embedder = pkgutil.resolve_name(EMBEDDERS[name])(**options)
     return embedder

@@ -270,7 +270,7 @@ def _fill_entry(
         both = " and ".join(str(path) for _, path in with_poses)
         raise ArtifactError(f"Two runs have poses of the same pair: {both}. Give one of the two runs.")
     files, path = with_poses[0]
-    if sequence and files.poses_txt(*pair).is_file():
+    if sequence:
         require_made_from(path, files.poses_txt(*pair))
     keyframes = captures[entry.scene][f"{entry.query_device}_query"].keyframes(queries)
     timestamps, device_ids = keyframes["timestamp"].to_numpy(np.int64), keyframes["device_id"]

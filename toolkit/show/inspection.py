@@ -75,7 +75,7 @@ class Comparison:
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """Status, method, numbers, errors and seconds; columns before and after."""
+        """Status, method, numbers, errors and seconds; columns before and after; lengths in `pair.unit`."""
         columns = {}
         for name, one in (("before", self.before), ("after", self.after)):
             error = dict(zip(("rotation_error_deg", "translation_error_m"), one.error or (), strict=False))

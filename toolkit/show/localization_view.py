@@ -55,7 +55,7 @@ def record_localizations(
         map_poses: world_from_cam (N, 4, 4) of the map's images; NaN rows are skipped.
         points: (P, 3), meters.
         colors: (P, 3) RGB or None.
-        details: number and details of the queries that can be chosen; consumed one at a time.
+        details: number and details of the queries that can be chosen; few are in memory at a time.
         up: up direction (3,); None: estimated from the map's cameras.
         tracks: positions (n, 3) of each piece of the query recordings: `odometry`, rigidly placed in the map, and
             `frames`, as estimated by the sequence stage.

@@ -62,7 +62,7 @@ class SequencePair:
         try:
             require_made_from(sequence, single)
         except ArtifactError as error:
-            log.warning("%s", error)
+            log.warning("Not used: %s", error)
             return None
         return cls(stem)
 
