@@ -241,9 +241,10 @@ def require_made_from(sequence: Path, single: Path) -> None:
         ArtifactError: the single-query poses are missing or have changed since. Files without a record are accepted,
             see `require_whole`.
     """
-    made_from = (_read_record(sequence).get("settings") or {}).get("poses")
-    if made_from and not (single.is_file() and made_from[0] == file_fingerprint(single)):
-        what = "has changed since" if single.is_file() else "is missing, which it was made from"
+    made_from = (_read_record(sequence).get("settings") or {}).get("poses")  # fingerprints, of the single poses first
+    present = file_fingerprint(single) if single.is_file() else None
+    if made_from and made_from[0] != present:
+        what = "has changed since" if present else "is missing, which it was made from"
         raise ArtifactError(f"{sequence}: {single.name} {what}. Run the localize and the sequence stage again.")
 
 

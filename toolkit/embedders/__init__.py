@@ -102,6 +102,6 @@ def create_embedder(name: str, **options: Any) -> Embedder:
         ManifestError: unknown embedder.
     """
     if name not in EMBEDDERS:
-        raise ManifestError(f"Unknown embedder {name!r}. {nearest(name, list(EMBEDDERS))}")
+        raise ManifestError(f"Unknown embedder {name!r}. {nearest(name, EMBEDDERS)}")
     embedder: Embedder = pkgutil.resolve_name(EMBEDDERS[name])(**options)
     return embedder

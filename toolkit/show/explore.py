@@ -202,9 +202,7 @@ def _draw_rows(
     capture = Capture.from_sessions_root(sessions_root)
     map_device, query_device = pair_devices(Path(jsonl).stem)
     if not rows:
-        figure = new_figure(4, 1)
-        figure.text(0.5, 0.5, f"no queries of {query_device}", ha="center", va="center")
-        return figure
+        return _empty(f"no queries of {query_device}")
     width = 1 + references * max(len(row) for row in rows)
     figure = new_figure(2.2 * width, 1.9 * len(rows))
     axes = figure.subplots(len(rows), width, squeeze=False)
@@ -266,7 +264,7 @@ def _descriptors(embeddings: Path, session: str, limit: int) -> list[NDArray[np.
 
 
 def _empty(why: str) -> "Figure":
-    figure = new_figure(5, 1)
+    figure = new_figure(4, 1)
     figure.text(0.5, 0.5, why, ha="center", va="center")
     return figure
 
