@@ -97,6 +97,26 @@ def _list(value: Any) -> list[torch.Tensor]:
 # The network
 
 
+@pytest.mark.parametrize("enabled", [True, False])
+def test_dense_heads_convolve_without_cudnn(
+    model: VGGT, images: torch.Tensor, monkeypatch: pytest.MonkeyPatch, enabled: bool
+) -> None:
+    """On a GPU, cuDNN's choice for them takes 36 GB and ten times the time; only there does the flag have an effect."""
+    monkeypatch.setattr(torch.backends.cudnn, "enabled", enabled)
+    seen = []
+    convolutions = [layer for layer in model.depth_head.modules() if isinstance(layer, torch.nn.Conv2d)]
+    hooks = [
+        layer.register_forward_pre_hook(lambda *_: seen.append(torch.backends.cudnn.enabled))
+        for layer in convolutions
+    ]
+    model(images, ("depth",))
+    for hook in hooks:
+        hook.remove()
+    assert len(seen) >= len(convolutions)
+    assert not any(seen)
+    assert torch.backends.cudnn.enabled == enabled
+
+
 def test_outputs_have_the_official_names_and_shapes(model: VGGT, images: torch.Tensor) -> None:
     output = model(images)
     assert output.keys() == set.union(*KEYS.values())

@@ -6,6 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from toolkit.models.compute import without_cudnn
+
 FRAMES_AT_A_TIME = 8
 """Images that a dense head processes at a time on a GPU; bounds the memory."""
 _EPS = 1e-5
@@ -128,9 +130,10 @@ def dense_output(
     result = torch.empty(B * S, *size, head.out, device=device)
     # The maps of a view take many times the memory of its tokens; on a CPU, one view keeps all cores busy.
     views = 1 if device.type == "cpu" else FRAMES_AT_A_TIME
-    for start in range(0, B * S, views):
-        part = slice(start, start + views)
-        result[part] = head([(within[part], among[part]) for within, among in flat], size).permute(0, 2, 3, 1)
+    with without_cudnn():
+        for start in range(0, B * S, views):
+            part = slice(start, start + views)
+            result[part] = head([(within[part], among[part]) for within, among in flat], size).permute(0, 2, 3, 1)
     result = result.unflatten(0, (B, S))
     return result[..., :-1], 1 + result[..., -1].exp()
 
