@@ -343,8 +343,11 @@ def test_a_map_image_without_points_does_no_harm(room: World) -> None:
     assert alone.status == "failed: too few matches"
 
 
-def twins(extra: int) -> tuple[World, NDArray[np.int64]]:
-    """Two copies of a structure 2 m apart, and `extra` points that are only once; what a query at the first sees."""
+def twins(extra: int, unlike_m: float = 0.0) -> tuple[World, NDArray[np.int64]]:
+    """Two copies of a structure 2 m apart, and `extra` points that are only once; what a query at the first sees.
+
+    The points of the second copy are `unlike_m` off in each axis (standard deviation).
+    """
     rng = np.random.default_rng(0)
     first = rng.uniform([-0.8, -0.8, 4], [0.8, 0.8, 5], (300, 3))
     once = rng.uniform([-0.8, -0.8, 4], [0.8, 0.8, 5], (extra, 3))
@@ -352,7 +355,8 @@ def twins(extra: int) -> tuple[World, NDArray[np.int64]]:
     poses = np.stack([facing(x + shift, y, 0) for shift in (0, 2) for x in (-0.4, 0, 0.4) for y in (-0.3, 0.3)])
     a, b, c = np.arange(300), np.arange(300, 600), np.arange(600, 600 + extra)
     sees = {index: np.concatenate([a, c]) if index < 6 else b for index in range(12)}
-    points = np.concatenate([first, first + np.array([2, 0, 0]), once])
+    second = first + np.array([2, 0, 0]) + unlike_m * rng.normal(size=first.shape)
+    points = np.concatenate([first, second, once])
     world = World.build(points, poses, np.concatenate([descriptors, descriptors, random_descriptors(rng, extra)]), sees)
     return world, np.concatenate([a, c])
 
@@ -370,6 +374,16 @@ def test_of_two_like_places_none_is_ok(outliers: float) -> None:
     np.testing.assert_allclose(apart, [2, 0, 0], atol=0.05)
     far = estimate.scaled(10.0).rivals[0].world_from_rig
     np.testing.assert_allclose(far[:3, 3], 10 * rival.world_from_rig[:3, 3])
+
+
+def test_of_two_places_the_one_that_matches_fit_better_wins() -> None:
+    """Both get about as many guided matches; at the other place, their errors are larger."""
+    world, visible = twins(extra=0, unlike_m=0.006)
+    pose = facing(0.1, 0.1, 0.3)
+    seen = world.look(PINHOLE, pose, noise_px=0.2, only=visible)
+    estimate = ask(world.localizer(), [PINHOLE], np.eye(4)[None], [seen], [list(range(12))])
+    check(estimate, pose, 0.2, 0.02)
+    assert 0.3 < estimate.rival_support < 0.8
 
 
 def test_what_is_there_once_decides_between_like_places() -> None:

@@ -31,7 +31,7 @@ class Rival(NamedTuple):
     world_from_rig: Floats
     """(4, 4)"""
     support: float
-    """Number of its guided matches, divided by that of the estimate."""
+    """Support by its guided matches, divided by that of the estimate, see `PoseEstimate.rival_support`."""
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,9 @@ class _Hypothesis:
 
     rig_from_world: Floats
     matches: Matches
+    support: float
+    """Sum over the matches of 1 - (error / `max_error_deg`)^2, as in MSAC (Torr and Zisserman, CVIU 2000). A wrong pose
+    near the right one may have as many guided matches, because these are searched near it, but with larger errors."""
 
     @property
     def world_from_rig(self) -> Floats:
@@ -159,10 +162,9 @@ class PnpLocalizer(WithoutNetwork):
             return estimate
         hypothesis = self._improve(query, start, near)
         same = bool(hypotheses) and not _differ(hypotheses[0], hypothesis)
-        support = len(hypotheses[0].matches) if hypotheses else 0
-        support_of_prior = len(hypothesis.matches)
-        clearly_more = support <= self.settings.ok_rival_support * support_of_prior  # a tie keeps the first estimate
-        if (support_of_prior >= support and estimate.status != "ok") if same else clearly_more:
+        support = hypotheses[0].support if hypotheses else 0.0
+        clearly_more = support <= self.settings.ok_rival_support * hypothesis.support  # a tie keeps the first estimate
+        if (hypothesis.support >= support and estimate.status != "ok") if same else clearly_more:
             # The matches near the prior judge the pose: like matches by descriptors, they were made without it.
             prior_references = [References.of(prior.images.tolist())]
             with_prior = self._estimate(query, near, [hypothesis, *hypotheses], prior_references)
@@ -172,7 +174,7 @@ class PnpLocalizer(WithoutNetwork):
             return estimate
         if same or estimate.world_from_rig is None:
             return estimate
-        rivals = sorted([*hypotheses, hypothesis], key=lambda rival: -len(rival.matches))
+        rivals = sorted([*hypotheses, hypothesis], key=lambda rival: -rival.support)
         return self._estimate(query, matches, rivals, references)
 
     def _covisible(self, images: Ints) -> Ints:
@@ -226,8 +228,8 @@ class PnpLocalizer(WithoutNetwork):
 
         With repeated structure (a row of similar windows), many descriptors agree with several poses, and RANSAC may
         find one of them or something in between. So unless the first pose is clear, search for others: with a tighter
-        threshold, among the outliers of the first, and among the matches of single references. The number of guided
-        matches decides: only at the correct pose does the rest of the map project where the query shows it.
+        threshold, among the outliers of the first, and among the matches of single references. The number and errors
+        of guided matches decide: only at the correct pose does the rest of the map project where the query shows it.
         """
         settings = self.settings
         hypotheses = [self._improve(query, start, matches)]
@@ -249,7 +251,7 @@ class PnpLocalizer(WithoutNetwork):
                 hypotheses.append(self._improve(query, other, matches))
         if share < settings.contested_inlier_ratio:
             self._add_by_reference(query, matches, references, hypotheses)
-        return sorted(hypotheses, key=lambda hypothesis: -len(hypothesis.matches))
+        return sorted(hypotheses, key=lambda hypothesis: -hypothesis.support)
 
     def _add_by_reference(
         self, query: RigQuery, matches: Matches, references: Sequence[References], hypotheses: list[_Hypothesis]
@@ -278,7 +280,7 @@ class PnpLocalizer(WithoutNetwork):
     def _improve(self, query: RigQuery, rig_from_world: Floats, matches: Matches) -> _Hypothesis:
         """Alternate between guided matching around the pose and refinement, while enough matches support it."""
         settings = self.settings
-        best = _Hypothesis(rig_from_world, matches[self._inliers(query, rig_from_world, matches)])
+        best = self._hypothesis(query, rig_from_world, matches[self._inliers(query, rig_from_world, matches)])
         min_matches = max(4, 0.5 * len(np.unique(best.matches.point)))
         vicinity: Vicinity | None = None
         for radius in settings.guided_radii_deg:
@@ -293,8 +295,12 @@ class PnpLocalizer(WithoutNetwork):
             guided = guided[query.errors_deg(refined, guided, self.map.points) < settings.max_error_deg]
             if len(guided) < min_matches:
                 break
-            best = _Hypothesis(query.refine(refined, guided, self.map.points), guided)
+            best = self._hypothesis(query, query.refine(refined, guided, self.map.points), guided)
         return best
+
+    def _hypothesis(self, query: RigQuery, rig_from_world: Floats, matches: Matches) -> _Hypothesis:
+        errors = query.errors_deg(rig_from_world, matches, self.map.points) / self.settings.max_error_deg
+        return _Hypothesis(rig_from_world, matches, float(np.maximum(1 - errors**2, 0).sum()))
 
     def _estimate(
         self, query: RigQuery, matches: Matches, hypotheses: list[_Hypothesis], references: Sequence[References]
@@ -408,8 +414,8 @@ class PnpLocalizer(WithoutNetwork):
         for other in hypotheses[1:]:
             if all(_differ(one, other) for one in kept):
                 kept.append(other)
-        support = max(len(hypotheses[0].matches), 1)
-        return [Rival(other.world_from_rig, len(other.matches) / support) for other in kept[1:]]
+        support = max(hypotheses[0].support, np.finfo(float).tiny)
+        return [Rival(other.world_from_rig, other.support / support) for other in kept[1:]]
 
     def _ransac(self, query: RigQuery, matches: Matches, max_error_deg: float, least_inliers: int = 0) -> Floats | None:
         return query.ransac(matches, self.map.points, max_error_deg, self.settings, self.seed, least_inliers)
