@@ -200,28 +200,29 @@ def _extrema(levels: Floats, contrast: float) -> Ints:
         contrast: of weaker extrema, some are left out already.
     """
     _, height, width = levels.shape
-    differences = np.empty((len(levels) - 1, height, width), np.float32)
-    extrema = [np.zeros(0, np.int64)]
-    for top in range(_BORDER, height - _BORDER, _ROWS):
-        bottom = min(top + _ROWS, height - _BORDER)
-        around = slice(top - 1, bottom + 1)
-        for below, above, difference in zip(levels[:-1], levels[1:], differences, strict=True):
-            cv2.absdiff(below[around], above[around], dst=difference[around])
-        for level in range(1, _INTERVALS + 1):
-            largest = cv2.dilate(differences[level, around], _NEIGHBORS)[1:-1]
-            in_rows = np.flatnonzero(differences[level, top:bottom] >= largest)
-            extrema.append(in_rows + (level * height + top) * width)
-    at, flat = np.concatenate(extrema), differences.reshape(-1)
     # The interpolated peak, which must reach the contrast, is a little higher than the pixel.
     # Flat areas, in which all pixels are equal, have none at any contrast.
-    at = at[flat[at] >= max(0.8 * contrast / _INTERVALS, 1e-6)]
-    x, size = at % width, height * width
-    at = at[(x >= _BORDER) & (x < width - _BORDER)]
-    at = at[(flat[at] >= flat[at - size]) & (flat[at] >= flat[at + size])]  # cheap test first; few pass it
-    other_levels = np.array(
-        [level * size + y * width + x for level in (-1, 1) for y in (-1, 0, 1) for x in (-1, 0, 1) if x or y]
-    )
-    return at[(flat[at] >= flat[at + other_levels[:, None]]).all(axis=0)]
+    least = np.float32(max(0.8 * contrast / _INTERVALS, 1e-6))
+    extrema = [np.zeros(0, np.int64)]
+    for top in range(_BORDER, height - _BORDER, _ROWS):
+        # With a row more above and below. Level i of the differences is that of levels i and i + 1.
+        rows = levels[:, top - 1 : min(top + _ROWS, height - _BORDER) + 1]
+        differences = np.empty((len(levels) - 1, *rows.shape[1:]), np.float32)
+        for below, above, difference in zip(rows[:-1], rows[1:], differences, strict=True):
+            cv2.absdiff(below, above, dst=difference)
+        flat, size = differences.reshape(-1), differences[0].size
+        other_levels = np.array(
+            [level * size + y * width + x for level in (-1, 1) for y in (-1, 0, 1) for x in (-1, 0, 1) if x or y]
+        )
+        for level in range(1, _INTERVALS + 1):
+            threshold = np.maximum(cv2.dilate(differences[level], _NEIGHBORS)[1:-1], least)
+            at = np.flatnonzero(differences[level, 1:-1] >= threshold) + level * size + width
+            x = at % width
+            at = at[(x >= _BORDER) & (x < width - _BORDER)]
+            at = at[(flat[at] >= flat[at - size]) & (flat[at] >= flat[at + size])]  # cheap test first; few pass it
+            at = at[(flat[at] >= flat[at + other_levels[:, None]]).all(axis=0)]
+            extrema.append(at + level * (height * width - size) + (top - 1) * width)
+    return np.concatenate(extrema)
 
 
 def _detect(pyramid: _Pyramid, contrast: float) -> _Keypoints:
