@@ -185,7 +185,7 @@ class Manifest(Settings):
 
     @field_validator(*OPTIONAL, mode="before")
     @classmethod
-    def _a_switch(cls, section: Any) -> Any:
+    def _section_from_switch(cls, section: Any) -> Any:
         """Read `rerank:` and `rerank: true` as an empty section, and `rerank: false` as no section."""
         return {} if section is None or section is True else None if section is False else section
 

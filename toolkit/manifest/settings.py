@@ -337,7 +337,7 @@ class FeaturesSettings(Settings):
 
     @model_validator(mode="before")
     @classmethod
-    def _one_kind(cls, raw: Any) -> Any:
+    def _kinds_from_name(cls, raw: Any) -> Any:
         """Take `features: sift` as `features: [sift]`."""
         if isinstance(raw, dict) and isinstance(raw.get("kinds"), str):
             return {**raw, "kinds": [raw["kinds"]]}
@@ -442,7 +442,7 @@ class SequenceSettings(Settings):
     these lengths of earlier data, in seconds, and one for all earlier data; `[]`: none."""
 
     @model_validator(mode="after")
-    def _of_the_past(self) -> Self:
+    def _length_needs_online(self) -> Self:
         if self.length_s is not None and not self.online:
             raise ValueError(f"length_s is {self.length_s:g}, which counts before a query: set online: true")
         return self
@@ -544,7 +544,7 @@ class PredictorSettings(Settings):
     networks are meant to receive all cameras or none; the benefit of a part of them is not measured."""
 
     @model_validator(mode="after")
-    def _cameras_to_who_takes_them(self) -> Self:
+    def _conditioned_needs_a_network_with_cameras(self) -> Self:
         if self.conditioned and self.name not in CONDITIONED:
             raise ValueError(
                 f"conditioned is true, but {self.name} does not accept cameras; expected the name to be one of "
@@ -593,7 +593,7 @@ class LocalizeSettings(Settings):
         return self.method in ("feed_forward", "hybrid")
 
     @model_validator(mode="after")
-    def _a_map_or_meters(self) -> Self:
+    def _unit_or_map(self) -> Self:
         if self.unit is None and self.map is None:
             raise ValueError("unit and map are null; without a unit, limits are relative to the depth in the map")
         return self
