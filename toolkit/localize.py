@@ -63,6 +63,7 @@ from toolkit.localizers.map import (
 from toolkit.localizers.mapping import map_settings
 from toolkit.localizers.misfit import LEAST_SIZE, SIGNIFICANCE
 from toolkit.localizers.picture import localize_image
+from toolkit.localizers.pnp import PNP_FORMAT
 from toolkit.localizers.predictors import open_predictor
 from toolkit.localizers.queries import localized_query, references_of_images, stored_query
 from toolkit.manifest import LocalizeSettings
@@ -265,7 +266,7 @@ class _Stage(Remade):
             read_references(pair.retrieval)  # raises an error that names the missing file
         record: dict[str, Any] = {
             "method": settings.method,
-            "pnp": settings.pnp.model_dump() | {"seed": settings.seed},
+            "pnp": settings.pnp.model_dump() | {"seed": settings.seed, "format": PNP_FORMAT},
             "misfit": [SIGNIFICANCE, LEAST_SIZE],
             "map": settings.map and map_settings(settings.map, settings.seed),
             "features": [kind.extractor.settings for kind in self.kinds],

@@ -8,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from toolkit.features import sift
 from toolkit.features.features import DESCRIPTOR_SCALE, KINDS, LocalFeatures
 from toolkit.features.matching import mutual_matches, unit_descriptors
 from toolkit.features.sift import SiftExtractor, SiftSettings, stretch_contrast
@@ -265,6 +266,17 @@ def test_pictures_of_odd_sizes(width: int, height: int) -> None:
     assert np.isfinite(found.keypoints).all()
     lengths = np.linalg.norm(found.descriptors / DESCRIPTOR_SCALE, axis=1)
     np.testing.assert_allclose(lengths, 1, atol=0.05)
+
+
+@pytest.mark.parametrize("rows", [1, 7, 10_000])
+def test_extrema_do_not_depend_on_the_bands_in_which_they_are_searched(
+    monkeypatch: pytest.MonkeyPatch, rows: int
+) -> None:
+    expected = SiftExtractor().extract([textured(3)])[0]
+    monkeypatch.setattr(sift, "_ROWS", rows)
+    found = SiftExtractor().extract([textured(3)])[0]
+    np.testing.assert_array_equal(found.keypoints, expected.keypoints)
+    np.testing.assert_array_equal(found.descriptors, expected.descriptors)
 
 
 def test_a_contrast_of_nothing_keeps_every_extremum() -> None:

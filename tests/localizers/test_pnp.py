@@ -16,7 +16,7 @@ from tests.queries import ask, rests_on
 from toolkit import geometry
 from toolkit.features.features import DESCRIPTOR_SCALE, KINDS, LocalFeatures
 from toolkit.features.matching import MutualMatcher, PairMatches
-from toolkit.localizers.base import CAMERA, PoseEstimate
+from toolkit.localizers.base import CAMERA, PoseEstimate, Prior
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.matches import MappedFeatures
 from toolkit.localizers.pnp import FIRST_REFERENCES, VIEWS, PnpLocalizer
@@ -343,10 +343,35 @@ def test_a_map_image_without_points_does_no_harm(room: World) -> None:
     assert alone.status == "failed: too few matches"
 
 
-def twins(extra: int, unlike_m: float = 0.0) -> tuple[World, NDArray[np.int64]]:
+@pytest.mark.parametrize(("seed", "limit", "outliers"), [(0, 120, 0.85), (4, 80, 0.8), (5, 120, 0.85)])
+def test_a_prior_confirms_the_doubtful_pose_that_it_leads_to(
+    room: World, seed: int, limit: int, outliers: float
+) -> None:
+    """Both poses are the same up to rounding, so neither has clearly more support."""
+    seen = replace(room, rng=np.random.default_rng(seed)).look(PINHOLE, QUERY, limit=limit, outliers=outliers)
+    localize = partial(ask, room.localizer(), [PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
+    alone = localize()
+    assert alone.status == "low_confidence"
+    prior = Prior(alone.world_from_rig, np.array(REFERENCES), 2.0, "near")
+    confirmed = localize(priors=[prior])
+    assert (confirmed.status, confirmed.found_by) == ("ok", "pnp+near")
+    np.testing.assert_allclose(confirmed.world_from_rig, alone.world_from_rig, atol=1e-5)
+
+
+def test_a_prior_without_support_gives_no_pose(room: World) -> None:
+    """Its few matches are all wrong."""
+    seen = replace(room, rng=np.random.default_rng(0)).look(PINHOLE, QUERY, limit=8, outliers=1.0)
+    prior = Prior(facing(0.0, 0.0, -3.0), np.array(REFERENCES), 10.0, "near")
+    estimate = ask(room.localizer(), [PINHOLE], np.eye(4)[None], [seen], [REFERENCES], priors=[prior])
+    assert estimate.status.startswith("failed")
+    assert estimate.world_from_rig is None
+
+
+def twins(extra: int, unlike_m: float = 0.0, unmapped: int = 0) -> tuple[World, NDArray[np.int64]]:
     """Two copies of a structure 2 m apart, and `extra` points that are only once; what a query at the first sees.
 
-    The points of the second copy are `unlike_m` off in each axis (standard deviation).
+    The points of the second copy are `unlike_m` off in each axis (standard deviation); of the first, the map lacks
+    `unmapped` of 300.
     """
     rng = np.random.default_rng(0)
     first = rng.uniform([-0.8, -0.8, 4], [0.8, 0.8, 5], (300, 3))
@@ -354,7 +379,7 @@ def twins(extra: int, unlike_m: float = 0.0) -> tuple[World, NDArray[np.int64]]:
     descriptors = random_descriptors(rng, 300)
     poses = np.stack([facing(x + shift, y, 0) for shift in (0, 2) for x in (-0.4, 0, 0.4) for y in (-0.3, 0.3)])
     a, b, c = np.arange(300), np.arange(300, 600), np.arange(600, 600 + extra)
-    sees = {index: np.concatenate([a, c]) if index < 6 else b for index in range(12)}
+    sees = {index: np.concatenate([a[unmapped:], c]) if index < 6 else b for index in range(12)}
     second = first + np.array([2, 0, 0]) + unlike_m * rng.normal(size=first.shape)
     points = np.concatenate([first, second, once])
     world = World.build(points, poses, np.concatenate([descriptors, descriptors, random_descriptors(rng, extra)]), sees)
@@ -376,14 +401,16 @@ def test_of_two_like_places_none_is_ok(outliers: float) -> None:
     np.testing.assert_allclose(far[:3, 3], 10 * rival.world_from_rig[:3, 3])
 
 
-def test_of_two_places_the_one_that_matches_fit_better_wins() -> None:
-    """Both get about as many guided matches; at the other place, their errors are larger."""
-    world, visible = twins(extra=0, unlike_m=0.006)
+@pytest.mark.parametrize("unmapped", [0, 60])
+def test_of_two_places_the_one_that_matches_fit_better_wins(unmapped: int) -> None:
+    """With 60 points unmapped, the other place gets more guided matches, but with larger errors."""
+    world, visible = twins(extra=0, unlike_m=0.007, unmapped=unmapped)
     pose = facing(0.1, 0.1, 0.3)
     seen = world.look(PINHOLE, pose, noise_px=0.2, only=visible)
-    estimate = ask(world.localizer(), [PINHOLE], np.eye(4)[None], [seen], [list(range(12))])
+    localizer = world.localizer(ok_rival_support=0.9)
+    estimate = ask(localizer, [PINHOLE], np.eye(4)[None], [seen], [list(range(12))])
     check(estimate, pose, 0.2, 0.02)
-    assert 0.3 < estimate.rival_support < 0.8
+    assert 0.3 < estimate.rival_support < (0.9 if unmapped else 0.75)
 
 
 def test_what_is_there_once_decides_between_like_places() -> None:

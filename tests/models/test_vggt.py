@@ -99,21 +99,22 @@ def _list(value: Any) -> list[torch.Tensor]:
 
 @pytest.mark.parametrize("enabled", [True, False])
 def test_dense_heads_convolve_without_cudnn(
-    model: VGGT, images: torch.Tensor, monkeypatch: pytest.MonkeyPatch, enabled: bool
+    images: torch.Tensor, monkeypatch: pytest.MonkeyPatch, enabled: bool
 ) -> None:
-    """On a GPU, cuDNN's choice for them takes 36 GB and ten times the time; only there does the flag have an effect."""
+    """On a GPU, cuDNN's choice for them takes 36 GB and many times as long; only there does the flag have an effect."""
     monkeypatch.setattr(torch.backends.cudnn, "enabled", enabled)
-    seen = []
-    convolutions = [layer for layer in model.depth_head.modules() if isinstance(layer, torch.nn.Conv2d)]
-    hooks = [
+    model, seen = tiny(("depth",)), []
+    kinds = (torch.nn.Conv2d, torch.nn.ConvTranspose2d)
+    convolutions = [layer for layer in model.depth_head.modules() if isinstance(layer, kinds)]
+    for layer in convolutions:
         layer.register_forward_pre_hook(lambda *_: seen.append(torch.backends.cudnn.enabled))
-        for layer in convolutions
-    ]
-    model(images, ("depth",))
-    for hook in hooks:
-        hook.remove()
+    model(images)
     assert len(seen) >= len(convolutions)
     assert not any(seen)
+    assert torch.backends.cudnn.enabled == enabled
+    convolutions[-1].register_forward_pre_hook(lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        model(images)
     assert torch.backends.cudnn.enabled == enabled
 
 

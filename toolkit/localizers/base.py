@@ -116,7 +116,7 @@ class PoseEstimate:
     rmse_px: float = float("nan")
     rival_support: float = 0.0
     """Support of the best clearly different pose, divided by that of this pose; 0 if there is no such pose. A guided
-    match supports a pose by 1 - (error / `max_error_deg`)^2."""
+    match supports a pose by 1 - (error / `max_error_deg`)^2, at least 0."""
     rivals: tuple[Rival, ...] = ()
     """Clearly different poses that some matches support, best supported first."""
     coverage: float = 0.0

@@ -34,6 +34,8 @@ from toolkit.localizers.misfit import find_misfit
 from toolkit.localizers.rig import Matches, RigQuery, least_squares_covariance
 from toolkit.manifest import PnpSettings
 
+PNP_FORMAT = 2
+"""Version of the poses. Increase when the same settings and files give other poses."""
 FIRST_REFERENCES = {2: 200, 4: 100}
 """Number of references per image to match first -> independent inliers that their pose needs to be kept. The next
 number, and finally all references, are matched if the pose has fewer, or if too few of the matches are inliers."""
@@ -43,13 +45,14 @@ VIEWS = 4
 
 @dataclass(frozen=True)
 class _Hypothesis:
-    """A pose and the guided matches that support it."""
+    """A pose and the matches that support it: guided matches, or those of RANSAC if guided matching finds too few."""
 
     rig_from_world: Floats
     matches: Matches
     support: float
-    """Sum over the matches of 1 - (error / `max_error_deg`)^2, as in MSAC (Torr and Zisserman, CVIU 2000). A wrong pose
-    near the right one may have as many guided matches, because these are searched near it, but with larger errors."""
+    """Sum over the matches of 1 - (error / `max_error_deg`)^2, at least 0 each, as in MSAC (Torr and Zisserman, CVIU
+    2000). Guided matches are searched near the projections of the map, so a wrong pose near the right one may have as
+    many, but with larger errors."""
 
     @property
     def world_from_rig(self) -> Floats:
@@ -77,8 +80,8 @@ class PnpLocalizer(WithoutNetwork):
     ) -> PoseEstimate:
         """Return one pose for the cameras of a rig, or for a single camera; see `Localizer`.
 
-        Images without features are left out. A prior is one more hypothesis: it wins if clearly more guided matches
-        support it. A prior that agrees with an `ok` pose changes nothing.
+        Images without features are left out. A prior is one more hypothesis: it wins if it has clearly more
+        support. A prior that agrees with an `ok` pose changes nothing.
         """
         usable = [index for index, features in enumerate(query.features) if not isinstance(features, str)]
         if len(usable) < len(query.features):
@@ -163,8 +166,10 @@ class PnpLocalizer(WithoutNetwork):
         hypothesis = self._improve(query, start, near)
         same = bool(hypotheses) and not _differ(hypotheses[0], hypothesis)
         support = hypotheses[0].support if hypotheses else 0.0
-        clearly_more = support <= self.settings.ok_rival_support * hypothesis.support  # a tie keeps the first estimate
-        if (hypothesis.support >= support and estimate.status != "ok") if same else clearly_more:
+        # A tie keeps the first estimate. Support is rounded: the same pose from two starts differs in the last digits.
+        clearly_more = hypothesis.support > 0 and support <= self.settings.ok_rival_support * hypothesis.support
+        as_much = hypothesis.support >= 0.99 * support
+        if (as_much and estimate.status != "ok") if same else clearly_more:
             # The matches near the prior judge the pose: like matches by descriptors, they were made without it.
             prior_references = [References.of(prior.images.tolist())]
             with_prior = self._estimate(query, near, [hypothesis, *hypotheses], prior_references)
@@ -243,11 +248,11 @@ class PnpLocalizer(WithoutNetwork):
                 hypotheses.append(self._improve(query, other, matches))
                 inliers |= self._inliers(query, hypotheses[1].rig_from_world, matches)
         rest = matches[~inliers]
-        # A pose with less than half of the support is no rival.
+        # A pose with less than half as many inliers is no rival.
         other = self._ransac(query, rest, settings.ransac_max_error_deg, least_inliers=int(inliers.sum() / 2))
         if other is not None:
-            support = self._inliers(query, other, rest).sum()
-            if share < settings.contested_inlier_ratio or support >= inliers.sum() / 2:
+            count = self._inliers(query, other, rest).sum()
+            if share < settings.contested_inlier_ratio or count >= inliers.sum() / 2:
                 hypotheses.append(self._improve(query, other, matches))
         if share < settings.contested_inlier_ratio:
             self._add_by_reference(query, matches, references, hypotheses)
@@ -280,13 +285,12 @@ class PnpLocalizer(WithoutNetwork):
     def _improve(self, query: RigQuery, rig_from_world: Floats, matches: Matches) -> _Hypothesis:
         """Alternate between guided matching around the pose and refinement, while enough matches support it."""
         settings = self.settings
-        best = self._hypothesis(query, rig_from_world, matches[self._inliers(query, rig_from_world, matches)])
-        min_matches = max(4, 0.5 * len(np.unique(best.matches.point)))
+        pose, inliers = rig_from_world, matches[self._inliers(query, rig_from_world, matches)]
+        min_matches = max(4, 0.5 * len(np.unique(inliers.point)))
         vicinity: Vicinity | None = None
         for radius in settings.guided_radii_deg:
-            pose = best.rig_from_world
             if vicinity is None or not vicinity.reaches(pose, radius):
-                images = self.matcher.covisible(np.unique(best.matches.point))
+                images = self.matcher.covisible(np.unique(inliers.point))
                 vicinity = self.matcher.vicinity(query, pose, images, radius)
             guided = vicinity.guided(pose, radius, settings.max_guided_matches)
             if len(guided) < min_matches:
@@ -295,12 +299,9 @@ class PnpLocalizer(WithoutNetwork):
             guided = guided[query.errors_deg(refined, guided, self.map.points) < settings.max_error_deg]
             if len(guided) < min_matches:
                 break
-            best = self._hypothesis(query, query.refine(refined, guided, self.map.points), guided)
-        return best
-
-    def _hypothesis(self, query: RigQuery, rig_from_world: Floats, matches: Matches) -> _Hypothesis:
-        errors = query.errors_deg(rig_from_world, matches, self.map.points) / self.settings.max_error_deg
-        return _Hypothesis(rig_from_world, matches, float(np.maximum(1 - errors**2, 0).sum()))
+            pose, inliers = query.refine(refined, guided, self.map.points), guided
+        errors = query.errors_deg(pose, inliers, self.map.points) / settings.max_error_deg
+        return _Hypothesis(pose, inliers, float(np.maximum(1 - errors**2, 0).sum()))
 
     def _estimate(
         self, query: RigQuery, matches: Matches, hypotheses: list[_Hypothesis], references: Sequence[References]

@@ -479,8 +479,8 @@ class PnpSettings(Settings):
     ransac_max_trials: Positive = 5000
     """Largest number of RANSAC samples."""
     clear_inlier_ratio: Share = 0.56
-    """Above this share of inliers among the matches, no rival pose is searched: the remaining matches are too few to
-    support one beyond `ok_rival_support`."""
+    """Above this share of inliers among the matches, no rival pose is searched: the remaining matches are usually too
+    few to support one beyond `ok_rival_support`."""
     contested_inlier_ratio: Share = 0.4
     """Below this share of inliers, the pose may mix two places: RANSAC runs again with the tighter `max_error_deg`, and
     separately for single references."""

@@ -31,7 +31,7 @@ DEVICE_NAME = r"auto|cpu|mps|cuda(:\d+)?"
 PRECISIONS = ("auto", "float32", "bfloat16", "float16")
 RUNNING = threading.RLock()
 """Held while a network runs. Networks in several threads at once would need memory that each of them counts as free,
-and would restore the settings of torch (`full_float32`, number of threads) that another one has changed."""
+and would restore the settings of torch (`full_float32`, `without_cudnn`, number of threads) that another has set."""
 
 
 def resolve_device(name: str = "auto") -> "torch.device":
@@ -246,16 +246,17 @@ def without_cudnn() -> Iterator[None]:
     """Convolve on a GPU by matrix products, not with cuDNN, inside the context.
 
     For 3 x 3 convolutions in full float32, cuDNN may prefer Fourier transforms: for six maps of 256 x 84 x 148 they
-    take 36 GB, and ten times as long.
+    take 36 GB, and many times as long. Holds `RUNNING`, because the choice is that of the process.
     """
     import torch
 
-    before = torch.backends.cudnn.enabled
-    try:
-        torch.backends.cudnn.enabled = False
-        yield
-    finally:
-        torch.backends.cudnn.enabled = before
+    with RUNNING:
+        before = torch.backends.cudnn.enabled
+        try:
+            torch.backends.cudnn.enabled = False
+            yield
+        finally:
+            torch.backends.cudnn.enabled = before
 
 
 @cache
