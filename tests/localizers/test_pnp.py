@@ -19,8 +19,8 @@ from toolkit.features.matching import MutualMatcher, PairMatches
 from toolkit.localizers.base import CAMERA, PoseEstimate, Prior
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.matches import MappedFeatures
-from toolkit.localizers.pnp import FIRST_REFERENCES, VIEWS, PnpLocalizer
-from toolkit.localizers.rig import least_squares_covariance
+from toolkit.localizers.pnp import FIRST_REFERENCES, VIEWS, PnpLocalizer, _Hypothesis
+from toolkit.localizers.rig import Matches, least_squares_covariance
 from toolkit.manifest import PnpSettings
 
 Floats = NDArray[np.float64]
@@ -399,6 +399,18 @@ def test_of_two_like_places_none_is_ok(outliers: float) -> None:
     np.testing.assert_allclose(apart, [2, 0, 0], atol=0.05)
     far = estimate.scaled(10.0).rivals[0].world_from_rig
     np.testing.assert_allclose(far[:3, 3], 10 * rival.world_from_rig[:3, 3])
+
+
+@pytest.mark.parametrize(("off_m", "yaw_deg", "is_rival"), [(0.2, 2, False), (0.3, 0, True), (0, 3, True)])
+def test_a_rival_is_so_far_away_that_one_of_both_is_wrong(
+    room: World, off_m: float, yaw_deg: float, is_rival: bool
+) -> None:
+    """A second pose nearby, by much the same matches, is no reason to doubt the first."""
+    none = Matches.pooled([])
+    poses = [facing(0, 0, 0), facing(off_m, 0, 0, yaw_deg=yaw_deg)]
+    hypotheses = [_Hypothesis(geometry.invert(pose), none, 10.0) for pose in poses]
+    rivals = room.localizer()._rivals(hypotheses)
+    assert [rival.support for rival in rivals] == [1.0] * is_rival
 
 
 @pytest.mark.parametrize("unmapped", [0, 60])

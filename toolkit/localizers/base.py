@@ -115,8 +115,8 @@ class PoseEstimate:
     """Guided matches within `max_error_deg`, from which the final pose is computed."""
     rmse_px: float = float("nan")
     rival_support: float = 0.0
-    """Support of the best clearly different pose, divided by that of this pose; 0 if there is no such pose. A guided
-    match supports a pose by 1 - (error / `max_error_deg`)^2, at least 0."""
+    """Support of the best clearly different pose (beyond 2.5 degrees or 0.25 m), divided by that of this pose; 0 if
+    there is none. A guided match supports a pose by 1 - (error / `max_error_deg`)^2, at least 0."""
     rivals: tuple[Rival, ...] = ()
     """Clearly different poses that some matches support, best supported first."""
     coverage: float = 0.0

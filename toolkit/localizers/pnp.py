@@ -19,6 +19,7 @@ from toolkit import geometry
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import (
     CAMERA,
+    CONFIRMED,
     NetworkMatches,
     PoseEstimate,
     Prior,
@@ -423,6 +424,6 @@ class PnpLocalizer(WithoutNetwork):
 
 
 def _differ(hypothesis: _Hypothesis, other: _Hypothesis) -> bool:
-    """Tell whether two hypotheses are clearly different poses."""
+    """Tell whether two hypotheses are clearly different poses: by more than half of what a right pose may be off."""
     rotation_deg, distance_m = geometry.pose_error(hypothesis.world_from_rig, other.world_from_rig)
-    return bool(rotation_deg > 1.0 or distance_m > 0.1)
+    return bool(rotation_deg > CONFIRMED[0] / 2 or distance_m > CONFIRMED[1] / 2)
