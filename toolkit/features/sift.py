@@ -203,6 +203,7 @@ def _extrema(levels: Floats, contrast: float) -> Ints:
     # The interpolated peak, which must reach the contrast, is a little higher than the pixel.
     # Flat areas, in which all pixels are equal, have none at any contrast.
     least = np.float32(max(0.8 * contrast / _INTERVALS, 1e-6))
+    around = np.array([y * width + x for y in (-1, 0, 1) for x in (-1, 0, 1) if x or y])
     extrema = [np.zeros(0, np.int64)]
     for top in range(_BORDER, height - _BORDER, _ROWS):
         # With a row more above and below. Level i of the differences is that of levels i and i + 1.
@@ -211,9 +212,7 @@ def _extrema(levels: Floats, contrast: float) -> Ints:
         for below, above, difference in zip(rows[:-1], rows[1:], differences, strict=True):
             cv2.absdiff(below, above, dst=difference)
         flat, size = differences.reshape(-1), differences[0].size
-        other_levels = np.array(
-            [level * size + y * width + x for level in (-1, 1) for y in (-1, 0, 1) for x in (-1, 0, 1) if x or y]
-        )
+        other_levels = np.concatenate([around - size, around + size])
         for level in range(1, _INTERVALS + 1):
             threshold = np.maximum(cv2.dilate(differences[level], _NEIGHBORS)[1:-1], least)
             at = np.flatnonzero(differences[level, 1:-1] >= threshold) + level * size + width

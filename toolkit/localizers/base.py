@@ -312,9 +312,9 @@ def rank(status: str) -> int:
     return {"ok": 2, "low_confidence": 1}.get(status.split(":")[0], 0)
 
 
-def agree(world_from_rig: Floats | None, other: Floats | None) -> bool:
-    """Tell whether two poses are close enough to confirm each other, see `CONFIRMED`."""
+def agree(world_from_rig: Floats | None, other: Floats | None, share: float = 1.0) -> bool:
+    """Tell whether two poses are close enough to confirm each other: within `share` of `CONFIRMED`."""
     if world_from_rig is None or other is None:
         return False
     rotation_deg, distance_m = geometry.pose_error(world_from_rig, other)
-    return bool(rotation_deg <= CONFIRMED[0] and distance_m <= CONFIRMED[1])
+    return bool(rotation_deg <= share * CONFIRMED[0] and distance_m <= share * CONFIRMED[1])

@@ -19,7 +19,6 @@ from toolkit import geometry
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import (
     CAMERA,
-    CONFIRMED,
     NetworkMatches,
     PoseEstimate,
     Prior,
@@ -167,9 +166,8 @@ class PnpLocalizer(WithoutNetwork):
         hypothesis = self._improve(query, start, near)
         same = bool(hypotheses) and not _differ(hypotheses[0], hypothesis)
         support = hypotheses[0].support if hypotheses else 0.0
-        # A tie keeps the first estimate. Support is rounded: the same pose from two starts differs in the last digits.
-        clearly_more = hypothesis.support > 0 and support <= self.settings.ok_rival_support * hypothesis.support
-        as_much = hypothesis.support >= 0.99 * support
+        clearly_more = support <= self.settings.ok_rival_support * hypothesis.support  # a tie keeps the first estimate
+        as_much = hypothesis.support >= 0.99 * support  # found from two starts, one pose differs in the last digits
         if (as_much and estimate.status != "ok") if same else clearly_more:
             # The matches near the prior judge the pose: like matches by descriptors, they were made without it.
             prior_references = [References.of(prior.images.tolist())]
@@ -425,5 +423,4 @@ class PnpLocalizer(WithoutNetwork):
 
 def _differ(hypothesis: _Hypothesis, other: _Hypothesis) -> bool:
     """Tell whether two hypotheses are clearly different poses: by more than half of what a right pose may be off."""
-    rotation_deg, distance_m = geometry.pose_error(hypothesis.world_from_rig, other.world_from_rig)
-    return bool(rotation_deg > CONFIRMED[0] / 2 or distance_m > CONFIRMED[1] / 2)
+    return not agree(hypothesis.world_from_rig, other.world_from_rig, share=0.5)
