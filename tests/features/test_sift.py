@@ -1,6 +1,7 @@
 """SIFT: where a keypoint is and what it looks like."""
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -287,3 +288,21 @@ def test_a_contrast_of_nothing_keeps_every_extremum() -> None:
     assert 0 < len(few) < len(many)
     assert few.scores.min() * 3 >= 0.05
     assert len(none) == 0
+
+
+@pytest.mark.parametrize("equal", [(0, 0, 1), (0, 1, 0), (0, 1, -1), (1, 0, 0), (1, 1, 1)])
+def test_of_equal_neighbors_only_the_first_is_an_extremum(equal: tuple[int, int, int]) -> None:
+    differences = np.zeros((5, 40, 40), np.int16)
+    first, second = (2, 20, 20), tuple(np.add((2, 20, 20), equal).tolist())
+    differences[first] = differences[second] = 1000
+    levels = np.concatenate([np.zeros((1, 40, 40)), np.cumsum(differences, axis=0)]).astype(np.int16)
+    (found,) = sift._extrema(levels, 0.01)
+    assert np.unravel_index(found, levels.shape) == first
+
+
+def test_the_memory_of_the_last_image_does_not_show_in_the_next() -> None:
+    extractor, images = SiftExtractor(), [textured(3), textured(4)[:200, :300], textured(3), textured(5)[:150]]
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(lambda image: extractor.extract([image])[0], images * 3))
+    for image, features in zip(images * 3, found, strict=True):
+        assert_same(features, SiftExtractor().extract([image])[0])

@@ -7,6 +7,7 @@ OpenCV's SIFT. Two choices differ from OpenCV, and both give more correct matche
 - A cell of the descriptor is 4 sigma wide instead of 3.
 """
 
+import threading
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -20,8 +21,9 @@ from toolkit.geometry import Ints
 from toolkit.manifest import SiftSettings
 
 Floats = NDArray[np.float32]
+Levels = NDArray[np.int16]
 
-_FORMAT = 4
+_FORMAT = 5
 """Version of the features, part of the settings. Increase when the same settings give other features."""
 _INTERVALS = 3
 """Number of levels per octave in which keypoints are detected."""
@@ -31,6 +33,8 @@ _BLURS = _SIGMA * 2 ** (np.arange(_INTERVALS + 3) / _INTERVALS)
 """Blur of each level of an octave, pixels of the octave."""
 _KERNEL_SIGMAS = 3.0
 """Radius of the blurring kernels, in units of their sigma."""
+_WHITE = 255 * 128
+"""White in the levels. Rounding to integers changes a keypoint by a hundredth of a pixel; float32 takes longer."""
 _CAMERA_SIGMA = 0.5
 """Assumed blur of the input image, pixels of the image."""
 _BORDER = 5
@@ -55,9 +59,9 @@ _CELL_SIGMAS = 4.0
 """Width of a descriptor cell, in units of the keypoint's sigma."""
 _MAX_ENTRY = 0.2
 """Limit of the entries of a descriptor of length 1, before it becomes RootSIFT."""
-_ROWS = 64
+_ROWS = 128
 """Number of rows in which extrema are searched at once, so that they fit into the processor's cache."""
-_CHUNK = 256
+_CHUNK = 128
 """Number of keypoints whose gradients are processed at once, so that they fit into the processor's cache."""
 _NEIGHBORS = np.ones((3, 3), np.uint8)
 
@@ -82,6 +86,7 @@ class SiftExtractor(Remade):
 
     def __init__(self, settings: SiftSettings | None = None):
         self._settings = settings or SiftSettings()
+        self._memory = _Memory()
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -102,7 +107,7 @@ class SiftExtractor(Remade):
         if size != (width, height):
             interpolation = cv2.INTER_AREA if size[0] < width else cv2.INTER_CUBIC
             image = np.asarray(cv2.resize(image, size, interpolation=interpolation), np.uint8)
-        pyramid = _Pyramid(image)
+        pyramid = _Pyramid(image, self._memory)
         keypoints = _detect(pyramid, settings.contrast_threshold)
         if not len(keypoints.x):
             return LocalFeatures.none((width, height))
@@ -122,6 +127,18 @@ class SiftExtractor(Remade):
         )
 
 
+class _Memory(threading.local):
+    """The memory of a thread's last pyramid, for its next one: the system takes long to give new memory."""
+
+    values: Levels = np.empty(0, np.int16)
+
+    def take(self, count: int) -> Levels:
+        """Return an array of this length; it shares its memory with the last one."""
+        if len(self.values) < count:
+            self.values = np.empty(count, np.int16)
+        return self.values[:count]
+
+
 class _Pyramid:
     """Blurred copies of an image: octaves with 6 levels of increasing blur, each half as large as the one before.
 
@@ -129,7 +146,7 @@ class _Pyramid:
     the octave before, at half their size.
     """
 
-    def __init__(self, image: NDArray[np.uint8]) -> None:
+    def __init__(self, image: NDArray[np.uint8], memory: _Memory) -> None:
         heights, widths = [2 * image.shape[0]], [2 * image.shape[1]]
         while min(heights[-1], widths[-1]) > 4 * _BORDER + 4:
             heights.append((heights[-1] + 1) // 2)
@@ -141,15 +158,15 @@ class _Pyramid:
         ends = np.cumsum(len(_BLURS) * self.sizes)
         self.starts = ends - len(_BLURS) * self.sizes
         """(O,) index in `values` at which each octave starts."""
-        self.values: Floats = np.empty(ends[-1], np.float32)
-        """The pixels of all levels, one level after the other, gray values from 0 to 1."""
+        self.values: Levels = memory.take(ends[-1])
+        """The pixels of all levels, one level after the other, from 0 to `_WHITE`."""
         self.octaves = [
             self.values[start:end].reshape(-1, height, width)
             for start, end, height, width in zip(self.starts, ends, heights, widths, strict=True)
         ]
         """For each octave, its levels (6, H, W): views of `values`."""
-        scaled = image.astype(np.float32) / 255
-        first = np.asarray(cv2.resize(scaled, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR), np.float32)
+        scaled = image.astype(np.int16) * np.int16(_WHITE // 255)
+        first = np.asarray(cv2.resize(scaled, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR), np.int16)
         _blur(first, 2 * _CAMERA_SIGMA, _BLURS[0], self.octaves[0][0])
         available = 1
         for octave, levels in enumerate(self.octaves):
@@ -166,7 +183,7 @@ class _Pyramid:
         return octave, np.stack([level, *np.divmod(in_level, self.widths[octave])])
 
 
-def _blur(image: Floats, sigma: float, wanted_sigma: float, out: Floats) -> None:
+def _blur(image: Levels, sigma: float, wanted_sigma: float, out: Levels) -> None:
     """Blur an image of blur `sigma` to a blur of `wanted_sigma`."""
     kernel_sigma = float(np.sqrt(wanted_sigma**2 - sigma**2))
     kernel_size = 2 * int(np.ceil(_KERNEL_SIGMAS * kernel_sigma)) + 1
@@ -190,10 +207,11 @@ class _Keypoints(NamedTuple):
         return _Keypoints(*columns)
 
 
-def _extrema(levels: Floats, contrast: float) -> Ints:
+def _extrema(levels: Levels, contrast: float) -> Ints:
     """Return the local extrema of the difference of Gaussians among all 26 neighbors, as flat indices into `levels`.
 
-    Absolute values are compared: near the extremum of a smooth function, all values have the same sign.
+    Absolute values are compared: near the extremum of a smooth function, all values have the same sign. Of equal
+    neighbors, the first is the extremum.
 
     Args:
         levels: (6, H, W), of an octave.
@@ -202,24 +220,25 @@ def _extrema(levels: Floats, contrast: float) -> Ints:
     _, height, width = levels.shape
     # The interpolated peak, which must reach the contrast, is a little higher than the pixel.
     # Flat areas, in which all pixels are equal, have none at any contrast.
-    least = np.float32(max(0.8 * contrast / _INTERVALS, 1e-6))
-    around = np.array([y * width + x for y in (-1, 0, 1) for x in (-1, 0, 1) if x or y])
+    least = max(0.8 * contrast / _INTERVALS * _WHITE, 1)
+    around = np.array([y * width + x for y in (-1, 0, 1) for x in (-1, 0, 1)])
     extrema = [np.zeros(0, np.int64)]
     for top in range(_BORDER, height - _BORDER, _ROWS):
         # With a row more above and below. Level i of the differences is that of levels i and i + 1.
         rows = levels[:, top - 1 : min(top + _ROWS, height - _BORDER) + 1]
-        differences = np.empty((len(levels) - 1, *rows.shape[1:]), np.float32)
+        differences = np.empty((len(levels) - 1, *rows.shape[1:]), np.int16)
         for below, above, difference in zip(rows[:-1], rows[1:], differences, strict=True):
             cv2.absdiff(below, above, dst=difference)
         flat, size = differences.reshape(-1), differences[0].size
-        other_levels = np.concatenate([around - size, around + size])
+        before, after = np.concatenate([around - size, around[:4]]), around + size
         for level in range(1, _INTERVALS + 1):
-            threshold = np.maximum(cv2.dilate(differences[level], _NEIGHBORS)[1:-1], least)
-            at = np.flatnonzero(differences[level, 1:-1] >= threshold) + level * size + width
+            threshold = cv2.max(cv2.dilate(differences[level], _NEIGHBORS), least)  # type: ignore[call-overload]
+            at = np.flatnonzero(differences[level, 1:-1] >= threshold[1:-1]) + level * size + width
             x = at % width
             at = at[(x >= _BORDER) & (x < width - _BORDER)]
-            at = at[(flat[at] >= flat[at - size]) & (flat[at] >= flat[at + size])]  # cheap test first; few pass it
-            at = at[(flat[at] >= flat[at + other_levels[:, None]]).all(axis=0)]
+            at = at[(flat[at] > flat[at - size]) & (flat[at] >= flat[at + size])]  # cheap test first; few pass it
+            at = at[(flat[at] >= flat[at + after[:, None]]).all(axis=0)]
+            at = at[(flat[at] > flat[at + before[:, None]]).all(axis=0)]
             extrema.append(at + level * (height * width - size) + (top - 1) * width)
     return np.concatenate(extrema)
 
@@ -254,7 +273,7 @@ def _detect(pyramid: _Pyramid, contrast: float) -> _Keypoints:
     )
 
 
-def _parabola(flat: Floats, at: Ints, width: Ints, size: Ints) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+def _parabola(flat: Levels, at: Ints, width: Ints, size: Ints) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Fit a parabola to the difference of Gaussians at N extrema.
 
     Args:
@@ -268,7 +287,7 @@ def _parabola(flat: Floats, at: Ints, width: Ints, size: Ints) -> tuple[Floats, 
 
     def value(offset: Ints | int) -> Floats:
         index = at + offset
-        return flat.take(index + size) - flat.take(index)
+        return (flat.take(index + size) - flat.take(index)) * np.float32(1 / _WHITE)
 
     center = value(0)
     steps = (1, width, size)
@@ -318,18 +337,19 @@ class _Grid(NamedTuple):
         start = pyramid.starts[keypoints.octave] + keypoints.level * pyramid.sizes[keypoints.octave]
         cos, sin = np.cos(angles) * keypoints.sigma, np.sin(angles) * keypoints.sigma
         # Adding a half makes the conversion to integers round.
-        x = self.x * cos - self.y * sin + (keypoints.x + np.float32(0.5))
-        y = self.x * sin + self.y * cos + (keypoints.y + np.float32(0.5))
-        column, row = x.astype(np.int32), y.astype(np.int32)
+        grid = np.hstack([self.x, self.y, np.ones_like(self.x)])
+        column = (grid @ np.stack([cos, -sin, keypoints.x + np.float32(0.5)])).astype(np.int32)
+        row = (grid @ np.stack([sin, cos, keypoints.y + np.float32(0.5)])).astype(np.int32)
         inside = (column >= 1) & (column < width - 1) & (row >= 1) & (row < height - 1)
         row *= width
         row += column
-        at = np.where(inside, row, width + 1) + start
+        row *= inside  # outside, any pixel will do
+        at = row + start
         flat = pyramid.values
         dx, dy = flat.take(at + 1), flat.take(at + width)
         dx -= flat.take(at - 1)
         dy -= flat.take(at - width)
-        magnitude, direction = cv2.cartToPolar(dx, dy)
+        magnitude, direction = cv2.cartToPolar(dx.astype(np.float32), dy.astype(np.float32))
         magnitude *= inside
         return magnitude, direction
 
