@@ -39,13 +39,10 @@ def scene(number: int, count: int = 200) -> tuple[RigQuery, Matches, NDArray[np.
     return query, Matches(which, np.concatenate(pixels), np.arange(number * count)), np.concatenate(points)
 
 
-@pytest.mark.parametrize("number", [1, 2, 3])
-def test_the_pose_is_that_of_colmap(number: int) -> None:
-    query, matches, points = scene(number)
-    start = geometry.make_pose(Rotation.from_rotvec([0.02, -0.01, 0.01]).as_matrix(), [0.1, 0.05, -0.1])
-    pose = query.refine(start, matches, points)
-    options = pycolmap.AbsolutePoseRefinementOptions(gradient_tolerance=1e-9)
-    theirs = pycolmap.refine_generalized_absolute_pose(
+def refined_by_colmap(
+    query: RigQuery, start: NDArray[np.float64], matches: Matches, points: NDArray[np.float64], scale_px: float
+) -> NDArray[np.float64]:
+    refined = pycolmap.refine_generalized_absolute_pose(
         pycolmap.Rigid3d(start[:3]),
         matches.pixels,
         points,
@@ -53,9 +50,18 @@ def test_the_pose_is_that_of_colmap(number: int) -> None:
         matches.camera.tolist(),
         [pycolmap.Rigid3d(cam[:3]) for cam in geometry.invert(query.rig_from_cams)],
         query.cameras,
-        options,
-    )["rig_from_world"]
-    rotation_deg, distance_m = geometry.pose_error(pose, np.vstack([theirs.matrix(), [0, 0, 0, 1]]))
+        pycolmap.AbsolutePoseRefinementOptions(gradient_tolerance=1e-9, loss_function_scale=scale_px),
+    )
+    assert refined is not None
+    return np.vstack([refined["rig_from_world"].matrix(), [0, 0, 0, 1]])
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_the_pose_is_that_of_colmap(number: int) -> None:
+    query, matches, points = scene(number)
+    start = geometry.make_pose(Rotation.from_rotvec([0.02, -0.01, 0.01]).as_matrix(), [0.1, 0.05, -0.1])
+    pose = query.refine(start, matches, points)
+    rotation_deg, distance_m = geometry.pose_error(pose, refined_by_colmap(query, start, matches, points, 1.0))
     assert rotation_deg < 3e-4
     assert distance_m < 5e-5
     off_deg, off_m = geometry.pose_error(pose, np.eye(4))
@@ -81,3 +87,18 @@ def test_points_behind_the_camera_have_no_say() -> None:
     points[150:] *= -1
     pose = query.refine(np.eye(4), matches, points)
     assert geometry.pose_error(pose, np.eye(4))[1] < 0.01
+
+
+@pytest.mark.parametrize("number", [1, 3])
+def test_from_a_close_pose_the_scale_of_the_loss_follows_the_errors(number: int) -> None:
+    query, matches, points = scene(number)
+    start = geometry.make_pose(np.eye(3), [0.002, 0, 0])
+    scale_px = 0.4 * (1 + 5 / (len(matches) - 6)) * float(np.median(query.errors_px(start, matches, points)))
+    assert 0.2 < scale_px < 0.4
+    pose = query.refine(start, matches, points, close=True)
+    theirs = refined_by_colmap(query, start, matches, points, scale_px)
+    rotation_deg, distance_m = geometry.pose_error(pose, theirs)
+    assert rotation_deg < 1e-3
+    assert distance_m < 1e-4
+    with_one_px = geometry.pose_error(refined_by_colmap(query, start, matches, points, 1.0), theirs)
+    assert with_one_px[1] > 2e-4

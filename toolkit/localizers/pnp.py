@@ -34,7 +34,7 @@ from toolkit.localizers.misfit import find_misfit
 from toolkit.localizers.rig import Matches, RigQuery, least_squares_covariance
 from toolkit.manifest import PnpSettings
 
-PNP_FORMAT = 2
+PNP_FORMAT = 3
 """Version of the poses. Increase when the same settings and files give other poses."""
 FIRST_REFERENCES = {2: 200, 4: 100}
 """Number of references per image to match first -> independent inliers that their pose needs to be kept. The next
@@ -298,7 +298,7 @@ class PnpLocalizer(WithoutNetwork):
             guided = guided[query.errors_deg(refined, guided, self.map.points) < settings.max_error_deg]
             if len(guided) < min_matches:
                 break
-            pose, inliers = query.refine(refined, guided, self.map.points), guided
+            pose, inliers = query.refine(refined, guided, self.map.points, close=True), guided
         errors = query.errors_deg(pose, inliers, self.map.points) / settings.max_error_deg
         return _Hypothesis(pose, inliers, float(np.maximum(1 - errors**2, 0).sum()))
 
