@@ -29,7 +29,7 @@ MatchCache = dict[tuple[int, int, int], tuple[Ints, Ints]]
 
 @dataclass(frozen=True)
 class MapImage:
-    """The features of a map image that observe a map point, longest tracks first."""
+    """The N features of a map image that observe a map point, longest tracks first."""
 
     points: Ints
     """(N,) the map point of each feature."""
@@ -37,6 +37,8 @@ class MapImage:
     """(N,) see `LocalFeatures`."""
     unit: NDArray[np.float32]
     """(N, D) see `unit_descriptors`."""
+    keypoints: NDArray[np.float32]
+    """(M, 2) pixels, of all features of the image."""
 
 
 class MappedFeatures:
@@ -65,8 +67,6 @@ class MappedFeatures:
         self.name = name
         self.image = lru_cache(CACHED_IMAGES)(self._image)
         """Cached `_image`."""
-        self.keypoints = lru_cache(CACHED_IMAGES)(self._keypoints)
-        """Cached `_keypoints`."""
         self._network = Lock()
 
     def with_map(self, local_map: LocalMap) -> "MappedFeatures":
@@ -117,12 +117,10 @@ class MappedFeatures:
         """Return the features of a map image that observe points, at most `max_features`, longest tracks first."""
         keypoint, point = self.map.observations(index)
         order = np.argsort(-self.map.track_lengths(point), kind="stable")[:max_features]
-        features = self.features[self.map.image_names[index]].take(keypoint[order])
-        return MapImage(point[order], features.scales, unit_descriptors(features.descriptors, self.kind.shorten))
-
-    def _keypoints(self, index: int) -> NDArray[np.float32]:
-        """Return the keypoints (N, 2) of a map image, pixels."""
-        return self.features[self.map.image_names[index]].keypoints
+        features = self.features[self.map.image_names[index]]
+        kept = features.take(keypoint[order])
+        unit = unit_descriptors(kept.descriptors, self.kind.shorten)
+        return MapImage(point[order], kept.scales, unit, features.keypoints)
 
     def _point_of_each_feature(self, index: int) -> Ints:
         """Return the map point (N,) of each feature of a map image, -1 for none."""
@@ -178,22 +176,26 @@ class MappedFeatures:
             visible, projected = visible[finite], projected[finite]
             tree = query.trees[camera][kind]
             near = KDTree(projected).sparse_distance_matrix(tree, radius, output_type="ndarray")
-            # Pair each near keypoint with all observations of the point.
-            near_point = visible[near["i"]]
+            near_point, keypoint = visible[near["i"]], near["j"]
+            # Compare each near keypoint with all observations of the point; the most similar one counts.
             count = counts[near_point]
-            keypoint = np.repeat(near["j"], count)
-            within = np.arange(len(keypoint)) - np.repeat(np.cumsum(count) - count, count)
+            pair = np.repeat(np.arange(len(near)), count)
+            within = np.arange(len(pair)) - np.repeat(np.cumsum(count) - count, count)
             observation = by_point[np.repeat(starts[near_point], count) + within]
-            expected_px = size[observation] * query.focals_px[camera] / in_cam[which[observation], 2]
-            octaves = np.abs(np.log2(features.scales[keypoint] / np.maximum(expected_px, 1e-6)))
-            similar = octaves < self.kind.scale_octaves
-            observation, keypoint = observation[similar], keypoint[similar]
-            score = _similarities(unit, observation, query.unit_descriptors(camera, kind, self.kind.shorten), keypoint)
+            expected_px = size * query.focals_px[camera] / np.maximum(in_cam[which, 2], 1e-6)
+            expected, actual = (np.log2(np.maximum(px, 1e-6)) for px in (expected_px, features.scales.astype(float)))
+            similar = np.abs(actual[keypoint[pair]] - expected[observation]) < self.kind.scale_octaves
+            pair, observation = pair[similar], observation[similar]
+            unit_query = query.unit_descriptors(camera, kind, self.kind.shorten)
+            scores = _similarities(unit, observation, unit_query, keypoint[pair])
+            first = np.flatnonzero(np.diff(pair, prepend=-1))
+            score, pair = np.maximum.reduceat(scores, first) if len(first) else scores, pair[first]
             good = np.flatnonzero(score > self.kind.guided_min_score)
-            good = good[np.lexsort((observation[good] * len(features) + keypoint[good], -score[good]))]
-            keypoint = keypoint[good]
+            near_point, keypoint = near_point[pair[good]], keypoint[pair[good]]
+            order = np.lexsort((near_point * len(features) + keypoint, -score[good]))
+            near_point, keypoint = near_point[order], keypoint[order]
             pixels = features.keypoints[keypoint].astype(np.float64)
-            yield Candidates(Matches(np.full(len(good), camera), pixels, point[which[observation[good]]]), keypoint)
+            yield Candidates(Matches(np.full(len(good), camera), pixels, point[near_point]), keypoint)
 
 
 def _similarities(
@@ -258,13 +260,17 @@ class Vicinity:
             radius_deg: radius of the search.
         """
         self._query, self._candidates, self._points, self._radius_deg = query, candidates, points, radius_deg
-        self._projected = [query.projected(rig_from_world, group.matches, points) for group in candidates]
+        # A point has several candidates, but is projected once.
+        unique = [np.unique(group.matches.point, return_index=True, return_inverse=True) for group in candidates]
+        self._once = [group.matches[first] for group, (_, first, _) in zip(candidates, unique, strict=True)]
+        self._which = [which for _, _, which in unique]
+        self._projected = self._project(rig_from_world)
 
     def reaches(self, rig_from_world: Floats, radius_deg: float) -> bool:
         """Tell whether the candidates include all keypoints within a radius of the projections at another pose."""
         return all(
-            (self._angles_deg(rig_from_world, group, projected) <= self._radius_deg - radius_deg).all()
-            for group, projected in zip(self._candidates, self._projected, strict=True)
+            self._near(projected, before, once, self._radius_deg - radius_deg).all()
+            for projected, before, once in zip(self._project(rig_from_world), self._projected, self._once, strict=True)
         )
 
     def guided(self, rig_from_world: Floats, radius_deg: float, limit: int) -> Matches:
@@ -276,15 +282,19 @@ class Vicinity:
             limit: largest number of matches per camera and kind; those with the highest scores stay.
         """
         chosen = []
-        for group in self._candidates:
-            near = self._angles_deg(rig_from_world, group, group.matches.pixels) <= radius_deg
+        for projected, which, group in zip(self._project(rig_from_world), self._which, self._candidates, strict=True):
+            near = self._near(projected[which], group.matches.pixels, group.matches, radius_deg)
             chosen.append(group.matches[group.mutual(np.flatnonzero(near))[:limit]])
         return Matches.pooled(chosen)
 
-    def _angles_deg(self, rig_from_world: Floats, group: Candidates, pixels: Floats) -> Floats:
-        """Return the angles (K,) between the projections of the candidates' points at a pose and pixels (K, 2)."""
-        offsets = self._query.projected(rig_from_world, group.matches, self._points) - pixels
-        return np.degrees(np.arctan(np.linalg.norm(offsets, axis=1) / self._query.focals_px[group.matches.camera]))
+    def _project(self, rig_from_world: Floats) -> list[Floats]:
+        """Return the projections (P, 2) of the P points of each group of candidates at a pose."""
+        return [self._query.projected(rig_from_world, once, self._points) for once in self._once]
+
+    def _near(self, projected: Floats, pixels: Floats, matches: Matches, radius_deg: float) -> NDArray[np.bool_]:
+        """Tell whether pixels (K, 2) are within a radius of projections (K, 2) in the images of K matches."""
+        radius_px = np.tan(np.radians(radius_deg)) * self._query.focals_px[matches.camera]
+        return np.asarray(np.linalg.norm(projected - pixels, axis=1) <= radius_px, np.bool_)
 
 
 class MapMatcher:
@@ -364,8 +374,8 @@ class MapMatcher:
         pixels = np.zeros((len(at), 2))
         kinds = np.searchsorted(self._first_point, points[at], side="right") - 1
         for kind in np.unique(kinds):
-            index = self._of_kind(int(kind), [image])[0]
-            pixels[kinds == kind] = self.mapped[kind].keypoints(index)[keypoint[observation[kinds == kind]]]
+            seen_by = self.mapped[kind].image(self._of_kind(int(kind), [image])[0], self.settings.max_map_features)
+            pixels[kinds == kind] = seen_by.keypoints[keypoint[observation[kinds == kind]]]
         return at, pixels
 
     def _of_kind(self, kind: int, images: Ints | Sequence[int]) -> list[int]:
