@@ -25,6 +25,8 @@ LOSS_SHARE = 0.4
 """Scale from a close pose, as a share of the median error. Errors of points and keypoints have heavy tails: with 1 px,
 the position errors of the captures in docs/results.md are 5 % larger."""
 LEAST_LOSS_PX = 0.05
+STEP = 1e-6
+"""Length of the step, meters and radians, after which a refinement ends."""
 POSELIB_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
 """COLMAP's names of the camera models that PoseLib 2.0.5 can refine with. With others it returns the pose unchanged."""
 
@@ -196,9 +198,9 @@ class RigQuery:
             # A pose fits few matches too well (Rousseeuw and Leroy 1987, "Robust Regression", section 5.1).
             scale_px = float(np.clip(LOSS_SHARE * (1 + 5 / (len(matches) - 6)) * median_px, LEAST_LOSS_PX, LOSS_PX))
         pixels, xyz, cameras = self._by_camera(matches, points, undistort=False)
-        loss = {"loss_type": "CAUCHY", "loss_scale": scale_px}
+        options = {"loss_type": "CAUCHY", "loss_scale": scale_px, "step_tol": STEP}
         refined, _ = poselib.refine_generalized_absolute_pose(
-            pixels, xyz, _poselib(rig_from_world), self._cams_from_rig, cameras, loss
+            pixels, xyz, _poselib(rig_from_world), self._cams_from_rig, cameras, options
         )
         return _matrix(refined.Rt)
 
