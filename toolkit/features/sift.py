@@ -61,7 +61,7 @@ _MAX_ENTRY = 0.2
 """Limit of the entries of a descriptor of length 1, before it becomes RootSIFT."""
 _ROWS = 128
 """Number of rows in which extrema are searched at once, so that they fit into the processor's cache."""
-_CHUNK = 128
+_CHUNK = 256
 """Number of keypoints whose gradients are processed at once, so that they fit into the processor's cache."""
 _NEIGHBORS = np.ones((3, 3), np.uint8)
 
