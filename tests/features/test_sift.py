@@ -306,3 +306,11 @@ def test_the_memory_of_the_last_image_does_not_show_in_the_next() -> None:
         found = list(pool.map(lambda image: extractor.extract([image])[0], images * 3))
     for image, features in zip(images * 3, found, strict=True):
         assert_same(features, SiftExtractor().extract([image])[0])
+
+
+def test_a_large_image_does_not_stay_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    expected = SiftExtractor().extract([textured(3)])[0]
+    monkeypatch.setattr(sift, "_MOST_KEPT", 10_000)
+    extractor = SiftExtractor()
+    assert_same(extractor.extract([textured(3)])[0], expected)
+    assert len(extractor._memory.values) == 0

@@ -15,12 +15,12 @@ from scipy.spatial.transform import Rotation
 from tests.queries import ask, rests_on
 from toolkit import geometry
 from toolkit.features.features import DESCRIPTOR_SCALE, KINDS, LocalFeatures
-from toolkit.features.matching import MutualMatcher, PairMatches
+from toolkit.features.matching import MutualMatcher, PairMatches, unit_descriptors
 from toolkit.localizers.base import CAMERA, PoseEstimate, Prior
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.matches import MappedFeatures
 from toolkit.localizers.pnp import FIRST_REFERENCES, VIEWS, PnpLocalizer, _Hypothesis
-from toolkit.localizers.rig import Matches, least_squares_covariance
+from toolkit.localizers.rig import Matches, RigQuery, least_squares_covariance
 from toolkit.manifest import PnpSettings
 
 Floats = NDArray[np.float64]
@@ -332,6 +332,23 @@ def test_a_query_from_elsewhere_is_not_ok(room: World, seed: int) -> None:
     )
     estimate = ask(room.localizer(), [PINHOLE], np.eye(4)[None], [stranger], [REFERENCES])
     assert estimate.status != "ok"
+
+
+def test_a_keypoint_near_a_point_is_one_candidate_by_its_best_image(room: World) -> None:
+    seen, (mapped,), settings = room.look(PINHOLE, QUERY), room.localizer().matcher.mapped, PnpSettings()
+    query = RigQuery([PINHOLE], np.eye(4)[None], [[seen]])
+    (group,) = mapped.candidates(query, 0, geometry.invert(QUERY), REFERENCES, 1.0, settings)
+    pairs = np.column_stack([group.keypoint, group.matches.point])
+    assert len(np.unique(pairs, axis=0)) == len(pairs) > 500
+    unit, best = unit_descriptors(seen.descriptors, mapped.kind.shorten), np.full(len(pairs), -1.0)
+    for image in (mapped.image(index, settings.max_map_features) for index in REFERENCES):
+        row = np.full(len(room.points), -1)
+        row[image.points] = np.arange(len(image.points))
+        at = np.flatnonzero(row[pairs[:, 1]] >= 0)
+        scores = (unit[pairs[at, 0]] * image.unit[row[pairs[at, 1]]]).sum(axis=1)
+        best[at] = np.maximum(best[at], scores)
+    assert best.min() > mapped.kind.guided_min_score - 1e-6
+    assert (np.diff(best) < 1e-6).all()
 
 
 def test_a_map_image_without_points_does_no_harm(room: World) -> None:

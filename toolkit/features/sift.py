@@ -34,7 +34,9 @@ _BLURS = _SIGMA * 2 ** (np.arange(_INTERVALS + 3) / _INTERVALS)
 _KERNEL_SIGMAS = 3.0
 """Radius of the blurring kernels, in units of their sigma."""
 _WHITE = 255 * 128
-"""White in the levels. Rounding to integers changes a keypoint by a hundredth of a pixel; float32 takes longer."""
+"""White in the levels. Rounding to integers usually changes a keypoint by less than a hundredth of a pixel."""
+_MOST_KEPT = 1 << 26
+"""Most values that a thread keeps for its next pyramid, 128 MB; an image of 1280 x 960 needs 39 million."""
 _CAMERA_SIGMA = 0.5
 """Assumed blur of the input image, pixels of the image."""
 _BORDER = 5
@@ -128,12 +130,14 @@ class SiftExtractor(Remade):
 
 
 class _Memory(threading.local):
-    """The memory of a thread's last pyramid, for its next one: the system takes long to give new memory."""
+    """The memory of a thread's largest pyramid, for its next one: the system takes long to give new memory."""
 
     values: Levels = np.empty(0, np.int16)
 
     def take(self, count: int) -> Levels:
-        """Return an array of this length; it shares its memory with the last one."""
+        """Return an array of this length; it may share its memory with the last one."""
+        if count > _MOST_KEPT:
+            return np.empty(count, np.int16)
         if len(self.values) < count:
             self.values = np.empty(count, np.int16)
         return self.values[:count]
