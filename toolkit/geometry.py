@@ -144,3 +144,10 @@ def project(points: Floats, camera: "pycolmap.Camera", world_from_cam: Floats) -
     if front.any():
         pixels[front] = camera.img_from_cam(in_cam[front])
     return pixels, front & np.isfinite(pixels).all(1)
+
+
+def unique_columns(numbers: Ints) -> tuple[Ints, ...]:
+    """Return the unique columns of non-negative integers (R, K), in ascending order, as R arrays."""
+    shape = tuple((numbers.max(axis=1, initial=0) + 1).tolist())
+    # Each column becomes one number, as `np.unique` takes five times as long with an axis.
+    return np.unravel_index(np.unique(np.ravel_multi_index(tuple(numbers), shape)), shape)

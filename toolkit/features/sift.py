@@ -316,15 +316,15 @@ def _parabola(flat: Levels, at: Ints, width: Ints, size: Ints) -> tuple[Floats, 
 
 
 class _Grid(NamedTuple):
-    """K positions around a keypoint at which gradients are sampled, as arrays (K, 1) in units of its sigma."""
+    """K positions around a keypoint at which gradients are sampled."""
 
-    x: Floats
-    y: Floats
+    xy1: Floats
+    """(K, 3) x and y in units of the keypoint's sigma, and ones."""
 
     @classmethod
     def square(cls, along: NDArray[np.float64]) -> "_Grid":
         y, x = np.meshgrid(along.astype(np.float32), along.astype(np.float32), indexing="ij")
-        return cls(x.reshape(-1, 1), y.reshape(-1, 1))
+        return cls(np.stack([x.ravel(), y.ravel(), np.ones(x.size, np.float32)], axis=1))
 
     def gradients(self, pyramid: _Pyramid, keypoints: _Keypoints, angles: Floats) -> tuple[Floats, Floats]:
         """Return magnitude (K, N) and direction (K, N), 0 to 2 pi, of the gradients around N keypoints.
@@ -341,9 +341,8 @@ class _Grid(NamedTuple):
         start = pyramid.starts[keypoints.octave] + keypoints.level * pyramid.sizes[keypoints.octave]
         cos, sin = np.cos(angles) * keypoints.sigma, np.sin(angles) * keypoints.sigma
         # Adding a half makes the conversion to integers round.
-        grid = np.hstack([self.x, self.y, np.ones_like(self.x)])
-        column = (grid @ np.stack([cos, -sin, keypoints.x + np.float32(0.5)])).astype(np.int32)
-        row = (grid @ np.stack([sin, cos, keypoints.y + np.float32(0.5)])).astype(np.int32)
+        column = (self.xy1 @ np.stack([cos, -sin, keypoints.x + np.float32(0.5)])).astype(np.int32)
+        row = (self.xy1 @ np.stack([sin, cos, keypoints.y + np.float32(0.5)])).astype(np.int32)
         inside = (column >= 1) & (column < width - 1) & (row >= 1) & (row < height - 1)
         row *= width
         row += column
@@ -359,7 +358,7 @@ class _Grid(NamedTuple):
 
 
 _WINDOW = _Grid.square(np.arange(-4.125, 4.5, 0.75))
-_WINDOW_WEIGHTS = np.exp(-(_WINDOW.x**2 + _WINDOW.y**2) / (2 * _WINDOW_SIGMA**2))
+_WINDOW_WEIGHTS = np.exp(-(_WINDOW.xy1[:, :2] ** 2).sum(axis=1, keepdims=True) / (2 * _WINDOW_SIGMA**2))
 
 
 def _chunks(keypoints: _Keypoints) -> Iterator[Ints]:

@@ -154,7 +154,7 @@ class LocalMap:
         which = np.repeat(np.arange(len(points)), self.track_lengths(points))  # the point of each observation
         image = self.obs_image[self.observations_of(points)]
         # Two keypoints of one image at one position (two orientations) are one view.
-        which, image = np.divmod(np.unique(which * len(self.image_names) + image), len(self.image_names))
+        which, image = geometry.unique_columns(np.stack([which, image]))
         views = np.bincount(which, minlength=len(points))
         in_cams = geometry.transform(self.cams_from_world[image], self.points[points[which], None])[:, 0]
         jacobian = projection_jacobian(in_cams, self.focals_px[image]) @ self.cams_from_world[image, :3, :3]

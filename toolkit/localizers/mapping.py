@@ -95,8 +95,7 @@ def select_pairs(
         order = np.argsort(-scores, kind="stable")[:per_image]
         chosen = near[order[scores[order] > 0.02]]
         pairs.append(np.column_stack([np.minimum(i, chosen), np.maximum(i, chosen)]))
-    all_pairs = np.concatenate(pairs)
-    return np.column_stack(np.divmod(np.unique(all_pairs[:, 0] * n + all_pairs[:, 1]), n))
+    return np.column_stack(geometry.unique_columns(np.concatenate(pairs).T))
 
 
 def instants(session: Session, rows: Ints) -> Ints:

@@ -225,13 +225,6 @@ class Candidates:
         return chosen[_is_first(self.keypoint[chosen]) & _is_first(self.matches.point[chosen])]
 
 
-def _unique_columns(numbers: Ints) -> tuple[Ints, ...]:
-    """Return the unique columns of non-negative integers (R, K), in ascending order, as R arrays."""
-    shape = tuple((numbers.max(axis=1, initial=0) + 1).tolist())
-    # Each column becomes one number, as `np.unique` takes five times as long with an axis.
-    return np.unravel_index(np.unique(np.ravel_multi_index(tuple(numbers), shape)), shape)
-
-
 def _is_first(numbers: Ints) -> NDArray[np.bool_]:
     """Tell for each of K non-negative numbers whether it is the first of its value, (K,)."""
     positions = np.arange(len(numbers))
@@ -339,7 +332,7 @@ class MapMatcher:
                 cache |= {(camera, kind, image): pairs for image, pairs in zip(new, made_now, strict=True)}
                 for keypoint, point in (cache[camera, kind, image] for image in images):
                     columns.append(np.stack([np.full(len(point), camera), keypoint, point + self._first_point[kind]]))
-            camera_index, keypoint, point = _unique_columns(np.concatenate(columns, axis=1))
+            camera_index, keypoint, point = geometry.unique_columns(np.concatenate(columns, axis=1))
             matches.append(Matches(camera_index, query.pixels(camera_index, keypoint, kind), point))
         return Matches.pooled(matches)
 
