@@ -11,7 +11,7 @@ PYTEST := $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadscope
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo run test test-slow test-browser test-rest browser-setup docs docs-setup docs-images docs-view lab lint bench clean test-gpu bench-gpu
+.PHONY: help demo run test test-kernels test-slow test-browser test-rest browser-setup docs docs-setup docs-images docs-view lab lint bench clean test-gpu bench-gpu
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */  make \1|/' | column -t -s '|'
@@ -24,6 +24,12 @@ run: $(INSTALLED)  ## run RUN_MANIFEST=data_manifests/<yours>.yaml
 
 test: $(INSTALLED)  ## run the default tests, 4 to 8 minutes on 2 idle cores
 	$(PYTEST)
+
+# An AVX2 laptop has the kernels of Haswell, a processor without AVX those of Prescott.
+test-kernels: $(INSTALLED)  ## run the tests of numbers with other BLAS kernels and numbers of threads
+	@set -e; for kernel in Haswell Prescott; do for threads in 1 2; do echo "$$kernel, $$threads BLAS threads"; \
+	OPENBLAS_CORETYPE=$$kernel OPENBLAS_NUM_THREADS=$$threads $(PYTEST) tests/test_threads.py tests/test_localize.py \
+	tests/test_geometry.py tests/features tests/embedders tests/localizers; done; done
 
 test-slow: $(INSTALLED)  ## run the slow tests: whole runs, and accuracy on real captures if present
 	$(PYTEST) -m slow

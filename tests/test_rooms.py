@@ -12,7 +12,7 @@ STAGES = ("embed", "retrieve", "rerank", "localize", "sequence", "evaluate", "vi
 LEVELS: list[tuple[str, ...]] = [
     ("__init__",),
     ("errors",),
-    ("files", "geometry"),
+    ("files", "geometry", "threads"),
     ("capture",),
     ("models",),
     ("manifest",),
@@ -86,7 +86,7 @@ def test_no_module_imports_itself_through_others() -> None:
 
 def test_the_top_level_is_a_table_of_contents() -> None:
     files = {path.stem for path in TOOLKIT.glob("*.py")} - {"__init__"}
-    assert files == {"__main__", "pipeline", "notebook", *STAGES, "geometry", "files", "errors"} | (
+    assert files == {"__main__", "pipeline", "notebook", *STAGES, "geometry", "files", "threads", "errors"} | (
         {"alignment"}  # the name that other code imports; the work is done in localizers/
         | set()
     )

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
-from toolkit.capture.images import default_workers, one_thread, prefetch, read_image
+from toolkit.capture.images import default_workers, prefetch, read_image
 from toolkit.capture.turning import turn_image
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import WEIGHTS, Embedder, create_embedder, resolve_model, shows_upright
@@ -41,6 +41,7 @@ from toolkit.files import (
 from toolkit.geometry import Ints, unit
 from toolkit.manifest import EmbedSettings
 from toolkit.models.weights import resolve_weights
+from toolkit.threads import one_thread
 
 log = logging.getLogger(__name__)
 
@@ -281,7 +282,7 @@ def _remove_former(out_dir: Path, names: list[str], parts: list[_Subsession]) ->
 
 def _vocabulary(capture: Capture, folders: _Folders, settings: EmbedSettings, skip_existing: bool) -> Path:
     """Learn the VLAD vocabulary from the map images of all devices, unless the file is current."""
-    from toolkit.embedders.vlad import Vlad
+    from toolkit.embedders.vlad import VLAD_FORMAT, Vlad
 
     maps = capture.usable("map")
     if not maps:
@@ -300,6 +301,7 @@ def _vocabulary(capture: Capture, folders: _Folders, settings: EmbedSettings, sk
         "features": SiftExtractor().settings,
         "images": {name: _images_fingerprint(capture[name], rows) for name, rows in chosen.items()},
         "seed": settings.seed,
+        "format": VLAD_FORMAT,
     }
     path, features_dir = folders.out / "vlad.npz", folders.features
     if skip_existing and (is_current(path, record) or folders.take_over(path, record)):

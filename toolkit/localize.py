@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
 from toolkit import geometry
@@ -69,6 +68,7 @@ from toolkit.localizers.queries import localized_query, references_of_images, st
 from toolkit.manifest import LocalizeSettings
 from toolkit.runs.pairs import PairRows
 from toolkit.show.metrics import camera_messages
+from toolkit.threads import fixed_sums
 
 __all__ = ["COLUMNS", "PREDICTION_COLUMNS", "Map", "explain_query", "localize_image", "localize_pairs"]
 
@@ -138,8 +138,7 @@ def localize_pairs(
     table = PairRows(capture.name, folders.out, folders.retrieval)
     query_tables: dict[str, list[pd.DataFrame]] = {}
     devices = product(capture.devices_with("map", map_device), capture.devices_with("query", query_device))
-    # One BLAS thread: queries already run in parallel, and the order of sums stays fixed.
-    with threadpool_limits(1, "blas"):
+    with fixed_sums:
         for mapped, queried in devices:
             pair = _Pair(stage, mapped, queried)
             with table.row(mapped, queried) as row:

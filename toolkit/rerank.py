@@ -19,7 +19,7 @@ import pandas as pd
 from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
-from toolkit.capture.images import default_workers, one_thread, prefetch
+from toolkit.capture.images import default_workers, prefetch
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.errors import INTERNAL, ArtifactError, reason_of
 from toolkit.features.features import KINDS
@@ -39,6 +39,7 @@ from toolkit.files import (
 from toolkit.geometry import Ints
 from toolkit.manifest import RerankSettings
 from toolkit.runs.pairs import PairRows
+from toolkit.threads import one_thread
 
 log = logging.getLogger(__name__)
 

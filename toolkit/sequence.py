@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
@@ -55,6 +54,7 @@ from toolkit.localizers.picture import localize_image
 from toolkit.localizers.pose_graph import place_online
 from toolkit.localizers.recording import localize_piece
 from toolkit.manifest import SequenceSettings
+from toolkit.threads import fixed_sums
 
 log = logging.getLogger(__name__)
 
@@ -73,6 +73,7 @@ STEP_COLUMNS = ("step", "timestamp", "device_id", *POSE_NAMES)
 """Columns of `<pair>_sequence_steps.csv`: the poses of queries after each of `STEPS`."""
 
 
+@fixed_sums
 def sequence_pairs(
     sessions_root: str | Path,
     poses_dir: str | Path,
@@ -290,8 +291,7 @@ class _Relocalizer:
             except Exception as error:  # one bad query never ends a run
                 return PoseEstimate(f"failed: {reason_of(error, f'localizing {paths[0]} again')}")
 
-        with threadpool_limits(1, "blas"):
-            estimates = list(prefetch(localize, range(len(todo)), default_workers()))
+        estimates = list(prefetch(localize, range(len(todo)), default_workers()))
         self.met_a_bug |= any(INTERNAL in estimate.status + estimate.reason for estimate in estimates)
         return estimates
 

@@ -6,7 +6,6 @@ import threading
 import time
 import zlib
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,13 +13,11 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
-from threadpoolctl import threadpool_info, threadpool_limits
 
 from toolkit.capture import read_depth
 from toolkit.capture.images import (
     WORKERS,
     default_workers,
-    one_thread,
     prefetch,
     read_for_display,
     read_image,
@@ -286,26 +283,6 @@ def test_an_image_without_its_last_bytes_is_refused_one_with_more_is_not(tmp_pat
     path.write_bytes(data + bytes(100) + b"what some cameras add")
     assert read_image(path).shape == (200, 300, 3)
 
-
-def test_one_thread_each_and_then_as_before() -> None:
-    def threads() -> list[int]:
-        blas = [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
-        return [cv2.getNumThreads(), *blas]
-
-    cv2_threads = cv2.getNumThreads()
-    cv2.setNumThreads(2)
-    try:
-        with threadpool_limits(2, "blas"):
-            before = threads()
-            inside = []
-            with suppress(ValueError), one_thread():
-                inside = threads()
-                raise ValueError
-            assert set(inside) == {1}
-            assert threads() == before
-            assert max(before) == 2
-    finally:
-        cv2.setNumThreads(cv2_threads)
 
 
 @pytest.mark.parametrize("size", [(960, 720), (720, 960), (641, 480), (965, 725), (100, 80)])

@@ -15,7 +15,6 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 from PIL import JpegImagePlugin, PngImagePlugin
-from threadpoolctl import threadpool_limits
 
 from toolkit.errors import ImageError
 
@@ -223,21 +222,6 @@ def _of_control_group(*files: str) -> list[list[int]]:
     with suppress(OSError, ValueError):
         return [[int(text) for file in files for text in (_CGROUPS / file).read_text().split()]]
     return []
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Let OpenCV and BLAS use one thread each, where a loop over images or queries has a thread a core already.
-
-    Sums are then in one order, whatever the machine has.
-    """
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        with threadpool_limits(1, "blas"):
-            yield
-    finally:
-        cv2.setNumThreads(threads)
 
 
 def prefetch(function: Callable[[T], R], items: Iterable[T], workers: int = 2, ahead: int = 4) -> Iterator[R]:

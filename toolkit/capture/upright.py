@@ -21,6 +21,7 @@ from toolkit.capture.session import Rows, Session
 from toolkit.capture.world_up import WorldUp, estimate_world_up, posed_photographs, sensor_names
 from toolkit.files import fingerprint
 from toolkit.geometry import Floats, Ints, unit
+from toolkit.threads import fixed_sums
 
 log = logging.getLogger(__name__)
 
@@ -120,6 +121,7 @@ class Turns:
         return codes.astype(np.int64), np.maximum(turns, 0)
 
 
+@fixed_sums
 def quarter_turns(maps: Sequence[Session], world_up: ArrayLike | None = None) -> Turns:
     """Find how each camera is mounted or held, from the poses of a capture's map sessions.
 

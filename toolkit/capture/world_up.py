@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from toolkit.capture.session import Session
 from toolkit.errors import CaptureError
 from toolkit.geometry import Floats, Ints
+from toolkit.threads import fixed_sums
 
 MAX_IMAGES = 2000  # images used per session
 SIGMA_ROLL = 0.1  # radians; standard deviation of the roll from the nearest multiple of 90 degrees
@@ -40,6 +41,7 @@ class WorldUp:
     reason: str
 
 
+@fixed_sums
 def estimate_world_up(sessions: Sequence[Session]) -> WorldUp:
     """Estimate the up direction of a capture from the poses of its map sessions, which share one world.
 

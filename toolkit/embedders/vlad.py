@@ -3,6 +3,10 @@
 For each visual word, the residuals of the whitened local descriptors assigned to it are summed (Jegou et al., CVPR
 2010). Residuals and sums are normalized (Delhumeau et al., ACM MM 2013; Arandjelovic and Zisserman, CVPR 2013). The
 result is projected to the principal directions of the map images.
+
+Learning would amplify a rounding error to another vocabulary, so it is exact: whitened descriptors and centroids are
+multiples of powers of two (`_POINT_STEP`, `_CENTROID_STEP`) whose products and sums float32 holds without rounding, in
+any order. The sample and the first centroids are chosen by a hash of each descriptor (`_keys`), not by its index.
 """
 
 import json
@@ -14,21 +18,34 @@ from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from toolkit.capture.images import default_workers, prefetch
 from toolkit.errors import ArtifactError, ToolkitError
-from toolkit.features.features import LocalFeatures
+from toolkit.features.features import DESCRIPTOR_SCALE, LocalFeatures
 from toolkit.features.matching import unit_descriptors
 from toolkit.files import file_fingerprint, require_whole, write_atomic
 from toolkit.geometry import unit
 from toolkit.manifest import VladSettings
+from toolkit.threads import fixed_sums
 
 Floats = NDArray[np.float32]
 
+VLAD_FORMAT = 2
+"""Version of the vocabulary, part of its record. Increase when the same settings give another one."""
 _SHORTEST = 1e-9  # shorter vectors are rounding errors, and are not normalized
 _CHUNK = 8192
-"""Number of local descriptors that are assigned at once. Fixed, so that the result does not depend on the threads."""
+"""Number of local descriptors that are assigned at once."""
+_POINT_STEP, _CENTROID_STEP = np.float32(2**-11), np.float32(2**-8)
+"""Whitened descriptors and centroids are multiples of these. The centroids' step is coarse, so that one that moves by a
+rounding error is the same again."""
+_PROJECTION_BITS = 14
+"""Bits of an entry of the local projection, an integer, so that products with uint8 descriptors stay below 2**24."""
+_KEY_STEPS = 32
+"""Steps per unit in which a descriptor is hashed: one entry off by the last bit usually leaves the hash as it is."""
+
+
+_ARRAYS = ("local_projection", "local_offset", "local_scale", "centroids", "projection")
+"""What a vocabulary file holds, besides the settings."""
 
 
 class Vlad:
@@ -42,7 +59,8 @@ class Vlad:
     def __init__(self, settings: VladSettings, arrays: dict[str, Floats], fingerprint: str = ""):
         self._settings = settings
         self._fingerprint = fingerprint
-        self.local_mean, self.local_projection = arrays["local_mean"], arrays["local_projection"]
+        self.local_projection = arrays["local_projection"]
+        self.local_offset, self.local_scale = arrays["local_offset"], arrays["local_scale"]
         self.centroids, self.projection = arrays["centroids"], arrays["projection"]
 
     @property
@@ -53,6 +71,7 @@ class Vlad:
     def settings(self) -> dict[str, Any]:
         return {"name": self.name, **self._settings.model_dump(), "vocabulary": self._fingerprint}
 
+    @fixed_sums
     def prepare(self, item: LocalFeatures | Floats) -> Floats:
         """Return the VLAD (words * local_dim,) of an image before the projection, of length 1 or 0."""
         if not isinstance(item, LocalFeatures):
@@ -60,7 +79,7 @@ class Vlad:
         vector = np.zeros_like(self.centroids)
         descriptors = _select(item, self._settings)
         if len(descriptors):
-            local = unit(((descriptors - self.local_mean) @ self.local_projection).astype(np.float32), _SHORTEST)
+            local = self._whitened(descriptors)
             nearest = _assign(local, self.centroids)
             residuals = unit(local - self.centroids[nearest], _SHORTEST)
             order = np.argsort(nearest, kind="stable")
@@ -69,11 +88,17 @@ class Vlad:
         flat = vector.reshape(-1)
         return unit(np.sign(flat) * np.sqrt(np.abs(flat)), _SHORTEST)
 
+    def _whitened(self, descriptors: Floats) -> Floats:
+        """Return the whitened local descriptors (N, local_dim), of length about 1."""
+        products: Floats = (descriptors * np.float32(DESCRIPTOR_SCALE)) @ self.local_projection
+        whitened = (products - self.local_offset) * self.local_scale
+        return _rounded(unit(whitened.astype(np.float32), _SHORTEST), _POINT_STEP)
+
     def stack(self, inputs: Sequence[LocalFeatures | Floats]) -> Floats:
         """Return the VLADs of images, (B, words * local_dim)."""
         return np.array([self.prepare(item) for item in inputs], np.float32).reshape(-1, self.centroids.size)
 
-    @threadpool_limits.wrap(limits=1, user_api="blas")  # the products are small: two threads take three times as long
+    @fixed_sums
     def embed(self, inputs: Sequence[LocalFeatures] | Floats) -> Floats:
         """Return the global descriptors (B, dim) of images, or of a batch from `stack`; zeros without features.
 
@@ -83,7 +108,7 @@ class Vlad:
         return batch @ self.projection
 
     @classmethod
-    @threadpool_limits.wrap(limits=1, user_api="blas")
+    @fixed_sums
     def learn(
         cls,
         features: Callable[[], Iterable[LocalFeatures]],
@@ -101,31 +126,27 @@ class Vlad:
             ToolkitError: the images have no local features.
         """
         settings = settings or VladSettings()
-        rng = np.random.default_rng(seed)
         share = -(-settings.sample_descriptors // max(count, 1))
-        parts = []
+        parts, all_keys = [], []
         for image in features():
             descriptors = _select(image, settings)
-            parts.append(descriptors[np.sort(rng.permutation(len(descriptors))[:share])])
+            keys = _keys(descriptors, seed)
+            chosen = np.sort(np.argsort(keys, kind="stable")[:share])
+            parts.append(descriptors[chosen])
+            all_keys.append(keys[chosen])
         sample = np.concatenate(parts) if parts else np.zeros((0, 1), np.float32)
         if len(sample) < 2:
             raise ToolkitError(
                 f"A VLAD vocabulary cannot be learned: {count} map images gave {len(sample)} local features. "
                 f"Check that they can be read and are not blank (`python -m toolkit check CAPTURE`)."
             )
-        mean = sample.mean(axis=0)
-        variance, directions = np.linalg.eigh(np.cov((sample - mean).T.astype(np.float64)))
-        keep = np.argsort(-variance, kind="stable")[: min(settings.local_dim, len(sample) - 1)]
-        # Without a lower bound, whitening would amplify the noise of almost constant directions.
-        scale = np.sqrt(np.maximum(variance[keep], 1e-4 * variance.max() + 1e-12))
-        arrays: dict[str, Floats] = {
-            "local_mean": mean.astype(np.float32),
-            "local_projection": (directions[:, keep] / scale).astype(np.float32),
+        arrays = _whitening(sample, settings.local_dim) | {
+            "centroids": np.zeros((0, 0), np.float32),
             "projection": np.zeros((0, 0), np.float32),
         }
-        local = unit(((sample - arrays["local_mean"]) @ arrays["local_projection"]).astype(np.float32), _SHORTEST)
+        local = cls(settings, arrays)._whitened(sample)
         words = max(1, min(settings.words, len(local) // 8))
-        arrays["centroids"] = _kmeans(local, words, settings.iterations, rng)
+        arrays["centroids"] = _kmeans(local, words, settings.iterations, np.concatenate(all_keys))
         vlad = cls(settings, arrays)
         vectors = np.stack(list(prefetch(vlad.prepare, features(), default_workers())))
         vlad.projection = _principal_projection(vectors, settings)
@@ -147,7 +168,7 @@ class Vlad:
 
     def save(self, path: str | Path) -> None:
         """Write the vocabulary (.npz) and take the file's fingerprint as its own."""
-        arrays = {name: getattr(self, name) for name in ("local_mean", "local_projection", "centroids", "projection")}
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
         settings = np.array(json.dumps(self._settings.model_dump()))
         with write_atomic(path) as temporary, open(temporary, "wb") as stream:
             np.savez(stream, allow_pickle=False, settings=settings, **arrays)
@@ -163,22 +184,68 @@ def _select(image: LocalFeatures, settings: VladSettings) -> Floats:
     return unit_descriptors(image.descriptors[chosen])
 
 
+def _keys(descriptors: Floats, seed: int) -> NDArray[np.uint32]:
+    """Return a number (N,) for each RootSIFT vector that looks random and depends on nothing but the vector."""
+    weights = np.random.default_rng(seed).integers(2**32, size=descriptors.shape[1], dtype=np.uint32)
+    return np.asarray((descriptors * np.float32(_KEY_STEPS)).astype(np.uint32) @ weights)
+
+
+def _rounded(values: Floats, step: np.float32) -> Floats:
+    """Return values rounded to multiples of a power of two."""
+    return np.asarray(np.rint(values / step) * step, np.float32)
+
+
+def _whitening(sample: Floats, dim: int) -> dict[str, Floats]:
+    """Return the PCA whitening of RootSIFT vectors (N, 128): `(512 * vectors @ projection - offset) * scale`.
+
+    The projection (128, dim) holds integers, so products with stored RootSIFT vectors, integers / 512, are exact.
+    """
+    squares, sums = np.zeros((sample.shape[1],) * 2), np.zeros(sample.shape[1])
+    for start in range(0, len(sample), _CHUNK):  # exact in float64, as descriptors are integers / 512
+        part = sample[start : start + _CHUNK].astype(np.float64)
+        squares += part.T @ part
+        sums += part.sum(axis=0)
+    mean = sums / len(sample)
+    variance, directions = np.linalg.eigh((squares - np.outer(sums, mean)) / (len(sample) - 1))
+    keep = np.argsort(-variance, kind="stable")[: min(dim, len(sample) - 1)]
+    directions = directions[:, keep]
+    largest = np.abs(directions).argmax(axis=0)
+    directions *= np.sign(directions[largest, np.arange(len(keep))])  # an eigenvector has no sign of its own
+    projection = np.rint(directions * 2**_PROJECTION_BITS)
+    # Without a lower bound, whitening would amplify the noise of almost constant directions.
+    scale = DESCRIPTOR_SCALE * 2**_PROJECTION_BITS * np.sqrt(np.maximum(variance[keep], 1e-4 * variance.max() + 1e-12))
+    return {
+        "local_projection": projection.astype(np.float32),
+        "local_offset": (DESCRIPTOR_SCALE * mean @ projection).astype(np.float32),
+        "local_scale": (1 / scale).astype(np.float32),
+    }
+
+
 def _assign(points: Floats, centroids: Floats) -> NDArray[np.intp]:
     """Return the index (N,) of each point's nearest centroid."""
     return np.asarray((points @ centroids.T - 0.5 * (centroids**2).sum(axis=1)).argmax(axis=1))
 
 
-def _kmeans(points: Floats, words: int, iterations: int, rng: np.random.Generator) -> Floats:
-    """Return centroids (words, D) by Lloyd's algorithm, starting from random points."""
-    centroids = points[np.sort(rng.permutation(len(points))[:words])].copy()
+def _kmeans(points: Floats, words: int, iterations: int, keys: NDArray[np.uint32]) -> Floats:
+    """Return centroids (words, D) by Lloyd's algorithm.
+
+    Args:
+        keys: (N,) a number of each point; points with the smallest ones are the first centroids.
+    """
+    order = np.unique(keys, return_index=True)[1]  # equal points, as of equal images, are one choice
+    order = np.concatenate([order, np.setdiff1d(np.arange(len(points)), order)])
+    seeds = points[order]
+    centroids, used = _rounded(seeds[:words], _CENTROID_STEP), words
     chunks = np.split(points, range(_CHUNK, len(points), _CHUNK))
     for _ in range(iterations):
         nearest = np.concatenate(list(prefetch(partial(_assign, centroids=centroids), chunks, default_workers())))
-        order = np.argsort(nearest, kind="stable")
-        present, starts, counts = np.unique(nearest[order], return_index=True, return_counts=True)
-        centroids[present] = np.add.reduceat(points[order], starts, axis=0) / counts[:, None]
+        by_word = np.argsort(nearest, kind="stable")
+        present, starts, counts = np.unique(nearest[by_word], return_index=True, return_counts=True)
+        sums = np.add.reduceat(points[by_word], starts, axis=0, dtype=np.float64)
+        centroids[present] = _rounded((sums / counts[:, None]).astype(np.float32), _CENTROID_STEP)
         empty = np.setdiff1d(np.arange(words), present)
-        centroids[empty] = points[rng.integers(len(points), size=len(empty))]
+        centroids[empty] = _rounded(seeds[np.arange(used, used + len(empty)) % len(seeds)], _CENTROID_STEP)
+        used += len(empty)
     return centroids
 
 

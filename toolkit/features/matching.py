@@ -36,6 +36,7 @@ from toolkit.models.weights import (
     find_weights,
     resolve_weights,
 )
+from toolkit.threads import fixed_sums
 
 log = logging.getLogger(__name__)
 
@@ -198,6 +199,7 @@ class MutualMatcher:
             matches.append(self.match_unit(unit_a, unit_descriptors(b.descriptors, self.shorten)))
         return matches
 
+    @fixed_sums
     def match_unit(self, unit_a: NDArray[np.float32], unit_b: NDArray[np.float32]) -> PairMatches:
         """Return the matches of two images, given by their `unit_descriptors`."""
         if not len(unit_a) or not len(unit_b):  # empty descriptors may have another length
@@ -328,6 +330,7 @@ _FAR_REACH = 0.1
 """Reach of a ray, radians, from which it is compared apart."""
 
 
+@fixed_sums
 def match_along_epipolar_lines(
     descriptors_a: NDArray[np.float32],
     descriptors_b: NDArray[np.float32],

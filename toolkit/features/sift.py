@@ -5,6 +5,9 @@ OpenCV's SIFT. Two choices differ from OpenCV, and both give more correct matche
 
 - A keypoint may be up to 0.6 pixels from its pixel, as in VLFeat, so fewer are lost between two pixels.
 - A cell of the descriptor is 4 sigma wide instead of 3.
+
+Matrix products are of integers, or of multiples of a power of two, that float32 sums without rounding. So neither the
+number of threads nor the kernel that BLAS has for a processor changes a feature.
 """
 
 import threading
@@ -19,11 +22,12 @@ from toolkit.features.features import DESCRIPTOR_SCALE, LocalFeatures
 from toolkit.files import Remade
 from toolkit.geometry import Ints
 from toolkit.manifest import SiftSettings
+from toolkit.threads import fixed_sums
 
 Floats = NDArray[np.float32]
 Levels = NDArray[np.int16]
 
-_FORMAT = 5
+_FORMAT = 6
 """Version of the features, part of the settings. Increase when the same settings give other features."""
 _INTERVALS = 3
 """Number of levels per octave in which keypoints are detected."""
@@ -61,6 +65,11 @@ _CELL_SIGMAS = 4.0
 """Width of a descriptor cell, in units of the keypoint's sigma."""
 _MAX_ENTRY = 0.2
 """Limit of the entries of a descriptor of length 1, before it becomes RootSIFT."""
+_SUBPIXELS = 2048
+"""Steps per pixel to which the position of a gradient is rounded; with those of 4,096 pixels, it has 23 bits."""
+_WEIGHT_STEPS, _MAGNITUDE_UNIT = 128, 4
+"""A gradient's weight in a cell and its magnitude are integers: multiples of 1 / 128 of the largest weight, and of 4 of
+the 2**15 gray values. No sum of a cell exceeds 1.1e7, below 2**24, where float32 starts to round."""
 _ROWS = 128
 """Number of rows in which extrema are searched at once, so that they fit into the processor's cache."""
 _CHUNK = 256
@@ -94,6 +103,7 @@ class SiftExtractor(Remade):
     def settings(self) -> dict[str, Any]:
         return {"name": "sift", **self._settings.model_dump(), "format": _FORMAT}
 
+    @fixed_sums
     def extract(self, images: Sequence[NDArray[np.uint8]]) -> list[LocalFeatures]:
         """Return the features of images, (H, W) gray or (H, W, 3) RGB, uint8."""
         return [self._extract(image) for image in images]
@@ -319,12 +329,15 @@ class _Grid(NamedTuple):
     """K positions around a keypoint at which gradients are sampled."""
 
     xy1: Floats
-    """(K, 3) x and y in units of the keypoint's sigma, and ones."""
+    """(K, 3) x and y in steps, multiples of a half, and ones."""
+    step: float
+    """Distance of two neighbors, in units of the keypoint's sigma."""
 
     @classmethod
-    def square(cls, along: NDArray[np.float64]) -> "_Grid":
-        y, x = np.meshgrid(along.astype(np.float32), along.astype(np.float32), indexing="ij")
-        return cls(np.stack([x.ravel(), y.ravel(), np.ones(x.size, np.float32)], axis=1))
+    def square(cls, side: int, step: float) -> "_Grid":
+        along = np.arange(side, dtype=np.float32) - np.float32((side - 1) / 2)
+        y, x = np.meshgrid(along, along, indexing="ij")
+        return cls(np.stack([x.ravel(), y.ravel(), np.ones(x.size, np.float32)], axis=1), step)
 
     def gradients(self, pyramid: _Pyramid, keypoints: _Keypoints, angles: Floats) -> tuple[Floats, Floats]:
         """Return magnitude (K, N) and direction (K, N), 0 to 2 pi, of the gradients around N keypoints.
@@ -339,10 +352,13 @@ class _Grid(NamedTuple):
         height = pyramid.heights[keypoints.octave].astype(np.int32)
         width = pyramid.widths[keypoints.octave].astype(np.int32)
         start = pyramid.starts[keypoints.octave] + keypoints.level * pyramid.sizes[keypoints.octave]
-        cos, sin = np.cos(angles) * keypoints.sigma, np.sin(angles) * keypoints.sigma
+        step = keypoints.sigma * np.float32(self.step)
         # Adding a half makes the conversion to integers round.
-        column = (self.xy1 @ np.stack([cos, -sin, keypoints.x + np.float32(0.5)])).astype(np.int32)
-        row = (self.xy1 @ np.stack([sin, cos, keypoints.y + np.float32(0.5)])).astype(np.int32)
+        half = np.float32(0.5)
+        vectors = np.stack([np.cos(angles) * step, np.sin(angles) * step, keypoints.x + half, keypoints.y + half])
+        cos, sin, x, y = np.rint(vectors * np.float32(_SUBPIXELS)) * np.float32(1 / _SUBPIXELS)
+        column = (self.xy1 @ np.stack([cos, -sin, x])).astype(np.int32)
+        row = (self.xy1 @ np.stack([sin, cos, y])).astype(np.int32)
         inside = (column >= 1) & (column < width - 1) & (row >= 1) & (row < height - 1)
         row *= width
         row += column
@@ -357,8 +373,10 @@ class _Grid(NamedTuple):
         return magnitude, direction
 
 
-_WINDOW = _Grid.square(np.arange(-4.125, 4.5, 0.75))
-_WINDOW_WEIGHTS = np.exp(-(_WINDOW.xy1[:, :2] ** 2).sum(axis=1, keepdims=True) / (2 * _WINDOW_SIGMA**2))
+_WINDOW = _Grid.square(12, 0.75)
+_WINDOW_WEIGHTS = np.exp(
+    -((_WINDOW.step * _WINDOW.xy1[:, :2]) ** 2).sum(axis=1, keepdims=True) / (2 * _WINDOW_SIGMA**2)
+)
 
 
 def _chunks(keypoints: _Keypoints) -> Iterator[Ints]:
@@ -389,12 +407,12 @@ def _orientations(pyramid: _Pyramid, keypoints: _Keypoints) -> tuple[Ints, Float
 
 
 def _descriptor_grid() -> tuple[_Grid, Floats]:
-    """Return the grid of the descriptor's K gradients, and the weight (16, K) of each in each cell."""
+    """Return the grid of the descriptor's K gradients, and the weight (16, K) of each in each cell, an integer."""
     along = (np.arange(15) - 7) / 3  # in cells: three gradients per cell, and half a cell more on both sides
     centers = np.arange(_CELLS) - (_CELLS - 1) / 2
     shares = np.maximum(1 - np.abs(along - centers[:, None]), 0) * np.exp(-((along / _CELLS) ** 2) * 2)
     weights = (shares[:, None, :, None] * shares[None, :, None, :]).reshape(_CELLS**2, -1)
-    return _Grid.square(along * _CELL_SIGMAS), weights.astype(np.float32)
+    return _Grid.square(len(along), _CELL_SIGMAS / 3), np.rint(weights * _WEIGHT_STEPS).astype(np.float32)
 
 
 _DESCRIPTOR, _CELL_WEIGHTS = _descriptor_grid()
@@ -408,6 +426,7 @@ def _descriptors(pyramid: _Pyramid, keypoints: _Keypoints, angles: Floats) -> ND
         direction -= angles[index]
         direction *= np.float32(_DIRECTIONS / (2 * np.pi))
         direction += (direction < 0) * np.float32(_DIRECTIONS)
+        magnitude *= np.float32(1 / _MAGNITUDE_UNIT)
         share = np.empty_like(direction)
         for center in range(_DIRECTIONS):  # a gradient is shared by the two directions next to its own
             np.abs(np.subtract(direction, np.float32(center), out=share), out=share)
@@ -416,6 +435,7 @@ def _descriptors(pyramid: _Pyramid, keypoints: _Keypoints, angles: Floats) -> ND
             np.subtract(np.float32(1), share, out=share)
             cv2.threshold(share, 0, 0, cv2.THRESH_TOZERO, dst=share)  # np.maximum takes seven times as long
             share *= magnitude
+            np.rint(share, out=share)
             cells[index, :, center] = (_CELL_WEIGHTS @ share).T
     descriptors = cells.reshape(len(angles), -1)
     descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-12)

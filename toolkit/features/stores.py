@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from toolkit.capture import Session
-from toolkit.capture.images import default_workers, one_thread, prefetch, read_image
+from toolkit.capture.images import default_workers, prefetch, read_image
 from toolkit.errors import ArtifactError, DamagedError, ImageError, first_line
 from toolkit.features.features import DESCRIPTOR_SCALE, KINDS, Extractor, LocalFeatures, extract_turned
 from toolkit.features.groups import HDF5_ERRORS, GroupWriter, group_names_of, has_group, read_group
@@ -34,6 +34,7 @@ from toolkit.features.matching import Matcher, PairMatches
 from toolkit.features.sift import SiftExtractor
 from toolkit.files import files_fingerprint, fingerprint, read_sidecar
 from toolkit.geometry import Ints
+from toolkit.threads import one_thread
 
 log = logging.getLogger(__name__)
 

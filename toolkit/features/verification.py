@@ -14,6 +14,7 @@ from toolkit.features.features import LocalFeatures
 from toolkit.features.matching import Matcher
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import RerankSettings
+from toolkit.threads import fixed_sums
 
 MAP_IMAGES_KEPT = 256
 """Number of map images whose features stay in memory, about 60 MB."""
@@ -31,6 +32,7 @@ class Verifier:
         self.store = store
         self._map_features = lru_cache(MAP_IMAGES_KEPT)(lambda name: self._strongest(store[name]))
 
+    @fixed_sums
     def verify(
         self,
         features: LocalFeatures,
@@ -76,6 +78,7 @@ class Verified(NamedTuple):
     """(3, 3) the essential matrix."""
 
 
+@fixed_sums
 def verified_matches(
     camera_a: pycolmap.Camera,
     pixels_a: NDArray[np.floating],

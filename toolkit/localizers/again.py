@@ -6,8 +6,6 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
-from threadpoolctl import threadpool_limits
-
 from toolkit.capture import Session
 from toolkit.capture.upright import Turns
 from toolkit.errors import ArtifactError, ManifestError
@@ -18,6 +16,7 @@ from toolkit.localizers.correspondences import LocalizedQuery
 from toolkit.localizers.map import Map, create_localizer
 from toolkit.localizers.queries import ReferencesOfImage, localized_query, references_of_images, stored_query
 from toolkit.manifest import LocalizeSettings
+from toolkit.threads import fixed_sums
 
 MADE_BEFORE = ("features", "matcher", "map", "unit", "world_up")
 """Settings that the stored features and map points depend on, so they cannot change."""
@@ -49,6 +48,7 @@ class LocalizeAgain:
             )
         return settings
 
+    @fixed_sums
     def localize(self, rows: Ints, settings: LocalizeSettings) -> tuple[PoseEstimate, LocalizedQuery, float]:
         """Return the estimate of a query, its correspondences, and the seconds that localization took.
 
@@ -63,8 +63,7 @@ class LocalizeAgain:
         stores = [] if settings.method in WITHOUT_FEATURES else self._stores
         started = time.perf_counter()
         query, references = stored_query(self.session, rows, references_of_image, stores, (), turns)
-        with threadpool_limits(1, "blas"):  # the same order of sums, and so the same result, as in a run
-            estimate = self.map.judged(localizer.localize(query, references))
+        estimate = self.map.judged(localizer.localize(query, references))
         seconds = time.perf_counter() - started
         return estimate, localized_query(query, estimate, localizer.image_names), seconds
 

@@ -32,6 +32,7 @@ from toolkit.localizers.robust import (
     noise_variance,
     rigid_poses,
 )
+from toolkit.threads import fixed_sums
 
 OUTLIER_SHARE = 0.2  # expected share of wrong references
 WRONG_PLACE = 20.0  # least extent of the space of wrong centers, in multiples of the expected noise
@@ -117,6 +118,7 @@ class Alignment:
         return int(self.inliers.sum())
 
 
+@fixed_sums
 def align_to_map(
     model_from_cams: ArrayLike,
     world_from_cams: ArrayLike,

@@ -21,6 +21,7 @@ from toolkit.localizers.references import select_references
 from toolkit.localizers.robust import AlignmentError
 from toolkit.manifest import PredictorSettings
 from toolkit.models.compute import RUNNING
+from toolkit.threads import fixed_sums
 
 FOCAL_TOLERANCE = 0.2
 """Difference between the log focal length ratios (predicted over stated) of query and references above which the stated
@@ -104,6 +105,7 @@ class FeedForwardLocalizer:
         """Queries expected in the next call of `predict`, and their groups."""
         self.image_names, self.batch_size = local_map.image_names, self.settings.batch_size
 
+    @fixed_sums
     def localize(
         self,
         query: Query,
@@ -114,6 +116,7 @@ class FeedForwardLocalizer:
         """Return the predicted pose of a query; see `Localizer`."""
         return self.answer(query, references, prediction).estimate
 
+    @fixed_sums
     def answer(
         self, query: Query, references: Sequence[References], prediction: QueryPrediction | None = None
     ) -> FeedForwardAnswer:

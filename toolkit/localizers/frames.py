@@ -22,6 +22,7 @@ from toolkit.localizers.picture import Picture, localize_image
 from toolkit.localizers.pose_graph import FAR, PlacedPiece, is_sure
 from toolkit.localizers.recording import localize_piece, queries_of
 from toolkit.manifest import SequenceSettings
+from toolkit.threads import fixed_sums
 
 Pictures = Picture | Sequence[Picture] | None
 """The picture of a frame, one picture per camera of a rig, or None for a frame with odometry only."""
@@ -63,6 +64,7 @@ def _localize(
         return PoseEstimate(f"failed: {error}")
 
 
+@fixed_sums
 def localize_sequence(
     map_: Map,
     images: Sequence[Pictures],
@@ -165,6 +167,7 @@ class SequenceLocalizer:
         self.single: PoseEstimate | None = None
         """Estimate from the latest frame's picture alone; None if it had no picture."""
 
+    @fixed_sums
     def add(
         self, timestamp: int, odom_from_rig: ArrayLike, image: Pictures = None, cameras: Cameras | None = None
     ) -> PoseEstimate:

@@ -9,6 +9,7 @@ from toolkit.localizers.base import PoseEstimate, Prior, Query, QueryInput, Refe
 from toolkit.localizers.feed_forward import FeedForwardLocalizer, QueryPrediction
 from toolkit.localizers.lifting import DepthLifter
 from toolkit.localizers.pnp import PnpLocalizer
+from toolkit.threads import fixed_sums
 
 TIE = 0.8  # share of the lifted pose's matches above which the pose from matching alone is kept
 
@@ -26,6 +27,7 @@ class HybridLocalizer:
         """Return the prediction of the network for each query; see `Localizer`."""
         return self.feed_forward.predict(queries, following)
 
+    @fixed_sums
     def localize(
         self,
         query: Query,

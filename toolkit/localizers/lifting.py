@@ -21,6 +21,7 @@ from toolkit.localizers.matches import MappedFeatures
 from toolkit.localizers.pnp import PnpLocalizer
 from toolkit.localizers.rig import Matches, RigQuery, least_squares_covariance
 from toolkit.manifest import PnpSettings
+from toolkit.threads import fixed_sums
 
 DEPTH_MAP_STD = 0.01  # relative standard deviation of the scale of a depth map
 LEAST_LIFTED = 20  # features of a map image with depth from its depth maps; with fewer, predicted depth is used
@@ -63,6 +64,7 @@ class DepthLifter:
     def __init__(self, pnp: PnpLocalizer, feed_forward: FeedForwardLocalizer) -> None:
         self._first, self._pnp, self._feed_forward = pnp.matcher.mapped[0], pnp, feed_forward
 
+    @fixed_sums
     def localize(
         self, query: Query, references: Sequence[References], answer: FeedForwardAnswer, priors: Sequence[Prior] = ()
     ) -> PoseEstimate | None:

@@ -11,7 +11,6 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
-from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
 from toolkit import geometry
@@ -31,6 +30,7 @@ from toolkit.localizers.tiles import JoinedImages, home_of, join_tiles, plan_til
 from toolkit.localizers.triangulation import triangulate
 from toolkit.manifest import MapSettings
 from toolkit.runs.cluster import current_cluster
+from toolkit.threads import fixed_sums
 
 _ToMatch = tuple[str, str, int, int]
 """A pair to match: group in the match file, fingerprint of the inputs of the matches, indices of the two images."""
@@ -172,6 +172,7 @@ def _kind_of(features: FeatureStore) -> FeatureKind:
     return feature_kind(features.settings.get("name", "sift"))
 
 
+@fixed_sums
 def build_map(
     session: Session,
     features: FeatureStore,
@@ -278,8 +279,7 @@ class MapPlan(Remade):
             self.groups,
             self.session.images["sensor_id"].to_numpy()[self.rows].tolist(),
         )
-        with threadpool_limits(1, "blas"):
-            return Survey(surveyed, lambda index: self.features[self.names[index]], self.kind)
+        return Survey(surveyed, lambda index: self.features[self.names[index]], self.kind)
 
     @cached_property
     def of_worker(self) -> Any:

@@ -26,6 +26,7 @@ from toolkit.localizers.matches import MappedFeatures
 from toolkit.localizers.pnp import PnpLocalizer
 from toolkit.localizers.triangulation import triangulate
 from toolkit.manifest import MapSettings, PnpSettings
+from toolkit.threads import fixed_sums
 
 FeatureSource = Callable[[str], LocalFeatures]
 """Returns the features of a map image, given by name; no features if the image cannot be read."""
@@ -85,6 +86,7 @@ class OnDemandLocalizer(WithoutNetwork):
         self._network = Lock()
         self.image_names = posed.names
 
+    @fixed_sums
     def localize(
         self, query: Query, references: Sequence[References], prediction: None = None, priors: Sequence[Prior] = ()
     ) -> PoseEstimate:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from toolkit.capture.cameras import camera_text, parse_camera
 from toolkit.capture.images import pixels_of, stored_size
@@ -21,6 +20,7 @@ from toolkit.features.sift import SiftExtractor
 from toolkit.features.stores import as_stored
 from toolkit.localizers.base import PoseEstimate, Prior, Query, RoughPose, View
 from toolkit.localizers.map import Map
+from toolkit.threads import fixed_sums
 
 _MAX_DEVIATION = 1e-3
 """Largest deviation of R @ R.T from the identity for a rotation R; rounding to float32 or in files stays below."""
@@ -28,7 +28,7 @@ Picture = Any
 """A file (str, Path), or pixels as `pixels_from` takes them."""
 
 
-@threadpool_limits.wrap(limits=1, user_api="blas")  # fixed order of sums, as in a run
+@fixed_sums
 def localize_image(
     place: Map,
     image: Picture | Sequence[Picture],

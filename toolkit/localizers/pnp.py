@@ -33,6 +33,7 @@ from toolkit.localizers.matches import MapMatcher, MappedFeatures, MatchCache, V
 from toolkit.localizers.misfit import find_misfit
 from toolkit.localizers.rig import Matches, RigQuery, least_squares_covariance
 from toolkit.manifest import PnpSettings
+from toolkit.threads import fixed_sums
 
 PNP_FORMAT = 3
 """Version of the poses. Increase when the same settings and files give other poses."""
@@ -75,6 +76,7 @@ class PnpLocalizer(WithoutNetwork):
     def image_names(self) -> list[str]:
         return self.map.image_names
 
+    @fixed_sums
     def localize(
         self, query: Query, references: Sequence[References], prediction: None = None, priors: Sequence[Prior] = ()
     ) -> PoseEstimate:

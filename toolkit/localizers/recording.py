@@ -17,6 +17,7 @@ from toolkit.localizers.gravity import Gravity
 from toolkit.localizers.odometry import UNKNOWN_COVARIANCE, Odometry, PosedQueries, place, vote_weights
 from toolkit.localizers.pose_graph import PlacedPiece, place_online, place_piece
 from toolkit.manifest import SequenceSettings
+from toolkit.threads import fixed_sums
 
 Relocalize = Callable[[Sequence[tuple[int, RoughPose]]], Sequence[PoseEstimate]]
 """Function that localizes queries again: takes (frame in the piece, predicted pose) pairs, returns their estimates."""
@@ -42,6 +43,7 @@ STEPS = ("voted", "graph", "again")
 after doubtful queries were localized again. The second pose graph, or bundle adjustment after it, gives the result."""
 
 
+@fixed_sums
 def localize_piece(
     odometry: Odometry,
     queries: PosedQueries,

@@ -26,6 +26,7 @@ from toolkit.features.verification import verified_matches
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.local_map import OPENGL_AXES, Consistency, LocalMap
 from toolkit.manifest import RerankSettings
+from toolkit.threads import fixed_sums
 
 ANCHORS = 12
 """Number of images, evenly spread over the map, that are matched with their neighbors."""
@@ -98,6 +99,7 @@ class VerifiedPair(NamedTuple):
 class Survey:
     """Matches a sample of the map images without their poses, and compares the matches with the poses."""
 
+    @fixed_sums
     def __init__(self, images: SurveyedImages, load: Callable[[int], LocalFeatures], kind: FeatureKind):
         """
         Args:
@@ -156,6 +158,7 @@ class Survey:
             depth = 10 * float(np.median(KDTree(centers).query(centers, k=2)[0][:, 1])) if len(centers) > 1 else 0.0
         return depth / NOMINAL_DEPTH or 1.0
 
+    @fixed_sums
     def consistency(self, local_map: LocalMap) -> Consistency:
         """Judge the poses of the map.
 

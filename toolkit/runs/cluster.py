@@ -17,7 +17,6 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
 from toolkit import __version__
@@ -26,6 +25,7 @@ from toolkit.capture.images import WORKERS, default_workers
 from toolkit.capture.names import ALLOW_OUTSIDE
 from toolkit.errors import ManifestError, ToolkitError, first_line
 from toolkit.files import environment_variable
+from toolkit.threads import fixed_sums
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -137,7 +137,7 @@ def _run_share(here: str, environment: Mapping[str, str], pickled: bytes) -> Non
         os.environ.update(environment)
         # The function has threads of its own; BLAS threads on top of them would only wait for each other. Standard
         # error is dropped because the submitter already shows a progress bar.
-        with threadpool_limits(1, "blas"), open(os.devnull, "w") as nowhere, redirect_stderr(nowhere):
+        with fixed_sums, open(os.devnull, "w") as nowhere, redirect_stderr(nowhere):
             function, share = pickle.loads(pickled)
             function(*share)
 

@@ -1,0 +1,109 @@
+"""What is computed depends on no number of threads, and features, vocabularies and matches on no BLAS kernel.
+
+`make test-kernels` runs the tests of numbers under other kernels and numbers of threads, too.
+"""
+
+import os
+import subprocess
+import sys
+import threading
+from contextlib import suppress
+
+import cv2
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
+
+from toolkit.threads import fixed_sums, one_thread
+
+
+def blas_threads() -> set[int]:
+    return {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
+
+
+def test_sums_are_fixed_within_and_the_limit_of_the_caller_holds_after() -> None:
+    with threadpool_limits(2, "blas"):
+        before = blas_threads()
+        with suppress(ValueError), fixed_sums:
+            with fixed_sums:
+                pass
+            assert blas_threads() == {1}, "the outer one is still entered"
+            raise ValueError
+        assert blas_threads() == before != {1}
+
+
+def test_the_limit_ends_with_the_last_thread_that_entered() -> None:
+    entered, leave, seen = threading.Event(), threading.Event(), list[set[int]]()
+
+    def stay() -> None:
+        with fixed_sums:
+            entered.set()
+            leave.wait()
+            seen.append(blas_threads())
+
+    with threadpool_limits(2, "blas"):
+        other = threading.Thread(target=stay)
+        other.start()
+        entered.wait()
+        with fixed_sums:
+            pass
+        leave.set()
+        other.join()
+        assert seen == [{1}], "another thread that left must not end the limit"
+        assert blas_threads() != {1}
+
+
+def test_one_thread_each_and_then_as_before() -> None:
+    def threads() -> list[int]:
+        blas = [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+        return [cv2.getNumThreads(), *blas]
+
+    cv2_threads = cv2.getNumThreads()
+    cv2.setNumThreads(2)
+    try:
+        with threadpool_limits(2, "blas"):
+            before = threads()
+            inside = []
+            with suppress(ValueError), one_thread():
+                inside = threads()
+                raise ValueError
+            assert set(inside) == {1}
+            assert threads() == before
+            assert max(before) == 2
+    finally:
+        cv2.setNumThreads(cv2_threads)
+
+
+NUMBERS = """
+import hashlib, sys
+import cv2, numpy as np
+from threadpoolctl import threadpool_limits
+from toolkit.embedders.vlad import Vlad, VladSettings
+from toolkit.features.features import KINDS
+from toolkit.features.matching import MutualMatcher
+from toolkit.features.sift import SiftExtractor
+
+rng = np.random.default_rng(0)
+noise = [cv2.GaussianBlur(rng.integers(0, 256, (240, 320), np.uint8), (0, 0), 2.0) for _ in range(3)]
+with threadpool_limits(int(sys.argv[1]), "blas"):
+    images = SiftExtractor().extract([*noise, np.roll(noise[0], 9, axis=1)])
+    vlad = Vlad.learn(lambda: iter(images), len(images), VladSettings(words=32))
+    matches = MutualMatcher.of(KINDS["sift"]).match([(images[0], images[3])])[0]
+arrays = [images[0].keypoints, images[0].descriptors, vlad.centroids, vlad.local_projection, vlad._whitened(
+    images[0].descriptors / np.float32(512)), matches.indices, matches.scores]
+print(len(matches.indices), *(hashlib.sha1(np.ascontiguousarray(array)).hexdigest()[:8] for array in arrays))
+"""
+
+
+def numbers(kernel: str, threads: int) -> list[str]:
+    environment = os.environ | {"OPENBLAS_CORETYPE": kernel, "OPENBLAS_NUM_THREADS": "2"}
+    command = [sys.executable, "-c", NUMBERS, str(threads)]
+    return subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout.split()
+
+
+@pytest.mark.skipif(np.__config__.show("dicts")["Machine Information"]["host"]["cpu"] != "x86_64", reason="x86 kernels")
+def test_features_vocabulary_and_matches_are_the_same_for_every_kernel_and_number_of_threads() -> None:
+    expected = numbers("Haswell", 1)
+    assert int(expected[0]) > 100
+    for kernel, threads in (("Haswell", 2), ("Prescott", 1), ("Prescott", 2)):
+        assert numbers(kernel, threads) == expected, (kernel, threads)
