@@ -90,9 +90,9 @@ class Vlad:
 
     def _whitened(self, descriptors: Floats) -> Floats:
         """Return the whitened local descriptors (N, local_dim), of length about 1."""
-        products: Floats = (descriptors * np.float32(DESCRIPTOR_SCALE)) @ self.local_projection
-        whitened = (products - self.local_offset) * self.local_scale
-        return _rounded(unit(whitened.astype(np.float32), _SHORTEST), _POINT_STEP)
+        products = (descriptors * np.float32(DESCRIPTOR_SCALE)) @ self.local_projection
+        whitened = np.asarray((products - self.local_offset) * self.local_scale, np.float32)
+        return _rounded(unit(whitened, _SHORTEST), _POINT_STEP)
 
     def stack(self, inputs: Sequence[LocalFeatures | Floats]) -> Floats:
         """Return the VLADs of images, (B, words * local_dim)."""
