@@ -96,7 +96,7 @@ def small_run(small_capture: Path, made_once: Callable[[str, Callable[[Path], ob
         manifest = folder / "small.yaml"
         manifest.write_text(f"description: a small run\ncaptures: ['{small_capture}']\n")
         overrides = [f"output_root={folder}", "visualize.samples=1"]
-        pipeline.run(manifest, overrides=overrides, say=lambda *a, **k: None)
+        pipeline.run(manifest, overrides=overrides, say=lambda *a, **k: None, in_place=True)
 
     return made_once("run", make) / "small"
 

@@ -112,7 +112,7 @@ def go(place: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[str, 
         """Run the manifest and return what became of each stage."""
         lines: list[str] = []
         pipeline.run(
-            place / "run.yaml", overrides=overrides, say=lambda *a, **k: lines.append(a[0]), **options
+            place / "run.yaml", overrides=overrides, say=lambda *a, **k: lines.append(a[0]), in_place=True, **options
         )
         record = json.loads((place / "runs/run/run.json").read_text())
         assert record["status"] == "done"

@@ -383,7 +383,7 @@ def test_one_capture_that_fails_does_not_stop_the_others(here: Path, command: Ca
     shutil.copytree(here / "P", here / "Q")
     code = "from toolkit.errors import CaptureError\nif '/P/' in out_jsonl:\n    raise CaptureError('a dragon')"
     write_notebook(here / "notebooks", "retrieve", PARAMETERS, code)
-    assert command("run", "run.yaml", "--set", "captures=[P, Q]") == 2
+    assert command("run", "run.yaml", "--set", "captures=[P, Q]", "--in-place") == 2
     record = record_of(here)
     assert record["status"] == "incomplete"
     assert {(row["scene"], row["stage"]): row["status"] for row in record["stages"]} == {
@@ -395,13 +395,14 @@ def test_one_capture_that_fails_does_not_stop_the_others(here: Path, command: Ca
 def test_one_pair_that_fails_does_not_stop_the_others(here: Path) -> None:
     code = "from toolkit.errors import CaptureError\nif query_device == 'hl':\n    raise CaptureError('a dragon')"
     write_notebook(here / "notebooks", "retrieve", PARAMETERS, code)
-    pipeline.run(here / "run.yaml", overrides=["pairs=[[ios, hl], [ios, ios]]"], say=quiet)
+    pipeline.run(here / "run.yaml", overrides=["pairs=[[ios, hl], [ios, ios]]"], say=quiet, in_place=True)
     record = record_of(here)
     assert (record["status"], record["exit_code"]) == ("incomplete", 2)
     assert [row["status"] for row in record["stages"] if row["stage"] == "retrieve"] == ["failed", "done"]
     assert record["failed"]["pairs"] == {"failed": 1, "of": 2}
     assert "`devices:`" in record["error"]
-    pipeline.run(here / "run.yaml", overrides=["pairs=[[ios, hl], [ios, ios]]", "tolerate_failed.pairs=0.5"], say=quiet)
+    overrides = ["pairs=[[ios, hl], [ios, ios]]", "tolerate_failed.pairs=0.5"]
+    pipeline.run(here / "run.yaml", overrides=overrides, say=quiet, in_place=True)
     assert record_of(here)["exit_code"] == 0
 
 

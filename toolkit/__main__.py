@@ -75,8 +75,16 @@ def run(
     force: Annotated[bool, typer.Option("--force", help="Also run stages that are up to date.")] = False,
     overrides: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Replace a setting, e.g. localize.method=nearest."),
+        typer.Option(
+            "--set", metavar="KEY=VALUE", help="Replace a setting, e.g. localize.method=nearest; in a run of its own."
+        ),
     ] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the run folder; default: the manifest's, with what --set changes.")
+    ] = None,
+    in_place: Annotated[
+        bool, typer.Option("--in-place", help="With --set: replace the results of the manifest's own run.")
+    ] = False,
     cluster: Annotated[
         str | None,
         typer.Option(
@@ -105,16 +113,18 @@ def run(
 
     tell = partial(print, file=sys.stderr) if as_json else print
     try:
+        if sweeps and (name or in_place):
+            raise ManifestError("--sweep names its runs itself: leave out --name and --in-place.")
         if sweeps:
             options = {"only": only, "force": force, "cluster": cluster}
             _sweep(manifest, sweeps, overrides or (), tell, as_json, **options)
             return
-        run_dir = pipeline.run(manifest, only=only, force=force, overrides=overrides or (), say=tell, cluster=cluster)
+        run_dir = pipeline.run(manifest, only, force, overrides or (), tell, cluster, name, in_place)
     except BaseException as error:
         if as_json:
             status = {IncompleteError: "incomplete", KeyboardInterrupt: "interrupted"}.get(type(error), "failed")
             outcome = {"status": status, "exit_code": exit_code(error), "error": sentence(error)}
-            _print_json(_summary_of_stopped(manifest, overrides or ()) | outcome)
+            _print_json(_summary_of_stopped(manifest, overrides or (), name, in_place) | outcome)
         raise
     tell(f"Report: {run_dir / 'report.html'}")
     result = summary(run_dir)
@@ -469,15 +479,16 @@ def _compare(
         tell(f"Comparison: {page}")
 
 
-def _summary_of_stopped(manifest: Path, overrides: Sequence[str]) -> dict[str, Any]:
+def _summary_of_stopped(manifest: Path, overrides: Sequence[str], name: str | None, in_place: bool) -> dict[str, Any]:
     """Return the summary of the run that this process started; empty if it had not started."""
     from toolkit.files import read_json
     from toolkit.manifest import load_manifest
+    from toolkit.pipeline import own_run
     from toolkit.runs.record import RECORD, summary
 
     with suppress(ToolkitError, OSError):
         content = load_manifest(manifest, overrides)
-        run_dir = Path(content.output_root) / content.name
+        run_dir = Path(content.output_root) / (content.name if in_place else own_run(manifest, overrides, name)[0])
         if read_json(run_dir / RECORD).get("pid") == os.getpid():
             return summary(run_dir)
     return {}

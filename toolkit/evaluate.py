@@ -22,6 +22,7 @@ from toolkit.files import (
     read_map_record,
     read_references,
     require_whole,
+    why_older,
     write_atomic,
     write_sidecar,
 )
@@ -115,6 +116,7 @@ def evaluate_scene(
     errors: list[pd.DataFrame] = []
     messages: list[str] = []
     references_dir = retrieval_dir and (reranked_dir or retrieval_dir)
+    sources: list[Path] = []
     for query in capture.devices_with("query", query_device):
         maps = [map_ for map_ in map_devices if pairs is None or [map_, query] in map(list, pairs)]
         if not maps:
@@ -141,7 +143,14 @@ def evaluate_scene(
                     table.append({**pair, "state": "no queries" if no_queries else "no ground truth"})
                 continue
             good = None
-            if references_dir is not None:
+            read = [Path(poses_dir) / f"{name}{end}" for end in (".txt", ".csv", "_sequence.txt")]
+            read += [Path(folder) / f"{name}.jsonl" for folder in (retrieval_dir, reranked_dir) if folder is not None]
+            sources += filter(Path.is_file, read)
+            older = why_older(Path(poses_dir) / f"{name}.txt", "localize", (".jsonl",), missing=False)
+            if older:
+                messages.append(f"{older} Retrieval is not judged.")
+                rows["retrieval"].append({**pair, "state": f"{LEFT_OUT}{older}"})
+            elif references_dir is not None:
                 path = Path(references_dir) / f"{name}.jsonl"
                 row, good = _retrieval_recall(
                     path, keys, truth, capture[f"{map_}_map"], settings.retrieval_ks, near, length
@@ -188,7 +197,7 @@ def evaluate_scene(
         logger.warning(message)
     if out_dir is not None:
         record = {"poses": str(poses_dir), "queries": queries, "at": at, **settings.model_dump()}
-        write_evaluation(evaluation, out_dir, record | {"messages": evaluation.messages})
+        write_evaluation(evaluation, out_dir, record | {"messages": evaluation.messages}, sources)
     return evaluation
 
 
@@ -240,8 +249,10 @@ def _unreadable(capture: Capture, session_id: str) -> str:
     return ""
 
 
-def write_evaluation(evaluation: Evaluation, out_dir: str | Path, settings: dict[str, Any]) -> None:
-    """Write the tables as CSV, the figures as PNG, and the settings to the sidecar of recall.csv."""
+def write_evaluation(
+    evaluation: Evaluation, out_dir: str | Path, settings: dict[str, Any], sources: Sequence[Path] = ()
+) -> None:
+    """Write the tables as CSV, the figures as PNG, and settings and `sources` to the sidecar of recall.csv."""
     out = Path(out_dir)
     written = [out / f"{name}.csv" for name in ("recall", "errors", "retrieval", "losses", "overlap")]
     tables = {path: getattr(evaluation, path.stem) for path in written}
@@ -261,7 +272,7 @@ def write_evaluation(evaluation: Evaluation, out_dir: str | Path, settings: dict
             written.append(out / f"{name}.png")
         else:  # a figure of an earlier evaluation would mislead
             (out / f"{name}.png").unlink(missing_ok=True)
-    write_sidecar(out / "recall.csv", settings, written[1:])
+    write_sidecar(out / "recall.csv", settings, written[1:], made_from=sources)
     logger.info("Evaluated %d of %d pairs: %s", (evaluation.recall["state"] == "evaluated").sum(),
                 len(evaluation.recall), out / "recall.csv")  # fmt: skip
 
@@ -514,6 +525,10 @@ def overlap_table(
             continue
         if causes := [cause for folder in references.values() if (cause := left_out(folder, name))]:
             row["state"] = f"{LEFT_OUT}{causes[0]}"  # the files are those of an earlier run
+            continue
+        maps_of = None if poses_dir is None else Path(poses_dir) / f"{name}.txt"
+        if maps_of is not None and (older := why_older(maps_of, "localize", (".npz",), missing=False)):
+            row["state"] = f"{LEFT_OUT}{older}"
             continue
         local_map = load(map_files(map_dir, f"{map_}_map", h5))
         for column, folder in references.items():

@@ -113,6 +113,17 @@ def environment_variable(name: str, value: str) -> Iterator[None]:
             os.environ[name] = before
 
 
+def link_or_copy(source: str | Path, target: str | Path) -> None:
+    """Make `target` a hard link to a file of a run, or a copy if the disk does not support links.
+
+    Either way, no change of one shows in the other: the toolkit never changes a file, but replaces it as a whole.
+    """
+    try:
+        os.link(source, target)
+    except OSError:  # another disk, or one without hard links
+        shutil.copy2(source, target)
+
+
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file atomically; see `write_atomic`."""
     with write_atomic(path) as temporary:
@@ -169,6 +180,7 @@ def write_sidecar(
     settings: dict[str, Any],
     others: Iterable[str | Path] = (),
     *,
+    made_from: Iterable[str | Path] = (),
     checksums: bool = True,
     unfinished: bool = False,
 ) -> None:
@@ -178,6 +190,7 @@ def write_sidecar(
 
     Args:
         others: further files beside it that belong to the artifact.
+        made_from: existing files that it was made from, see `changed_sources`.
         checksums: False for a file that contains checksums of its own; only its size is recorded.
         unfinished: a part of the artifact failed and must be tried again: this run uses it, later runs do not reuse it.
     """
@@ -186,6 +199,7 @@ def write_sidecar(
         "version": __version__,
         "fingerprint": fingerprint(settings),
         "files": {file.name: [file.stat().st_size, checksum(file) if checksums else None] for file in files},
+        "made_from": {os.path.relpath(source, Path(path).parent): _content(source) for source in made_from},
         **({"unfinished": True} if unfinished else {}),
         "settings": settings,
     }
@@ -234,18 +248,75 @@ def require_whole(path: str | Path, of: str | Path | None = None) -> None:
         )
 
 
-def require_made_from(sequence: Path, single: Path) -> None:
-    """Refuse sequence poses that were made from other single-query poses than those beside them.
+def changed_sources(artifact: str | Path) -> list[Path]:
+    """Return the files that an artifact was made from and that have changed since, or are missing.
+
+    Whatever reads several artifacts of a run asks this: if one of them is older than another that it was made from, the
+    two do not belong together. An artifact without a record is from another tool, and as current as can be known.
+    """
+    recorded = _read_record(artifact).get("made_from")
+    sources = recorded.items() if isinstance(recorded, dict) else ()
+    paths = [(Path(os.path.normpath(Path(artifact).parent / name)), content) for name, content in sources]
+    return [path for path, content in paths if _content(path) != content]
+
+
+def why_older(artifact: str | Path, stage: str, suffixes: Iterable[str] = (), missing: bool = True) -> str:
+    """Return a sentence that says which sources of an artifact have changed since it was made; empty if none has.
+
+    Args:
+        stage: the stage that makes it again.
+        suffixes: only sources with these suffixes; empty: all.
+        missing: whether a source that is missing counts as changed.
+    """
+    changed = [path for path in changed_sources(artifact) if missing or path.exists()]
+    if suffixes:
+        changed = [path for path in changed if path.suffix in suffixes]
+    if not changed:
+        return ""
+    name, first = Path(artifact).name, f"{changed[0].parent.name}/{changed[0].name}"
+    more = f" (and of {len(changed) - 1} more that changed)" if len(changed) > 1 else ""
+    found = f"is of an older {first}{more}" if changed[0].exists() else f"is of {first}, which is missing now"
+    return f"{name} {found}: run the {stage} stage again."
+
+
+def require_current(artifact: str | Path, stage: str, suffixes: Iterable[str] = (), missing: bool = True) -> None:
+    """Refuse an artifact whose sources have changed since it was made; see `why_older`.
 
     Raises:
-        ArtifactError: the single-query poses are missing or have changed since. Files without a record are accepted,
-            see `require_whole`.
+        ArtifactError: names the artifact and the first source.
     """
-    made_from = (_read_record(sequence).get("settings") or {}).get("poses")  # fingerprints, of the single poses first
-    present = file_fingerprint(single) if single.is_file() else None
-    if made_from and made_from[0] != present:
-        what = "has changed since" if present else "is missing, which it was made from"
-        raise ArtifactError(f"{sequence}: {single.name} {what}. Run the localize and the sequence stage again.")
+    if why := why_older(artifact, stage, suffixes, missing):
+        raise ArtifactError(f"{Path(artifact).parent}: {why}")
+
+
+def older_files(folder: str | Path, stage: str, of: Callable[[str], bool] = lambda name: True) -> dict[str, str]:
+    """Return the files below a folder that are older than what they were made from, and why.
+
+    Args:
+        folder: folder of a stage's results.
+        stage: that stage.
+        of: selects artifacts by their path in the folder.
+
+    Returns:
+        The sentence of `why_older`, by path in the folder, for all files of these artifacts.
+    """
+    older: dict[str, str] = {}
+    for record in sorted(Path(folder).rglob("*.meta.json")):
+        artifact = record.with_name(record.name.removesuffix(".meta.json"))
+        name = artifact.relative_to(folder).as_posix()
+        if of(name) and (why := why_older(artifact, stage, missing=stage not in ("retrieve", "rerank", "localize"))):
+            files = _read_record(artifact).get("files", {})
+            older |= {artifact.with_name(file).relative_to(folder).as_posix(): why for file in (artifact.name, *files)}
+    return older
+
+
+def _content(path: str | Path) -> str | None:
+    """Return a hash of a file, which is quick for an artifact with a record; None if it is missing."""
+    try:
+        size, recorded = _read_record(path).get("files", {}).get(Path(path).name, (None, None))
+        return recorded if recorded and Path(path).stat().st_size == size else checksum(path)
+    except (OSError, TypeError, ValueError, AttributeError):
+        return None
 
 
 def any_unfinished(folder: str | Path, of: Callable[[str], bool]) -> bool:

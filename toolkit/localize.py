@@ -156,7 +156,12 @@ def localize_pairs(
                     _write_poses(pair, localized, settings)
                     unfinished = any(map(_is_internal, localized))
                 if update_attributes(pair.file("h5"), h5_attributes) or not skipped:
-                    write_sidecar(pair.file("txt"), record, [pair.file("csv"), pair.file("h5")], unfinished=unfinished)
+                    maps = [stage.folders.map / name for name in json.loads(h5_attributes[MAPS])]
+                    write_sidecar(
+                        *(pair.file("txt"), record, [pair.file("csv"), pair.file("h5")]),
+                        made_from=[pair.retrieval, *maps],
+                        unfinished=unfinished,
+                    )
                 rows = read_query_table(pair.file("csv"), ["status"])
                 query_tables.setdefault(queried, []).append(rows)
                 counts = rows["status"].str.split(":").str[0].value_counts()

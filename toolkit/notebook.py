@@ -20,7 +20,7 @@ import tqdm.std
 
 from toolkit import errors
 from toolkit.errors import CaptureError, ManifestError, StageError, shortage
-from toolkit.files import SceneFiles
+from toolkit.files import SceneFiles, files_fingerprint, link_or_copy, older_files, read_json, write_text
 from toolkit.manifest import (
     OPTIONAL,
     STAGES,
@@ -36,6 +36,7 @@ from toolkit.manifest import (
 from toolkit.runs.folder import LOG_VARIABLE, log_to
 from toolkit.runs.kernel import TEXT_BARS, Kernels, MemoryWatch, kernel_error
 from toolkit.runs.pairs import left_out_of
+from toolkit.runs.record import RECORD
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -88,8 +89,9 @@ def start(stage: str, sessions_root: str | None = None, **folders: str | None) -
     Args:
         stage: name of the stage, one of `toolkit.manifest.STAGES`.
         sessions_root: folder `sessions` of a capture; None: the demo capture, rendered if absent.
-        **folders: the notebook's other folders by the names of its parameters; None: below `runs/<scene>/` of
-            the repository. If such a default folder lacks the results of an earlier stage, that stage runs now.
+        **folders: the notebook's other folders by the names of its parameters; None: below `runs/<scene>-by-hand/` of
+            the repository, see `_by_hand`. If such a default folder lacks the results of an earlier stage, or they are
+            older than those of the stage before it, that stage runs now.
 
     Raises:
         ManifestError: a parameter is unknown to the notebook, or has a wrong type.
@@ -102,7 +104,8 @@ def start(stage: str, sessions_root: str | None = None, **folders: str | None) -
     sessions, root = sessions_or_demo(sessions_root), _root()
     _check_devices_and_queries(stage, sessions)
     scene = sessions.parent.name
-    files = SceneFiles(root / "runs" / scene, scene)
+    by_default = any(folder is None for folder in folders.values())
+    files = _by_hand(stage, root / "runs", scene) if by_default else SceneFiles(root / "runs" / scene, scene)
     defaults = {**stage_folders(files), "out_dir": stage_outputs(files, stage)}
     _make_upstream(stage, sessions, files, {defaults[name] for name, folder in folders.items() if folder is None})
     resolved = {"sessions_root": sessions}
@@ -255,31 +258,91 @@ def stage_outputs(files: SceneFiles, stage: str) -> Path | None:
     }.get(stage)
 
 
+_TAKEN = ".taken.json"
+_FOLDERS = {"embeddings": "embed", "retrieval": "retrieve", "reranked": "rerank", "poses": "localize"}
+"""Folders of results that a notebook by hand takes from a run, and the stages that make them."""
+_CACHES = ("features", "map", "index")
+
+
+def _by_hand(stage: str, runs: Path, scene: str) -> SceneFiles:
+    """Return the files of notebooks that are run by hand, so that they leave finished runs as they are.
+
+    The folder is `<scene>-by-hand` beside the runs. Results that no notebook has made there by hand are hard links to
+    those of a finished run of the scene: the run called `<scene>`, or else the latest one. They follow that run.
+    """
+    files = SceneFiles(runs / f"{scene}-by-hand", scene)
+    taken = read_json(files.root / _TAKEN)
+    made_here = stage_outputs(files, stage)
+    if made_here is not None and made_here.name in taken and made_here.name in _FOLDERS:
+        taken.pop(made_here.name)  # the links stay until the stage replaces them; from now on they are its own
+        write_text(files.root / _TAKEN, json.dumps(taken) + "\n")
+    run = _finished_run(runs, scene)
+    if run is None:
+        return files
+    donor = SceneFiles(run, scene)
+    for name in (*_FOLDERS, *_CACHES):
+        source, target = donor.root / name, files.root / name
+        state = str(run / _state(source))
+        own = target.exists() and name not in taken  # made by hand
+        if source.is_dir() and not own and taken.get(name) != state and target != made_here:
+            if name in _CACHES and target.exists():
+                continue  # it may hold more by now; stages find in it what still fits
+            shutil.rmtree(target, ignore_errors=True)
+            shutil.copytree(source, target, copy_function=link_or_copy, ignore=shutil.ignore_patterns(".*"))
+            taken[name] = state
+            print(f"{name}: taken from {run}")
+    if taken:
+        write_text(files.root / _TAKEN, json.dumps(taken) + "\n")
+    return files
+
+
+def _state(folder: Path) -> str:
+    """Return a fingerprint of a folder's files."""
+    return files_fingerprint(sorted(path for path in folder.rglob("*") if path.is_file()))
+
+
+def _finished_run(runs: Path, scene: str) -> Path | None:
+    """Return the run of a scene from which notebooks by hand take results; None if there is none."""
+    records = {path.parent: read_json(path) for path in sorted(runs.glob(f"*/{RECORD}"))}
+    with_scene = [run for run, record in records.items() if scene in record.get("scenes", ())]
+    return max(with_scene, key=lambda run: (run.name == scene, str(records[run].get("created"))), default=None)
+
+
 def _make_upstream(stage: str, sessions: Path, files: SceneFiles, folders: set[Path | None]) -> None:
     """Run the earlier stages whose results `stage` needs and whose folder is in `folders` and empty or absent."""
     for name in UPSTREAM[stage]:
         folder = stage_outputs(files, name)
-        if folder is None or name in OPTIONAL or folder not in folders or (folder.is_dir() and any(folder.iterdir())):
+        if folder is None or name in OPTIONAL or folder not in folders:
             continue
         _make_upstream(name, sessions, files, {stage_outputs(files, earlier) for earlier in UPSTREAM[name]})
-        print(f"{name}: no results yet, running it now into {folder}")
+        if not (folder.is_dir() and any(folder.iterdir())):
+            print(f"{name}: no results yet, running it now into {folder}")
+        elif older := older_files(folder, name):
+            print(f"{next(iter(older.values()))} Running it now.")
+        else:
+            continue
         _run_stage(name, sessions, files)
 
 
 def _run_stage(stage: str, sessions: Path, files: SceneFiles) -> None:
-    """Run `embed`, `retrieve` or `localize` with default settings."""
+    """Run `embed`, `retrieve` or `localize` with the settings of the run that results are taken from, or defaults."""
+    run = _finished_run(files.run.parent, files.scene)
+    content = read_json(run / RECORD).get("manifest", {}) if run else {}
+    manifest = Manifest.model_validate(content or {"name": "by-hand", "captures": [str(sessions.parent)]})
+    settings, queries = manifest.stage(stage).given(), manifest.queries
     if stage == "embed":
         from toolkit.embed import embed_sessions
 
-        embed_sessions(sessions, files.embeddings)
+        embed_sessions(sessions, files.embeddings, settings)
     elif stage == "retrieve":
         from toolkit.retrieve import retrieve_pairs
 
-        retrieve_pairs(sessions, files.embeddings, out_jsonl=files.retrieval_dir)
+        retrieve_pairs(sessions, files.embeddings, files.retrieval_dir, settings, queries=queries)
     else:
         from toolkit.localize import localize_pairs
 
-        localize_pairs(sessions, files.retrieval_dir, files.poses_dir, files.features, files.maps)
+        folders = (files.retrieval_dir, files.poses_dir, files.features, files.maps)
+        localize_pairs(sessions, *folders, settings, queries=queries)
 
 
 def _user_names() -> dict[str, Any]:

@@ -34,6 +34,7 @@ from toolkit.files import (
     files_fingerprint,
     fingerprint,
     of_sequence,
+    older_files,
     read_json,
     write_text,
 )  # fmt: skip
@@ -70,8 +71,8 @@ from toolkit.runs.cluster import open_cluster
 from toolkit.runs.folder import LOG, held, warnings_of_kernels
 from toolkit.runs.kernel import Kernels
 from toolkit.runs.pairs import pair_text, way_out
-from toolkit.runs.record import RunLog, failures
-from toolkit.runs.sweep import SweptRun, swept_runs, take_over
+from toolkit.runs.record import OLDER, Earlier, RunLog, failures
+from toolkit.runs.sweep import Shared, SweptRun, changed_keys, swept_runs, take_over, variant_name
 
 log = logging.getLogger(__name__)
 
@@ -129,6 +130,12 @@ class Job:
         maps = sorted(folder.glob(f"{'*' if device == 'all' else device}_map*.{suffix}"))
         return fingerprint([results, [[path.name, checksum(path)] for path in maps]])
 
+    def older(self) -> str:
+        """Return why the results are older than what they were made from; empty if they are not."""
+        folder = stage_outputs(self.files, self.stage)
+        older = older_files(folder, self.stage, self.makes) if folder else {}
+        return next(iter(older.values()), "")
+
     def forget(self) -> None:
         """Remove the fingerprints beside the outputs, so that the stage reuses none of them."""
         folder = stage_outputs(self.files, self.stage)
@@ -145,8 +152,14 @@ def run(
     overrides: Iterable[str] = (),
     say: Say = print,
     cluster: str | None = None,
+    name: str | None = None,
+    in_place: bool = False,
 ) -> Path:
     """Run a manifest and return its run folder, with `run.json` and `report.html` in it.
+
+    With `overrides` that change a result, the run has a folder of its own, `<output_root>/<name>-<key>-<value>`, and
+    takes over from the run of the manifest itself what they leave as it is. So a finished run changes only by its
+    manifest.
 
     Args:
         manifest_path: YAML file, see `toolkit.manifest`.
@@ -155,6 +168,8 @@ def run(
         overrides: `key=value` or `stage.key=value`, replace values of the manifest.
         say: prints progress lines; called like `print`.
         cluster: cluster whose workers the stages use, see `runs.cluster.open_cluster`.
+        name: name of the run folder; None: as above.
+        in_place: write into the folder of the manifest, whatever the overrides are.
 
     Raises:
         ManifestError: the manifest or an argument is wrong; nothing has run.
@@ -162,9 +177,59 @@ def run(
     """
     if only is not None and only not in STAGES:
         raise ManifestError(f"--only {only}: no such stage. {nearest(only, STAGES)}")
+    if in_place and name:
+        raise ManifestError("--in-place and --name exclude each other: give one of them.")
+    overrides = list(overrides)
     manifest = load_manifest(manifest_path, overrides)
     if only is not None and only not in manifest.stages:
         raise ManifestError(f"--only {only}: {manifest_path} has no section `{only}`, so the stage is off.")
+    if not in_place:
+        name, shared = own_run(manifest_path, overrides, name)
+        if name != manifest.name or shared:
+            manifest = _own_manifest(manifest_path, overrides, name, shared)
+            say(f"Run folder: {Path(manifest.output_root) / name}")
+    return _run_in(manifest, manifest_path, only, force, say, cluster)
+
+
+def own_run(manifest_path: str | Path, overrides: Sequence[str], name: str | None = None) -> tuple[str, Shared | None]:
+    """Return the name of the run with these overrides, and what it shares with the manifest's own run.
+
+    Args:
+        name: chosen by the user; None: named after the overrides that change a result.
+
+    Returns:
+        The name; and what it shares, None if it is the manifest's own run or there can be none.
+    """
+    manifest = load_manifest(manifest_path, overrides)
+    try:
+        plain = load_manifest(manifest_path)
+    except ManifestError:  # it needs the overrides, so there is no run without them
+        return name or manifest.name, None
+    keys = changed_keys(plain, manifest, overrides)
+    if name is None:
+        name = manifest.name if manifest.name != plain.name else variant_name(plain.name, keys)
+    return name, Shared(plain.name, list(keys)) if name != plain.name else None
+
+
+def _own_manifest(
+    manifest_path: str | Path, overrides: Sequence[str], name: str, shared: Shared | None
+) -> Manifest:
+    """Return the manifest of a run of its own, and fill its folder with what it shares with another run."""
+    manifest = load_manifest(manifest_path, [*overrides, f"name={name}"])
+    if shared is None or {key.partition(".")[0] for key in shared.differing} & {"captures", "demo_data"}:
+        return manifest
+    root = Path(manifest.output_root)
+    if manifest.demo_data:  # rendered once for all runs
+        captures = _captures(manifest.model_copy(update={"name": load_manifest(manifest_path).name}))
+        rendered = ["demo_data=null", f"captures={json.dumps(list(map(str, captures)))}"]
+        manifest = load_manifest(manifest_path, [*overrides, *rendered, f"name={name}"])
+    take_over(root / shared.run, root / name, [Path(capture).name for capture in manifest.captures], shared.differing)
+    return manifest
+
+
+def _run_in(
+    manifest: Manifest, manifest_path: str | Path, only: str | None, force: bool, say: Say, cluster: str | None
+) -> Path:
     devices = [device.model_dump(exclude_none=True) for device in manifest.extra_devices]
     with extra_devices(devices), allow_outside(manifest.allow_outside):
         return _run(manifest, manifest_path, only, force, say, cluster)
@@ -175,7 +240,9 @@ def sweep(
     sweeps: Sequence[str],
     overrides: Sequence[str] = (),
     say: Say = print,
-    **options: Any,
+    only: str | None = None,
+    force: bool = False,
+    cluster: str | None = None,
 ) -> tuple[list[Path], list[ToolkitError]]:
     """Run a manifest once per swept value, in folders `<output_root>/<name>-<key>-<value>`.
 
@@ -185,7 +252,7 @@ def sweep(
 
     Args:
         sweeps: `key=a,b,c` each, see `runs.sweep.swept_runs`; several keys give all combinations of their values.
-        manifest_path, overrides, say, options: as for `run`.
+        manifest_path, overrides, say, only, force, cluster: as for `run`.
 
     Returns:
         The folders of the runs that succeeded, and the errors of the runs that failed.
@@ -193,26 +260,27 @@ def sweep(
     Raises:
         ManifestError: the manifest or a swept value is wrong; nothing has run.
     """
-    plain = load_manifest(manifest_path, overrides)
-    runs = swept_runs(plain.name, sweeps)
+    name, shared = own_run(manifest_path, overrides)
+    plain = shared or Shared(name, [])
+    runs = swept_runs(name, sweeps)
     for one in runs:  # find mistakes before hours of work
         _check_stages(load_manifest(manifest_path, [*overrides, *one.overrides, f"name={one.name}"]), manifest_path)
-    captures = _captures(plain)
-    rendered = ["demo_data=null", f"captures={json.dumps(list(map(str, captures)))}"] if plain.demo_data else []
-    root, done, failed = Path(plain.output_root), dict[SweptRun, Path](), dict[SweptRun, ToolkitError]()
+    done, failed = dict[SweptRun, Path](), dict[SweptRun, ToolkitError]()
     for number, one in enumerate(runs, 1):
         say(f"{one.name} ({number} of {len(runs)}): {', '.join(one.overrides)}")
         # The run that differs in the fewest keys has most results to share; among equals, prefer one that succeeded.
         donor = max(
             [*done, *failed],
             key=lambda other: (len({*other.overrides} & {*one.overrides}), other in done),
-            default=SweptRun(plain.name, ()),
+            default=SweptRun(plain.run, ()),
         )
         keys = [override.partition("=")[0] for override in one.overrides if override not in donor.overrides]
-        take_over(root / donor.name, root / one.name, [capture.name for capture in captures], keys)
+        differing = [*keys, *(plain.differing if donor.name == plain.run else ())]
         try:
-            settings = [*overrides, *rendered, *one.overrides, f"name={one.name}"]
-            done[one] = run(manifest_path, overrides=settings, say=say, **options)
+            manifest = _own_manifest(
+                manifest_path, [*overrides, *one.overrides], one.name, Shared(donor.name, differing)
+            )
+            done[one] = _run_in(manifest, manifest_path, only, force, say, cluster)
         except ToolkitError as error:
             say(f"{one.name}: {sentence(error)}")
             failed[one] = error
@@ -277,7 +345,7 @@ def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: boo
             force or not _reusable(job, _inputs_of(job, inputs[job.files.scene]))
         ):
             _require_weights(job.stage, job.settings)
-    earlier = [job.record for job in every if job.stage not in stages]
+    earlier = [Earlier(job.record, job.older) for job in every if job.stage not in stages]
     record = RunLog(run_dir, manifest, inputs, _code_fingerprint(), earlier)
     try:
         record.write()
@@ -291,6 +359,9 @@ def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: boo
                 if not error.of_the_data:
                     raise
                 failed.append((job, error))  # other captures and pairs may succeed
+        for row in record.all_rows():
+            if row["status"] == OLDER:
+                say(f"{row['stage']} {row['scene']} was not run again: {row['reason']}")
         last = [row["status"] for row in record.rows if row["stage"] == stages[-1]]
         if failed and not {"done", "reused"} & set(last):
             raise failed[0][1]

@@ -181,7 +181,7 @@ class _Pair:
                     progress.add(str(index), note=row)
             rows = progress.notes() | broken
             write_text(self.path, "".join(json.dumps(rows[str(index)]) + "\n" for index in range(len(queries))))
-            write_sidecar(self.path, self.record, unfinished=bool(broken))
+            write_sidecar(self.path, self.record, made_from=[self.retrieval], unfinished=bool(broken))
             if not broken:
                 progress.discard()
 

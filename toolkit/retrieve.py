@@ -132,7 +132,7 @@ def retrieve_pairs(
                 started = time.perf_counter()
                 found = found or find({device: query})
                 _write_pair(path, query, database, found.pop(device))
-                write_sidecar(path, record)
+                write_sidecar(path, record, made_from=_matrices(query.session, database.session, embeddings=embeddings))
                 row["seconds"] = round(shared + time.perf_counter() - started, 3)
     frame = table.frame()
     write_text(folder / "settings.json", settings.model_dump_json(indent=1) + "\n")
@@ -259,10 +259,15 @@ def _records(table: pd.DataFrame, *columns: str) -> list[dict[str, Any]]:
 
 def _inputs(session: Session, embeddings: Path) -> list[Any]:
     """Return fingerprints of a session's embeddings, poses and calibration, on which a pair's file depends."""
-    folders = [folder / session.id for folder in embedding_folders(embeddings).values()]
-    matrices = [path for folder in folders for path in sorted(folder.rglob("*.npy"))]
+    matrices = _matrices(session, embeddings=embeddings)
     texts = [session.path / name for name in ("images.txt", "trajectories.txt", "rigs.txt")]
     return [matrix_fingerprints(matrices), [file_fingerprint(path) for path in texts if path.exists()]]
+
+
+def _matrices(*sessions: Session, embeddings: Path) -> list[Path]:
+    """Return the files of the sessions' embeddings."""
+    folders = [folder / session.id for session in sessions for folder in embedding_folders(embeddings).values()]
+    return [path for folder in folders for path in sorted(folder.rglob("*.npy"))]
 
 
 def _rough_poses(settings: MaskSettings) -> Trajectory | None:

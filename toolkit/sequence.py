@@ -165,7 +165,7 @@ def _place_pair(
             with write_atomic(path) as temporary:
                 rows.to_csv(temporary, index=False)
         trajectory.write(out)
-        write_sidecar(out, record, list(csvs), unfinished=again is not None and again.met_a_bug)
+        write_sidecar(out, record, list(csvs), made_from=inputs, unfinished=again is not None and again.met_a_bug)
     frames = pd.read_csv(out.with_suffix(".csv"), keep_default_na=False)
     status = frames["status"].str.split(":").str[0].value_counts()
     return {

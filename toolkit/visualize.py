@@ -15,7 +15,7 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError, DamagedError
-from toolkit.files import pair_name
+from toolkit.files import pair_name, require_current, sidecar_path, write_sidecar
 from toolkit.geometry import Floats
 from toolkit.manifest import VisualizeSettings
 from toolkit.runs.pairs import PairRows, left_out
@@ -81,14 +81,18 @@ def visualize_scene(
     if not chosen:
         raise ArtifactError(f"{poses_dir}: no poses of {capture.name} for the chosen devices. Localize them first.")
     table, worst = PairRows(capture.name, out, Path(poses_dir)), []
+    sources: list[Path] = []
     sheet = out / f"worst_{capture.name}.png"
-    sheet.unlink(missing_ok=True)
+    for path in (sheet, sidecar_path(sheet)):
+        path.unlink(missing_ok=True)
     for m, q in tqdm(chosen, desc="visualize", unit="pair"):
         name = pair_name(capture.name, m, q)
         _remove_pictures(out, name)  # those of an earlier run would look like results of this one
         with table.row(m, q) as row:
             table.check_upstream()
             started = time.perf_counter()
+            of_pair = _poses(capture, poses_dir, m, q)
+            require_current(of_pair, "localize", (".npz",), missing=False)
             pair = LocalizedPair.open(capture, m, q, poses_dir, map_dir)
             sequences = SequencePair.find(poses_dir, capture.name, m, q)
             try:
@@ -103,11 +107,15 @@ def visualize_scene(
                 "still": str(out / f"{pair.name}.png"),
                 "recording": str(out / f"{pair.name}.rrd") if settings.recordings else "",
             }
+            made_from = [of_pair, of_pair.with_suffix(".csv"), *([] if sequences is None else [sequences.path])]
+            sources += made_from
+            write_sidecar(out / f"{name}.png", settings.model_dump(), _pictures(out, name)[1:], made_from=made_from)
         if row["reason"]:
             _remove_pictures(out, name)
     frame = table.frame()
     present = [(row["map_device"], row["query_device"]) for row in table.rows if not row["reason"]]
     _draw_worst(sheet, capture.name, pd.concat(worst, ignore_index=True))
+    write_sidecar(sheet, settings.model_dump(), made_from=sources)
     sides = dict.fromkeys((*((m, "map") for m, _ in present), *((q, "query") for _, q in present)))
     for device, split in sides:
         recording, poses = out / f"{capture.name}_{device}_{split}.rrd", None
@@ -148,8 +156,14 @@ def sample_pictures(out_dir: str | Path, name: str) -> list[Path]:
 
 def _remove_pictures(out: Path, name: str) -> None:
     """Remove the pictures and the recording of a pair."""
-    for path in (*(out / f"{name}{end}" for end in (".png", "_sequence.png", ".rrd")), *sample_pictures(out, name)):
+    for path in (*_pictures(out, name), sidecar_path(out / f"{name}.png")):
         path.unlink(missing_ok=True)
+
+
+def _pictures(out: Path, name: str) -> list[Path]:
+    """Return the existing pictures and the recording of a pair, `<name>.png` first."""
+    paths = [*(out / f"{name}{end}" for end in (".png", "_sequence.png", ".rrd")), *sample_pictures(out, name)]
+    return [path for path in paths if path.exists()]
 
 
 def _draw_pair(

@@ -15,7 +15,7 @@ from toolkit.capture import Trajectory, write_session
 from toolkit.errors import ArtifactError, CaptureError, ManifestError, ToolkitError
 from toolkit.exchange.export import export_intrinsics
 from toolkit.exchange.submission import collect
-from toolkit.files import SceneFiles, file_fingerprint, write_sidecar
+from toolkit.files import SceneFiles, write_sidecar
 from toolkit.geometry import make_pose, pose_from_qt
 
 DEVICES = ("ios", "hl", "spot")
@@ -172,14 +172,13 @@ def test_poses_of_the_sequence_are_taken_where_asked_for(run: Path, tmp_path: Pa
     found = poses_in(submission.write(), "HYDRO_map_ios_query_hl.txt", tmp_path)
     np.testing.assert_allclose(found.qt, qt[:0:-1], atol=1e-15)
     single = files.poses_txt("ios", "hl")
-    record = {"poses": [file_fingerprint(single)]}
-    write_sidecar(files.sequence_txt("ios", "hl"), record)
+    write_sidecar(files.sequence_txt("ios", "hl"), {}, made_from=[single])
     assert collect([run], "Ours.", sequence=True).entries
     single.write_text(single.read_text() + "# localized again\n")
     with pytest.raises(ArtifactError, match=single.name):
         collect([run], "Ours.", sequence=True)
     single.unlink()  # the localize stage has left the pair out
-    with pytest.raises(ArtifactError, match="is missing"):
+    with pytest.raises(ArtifactError, match="missing now"):
         collect([run], "Ours.", sequence=True)
 
 

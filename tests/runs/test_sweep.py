@@ -2,12 +2,15 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
 from toolkit.errors import ManifestError
+from toolkit.features.groups import GroupWriter
 from toolkit.files import SceneFiles
-from toolkit.runs.sweep import swept_runs, take_over
+from toolkit.manifest import load_manifest
+from toolkit.runs.sweep import changed_keys, swept_runs, take_over, variant_name
 
 
 def test_a_run_a_value() -> None:
@@ -66,8 +69,7 @@ def test_a_run_takes_over_what_is_made_before_the_swept_stage(tmp_path: Path) ->
     take_over(donor.run, tmp_path / "b", ["P"], ["localize.method"])
     mine = SceneFiles(tmp_path / "b", "P")
     assert sorted(path.name for path in mine.root.iterdir()) == ["embeddings", "features", "map", "retrieval"]
-    (mine.features / "made.h5").write_text("written to in its place")
-    assert (donor.features / "made.h5").read_text() == "a", "HDF5 files are not shared"
+    assert (mine.features / "made.h5").samefile(donor.features / "made.h5")
     assert (mine.embeddings / "made.txt").samefile(donor.embeddings / "made.txt")
     take_over(donor.run, tmp_path / "c", ["P"], ["evaluate.thresholds"])
     assert (tmp_path / "c" / "P" / "poses").is_dir()
@@ -81,3 +83,40 @@ def test_a_run_that_is_there_is_left_as_it_is(tmp_path: Path) -> None:
     mine.root.mkdir(parents=True)
     take_over(donor.run, mine.run, ["P"], ["localize.method"])
     assert not mine.embeddings.exists()
+
+
+def test_what_is_added_to_a_linked_file_is_not_in_the_other_run(tmp_path: Path) -> None:
+    donor, mine = SceneFiles(tmp_path / "a", "P"), SceneFiles(tmp_path / "b", "P")
+    with GroupWriter(donor.features / "made.h5", {"made": "by"}) as writer:
+        writer.add("first", "source", {"values": np.zeros(3)})
+        writer.finish()
+    before = (donor.features / "made.h5").read_bytes()
+    take_over(donor.run, mine.run, ["P"], ["localize.method"])
+    with GroupWriter(mine.features / "made.h5", {"made": "by"}) as writer:
+        assert list(writer.index.groups) == ["first"]
+        writer.add("second", "source", {"values": np.ones(3)})
+        writer.finish()
+    assert (donor.features / "made.h5").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("overrides", "name"),
+    [
+        (["output_root=elsewhere", "tolerate_failed.pairs=0.5"], "x"),
+        (["localize.method=pnp"], "x"),  # the default
+        (["localize.method=nearest"], "x-method-nearest"),
+        (["localize.pnp.min_inliers=30", "retrieve.topk=2"], "x-min_inliers-30-topk-2"),
+        (["rerank.topn=30"], "x-topn-30"),
+        (["captures=[b]"], "x-captures-b"),
+    ],
+)
+def test_a_run_is_named_after_what_differs(tmp_path: Path, overrides: list[str], name: str) -> None:
+    (tmp_path / "x.yaml").write_text("captures: [a]\n")
+    plain, changed = load_manifest(tmp_path / "x.yaml"), load_manifest(tmp_path / "x.yaml", overrides)
+    assert variant_name("x", changed_keys(plain, changed, overrides)) == name
+
+
+def test_a_long_name_is_cut_and_still_its_own() -> None:
+    names = [variant_name("x", {"captures": "/a/long/path" * 20 + end}) for end in "ab"]
+    assert max(map(len, names)) <= 100
+    assert len(set(names)) == 2

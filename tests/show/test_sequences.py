@@ -12,7 +12,7 @@ from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.errors import ArtifactError
 from toolkit.evaluate import evaluate_scene
-from toolkit.files import file_fingerprint, pair_name, write_sidecar
+from toolkit.files import pair_name, write_sidecar
 from toolkit.sequence import sequence_pairs
 from toolkit.show.sequences import SequencePair, draw_sequence, draw_steps
 
@@ -66,7 +66,7 @@ def test_which_queries_were_rescued_and_broken(pair: SequencePair) -> None:
 
 def test_results_from_other_single_poses_or_damaged_ones_are_not_used(pair: SequencePair) -> None:
     single, sequence, steps = (Path(f"{pair.stem}{end}") for end in (".txt", "_sequence.txt", "_sequence_steps.csv"))
-    write_sidecar(sequence, {"poses": [file_fingerprint(single), "of the table"]}, [steps])
+    write_sidecar(sequence, {}, [steps], made_from=[single])
     found = SequencePair.find(pair.stem.parent, "A", "ios", "hl")
     assert found is not None
     steps.write_text(steps.read_text().rpartition("\n")[0])

@@ -29,7 +29,7 @@ from toolkit.files import (
     file_fingerprint,
     pair_name,
     read_references,
-    require_made_from,
+    require_current,
     write_atomic,
     write_sidecar,
 )
@@ -271,7 +271,7 @@ def _fill_entry(
         raise ArtifactError(f"Two runs have poses of the same pair: {both}. Give one of the two runs.")
     files, path = with_poses[0]
     if sequence:
-        require_made_from(path, files.poses_txt(*pair))
+        require_current(path, "sequence")
     keyframes = captures[entry.scene][f"{entry.query_device}_query"].keyframes(queries)
     timestamps, device_ids = keyframes["timestamp"].to_numpy(np.int64), keyframes["device_id"]
     poses = _read_poses(path)
@@ -280,6 +280,7 @@ def _fill_entry(
     entry.not_asked = len(poses) - int(np.sum(rows >= 0))
     nearest, why_not = dict[Key, np.ndarray](), "not localized"
     if failed == "nearest" and np.any(rows < 0):
+        require_current(files.poses_txt(*pair), "localize", (".jsonl",), missing=False)
         nearest, why_not = _nearest_references(files.retrieval(*pair))
     qt, origins, reasons = np.full((len(rows), 7), np.nan), [LEFT_OUT] * len(rows), [""] * len(rows)
     for index, (key, row) in enumerate(zip(zip(timestamps.tolist(), device_ids, strict=True), rows, strict=True)):

@@ -34,6 +34,7 @@ from toolkit.files import (
     image_name,
     pair_devices,
     read_sidecar,
+    require_current,
     write_atomic,
     write_sidecar,
 )  # fmt: skip
@@ -146,6 +147,8 @@ class Map:
         if not pairs:
             raise ArtifactError(f"{_unknown(files, device)} Localize first: python -m toolkit run MANIFEST.")
         localized = _last_localized(files, pairs)
+        for pair in pairs:
+            require_current(pair.with_suffix(".txt"), "localize", missing=False)
         reranked = Path(localized[1][RETRIEVAL]).name == files.reranked_dir.name
         return replace(cls._stored_in(device, localized, files.features, files.maps), files=files, reranked=reranked)
 

@@ -6,7 +6,7 @@ import os
 import platform
 import time
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -23,6 +23,28 @@ RECORD = "run.json"
 _VERSIONS = ("numpy", "pycolmap", "faiss-cpu", "opencv-python-headless", "pandas", "pillow", "torch", "rerun-sdk")
 
 
+OLDER = "older"
+"""Status of a stage that this run left out (`--only`), and whose results are older than what they were made from."""
+
+
+@dataclass(frozen=True)
+class Earlier:
+    """A job that a run leaves out (`--only`)."""
+
+    record: Path
+    """Its record; missing if it has never been finished."""
+    why_older: Callable[[], str]
+    """Returns why its results are older than what they were made from; empty if they are not."""
+
+    def row(self) -> dict[str, Any] | None:
+        """Return the row of its last execution, with its present status."""
+        row = read_json(self.record).get("row")
+        if not row:
+            return None
+        reason = self.why_older()
+        return {**row, "status": OLDER, "reason": reason} if reason else {**row, "status": "reused"}
+
+
 @dataclass
 class RunLog:
     """The content of `run.json`, rewritten after every stage.
@@ -37,8 +59,7 @@ class RunLog:
     """Fingerprint of each scene's capture."""
     code: str
     """Fingerprint of the toolkit's code."""
-    earlier: Sequence[Path] = ()
-    """Records of the jobs that this run leaves out (`--only`); missing if a job has never been finished."""
+    earlier: Sequence[Earlier] = ()
     status: str = "running"
     """`running`, `done`, `incomplete` (more failed than the manifest tolerates), `failed`, or `interrupted`."""
     error: str | None = None
@@ -101,9 +122,8 @@ class RunLog:
 
     def all_rows(self) -> list[dict[str, Any]]:
         """Return this run's rows and, for stages that it did not run (`--only`), the rows in their records."""
-        kept = [row for path in self.earlier if (row := read_json(path).get("row"))]
         scenes = list(self.inputs)
-        rows = [*self.rows, *({**row, "status": "reused"} for row in kept)]
+        rows = [*self.rows, *(row for job in self.earlier if (row := job.row()))]
         return sorted(rows, key=lambda row: (scenes.index(row["scene"]), STAGES.index(row["stage"])))
 
 
@@ -135,7 +155,7 @@ def summary(run_dir: Path) -> dict[str, Any]:
     """Return the output of `--json`: how the run ended, what failed, and the result of each stage."""
     record = read_json(run_dir / RECORD)
     kept = ("name", "status", "exit_code", "error", "failed", "created", "total_seconds")
-    of_stage = ("scene", "stage", "part", "status", "seconds", "counts", "left_out", "error")
+    of_stage = ("scene", "stage", "part", "status", "reason", "seconds", "counts", "left_out", "error")
     stages = [{key: row[key] for key in of_stage if key in row} for row in record.get("stages", ())]
     return {key: record.get(key) for key in kept} | {"run": str(run_dir), "stages": stages}
 

@@ -1,21 +1,68 @@
-"""Sweeps: run a manifest with several values of some settings; name the runs and share results between them."""
+"""Runs of a manifest with other values of some settings: their names, and the results that they share."""
 
-import os
 import re
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import yaml
 
 from toolkit.errors import ManifestError
-from toolkit.files import SceneFiles
-from toolkit.manifest import STAGES
+from toolkit.files import SceneFiles, fingerprint, link_or_copy
+from toolkit.manifest import STAGES, Manifest
 
 MOST_RUNS = 100
 """Limit of runs in a sweep: more are most likely a mistake."""
+
+
+_NO_RESULT = {"name", "output_root", "tolerate_failed", "description"}
+"""Keys of a manifest that change no result."""
+_LONGEST = 100
+"""Longest name of a run folder, letters; a longer one ends in a fingerprint."""
+
+
+@dataclass(frozen=True)
+class Shared:
+    """What a new run takes over from another one."""
+
+    run: str
+    """Name of the other run's folder."""
+    differing: list[str]
+    """Keys whose values differ; results that they change are not taken."""
+
+
+def changed_keys(plain: Manifest, changed: Manifest, overrides: Iterable[str]) -> dict[str, str]:
+    """Return, by key, the values of overrides that change a result.
+
+    Args:
+        plain, changed: the manifest without and with all overrides.
+        overrides: `key=value` each.
+    """
+    before, after = (manifest.model_dump(mode="json") for manifest in (plain, changed))
+    keys = {}
+    for override in overrides:
+        key, _, value = override.partition("=")
+        if key.partition(".")[0] not in _NO_RESULT and _value(before, key) != _value(after, key):
+            keys[key.strip()] = value
+    return keys
+
+
+def _value(content: Any, key: str) -> Any:
+    for part in key.strip().split("."):
+        content = content.get(part, KeyError) if isinstance(content, dict) else KeyError
+    return content
+
+
+def variant_name(name: str, keys: Mapping[str, str]) -> str:
+    """Return the name of a run that differs from the run `name` in these keys and values: `<name>-<key>-<value>`."""
+    short = [key.rpartition(".")[2] for key in keys]
+    labels = short if len(set(short)) == len(short) else list(keys)
+    parts = [f"{label}-{_plain(value)}" for label, value in zip(labels, keys.values(), strict=True)]
+    whole = "-".join([name, *parts])
+    return whole if len(whole) <= _LONGEST else f"{whole[: _LONGEST - 9]}-{fingerprint(whole)[:8]}"
 
 
 @dataclass(frozen=True)
@@ -62,13 +109,11 @@ def swept_runs(name: str, sweeps: Sequence[str]) -> list[SweptRun]:
     combinations = list(product(*values))
     if len(combinations) > MOST_RUNS:
         raise ManifestError(f"--sweep: found {len(combinations)} runs, expected at most {MOST_RUNS}. Use fewer values.")
-    short = [key.rpartition(".")[2] for key in keys]
-    labels = short if len(set(short)) == len(short) else keys
     runs = []
     for chosen in combinations:
-        parts = [f"{label}-{_plain(value)}" for label, value in zip(labels, chosen, strict=True)]
-        overrides = tuple(f"{key}={value}" for key, value in zip(keys, chosen, strict=True))
-        runs.append(SweptRun("-".join([name, *parts]), overrides))
+        values_of = dict(zip(keys, chosen, strict=True))
+        overrides = tuple(f"{key}={value}" for key, value in values_of.items())
+        runs.append(SweptRun(variant_name(name, values_of), overrides))
     if len({run.name for run in runs}) < len(runs):
         raise ManifestError(f"--sweep {' '.join(sweeps)}: two runs have the same folder name. Sweep one key at a time.")
     return runs
@@ -80,17 +125,17 @@ def _plain(value: str) -> str:
 
 
 def take_over(donor: Path, run_dir: Path, scenes: Iterable[str], keys: Sequence[str]) -> None:
-    """Fill a new run folder with the results of another run that do not depend on the swept keys.
+    """Fill a new run folder with the results of another run that do not depend on the differing keys.
 
-    These are features, maps, and the results of all stages before the first stage with a swept key. Too much does no
-    harm: each stage reuses only what fits its settings. HDF5 files are copied, because stages write to them; all other
-    files are replaced as a whole, so they become hard links, or copies if the disk does not support links.
+    These are features, maps, and the results of all stages before the first stage with a differing key. Too much does
+    no harm: each stage reuses only what fits its settings. Files become hard links, since the toolkit never changes a
+    file but replaces it as a whole; or copies, if the disk does not support links.
 
     Args:
         donor: run folder to take from.
         run_dir: run folder to fill. Scenes that already have a folder there are skipped.
         scenes: names of the captures.
-        keys: the swept keys, `stage.key`.
+        keys: the differing keys, `stage.key`.
     """
     stages = [key.partition(".")[0] for key in keys]
     first = min((STAGES.index(stage) for stage in stages if stage in STAGES), default=0)
@@ -104,14 +149,5 @@ def take_over(donor: Path, run_dir: Path, scenes: Iterable[str], keys: Sequence[
         for name in sorted({"features", "maps", "index"} | earlier):
             source: Path = getattr(theirs, name)
             if source.is_dir():
-                shutil.copytree(source, getattr(mine, name), copy_function=_link, ignore=shutil.ignore_patterns(".*"))
-
-
-def _link(source: str, target: str) -> None:
-    if not source.endswith(".h5"):
-        try:
-            os.link(source, target)
-            return
-        except OSError:  # another disk, or one without hard links
-            pass
-    shutil.copy2(source, target)
+                hidden = shutil.ignore_patterns(".*")
+                shutil.copytree(source, getattr(mine, name), copy_function=link_or_copy, ignore=hidden)

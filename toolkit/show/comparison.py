@@ -20,7 +20,7 @@ from toolkit.capture import Capture
 from toolkit.capture.devices import extra_devices
 from toolkit.capture.names import allow_outside
 from toolkit.errors import ArtifactError, ToolkitError
-from toolkit.files import SceneFiles, require_whole, write_text
+from toolkit.files import SceneFiles, require_current, require_whole, write_text
 from toolkit.geometry import Floats, Ints
 from toolkit.show.figures import BLUE, GREEN, ORANGE, SKY, VERMILLION, new_figure, number, percent, save_figure, styled
 from toolkit.show.localized import LocalizedPair
@@ -237,6 +237,7 @@ def _read_errors(folder: Path, record: Mapping[str, Any]) -> pd.DataFrame:
             missing.append(str(path))
             continue
         require_whole(path, of=path.with_name("recall.csv"))
+        require_current(path.with_name("recall.csv"), "evaluate")
         try:
             types = {"timestamp": np.int64, "device_id": str, "sensor_id": str, "status": str}
             table = pd.read_csv(path, dtype={**types, **dict.fromkeys(_ERRORS, float)})

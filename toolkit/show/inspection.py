@@ -15,7 +15,7 @@ import pandas as pd
 
 from toolkit.capture import Capture, Trajectory
 from toolkit.errors import OF_THE_DATA, ArtifactError
-from toolkit.files import SceneFiles, image_name, pair_devices, read_references
+from toolkit.files import SceneFiles, image_name, pair_devices, read_references, require_current
 from toolkit.geometry import Floats
 from toolkit.localizers.again import LocalizeAgain
 from toolkit.localizers.map import RETRIEVAL, SESSIONS_ROOT, Map, how_localized, label
@@ -215,6 +215,7 @@ class InspectedPair:
     @cached_property
     def _again(self) -> LocalizeAgain:
         """Cached: opening the map takes time."""
+        require_current(self._h5.with_suffix(".txt"), "localize", missing=False)
         map_ = Map.of_pair(self._h5, self.map_device, self._features_dir, self._map_dir)
         return LocalizeAgain(map_, self.localized.query_session, self.retrieval)
 
@@ -235,7 +236,8 @@ class InspectedPair:
 
     @cached_property
     def _topk(self) -> dict[tuple[int, str], list[dict[str, Any]]]:
-        with suppress(ArtifactError):  # poses can be inspected without the retrieval
+        with suppress(ArtifactError):  # poses can be inspected without the retrieval that they were made from
+            require_current(self._h5.with_suffix(".txt"), "localize", (".jsonl",))
             rows = read_references(self.retrieval)
             return {(int(row["timestamp"]), str(row["sensor_id"])): row["topk"] for row in rows}
         return {}

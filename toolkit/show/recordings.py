@@ -177,7 +177,7 @@ def record_session(
     if counts["unreadable"]:
         messages.append(f"{session.id}: {counts['unreadable']} images or depth maps cannot be read.")
     seconds, size_bytes = round(time.perf_counter() - started, 2), path.stat().st_size
-    write_sidecar(path, settings)
+    write_sidecar(path, settings, made_from=[] if queries_pose is None else [queries_pose])
     recording = SessionRecording(path, **counts, seconds=seconds, bytes=size_bytes, messages=messages)
     logger.info("%s: %d frames, %d images in %.0f s, %.1f MB", path, recording.frames, recording.images, seconds,
                 size_bytes / 1e6)  # fmt: skip

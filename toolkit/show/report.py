@@ -5,7 +5,7 @@ import glob
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,16 @@ from urllib.parse import quote
 import pandas as pd
 
 from toolkit.errors import ArtifactError
-from toolkit.files import SceneFiles, of_sequence, pair_devices, read_json, read_map_record, sidecar_path, write_text
+from toolkit.files import (
+    SceneFiles,
+    of_sequence,
+    older_files,
+    pair_devices,
+    read_json,
+    read_map_record,
+    sidecar_path,
+    write_text,
+)
 from toolkit.show.figures import number, percent
 from toolkit.show.metrics import (
     REASONS,
@@ -263,6 +272,19 @@ def _scene(files: SceneFiles, fingerprint: str, album: "Album") -> dict[str, Any
     )
     thresholds = [column for column in recall.columns if column.startswith("recall@")]
     statuses = _read_statuses(files, messages)
+    older = older_files(files.evaluation, "evaluate")
+    older_pictures = older_files(files.visualization, "visualize")
+    if why := older.get("recall.csv"):  # its numbers are of other poses than those listed below
+        recall, errors, losses, retrieval, sequences, changes = (pd.DataFrame() for _ in tables)
+        thresholds = []
+        messages.append(f"Not shown: {why}")
+    if older_pictures:
+        first = next(iter(older_pictures.values()))
+        messages.append(f"Not shown: {len(older_pictures)} pictures and recordings. {first}")
+    older |= older_pictures
+    made = {"localize": files.poses_dir, "rerank": files.reranked_dir, "retrieve": files.retrieval_dir}
+    for stage, folder in made.items():
+        messages += list(older_files(folder, stage).values())[:1]
     if len(recall):
         messages += read_json(sidecar_path(files.evaluation / "recall.csv")).get("settings", {}).get("messages", [])
     unit = unit_of(*thresholds)
@@ -277,12 +299,16 @@ def _scene(files: SceneFiles, fingerprint: str, album: "Album") -> dict[str, Any
         remarks.append(f"The unit of the poses is not known: {unit} is {depth}.")
     verdict, headlines = _verdict(recall, errors, statuses, thresholds)
     matrices, note = _retrieval(retrieval, headlines, unit)
-    stills = sorted(files.visualization.glob("*.png"), key=_natural)
+    stills = sorted((path for path in files.visualization.glob("*.png") if path.name not in older), key=_natural)
     worst = [path for path in stills if path.name.startswith("worst")]
     samples = [path for path in stills if path.name.startswith("localization")]
     recordings = [path for path in stills if of_sequence(path.name)]
     maps = [path for path in stills if path not in (*worst, *samples, *recordings)]
-    figures = {files.evaluation / f"{name}.png": texts for name, texts in EVALUATION_FIGURES.items()}
+    figures = {
+        files.evaluation / f"{name}.png": texts
+        for name, texts in EVALUATION_FIGURES.items()
+        if f"{name}.png" not in older
+    }
     return {
         "name": files.scene,
         "fingerprint": fingerprint,
@@ -315,9 +341,9 @@ def _scene(files: SceneFiles, fingerprint: str, album: "Album") -> dict[str, Any
         "sequences": [album.picture(path) for path in recordings],
         "maps": [album.picture(path) for path in maps],
         "samples": [album.picture(path) for path in samples],
-        "recordings": _linked(files.run, files.visualization.glob("*.rrd")),
-        "files": _files(files),
-        "others": _linked(files.run, files.evaluation.glob("*.csv")),
+        "recordings": _linked(files.run, (p for p in files.visualization.glob("*.rrd") if p.name not in older)),
+        "files": _files(files, older),
+        "others": _linked(files.run, (path for path in files.evaluation.glob("*.csv") if path.name not in older)),
     }
 
 
@@ -552,8 +578,8 @@ def _retrieval(retrieval: pd.DataFrame, headlines: list[tuple[str, str]], unit: 
     return matrices, f"{note}same way to within {done['angle_deg'].iloc[0]:g}°."
 
 
-def _files(files: SceneFiles) -> Table | None:
-    """Link the files of each pair."""
+def _files(files: SceneFiles, older: Collection[str]) -> Table | None:
+    """Link the files of each pair, except for those named `older`."""
     rows = []
     for (map_device, query_device), stem in _pairs_of(files).items():
         paths = {
@@ -562,7 +588,10 @@ def _files(files: SceneFiles) -> Table | None:
             "references": files.retrieval(map_device, query_device),
             "recording": files.visualization / f"{stem.name}.rrd",
         }
-        links = [Cell(name, link=_link(files.run, path)) if path.is_file() else "–" for name, path in paths.items()]
+        links = [
+            Cell(name, link=_link(files.run, path)) if path.is_file() and path.name not in older else "–"
+            for name, path in paths.items()
+        ]
         rows.append([map_device, query_device, *links])
     caption = "Files of each pair: poses (device to world), a status row for each query, references of each image"
     return Table(caption, ["map", "query", "poses", "statuses", "references", "recording"], rows) if rows else None

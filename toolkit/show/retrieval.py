@@ -15,7 +15,7 @@ from toolkit.capture.images import read_for_display
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.embedders import open_descriptors
 from toolkit.errors import ArtifactError
-from toolkit.files import image_name, pair_devices, read_references
+from toolkit.files import image_name, pair_devices, read_references, require_current
 from toolkit.geometry import Floats, Ints
 from toolkit.show.choice import find_query, shown_name
 from toolkit.show.figures import (
@@ -108,12 +108,13 @@ class RetrievedPair:
                 used. None, or without files yet: overlap is computed without map points.
 
         Raises:
-            ArtifactError: the references are missing or damaged.
+            ArtifactError: the references are missing, damaged, or older than the embeddings.
         """
         capture = Capture.from_sessions_root(sessions_root)
         jsonl = Path(jsonl)
         map_device, query_device = pair_devices(jsonl.stem)
         self.session, self.map_session = capture[f"{query_device}_query"], capture[f"{map_device}_map"]
+        require_current(jsonl, "retrieve", missing=False)
         self.embeddings, self.lines = Path(embeddings), read_references(jsonl, "path")
         h5 = None if poses_dir is None else Path(poses_dir) / f"{jsonl.stem}.h5"
         self.local_map = load_maps(map_files(map_dir, self.map_session.id, h5))

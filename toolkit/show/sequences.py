@@ -16,7 +16,7 @@ from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.tables import POSE_NAMES, as_strings, read_query_table
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import ArtifactError
-from toolkit.files import pair_name, require_made_from, require_whole
+from toolkit.files import pair_name, require_current, require_whole
 from toolkit.geometry import Floats
 from toolkit.show.figures import GREEN, ORANGE, SKY, VERMILLION, new_figure, percent, shared_legend, styled
 from toolkit.show.metrics import (
@@ -60,11 +60,16 @@ class SequencePair:
         if not (single.is_file() and sequence.is_file()):
             return None
         try:
-            require_made_from(sequence, single)
+            require_current(sequence, "sequence")
         except ArtifactError as error:
             log.warning("Not used: %s", error)
             return None
         return cls(stem)
+
+    @property
+    def path(self) -> Path:
+        """The poses of the frames."""
+        return self.stem.with_name(f"{self.stem.name}_sequence.txt")
 
     def _path(self, end: str) -> Path:
         """Return a file of the pair; raise ArtifactError if it is damaged."""

@@ -1,0 +1,236 @@
+"""Artifacts that belong together: what is older than what it was made from is made again, or withheld and named."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from toolkit import pipeline
+from toolkit.errors import ArtifactError
+from toolkit.evaluate import evaluate_scene
+from toolkit.exchange.submission import collect
+from toolkit.files import (
+    SceneFiles,
+    changed_sources,
+    file_fingerprint,
+    link_or_copy,
+    older_files,
+    read_sidecar,
+    require_current,
+    why_older,
+    write_sidecar,
+)
+from toolkit.localizers.map import Map
+from toolkit.show.comparison import compare_runs
+from toolkit.show.inspection import inspect_query
+from toolkit.show.report import write_report
+from toolkit.show.retrieval import RetrievedPair
+from toolkit.visualize import visualize_scene
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> tuple[Path, Path, Path]:
+    """Poses, made from references, and an evaluation, made from both."""
+    names = "retrieval/a.jsonl", "poses/a.txt", "evaluation/e.csv"
+    references, poses, evaluation = (tmp_path / name for name in names)
+    for path, sources in ((references, []), (poses, [references]), (evaluation, [poses, references])):
+        path.parent.mkdir()
+        path.write_text(path.name)
+        write_sidecar(path, {}, made_from=sources)
+    return references, poses, evaluation
+
+
+def test_what_nothing_has_changed_is_current(made: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    references, poses, evaluation = made
+    assert [changed_sources(path) for path in made] == [[], [], []]
+    references.touch()  # the content counts, not the time
+    write_sidecar(references, {"made": "again, the same"})
+    assert not why_older(poses, "localize")
+    require_current(evaluation, "evaluate")
+    shutil.copytree(tmp_path, tmp_path.parent / f"{tmp_path.name}-moved")
+    moved = tmp_path.parent / f"{tmp_path.name}-moved" / "poses" / "a.txt"
+    (moved.parents[1] / "retrieval" / "a.jsonl").write_text("other")
+    assert changed_sources(moved) == [moved.parents[1] / "retrieval" / "a.jsonl"]
+    assert not changed_sources(poses), "a moved run refers to its own files"
+
+
+def test_what_is_older_is_named_with_what_to_do(made: tuple[Path, Path, Path]) -> None:
+    references, poses, evaluation = made
+    references.write_text("other references")
+    write_sidecar(references, {})
+    assert changed_sources(poses) == [references]
+    assert why_older(poses, "localize") == "a.txt is of an older retrieval/a.jsonl: run the localize stage again."
+    with pytest.raises(ArtifactError, match="run the evaluate stage"):
+        require_current(evaluation, "evaluate")
+    assert not why_older(evaluation, "evaluate", (".txt",)), "of these sources, none has changed"
+    assert set(older_files(evaluation.parent, "evaluate")) == {"e.csv"}
+
+
+def test_a_missing_source_is_told_from_a_changed_one(made: tuple[Path, Path, Path]) -> None:
+    references, poses, evaluation = made
+    references.unlink()
+    assert "which is missing now" in why_older(poses, "localize")
+    assert not why_older(poses, "localize", missing=False)
+    assert not older_files(poses.parent, "localize"), "poses outlive their references"
+    assert older_files(evaluation.parent, "evaluate")
+
+
+def test_a_file_of_another_tool_has_no_sources(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("a")
+    assert not changed_sources(tmp_path / "a.txt")
+    (tmp_path / "a.txt.meta.json").write_text(json.dumps({"made_from": ["no", "mapping"]}))
+    assert not changed_sources(tmp_path / "a.txt")
+
+
+# Every pair of artifacts that a reader combines: the one made older, the reader, and what it then says.
+
+
+def quiet(*_: object, **__: object) -> None:
+    pass
+
+
+def evaluated(files: SceneFiles, capture: Path) -> str:
+    evaluation = evaluate_scene(capture / "sessions", files.poses_dir, files.retrieval_dir, None, map_dir=files.maps)
+    states = [*evaluation.retrieval["state"], *evaluation.overlap["state"]]
+    return "\n".join([*evaluation.messages, *map(str, states)])
+
+
+def visualized(files: SceneFiles, capture: Path) -> str:
+    chosen = {"samples": 0, "recordings": False, "session_recordings": False}
+    folders = files.poses_dir, files.maps, files.run / "pictures"
+    table = visualize_scene(capture / "sessions", *folders, chosen, map_device="ios")
+    return "\n".join(table["reason"])
+
+
+def reported(files: SceneFiles, capture: Path) -> str:
+    return write_report(files.run).read_text()
+
+
+def compared(files: SceneFiles, capture: Path) -> str:
+    return str(compare_runs([files.run, files.run]))
+
+
+def inspected_again(files: SceneFiles, capture: Path) -> str:
+    return str(inspect_query(files.run, files.scene, "ios", "hl").again({}))
+
+
+def inspected(files: SceneFiles, capture: Path) -> str:
+    return "" if inspect_query(files.run, files.scene, "ios", "hl").retrieved else "run the localize stage again"
+
+
+def opened(files: SceneFiles, capture: Path) -> str:
+    return str(Map.open(files.run, files.scene, "ios"))
+
+
+def retrieved(files: SceneFiles, capture: Path) -> str:
+    return str(RetrievedPair(capture / "sessions", files.retrieval("ios", "hl"), files.embeddings))
+
+
+def submitted(files: SceneFiles, capture: Path) -> str:
+    poses = files.poses_txt("ios", "hl")
+    poses.write_text("".join(poses.read_text().splitlines(keepends=True)[:-1]))  # a query without a pose
+    return collect([files.run], "Ours.", captures=[capture]).text()
+
+
+POSES, TABLE, REFERENCES, MAP, VECTORS = "poses txt", "poses csv", "references", "map", "vectors"
+READERS = [
+    (POSES, reported, "Not shown: recall.csv is of an older poses/"),
+    (TABLE, reported, "Not shown: recall.csv is of an older poses/"),
+    (REFERENCES, reported, "Not shown: recall.csv is of an older"),
+    (VECTORS, reported, "run the retrieve stage again"),
+    (POSES, compared, "run the evaluate stage again"),
+    (REFERENCES, evaluated, "Retrieval is not judged."),
+    (MAP, evaluated, "run the localize stage again"),
+    (MAP, visualized, "run the localize stage again"),
+    (REFERENCES, inspected, "run the localize stage again"),
+    (REFERENCES, inspected_again, "run the localize stage again"),
+    (MAP, inspected_again, "run the localize stage again"),
+    (REFERENCES, opened, "run the localize stage again"),
+    (MAP, opened, "run the localize stage again"),
+    (VECTORS, retrieved, "run the retrieve stage again"),
+    (REFERENCES, submitted, "run the localize stage again"),
+]
+
+
+def change(files: SceneFiles, what: str) -> None:
+    """Replace an artifact by an equally good one of other content, as its stage does."""
+    poses, references = files.poses_txt("ios", "hl"), files.retrieval("ios", "hl")
+    if what == VECTORS:
+        path = next(files.embeddings.glob("ios_map/*/*.npy"))
+        vectors = np.load(path)
+        path.unlink()  # a link to the finished run
+        np.save(path, -vectors)
+        write_sidecar(path, read_sidecar(path) or {"embedder": "other"})
+        return
+    table = poses.with_suffix(".csv")
+    path = {POSES: poses, TABLE: table, REFERENCES: references, MAP: files.maps / "ios_map.npz"}[what]
+    content = path.read_bytes()
+    if what == MAP:
+        with np.load(path) as stored:
+            arrays = dict(stored)
+        path.unlink()
+        np.savez_compressed(path, **arrays)
+    else:
+        lines = content.decode().splitlines(keepends=True)
+        path.unlink()
+        path.write_text("".join([*lines[:-2], *lines[:-3:-1]]))  # the last two in another order
+    artifact = poses if what == TABLE else path
+    others = [table, poses.with_suffix(".h5")] if artifact == poses else []
+    write_sidecar(artifact, {"made": "again"}, others)
+
+
+@pytest.fixture
+def linked(small_run: Path, tmp_path: Path) -> SceneFiles:
+    """The small run, by hard links, so that nothing done here is done there."""
+    shutil.copytree(small_run, tmp_path / small_run.name, copy_function=link_or_copy)
+    return SceneFiles(tmp_path / small_run.name, "SMALL")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("what", "read", "said"), READERS, ids=[f"{r.__name__}-{what}" for what, r, _ in READERS])
+def test_no_reader_combines_an_artifact_with_an_older_one(
+    linked: SceneFiles, small_capture: Path, what: str, read: Callable[[SceneFiles, Path], str], said: str
+) -> None:
+    change(linked, what)
+    try:
+        text = read(linked, small_capture)
+    except ArtifactError as error:
+        text = str(error)
+    assert said in text
+
+
+@pytest.mark.slow
+def test_what_only_left_out_says_older_and_the_next_run_mends_it(linked: SceneFiles, small_capture: Path) -> None:
+    manifest = linked.run.parent / f"{linked.run.name}.yaml"
+    manifest.write_text(f"captures: ['{small_capture}']\noutput_root: .\n")
+    common = ["visualize.samples=1", "visualize.recordings=false", "visualize.session_recordings=false"]
+    nearest = [*common, "localize.method=nearest"]
+    pipeline.run(manifest, only="localize", overrides=nearest, say=quiet, in_place=True)
+    rows = {row["stage"]: row for row in json.loads((linked.run / "run.json").read_text())["stages"]}
+    assert {stage: row["status"] for stage, row in rows.items()} == {
+        **dict.fromkeys(("explore", "embed", "retrieve"), "reused"), "localize": "done",
+        **dict.fromkeys(("evaluate", "visualize"), "older"),
+    }  # fmt: skip
+    assert "run the evaluate stage again" in rows["evaluate"]["reason"]
+    page = (linked.run / "report.html").read_text()
+    assert "mean recall" not in page
+    pipeline.run(manifest, overrides=nearest, say=quiet, in_place=True)
+    rows = {row["stage"]: row["status"] for row in json.loads((linked.run / "run.json").read_text())["stages"]}
+    assert (rows["evaluate"], rows["visualize"]) == ("done", "done")
+    assert "mean recall" in (linked.run / "report.html").read_text()
+
+
+@pytest.mark.slow
+def test_a_run_with_other_settings_leaves_the_finished_one_as_it_is(linked: SceneFiles, small_capture: Path) -> None:
+    manifest = linked.run.parent / f"{linked.run.name}.yaml"
+    manifest.write_text(f"captures: ['{small_capture}']\noutput_root: .\n")
+    before = {path: file_fingerprint(path) for path in linked.run.rglob("*") if path.is_file()}
+    run = pipeline.run(manifest, only="localize", overrides=["localize.method=nearest"], say=quiet)
+    assert run.name == f"{linked.run.name}-method-nearest"
+    assert {path: file_fingerprint(path) for path in linked.run.rglob("*") if path.is_file()} == before
+    taken = SceneFiles(run, "SMALL")
+    assert taken.retrieval("ios", "hl").samefile(linked.retrieval("ios", "hl"))
+    assert "nearest" in taken.poses_csv("ios", "hl").read_text()
