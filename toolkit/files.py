@@ -199,7 +199,8 @@ def write_sidecar(
         "version": __version__,
         "fingerprint": fingerprint(settings),
         "files": {file.name: [file.stat().st_size, checksum(file) if checksums else None] for file in files},
-        "made_from": {os.path.relpath(source, Path(path).parent): _content(source) for source in made_from},
+        "made_from": (sources := {os.path.relpath(one, Path(path).parent): _content(one) for one in made_from}),
+        "sources": fingerprint(sources),
         **({"unfinished": True} if unfinished else {}),
         "settings": settings,
     }
@@ -218,7 +219,8 @@ def read_sidecar(path: str | Path) -> dict[str, Any] | None:
     if not record.get("files"):  # written by a version without checksums
         return None
     damage = _damage(path, record)
-    if not damage and record.get("fingerprint") != fingerprint(settings):
+    whole = record.get("fingerprint") == fingerprint(settings)
+    if not damage and not (whole and record.get("sources", "") in ("", fingerprint(record.get("made_from")))):
         damage = f"{sidecar_path(path)} is damaged"
     if damage:
         log.warning("%s: not reused.", damage)

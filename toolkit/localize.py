@@ -134,7 +134,7 @@ def localize_pairs(
     settings = resolve_auto(LocalizeSettings.of(settings))
     folders = _Folders(*map(Path, (sessions_root, retrieval_dir, out_dir, features_dir, map_dir)))
     stage = _Stage(folders, settings, queries, skip_existing, workers or default_workers())
-    capture = stage.capture
+    capture, settings = stage.capture, stage.settings
     table = PairRows(capture.name, folders.out, folders.retrieval)
     query_tables: dict[str, list[pd.DataFrame]] = {}
     devices = product(capture.devices_with("map", map_device), capture.devices_with("query", query_device))
@@ -247,9 +247,13 @@ class _Stage(Remade):
             time_ns: when the work was distributed, so that a worker does not reuse a stage that it opened earlier.
             made_by: the `networks` of the main process; a worker must have the same.
         """
-        self.folders, self.settings, self.queries = folders, settings, queries
+        self.folders, self.queries = folders, queries
         self.skip_existing, self.workers = skip_existing, workers or default_workers()
         self.capture = Capture.from_sessions_root(folders.sessions)
+        if settings.unit == "auto":
+            settings = LocalizeSettings.of(settings, {"unit": self.capture.unit})
+        self.settings = settings
+        """With the capture's unit instead of `auto`."""
         self.kinds, self.escalation = create_methods(settings)
         self.predictor = open_predictor(settings, self.capture, folders.map) if settings.predicts else None
         if made_by is not None:

@@ -137,11 +137,14 @@ class Job:
         return next(iter(older.values()), "")
 
     def forget(self) -> None:
-        """Remove the fingerprints beside the outputs, so that the stage reuses none of them."""
+        """Remove the fingerprints beside the outputs, so that the stage reuses none of them.
+
+        HDF5 files keep theirs: they look torn without, and a stage discards their groups itself (`skip_existing`).
+        """
         folder = stage_outputs(self.files, self.stage)
         if folder:
             for path in folder.rglob("*.meta.json"):
-                if self.makes(path.relative_to(folder).as_posix()):
+                if self.makes(path.relative_to(folder).as_posix()) and not path.name.endswith(".h5.meta.json"):
                     path.unlink()
 
 

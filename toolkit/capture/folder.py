@@ -8,8 +8,12 @@ from toolkit.capture.devices import SPLITS, in_order, session_id, session_of
 from toolkit.capture.names import require_name
 from toolkit.capture.session import Session
 from toolkit.errors import CaptureError
+from toolkit.files import read_json
 
 log = logging.getLogger(__name__)
+
+IMPORT_RECORD = "proc/import.json"
+"""What an import has noted in a session: the unit of its poses, `m` or null if unknown, and its inputs."""
 
 
 class Capture:
@@ -64,6 +68,12 @@ class Capture:
     def name(self) -> str:
         """Name of the folder, which is the name of the scene in all outputs."""
         return self.path.absolute().name
+
+    @property
+    def unit(self) -> str | None:
+        """Unit of the poses: `m`, or None if the import of a session has noted that it is unknown."""
+        units = [read_json(folder / IMPORT_RECORD).get("unit", "m") for folder in self._folders.values()]
+        return None if None in units else "m"
 
     @property
     def devices(self) -> list[str]:

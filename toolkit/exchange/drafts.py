@@ -22,6 +22,7 @@ from toolkit.capture import RAW_DATA, Trajectory, write_session
 from toolkit.capture.cameras import camera_text
 from toolkit.capture.devices import SPLITS
 from toolkit.capture.exif import NO_FILE, ORIENTATION, read_header, read_number, time_taken
+from toolkit.capture.folder import IMPORT_RECORD
 from toolkit.capture.names import EXPECTED_NAME, is_bad_name, note_linked_here
 from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.files import IMPORTED, write_folder
@@ -31,7 +32,6 @@ from toolkit.manifest import nearest
 SUBSESSION = "import"
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 PLACING = ("link", "copy")
-IMPORT_RECORD = "proc/import.json"
 NOT_INSIDE = "not a path inside the folder of images"
 AXES = {"opencv": np.eye(4), "opengl": np.diag([1.0, -1.0, -1.0, 1.0])}
 """named_from_cam (4, 4) for each named convention of camera axes: `opencv`, the toolkit's own, has x right, y down, z

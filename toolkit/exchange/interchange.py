@@ -22,10 +22,10 @@ import pycolmap
 
 from toolkit.capture import parse_camera
 from toolkit.capture.exif import exif_camera
+from toolkit.capture.folder import IMPORT_RECORD
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.exchange.drafts import (
-    IMPORT_RECORD,
     SUBSESSION,
     DraftImage,
     ImportReport,
@@ -198,7 +198,8 @@ def import_once(
             report = import_transforms(options["table"], capture, device, split, unit_m=unit_m)[0]
         else:
             report = import_images(images, capture, device, split, unit_m=unit_m or 1.0, **options)
-        write_text(record, json.dumps(read_json(record) | {"input": inputs}, indent=1) + "\n")
+        unknown = {"unit": None} if unit_m is None else {}
+        write_text(record, json.dumps(read_json(record) | unknown | {"input": inputs}, indent=1) + "\n")
         return report.text()
     before = read_json(record).get("input", {})
     if differing := [name for name in inputs if before.get(name) != inputs[name]]:

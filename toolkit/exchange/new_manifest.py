@@ -9,8 +9,7 @@ from pathlib import Path
 from toolkit.capture import Capture
 from toolkit.capture.check import ASKED, check_capture
 from toolkit.errors import ManifestError
-from toolkit.exchange.drafts import IMPORT_RECORD
-from toolkit.files import read_json, write_text
+from toolkit.files import write_text
 
 TEMPLATE = Path(__file__).resolve().parents[2] / "data_manifests" / "my-capture.yaml"
 MOST_PROBLEMS = 10
@@ -56,7 +55,6 @@ def _new_lines(path: Path, folder: Path) -> dict[str, str]:
     """Return lines for a manifest in `folder`, keyed by the prefix of the template's line that each replaces."""
     capture = Capture.open(path)
     lists = {name for session in capture.usable("query") for name in session.keyframe_files}
-    units = {read_json(capture.folder(name) / IMPORT_RECORD).get("unit", "m") for name in capture.session_ids}
     outside = not path.resolve().is_relative_to(Path.cwd().resolve())
     where = str(path.resolve()) if outside else os.path.relpath(path.resolve(), folder.resolve())
     lines = {
@@ -66,6 +64,6 @@ def _new_lines(path: Path, folder: Path) -> dict[str, str]:
     if ASKED not in lists:
         choices = ", ".join(f"keyframes_{name}" for name in sorted(lists))
         lines["queries: "] = "queries: all # images of the query sessions" + (f", or {choices}" if choices else "")
-    if None in units:
+    if capture.unit is None:
         lines["unit: "] = "unit: null # unknown according to its import; limits are relative to the depth of the scene"
     return lines

@@ -164,8 +164,9 @@ class Manifest(Settings):
     """Up direction of the captures' world, three numbers; null: estimate it from the map's camera poses if needed."""
     tolerate_failed: Tolerance = Tolerance()
     """Shares of failures that a run tolerates. Failures never stop the run; too many change its exit code."""
-    unit: Unit = "m"
-    """Unit of the captures' poses; null: unknown, and limits are relative to the depth of the scene in the map."""
+    unit: Unit = "auto"
+    """Unit of the captures' poses: m, or null if unknown, and limits are relative to the depth of the scene in the map.
+    auto: as the sessions' import has noted, else m."""
     explore: ExploreSettings = ExploreSettings()
     """Contents of notebook 01, which shows the capture."""
     embed: EmbedSettings = EmbedSettings()

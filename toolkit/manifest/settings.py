@@ -41,7 +41,7 @@ def _check_models(model: str | list[str]) -> str | list[str]:
     return model if len(model) > 1 else model[0]
 
 
-Unit = Literal["m"] | None
+Unit = Literal["auto", "m"] | None
 Direction = Annotated[list[float], Field(min_length=3, max_length=3), AfterValidator(_check_direction)]
 
 
@@ -146,8 +146,8 @@ class ExploreSettings(Settings):
     """Number of sample images shown per session."""
     world_up: Direction | None = None
     """Up direction of the world, three numbers; null: estimate it from the camera poses."""
-    unit: Unit = "m"
-    """Unit of the poses; null: unknown, and figures show no unit."""
+    unit: Unit = "auto"
+    """Unit of the poses: m, or null if unknown, and figures show no unit; auto: as the sessions' import has noted."""
 
 
 class VladSettings(Settings):
@@ -584,8 +584,9 @@ class LocalizeSettings(Settings):
     """Random seed of RANSAC. The same seed gives the same poses for any number of threads."""
     world_up: Direction | None = None
     """Up direction of the map's world, three numbers; null: estimate it from the map's camera poses."""
-    unit: Unit = "m"
-    """Unit of the capture's poses; null: unknown, and limits are relative to the depth of the scene in the map."""
+    unit: Unit = "auto"
+    """Unit of the capture's poses: m, or null if unknown, and limits are relative to the depth of the scene in the map.
+    auto: as the sessions' import has noted, else m."""
 
     @property
     def predicts(self) -> bool:

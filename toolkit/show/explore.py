@@ -103,14 +103,15 @@ def draw_samples(capture: Capture, count: int = 4) -> "Figure":
 
 
 @styled
-def draw_top_view(capture: Capture, up: ArrayLike | None = None, unit: str | None = "m") -> "Figure":
+def draw_top_view(capture: Capture, up: ArrayLike | None = None, unit: str | None = "auto") -> "Figure":
     """Draw all camera centers from above, those of queries only with ground truth; return the figure.
 
     Args:
         capture: the capture; places far apart get panels of their own.
         up: up direction (3,); None: estimated from the cameras.
-        unit: unit of the poses, None if unknown.
+        unit: unit of the poses, None if unknown; `auto`: that of the capture.
     """
+    unit = capture.unit if unit == "auto" else unit
     poses = {session.id: of_session for session in _usable(capture) if len(of_session := _poses(session))}
     if not poses:
         return _empty("no session with poses can be used")
