@@ -137,14 +137,14 @@ class Job:
         return next(iter(older.values()), "")
 
     def forget(self) -> None:
-        """Remove the fingerprints beside the outputs, so that the stage reuses none of them.
+        """Remove the fingerprints beside the outputs of a stage without `skip_existing`, so that it reuses none of them.
 
-        HDF5 files keep theirs: they look torn without, and a stage discards their groups itself (`skip_existing`).
+        The other stages discard their results themselves; without their records, these would look torn.
         """
         folder = stage_outputs(self.files, self.stage)
-        if folder:
+        if folder and "skip_existing" not in self.parameters:
             for path in folder.rglob("*.meta.json"):
-                if self.makes(path.relative_to(folder).as_posix()) and not path.name.endswith(".h5.meta.json"):
+                if self.makes(path.relative_to(folder).as_posix()):
                     path.unlink()
 
 
