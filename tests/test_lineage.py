@@ -69,6 +69,17 @@ def test_what_is_older_is_named_with_what_to_do(made: tuple[Path, Path, Path]) -
     assert set(older_files(evaluation.parent, "evaluate")) == {"e.csv"}
 
 
+def test_the_time_that_queries_took_is_no_change(tmp_path: Path) -> None:
+    table, evaluation = tmp_path / "poses.csv", tmp_path / "recall.csv"
+    table.write_text("status,seconds,focal_px\nok,0.5,\n")
+    evaluation.write_text("made")
+    write_sidecar(evaluation, {}, made_from=[table])
+    table.write_text("status,seconds,focal_px\nok,0.7,\n")
+    assert not changed_sources(evaluation)
+    table.write_text("status,seconds,focal_px\nlow_confidence,0.5,\n")
+    assert changed_sources(evaluation) == [table]
+
+
 def test_a_missing_source_is_told_from_a_changed_one(made: tuple[Path, Path, Path]) -> None:
     references, poses, evaluation = made
     references.unlink()

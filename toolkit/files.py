@@ -1,5 +1,6 @@
 """Artifacts on disk: written atomically, each with a record of its settings, inputs and checksums."""
 
+import csv
 import glob
 import hashlib
 import json
@@ -312,12 +313,24 @@ def older_files(folder: str | Path, stage: str, of: Callable[[str], bool] = lamb
     return older
 
 
+_TIMES = {"seconds", "first_seconds"}
+"""Columns that differ between two equal tables of queries."""
+
+
 def _content(path: str | Path) -> str | None:
-    """Return a hash of a file, which is quick for an artifact with a record; None if it is missing."""
+    """Return a hash of a file, which is quick for an artifact with a record; None if it is missing.
+
+    The time that queries took does not count: the same poses, computed again, are the same.
+    """
     try:
+        if Path(path).suffix == ".csv":
+            with open(path, newline="", encoding="utf-8") as stream:
+                rows = csv.reader(stream)
+                columns = [number for number, name in enumerate(next(rows, [])) if name not in _TIMES]
+                return fingerprint([[row[number] for number in columns if number < len(row)] for row in rows])
         size, recorded = _read_record(path).get("files", {}).get(Path(path).name, (None, None))
         return recorded if recorded and Path(path).stat().st_size == size else checksum(path)
-    except (OSError, TypeError, ValueError, AttributeError):
+    except (OSError, TypeError, ValueError, AttributeError, csv.Error):
         return None
 
 

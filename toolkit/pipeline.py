@@ -137,7 +137,7 @@ class Job:
         return next(iter(older.values()), "")
 
     def forget(self) -> None:
-        """Remove the fingerprints beside the outputs of a stage without `skip_existing`, so that it reuses none of them.
+        """Remove the fingerprints beside the outputs of a stage without `skip_existing`, so that it reuses none.
 
         The other stages discard their results themselves; without their records, these would look torn.
         """
