@@ -25,6 +25,7 @@ from tests.calls import call
 from tests.other_kind import add_other_kind
 from toolkit import geometry, localize, sequence
 from toolkit.capture import Capture, Session, Trajectory
+from toolkit.capture.folder import IMPORT_RECORD
 from toolkit.capture.images import read_image
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.embed import embed_sessions
@@ -53,6 +54,7 @@ from toolkit.manifest import EmbedSettings, LocalizeSettings
 from toolkit.rerank import rerank_pairs
 from toolkit.retrieve import load_embeddings, retrieve_pairs
 from toolkit.sequence import sequence_pairs
+from toolkit.show.inspection import InspectedPair
 
 LIST = "keyframes_original"
 DEVICES = ("ios", "hl", "spot")
@@ -1020,7 +1022,7 @@ ESCALATES = {"features": {"kinds": ["sift"], "escalation": ["other"]}, "pnp": {"
     ],
     ids=["pnp", "nearest", "feed_forward", "hybrid", "no map", "escalates", "hybrid escalates", "no map escalates"],
 )
-def test_pictures_get_the_pose_of_the_run_byte_for_byte(
+def test_pictures_and_inspections_get_the_pose_of_the_run_byte_for_byte(
     small_capture: Path, run: SceneFiles, monkeypatch: pytest.MonkeyPatch, method: dict[str, Any], device: str
 ) -> None:
     add_other_kind(monkeypatch)
@@ -1030,15 +1032,15 @@ def test_pictures_get_the_pose_of_the_run_byte_for_byte(
     settings |= method
     run_stage(small_capture, run, query_device=device, **settings)
     place = Map.open(run.run, run.scene, "ios")
-    assert place.settings == LocalizeSettings.of(settings), "the run's own settings"
+    assert place.settings == LocalizeSettings.of(settings, {"unit": "m"}), "the run's own settings"
     session = Capture.open(small_capture)[f"{device}_query"]
+    pair = InspectedPair("ios", device, run.poses_dir)
     keyframes = session.keyframes(LIST)
     quarter_turns = place.turns.of(session) if place.turns else np.zeros(len(session.images), int)
     lines = run.poses_txt("ios", device).read_text().splitlines()[1:]
     localized = LocalizedQueries(run.poses_dir / f"{run.poses_txt('ios', device).stem}.h5")
-    for line, rows, key in zip(
-        lines, session.rows_of_keyframes(keyframes), keyframes.itertuples(index=False), strict=True
-    ):
+    queries = zip(lines, session.rows_of_keyframes(keyframes), keyframes.itertuples(index=False), strict=True)
+    for number, (line, rows, key) in enumerate(queries):
         paths = [session.image_path(int(row)) for row in rows]
         cameras = [session.camera(sensor) for sensor in session.images["sensor_id"].iloc[rows]]
         rig = session.rig_from_cam(rows)
@@ -1049,9 +1051,29 @@ def test_pictures_get_the_pose_of_the_run_byte_for_byte(
         )
         text = ", ".join(repr(float(number)) for number in geometry.qt_from_pose(estimate.world_from_rig))
         assert text in line, f"{key.timestamp}"
+        if number < 2:
+            again = pair.look(number).again().after
+            np.testing.assert_array_equal(again.pose, estimate.world_from_rig)
+            assert (again.status, again.numbers["num_inliers"]) == (estimate.status, estimate.num_inliers)
         before = localized[key.timestamp, key.device_id].correspondences
         np.testing.assert_array_equal(before.point_index, estimate.correspondences.point_index)
         np.testing.assert_array_equal(before.inlier, estimate.correspondences.inlier)
+
+
+def test_the_unit_that_an_import_noted_is_that_of_every_door(capture: Path, run: SceneFiles) -> None:
+    record = capture / "sessions" / "ios_map" / IMPORT_RECORD
+    record.parent.mkdir(exist_ok=True)
+    record.write_text('{"unit": null}')
+    run_stage(capture, run, query_device="ios")  # as a notebook by hand: no word about the unit
+    by_hand = run.poses_txt("ios", "ios").read_bytes()
+    assert read_map_record(map_record_path(run.poses_dir, run.scene, "ios"))["unit"] is None
+    assert Map.open(run.run, run.scene, "ios").settings.unit is None
+    assert InspectedPair("ios", "ios", run.poses_dir).localized.unit[0] != "m"
+    table = run_stage(capture, run, query_device="ios", unit=None)  # as a run of the manifest of `new`
+    assert table["skipped"].all(), "the same settings"
+    run_stage(capture, run, query_device="ios", unit="m")
+    assert read_map_record(map_record_path(run.poses_dir, run.scene, "ios"))["unit"] == "m", "who knows better, decides"
+    assert by_hand != run.poses_txt("ios", "ios").read_bytes()
 
 
 @pytest.mark.slow
