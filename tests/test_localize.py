@@ -1069,6 +1069,17 @@ def test_the_unit_that_an_import_noted_is_that_of_every_door(capture: Path, run:
     assert read_map_record(map_record_path(run.poses_dir, run.scene, "ios"))["unit"] is None
     assert Map.open(run.run, run.scene, "ios").settings.unit is None
     assert InspectedPair("ios", "ios", run.poses_dir).localized.unit[0] != "m"
+    assert not [name for name in pd.read_csv(run.poses_csv("ios", "ios")) if name.endswith("_m")], "no meters"
+    folders = run.poses_dir, run.retrieval_dir, run.evaluation
+    evaluate_scene(capture / "sessions", *folders, map_device="ios", query_device="ios", queries=LIST)
+    for path in run.evaluation.glob("*.csv"):
+        assert not [name for name in pd.read_csv(path) if name.endswith("_m")], path.name
+    errors = pd.read_csv(run.evaluation / "errors.csv")
+    assert {"translation_error_L", "position_std_L"} <= {*errors}
+    table = pd.read_csv(run.poses_csv("ios", "ios"))
+    length = InspectedPair("ios", "ios", run.poses_dir).localized.unit[1]
+    np.testing.assert_allclose(errors["position_std_L"] * length, table["position_std"])
+    assert set(table["unit"]) == {"unknown"}
     table = run_stage(capture, run, query_device="ios", unit=None)  # as a run of the manifest of `new`
     assert table["skipped"].all(), "the same settings"
     run_stage(capture, run, query_device="ios", unit="m")

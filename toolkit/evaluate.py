@@ -43,6 +43,7 @@ from toolkit.show.metrics import (
     is_below,
     is_posed,
     length_unit,
+    named_by_unit,
     pose_errors,
     poses_of,
     recall,
@@ -84,7 +85,7 @@ def evaluate_scene(
     """Evaluate the poses of all pairs of a scene and write tables and figures.
 
     A pair without poses, without queries or without ground truth gets a row that says so. If the unit of the poses is
-    unknown, lengths are in `metrics.UNKNOWN_UNIT` instead of meters, also in columns that end in `_m`.
+    unknown, lengths are in `metrics.UNKNOWN_UNIT` instead of meters; in the files, their columns end in `_L`, not `_m`.
 
     Args:
         sessions_root: folder `sessions/` of the capture.
@@ -264,7 +265,7 @@ def write_evaluation(
             path.unlink(missing_ok=True)
     for path, table in tables.items():
         with write_atomic(path) as temporary:
-            table.to_csv(temporary, index=False)
+            named_by_unit(table, evaluation.unit).to_csv(temporary, index=False)
     figures = draw_evaluation(evaluation)
     for name in FIGURES:
         if name in figures:

@@ -145,11 +145,12 @@ def _root() -> Path:
     return NOTEBOOKS.parent if NOTEBOOKS.is_dir() else Path.cwd()
 
 
-def readable(table: "pd.DataFrame") -> "pd.DataFrame":
+def readable(table: "pd.DataFrame", unit: str = "m") -> "pd.DataFrame":
     """Return a stage's table in a form that fits a page: rows `<query> in <map>`, medians and recall first, no folders.
 
     Columns without information are dropped: a `reason` that is always empty, a `state` that is always `evaluated`, and
-    `localized`, the sum of `ok` and `low_confidence`. Column names are shortened where the unit implies the quantity.
+    `localized`, the sum of `ok` and `low_confidence`. Columns of lengths end in their `unit`. Column names are
+    shortened where the unit implies the quantity.
     """
     trivial = {"state": "evaluated", "reason": ""}
     dropped = [name for name, text in trivial.items() if name in table and (table[name] == text).all()]
@@ -160,6 +161,7 @@ def readable(table: "pd.DataFrame") -> "pd.DataFrame":
         shown[name] = [Path(path).name for path in shown[name]]
     first = [name for word in ("median", "recall@") for name in shown if name.startswith(word)]
     shown = shown[[*first, *(name for name in shown if name not in first)]]
+    shown = shown if unit == "m" else shown.rename(columns=lambda name: re.sub(r"_m$", f"_{unit}", name))
     return shown.rename(columns=_short_column)
 
 

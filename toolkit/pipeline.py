@@ -210,7 +210,8 @@ def own_run(manifest_path: str | Path, overrides: Sequence[str], name: str | Non
         return name or manifest.name, None
     keys = changed_keys(plain, manifest, overrides)
     if name is None:
-        name = manifest.name if manifest.name != plain.name else variant_name(plain.name, keys)
+        chosen = any(override.partition("=")[0].strip() == "name" for override in overrides)
+        name = manifest.name if chosen else variant_name(plain.name, keys)
     return name, Shared(plain.name, list(keys)) if name != plain.name else None
 
 

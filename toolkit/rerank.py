@@ -57,12 +57,13 @@ def rerank_pairs(
     skip_existing: bool = True,
     workers: int = 0,
 ) -> pd.DataFrame:
-    """Write, for every pair of devices, the references of each query image in order of verified inliers.
+    """Write, for every pair of devices, the references of each query image in order of verified matches.
 
-    The files have the retrieval stage's format. `score` is the number of inliers, or 0 if as many occur by chance;
-    references with equal scores keep their order. Each reference also has `retrieval_score`, `retrieval_rank`, and
-    `num_matches`, of which the inliers are a part. A query image that cannot be verified keeps the order of retrieval,
-    and its `reason` says why. Every image of a rig is verified separately.
+    The files have the retrieval stage's format. `score` is the number of verified matches, which fit one essential
+    matrix, or 0 if as many occur by chance; references with equal scores keep their order. Each reference also has
+    `retrieval_score`, `retrieval_rank`, and `num_matches`, of which the verified ones are a part. A query image that
+    cannot be verified keeps the order of retrieval, and its `reason` says why. Every image of a rig is verified
+    separately.
 
     Args:
         sessions_root: `<capture>/sessions`.
@@ -200,7 +201,7 @@ class _Pair:
     def _reranked(
         self, query: dict[str, Any], verifier: Verifier, map_store: FeatureStore, query_store: FeatureStore
     ) -> dict[str, Any]:
-        """Return a query image's row with its references in order of verified inliers."""
+        """Return a query image's row with its references in order of verified matches."""
         name, references = _name(query), query["topk"][: self.settings.topn]
         if name not in query_store:
             return self._kept(query, query_store.failed.get(name, "no local features of the query image"))

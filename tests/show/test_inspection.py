@@ -76,7 +76,7 @@ def test_it_shows_what_the_stage_stored(files: SceneFiles, pair: InspectedPair) 
     stored = pair.localized.queries[int(row["timestamp"]), row["device_id"]]
     assert one.status == row["status"]
     assert one.numbers["num_inliers"] == row["num_inliers"]
-    assert one.matches["inliers"].sum() == stored.correspondences.inlier.sum() > 0
+    assert one.matches["agree"].sum() == stored.correspondences.inlier.sum() > 0
     assert one.matches.to_numpy().sum() == len(stored.correspondences)
     assert one.references["name"][one.references["used"]].tolist() == stored.references
     ranked = one.references.dropna(subset="rank")
@@ -84,8 +84,8 @@ def test_it_shows_what_the_stage_stored(files: SceneFiles, pair: InspectedPair) 
     assert ranked.sort_values("rank")["score"].notna().all()
     legend = [mark.get_label() for mark in _marks_of(one.correspondences)]
     for kind, counts in one.matches.iterrows():
-        if counts["inliers"]:
-            assert f"{str(kind).replace('/', ', ')}: {counts['inliers']} inliers" in legend
+        if counts["agree"]:
+            assert f"{str(kind).replace('/', ', ')}: {counts['agree']} agree" in legend
     shown = text_of(one.figure)
     assert one.status in shown
     assert f"\n{one.name.partition('/raw_data/')[2]}\n" in shown

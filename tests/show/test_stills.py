@@ -116,7 +116,7 @@ def test_localization_pictures_of_success_and_failure(images):
     references = [reference, replace(reference, name="r2")]
     done = draw_localization(QueryDetails([query], references, references[:1]), "query 7: ok")
     assert done.get_suptitle() == "query 7: ok · off by 0°, 2 cm"
-    titles = ["query: 4 of 5 map points agree", *(f"reference {k}: 2 inliers" for k in (1, 2))]
+    titles = ["query: 4 of 5 map points agree", *(f"reference {k}: sees 2 points" for k in (1, 2))]
     assert [axis.get_title() for axis in done.axes] == [*titles, "rejected: contradicts the others"]
     lost = QueryDetails([ShownImage("q", query.path, CAMERA, np.full((4, 4), np.nan))])
     failed = draw_localization(lost, "query 8")
@@ -147,7 +147,7 @@ def test_the_worst_queries_are_drawn_with_the_matches_they_share_with_a_referenc
     np.testing.assert_allclose([line[0] for line in agreeing], query.pixels[[0, 4]])
     np.testing.assert_allclose([line[1] for line in agreeing], reference.pixels[[1, 0]] / 2 + [64 * 1.03, 0])
     np.testing.assert_allclose([line[0] for line in rejected], query.pixels[[2]])
-    assert [text.get_text() for text in third.texts] == ["no common inliers"]
+    assert [text.get_text() for text in third.texts] == ["no common points"]
     assert [text.get_text() for text in fourth.texts] == ["no matches; rejected: contradicts the others"]
     assert draw_worst([])
 

@@ -409,6 +409,11 @@ class KeyIndex:
         return [self._order[start:end] for start, end in zip(starts, ends, strict=True)]
 
 
+POSES_UNIT = {"position_std": "position_std_m"}
+"""Length column of a pair's table if the unit of its poses is unknown, and its name where the unit is the meter. A
+column `unit` then says `unknown`: lengths are in the unit of the poses."""
+
+
 def read_query_table(path: Path, columns: Sequence[str]) -> pd.DataFrame:
     """Read the CSV file of a pair with one row per query: timestamp as int64, device_id and `columns` as text.
 
@@ -417,7 +422,7 @@ def read_query_table(path: Path, columns: Sequence[str]) -> pd.DataFrame:
     """
     types: dict[Any, Any] = {"timestamp": np.int64, "device_id": str, **dict.fromkeys(columns, str)}
     try:
-        table = pd.read_csv(path, dtype=types)
+        table = pd.read_csv(path, dtype=types).rename(columns=POSES_UNIT)
     except (OSError, ValueError, OverflowError) as error:
         raise ArtifactError(f"{path}: not a table of queries ({error}). Localize this pair again.") from None
     if missing := [name for name in types if name not in table]:

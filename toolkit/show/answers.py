@@ -87,9 +87,9 @@ class Answer:
 
     @cached_property
     def matches(self) -> pd.DataFrame:
-        """Counts of the correspondences: one row per kind (`sift/guided`), columns inliers and rejected."""
+        """Counts of the correspondences: one row per kind (`sift/guided`), columns agree and rejected."""
         matches = self.correspondences
-        counts = pd.DataFrame({"inliers": matches.inlier, "rejected": ~matches.inlier}, dtype=int)
+        counts = pd.DataFrame({"agree": matches.inlier, "rejected": ~matches.inlier}, dtype=int)
         return counts.groupby(pd.Index(matches.found_by.astype(object), name="found by")).sum()
 
     @cached_property
@@ -97,8 +97,8 @@ class Answer:
         """One row per reference that was retrieved or used, best first.
 
         Columns: name; rank and score of the retrieval (for a rig, of the camera that ranks it highest); used (whether
-        the pose was computed from it); rejected (whether it contradicts the used references); inliers (inliers that it
-        observes; missing if its views were not stored).
+        the pose was computed from it); rejected (whether it contradicts the used references); shared (points
+        that agree with the pose and that it observes; missing if its views were not stored).
         """
         retrieved, matches, used = self.retrieved, self.correspondences, self.localized.references
         names = list(dict.fromkeys([*used, *self.localized.rejected, *retrieved]))
@@ -108,10 +108,10 @@ class Answer:
             rank, score = retrieved.get(name, (None, np.nan))
             number = used.index(name) if name in used else -1
             seen = matches.view_of[matches.view_reference == number]
-            inliers = int(matches.inlier[seen].sum()) if number in kept else None
-            rows.append((name, rank, score, name in used, name in self.localized.rejected, inliers))
-        table = pd.DataFrame(rows, columns=["name", "rank", "score", "used", "rejected", "inliers"])
-        return table.astype({"rank": "Int64", "inliers": "Int64"})
+            shared = int(matches.inlier[seen].sum()) if number in kept else None
+            rows.append((name, rank, score, name in used, name in self.localized.rejected, shared))
+        table = pd.DataFrame(rows, columns=["name", "rank", "score", "used", "rejected", "shared"])
+        return table.astype({"rank": "Int64", "shared": "Int64"})
 
     def __repr__(self) -> str:
         return f"{self.headline}\n{self.name}\n{self.reason}"

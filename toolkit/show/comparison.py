@@ -24,7 +24,7 @@ from toolkit.files import SceneFiles, require_current, require_whole, write_text
 from toolkit.geometry import Floats, Ints
 from toolkit.show.figures import BLUE, GREEN, ORANGE, SKY, VERMILLION, new_figure, number, percent, save_figure, styled
 from toolkit.show.localized import LocalizedPair
-from toolkit.show.metrics import is_below, parse_threshold, unit_of
+from toolkit.show.metrics import is_below, named_as_meters, parse_threshold, unit_of
 from toolkit.show.report import (
     PICTURE_BUDGET,
     Album,
@@ -243,6 +243,7 @@ def _read_errors(folder: Path, record: Mapping[str, Any]) -> pd.DataFrame:
             table = pd.read_csv(path, dtype={**types, **dict.fromkeys(_ERRORS, float)})
         except (OSError, ValueError, OverflowError) as error:
             raise ArtifactError(f"{path}: not a table of errors ({error}). Run its stage evaluate again.") from None
+        table = named_as_meters(table)
         if lacking := [name for name in _NEEDED if name not in table]:
             raise ArtifactError(f"{path}: column {lacking[0]!r} is missing. Run its stage evaluate again.")
         tables.append(table.assign(scene=scene))

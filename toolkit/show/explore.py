@@ -214,8 +214,8 @@ def _draw_rows(
         for block, query in enumerate(row):
             for axis, hit in zip(line[1 + block * references :], query["topk"][:references], strict=False):
                 verified = "retrieval_rank" in hit
-                title = f"{hit['score']} inliers, was {hit['retrieval_rank']}" if verified else f"{hit['score']:.2f}"
-                shown.append((axis, hit, f"{map_device} {title}"))
+                score = f"{hit['score']} verified, was {hit['retrieval_rank']}" if verified else f"{hit['score']:.2f}"
+                shown.append((axis, hit, f"{map_device} {score}"))
         for axis, entry, title in shown:
             axis.imshow(read_for_display(capture.image_path(image_name(entry["path"])), inches_to_pixels(2.2)))
             axis.set_title(title, fontsize=8)

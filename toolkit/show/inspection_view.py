@@ -28,14 +28,14 @@ if TYPE_CHECKING:
 
 PURPLE = "#CC79A7"
 WAYS = {"guided": GREEN, "descriptors": SKY, "lifted": PURPLE}
-"""Colors of inliers, by how they were found."""
+"""Colors of correspondences that agree with the pose, by how they were found."""
 MARKERS = {"sift": "o", "aliked": "^", "superpoint": "s"}
 """Markers, by kind of features."""
 REJECTED = ESTIMATED
 LONGEST_SIDE = 900
 """Longer side of a drawn image, pixels, at most: no figure shows more detail."""
 LINES = 60
-"""Lines drawn at most for inliers, and for rejected matches: more would hide the images."""
+"""Lines drawn at most for correspondences that agree, and for rejected ones: more would hide the images."""
 SURE = 2.4477
 """Radius of the 95 % region of a 2D normal distribution, standard deviations."""
 MAX_POINTS = 20_000
@@ -44,7 +44,7 @@ LABELS = {
     "inlier_ratio": ("inlier ratio", "{:.0%}"), "num_guided": ("guided matches", "{:.0f}"),
     "rmse_px": ("reprojection error [px]", "{:.2f}"), "coverage": ("image covered", "{:.0%}"),
     "p_correct": ("probability of being right", "{:.1%}"), "rival_support": ("support of the best rival", "{:.0%}"),
-    "agreement": ("inliers of a second kind", "{:.0f}"), "position_std_m": ("std. dev. of position [{unit}]", "{:.2g}"),
+    "agreement": ("matches of a second kind", "{:.0f}"), "position_std_m": ("std. dev. of position [{unit}]", "{:.2g}"),
     "rotation_std_deg": ("std. dev. of rotation [deg]", "{:.2g}"), "scale_std": ("std. dev. of scale", "{:.1%}"),
 }  # fmt: skip
 """Label and format of each number; `{unit}` stands for the pair's unit of length."""
@@ -78,7 +78,7 @@ def draw_inspection(answer: Answer) -> "Figure":
     if legend:
         above.legend(handles=legend, loc="outside lower center", ncols=6, fontsize=8)
     further = [
-        (image, f"query, {_camera_name(image)}" + f": {image.num_inliers} inliers" * details.has_matches, True)
+        (image, f"query, {_camera_name(image)}" + f": {image.num_inliers} map points agree" * details.has_matches, True)
         for image in details.cameras[1:]
     ]
     images = [*references[1:], *further]
@@ -136,12 +136,12 @@ def _caption(answer: Answer) -> str:
     if not references:
         return f"{text} · no reference"
     both = np.isin(camera.matches, references[0][0].matches)
-    joined = f", {int(camera.inlier[both].sum())} of them in both" if both.any() else ""
+    joined = f", {int(camera.inlier[both].sum())} of this image" if both.any() else ""
     return f"{text} · {references[0][1]}{joined}"
 
 
 def _draw_joined(axis: "Axes", answer: Answer) -> None:
-    """Draw the query image with the most inliers and its best reference at one height, and join common points."""
+    """Draw the query image with the most points and its best reference at one height, and join common points."""
     details, correspondences = answer.details, answer.correspondences
     image, references = details.cameras[0], details.captioned_references()[:1]
     width, height = _draw_photograph(axis, image)
@@ -218,7 +218,7 @@ def _marks_of(correspondences: Correspondences) -> list[Any]:
     from matplotlib.lines import Line2D
 
     marks = []
-    for agrees, text in ((True, "inliers"), (False, "rejected")):
+    for agrees, text in ((True, "agree"), (False, "rejected")):
         for kind in sorted(set(correspondences.found_by[correspondences.inlier == agrees].tolist())):
             count = int(((correspondences.found_by == kind) & (correspondences.inlier == agrees)).sum())
             color, marker = _style(kind, agrees)

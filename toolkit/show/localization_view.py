@@ -195,7 +195,7 @@ class _ChosenWriter:
         text += [f"- {image.name}" for image in query.cameras]
         if query.has_matches:
             rejected = sum(len(image.matches) for image in query.cameras) - len(points)
-            text += ["", f"{len(points)} inliers: green projections of map points, white measured keypoints. "
+            text += ["", f"{len(points)} map points agree: green projections, white measured keypoints. "
                      f"{rejected} rejected matches: orange.", ""]  # fmt: skip
         elif located:
             text += ["", "No matches: the pose comes from the references as a whole.", ""]

@@ -105,7 +105,7 @@ class QueryDetails:
     """Images and correspondences of one query."""
 
     cameras: Sequence[ShownImage]
-    """Its images, at the estimated pose; the one with the most inliers first."""
+    """Its images, at the estimated pose; the one with the most points that agree first."""
     references: Sequence[ShownImage] = ()
     """Map images that it was localized with, best first."""
     rejected: Sequence[ShownImage] = ()
@@ -128,7 +128,7 @@ class QueryDetails:
     def captioned_references(self) -> list[tuple[ShownImage, str, bool]]:
         """Return at most `REFERENCES` references, up to two of them rejected: image, caption, whether used."""
         agree = [
-            (image, f"reference {rank}" + (f": {image.num_inliers} inliers" if self.has_matches else ""), True)
+            (image, f"reference {rank}" + (f": sees {image.num_inliers} points" if self.has_matches else ""), True)
             for rank, image in enumerate(self.references, start=1)
         ]
         rejected = [(image, "rejected: contradicts the others", False) for image in self.rejected]

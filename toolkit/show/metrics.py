@@ -40,6 +40,16 @@ def unit_of(*thresholds: str) -> str:
     return UNKNOWN_UNIT if any(name.endswith(f"{UNKNOWN_UNIT})") for name in thresholds) else "m"
 
 
+def named_by_unit(table: pd.DataFrame, unit: str) -> pd.DataFrame:
+    """Return a table whose columns of lengths say their unit: `translation_error_L`, not `translation_error_m`."""
+    return table if unit == "m" else table.rename(columns=lambda name: re.sub(r"_m$", f"_{unit}", name))
+
+
+def named_as_meters(table: pd.DataFrame) -> pd.DataFrame:
+    """Return a table that `named_by_unit` has named, with the names that the toolkit computes with."""
+    return table.rename(columns=lambda name: re.sub(f"_{UNKNOWN_UNIT}$", "_m", name))
+
+
 def small_unit(unit: str) -> tuple[str, float]:
     """Return the unit that errors are shown in, and the factor from `unit` to it."""
     return ("cm", 100.0) if unit == "m" else (unit, 1.0)

@@ -13,6 +13,7 @@ from urllib.parse import quote
 
 import pandas as pd
 
+from toolkit.capture.tables import POSES_UNIT
 from toolkit.errors import ArtifactError
 from toolkit.files import (
     SceneFiles,
@@ -30,6 +31,7 @@ from toolkit.show.metrics import (
     THRESHOLDS,
     WRONG,
     length_unit,
+    named_as_meters,
     parse_threshold,
     small_unit,
     unit_of,
@@ -350,7 +352,7 @@ def _scene(files: SceneFiles, fingerprint: str, album: "Album") -> dict[str, Any
 def _read_table(path: Path, messages: list[str]) -> pd.DataFrame:
     """Read a table; empty if the file is missing. An unreadable file adds a line to `messages`."""
     try:
-        return pd.read_csv(path, dtype={"device_id": str})
+        return named_as_meters(pd.read_csv(path, dtype={"device_id": str}).rename(columns=POSES_UNIT))
     except (FileNotFoundError, pd.errors.EmptyDataError):
         pass
     except (OSError, ValueError) as error:

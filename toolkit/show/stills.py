@@ -147,9 +147,9 @@ def draw_scene(
 def draw_localization(query: QueryDetails, title: str = "", unit: tuple[str, float] = ("m", 1.0)) -> "Figure":
     """Draw the first image of a query beside its references, with their correspondences; return the figure.
 
-    Green dots are the projections of the inliers' map points; a white line joins each to its measured keypoint. Orange
-    dots are keypoints of rejected matches. The references have the same colors. A pose without matches is shown with
-    the references that it was computed from, and those that were rejected.
+    Green dots are the projections of map points that agree with the pose; a white line joins each to its measured
+    keypoint. Orange dots are keypoints of rejected matches. The references have the same colors. A pose without matches
+    is shown with the references that it was computed from, and those that were rejected.
 
     Args:
         query: the query; its first image is drawn.
@@ -213,7 +213,7 @@ def draw_worst(queries: Sequence[WorstQuery], title: str = "The worst queries") 
         off = f"off by {query.rotation_deg:.2g}°, {_length(query.translation_m, query.unit)}; " if has_error else ""
         name = shown_name(query.details.cameras[0].name, MOST_LETTERS)
         axis.set_title(f"{rank}. {query.pair}: {off}{query.reason}\n{name}", fontsize=8, loc="left", wrap=True)
-    legend = "left: query, right: its best reference; lines: inliers (green) and rejected matches (orange) of both"
+    legend = "left: query, right: its best reference; lines: agreeing (green) and rejected matches (orange) of both"
     figure.suptitle(f"{title}\n({legend})")
     return figure
 
@@ -236,7 +236,7 @@ def _draw_side_by_side(axis: "Axes", query: QueryDetails) -> None:
             axis.add_collection(LineCollection(list(joined[::step]), colors=color, linewidths=0.5, alpha=0.8))
             draw_dots(axis, joined.reshape(-1, 2), s=4, c=color, lw=0)
         if not image.inlier[i].any():
-            text = "no common inliers" if query.has_matches else f"no matches; {caption}"
+            text = "no common points" if query.has_matches else f"no matches; {caption}"
             axis.text(end / 2, height * 0.96, text, ha="center", color="white", fontsize=8,
                       bbox={"facecolor": "black", "alpha": 0.6, "lw": 0, "pad": 2})  # fmt: skip
     axis.set(xlim=(0, end), ylim=(height, 0), aspect="equal")
