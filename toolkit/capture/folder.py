@@ -71,8 +71,9 @@ class Capture:
 
     @property
     def unit(self) -> str | None:
-        """Unit of the poses: `m`, or None if the import of a session has noted that it is unknown."""
-        units = [read_json(folder / IMPORT_RECORD).get("unit", "m") for folder in self._folders.values()]
+        """Unit of the map's poses: `m`, or None if the import of a map session has noted that it is unknown."""
+        maps = [folder for folder in self._folders.values() if session_of(folder.name)[1] == "map"]
+        units = [read_json(folder / IMPORT_RECORD).get("unit", "m") for folder in maps or self._folders.values()]
         return None if None in units else "m"
 
     @property

@@ -99,8 +99,7 @@ def import_transforms(
             draft.unit = None
             draft.notes.append(
                 "unit of the poses: not known. If you know its length in meters, give --unit METERS (1 if a phone's "
-                "tracking or a scanner gave the poses); else set `unit: null` in the manifest, as `python -m toolkit "
-                "new` does"
+                "tracking or a scanner gave the poses). Lengths are otherwise relative to the depth of the scene"
             )
     return write_drafts(*drafts)
 

@@ -78,7 +78,7 @@ def draw_inspection(answer: Answer) -> "Figure":
     if legend:
         above.legend(handles=legend, loc="outside lower center", ncols=6, fontsize=8)
     further = [
-        (image, f"query, {_camera_name(image)}" + f": {image.num_inliers} map points agree" * details.has_matches, True)
+        (image, f"query, {_camera_name(image)}" + f": {image.num_inliers} points agree" * details.has_matches, True)
         for image in details.cameras[1:]
     ]
     images = [*references[1:], *further]
