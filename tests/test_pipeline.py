@@ -370,7 +370,7 @@ def test_a_failing_cell_stops_with_its_message_and_the_notebook(
         pipeline, "_write_report", lambda run: reports.append(json.loads((run / "run.json").read_text())["status"])
     )
     with pytest.raises(StageError) as error:
-        pipeline.run(place / "run.yaml", overrides=["retrieve.topk=99"], only="retrieve")
+        pipeline.run(place / "run.yaml", overrides=["retrieve.topk=99"], only="retrieve", in_place=True)
     message, where = str(error.value).splitlines()
     assert message == "images.txt, line 3: found a dragon."
     executed = Path(where.rpartition("where: ")[2])

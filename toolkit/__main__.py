@@ -488,7 +488,8 @@ def _summary_of_stopped(manifest: Path, overrides: Sequence[str], name: str | No
 
     with suppress(ToolkitError, OSError):
         content = load_manifest(manifest, overrides)
-        run_dir = Path(content.output_root) / (content.name if in_place else own_run(manifest, overrides, name)[0])
+        own = content.name if in_place else own_run(manifest, content, overrides, name)[0]
+        run_dir = Path(content.output_root) / own
         if read_json(run_dir / RECORD).get("pid") == os.getpid():
             return summary(run_dir)
     return {}

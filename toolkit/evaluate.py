@@ -527,8 +527,7 @@ def overlap_table(
         if causes := [cause for folder in references.values() if (cause := left_out(folder, name))]:
             row["state"] = f"{LEFT_OUT}{causes[0]}"  # the files are those of an earlier run
             continue
-        maps_of = None if poses_dir is None else Path(poses_dir) / f"{name}.txt"
-        if maps_of is not None and (older := why_older(maps_of, "localize", (".npz",), missing=False)):
+        if h5 is not None and (older := why_older(h5.with_suffix(".txt"), "localize", (".npz",), missing=False)):
             row["state"] = f"{LEFT_OUT}{older}"
             continue
         local_map = load(map_files(map_dir, f"{map_}_map", h5))

@@ -125,6 +125,11 @@ def link_or_copy(source: str | Path, target: str | Path) -> None:
         shutil.copy2(source, target)
 
 
+def link_folder(source: str | Path, target: str | Path) -> None:
+    """Make a new folder of hard links to the files of another, see `link_or_copy`; hidden ones are left out."""
+    shutil.copytree(source, target, copy_function=link_or_copy, ignore=shutil.ignore_patterns(".*"))
+
+
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file atomically; see `write_atomic`."""
     with write_atomic(path) as temporary:

@@ -3,7 +3,7 @@
 Poses are `a_from_b`, (..., 4, 4) float64; quaternions are qw qx qy qz.
 """
 
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,6 +21,11 @@ def unit(vectors: NDArray[Real], shortest: float = 1e-12) -> NDArray[Real]:
     lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
     units: NDArray[Real] = vectors / np.maximum(lengths, vectors.dtype.type(shortest))
     return units
+
+
+def rounded(values: NDArray[Any], step: float) -> NDArray[np.float32]:
+    """Return values rounded to multiples of `step`, a power of two: float32 sums such numbers exactly, in any order."""
+    return np.asarray(np.rint(values / np.float32(step)) * np.float32(step), np.float32)
 
 
 def quaternion_to_rotation(qwxyz: ArrayLike) -> Floats:

@@ -20,7 +20,7 @@ import tqdm.std
 
 from toolkit import errors
 from toolkit.errors import CaptureError, ManifestError, StageError, shortage
-from toolkit.files import SceneFiles, files_fingerprint, link_or_copy, older_files, read_json, write_text
+from toolkit.files import SceneFiles, files_fingerprint, link_folder, older_files, read_json, write_text
 from toolkit.manifest import (
     OPTIONAL,
     STAGES,
@@ -90,8 +90,8 @@ def start(stage: str, sessions_root: str | None = None, **folders: str | None) -
         stage: name of the stage, one of `toolkit.manifest.STAGES`.
         sessions_root: folder `sessions` of a capture; None: the demo capture, rendered if absent.
         **folders: the notebook's other folders by the names of its parameters; None: below `runs/<scene>-by-hand/` of
-            the repository, see `_by_hand`. If such a default folder lacks the results of an earlier stage, or they are
-            older than those of the stage before it, that stage runs now.
+            the repository, see `_take_from_run`. If such a default folder lacks the results of an earlier stage, or
+            they are older than those of the stage before it, that stage runs now.
 
     Raises:
         ManifestError: a parameter is unknown to the notebook, or has a wrong type.
@@ -104,8 +104,9 @@ def start(stage: str, sessions_root: str | None = None, **folders: str | None) -
     sessions, root = sessions_or_demo(sessions_root), _root()
     _check_devices_and_queries(stage, sessions)
     scene = sessions.parent.name
-    by_default = any(folder is None for folder in folders.values())
-    files = _by_hand(stage, root / "runs", scene) if by_default else SceneFiles(root / "runs" / scene, scene)
+    files = SceneFiles(root / "runs" / f"{scene}-by-hand", scene)
+    if None in folders.values():
+        _take_from_run(stage, files)
     defaults = {**stage_folders(files), "out_dir": stage_outputs(files, stage)}
     _make_upstream(stage, sessions, files, {defaults[name] for name, folder in folders.items() if folder is None})
     resolved = {"sessions_root": sessions}
@@ -152,6 +153,8 @@ def readable(table: "pd.DataFrame", unit: str = "m") -> "pd.DataFrame":
     `localized`, the sum of `ok` and `low_confidence`. Columns of lengths end in their `unit`. Column names are
     shortened where the unit implies the quantity.
     """
+    from toolkit.show.metrics import named_by_unit
+
     trivial = {"state": "evaluated", "reason": ""}
     dropped = [name for name, text in trivial.items() if name in table and (table[name] == text).all()]
     shown = table.drop(columns=["path", "localized", *dropped], errors="ignore")
@@ -161,8 +164,7 @@ def readable(table: "pd.DataFrame", unit: str = "m") -> "pd.DataFrame":
         shown[name] = [Path(path).name for path in shown[name]]
     first = [name for word in ("median", "recall@") for name in shown if name.startswith(word)]
     shown = shown[[*first, *(name for name in shown if name not in first)]]
-    shown = shown if unit == "m" else shown.rename(columns=lambda name: re.sub(r"_m$", f"_{unit}", name))
-    return shown.rename(columns=_short_column)
+    return named_by_unit(shown, unit).rename(columns=_short_column)
 
 
 def _short_column(name: str) -> str:
@@ -261,41 +263,33 @@ def stage_outputs(files: SceneFiles, stage: str) -> Path | None:
 
 
 _TAKEN = ".taken.json"
-_FOLDERS = {"embeddings": "embed", "retrieval": "retrieve", "reranked": "rerank", "poses": "localize"}
-"""Folders of results that a notebook by hand takes from a run, and the stages that make them."""
-_CACHES = ("features", "map", "index")
+_RESULTS, _CACHES = ("embeddings", "retrieval", "reranked", "poses"), ("features", "map", "index")
+"""Folders that notebooks by hand take from a run. Caches are taken once: stages find in them what still fits."""
 
 
-def _by_hand(stage: str, runs: Path, scene: str) -> SceneFiles:
-    """Return the files of notebooks that are run by hand, so that they leave finished runs as they are.
+def _take_from_run(stage: str, files: SceneFiles) -> None:
+    """Fill the folder of notebooks by hand, as far as no notebook has made results there, with hard links.
 
-    The folder is `<scene>-by-hand` beside the runs. Results that no notebook has made there by hand are hard links to
-    those of a finished run of the scene: the run called `<scene>`, or else the latest one. They follow that run.
+    They lead to results of a finished run of the scene: the run called `<scene>`, or else the latest one. If that run
+    changes, its new results are taken.
     """
-    files = SceneFiles(runs / f"{scene}-by-hand", scene)
-    taken = read_json(files.root / _TAKEN)
-    made_here = stage_outputs(files, stage)
-    if made_here is not None and made_here.name in taken and made_here.name in _FOLDERS:
-        taken.pop(made_here.name)  # the links stay until the stage replaces them; from now on they are its own
-        write_text(files.root / _TAKEN, json.dumps(taken) + "\n")
-    run = _finished_run(runs, scene)
-    if run is None:
-        return files
-    donor = SceneFiles(run, scene)
-    for name in (*_FOLDERS, *_CACHES):
-        source, target = donor.root / name, files.root / name
-        state = str(run / _state(source))
-        own = target.exists() and name not in taken  # made by hand
-        if source.is_dir() and not own and taken.get(name) != state and target != made_here:
-            if name in _CACHES and target.exists():
-                continue  # it may hold more by now; stages find in it what still fits
+    taken, made_here = read_json(files.root / _TAKEN), stage_outputs(files, stage)
+    if made_here is not None:
+        taken.pop(made_here.name, None)  # the links stay until the stage replaces them; from now on they are its own
+    run = _finished_run(files.run.parent, files.scene)
+    donor = None if run is None else SceneFiles(run, files.scene).root
+    links = {} if donor is None else {name: (donor / name, files.root / name) for name in (*_RESULTS, *_CACHES)}
+    for name, (source, target) in links.items():
+        if not source.is_dir() or target == made_here or (target.exists() and name not in taken):
+            continue
+        state = f"{run} {_state(source)}"
+        if taken.get(name) != state:
             shutil.rmtree(target, ignore_errors=True)
-            shutil.copytree(source, target, copy_function=link_or_copy, ignore=shutil.ignore_patterns(".*"))
-            taken[name] = state
+            link_folder(source, target)
+            taken |= {name: state} if name in _RESULTS else {}
             print(f"{name}: taken from {run}")
-    if taken:
+    if taken or (files.root / _TAKEN).exists():
         write_text(files.root / _TAKEN, json.dumps(taken) + "\n")
-    return files
 
 
 def _state(folder: Path) -> str:

@@ -178,32 +178,39 @@ def run(
         ManifestError: the manifest or an argument is wrong; nothing has run.
         StageError: a notebook failed; `run.json` then says `"status": "failed"`.
     """
-    if only is not None and only not in STAGES:
-        raise ManifestError(f"--only {only}: no such stage. {nearest(only, STAGES)}")
     if in_place and name:
         raise ManifestError("--in-place and --name exclude each other: give one of them.")
     overrides = list(overrides)
     manifest = load_manifest(manifest_path, overrides)
-    if only is not None and only not in manifest.stages:
-        raise ManifestError(f"--only {only}: {manifest_path} has no section `{only}`, so the stage is off.")
+    _check_only(only, manifest, manifest_path)
     if not in_place:
-        name, shared = own_run(manifest_path, overrides, name)
+        name, shared = own_run(manifest_path, manifest, overrides, name)
         if name != manifest.name or shared:
-            manifest = _own_manifest(manifest_path, overrides, name, shared)
+            manifest = _own_manifest(manifest, name, shared, shared.run if shared else name)
             say(f"Run folder: {Path(manifest.output_root) / name}")
     return _run_in(manifest, manifest_path, only, force, say, cluster)
 
 
-def own_run(manifest_path: str | Path, overrides: Sequence[str], name: str | None = None) -> tuple[str, Shared | None]:
-    """Return the name of the run with these overrides, and what it shares with the manifest's own run.
+def _check_only(only: str | None, manifest: Manifest, manifest_path: str | Path) -> None:
+    """Raise ManifestError for a stage to run alone that does not exist or is off."""
+    if only is not None and only not in STAGES:
+        raise ManifestError(f"--only {only}: no such stage. {nearest(only, STAGES)}")
+    if only is not None and only not in manifest.stages:
+        raise ManifestError(f"--only {only}: {manifest_path} has no section `{only}`, so the stage is off.")
+
+
+def own_run(
+    manifest_path: str | Path, manifest: Manifest, overrides: Sequence[str], name: str | None = None
+) -> tuple[str, Shared | None]:
+    """Return the name of the run of a manifest with overrides, and what it shares with the run without them.
 
     Args:
+        manifest: content of `manifest_path`, with the overrides.
         name: chosen by the user; None: named after the overrides that change a result.
 
     Returns:
         The name; and what it shares, None if it is the manifest's own run or there can be none.
     """
-    manifest = load_manifest(manifest_path, overrides)
     try:
         plain = load_manifest(manifest_path)
     except ManifestError:  # it needs the overrides, so there is no run without them
@@ -215,20 +222,21 @@ def own_run(manifest_path: str | Path, overrides: Sequence[str], name: str | Non
     return name, Shared(plain.name, list(keys)) if name != plain.name else None
 
 
-def _own_manifest(
-    manifest_path: str | Path, overrides: Sequence[str], name: str, shared: Shared | None
-) -> Manifest:
-    """Return the manifest of a run of its own, and fill its folder with what it shares with another run."""
-    manifest = load_manifest(manifest_path, [*overrides, f"name={name}"])
+def _own_manifest(manifest: Manifest, name: str, shared: Shared | None, plain: str) -> Manifest:
+    """Return the manifest of a run of its own, and fill its folder with what it shares with another run.
+
+    Args:
+        plain: name of the manifest without overrides, whose rendered capture all its runs use.
+    """
+    own = manifest.model_copy(update={"name": name})
     if shared is None or {key.partition(".")[0] for key in shared.differing} & {"captures", "demo_data"}:
-        return manifest
-    root = Path(manifest.output_root)
-    if manifest.demo_data:  # rendered once for all runs
-        captures = _captures(manifest.model_copy(update={"name": load_manifest(manifest_path).name}))
-        rendered = ["demo_data=null", f"captures={json.dumps(list(map(str, captures)))}"]
-        manifest = load_manifest(manifest_path, [*overrides, *rendered, f"name={name}"])
-    take_over(root / shared.run, root / name, [Path(capture).name for capture in manifest.captures], shared.differing)
-    return manifest
+        return own
+    if manifest.demo_data:
+        captures = _captures(manifest.model_copy(update={"name": plain}))
+        own = own.model_copy(update={"demo_data": None, "captures": list(map(str, captures))})
+    root = Path(own.output_root)
+    take_over(root / shared.run, root / name, [Path(capture).name for capture in own.captures], shared.differing)
+    return own
 
 
 def _run_in(
@@ -264,13 +272,14 @@ def sweep(
     Raises:
         ManifestError: the manifest or a swept value is wrong; nothing has run.
     """
-    name, shared = own_run(manifest_path, overrides)
+    name, shared = own_run(manifest_path, load_manifest(manifest_path, overrides), overrides)
     plain = shared or Shared(name, [])
-    runs = swept_runs(name, sweeps)
-    for one in runs:  # find mistakes before hours of work
-        _check_stages(load_manifest(manifest_path, [*overrides, *one.overrides, f"name={one.name}"]), manifest_path)
+    runs = {one: load_manifest(manifest_path, [*overrides, *one.overrides]) for one in swept_runs(name, sweeps)}
+    for manifest in runs.values():  # find mistakes before hours of work
+        _check_only(only, manifest, manifest_path)
+        _check_stages(manifest, manifest_path)
     done, failed = dict[SweptRun, Path](), dict[SweptRun, ToolkitError]()
-    for number, one in enumerate(runs, 1):
+    for number, (one, manifest) in enumerate(runs.items(), 1):
         say(f"{one.name} ({number} of {len(runs)}): {', '.join(one.overrides)}")
         # The run that differs in the fewest keys has most results to share; among equals, prefer one that succeeded.
         donor = max(
@@ -281,10 +290,8 @@ def sweep(
         keys = [override.partition("=")[0] for override in one.overrides if override not in donor.overrides]
         differing = [*keys, *(plain.differing if donor.name == plain.run else ())]
         try:
-            manifest = _own_manifest(
-                manifest_path, [*overrides, *one.overrides], one.name, Shared(donor.name, differing)
-            )
-            done[one] = _run_in(manifest, manifest_path, only, force, say, cluster)
+            own = _own_manifest(manifest, one.name, Shared(donor.name, differing), plain.run)
+            done[one] = _run_in(own, manifest_path, only, force, say, cluster)
         except ToolkitError as error:
             say(f"{one.name}: {sentence(error)}")
             failed[one] = error

@@ -10,6 +10,7 @@ from toolkit.errors import ManifestError
 from toolkit.features.groups import GroupWriter
 from toolkit.files import SceneFiles
 from toolkit.manifest import load_manifest
+from toolkit.pipeline import sweep
 from toolkit.runs.sweep import changed_keys, swept_runs, take_over, variant_name
 
 
@@ -120,3 +121,11 @@ def test_a_long_name_is_cut_and_still_its_own() -> None:
     names = [variant_name("x", {"captures": "/a/long/path" * 20 + end}) for end in "ab"]
     assert max(map(len, names)) <= 100
     assert len(set(names)) == 2
+
+
+def test_a_sweep_of_a_stage_that_is_off_is_refused_before_any_work(tmp_path: Path) -> None:
+    (tmp_path / "x.yaml").write_text(f"captures: [a]\noutput_root: {tmp_path}/runs\n")
+    for only, said in (("retreive", "no such stage"), ("rerank", "so the stage is off")):
+        with pytest.raises(ManifestError, match=said):
+            sweep(tmp_path / "x.yaml", ["localize.method=pnp,nearest"], only=only)
+    assert not (tmp_path / "runs").exists()

@@ -24,7 +24,7 @@ from toolkit.errors import ArtifactError, ToolkitError
 from toolkit.features.features import DESCRIPTOR_SCALE, LocalFeatures
 from toolkit.features.matching import unit_descriptors
 from toolkit.files import file_fingerprint, require_whole, write_atomic
-from toolkit.geometry import unit
+from toolkit.geometry import rounded, unit
 from toolkit.manifest import VladSettings
 from toolkit.threads import fixed_sums
 
@@ -35,7 +35,7 @@ VLAD_FORMAT = 2
 _SHORTEST = 1e-9  # shorter vectors are rounding errors, and are not normalized
 _CHUNK = 8192
 """Number of local descriptors that are assigned at once."""
-_POINT_STEP, _CENTROID_STEP = np.float32(2**-11), np.float32(2**-8)
+_POINT_STEP, _CENTROID_STEP = 2**-11, 2**-8
 """Whitened descriptors and centroids are multiples of these. The centroids' step is coarse, so that one that moves by a
 rounding error is the same again."""
 _PROJECTION_BITS = 14
@@ -92,7 +92,7 @@ class Vlad:
         """Return the whitened local descriptors (N, local_dim), of length about 1."""
         products = (descriptors * np.float32(DESCRIPTOR_SCALE)) @ self.local_projection
         whitened = np.asarray((products - self.local_offset) * self.local_scale, np.float32)
-        return _rounded(unit(whitened, _SHORTEST), _POINT_STEP)
+        return rounded(unit(whitened, _SHORTEST), _POINT_STEP)
 
     def stack(self, inputs: Sequence[LocalFeatures | Floats]) -> Floats:
         """Return the VLADs of images, (B, words * local_dim)."""
@@ -190,11 +190,6 @@ def _keys(descriptors: Floats, seed: int) -> NDArray[np.uint32]:
     return np.asarray((descriptors * np.float32(_KEY_STEPS)).astype(np.uint32) @ weights)
 
 
-def _rounded(values: Floats, step: np.float32) -> Floats:
-    """Return values rounded to multiples of a power of two."""
-    return np.asarray(np.rint(values / step) * step, np.float32)
-
-
 def _whitening(sample: Floats, dim: int) -> dict[str, Floats]:
     """Return the PCA whitening of RootSIFT vectors (N, 128): `(512 * vectors @ projection - offset) * scale`.
 
@@ -235,16 +230,16 @@ def _kmeans(points: Floats, words: int, iterations: int, keys: NDArray[np.uint32
     order = np.unique(keys, return_index=True)[1]  # equal points, as of equal images, are one choice
     order = np.concatenate([order, np.setdiff1d(np.arange(len(points)), order)])
     seeds = points[order]
-    centroids, used = _rounded(seeds[:words], _CENTROID_STEP), words
+    centroids, used = rounded(seeds[:words], _CENTROID_STEP), words
     chunks = np.split(points, range(_CHUNK, len(points), _CHUNK))
     for _ in range(iterations):
         nearest = np.concatenate(list(prefetch(partial(_assign, centroids=centroids), chunks, default_workers())))
         by_word = np.argsort(nearest, kind="stable")
         present, starts, counts = np.unique(nearest[by_word], return_index=True, return_counts=True)
         sums = np.add.reduceat(points[by_word], starts, axis=0, dtype=np.float64)
-        centroids[present] = _rounded((sums / counts[:, None]).astype(np.float32), _CENTROID_STEP)
+        centroids[present] = rounded((sums / counts[:, None]).astype(np.float32), _CENTROID_STEP)
         empty = np.setdiff1d(np.arange(words), present)
-        centroids[empty] = _rounded(seeds[np.arange(used, used + len(empty)) % len(seeds)], _CENTROID_STEP)
+        centroids[empty] = rounded(seeds[np.arange(used, used + len(empty)) % len(seeds)], _CENTROID_STEP)
         used += len(empty)
     return centroids
 

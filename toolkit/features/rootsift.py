@@ -14,11 +14,11 @@ rounding: scores, and so matches, are the same for every number of threads and e
 import numpy as np
 from numpy.typing import NDArray
 
-from toolkit.geometry import unit
+from toolkit.geometry import rounded, unit
 
 LENGTH = 64
 """Length of a shortened descriptor."""
-STEP = np.float32(2**-11)
+STEP = 2**-11
 # Measured on 20 photographs that are not in STRECHA or STRECHA_HARD, whose deviations differ by 5 %.
 _DEVIATIONS = np.array([
     [[74, 140, 116, 152, 105, 49, 40, 56], [95, 124, 67, 95, 72, 41, 33, 30],
@@ -43,7 +43,7 @@ def _components() -> NDArray[np.float32]:
     components = np.einsum("ai,bj,ck->abcijk", along_cells, along_cells, directions).reshape(128, 128)
     kept = np.argsort(-_DEVIATIONS, axis=None, kind="stable")[:LENGTH]
     weighted = components[kept] / np.sqrt(_DEVIATIONS.reshape(-1)[kept, None])
-    return (np.rint(weighted / STEP) * STEP).T.astype(np.float32)
+    return rounded(weighted, STEP).T
 
 
 _COMPONENTS = _components()

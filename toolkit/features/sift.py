@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from toolkit.features.features import DESCRIPTOR_SCALE, LocalFeatures
 from toolkit.files import Remade
-from toolkit.geometry import Ints
+from toolkit.geometry import Ints, rounded
 from toolkit.manifest import SiftSettings
 from toolkit.threads import fixed_sums
 
@@ -356,7 +356,7 @@ class _Grid(NamedTuple):
         # Adding a half makes the conversion to integers round.
         half = np.float32(0.5)
         vectors = np.stack([np.cos(angles) * step, np.sin(angles) * step, keypoints.x + half, keypoints.y + half])
-        cos, sin, x, y = np.rint(vectors * np.float32(_SUBPIXELS)) * np.float32(1 / _SUBPIXELS)
+        cos, sin, x, y = rounded(vectors, 1 / _SUBPIXELS)
         column = (self.xy1 @ np.stack([cos, -sin, x])).astype(np.int32)
         row = (self.xy1 @ np.stack([sin, cos, y])).astype(np.int32)
         inside = (column >= 1) & (column < width - 1) & (row >= 1) & (row < height - 1)

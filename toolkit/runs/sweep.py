@@ -1,7 +1,6 @@
 """Runs of a manifest with other values of some settings: their names, and the results that they share."""
 
 import re
-import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -11,13 +10,11 @@ from typing import Any
 import yaml
 
 from toolkit.errors import ManifestError
-from toolkit.files import SceneFiles, fingerprint, link_or_copy
+from toolkit.files import SceneFiles, fingerprint, link_folder
 from toolkit.manifest import STAGES, Manifest
 
 MOST_RUNS = 100
 """Limit of runs in a sweep: more are most likely a mistake."""
-
-
 _NO_RESULT = {"name", "output_root", "tolerate_failed", "description"}
 """Keys of a manifest that change no result."""
 _LONGEST = 100
@@ -50,9 +47,13 @@ def changed_keys(plain: Manifest, changed: Manifest, overrides: Iterable[str]) -
     return keys
 
 
+_ABSENT = object()
+
+
 def _value(content: Any, key: str) -> Any:
+    """Return the value of a key `stage.key` in nested dicts, `_ABSENT` without one."""
     for part in key.strip().split("."):
-        content = content.get(part, KeyError) if isinstance(content, dict) else KeyError
+        content = content.get(part, _ABSENT) if isinstance(content, dict) else _ABSENT
     return content
 
 
@@ -149,5 +150,4 @@ def take_over(donor: Path, run_dir: Path, scenes: Iterable[str], keys: Sequence[
         for name in sorted({"features", "maps", "index"} | earlier):
             source: Path = getattr(theirs, name)
             if source.is_dir():
-                hidden = shutil.ignore_patterns(".*")
-                shutil.copytree(source, getattr(mine, name), copy_function=link_or_copy, ignore=hidden)
+                link_folder(source, getattr(mine, name))

@@ -269,17 +269,14 @@ def _scene(files: SceneFiles, fingerprint: str, album: "Album") -> dict[str, Any
     """Return the template variables of one scene."""
     messages: list[str] = []
     tables = ("recall", "errors", "losses", "retrieval", "sequence", "changes")
+    older, older_pictures = older_files(files.evaluation, "evaluate"), older_files(files.visualization, "visualize")
     recall, errors, losses, retrieval, sequences, changes = (
-        _read_table(files.evaluation / f"{name}.csv", messages) for name in tables
+        pd.DataFrame() if f"{name}.csv" in older else _read_table(files.evaluation / f"{name}.csv", messages)
+        for name in tables
     )
     thresholds = [column for column in recall.columns if column.startswith("recall@")]
     statuses = _read_statuses(files, messages)
-    older = older_files(files.evaluation, "evaluate")
-    older_pictures = older_files(files.visualization, "visualize")
-    if why := older.get("recall.csv"):  # its numbers are of other poses than those listed below
-        recall, errors, losses, retrieval, sequences, changes = (pd.DataFrame() for _ in tables)
-        thresholds = []
-        messages.append(f"Not shown: {why}")
+    messages += [f"Not shown: {why}" for why in dict.fromkeys(older.values())]
     if older_pictures:
         first = next(iter(older_pictures.values()))
         messages.append(f"Not shown: {len(older_pictures)} pictures and recordings. {first}")
