@@ -15,10 +15,10 @@ from tests.localized import write_queries
 from tests.localizers.drifting import PLACE, Drive, drive, lost_in_a_gap, small_motion
 from toolkit import geometry, sequence
 from toolkit.capture import Session, Trajectory
-from toolkit.capture.tables import as_strings
+from toolkit.capture.tables import as_strings, read_query_table
 from toolkit.embed import embed_sessions
 from toolkit.errors import ManifestError
-from toolkit.files import SceneFiles, pair_name
+from toolkit.files import SceneFiles, map_record_path, pair_name
 from toolkit.localize import localize_pairs
 from toolkit.localizers.base import PoseEstimate
 from toolkit.localizers.correspondences import Correspondences, LocalizedQuery
@@ -89,6 +89,18 @@ def test_every_frame_of_the_odometry_has_a_pose(place: Path, tmp_path: Path) -> 
     assert found.covariances is not None
     stds = np.sqrt(np.trace(found.covariances[:, 3:, 3:], axis1=1, axis2=2))
     np.testing.assert_allclose(stds, table["position_std_m"], atol=1e-6)
+
+
+def test_lengths_of_an_unknown_unit_are_not_named_meters(place: Path, tmp_path: Path) -> None:
+    record = map_record_path(tmp_path / "poses", place.name, "ios")
+    record.write_text('{"unit": null, "depth": 5.0}')
+    done = sequence_pairs(place / "sessions", tmp_path / "poses", map_device="ios", query_device="ios").iloc[0]
+    assert done["queries"] > 0
+    path = Path(str(done["path"]).replace(".txt", ".csv"))
+    table = pd.read_csv(path)
+    assert not [name for name in table if name.endswith("_m")]
+    assert set(table["unit"]) == {"unknown"}
+    assert {*COLUMNS} <= {*read_query_table(path, ["status"])}, "readers have the names that they know"
 
 
 def test_a_result_is_made_again_when_poses_odometry_or_settings_change(place: Path, tmp_path: Path) -> None:

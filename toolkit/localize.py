@@ -17,7 +17,7 @@ from tqdm.auto import tqdm
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import default_workers, prefetch
-from toolkit.capture.tables import POSES_UNIT, read_query_table
+from toolkit.capture.tables import in_unit_of_poses, read_query_table
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.errors import INTERNAL, ToolkitError, reason_of
 from toolkit.features.groups import GroupWriter, heals
@@ -623,11 +623,8 @@ def _write_poses(pair: _Pair, rows: list[dict[str, Any]], settings: LocalizeSett
     """Write the table and the poses of a pair; the poses last, because their file marks the pair as finished."""
     columns = [*COLUMNS, *(PREDICTION_COLUMNS if settings.predicts else [])]
     columns += ESCALATION_COLUMNS if settings.features.escalation else []
-    table = pd.DataFrame(rows, columns=columns)
-    if settings.unit is None:
-        table = table.rename(columns={name: unknown for unknown, name in POSES_UNIT.items()}).assign(unit="unknown")
     with write_atomic(pair.file("csv")) as temporary:
-        table.to_csv(temporary, index=False)
+        in_unit_of_poses(pd.DataFrame(rows, columns=columns), settings.unit).to_csv(temporary, index=False)
     posed = [row for row in rows if row["qt"] is not None]
     unknown = [float("nan")] * 36
     covariances = [row["covariance"] or unknown for row in posed]

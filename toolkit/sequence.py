@@ -19,14 +19,16 @@ from numpy.typing import NDArray
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import default_workers, prefetch
-from toolkit.capture.tables import POSE_NAMES, KeyIndex, as_strings, read_query_table
+from toolkit.capture.tables import POSE_NAMES, POSES_UNIT, KeyIndex, as_strings, in_unit_of_poses, read_query_table
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import INTERNAL, OF_THE_DATA, ArtifactError, reason_of
 from toolkit.files import (
     SceneFiles,
     file_fingerprint,
     is_current,
+    map_record_path,
     pair_name,
+    read_map_record,
     read_sidecar,
     require_whole,
     write_atomic,
@@ -68,7 +70,8 @@ COLUMNS = (
 )  # fmt: skip
 """Columns of `<pair>_sequence.csv`. `single_status` and `again_status` are the statuses of a query localized alone and
 again near its predicted pose, empty for none. `used`: the query's own pose agrees with the result of its piece.
-`moved_m` and `turned_deg` are the differences between the query's result and its first single pose."""
+`moved_m` and `turned_deg` are the differences between the query's result and its first single pose. If the unit of the
+poses is unknown, lengths are named by `in_unit_of_poses`."""
 STEP_COLUMNS = ("step", "timestamp", "device_id", *POSE_NAMES)
 """Columns of `<pair>_sequence_steps.csv`: the poses of queries after each of `STEPS`."""
 
@@ -160,13 +163,14 @@ def _place_pair(
             frames, steps, trajectory = _frames(
                 session, singles, settings, again, lambda: up_of_cameras(map_session.world_from_cam()), correspondences
             )
-        csvs = {out.with_suffix(".csv"): frames, out.with_name(f"{out.stem}_steps.csv"): steps}
+        unit = read_map_record(map_record_path(poses_dir, capture.name, map_device))["unit"]
+        csvs = {out.with_suffix(".csv"): in_unit_of_poses(frames, unit), out.with_name(f"{out.stem}_steps.csv"): steps}
         for path, rows in csvs.items():
             with write_atomic(path) as temporary:
                 rows.to_csv(temporary, index=False)
         trajectory.write(out)
         write_sidecar(out, record, list(csvs), made_from=inputs, unfinished=again is not None and again.met_a_bug)
-    frames = pd.read_csv(out.with_suffix(".csv"), keep_default_na=False)
+    frames = pd.read_csv(out.with_suffix(".csv"), keep_default_na=False).rename(columns=POSES_UNIT)
     status = frames["status"].str.split(":").str[0].value_counts()
     return {
         "frames": len(frames),

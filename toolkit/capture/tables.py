@@ -409,9 +409,18 @@ class KeyIndex:
         return [self._order[start:end] for start, end in zip(starts, ends, strict=True)]
 
 
-POSES_UNIT = {"position_std": "position_std_m"}
-"""Length column of a pair's table if the unit of its poses is unknown, and its name where the unit is the meter. A
-column `unit` then says `unknown`: lengths are in the unit of the poses."""
+POSES_UNIT = {"position_std": "position_std_m", "moved": "moved_m"}
+"""Columns of lengths in a pair's table if the unit of its poses is unknown, and their names where it is the meter."""
+
+
+def in_unit_of_poses(table: pd.DataFrame, unit: str | None) -> pd.DataFrame:
+    """Return a pair's table as it is written: if the unit of its poses is unknown (None), no length is named in meters.
+
+    A column `unit` then says `unknown`: lengths are in the unit of the poses. `read_query_table` restores the names.
+    """
+    if unit is not None:
+        return table
+    return table.rename(columns={name: unknown for unknown, name in POSES_UNIT.items()}).assign(unit="unknown")
 
 
 def read_query_table(path: Path, columns: Sequence[str]) -> pd.DataFrame:
