@@ -4,13 +4,17 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
+import papermill
 import pytest
 
-from toolkit import pipeline
-from toolkit.errors import ArtifactError
+from toolkit import notebook, pipeline
+from toolkit.errors import ArtifactError, ManifestError
 from toolkit.evaluate import evaluate_scene
+from toolkit.exchange.export import export_colmap, export_pairs, export_poses
 from toolkit.exchange.submission import collect
 from toolkit.files import (
     SceneFiles,
@@ -24,6 +28,7 @@ from toolkit.files import (
     write_sidecar,
 )
 from toolkit.localizers.map import Map
+from toolkit.notebook import notebook_path
 from toolkit.show.comparison import compare_runs
 from toolkit.show.inspection import inspect_query
 from toolkit.show.report import write_report
@@ -142,8 +147,22 @@ def retrieved(files: SceneFiles, capture: Path) -> str:
 
 def submitted(files: SceneFiles, capture: Path) -> str:
     poses = files.poses_txt("ios", "hl")
-    poses.write_text("".join(poses.read_text().splitlines(keepends=True)[:-1]))  # a query without a pose
+    lines = poses.read_text().splitlines(keepends=True)
+    poses.unlink()  # a link to the finished run
+    poses.write_text("".join(lines[:-1]))  # a query without a pose
     return collect([files.run], "Ours.", captures=[capture]).text()
+
+
+def exported_map(files: SceneFiles, capture: Path) -> str:
+    return str(export_colmap(files.run, files.scene, "ios", files.run / "model", capture))
+
+
+def exported_pairs(files: SceneFiles, capture: Path) -> str:
+    return str(export_pairs(files.run, files.scene, "ios", "hl", files.run / "pairs.txt"))
+
+
+def exported_poses(files: SceneFiles, capture: Path) -> str:
+    return str(export_poses(files.run, files.scene, "ios", "hl", files.run / "hloc.txt", capture))
 
 
 POSES, TABLE, REFERENCES, MAP, VECTORS = "poses txt", "poses csv", "references", "map", "vectors"
@@ -163,6 +182,10 @@ READERS = [
     (MAP, opened, "run the localize stage again"),
     (VECTORS, retrieved, "run the retrieve stage again"),
     (REFERENCES, submitted, "run the localize stage again"),
+    (MAP, exported_map, "run the localize stage again"),
+    (VECTORS, exported_pairs, "run the retrieve stage again"),
+    (REFERENCES, exported_poses, "run the localize stage again"),
+    (MAP, exported_poses, "run the localize stage again"),
 ]
 
 
@@ -256,3 +279,38 @@ def test_a_run_with_other_settings_leaves_the_finished_one_as_it_is(linked: Scen
     taken = SceneFiles(run, "SMALL")
     assert taken.retrieval("ios", "hl").samefile(linked.retrieval("ios", "hl"))
     assert "nearest" in taken.poses_csv("ios", "hl").read_text()
+
+
+METHODS: list[dict[str, Any]] = [
+    {"method": "pnp"}, {"method": "pnp", "pnp": {"max_error_deg": 0.4}}, {"method": "nearest"},
+    {"method": "feed_forward", "predictor": "simulated"}, {"method": "hybrid", "predictor": "simulated"},
+]  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS, ids=[" ".join(map(str, method.values())) for method in METHODS])
+def test_a_notebook_by_hand_gives_the_poses_of_a_run(
+    linked: SceneFiles, small_capture: Path, tmp_path: Path, method: dict[str, Any]
+) -> None:
+    manifest = linked.run.parent / f"{linked.run.name}.yaml"
+    manifest.write_text(f"captures: ['{small_capture}']\noutput_root: .\nlocalize: {json.dumps(method)}\n")
+    pipeline.run(manifest, only="localize", say=quiet, in_place=True)
+    nested = {name: value for name, value in method.items() if isinstance(value, dict)}
+    parameters = {name: value for name, value in method.items() if name not in nested} | {"settings": nested}
+    folders = {name: str(tmp_path / name) for name in ("out_dir", "features_dir", "map_dir")}
+    folders |= {"sessions_root": str(small_capture / "sessions"), "retrieval_dir": str(linked.retrieval_dir)}
+    papermill.execute_notebook(notebook_path("localize"), None, parameters | folders, progress_bar=False)
+    poses = sorted(linked.poses_dir.glob(f"{linked.scene}_*.txt"))
+    assert len(poses) == 9
+    for path in poses:
+        assert (tmp_path / "out_dir" / path.name).read_bytes() == path.read_bytes()
+        by_run, by_hand = (pd.read_csv(one / f"{path.stem}.csv") for one in (linked.poses_dir, tmp_path / "out_dir"))
+        pd.testing.assert_frame_equal(by_run.drop(columns="seconds"), by_hand.drop(columns="seconds"))
+
+
+def test_the_results_of_a_notebook_by_hand_do_not_go_into_a_run(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "run.json").write_text("{}")
+    with pytest.raises(ManifestError, match="changes only by its manifest"):
+        notebook.start("embed", sessions_root="C/sessions", out_dir=str(tmp_path / "run" / "C" / "embeddings"))
+    assert not (tmp_path / "run" / "C").exists()

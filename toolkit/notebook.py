@@ -94,10 +94,12 @@ def start(stage: str, sessions_root: str | None = None, **folders: str | None) -
             they are older than those of the stage before it, that stage runs now.
 
     Raises:
-        ManifestError: a parameter is unknown to the notebook, or has a wrong type.
+        ManifestError: a parameter is unknown to the notebook, or has a wrong type; or the folder for the results of a
+            notebook that a person runs lies in a finished run, which changes only by its manifest.
         CaptureError: a device or list of queries in the parameters has no session in the capture.
     """
-    if run_log := os.environ.get(LOG_VARIABLE):
+    run_log = os.environ.get(LOG_VARIABLE)
+    if run_log:
         logging.captureWarnings(True)
         log_to(Path(run_log))
     check_given(stage)
@@ -112,9 +114,22 @@ def start(stage: str, sessions_root: str | None = None, **folders: str | None) -
     resolved = {"sessions_root": sessions}
     for name, folder in folders.items():
         path = Path(folder).expanduser().resolve() if folder else defaults[name]
+        if folder and run_log is None and defaults[name] == defaults["out_dir"]:
+            _require_outside_of_runs(name, Path(folder), sessions)
         if path is not None:
             resolved[name] = path
     return Folders(resolved)
+
+
+def _require_outside_of_runs(name: str, folder: Path, sessions: Path) -> None:
+    """Refuse a folder of results, the value of the parameter `name`, that belongs to a finished run."""
+    folder = folder.expanduser().resolve()
+    run = next((parent for parent in folder.parents if (parent / RECORD).is_file()), None)
+    if run is not None:
+        raise ManifestError(
+            f"{name}: {folder} belongs to the run {run}, which changes only by its manifest. Leave {name} out: results "
+            f"then go to {_root() / 'runs' / f'{sessions.parent.name}-by-hand'}. Or give another folder."
+        )
 
 
 def sessions_or_demo(sessions_root: str | None) -> Path:

@@ -30,6 +30,7 @@ from toolkit.files import (
     own_name,
     pair_name,
     read_references,
+    require_current,
     require_whole,
     write_atomic,
     write_folder,
@@ -55,7 +56,7 @@ def export_colmap(
     the same poses are merged into one.
 
     Raises:
-        ArtifactError: the run has not localized in such a map.
+        ArtifactError: the run has not localized in such a map, or the map was built again since.
         ManifestError: the folder `out` contains files.
     """
     _require_names(names)
@@ -76,8 +77,10 @@ def _maps_of(files: SceneFiles, device: str) -> list[Path]:
     """Return the files of the triangulated maps that a run localized with, one per kind of features."""
     for path in sorted(files.poses_dir.glob(f"{pair_name(files.scene, device, '*')}.h5")):
         with closing(LocalizedQueries(path)) as queries:
-            if queries.maps:
-                return [files.maps / name for name in queries.maps]
+            maps = [files.maps / name for name in queries.maps]
+        if maps:
+            require_current(path.with_suffix(".txt"), "localize", (".npz",))
+            return maps
     raise ArtifactError(
         f"{files.poses_dir}: no query was localized in a triangulated map of {device}. Run the localize stage with a "
         "method that uses one (python -m toolkit run MANIFEST --only localize)."
@@ -225,11 +228,12 @@ def export_pairs(
         topk: number of references per query; None: all retrieved ones.
 
     Raises:
-        ArtifactError: the run has no such retrieval, a line of it is malformed, a name contains a space, or a query
-            and a reference have the same name.
+        ArtifactError: the run has no such retrieval, it is of older vectors, a line of it is malformed, a name contains
+            a space, or a query and a reference have the same name.
     """
     _require_names(names)
     path = SceneFiles(Path(run), scene).retrieval(map_device, query_device)
+    require_current(path, "retrieve", missing=False)
     pairs = []
     for row in read_references(path, "path"):
         paths = [str(entry["path"]) for entry in (row, *row["topk"][:topk])]
@@ -262,7 +266,8 @@ def export_poses(
     out. Names are complete paths, whereas hloc writes file names only. Return the number of lines.
 
     Raises:
-        ArtifactError: the run has no such poses, or a name contains a space.
+        ArtifactError: the run has no such poses, they are of older references or of an older map, or a name contains a
+            space.
     """
     _require_names(names)
     path = _require_poses(SceneFiles(Path(run), scene).poses_txt(map_device, query_device))
@@ -328,6 +333,7 @@ def _require_poses(path: Path) -> Path:
             "(python -m toolkit run MANIFEST --only localize)."
         )
     require_whole(path, of=path.with_suffix(".txt"))
+    require_current(path.with_suffix(".txt"), "localize", missing=False)
     return path
 
 

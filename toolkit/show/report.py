@@ -67,8 +67,9 @@ EVALUATION_FIGURES = {
     ),
     "deviations": (
         "Stated and actual deviation",
-        "Position error of each pose against its stated standard deviation (position_std_m). With 30 poses or more, "
-        "a line joins the median of each tenth. Poses above the dashed line are off by more than five deviations.",
+        "Position error of each pose against its stated standard deviation (position_std in poses/*.csv). With 30 "
+        "poses or more, a line joins the median of each tenth. Poses above the dashed line are off by more than five "
+        "deviations.",
     ),
     "losses": (
         "Where accuracy was lost",
