@@ -60,7 +60,7 @@ from toolkit.localizers.map import (
     update_attributes,
 )
 from toolkit.localizers.mapping import map_settings
-from toolkit.localizers.misfit import LEAST_SIZE, SIGNIFICANCE
+from toolkit.localizers.misfit import MAX_SHARES, SIGNIFICANCE
 from toolkit.localizers.picture import localize_image
 from toolkit.localizers.pnp import PNP_FORMAT
 from toolkit.localizers.predictors import open_predictor
@@ -275,7 +275,7 @@ class _Stage(Remade):
         record: dict[str, Any] = {
             "method": settings.method,
             "pnp": settings.pnp.model_dump() | {"seed": settings.seed, "format": PNP_FORMAT},
-            "misfit": [SIGNIFICANCE, LEAST_SIZE],
+            "misfit": [SIGNIFICANCE, MAX_SHARES],
             "map": settings.map and map_settings(settings.map, settings.seed),
             "features": [kind.extractor.settings for kind in self.kinds],
             "matchers": [kind.matcher.settings for kind in self.kinds],

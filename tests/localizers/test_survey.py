@@ -5,17 +5,20 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
 from toolkit import geometry
 from toolkit.capture import Capture, Trajectory
+from toolkit.capture.cameras import rays_of
 from toolkit.features.features import KINDS
 from toolkit.features.sift import SiftExtractor
 from toolkit.features.stores import FeatureStore
 from toolkit.geometry import Floats
 from toolkit.localizers.local_map import Consistency, LocalMap
 from toolkit.localizers.mapping import build_map, instants
+from toolkit.localizers.pose_noise import SurveyedPairs, _changed
 from toolkit.localizers.survey import Survey, SurveyedImages
 
 Change = Callable[[Floats], Floats]
@@ -64,17 +67,22 @@ def upright_otherwise(poses: Floats) -> Floats:
     return world @ poses
 
 
-def survey_of(capture: Path, features: Path, device: str, change: Change, count: int | None = None) -> Survey:
-    """Return the survey of the first images of a map whose poses were changed."""
+def survey_of(
+    capture: Path, features: Path, device: str, change: Change, count: int | None = None, scale: float = 1
+) -> Survey:
+    """Return the survey of the first images of a map whose poses were changed, and the offsets of its rigs scaled."""
     session = Capture.open(capture)[f"{device}_map"]
     store = FeatureStore.of_session(features, session.id, SiftExtractor().settings)
     rows = np.arange(len(session.images))[:count]
     rig_from_cams = session.rig_from_cam(rows)
+    poses = change(session.world_from_cam(rows) @ geometry.invert(rig_from_cams))
+    if scale != 1:
+        rig_from_cams = scaled(scale)(rig_from_cams)
     names, sensors = [session.image_name(int(row)) for row in rows], session.images["sensor_id"].tolist()[:count]
     images = SurveyedImages(
         names,
         [session.camera(sensor) for sensor in sensors],
-        change(session.world_from_cam(rows) @ geometry.invert(rig_from_cams)),
+        poses,
         rig_from_cams,
         instants(session, rows),
         sensors,
@@ -94,13 +102,94 @@ def consistency_of(survey: Survey) -> Consistency:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("change", [np.array, upright_otherwise, scaled(100)], ids=["right", "upright", "scaled"])
+@pytest.mark.parametrize(
+    ("change", "scale"), [(np.array, 1), (upright_otherwise, 1), (scaled(100), 100)], ids=["right", "upright", "scaled"]
+)
 @pytest.mark.parametrize("device", ["ios", "hl", "spot"])
-def test_right_poses_are_consistent(small_capture: Path, small_features: Path, device: str, change: Change) -> None:
-    found = consistency_of(survey_of(small_capture, small_features, device, change))
+def test_right_poses_are_consistent(
+    small_capture: Path, small_features: Path, device: str, change: Change, scale: float
+) -> None:
+    found = consistency_of(survey_of(small_capture, small_features, device, change, scale=scale))
     assert found.verdict == "consistent"
     assert found.agreeing > 0.9 * found.pairs
     assert not found.text
+
+
+def noisy(rotation_deg: float, position_m: float, seed: int) -> Change:
+    """Poses with noise of these standard deviations per axis."""
+
+    def change(poses: Floats) -> Floats:
+        rng = np.random.default_rng(seed)
+        turns = Rotation.from_rotvec(np.radians(rotation_deg) * rng.normal(size=(len(poses), 3))).as_matrix()
+        moved = poses[:, :3, 3] + position_m * rng.normal(size=(len(poses), 3))
+        return geometry.make_pose(poses[:, :3, :3] @ turns, moved)
+
+    return change
+
+
+@pytest.mark.parametrize(("rotation_deg", "position_m"), [(0.3, 0.0), (0.3, 0.02), (1.0, 0.02), (0.0, 0.03)])
+def test_the_noise_of_the_poses_is_measured(
+    small_capture: Path, small_features: Path, rotation_deg: float, position_m: float
+) -> None:
+    found = [
+        consistency_of(survey_of(small_capture, small_features, device, noisy(rotation_deg, position_m, seed)))
+        for device in ("hl", "spot")
+        for seed in (1, 2, 3)
+    ]
+    names = ("rotation_noise_deg", "position_noise")
+    rotation, position = (np.median([getattr(one, name) for one in found]) for name in names)
+    # Nearby, a turn looks like a step: their sum is known better than each.
+    depth = 3.0
+    expected = np.hypot(rotation_deg, np.degrees(position_m / depth))
+    assert np.hypot(rotation, np.degrees(position / depth)) == pytest.approx(expected, rel=0.4)
+    assert all(one.verdict == "consistent" and not one.camera for one in found)
+
+
+def test_exact_poses_have_no_noise(small_capture: Path, small_features: Path) -> None:
+    for device in ("ios", "hl", "spot"):
+        found = consistency_of(survey_of(small_capture, small_features, device, np.array))
+        assert (found.rotation_noise_deg, found.position_noise, found.direction_noise_deg) == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("factor", "noise_deg"),
+    [*((one, 0.0) for one in (0.5, 0.9, 1.05, 1.12, 2.0)), *((one, 0.15) for one in (0.5, 0.85, 1.15, 2.0))],
+)
+def test_a_wrong_focal_length_of_the_map_is_named(
+    small_capture: Path, small_features: Path, factor: float, noise_deg: float
+) -> None:
+    survey = survey_of(small_capture, small_features, "spot", noisy(noise_deg, 0.0, 1))
+    cameras, pairs = [], []
+    for camera in survey.images.cameras:
+        other = pycolmap.Camera(camera.todict())
+        params = other.params
+        params[[int(index) for index in other.focal_length_idxs()]] *= factor
+        other.params = params
+        cameras.append(other)
+    for pair in survey.sample:
+        pixels = [
+            np.asarray(survey.images.cameras[index].img_from_cam(rays))
+            for index, rays in ((pair.i, pair.rays_i), (pair.j, pair.rays_j))
+        ]
+        rays = [rays_of(cameras[index], xy) for index, xy in zip((pair.i, pair.j), pixels, strict=True)]
+        pairs.append(pair._replace(rays_i=rays[0], rays_j=rays[1]))
+    text = SurveyedPairs(pairs, survey.images.world_from_cams).misfit(cameras)
+    assert text.startswith("the focal length")
+    if "times" in text:
+        found = 1 / float(text.split(" are ")[1].split()[0])
+    else:
+        found = float(text.split("given ")[1]) / float(text.split(" is ")[1].split()[0])
+    assert found == pytest.approx(factor, rel=0.03 if noise_deg == 0 else 0.05)
+
+
+def test_a_focal_length_one_percent_off_is_not_worth_a_word(small_capture: Path, small_features: Path) -> None:
+    survey = survey_of(small_capture, small_features, "spot", np.array)
+    change = np.array([0.01, 0, 0, 0])
+    pairs = [
+        pair._replace(rays_i=_changed(pair.rays_i, change), rays_j=_changed(pair.rays_j, change))
+        for pair in survey.sample
+    ]
+    assert not SurveyedPairs(pairs, survey.images.world_from_cams).misfit(survey.images.cameras)
 
 
 @pytest.mark.parametrize(

@@ -50,6 +50,19 @@ class Consistency:
     """Share of the points that at least three images observe."""
     wrong: list[str] = field(default_factory=list)
     """Images whose poses contradict those of the other images."""
+    camera: str = ""
+    """For a map whose intrinsics do not fit its images, those that would fit."""
+    rotation_noise_deg: float = 0.0
+    """Standard deviation of the noise of the poses, per axis."""
+    position_noise: float = 0.0
+    """In map lengths, see `LocalMap.length`, per axis."""
+    direction_noise_deg: float = 0.0
+    """Standard deviation of the direction to a point at the median depth, due to the noise of a pose, per axis."""
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the map may give poses that are `ok`."""
+        return self.verdict != "inconsistent" and not self.camera
 
     @property
     def text(self) -> str:
@@ -64,6 +77,8 @@ class Consistency:
                 f"the poses of the map contradict its images: {self.agreeing} of {self.pairs} image pairs with "
                 f"verified matches agree with the poses. {cause}"
             )
+        if self.camera:
+            return f"the intrinsics of the map contradict its images: {self.camera}. Correct them and localize again"
         if self.wrong:
             names = ", ".join(self.wrong[:8]) + (f" and {len(self.wrong) - 8} more" if len(self.wrong) > 8 else "")
             return f"{len(self.wrong)} map images have poses that contradict the others: {names}"

@@ -66,6 +66,8 @@ MOST_IN_MEMORY = 1 << 30
 NEAR, NEAR_DEG = 10.0, 60.0
 """Largest distance (in map lengths, see `Survey.length`) and angle (degrees) between a camera and a map image that may
 show the same scene."""
+WORTH_DEG, WORTH_LENGTHS = 0.05, 0.005
+"""Noise of the map's poses, degrees and map lengths per axis, from which the user is told of it."""
 RETRIEVAL = "retrieval_dir"
 """`SETTINGS`, `SESSIONS_ROOT` and `RETRIEVAL` are attributes of `poses/<pair>.h5`: the settings that the pair was
 localized with, the `sessions` folder of the capture, and the folder of the references."""
@@ -261,7 +263,7 @@ class Map:
         """Warnings for the user about the map; empty if there are none, or if the map has no points."""
         if not self.mapped:
             return ""
-        parts, depth = [self.consistency.text], self.length * USUAL_DEPTHS_M[int(self.length > 1)]
+        parts, depth = [self.consistency.text, self._noise], self.length * USUAL_DEPTHS_M[int(self.length > 1)]
         plausible = self.consistency.verdict != "inconsistent"
         if plausible and self.settings.unit and self.length != 1 and not ODD_DEPTHS_M[0] < depth < ODD_DEPTHS_M[1]:
             odd = f"the median depth of the map is {depth:.3g} m"
@@ -269,18 +271,30 @@ class Map:
             parts.append(f"{odd}: if its poses are not in meters, {fix}")
         return "; ".join(filter(None, parts))
 
+    @property
+    def _noise(self) -> str:
+        """How good the poses are, if their noise is worth a word."""
+        noise = self.consistency
+        if noise.rotation_noise_deg < WORTH_DEG and noise.position_noise < WORTH_LENGTHS:
+            return ""
+        unit, factor = ("m", 1.0) if self.settings.unit else ("of the median depth", 1 / NOMINAL_DEPTH)
+        position = np.sqrt(3) * noise.position_noise * (self.length if self.settings.unit else factor)
+        text = f"{100 * position:.2g} c{unit}" if unit == "m" else f"{100 * position:.2g} % {unit}"
+        return f"the poses of the map are good to about {np.sqrt(3) * noise.rotation_noise_deg:.2g} deg, {text}"
+
     def record(self) -> dict[str, Any]:
         """Return the unit, the depth and the consistency of the map, for JSON."""
         depth = self.length * NOMINAL_DEPTH if self.settings.unit is None else None
         return {"unit": self.settings.unit, "depth": depth, "text": self.remarks, **asdict(self.consistency)}
 
     def judged(self, estimate: PoseEstimate) -> PoseEstimate:
-        """Return the estimate; with low confidence if the map's poses contradict its images."""
-        if self.consistency.verdict != "inconsistent" or estimate.world_from_rig is None:
+        """Return the estimate; with low confidence if the map's poses or intrinsics contradict its images."""
+        if self.consistency.trusted or estimate.world_from_rig is None:
             return estimate
         # In such a map, a misfit says nothing about the query's camera.
         reason = "; ".join(filter(None, ["" if estimate.misfit else estimate.reason, self.consistency.text]))
-        status = "low_confidence: the poses of the map contradict its images"
+        what = "poses" if self.consistency.verdict == "inconsistent" else "intrinsics"
+        status = f"low_confidence: the {what} of the map contradict its images"
         return replace(estimate, status=status, reason=reason, focals_px=())
 
     @cached_property
@@ -586,7 +600,7 @@ def _scaled(localizer: Localizer, map: Map) -> Localizer:  # noqa: A002
 
 def _escalating(first: Localizer, settings: LocalizeSettings, map: Map) -> Localizer:  # noqa: A002
     """Return a localizer that uses the escalation features, if there are any, where `first` gives no sure pose."""
-    if not map.escalation or map.consistency.verdict == "inconsistent":  # no features make up for a wrong map
+    if not map.escalation or not map.consistency.trusted:  # no features make up for a wrong map
         return first
     kinds: list[AnyMethod] = [*(map.kinds if settings.map is None else ()), *map.escalation]
     second = _scaled(_on_demand(settings, map, kinds, first.image_names), map)

@@ -36,7 +36,7 @@ _ToMatch = tuple[str, str, int, int]
 """A pair to match: group in the match file, fingerprint of the inputs of the matches, indices of the two images."""
 DEPTHS = (2.0, 4.0, 8.0, 16.0)
 """Depths at which the views of two images are compared, in map lengths (meters; see `Survey.length`)."""
-_MAP_FORMAT = 5
+_MAP_FORMAT = 6
 """Increase when the same settings give another file, so that existing maps are built again."""
 
 

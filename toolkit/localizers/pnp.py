@@ -35,7 +35,7 @@ from toolkit.localizers.rig import Matches, RigQuery, least_squares_covariance
 from toolkit.manifest import PnpSettings
 from toolkit.threads import fixed_sums
 
-PNP_FORMAT = 3
+PNP_FORMAT = 4
 """Version of the poses. Increase when the same settings and files give other poses."""
 FIRST_REFERENCES = {2: 200, 4: 100}
 """Number of references per image to match first -> independent inliers that their pose needs to be kept. The next
@@ -67,8 +67,13 @@ class PnpLocalizer(WithoutNetwork):
     """
 
     def __init__(self, mapped: Sequence[MappedFeatures], settings: PnpSettings | None = None, seed: int = 0):
-        self.settings = settings or PnpSettings()
         self.seed = seed
+        consistency = mapped[0].map.consistency
+        self._noise_deg = consistency.direction_noise_deg
+        self.settings = _widened(settings or PnpSettings(), self._noise_deg)
+        stds = np.repeat([np.radians(consistency.rotation_noise_deg), consistency.position_noise], 3)
+        self._noise_of_poses = np.diag(stds**2)
+        """Covariance (6, 6) of a pose of the map. A query's pose is as far off as the map's poses around it are."""
         self.matcher = MapMatcher(mapped, self.settings)
         self.map = self.matcher.map
 
@@ -134,6 +139,7 @@ class PnpLocalizer(WithoutNetwork):
             self.map.points,
             self.settings.ransac_max_error_deg,
             focal_alone=estimate.rival_support > self.settings.ok_rival_support,
+            noise_deg=self._noise_deg,
         )
         if misfit is None:
             return estimate
@@ -393,7 +399,8 @@ class PnpLocalizer(WithoutNetwork):
         """Return the covariance (6, 6) of a pose estimated from matches; None if it is undefined."""
         of_pose, of_point = query.jacobians(rig_from_world, matches, self.map.points)
         errors = query.errors_px(rig_from_world, matches, self.map.points)
-        return least_squares_covariance(of_pose, errors, self._noise_of_points(query, matches, of_point))
+        of_matches = least_squares_covariance(of_pose, errors, self._noise_of_points(query, matches, of_point))
+        return None if of_matches is None else of_matches + self._noise_of_poses
 
     def _noise_of_points(self, query: RigQuery, matches: Matches, of_point: Floats) -> Floats:
         """Return the covariance (K, 2, 2) of projections due to the noise of their points, square pixels; NaN: unknown.
@@ -421,6 +428,15 @@ class PnpLocalizer(WithoutNetwork):
 
     def _ransac(self, query: RigQuery, matches: Matches, max_error_deg: float, least_inliers: int = 0) -> Floats | None:
         return query.ransac(matches, self.map.points, max_error_deg, self.settings, self.seed, least_inliers)
+
+
+def _widened(settings: PnpSettings, noise_deg: float) -> PnpSettings:
+    """Return settings that search as widely as noise of the map's poses asks for, given as an angle."""
+    if not noise_deg:
+        return settings
+    radii = [max(radius, 3 * noise_deg) for radius in settings.guided_radii_deg]
+    limit = max(settings.max_error_deg, 1.5 * noise_deg)
+    return settings.model_copy(update={"guided_radii_deg": radii, "max_error_deg": limit})
 
 
 def _differ(hypothesis: _Hypothesis, other: _Hypothesis) -> bool:

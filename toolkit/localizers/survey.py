@@ -25,6 +25,7 @@ from toolkit.features.matching import MutualMatcher
 from toolkit.features.verification import verified_matches
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.local_map import OPENGL_AXES, Consistency, LocalMap
+from toolkit.localizers.pose_noise import SurveyedPairs, VerifiedPair
 from toolkit.manifest import RerankSettings
 from toolkit.threads import fixed_sums
 
@@ -81,19 +82,6 @@ class SurveyedImages(NamedTuple):
     @property
     def world_from_cams(self) -> Floats:
         return self.world_from_rigs @ self.rig_from_cams
-
-
-class VerifiedPair(NamedTuple):
-    """Two images and their matches that agree with one essential matrix."""
-
-    i: int
-    j: int
-    rays_i: Floats
-    """(K, 3) unit rays in the frame of camera i."""
-    rays_j: Floats
-    """(K, 3) unit rays in the frame of camera j."""
-    j_from_i: Floats
-    """(4, 4) relative pose from the matches alone; the translation has length 1."""
 
 
 class Survey:
@@ -181,7 +169,18 @@ class Survey:
             )
             if fits or (share < 0.5 and too_coarse):
                 return replace(result, verdict="inconsistent", fits=fits)
-        return replace(result, verdict="consistent", wrong=self._wrong_images(local_map))
+        matches = SurveyedPairs(self.sample, self.images.world_from_cams)
+        noise, depth = matches.noise(local_map.length), self.typical_depth() / local_map.length
+        moved_deg = 0.0 if np.isnan(depth) else np.degrees(np.arctan(noise.position / depth))
+        return replace(
+            result,
+            verdict="consistent",
+            wrong=self._wrong_images(local_map),
+            camera=matches.misfit(self.images.cameras),
+            rotation_noise_deg=round(noise.rotation_deg, 4),
+            position_noise=round(noise.position, 6),
+            direction_noise_deg=round(float(np.hypot(noise.rotation_deg, moved_deg)), 4),
+        )
 
     def _errors_deg(self, pairs: Sequence[VerifiedPair]) -> list[float]:
         """Return, per pair, the median angle between matches and their epipolar planes."""
