@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from toolkit.localizers.confidence import WEIGHTS, probability_right
+from toolkit.localizers.confidence import WEIGHTS, bounded_by_rivals, probability_right
 
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "confidence.py"
 
@@ -97,3 +97,12 @@ def test_degradations_keep_the_picture_and_make_it_worse(confidence: ModuleType)
     assert made["dark"].mean() < 0.3 * image.mean()
     assert 0.02 < (made["hidden"] == image).mean() < 0.5
     assert made["blurred"].std() < 0.6 * image.std()
+
+
+def test_rivals_bound_the_probability() -> None:
+    assert bounded_by_rivals(0.97, []) == 0.97
+    assert bounded_by_rivals(1.0, [1.0]) == pytest.approx(1 / 2)
+    assert bounded_by_rivals(1.0, [1.0, 1.0]) == pytest.approx(1 / 3)
+    bounds = [bounded_by_rivals(1.0, [support]) for support in np.linspace(0, 1, 11)]
+    assert bounds == sorted(bounds, reverse=True), "more support of a rival never makes the pose more probable"
+    assert bounded_by_rivals(0.3, [0.1]) == 0.3

@@ -47,7 +47,7 @@ from toolkit.localizers.base import (
     ScaledLocalizer,
 )
 from toolkit.localizers.correspondences import MAPS, LocalizedQuery, query_group
-from toolkit.localizers.escalation import EscalatingLocalizer, can_gain, is_better, is_sure
+from toolkit.localizers.escalation import EscalatingLocalizer, can_gain, is_better, is_sure, known_poses
 from toolkit.localizers.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
 from toolkit.localizers.map import (
     Map,
@@ -501,7 +501,8 @@ class _PairRun:
         assert isinstance(self.localizer, EscalatingLocalizer)
         faulty: dict[str, dict[str, Any]] = {}
         first_rows = {number: (group, row) for group, number, row in first_results}
-        tasks = ((number, *self.query(number), None, shared) for number in first_rows)
+        # The first poses take the place of a prediction.
+        tasks = ((number, *self.query(number), row["known"], shared) for number, (_, row) in first_rows.items())
         for number, row, localized in self._localized(self.localizer.escalate, tasks, len(first_results)):
             group, first_row = first_rows[number]
             history = {
@@ -615,6 +616,7 @@ def _row(
         "first_status": None,
         "first_seconds": None,
         "qt": pose,
+        "known": [pose.tolist() for pose in known_poses(estimate)],
         "covariance": covariance,
     }
 

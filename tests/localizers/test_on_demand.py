@@ -15,6 +15,7 @@ from toolkit import geometry
 from toolkit.features.features import LocalFeatures
 from toolkit.features.matching import LocalMethod, Matcher, MutualMatcher, PairMatches
 from toolkit.localizers.base import PoseEstimate, Prior, Query, References
+from toolkit.localizers.correspondences import Rival
 from toolkit.localizers.escalation import EscalatingLocalizer
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.matches import MappedFeatures
@@ -235,13 +236,18 @@ class Scripted:
     image_names = ("a",)
 
     def __init__(self, *answers: PoseEstimate) -> None:
-        self.answers, self.asked = list(answers), list[Query]()
+        self.answers, self.asked, self.priors = list(answers), list[Query](), list[Prior]()
 
     def localize(
         self, query: Query, references: Sequence[References], prediction: Any = None, priors: Sequence[Prior] = ()
     ) -> PoseEstimate:
         self.asked.append(query)
+        self.priors += priors
         return self.answers.pop(0)
+
+
+def nothing_near(world_from_rig: NDArray[np.float64]) -> NDArray[np.int64]:
+    return np.zeros(0, np.int64)
 
 
 OK, LOW = PoseEstimate("ok", np.eye(4)), PoseEstimate("low_confidence", np.eye(4))
@@ -280,12 +286,27 @@ def test_more_features_are_asked_where_a_pose_is_not_sure(
     extractor = SimpleNamespace(extract=extract, color=False)
     further = Scripted(*([] if second is None else [second]))
     kind: Any = SimpleNamespace(name="sift", extractor=extractor)
-    localizer: Any = EscalatingLocalizer(Scripted(first), further, [kind], 0.05)  # type: ignore[arg-type]
+    localizer: Any = EscalatingLocalizer(Scripted(first), further, [kind], 0.05, nothing_near)  # type: ignore[arg-type]
     estimate = localizer.localize(scene.query, scene.references)
     assert (estimate.status, estimate.found_by) == (status, found_by)
     assert len(extracted) == len(further.asked) == (second is not None)
     if further.asked:
         assert [len(kinds) for kinds in further.asked[0].features] == [2]
+
+
+def test_what_the_first_attempt_knew_of_rivals_is_judged_by_all_features() -> None:
+    """More features once turned a wrong pose into ok, as they had forgotten the rival that SIFT knew."""
+    scene, there, far = Scene(), np.eye(4), np.eye(4)
+    there[0, 3], far[0, 3] = 28.0, 900.0
+    first = replace(LOW, rivals=(Rival(there, 0.9), Rival(far, 0.3)))
+    extractor = SimpleNamespace(extract=lambda images: [scene.features[scene.names[0]]] * len(images), color=False)
+    further, kind = Scripted(OK), SimpleNamespace(name="sift", extractor=extractor)
+    near = {0.0: [0, 1], 28.0: [5], 900.0: []}
+    localizer: Any = EscalatingLocalizer(
+        Scripted(first), further, [kind], 0.05, lambda pose: np.array(near[pose[0, 3]], np.int64)  # type: ignore[arg-type]
+    )
+    localizer.localize(scene.query, scene.references)
+    assert [(prior.world_from_rig[0, 3], prior.images.tolist()) for prior in further.priors] == [(0, [0, 1]), (28, [5])]
 
 
 @pytest.mark.parametrize("lacks", ["references", "readable image"])
@@ -294,6 +315,6 @@ def test_a_query_that_nothing_can_help_is_not_asked_again(lacks: str) -> None:
     query = scene.query if lacks == "references" else replace(scene.query, features=["no image"])
     references = [References.of([])] if lacks == "references" else scene.references
     first, further = Scripted(FAILED), Scripted()
-    localizer: Any = EscalatingLocalizer(first, further, [], 0.05)  # type: ignore[arg-type]
+    localizer: Any = EscalatingLocalizer(first, further, [], 0.05, nothing_near)  # type: ignore[arg-type]
     assert localizer.localize(query, references) is FAILED
     assert not further.asked

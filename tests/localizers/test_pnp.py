@@ -154,8 +154,10 @@ def room() -> World:
     return World.build(np.random.default_rng(0).uniform([-4, -2.5, 3.5], [4, 2.5, 8], (1200, 3)), MAP_POSES)
 
 
-def check(estimate: PoseEstimate, true: Floats, max_deg: float = 0.1, max_m: float = 0.01) -> None:
-    assert estimate.status == "ok"
+def check(
+    estimate: PoseEstimate, true: Floats, max_deg: float = 0.1, max_m: float = 0.01, status: str = "ok"
+) -> None:
+    assert estimate.status == status
     assert estimate.world_from_rig is not None
     rotation_deg, distance_m = geometry.pose_error(estimate.world_from_rig, true)
     assert rotation_deg < max_deg
@@ -473,7 +475,9 @@ def test_the_right_one_of_many_like_places_is_found(place: int) -> None:
     }
     seen = LocalFeatures(**both, image_size=(640, 480))
     localizer = world.localizer(max_query_features=len(strong), contested_references=10)
-    check(ask(localizer, [PINHOLE], np.eye(4)[None], [seen], [list(range(10))]), pose, 0.2, 0.02)
+    estimate = ask(localizer, [PINHOLE], np.eye(4)[None], [seen], [list(range(10))])
+    check(estimate, pose, 0.2, 0.02, status="low_confidence")  # four rivals with two thirds of its support
+    assert 0.5 < estimate.p_correct < 0.99
 
 
 @pytest.mark.slow

@@ -1,14 +1,19 @@
 """Localize again with further kinds of local features if the first pose is uncertain."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
+from toolkit import geometry
 from toolkit.capture.images import pixels_of
 from toolkit.features.features import KINDS, LocalFeatures, extract_turned
 from toolkit.features.matching import AnyMethod
 from toolkit.features.stores import as_stored
-from toolkit.localizers.base import Localizer, PoseEstimate, Prior, Query, QueryInput, References, rank
+from toolkit.geometry import Floats, Ints
+from toolkit.localizers.base import SEARCH_DEG, Localizer, PoseEstimate, Prior, Query, QueryInput, References, rank
+
+MAX_KNOWN = 3
+"""Largest number of earlier poses of a query that all kinds of features judge."""
 
 
 def is_sure(status: str, position_std_m: float, limit_m: float) -> bool:
@@ -29,11 +34,22 @@ def is_better(status: str, first_status: str) -> bool:
     return rank(status) >= max(rank(first_status), 1)
 
 
+def known_poses(estimate: PoseEstimate) -> list[Floats]:
+    """Return the pose of an estimate and those of its best rivals, as quaternion and translation (7,) each."""
+    poses = [estimate.world_from_rig, *(rival.world_from_rig for rival in estimate.rivals)]
+    return [geometry.qt_from_pose(pose) for pose in poses[:MAX_KNOWN] if pose is not None]
+
+
 class EscalatingLocalizer:
     """Runs a localizer, and where its pose is uncertain a second one that has more kinds of features."""
 
     def __init__(
-        self, first: Localizer, second: Localizer, further: Sequence[AnyMethod], sure_position_std_m: float
+        self,
+        first: Localizer,
+        second: Localizer,
+        further: Sequence[AnyMethod],
+        sure_position_std_m: float,
+        images_near: Callable[[Floats], Ints],
     ) -> None:
         """
         Args:
@@ -41,8 +57,10 @@ class EscalatingLocalizer:
             second: its kinds of features are those of `first`, followed by the further ones.
             further: the further kinds of features.
             sure_position_std_m: see `PnpSettings`.
+            images_near: returns the map images that may show what a rig at a pose (4, 4) sees.
         """
         self.first, self.second, self._further, self._limit_m = first, second, further, sure_position_std_m
+        self._images_near = images_near
         self.image_names, self.batch_size = first.image_names, first.batch_size
 
     def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[Any]:
@@ -60,14 +78,28 @@ class EscalatingLocalizer:
         sure = is_sure(estimate.status, estimate.position_std_m, self._limit_m)
         if sure or estimate.misfit or not can_gain(query, references):  # no features repair wrong intrinsics
             return estimate
-        escalated = self.escalate(self._with_all_features(query), references, None, priors)
+        escalated = self.escalate(self._with_all_features(query), references, known_poses(estimate), priors)
         return escalated if is_better(escalated.status, estimate.status) else estimate
 
     def escalate(
-        self, query: Query, references: Sequence[References], prediction: None = None, priors: Sequence[Prior] = ()
+        self,
+        query: Query,
+        references: Sequence[References],
+        known: Sequence[Floats] = (),
+        priors: Sequence[Prior] = (),
     ) -> PoseEstimate:
-        """Return the pose from all kinds of features, for a query that has them all; see `localize`."""
-        escalated = self.second.localize(query, references, None, priors)
+        """Return the pose from all kinds of features, for a query that has them all; see `localize`.
+
+        Args:
+            query, references, priors: see `Localizer`.
+            known: `known_poses` of the first estimate. All kinds of features judge them, too.
+        """
+        again = [
+            Prior(pose, images, SEARCH_DEG[0], "first")
+            for pose in map(geometry.pose_from_qt, known)
+            if len(images := self._images_near(pose))
+        ]
+        escalated = self.second.localize(query, references, None, [*priors, *again])
         return replace(escalated, found_by="+".join([escalated.found_by, *(kind.name for kind in self._further)]))
 
     def _with_all_features(self, query: Query) -> Query:

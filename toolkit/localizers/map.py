@@ -38,7 +38,7 @@ from toolkit.files import (
     write_atomic,
     write_sidecar,
 )  # fmt: skip
-from toolkit.geometry import unit
+from toolkit.geometry import Floats, Ints, unit
 from toolkit.localizers.base import Localizer, PoseEstimate, References, RoughPose, ScaledLocalizer
 from toolkit.localizers.correspondences import MAPS
 from toolkit.localizers.escalation import EscalatingLocalizer
@@ -604,7 +604,14 @@ def _escalating(first: Localizer, settings: LocalizeSettings, map: Map) -> Local
         return first
     kinds: list[AnyMethod] = [*(map.kinds if settings.map is None else ()), *map.escalation]
     second = _scaled(_on_demand(settings, map, kinds, first.image_names), map)
-    return EscalatingLocalizer(first, second, map.escalation, map.sure_position_std)
+    return EscalatingLocalizer(first, second, map.escalation, map.sure_position_std, partial(_images_near, map, first))
+
+
+def _images_near(map: Map, localizer: Localizer, world_from_rig: Floats) -> Ints:  # noqa: A002
+    """Return the map images, by index in a localizer, that may show what a rig at a pose (4, 4) sees."""
+    rows = np.array([map.session.row_of_name[name] for name in localizer.image_names], np.int64)
+    poses = map.session.world_from_cam(rows)
+    return np.flatnonzero(masks.near(poses, world_from_rig, NEAR * map.length, NEAR_DEG))
 
 
 def _on_demand(

@@ -27,7 +27,7 @@ from toolkit.localizers.base import (
     WithoutNetwork,
     agree,
 )
-from toolkit.localizers.confidence import EVIDENCE, probability_right
+from toolkit.localizers.confidence import EVIDENCE, bounded_by_rivals, probability_right
 from toolkit.localizers.correspondences import Correspondences, Rival
 from toolkit.localizers.matches import MapMatcher, MappedFeatures, MatchCache, Vicinity
 from toolkit.localizers.misfit import find_misfit
@@ -40,6 +40,9 @@ PNP_FORMAT = 4
 FIRST_REFERENCES = {2: 200, 4: 100}
 """Number of references per image to match first -> independent inliers that their pose needs to be kept. The next
 number, and finally all references, are matched if the pose has fewer, or if too few of the matches are inliers."""
+RIVAL_SHARE = 0.25
+"""Smallest number of matches by descriptors that agree with a rival, as a share of those that agree with the pose. Such
+a rival may have most of the guided matches, as references of one place hide those of its double."""
 VIEWS = 4
 """Number of references whose keypoints are stored with the correspondences: those that observe the most of them."""
 
@@ -255,11 +258,12 @@ class PnpLocalizer(WithoutNetwork):
                 hypotheses.append(self._improve(query, other, matches))
                 inliers |= self._inliers(query, hypotheses[1].rig_from_world, matches)
         rest = matches[~inliers]
-        # A pose with less than half as many inliers is no rival.
-        other = self._ransac(query, rest, settings.ransac_max_error_deg, least_inliers=int(inliers.sum() / 2))
+        # A pose with a smaller share of inliers is no rival.
+        least = RIVAL_SHARE * int(inliers.sum())
+        other = self._ransac(query, rest, settings.ransac_max_error_deg, least_inliers=int(least))
         if other is not None:
             count = self._inliers(query, other, rest).sum()
-            if share < settings.contested_inlier_ratio or count >= inliers.sum() / 2:
+            if share < settings.contested_inlier_ratio or count >= least:
                 hypotheses.append(self._improve(query, other, matches))
         if share < settings.contested_inlier_ratio:
             self._add_by_reference(query, matches, references, hypotheses)
@@ -355,7 +359,8 @@ class PnpLocalizer(WithoutNetwork):
             correspondences=self._correspondences(all_matches, agreeing, len(guided), used),
         )
         evidence = {name: getattr(estimate, name) for name in EVIDENCE}
-        estimate = replace(estimate, p_correct=float(probability_right(evidence)))
+        probability = bounded_by_rivals(float(probability_right(evidence)), [rival.support for rival in rivals])
+        estimate = replace(estimate, p_correct=probability)
         certain = estimate.p_correct >= settings.ok_probability and estimate.rival_support <= settings.ok_rival_support
         return estimate if certain else replace(estimate, status="low_confidence")
 
