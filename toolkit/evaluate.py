@@ -131,7 +131,8 @@ def evaluate_scene(
             reason = str(error)
         for map_ in maps:
             pair = {"map_device": map_, "query_device": query}
-            unit, length = length_unit(read_map_record(map_record_path(poses_dir, capture.name, map_)))
+            record = read_map_record(map_record_path(poses_dir, capture.name, map_))
+            unit, length = length_unit(record)
             name = pair_name(capture.name, map_, query)
             if cause := reason or left_out(poses_dir, name) or _unreadable(capture, f"{map_}_map"):
                 messages.append(f"{name} was left out: {cause}")
@@ -154,7 +155,8 @@ def evaluate_scene(
             elif references_dir is not None:
                 path = Path(references_dir) / f"{name}.jsonl"
                 row, good = _retrieval_recall(
-                    path, keys, truth, capture[f"{map_}_map"], settings.retrieval_ks, near, length
+                    *(path, keys, truth, capture[f"{map_}_map"], settings.retrieval_ks),
+                    *(near, length, record["length"] or length),
                 )
                 rows["retrieval"].append({**pair, **row})
                 if good is None:
@@ -230,7 +232,8 @@ def evaluate_sequences(
             keys, truth = _queries_with_truth(capture[f"{query}_query"], queries, [])
             if truth is None or not len(keys):
                 continue
-            unit, length = length_unit(read_map_record(map_record_path(poses_dir, capture.name, map_)))
+            record = read_map_record(map_record_path(poses_dir, capture.name, map_))
+            unit, length = length_unit(record)
             pair = {"map_device": map_, "query_device": query}
             steps.append(pd.DataFrame(sequence.recalls(keys, truth, limits, unit, length)).assign(**pair))
             changes.append(sequence.changes(keys, truth, limits[-1], length).assign(**pair))
@@ -426,12 +429,14 @@ def _retrieval_recall(
     ks: Sequence[int],
     limits: tuple[float, float],
     length: float,
+    map_length: float,
 ) -> tuple[dict[str, Any], NDArray[np.bool_] | None]:
     """Return a pair's row of the table `retrieval`, and whether each query has a good reference (None if unreadable).
 
     Args:
-        limits: largest distance and angle (degrees) between a query and a good reference.
-        length: unit of the distance, in the unit of the poses.
+        limits: largest distance, in map lengths, and angle (degrees) between a query and a good reference.
+        length: the unit of lengths in the table, in the unit of the poses.
+        map_length: `Survey.length`, in the unit of the poses: far scenes show the same from further apart.
     """
     if not path.is_file():
         return {"state": "no retrieval file", "queries": len(keys)}, None
@@ -448,7 +453,7 @@ def _retrieval_recall(
         state = f"unreadable retrieval file ({type(error).__name__}: {error})"
         return {"state": state, "queries": len(keys)}, None
     cameras = poses_of(truth, index) @ device_from_cam  # type: ignore[arg-type]
-    reach = limits[0] * length, limits[1]
+    reach = limits[0] * map_length, limits[1]
     near = _is_near(references, cameras[:, None], reach)
     best = np.where(near.any(1), near.argmax(1), np.inf)
     in_map = _near_any(cameras, map_session.world_from_cam(), reach)
@@ -456,7 +461,8 @@ def _retrieval_recall(
     frame = index.assign(rank=best, in_map=in_map).groupby(["timestamp", "device_id"], as_index=False)
     by_device = keys.merge(frame.agg(rank=("rank", "min"), in_map=("in_map", "any")), how="left")
     rank = by_device["rank"].fillna(np.inf).to_numpy(float)
-    row: dict[str, Any] = {"state": "evaluated", "queries": len(keys), "radius_m": limits[0], "angle_deg": limits[1]}
+    row: dict[str, Any] = {"state": "evaluated", "queries": len(keys), "angle_deg": limits[1]}
+    row["radius_m"] = round(reach[0] / length, 4)
     row |= {f"recall@{k}": float(np.mean(rank < k)) for k in ks}
     return {**row, "in_map": float(by_device["in_map"].eq(True).mean())}, np.isfinite(rank)
 

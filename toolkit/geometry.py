@@ -97,6 +97,27 @@ def make_pose(rotation: ArrayLike, translation: ArrayLike) -> Floats:
     return pose
 
 
+FAR = 1e4
+"""Distance from the origin beyond which coordinates (UTM, ECEF) are shifted before numbers are squared."""
+
+
+def local_origin(points: ArrayLike) -> Floats:
+    """Return a point (3,) near the middle of points (N, 3) that are `FAR` away, in whole hundreds; else zero.
+
+    Numerical results depend a little on the frame, so a local one is the same wherever a world is shifted to.
+    """
+    points = np.asarray(points, np.float64).reshape(-1, 3)
+    middle = np.median(points, axis=0) if len(points) else np.zeros(3)
+    return 100 * np.round(middle / 100) if np.abs(middle).max() > FAR else np.zeros(3)
+
+
+def shifted(a_from_b: ArrayLike, offset: ArrayLike) -> Floats:
+    """Return poses (..., 4, 4) with an offset (3,), in frame a, added to their translations."""
+    poses = np.array(a_from_b, np.float64)
+    poses[..., :3, 3] += np.asarray(offset, np.float64)
+    return poses
+
+
 def invert(a_from_b: ArrayLike) -> Floats:
     """Return b_from_a, (..., 4, 4), of rigid poses a_from_b, (..., 4, 4)."""
     pose = np.asarray(a_from_b, np.float64)

@@ -210,11 +210,12 @@ def test_images_are_looked_at(capture: Path) -> None:
             assert lines[problem.line] in problem.message
 
 
-def walk(capture: Path, step: list[float], turn: float = 0.01, frames: int = 12) -> None:
-    """Let the map be of one camera that is moved by `step` meters and turned by `turn` from frame to frame."""
+def walk(capture: Path, step: list[float], turn: float = 0.01, frames: int = 12, still: int = 0) -> None:
+    """Let the map be of one camera that moves by `step` meters and turns by `turn` a frame; `still` on a tripod."""
     angles = turn * np.arange(frames)
     qt = np.zeros((frames, 7))
     qt[:, 0], qt[:, 2], qt[:, 4:] = np.cos(angles), np.sin(angles), np.outer(np.arange(frames), step)
+    qt[:still, 4:] = 0.01 * np.arange(still)[:, None] / max(still, 1)  # about a tripod
     session = capture / "sessions" / "hl_map"
     rows = [(time, "s/a", f"s/a/{time}.jpg") for time in range(frames)]
     for _, _, path in rows:
@@ -233,6 +234,9 @@ def test_poses_that_cannot_be_right_are_found(capture: Path) -> None:
     assert any("trajectories.txt: error: all 12 images stand in one place" in line for line in found(capture))
     walk(capture, [0, 0, -0.5])
     assert any("trajectories.txt: warning: cameras move backwards" in line for line in found(capture))
+    walk(capture, [0, 0, 0.5], still=7)
+    tripod = "trajectories.txt: warning: 7 of 12 images were taken from one place: nothing has parallax"
+    assert any(tripod in line for line in found(capture))
     walk(capture, [0, 0, 0.5], turn=0)
     assert any("trajectories.txt: warning: all 12 images have the same rotation" in line for line in found(capture))
 

@@ -10,7 +10,7 @@ import pytest
 from toolkit.capture import Capture, Session, Trajectory, write_session
 from toolkit.capture.turning import turned_from_cam
 from toolkit.capture.upright import quarter_turns
-from toolkit.capture.world_up import estimate_world_up
+from toolkit.capture.world_up import estimate_world_up, up_of_cameras
 from toolkit.errors import CaptureError
 from toolkit.geometry import invert, make_pose
 
@@ -130,6 +130,16 @@ def test_world_up_is_found(write: Write, frames: list[Frame], world: np.ndarray)
 def test_world_up_of_many_images_is_exact_to_a_few_degrees(write: Write) -> None:
     frames = _frames("r/a", 0, count=200) + _frames("r/b", 1, count=200, pitch=-30, odd=[3] * 40)
     assert _angle(estimate_world_up([write("hl_map", frames, world=TILTED)]).direction, TILTED[:3, 2]) < 1.5
+
+
+@pytest.mark.parametrize("headings", [3, 180])
+def test_a_drone_that_looks_straight_down_does_not_tell_where_up_is(write: Write, headings: float) -> None:
+    up = estimate_world_up([write("ios_map", _frames("r/cam", 0, pitch=-88, headings=headings, noise=2))])
+    assert not up.known
+    assert up.direction.tolist() == [0, 0, 1]
+    assert "straight down, if z is up" in up.reason
+    poses = np.array([pose for _, pose in _frames("r/cam", 0, pitch=-88, headings=headings, noise=2)])
+    assert up_of_cameras(poses).tolist() == [0, 0, 1]
 
 
 def test_all_cameras_rolled_leave_the_sign_to_a_guess(write: Write) -> None:

@@ -822,3 +822,24 @@ def test_a_network_sees_all_features_and_is_not_asked_what_is_known(room: World)
     assert network.sizes == []
     assert names == [room.local_map.image_names[index] for index in first]
     np.testing.assert_array_equal(again.world_from_rig, estimate.world_from_rig)
+
+
+@pytest.mark.parametrize("rig", [False, True])
+def test_coordinates_of_a_country_give_the_same_pose(room: World, rig: bool) -> None:
+    """UTM coordinates have millions of meters; squared in double precision, they leave millimeters."""
+    far = np.array([500_000.0, 5_000_000.0, 400.0])
+    cameras, poses = ([PINHOLE] * 2, RIG_FROM_CAMS[:2]) if rig else ([PINHOLE], np.eye(4)[None])
+    seen = [room.look(camera, QUERY @ pose) for camera, pose in zip(cameras, poses, strict=True)]
+    moved = replace(
+        room.local_map,
+        points=room.local_map.points + far,
+        world_from_cams=geometry.shifted(room.local_map.world_from_cams, far),
+    )
+    near, there = (
+        ask(PnpLocalizer([MappedFeatures(one, room.features)]), cameras, poses, seen, [REFERENCES] * len(cameras))
+        for one in (room.local_map, moved)
+    )
+    assert near.world_from_rig is not None
+    assert there.world_from_rig is not None
+    np.testing.assert_allclose(there.world_from_rig[:3, 3] - far, near.world_from_rig[:3, 3], rtol=0, atol=2e-6)
+    np.testing.assert_allclose(there.world_from_rig[:3, :3], near.world_from_rig[:3, :3], rtol=0, atol=1e-6)

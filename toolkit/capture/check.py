@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from scipy.spatial import KDTree
 
 from toolkit.capture.cameras import CAMERA_TYPES, parse_camera
 from toolkit.capture.devices import OTHER_SESSIONS, SPLITS, kinds
@@ -18,13 +19,15 @@ from toolkit.capture.trajectory import Trajectory
 from toolkit.capture.world_up import estimate_world_up, posed_photographs
 from toolkit.capture.writing import read_depth
 from toolkit.errors import CaptureError, ImageError
-from toolkit.geometry import unit
+from toolkit.geometry import Floats, unit
 
 ERROR, WARNING = "error", "warning"
 ASKED = "pruned_subsampled"
 """Keyframe list that manifests localize by default."""
 SAME_PLACE_M = 1e-6
 """Positions closer than this are the same, meters."""
+PLACE_SHARE = 0.005
+"""Positions closer than this share of the extent of all positions are one place, as of a tripod."""
 WALK = 10
 """Smallest number of steps between camera positions from which the direction of motion is judged."""
 UNIT_TOLERANCE = 1e-3
@@ -313,6 +316,9 @@ class _SessionCheck:
             self._add(file, 0, f"all {len(poses)} images stand in one place: nothing can be triangulated")
         elif np.ptp(poses[:, :3, :3], axis=0).max() < 1e-9:
             self._add(file, 0, f"all {len(poses)} images have the same rotation: were rotations lost?", WARNING)
+        elif (together := _most_in_one_place(poses[:, :3, 3])) >= max(3, len(poses) / 2):
+            message = f"{together} of {len(poses)} images were taken from one place: nothing has parallax between them"
+            self._add(file, 0, message, WARNING)
         steps = np.diff(poses[:, :3, 3], axis=0)
         walked = (np.linalg.norm(steps, axis=1) > SAME_PLACE_M) & (recording[1:] == recording[:-1])
         forward = np.sum(unit(steps[walked]) * poses[1:][walked, :3, 2], axis=1)
@@ -389,3 +395,9 @@ class _SessionCheck:
 
 def _count(number: int, what: str) -> str:
     return f"{number:,} {what}" + ("" if number == 1 else "s")
+
+
+def _most_in_one_place(centers: Floats) -> int:
+    """Return the largest number of camera centers (N, 3) that stand in one place."""
+    tree, extent = KDTree(centers), float(np.linalg.norm(np.ptp(centers, axis=0)))
+    return int(tree.query_ball_point(centers, PLACE_SHARE * extent, return_length=True).max())

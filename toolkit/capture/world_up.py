@@ -23,6 +23,7 @@ OUTLIER = 0.005  # likelihood of an outlier, an image held in any other way
 SENSOR_PRIOR = np.array([0.0, -1.0, -2.0, -1.0])  # log prior: most likely upright, least likely upside down
 Z_BONUS, Z_NEAR = 1.5, np.radians(10.0)  # log, radians; prior that the world's z axis is vertical
 WALK_BONUS = 2.0  # log; prior that cameras spread least along up, because people walk on the ground
+NADIR = np.radians(25.0)  # largest angle to -z of views that look straight down
 DECISIVE = 0.5  # log; smallest difference of the scores of up and down that decides between them
 
 
@@ -53,7 +54,8 @@ def estimate_world_up(sessions: Sequence[Session]) -> WorldUp:
     rolled and move along the ground, and the world's z axis is vertical.
 
     Upright cameras distinguish up from down. If the cameras do not, up is +z if z is within 25 degrees of the axis (the
-    convention of CroCoDL and LaMAR), else the sign is arbitrary; `known` is False in both cases.
+    convention of CroCoDL and LaMAR), else the sign is arbitrary; `known` is False in both cases. Cameras that all look
+    along -z are taken for those of a drone; whether z is up, they cannot tell.
 
     Raises:
         CaptureError: no image has a pose.
@@ -66,6 +68,9 @@ def estimate_world_up(sessions: Sequence[Session]) -> WorldUp:
             f"No image of the map sessions ({names}) has a pose, so the up direction cannot be estimated: expected "
             "poses in trajectories.txt. Or set `world_up` in the manifest."
         )
+    if _look_down_z(axes):
+        reason = f"(0, 0, 1), a guess from {count} images that all look along -z: straight down, if z is up"
+        return WorldUp(np.array([0.0, 0.0, 1.0]), False, reason)
     up, difference = _most_upright(axes, centers, groups)
     known, how = difference >= DECISIVE, "as most of its cameras are held"
     if not known:
@@ -84,9 +89,15 @@ def up_of_cameras(world_from_cams: ArrayLike) -> Floats:
     poses = np.asarray(world_from_cams, np.float64).reshape(-1, 4, 4)
     poses = poses[np.isfinite(poses).all(axis=(1, 2))]
     poses = poses[_evenly(len(poses), MAX_IMAGES)]
-    if not len(poses):
+    if not len(poses) or _look_down_z(poses[:, :3, :3]):
         return np.array([0.0, 0.0, 1.0])
     return _most_upright(poses[:, :3, :3], poses[:, :3, 3], np.zeros(len(poses), np.int64))[0]
+
+
+def _look_down_z(axes: Floats) -> bool:
+    """Tell whether cameras with these axes (N, 3, 3) all look along -z, so that level axes tell nothing."""
+    along = -axes[:, 2, 2]
+    return bool(len(axes) > 2 and np.quantile(along, 0.1) > np.cos(NADIR))
 
 
 def _most_upright(axes: Floats, centers: Floats, groups: Ints) -> tuple[Floats, float]:

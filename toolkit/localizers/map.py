@@ -283,9 +283,10 @@ class Map:
         return f"the poses of the map are good to about {np.sqrt(3) * noise.rotation_noise_deg:.2g} deg, {text}"
 
     def record(self) -> dict[str, Any]:
-        """Return the unit, the depth and the consistency of the map, for JSON."""
+        """Return the unit, depth, length and consistency of the map, for JSON."""
         depth = self.length * NOMINAL_DEPTH if self.settings.unit is None else None
-        return {"unit": self.settings.unit, "depth": depth, "text": self.remarks, **asdict(self.consistency)}
+        unit = {"unit": self.settings.unit, "depth": depth, "length": self.length}
+        return {**unit, "text": self.remarks, **asdict(self.consistency)}
 
     def judged(self, estimate: PoseEstimate) -> PoseEstimate:
         """Return the estimate; with low confidence if the map's poses or intrinsics contradict its images."""

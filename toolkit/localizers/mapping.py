@@ -380,17 +380,19 @@ class MapPlan(Remade):
             return stores[self._home[i]][self.names[i], self.names[j]].indices
 
         poses = self.world_from_cams[images]
+        origin = geometry.local_origin(self.world_from_cams[:, :3, 3])
         local_map = triangulate(
             [self.names[image] for image in images],
             [self.cameras[image] for image in images],
-            geometry.make_pose(poses[:, :3, :3], poses[:, :3, 3] / self.length),
+            geometry.make_pose(poses[:, :3, :3], (poses[:, :3, 3] - origin) / self.length),
             [self._keypoints(image) for image in images],
             np.searchsorted(images, pairs),
             [matches_of(i, j) for i, j in pairs.tolist()],
             self.settings,
             self.seed,
         ).scaled(self.length)
-        local_map = replace(local_map, world_from_cams=poses, length=self.length)
+        points = local_map.points + origin
+        local_map = replace(local_map, world_from_cams=poses, points=points, length=self.length)
         if len(core) == len(images):
             return local_map
         in_core = np.isin(images[local_map.obs_image], core)

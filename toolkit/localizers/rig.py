@@ -141,7 +141,8 @@ class RigQuery:
             "seed": seed,
             "max_reproj_error": float(np.tan(np.radians(max_error_deg)) * self.focals_px.mean()),
         }
-        pixels, xyz, cameras = self._by_camera(matches, points, undistort=True)
+        origin = geometry.local_origin(points[matches.point])
+        pixels, xyz, cameras = self._by_camera(matches, points, origin, undistort=True)
         if sum(map(len, xyz)) < 4:
             return None
         if len(self.cameras) == 1:
@@ -155,23 +156,24 @@ class RigQuery:
         if info["num_inliers"] < 4 or not np.isfinite(pose.Rt).all():
             return None
         if len(self.cameras) == 1:
-            return np.asarray(self.rig_from_cams[0] @ _matrix(pose.Rt), np.float64)
+            return _from_world(self.rig_from_cams[0] @ _matrix(pose.Rt), origin)
         rotation = geometry.quaternion_to_rotation(np.round(pose.q, _DECIMALS))
-        return geometry.make_pose(rotation, np.round(pose.t, _DECIMALS - 3))
+        return _from_world(geometry.make_pose(rotation, np.round(pose.t, _DECIMALS - 3)), origin)
 
     def _by_camera(
-        self, matches: Matches, points: Floats, undistort: bool
+        self, matches: Matches, points: Floats, origin: Floats, undistort: bool
     ) -> tuple[list[Floats], list[Floats], list[dict[str, Any]]]:
         """Return pixels (n, 2) and points (n, 3) of the matches of each camera, and the cameras, as PoseLib takes them.
 
         Args:
+            origin: (3,) in the world, origin of the returned points.
             undistort: return pixels of pinhole cameras with the mean focal length of the rig, not of the actual lenses.
         """
         focal_px = float(self.focals_px.mean())
         pixels, xyz, cameras = [], [], []
         for index, camera in enumerate(self.cameras):
             part = matches.camera == index
-            xy, in_world = matches.pixels[part], points[matches.point[part]]
+            xy, in_world = matches.pixels[part], points[matches.point[part]] - origin
             model, params = camera.model.name, camera.params.tolist()
             if undistort or model not in POSELIB_MODELS:
                 xy = focal_px * np.asarray(camera.cam_from_img(xy)).reshape(-1, 2)
@@ -200,12 +202,13 @@ class RigQuery:
             median_px = np.median(self.errors_px(rig_from_world, matches, points))
             # A pose fits few matches too well (Rousseeuw and Leroy 1987, "Robust Regression", section 5.1).
             scale_px = float(np.clip(LOSS_SHARE * (1 + 5 / (len(matches) - 6)) * median_px, LEAST_LOSS_PX, LOSS_PX))
-        pixels, xyz, cameras = self._by_camera(matches, points, undistort=False)
+        origin = geometry.local_origin(points[matches.point])
+        pixels, xyz, cameras = self._by_camera(matches, points, origin, undistort=False)
         options = {"loss_type": "CAUCHY", "loss_scale": scale_px, "step_tol": STEP}
         refined, _ = poselib.refine_generalized_absolute_pose(
-            pixels, xyz, _poselib(rig_from_world), self._cams_from_rig, cameras, options
+            pixels, xyz, _poselib(_from_world(rig_from_world, -origin)), self._cams_from_rig, cameras, options
         )
-        return _matrix(refined.Rt)
+        return _from_world(_matrix(refined.Rt), origin)
 
     def projected(self, rig_from_world: Floats, matches: Matches, points: Floats) -> Floats:
         """Return the projections (K, 2) of the matched points in their images, pixels; inf behind a camera."""
@@ -287,6 +290,13 @@ def least_squares_covariance(
     middle = np.einsum("oki,okl,olj->ij", jacobian, noise, jacobian) + variance**2 * prior
     inverse = np.linalg.inv(information)
     return np.asarray(inverse @ middle @ inverse, np.float64)
+
+
+def _from_world(rig_from_local: Floats, origin: Floats) -> Floats:
+    """Return rig_from_world (4, 4), given a pose in a frame whose origin (3,) is in the world; zero: the same frame."""
+    if not origin.any():
+        return np.asarray(rig_from_local, np.float64)
+    return geometry.shifted(rig_from_local, -rig_from_local[:3, :3] @ origin)
 
 
 def _poselib(pose: Floats) -> poselib.CameraPose:

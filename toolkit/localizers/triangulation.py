@@ -47,9 +47,11 @@ def triangulate(
     """
     settings = settings or MapSettings()
     # A function of its own, so that the memory that COLMAP takes, about 2 MB per image, is free afterward.
-    tracks = _tracks(names, cameras, world_from_cams, keypoints, pairs, matches, settings, seed)
-    refined = refine_points(*tracks, cameras, world_from_cams, keypoints, settings)
-    points, observations = refined.points, refined.observations
+    origin = geometry.local_origin(np.asarray(world_from_cams)[:, :3, 3])
+    local = geometry.shifted(world_from_cams, -origin)
+    tracks = _tracks(names, cameras, local, keypoints, pairs, matches, settings, seed)
+    refined = refine_points(*tracks, cameras, local, keypoints, settings)
+    points, observations = refined.points + origin, refined.observations
     return LocalMap(
         image_names=list(names),
         cameras=list(cameras),
