@@ -164,7 +164,7 @@ def rows_of_run(capture_path: Path, run: Path) -> pd.DataFrame:
     for path in sorted(SceneFiles(run, capture.name).poses_dir.glob("*.csv")):
         truth = capture[f"{path.stem.rpartition('_query_')[2]}_query"].ground_truth
         assert truth is not None, f"{capture_path} has no ground truth"
-        table = pd.read_csv(path, dtype={"device_id": str})
+        table = pd.read_csv(path, dtype={"device_id": str}).rename(columns={"position_std": "position_std_m"})
         rotation_deg, distance_m = pose_errors(Trajectory.read(path.with_suffix(".txt")), truth, table)
         wrong = (rotation_deg > WRONG[0]) | (distance_m > WRONG[1])
         tables.append(table.assign(scene=capture.name, posed=np.isfinite(distance_m), wrong=wrong))

@@ -77,7 +77,7 @@ log = logging.getLogger(__name__)
 COLUMNS = [
     "timestamp", "device_id", "image", "status", "method", "num_inliers", "num_matches", "inlier_ratio", "num_guided",
     "rmse_px", "rival_support", "coverage", "agreement", "p_correct", "position_std_m", "rotation_std_deg",
-    "references", "seconds", "focal_px", "reason",
+    "references", "seconds", "focal_px", "principal_point_px", "reason",
 ]  # fmt: skip
 PREDICTION_COLUMNS = ["scale_std", "rejected"]
 """Additional columns of `feed_forward` and `hybrid`."""
@@ -590,6 +590,7 @@ def _row(
     pose = None if estimate.world_from_rig is None else geometry.qt_from_pose(estimate.world_from_rig).tolist()
     covariance = None if estimate.covariance is None else estimate.covariance.ravel().tolist()
     focals = estimate.focals_px if np.isfinite(estimate.focals_px).any() else ()
+    centers = estimate.centers_px if np.isfinite(estimate.centers_px).any() else ()
     return {
         "timestamp": key[0],
         "device_id": key[1],
@@ -609,6 +610,7 @@ def _row(
         "references": ";".join(localized.references),
         "seconds": round(time.perf_counter() - started, 4),
         "focal_px": ";".join("" if np.isnan(focal) else f"{focal:.1f}" for focal in focals),
+        "principal_point_px": ";".join("" if np.isnan(x) else f"{x:.1f} {y:.1f}" for x, y in centers),
         "scale_std": round(estimate.scale_std, 6),
         "rejected": ";".join(localized.rejected),
         "reason": estimate.reason,

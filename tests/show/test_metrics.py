@@ -42,7 +42,9 @@ def test_a_camera_that_does_not_fit_most_of_its_queries_is_named_once():
     session = SimpleNamespace(
         id="ios_query",
         images=pd.DataFrame({"sensor_id": names}),
-        camera=lambda name: SimpleNamespace(mean_focal_length=lambda: stated[name]),
+        camera=lambda name: SimpleNamespace(
+            mean_focal_length=lambda: stated[name], principal_point_x=320.0, principal_point_y=240.0
+        ),
         rows_of_keyframes=lambda table: [np.array(rows) for rows in ([0], [1], [2, 3], [4, 5])][: len(table)],
     )
     doubted = "low_confidence: camera?"
@@ -54,6 +56,10 @@ def test_a_camera_that_does_not_fit_most_of_its_queries_is_named_once():
     assert [message.split(":")[0] for message in messages] == ["camera phone/cam", "camera rig/left"]
     assert "0.900 times those in ios_query/sensors.txt (median of 2 poses)" in messages[0]
     assert "360 px (median of 2 poses), ios_query/sensors.txt says 400 px" in messages[1]
+    centers = pd.DataFrame({"status": [doubted, doubted], "principal_point_px": ["300.0 260.0", "310.0 250.0"]})
+    (message,) = camera_messages(session, [centers])  # type: ignore[arg-type]
+    assert message.startswith("camera phone/cam: the principal point that fits is 305, 255 px (median of 2 poses)")
+    assert "says 320, 240. Correct it" in message
     assert camera_messages(session, [second.drop(columns="focal_px")]) == []  # type: ignore[arg-type]
     contradicted = "low_confidence: the poses of the map contradict its images"
     # A doubt for another reason, such as the map's poses, names no focal length, be the column of numbers or texts.

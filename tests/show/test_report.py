@@ -140,6 +140,21 @@ def test_the_worst_queries_come_first_and_say_why(full):
     assert page.index('alt="second worst"') < page.index('alt="tenth worst"') < page.index('alt="a sample"')
 
 
+def test_what_is_called_ok_but_wrong_comes_first_and_in_red(full):
+    page = write_report(full).read_text()
+    assert "called ok are wrong" not in page
+    path = next(full.rglob("errors.csv"))
+    errors = pd.read_csv(path).assign(image=["a.jpg", "b.jpg", "c.jpg"], p_correct=0.998, rival_support=[0.62, 0, 0])
+    errors.loc[0, ["rotation_error_deg", "translation_error_m"]] = 2.0, 28.3
+    errors.to_csv(path, index=False)
+    text = write_report(full).read_text()
+    alarm = text[text.index('<div class="alarm"><b>1 of 1 poses that are called ok are wrong') :]
+    assert text.index("called ok are wrong") < text.index('class="verdict"')
+    assert "ios in ios map, a.jpg" in alarm
+    assert "off by 2.00°, 28 m" in alarm
+    assert "stated to be right with 99.8%, a rival has 62% of its support" in alarm
+
+
 def test_links_are_relative_and_lead_to_files(full):
     links = re.findall(r'href="([^"#]*)"', write_report(full).read_text())
     assert len(links) == len(re.findall("<a href", write_report(full).read_text())) - 4

@@ -145,6 +145,8 @@ class PoseEstimate:
     focals_px: tuple[float, ...] = ()
     """Per query image, the focal length that fits, or NaN if the focal length is not the problem. Empty if the
     intrinsics are not contradicted."""
+    centers_px: tuple[tuple[float, float], ...] = ()
+    """Per query image, the principal point that fits, or NaN; as `focals_px`."""
 
     def scaled(self, factor: float) -> "PoseEstimate":
         """Return the estimate with all lengths multiplied by a factor."""

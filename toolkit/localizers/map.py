@@ -296,7 +296,7 @@ class Map:
         reason = "; ".join(filter(None, ["" if estimate.misfit else estimate.reason, self.consistency.text]))
         what = "poses" if self.consistency.verdict == "inconsistent" else "intrinsics"
         status = f"low_confidence: the {what} of the map contradict its images"
-        return replace(estimate, status=status, reason=reason, focals_px=())
+        return replace(estimate, status=status, reason=reason, focals_px=(), centers_px=())
 
     @cached_property
     def localizer(self) -> Localizer:

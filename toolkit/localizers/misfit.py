@@ -73,12 +73,25 @@ class Misfit:
         """Whether a significant change moves the pose beyond `MAX_SHARES`, or the intrinsics that fit are unknown."""
         return bool(np.isnan(self.parameters).any() or (self.shares > MAX_SHARES).any())
 
+    def _at_fault(self, kind: int) -> Bools:
+        """Tell for each camera whether focal length (0), principal point (1) or distortion (2) misfits the most."""
+        excess = self.shares / MAX_SHARES
+        return (excess[:, kind] > 0) & (excess.argmax(axis=1) == kind)
+
     def focals_px(self, cameras: list[pycolmap.Camera]) -> tuple[float, ...]:
         """Return the focal length that fits each camera; NaN if something else or nothing misfits."""
-        excess = self.shares / MAX_SHARES
-        at_fault = (excess[:, 0] > 0) & (excess.argmax(axis=1) == 0)
         stated = np.array([camera.mean_focal_length() for camera in cameras])
-        return tuple(np.where(at_fault, stated * (1 + self.parameters[:, 0]), np.nan).tolist())
+        return tuple(np.where(self._at_fault(0), stated * (1 + self.parameters[:, 0]), np.nan).tolist())
+
+    def centers_px(self, cameras: list[pycolmap.Camera]) -> tuple[tuple[float, float], ...]:
+        """Return the principal point that fits each camera; NaN if something else or nothing misfits."""
+        stated = [(one.principal_point_x, one.principal_point_y, one.mean_focal_length()) for one in cameras]
+        fitted = [
+            (x + focal_px * right, y + focal_px * down)
+            for (x, y, focal_px), (_, right, down, _) in zip(stated, self.parameters.tolist(), strict=True)
+        ]
+        unknown = (float("nan"),) * 2
+        return tuple(xy if fault else unknown for xy, fault in zip(fitted, self._at_fault(1), strict=True))
 
     def reason(self, cameras: list[pycolmap.Camera]) -> str:
         """Return a text that compares, for each camera that misfits, the fitted and the stated value."""

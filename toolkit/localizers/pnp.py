@@ -125,8 +125,12 @@ class PnpLocalizer(WithoutNetwork):
         used = replace(estimate.correspondences, camera=np.array(usable, np.int64)[estimate.correspondences.camera])
         focals_px = np.full(len(query.features), np.nan)
         focals_px[usable] = estimate.focals_px or np.nan
+        centers_px = np.full((len(query.features), 2), np.nan)
+        centers_px[usable] = np.array(estimate.centers_px).reshape(-1, 2) if estimate.centers_px else np.nan
         reason = "; ".join(filter(None, [estimate.reason, missing]))
-        return replace(estimate, correspondences=used, focals_px=tuple(focals_px.tolist()), reason=reason)
+        centers = tuple((x, y) for x, y in centers_px.tolist())
+        focals = tuple(focals_px.tolist())
+        return replace(estimate, correspondences=used, focals_px=focals, centers_px=centers, reason=reason)
 
     def _with_misfit(self, query: RigQuery, matches: Matches, estimate: PoseEstimate) -> PoseEstimate:
         """Return the estimate, with a warning if matches made without the pose contradict the query's intrinsics.
@@ -147,12 +151,16 @@ class PnpLocalizer(WithoutNetwork):
         if misfit is None:
             return estimate
         covariance = estimate.covariance
+        wider = None if covariance is None else covariance + np.outer(misfit.shift, misfit.shift)
+        if not misfit.doubtful:
+            return replace(estimate, covariance=wider, misfit=True)
         return replace(
             estimate,
-            status=CAMERA if misfit.doubtful else estimate.status,
-            covariance=None if covariance is None else covariance + np.outer(misfit.shift, misfit.shift),
+            status=CAMERA,
+            covariance=wider,
             misfit=True,
             focals_px=misfit.focals_px(query.cameras),
+            centers_px=misfit.centers_px(query.cameras),
             reason=misfit.reason(query.cameras),
         )
 

@@ -148,40 +148,54 @@ def worst_first(queries: pd.DataFrame, threshold: Threshold = THRESHOLDS[0]) -> 
 
 
 def camera_messages(session: "Session", tables: Sequence[pd.DataFrame]) -> list[str]:
-    """Return a message for each camera whose focal length does not fit most of its queries.
+    """Return a message for each camera whose focal length or principal point does not fit most of its queries.
 
     Cameras whose names differ only in a timestamp at the end count as one: a phone may have one for each picture.
 
     Args:
         session: session of the queries.
-        tables: `poses/<pair>.csv` of pairs with these queries: timestamp, device_id, status and focal_px.
+        tables: `poses/<pair>.csv` of pairs with these queries: timestamp, device_id, status, focal_px and
+            principal_point_px.
     """
     posed: dict[str, int] = {}
-    focals_px: dict[str, list[tuple[float, float]]] = {}
+    fitted: dict[tuple[str, str], list[tuple[list[float], str]]] = {}
     sensors = session.images["sensor_id"].to_numpy()
     for table in tables:
-        focals = (table["focal_px"] if "focal_px" in table else pd.Series("", table.index)).astype(object)
-        texts = focals.where(focals.notna(), "").astype(str)
+        texts = {name: _texts(table, name) for name in ("focal_px", "principal_point_px")}
         statuses = table["status"].fillna("failed")
-        for images, status, text in zip(session.rows_of_keyframes(table), statuses, texts, strict=True):
+        for number, (images, status) in enumerate(zip(session.rows_of_keyframes(table), statuses, strict=True)):
             if status.startswith("failed"):
                 continue
-            doubted = text.split(";") if status.startswith("low_confidence: ") else []
-            of_images = pd.to_numeric(pd.Series(doubted, dtype=str).reindex(range(len(images))), errors="coerce")
-            for sensor_id, focal_px in zip(sensors[images], of_images, strict=True):
-                name = re.sub(r"[_-]\d{6,}$", "", sensor_id)
+            names = [re.sub(r"[_-]\d{6,}$", "", sensor_id) for sensor_id in sensors[images]]
+            for name in names:
                 posed[name] = posed.get(name, 0) + 1
-                if focal_px > 0:
-                    stated_px = session.camera(sensor_id).mean_focal_length()
-                    focals_px.setdefault(name, []).append((focal_px, stated_px))
+            for column, of_queries in texts.items() if status.startswith("low_confidence: ") else ():
+                values = of_queries[number].split(";")
+                for name, sensor_id, value in zip(names, sensors[images], values, strict=False):
+                    if value:
+                        fitted.setdefault((name, column), []).append(([float(x) for x in value.split()], sensor_id))
     messages = []
-    for name, pairs in focals_px.items():
-        if len(pairs) < posed[name] / 2:
+    for (name, column), found in fitted.items():
+        if len(found) < posed[name] / 2:
             continue
-        fitted, stated = np.array(pairs).T
-        file, median_of = f"{session.id}/sensors.txt", f"(median of {len(pairs)} poses)"
-        text = f"the focal length that fits is {np.median(fitted):.0f} px {median_of}, {file} says {stated[0]:.0f} px"
-        if np.ptp(stated) > 0:
-            text = f"the focal lengths that fit are {np.median(fitted / stated):.3f} times those in {file} {median_of}"
-        messages.append(f"camera {name}: {text}. Correct it and localize again.")
+        file, median_of = f"{session.id}/sensors.txt", f"(median of {len(found)} poses)"
+        fits_px, cameras = np.array([value for value, _ in found]), [session.camera(sensor) for _, sensor in found]
+        if column == "focal_px":
+            stated = np.array([camera.mean_focal_length() for camera in cameras])
+            fits = f"the focal length that fits is {np.median(fits_px):.0f} px {median_of}, "
+            fits += f"{file} says {stated[0]:.0f} px"
+            if np.ptp(stated) > 0:
+                ratio = np.median(fits_px[:, 0] / stated)
+                fits = f"the focal lengths that fit are {ratio:.3f} times those in {file} {median_of}"
+        else:
+            x, y = np.median(fits_px, axis=0)
+            stated_xy = f"{cameras[0].principal_point_x:.0f}, {cameras[0].principal_point_y:.0f}"
+            fits = f"the principal point that fits is {x:.0f}, {y:.0f} px {median_of}, {file} says {stated_xy}"
+        messages.append(f"camera {name}: {fits}. Correct it and localize again.")
     return messages
+
+
+def _texts(table: pd.DataFrame, name: str) -> list[str]:
+    """Return a column as texts, empty where it is missing."""
+    values = (table[name] if name in table else pd.Series("", table.index)).astype(object)
+    return values.where(values.notna(), "").astype(str).tolist()

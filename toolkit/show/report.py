@@ -30,6 +30,7 @@ from toolkit.show.metrics import (
     REASONS,
     THRESHOLDS,
     WRONG,
+    is_below,
     length_unit,
     named_as_meters,
     parse_threshold,
@@ -313,6 +314,7 @@ def _scene(files: SceneFiles, fingerprint: str, album: "Album") -> dict[str, Any
         "name": files.scene,
         "fingerprint": fingerprint,
         "verdict": verdict,
+        "wrong_ok": _wrong_ok(errors, unit),
         "headlines": headlines,
         "messages": messages,
         "remarks": remarks,
@@ -518,6 +520,33 @@ def _failures(statuses: pd.DataFrame) -> Table | None:
     if rest := sum(len(group) for _, group in groups[MOST_REASONS:]):
         rows.append(["other reasons", rest, ""])
     return Table("Queries without a pose, by reason", ["reason", "queries", "where"], rows)
+
+
+def _wrong_ok(errors: pd.DataFrame, unit: str) -> Table | None:
+    """List the poses that are called ok but are wrong, the largest errors first; None if there are none."""
+    if not len(errors) or not (errors["status"] == "ok").any():
+        return None
+    called_ok = errors[errors["status"] == "ok"]
+    right = is_below(
+        called_ok["rotation_error_deg"].to_numpy(float), called_ok["translation_error_m"].to_numpy(float), WRONG
+    )
+    wrong = called_ok[~right].sort_values("translation_error_m", ascending=False)
+    if not len(wrong):
+        return None
+    limit = f"{WRONG[0]:g}°, {WRONG[1]:g} {unit}"
+    caption = f"{len(wrong)} of {len(called_ok)} poses that are called ok are wrong: beyond {limit}."
+    rows = []
+    for row in wrong.head(WORST).to_dict("records"):
+        name = _shown_names(row["image"]) if isinstance(row.get("image"), str) else f"{row['timestamp']}"
+        what = f"off by {off_by(row, unit=unit)}"
+        if "p_correct" in row and not pd.isna(row["p_correct"]):
+            what += f", stated to be right with {row['p_correct']:.1%}"
+        if row.get("rival_support", 0) > 0:
+            what += f", a rival has {row['rival_support']:.0%} of its support"
+        rows.append([f"{row['query_device']} in {row['map_device']} map, {name}", what])
+    if len(wrong) > WORST:
+        rows.append([f"and {len(wrong) - WORST} more", "see evaluation/errors.csv"])
+    return Table(caption, ["query", "what"], rows)
 
 
 def _worst(queries: pd.DataFrame, thresholds: list[str]) -> Table | None:
