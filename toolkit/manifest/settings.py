@@ -608,7 +608,8 @@ class EvaluateSettings(Settings):
     retrieval_ks: list[Positive] = [1, 5, 10]
     """Retrieval recall is reported for these numbers of references."""
     retrieval_radius_m: PositiveNumber = 8.0
-    """Largest distance of a correct reference from the query, meters."""
+    """Largest distance of a correct reference from the query: meters, or half of the median depth where that is above
+    16 m."""
     retrieval_angle_deg: PositiveNumber = 45.0
     """Largest angle between the viewing directions of a correct reference and the query, degrees; roll is ignored."""
 
