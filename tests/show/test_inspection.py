@@ -267,7 +267,7 @@ def test_an_estimate_in_doubt_says_why() -> None:
     numbers = {"num_inliers": 20, "num_matches": 80, "inlier_ratio": 0.25, "coverage": 0.2, "p_correct": 0.7}
     words = reason_in_words("low_confidence", "", numbers | {"rival_support": 0.93}, LocalizeSettings())
     assert "probability of 70%; ok requires 99%" in words
-    assert "Another pose has 93% of its support; ok allows 80%" in words
+    assert "Another pose has 93% of its support, so it may be the right one." in words
     nearest = reason_in_words("low_confidence", "", {}, LocalizeSettings.of({"method": "nearest"}))
     assert nearest == "This is the unchanged pose of the best reference, which is never called ok."
     fits = "the focal length that fits is 500 px"

@@ -9,6 +9,7 @@ import pandas as pd
 
 from toolkit.geometry import Floats
 from toolkit.localizers.base import CAMERA
+from toolkit.localizers.confidence import bounded_by_rivals
 from toolkit.localizers.correspondences import Correspondences, LocalizedQuery, Rival
 from toolkit.manifest import LocalizeSettings
 from toolkit.show.localized import LocalizedPair, QueryDetails
@@ -161,8 +162,8 @@ def _doubts(numbers: Mapping[str, float], settings: LocalizeSettings) -> list[st
     probability, rival = numbers.get("p_correct", np.nan), numbers.get("rival_support", 0.0)
     if probability < limits.ok_probability:
         doubts.append(f"It is right with a probability of {probability:.0%}; ok requires {limits.ok_probability:.0%}.")
-    if rival > limits.ok_rival_support:
-        doubts.append(f"Another pose has {rival:.0%} of its support; ok allows {limits.ok_rival_support:.0%}.")
+    if bounded_by_rivals(1.0, [rival]) < limits.ok_probability:
+        doubts.append(f"Another pose has {rival:.0%} of its support, so it may be the right one.")
     return doubts or ["It has too little support to be trusted."]
 
 
