@@ -504,7 +504,8 @@ class PnpSettings(Settings):
     """A pose is `ok` only if the estimated probability that it is right (within 5 degrees and 0.5 m) reaches this
     value; see `localizers/confidence.py`."""
     ok_rival_support: PositiveNumber = 0.8
-    """A pose is `ok` only if the best rival pose has at most this fraction of its support."""
+    """A pose is `ok` only if the best rival pose has at most this fraction of its support. With the default
+    `ok_probability` the limit is 0.7, see `localizers/confidence.py`."""
     sure_position_std_m: PositiveNumber = 0.05
     """An `ok` pose with at most this standard deviation of the position, meters, is precise enough; otherwise the
     further features of `escalation` are used too."""
