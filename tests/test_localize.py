@@ -140,17 +140,37 @@ def test_counts_balance(small_capture: Path, finished: tuple[SceneFiles, pd.Data
         assert not row.skipped
 
 
-def test_a_wrong_focal_length_is_doubted_and_said_once_a_camera(
-    capture: Path, run: SceneFiles, caplog: pytest.LogCaptureFixture
-) -> None:
-    sensors = capture / "sessions" / "ios_query" / "sensors.txt"
+def lengthen(sensors: Path, factor: float) -> None:
+    """Multiply all focal lengths of a session."""
     text = sensors.read_text()
     for line in text.splitlines():
         if ", camera, " in line:
             *start, focal_x, focal_y, x, y = line.split(", ")
-            wrong = [f"{1.1 * float(focal)}" for focal in (focal_x, focal_y)]
+            wrong = [f"{factor * float(focal)}" for focal in (focal_x, focal_y)]
             text = text.replace(line, ", ".join([*start, *wrong, x, y]))
     sensors.write_text(text)
+
+
+def test_wrong_focal_lengths_of_the_map_are_not_blamed_on_the_queries(
+    capture: Path, run: SceneFiles, caplog: pytest.LogCaptureFixture
+) -> None:
+    lengthen(capture / "sessions" / "ios_map" / "sensors.txt", 1.1)
+    shutil.rmtree(run.maps, ignore_errors=True)
+    table = run_stage(capture, run, query_device="ios")
+    found = rows_of(run, "ios")
+    assert table["map_poses"].tolist() == ["inconsistent"]
+    assert set(found["status"]) == {"low_confidence: the intrinsics of the map contradict its images"}
+    assert found["focal_px"].isna().all()
+    (said,) = {record for record in caplog.messages if "intrinsics of the map" in record}
+    assert "the focal length" in said
+    assert "the poses of the map are good to" not in said, "wrong intrinsics look like noise of the poses"
+    assert not [record for record in caplog.messages if "ios_query/sensors.txt" in record]
+
+
+def test_a_wrong_focal_length_is_doubted_and_said_once_a_camera(
+    capture: Path, run: SceneFiles, caplog: pytest.LogCaptureFixture
+) -> None:
+    lengthen(capture / "sessions" / "ios_query" / "sensors.txt", 1.1)
     run_stage(capture, run, query_device="ios")
     found = rows_of(run, "ios")
     assert not (found["status"] == "ok").any()

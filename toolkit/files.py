@@ -477,7 +477,9 @@ def read_json(path: str | Path) -> dict[str, Any]:
 
 def read_map_record(path: str | Path) -> dict[str, Any]:
     """Return the localize stage's record of a map; by default, the unit of its poses is meters."""
-    return {"unit": "m", "depth": None, "length": None, "verdict": "unknown", "text": "", "wrong": []} | read_json(path)
+    unknown: dict[str, Any] = {"unit": "m", "depth": None, "length": None}
+    unknown |= {"verdict": "unknown", "text": "", "wrong": [], "camera": ""}
+    return unknown | read_json(path)
 
 
 def read_references(path: str | Path, *needed: str) -> list[dict[str, Any]]:

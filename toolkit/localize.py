@@ -122,8 +122,9 @@ def localize_pairs(
 
     Returns:
         One row per pair: map_device, query_device, queries = ok + low_confidence + failed, escalated (queries localized
-        again with the escalation features), map_poses (`consistent` with the map's images, `inconsistent` or
-        `unknown`), seconds, skipped, path, reason. A pair that cannot be localized has zeros and a `reason`.
+        again with the escalation features), map_poses (`consistent` with the map's images, `inconsistent`, also if its
+        intrinsics are wrong, or `unknown`), seconds, skipped, path, reason. A pair that cannot be localized has zeros
+        and a `reason`.
 
     Raises:
         ManifestError: unknown method, predictor, features or matcher, or a number that is not positive.
@@ -165,11 +166,12 @@ def localize_pairs(
                 rows = read_query_table(pair.file("csv"), ["status"])
                 query_tables.setdefault(queried, []).append(rows)
                 counts = rows["status"].str.split(":").str[0].value_counts()
+                of_map = read_map_record(pair.map_record)
                 row |= {
                     "queries": int(counts.sum()),
                     **{status: int(counts.get(status, 0)) for status in ("ok", "low_confidence", "failed")},
                     "escalated": int(rows["first_status"].notna().sum()) if settings.features.escalation else 0,
-                    "map_poses": read_map_record(pair.map_record)["verdict"],
+                    "map_poses": "inconsistent" if of_map["camera"] else of_map["verdict"],
                     "seconds": round(time.perf_counter() - started, 2),
                     "skipped": skipped,
                     "path": str(pair.file("txt")),

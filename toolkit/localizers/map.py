@@ -275,6 +275,8 @@ class Map:
     def _noise(self) -> str:
         """How good the poses are, if their noise is worth a word."""
         noise = self.consistency
+        if not noise.trusted:  # wrong intrinsics look like noise of the poses
+            return ""
         if noise.rotation_noise_deg < WORTH_DEG and noise.position_noise < WORTH_LENGTHS:
             return ""
         unit, factor = ("m", 1.0) if self.settings.unit else ("of the median depth", 1 / NOMINAL_DEPTH)
