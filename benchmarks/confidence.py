@@ -156,6 +156,7 @@ def measure(
 def rows_of_run(capture_path: Path, run: Path) -> pd.DataFrame:
     """Return a row for each query of all pairs of a finished run."""
     from toolkit.capture import Capture, Trajectory
+    from toolkit.capture.tables import POSES_UNIT
     from toolkit.evaluate import pose_errors
     from toolkit.files import SceneFiles
 
@@ -164,7 +165,7 @@ def rows_of_run(capture_path: Path, run: Path) -> pd.DataFrame:
     for path in sorted(SceneFiles(run, capture.name).poses_dir.glob("*.csv")):
         truth = capture[f"{path.stem.rpartition('_query_')[2]}_query"].ground_truth
         assert truth is not None, f"{capture_path} has no ground truth"
-        table = pd.read_csv(path, dtype={"device_id": str}).rename(columns={"position_std": "position_std_m"})
+        table = pd.read_csv(path, dtype={"device_id": str}).rename(columns=POSES_UNIT)
         rotation_deg, distance_m = pose_errors(Trajectory.read(path.with_suffix(".txt")), truth, table)
         wrong = (rotation_deg > WRONG[0]) | (distance_m > WRONG[1])
         tables.append(table.assign(scene=capture.name, posed=np.isfinite(distance_m), wrong=wrong))

@@ -232,8 +232,7 @@ def evaluate_sequences(
             keys, truth = _queries_with_truth(capture[f"{query}_query"], queries, [])
             if truth is None or not len(keys):
                 continue
-            record = read_map_record(map_record_path(poses_dir, capture.name, map_))
-            unit, length = length_unit(record)
+            unit, length = length_unit(read_map_record(map_record_path(poses_dir, capture.name, map_)))
             pair = {"map_device": map_, "query_device": query}
             steps.append(pd.DataFrame(sequence.recalls(keys, truth, limits, unit, length)).assign(**pair))
             changes.append(sequence.changes(keys, truth, limits[-1], length).assign(**pair))

@@ -114,16 +114,15 @@ def start(stage: str, sessions_root: str | None = None, **folders: str | None) -
     resolved = {"sessions_root": sessions}
     for name, folder in folders.items():
         path = Path(folder).expanduser().resolve() if folder else defaults[name]
-        if folder and run_log is None and defaults[name] == defaults["out_dir"]:
-            _require_outside_of_runs(name, Path(folder), sessions)
         if path is not None:
+            if folder and run_log is None and defaults[name] == defaults["out_dir"]:
+                _require_outside_of_runs(name, path, sessions)
             resolved[name] = path
     return Folders(resolved)
 
 
 def _require_outside_of_runs(name: str, folder: Path, sessions: Path) -> None:
     """Refuse a folder of results, the value of the parameter `name`, that belongs to a finished run."""
-    folder = folder.expanduser().resolve()
     run = next((parent for parent in folder.parents if (parent / RECORD).is_file()), None)
     if run is not None:
         raise ManifestError(

@@ -607,14 +607,14 @@ def _escalating(first: Localizer, settings: LocalizeSettings, map: Map) -> Local
         return first
     kinds: list[AnyMethod] = [*(map.kinds if settings.map is None else ()), *map.escalation]
     second = _scaled(_on_demand(settings, map, kinds, first.image_names), map)
-    return EscalatingLocalizer(first, second, map.escalation, map.sure_position_std, partial(_images_near, map, first))
+    rows = np.array([map.session.row_of_name[name] for name in first.image_names], np.int64)
+    near = partial(_images_near, map.session.world_from_cam(rows), NEAR * map.length)
+    return EscalatingLocalizer(first, second, map.escalation, map.sure_position_std, near)
 
 
-def _images_near(map: Map, localizer: Localizer, world_from_rig: Floats) -> Ints:  # noqa: A002
-    """Return the map images, by index in a localizer, that may show what a rig at a pose (4, 4) sees."""
-    rows = np.array([map.session.row_of_name[name] for name in localizer.image_names], np.int64)
-    poses = map.session.world_from_cam(rows)
-    return np.flatnonzero(masks.near(poses, world_from_rig, NEAR * map.length, NEAR_DEG))
+def _images_near(world_from_cams: Floats, distance: float, world_from_rig: Floats) -> Ints:
+    """Return the map images, by index, that may show what a rig at a pose (4, 4) sees."""
+    return np.flatnonzero(masks.near(world_from_cams, world_from_rig, distance, NEAR_DEG))
 
 
 def _on_demand(

@@ -380,6 +380,7 @@ class MapPlan(Remade):
             return stores[self._home[i]][self.names[i], self.names[j]].indices
 
         poses = self.world_from_cams[images]
+        # In the unit of the poses: divided by the length, a shift by whole hundreds would no longer be one.
         origin = geometry.local_origin(self.world_from_cams[:, :3, 3])
         local_map = triangulate(
             [self.names[image] for image in images],
