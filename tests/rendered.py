@@ -1,6 +1,7 @@
 """A rendered capture, localized by a predictor that knows the truth and blurs it."""
 
 import json
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -46,6 +47,11 @@ class World:
         keyframes = session.keyframes(LIST)
         queries = [session_query(session, rows, self.map, count) for rows in session.rows_of_keyframes(keyframes)]
         return queries, session.ground_truth.lookup(keyframes["timestamp"], keyframes["device_id"])
+
+
+def copy_shared(folder: Path, to: Path) -> Path:
+    """Copy a folder that other tests may be using at this moment, without the locks that come and go."""
+    return Path(shutil.copytree(folder, to, ignore=shutil.ignore_patterns("*.lock")))
 
 
 def run_stage(

@@ -11,6 +11,7 @@ import h5py
 import pandas as pd
 import pytest
 
+from tests.rendered import copy_shared
 from toolkit.embed import embed_sessions
 from toolkit.files import SceneFiles
 from toolkit.localize import localize_pairs
@@ -171,7 +172,7 @@ def test_a_damaged_artifact_is_made_again_as_it_was(
 ) -> None:
     stage, files, gone = ARTIFACTS[artifact]
     run = SceneFiles(tmp_path, finished.scene)
-    shutil.copytree(finished.root, run.root)
+    copy_shared(finished.root, run.root)
     path = sorted(run.root.glob(files))[0]
     damage(path, how)
     for name in gone:

@@ -18,6 +18,7 @@ from PIL import Image
 
 import toolkit
 from docs import chromium, make_images, site_hooks
+from tests.rendered import copy_shared
 from tests.test_rooms import LEVELS
 from toolkit.__main__ import app
 from toolkit.embed import embed_sessions
@@ -278,7 +279,7 @@ def test_python_examples_run(
     (tmp_path / "data").mkdir()
     sessions = Path(shutil.copytree(small_capture, tmp_path / "data" / "demo")) / "sessions"
     files = SceneFiles(tmp_path / "runs" / "demo", "demo")
-    shutil.copytree(small_features, files.features)
+    copy_shared(small_features, files.features)
     embed_sessions(sessions, files.embeddings, device="ios", features_dir=files.features)
     retrieve_pairs(sessions, files.embeddings, files.retrieval_dir, map_device="ios", query_device="ios")
     where = (files.retrieval_dir, files.poses_dir, files.features, files.maps)

@@ -23,6 +23,7 @@ from numpy.testing import assert_allclose
 
 from tests.calls import call
 from tests.other_kind import add_other_kind
+from tests.rendered import copy_shared
 from toolkit import geometry, localize, sequence
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.folder import IMPORT_RECORD
@@ -73,7 +74,7 @@ def finished(
 ) -> tuple[SceneFiles, pd.DataFrame]:
     """A run that has localized all devices in the phone's map, and its table; do not write to it."""
     files = SceneFiles(tmp_path_factory.mktemp("run"), small_capture.name)
-    shutil.copytree(small_features, files.features)
+    copy_shared(small_features, files.features)
     sessions = small_capture / "sessions"
     embed_sessions(sessions, files.embeddings, features_dir=files.features)
     retrieve_pairs(sessions, files.embeddings, map_device="ios", out_jsonl=files.retrieval_dir, queries=LIST)
@@ -84,7 +85,7 @@ def finished(
 def run(finished: tuple[SceneFiles, pd.DataFrame], tmp_path: Path) -> SceneFiles:
     """A copy of the run without its poses, to work in."""
     files = SceneFiles(tmp_path / "run", finished[0].scene)
-    shutil.copytree(finished[0].root, files.root)
+    copy_shared(finished[0].root, files.root)
     shutil.rmtree(files.poses_dir)
     return files
 
@@ -1348,7 +1349,7 @@ def test_pairs_of_a_map_do_not_call_its_record_damaged(
     small_capture: Path, finished: tuple[SceneFiles, pd.DataFrame], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     run = SceneFiles(tmp_path / "run", finished[0].scene)
-    shutil.copytree(finished[0].root, run.root)
+    copy_shared(finished[0].root, run.root)
     run_stage(small_capture, run, query_device="spot", unit=None)
     table = run_stage(small_capture, run)
     assert "damaged" not in caplog.text
@@ -1428,7 +1429,7 @@ def test_a_picture_is_not_compared_with_vectors_of_another_vocabulary(
     capture: Path, finished: tuple[SceneFiles, pd.DataFrame], tmp_path: Path
 ) -> None:
     files = SceneFiles(tmp_path / "run", finished[0].scene)
-    shutil.copytree(finished[0].root, files.root)
+    copy_shared(finished[0].root, files.root)
     place, session = Map.open(files.run, files.scene, "ios"), Capture.open(capture)["ios_query"]
     path, camera = session.image_path(0), session.camera(session.images["sensor_id"][0])
     with np.load(files.embeddings / "vlad.npz") as stored:
@@ -1444,7 +1445,7 @@ def test_a_query_that_failed_is_localized_again_where_odometry_leads(
 ) -> None:
     pytest.importorskip("gtsam")
     files = SceneFiles(tmp_path / "run", finished[0].scene)
-    shutil.copytree(finished[0].root, files.root)
+    copy_shared(finished[0].root, files.root)
     session = Session(capture / "sessions/ios_query")
     truth = session.ground_truth
     assert truth is not None

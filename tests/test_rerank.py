@@ -13,6 +13,7 @@ import pytest
 
 from tests.calls import call
 from tests.other_kind import add_other_kind
+from tests.rendered import copy_shared
 from toolkit import rerank
 from toolkit.capture import Capture, Trajectory
 from toolkit.embed import embed_sessions
@@ -138,7 +139,7 @@ def test_overlap_is_the_share_of_points_in_view() -> None:
 def finished(small_capture: Path, small_features: Path, tmp_path_factory: pytest.TempPathFactory) -> SceneFiles:
     """A retrieval in the phone's map in reversed order, reranked; do not write to it."""
     files = SceneFiles(tmp_path_factory.mktemp("run"), small_capture.name)
-    shutil.copytree(small_features, files.features)
+    copy_shared(small_features, files.features)
     sessions = small_capture / "sessions"
     embed_sessions(sessions, files.embeddings, features_dir=files.features)
     retrieve_pairs(
@@ -159,7 +160,7 @@ def finished(small_capture: Path, small_features: Path, tmp_path_factory: pytest
 def files(finished: SceneFiles, tmp_path: Path) -> SceneFiles:
     """A copy of the run, to work in."""
     copy = SceneFiles(tmp_path / "run", finished.scene)
-    shutil.copytree(finished.root, copy.root)
+    copy_shared(finished.root, copy.root)
     return copy
 
 

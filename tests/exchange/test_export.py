@@ -12,6 +12,7 @@ import pycolmap
 import pytest
 from typer.testing import CliRunner
 
+from tests.rendered import copy_shared
 from toolkit.__main__ import app
 from toolkit.capture import Capture, Session
 from toolkit.errors import ArtifactError, ManifestError
@@ -37,7 +38,7 @@ def run(small_capture: Path, small_features: Path, tmp_path_factory: pytest.Temp
     """A run that has built the headset's map; do not write to it."""
     files = SceneFiles(tmp_path_factory.mktemp("run"), small_capture.name)
     session = Capture.open(small_capture)["hl_map"]
-    shutil.copytree(small_features, files.features)
+    copy_shared(small_features, files.features)
     store = extract_session(session, files.features, workers=1, progress=False)
     build_map(session, store, files.maps / "hl_map.npz")
     write_localization(files, "hl", "hl", [])  # `nearest` uses no map

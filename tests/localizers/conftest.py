@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.rendered import World, run_stage, write_retrieval
+from tests.rendered import World, copy_shared, run_stage, write_retrieval
 from toolkit.capture import Capture
 from toolkit.files import SceneFiles
 
@@ -19,7 +19,7 @@ def finished(
 
     def make(folder: Path) -> None:
         files = SceneFiles(folder, small_capture.name)
-        shutil.copytree(small_features, files.features)
+        copy_shared(small_features, files.features)
         capture = Capture.open(small_capture)
         for device in capture.devices:
             write_retrieval(files.retrieval("ios", device), capture["ios_map"], capture[f"{device}_query"])
@@ -37,6 +37,6 @@ def world(small_capture: Path, finished: SceneFiles) -> World:
 def run(finished: SceneFiles, tmp_path: Path) -> SceneFiles:
     """A copy of the run without its poses, to work in."""
     files = SceneFiles(tmp_path / "run", finished.scene)
-    shutil.copytree(finished.root, files.root)
+    copy_shared(finished.root, files.root)
     shutil.rmtree(files.poses_dir)
     return files

@@ -1,6 +1,5 @@
 """Queries localized again with a method that the run did not have."""
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,6 +9,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
+from tests.rendered import copy_shared
 from toolkit.capture import Session
 from toolkit.errors import ArtifactError
 from toolkit.files import SceneFiles
@@ -83,7 +83,7 @@ def test_a_run_of_predictions_can_be_asked_to_match_if_features_of_its_queries_a
     assert again.map.settings.method == "feed_forward"
     estimate = answer(again, method=method)
     assert (estimate.status, estimate.found_by) == ("ok", "pnp")
-    features = Path(shutil.copytree(finished.features, tmp_path / "features"))
+    features = copy_shared(finished.features, tmp_path / "features")
     (of_queries,) = (features / "ios_query").glob("*.h5")
     of_queries.unlink()
     again = asking(small_capture, finished, features_dir=features)

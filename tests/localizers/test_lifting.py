@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from tests.calls import call
 from tests.queries import session_query
+from tests.rendered import copy_shared
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.names import ALLOW_OUTSIDE, allow_outside
@@ -75,7 +76,7 @@ def pointless(session: Session, store: FeatureStore) -> LocalMap:
 @pytest.fixture(scope="module")
 def world(small_capture: Path, small_features: Path, tmp_path_factory: pytest.TempPathFactory) -> World:
     folder = tmp_path_factory.mktemp("lifting")
-    shutil.copytree(small_features, folder / "features")
+    copy_shared(small_features, folder / "features")
     capture = Capture.open(small_capture)
     mapped = capture["ios_map"]
     bare = folder / "ios_map"  # the same photographs, without depth maps

@@ -20,6 +20,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from tests.other_kind import add_other_kind
+from tests.rendered import copy_shared
 from toolkit.capture import Capture
 from toolkit.capture.names import ALLOW_OUTSIDE
 from toolkit.embed import embed_sessions
@@ -193,7 +194,7 @@ def test_poses_are_those_of_one_process(
     add_other_kind(monkeypatch)
     settings = {"features": {"kinds": ["sift"], "escalation": escalation}, "pnp": {"ok_probability": 1.0}}
     files = SceneFiles(tmp_path / "run", small_capture.name)
-    shutil.copytree(small_features, files.features)
+    copy_shared(small_features, files.features)
     sessions = small_capture / "sessions"
     embed_sessions(sessions, files.embeddings, features_dir=files.features)
     retrieve_pairs(sessions, files.embeddings, map_device="ios", out_jsonl=files.retrieval_dir, queries=LIST)

@@ -12,7 +12,7 @@ import pytest
 
 from tests.displayed import picture_of
 from tests.localized import some_correspondences, write_pair
-from tests.rendered import LIST, write_retrieval
+from tests.rendered import LIST, copy_shared, write_retrieval
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError, ManifestError
 from toolkit.files import SceneFiles, map_record_path
@@ -34,7 +34,7 @@ def files(
 
     def make(folder: Path) -> None:
         files = SceneFiles(folder, small_capture.name)
-        shutil.copytree(small_features, files.features)
+        copy_shared(small_features, files.features)
         capture = Capture.open(small_capture)
         write_retrieval(files.retrieval("ios", "spot"), capture["ios_map"], capture["spot_query"])
         folders = files.retrieval_dir, files.poses_dir, files.features, files.maps

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.displayed import picture_of
+from tests.rendered import copy_shared
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError
 from toolkit.retrieve import retrieve_pairs
@@ -21,7 +22,7 @@ def pair(small_capture: Path, small_features: Path, tmp_path_factory: pytest.Tem
     from toolkit.embed import embed_sessions
 
     folder = tmp_path_factory.mktemp("retrieved")
-    shutil.copytree(small_features, folder / "features")
+    copy_shared(small_features, folder / "features")
     sessions = small_capture / "sessions"
     embed_sessions(sessions, folder / "embeddings", features_dir=folder / "features")
     pair = {"map_device": "hl", "query_device": "ios", "queries": "all"}

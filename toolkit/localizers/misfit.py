@@ -143,7 +143,8 @@ def find_misfit(
     start = _Estimate(rig_from_world, np.zeros(problem.unknowns - 6))
     first = problem.step(start, free, WIDENINGS[0])
     by_chance = 1.0 if first is None else first.probability(first.change, free & ~pose)
-    share = float(problem.inliers(start).mean())
+    inliers = problem.inliers(start)
+    share = float(inliers.mean()) if inliers.size else 1.0
     if by_chance > SUSPICIOUS and share > VERY_FEW:
         return None
     fitted = problem.fit(start, free)
