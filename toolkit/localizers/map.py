@@ -120,8 +120,9 @@ class Map:
             path = map_path(map_dir, session.id, kind.name)
             assert settings.map is not None
             metric = settings.unit is not None
+            first = mapped[0].map.poses if mapped and settings.map.refine_poses else None
             local_map = build_map(
-                session, store, path, settings.map, settings.seed, skip_existing, inputs, workers, metric
+                session, store, path, settings.map, settings.seed, skip_existing, inputs, workers, metric, first
             )
             mapped.append(MappedFeatures(local_map, store, KINDS[kind.name], kind.matcher, kind.name))
         if mapped and map_.remarks:
@@ -627,8 +628,9 @@ def _on_demand(
 
     `names` are the names of its images; None: all map images with a pose.
     """
+    refined = map.mapped[0].map.poses if map.mapped and settings.map and settings.map.refine_poses else {}
     return OnDemandLocalizer(
-        PosedImages.of_session(map.session, names, map.length),
+        PosedImages.of_session(map.session, names, map.length, refined),
         map.in_lengths,
         [(kind, partial(lambda kind, name: map.on_demand(kind)(name), kind)) for kind in kinds],
         settings.map,

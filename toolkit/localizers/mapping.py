@@ -1,6 +1,6 @@
 """Build a map: choose pairs of posed images, match them, and triangulate points from the matches."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, lru_cache
@@ -25,6 +25,7 @@ from toolkit.features.stores import FeatureStore, MatchStore, group_names, match
 from toolkit.files import Remade, fingerprint, is_current, temporary_folder, write_sidecar
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.local_map import LocalMap
+from toolkit.localizers.map_refinement import refined_poses
 from toolkit.localizers.survey import Survey, SurveyedImages
 from toolkit.localizers.tiles import JoinedImages, home_of, join_tiles, plan_tiles
 from toolkit.localizers.triangulation import triangulate
@@ -36,6 +37,9 @@ _ToMatch = tuple[str, str, int, int]
 """A pair to match: group in the match file, fingerprint of the inputs of the matches, indices of the two images."""
 DEPTHS = (2.0, 4.0, 8.0, 16.0)
 """Depths at which the views of two images are compared, in map lengths (meters; see `Survey.length`)."""
+MAX_REFINEMENTS = 3  # rounds of bundle adjustment
+MIN_NOISE_PX = 1.0  # noise of the direction to points of the map, pixels, from which poses are refined
+NOISE_LIMIT = 4.0  # limits of a map whose poses are refined, in multiples of the noise of the direction to its points
 _MAP_FORMAT = 6
 """Increase when the same settings give another file, so that existing maps are built again."""
 
@@ -183,6 +187,7 @@ def build_map(
     inputs: str = "",
     workers: int = 1,
     metric: bool = True,
+    poses: Mapping[str, Floats] | None = None,
 ) -> LocalMap:
     """Triangulate the map of a session with its known poses, or open the one at `path` if it is current.
 
@@ -198,6 +203,7 @@ def build_map(
         inputs: fingerprint of the inputs of the features and poses.
         workers: threads.
         metric: whether the poses are in meters; if not, limits are relative to the depth of the scene.
+        poses: world_from_cam (4, 4) by image name, instead of those of the session.
 
     Raises:
         ArtifactError: no image has both a pose and features.
@@ -208,16 +214,48 @@ def build_map(
         "matcher": _matcher_settings(settings, _kind_of(features)),
         "inputs": inputs,
         "metric": metric,
+        "poses": fingerprint({name: pose.tolist() for name, pose in poses.items()}) if poses else "",
     }
     if skip_existing and is_current(path, map_record):
         with suppress(ArtifactError):  # the file is damaged: build it again
             return LocalMap.load(path)
-    plan = MapPlan(session, features, Path(path), settings, seed, metric)
+    plan = MapPlan(session, features, Path(path), settings, seed, metric, poses=poses)
+    if settings.refine_poses and poses is None:
+        plan = _refined(plan, workers)
     for number in range(len(plan.tiles)):
         plan.match(number, skip_existing, workers)
     plan.build(skip_existing)
     write_sidecar(path, map_record)
     return LocalMap.load(path)
+
+
+def _refined(given: "MapPlan", workers: int) -> "MapPlan":
+    """Return the plan of a map with poses refined by bundle adjustment; the given plan if its poses are good.
+
+    Each round matches and triangulates with limits as wide as the remaining noise asks for.
+    """
+    plan, depth = given, given.survey.typical_depth() / given.length
+    focal_px = float(np.median([camera.mean_focal_length() for camera in given.cameras]))
+    for _ in range(MAX_REFINEMENTS):
+        noise = plan.survey.noise(plan.length)
+        noise_px = np.radians(noise.direction_deg(depth)) * focal_px
+        if plan is given and noise_px < MIN_NOISE_PX:
+            break
+        limits = {
+            name: max(getattr(given.settings, name), NOISE_LIMIT * noise_px)
+            for name in ("max_epipolar_error_px", "max_reprojection_error_px")
+        }
+        settings = given.settings.model_copy(update={**limits, "tile_images": len(given.names)})
+        with temporary_folder(given.path) as folder:
+            wide = given.with_poses(plan.world_from_cams, folder / given.path.name, settings)
+            wide.match(0, False, workers)
+            local_map = wide.triangulated(0)
+            if plan is given and not given.survey.consistency(local_map).trusted:
+                break  # it would bend the map to intrinsics that are wrong
+            keypoints = [wide.keypoints(image) for image in range(len(wide.names))]
+            poses = refined_poses(local_map, keypoints, noise, workers)
+        plan = given.with_poses(poses, given.path, given.settings)
+    return plan
 
 
 def _match_share(writer: GroupWriter, todo: Sequence[_ToMatch], plan: "MapPlan") -> None:
@@ -236,19 +274,22 @@ class MapPlan(Remade):
         seed: int = 0,
         metric: bool = True,
         length: float | None = None,
+        poses: Mapping[str, Floats] | None = None,
     ):
         """See `build_map`; `length` is the survey's length if it is known, which saves the survey."""
         self.session, self.features, self.path, self.settings, self.seed = session, features, path, settings, seed
-        names, poses = session.image_names, session.world_from_cam()
-        self.rows = np.array(
-            [row for row, name in enumerate(names) if name in features and np.isfinite(poses[row]).all()], np.int64
-        )
+        names, world_from_cams = session.image_names, session.world_from_cam()
+        self._poses = poses
+        for name, pose in (poses or {}).items():
+            world_from_cams[session.row_of_name[name]] = pose
+        posed = np.isfinite(world_from_cams).reshape(-1, 16).all(axis=1)
+        self.rows = np.flatnonzero(posed & np.array([name in features for name in names], bool))
         """(N,) rows of the map images in the session."""
         if not len(self.rows):
             raise ArtifactError(
                 f"Session {session.id} has no image with both a pose and local features: no map can be built."
             )
-        self.world_from_cams = poses[self.rows]
+        self.world_from_cams = world_from_cams[self.rows]
         self.names = [names[row] for row in self.rows]
         self.cameras = session.cameras(self.rows)
         self.kind, self.groups = _kind_of(features), instants(session, self.rows)
@@ -284,7 +325,15 @@ class MapPlan(Remade):
     @cached_property
     def of_worker(self) -> Any:
         """This plan for a worker, which gets the length and so needs no survey."""
-        return MapPlan.elsewhere(self.session, self.features, self.path, self.settings, self.seed, length=self.length)
+        arguments = (self.session, self.features, self.path, self.settings, self.seed)
+        return MapPlan.elsewhere(*arguments, length=self.length, poses=self._poses)
+
+    def with_poses(self, world_from_cams: Floats, path: Path, settings: MapSettings) -> "MapPlan":
+        """Return the plan of the same map with other poses (N, 4, 4) of its images, file and settings."""
+        poses = dict(zip(self.names, world_from_cams, strict=True))
+        plan = MapPlan(self.session, self.features, path, settings, self.seed, length=self.length, poses=poses)
+        plan.survey = self.survey.with_poses(world_from_cams)
+        return plan
 
     @cached_property
     def _made_from(self) -> list[str]:
@@ -359,7 +408,7 @@ class MapPlan(Remade):
             "pairs": fingerprint(self._pairs_in(number).tolist()),
         }
         if not (skip_existing and is_current(path, record)):
-            self._triangulated(number).save(path)
+            self.triangulated(number).save(path)
             write_sidecar(path, record)
 
     def _pairs_in(self, number: int) -> Ints:
@@ -368,7 +417,7 @@ class MapPlan(Remade):
         pairs = np.concatenate([self.pairs_of[tile] for tile in np.unique(self._home[images])])
         return pairs[np.isin(pairs, images).all(axis=1)]
 
-    def _triangulated(self, number: int) -> LocalMap:
+    def triangulated(self, number: int) -> LocalMap:
         """Return the map of a tile, with the points that images of its core see."""
         core, images = self.tiles[number]
         pairs = self._pairs_in(number)
@@ -386,7 +435,7 @@ class MapPlan(Remade):
             [self.names[image] for image in images],
             [self.cameras[image] for image in images],
             geometry.make_pose(poses[:, :3, :3], (poses[:, :3, 3] - origin) / self.length),
-            [self._keypoints(image) for image in images],
+            [self.keypoints(image) for image in images],
             np.searchsorted(images, pairs),
             [matches_of(i, j) for i, j in pairs.tolist()],
             self.settings,
@@ -402,7 +451,7 @@ class MapPlan(Remade):
     def build(self, skip_existing: bool = True) -> None:
         """Triangulate the map and write it; all pairs must be matched."""
         if len(self.tiles) == 1:
-            local_map = self._triangulated(0)
+            local_map = self.triangulated(0)
             first = np.unique(local_map.obs_point, return_index=True)[1]
             colors = self._colors(local_map.obs_image[first], local_map.obs_keypoint[first])
             self._save(replace(local_map, colors=colors))
@@ -414,7 +463,7 @@ class MapPlan(Remade):
         else:
             for number in tqdm(numbers, desc=label, unit="tile"):
                 self.triangulate(number, skip_existing)
-        images = JoinedImages(self.names, self.cameras, self.world_from_cams, self._keypoints, self._colors)
+        images = JoinedImages(self.names, self.cameras, self.world_from_cams, self.keypoints, self._colors)
         with temporary_folder(self.path) as folder:
             self._save(
                 join_tiles(
@@ -425,7 +474,7 @@ class MapPlan(Remade):
     def _save(self, local_map: LocalMap) -> None:
         local_map.judged(self.survey.consistency(local_map)).save(self.path)
 
-    def _keypoints(self, image: int) -> NDArray[np.float32]:
+    def keypoints(self, image: int) -> NDArray[np.float32]:
         kept = self._keypoints_of.get(image)
         return self.features[self.names[image]].keypoints if kept is None else kept
 
@@ -435,7 +484,7 @@ class MapPlan(Remade):
 
         def read(image: int) -> NDArray[np.uint8]:
             in_image = which == np.searchsorted(wanted, image)
-            xy = self._keypoints(image)[keypoints[in_image]].astype(np.int64)
+            xy = self.keypoints(image)[keypoints[in_image]].astype(np.int64)
             try:
                 pixels = read_image(self.session.image_path(int(self.rows[image])))
             except ImageError:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from threading import Lock
+from types import MappingProxyType
 
 import numpy as np
 import pycolmap
@@ -44,8 +45,21 @@ class PosedImages:
     """(N,) equal numbers for images that one rig took at one instant; these are never paired."""
 
     @classmethod
-    def of_session(cls, session: Session, names: list[str] | None = None, length: float = 1.0) -> "PosedImages":
-        """Return images of a session, by name; None: all images with a pose. Positions are divided by `length`."""
+    def of_session(
+        cls,
+        session: Session,
+        names: list[str] | None = None,
+        length: float = 1.0,
+        refined: Mapping[str, Floats] = MappingProxyType({}),
+    ) -> "PosedImages":
+        """Return images of a session.
+
+        Args:
+            session: the map session.
+            names: of the images; None: all images with a pose.
+            length: positions are divided by it.
+            refined: poses (4, 4) by image name, instead of those of the session.
+        """
         if names is None:
             rows = session.camera_rows
             rows = rows[np.isfinite(session.world_from_cam(rows)).reshape(-1, 16).all(axis=1)]
@@ -53,6 +67,7 @@ class PosedImages:
         else:
             rows = np.array([session.row_of_name[name] for name in names], np.int64)
         poses = session.world_from_cam(rows)
+        poses = np.array([refined.get(name, pose) for name, pose in zip(names, poses, strict=True)]).reshape(-1, 4, 4)
         poses[:, :3, 3] /= length
         return cls(names, session.cameras(rows), poses, instants(session, rows))
 

@@ -53,6 +53,10 @@ class PoseNoise(NamedTuple):
     position: float = 0.0
     """In map lengths, see `Survey.length`."""
 
+    def direction_deg(self, depth: float) -> float:
+        """Return the standard deviation of the direction to a point at a depth, map lengths; NaN: far away."""
+        return float(np.hypot(self.rotation_deg, np.nan_to_num(np.degrees(np.arctan(self.position / depth)))))
+
 
 class SurveyedPairs:
     """The matches of all pairs of a survey, one after the other, with the poses of their images."""

@@ -6,6 +6,7 @@ mirrored axes of the cameras or of the positions, another order of the quaternio
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import lru_cache, partial
 from itertools import permutations, product
@@ -25,7 +26,7 @@ from toolkit.features.matching import MutualMatcher
 from toolkit.features.verification import verified_matches
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.local_map import OPENGL_AXES, Consistency, LocalMap
-from toolkit.localizers.pose_noise import SurveyedPairs, VerifiedPair
+from toolkit.localizers.pose_noise import PoseNoise, SurveyedPairs, VerifiedPair
 from toolkit.manifest import RerankSettings
 from toolkit.threads import fixed_sums
 
@@ -169,18 +170,31 @@ class Survey:
             )
             if fits or (share < 0.5 and too_coarse):
                 return replace(result, verdict="inconsistent", fits=fits)
-        matches = SurveyedPairs(self.sample, self.images.world_from_cams)
-        noise, depth = matches.noise(local_map.length), self.typical_depth() / local_map.length
-        moved_deg = 0.0 if np.isnan(depth) else np.degrees(np.arctan(noise.position / depth))
+        noise = self.noise(local_map.length)
         return replace(
             result,
             verdict="consistent",
             wrong=self._wrong_images(local_map),
-            camera=matches.misfit(self.images.cameras),
+            camera=self._pairs.misfit(self.images.cameras),
             rotation_noise_deg=round(noise.rotation_deg, 4),
             position_noise=round(noise.position, 6),
-            direction_noise_deg=round(float(np.hypot(noise.rotation_deg, moved_deg)), 4),
+            direction_noise_deg=round(noise.direction_deg(self.typical_depth() / local_map.length), 4),
         )
+
+    @property
+    def _pairs(self) -> SurveyedPairs:
+        return SurveyedPairs(self.sample, self.images.world_from_cams)
+
+    def noise(self, length: float) -> PoseNoise:
+        """Return the noise of the poses; see `SurveyedPairs.noise`."""
+        return self._pairs.noise(length)
+
+    def with_poses(self, world_from_cams: Floats) -> "Survey":
+        """Return this survey of the same matches for other poses (N, 4, 4)."""
+        other = copy(self)
+        world_from_rigs = world_from_cams @ geometry.invert(self.images.rig_from_cams)
+        other.images = self.images._replace(world_from_rigs=world_from_rigs)
+        return other
 
     def _errors_deg(self, pairs: Sequence[VerifiedPair]) -> list[float]:
         """Return, per pair, the median angle between matches and their epipolar planes."""
