@@ -1,6 +1,7 @@
 """Recordings read back: they hold the frames, poses and queries that the files say, and nothing else."""
 
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -9,6 +10,7 @@ import pycolmap
 import pytest
 
 from tests.localized import write_queries
+from toolkit import geometry
 from toolkit.capture import Capture, Trajectory, write_depth, write_session
 from toolkit.errors import ArtifactError, CaptureError
 from toolkit.geometry import make_pose, quaternion_to_rotation
@@ -327,6 +329,45 @@ def test_a_localization_view_holds_the_queries(capture, tmp_path, monkeypatch):
     assert [row[0] for row in logged(found["/world/references/1/image"], "EncodedImage:blob")] == [1, 2]
     text = logged(found["/about"], "TextDocument:text")
     assert text[1][2][0].startswith("**query 2: c, failed: dark")
+
+
+def test_a_world_far_from_its_origin_is_shown_without_jitter(small_capture: Path, tmp_path: Path) -> None:
+    """The viewer has single precision: at 5,000 km its positions are multiples of half a meter."""
+    offset = np.array([5e5, 5e6, 400.0])
+    far = Path(shutil.copytree(small_capture, tmp_path / small_capture.name))
+    for path in far.glob("sessions/*_map/trajectories.txt"):
+        near = Trajectory.read(path)
+        path.unlink()
+        shifted = geometry.shifted(near.world_from_device, offset)
+        Trajectory.from_poses(near.timestamps, near.arrow_ids, shifted).write(path)
+    poses = Capture.open(small_capture)["ios_map"].world_from_cam()
+    camera = Capture.open(small_capture)["ios_map"].cameras([0])[0]
+    file = Capture.open(small_capture)["ios_map"].image_path(0)
+    correspondences = np.ones((2, 2)), poses[:2, :3, 3], np.arange(2), np.ones(2, bool)
+    shown = ShownImage("b.jpg", file, camera, poses[1], *correspondences)
+    table = pd.DataFrame({"status": ["ok", "failed: dark"], "num_inliers": [9, 0]})
+    estimated = np.stack([poses[1], np.full((4, 4), np.nan)])
+    queries = Localizations(["a", "b"], table, estimated, poses[:2], poses[:2, :3, 3])
+    views = []
+    for name, shift, capture in (("near", np.zeros(3), small_capture), ("far", offset, far)):
+        moved = [(0, QueryDetails([shown], [shown]).shifted(shift))]
+        record_localizations(
+            *(tmp_path / f"{name}.rrd", "view", geometry.shifted(poses, shift), poses[:, :3, 3] + shift, None),
+            *(queries.shifted(shift), moved),
+            up=[0, 0, 1],
+            tracks={"frames": [poses[:, :3, 3] + shift]},
+        )
+        record_session(capture, "map", "ios", out=tmp_path / f"{name}_session.rrd", world_up=[0, 0, 1], progress=False)
+        views.append([read_back(tmp_path / f"{name}{end}.rrd") for end in ("", "_session")])
+    for near_view, far_view in zip(*views, strict=True):
+        compared = 0
+        for entity, chunks in near_view.items():
+            for kind in ("Points3D:positions", "LineStrips3D:strips", "Transform3D:translation"):
+                for one, other in zip(logged(chunks, kind), logged(far_view[entity], kind), strict=True):
+                    for expected, found in zip(one[2], other[2], strict=True):
+                        np.testing.assert_allclose(found, expected, atol=1e-5)
+                        compared += 1
+        assert compared > 5
 
 
 def test_a_view_without_queries_points_or_map(tmp_path):

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.images import prefetch, read_for_display
 from toolkit.capture.world_up import up_of_cameras
-from toolkit.geometry import Floats, project
+from toolkit.geometry import Floats, local_origin, project, shifted
 from toolkit.show import viewer
 from toolkit.show.figures import ESTIMATED, GREEN, MAP, ORANGE, SKY, TRUE, draw_error_legend, error_colors
 from toolkit.show.localized import REFERENCES, Localizations, QueryDetails, ShownImage, support_of
@@ -49,7 +49,8 @@ def record_localizations(
     Entities: `world/{points,map_cameras}`, `world/queries/{estimated,true,error,failed}`,
     `world/recording/{odometry,frames}`. For the query chosen on the timeline `query`: `world/chosen/camera_<k>`,
     `world/truth/camera_0`, `world/references/<rank>`, `world/chosen_points`, and `about`, a page of text. Errors are
-    colored by `figures.error_colors`.
+    colored by `figures.error_colors`. The viewer has numbers of single precision, so a world far from its origin (UTM,
+    ECEF) is shifted, see `geometry.local_origin`.
 
     Args:
         map_poses: world_from_cam (N, 4, 4) of the map's images; NaN rows are skipped.
@@ -64,6 +65,9 @@ def record_localizations(
 
     started = time.perf_counter()
     poses = map_poses[is_posed(map_poses)]
+    shift = -local_origin(poses[:, :3, 3])
+    poses, points, localizations = shifted(poses, shift), np.asarray(points) + shift, localizations.shifted(shift)
+    details = ((number, query.shifted(shift)) for number, query in details)
     up = np.asarray(up_of_cameras(poses) if up is None else up, np.float64)
     size = viewer.camera_depth_m(poses[:, :3, 3])
     count = 0
@@ -74,7 +78,7 @@ def record_localizations(
         _log_overview(stream, localizations)
         for kind, color in (("odometry", ORANGE), ("frames", SKY)):
             if tracks and tracks.get(kind):
-                lines = rr.LineStrips3D(tracks[kind], colors=viewer.rgb(color))
+                lines = rr.LineStrips3D([track + shift for track in tracks[kind]], colors=viewer.rgb(color))
                 stream.log(f"world/recording/{kind}", lines, static=True)
         writer = _ChosenWriter(stream, localizations, 2 * size)
         for number, chosen in prefetch(writer.read, details):

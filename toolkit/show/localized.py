@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.tables import read_query_table
 from toolkit.errors import ArtifactError
@@ -96,6 +97,15 @@ class ShownImage:
     def num_inliers(self) -> int:
         return int(self.inlier.sum())
 
+    def shifted(self, offset: Floats) -> "ShownImage":
+        """Return the image in a world whose origin is shifted: `offset` (3,) is added to all positions."""
+        return replace(
+            self,
+            points=self.points + offset,
+            world_from_cam=geometry.shifted(self.world_from_cam, offset),
+            world_from_cam_true=geometry.shifted(self.world_from_cam_true, offset),
+        )
+
 
 _OF_A_MATCH = ("pixels", "points", "matches", "inlier")
 
@@ -115,6 +125,11 @@ class QueryDetails:
     def has_matches(self) -> bool:
         """Whether the method matched keypoints, rather than used the poses of whole references."""
         return any(len(camera.matches) for camera in self.cameras)
+
+    def shifted(self, offset: Floats) -> "QueryDetails":
+        """Return the images in a world whose origin is shifted, see `ShownImage.shifted`."""
+        groups = (self.cameras, self.references, self.rejected)
+        return QueryDetails(*([image.shifted(offset) for image in images] for images in groups))
 
     def of_first_camera(self) -> "QueryDetails":
         """Return the first image alone, and references with only its correspondences."""
@@ -159,6 +174,15 @@ class Localizations:
     """Unit that lengths are shown in, see `metrics.length_unit`."""
     cam_from_rig: Floats = field(default_factory=lambda: np.eye(4))
     """(Q, 4, 4), or one (4, 4) for all."""
+
+    def shifted(self, offset: Floats) -> "Localizations":
+        """Return the queries in a world whose origin is shifted, see `ShownImage.shifted`."""
+        return replace(
+            self,
+            estimated=geometry.shifted(self.estimated, offset),
+            true=geometry.shifted(self.true, offset),
+            nearest_reference=self.nearest_reference + offset,
+        )
 
     @cached_property
     def ranked(self) -> pd.DataFrame:

@@ -19,7 +19,7 @@ from toolkit.capture.images import decode, default_workers, prefetch, read_for_d
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import ArtifactError, CaptureError, ImageError
 from toolkit.files import file_fingerprint, files_fingerprint, pair_devices, write_sidecar
-from toolkit.geometry import Floats, Ints
+from toolkit.geometry import Floats, Ints, local_origin, shifted
 from toolkit.localizers.correspondences import LocalizedQueries, LocalizedQuery
 from toolkit.show import viewer
 from toolkit.show.figures import ORANGE
@@ -94,6 +94,8 @@ def record_session(
 
     Sensors and rigs with a new id in each frame share an entity. Timelines: `frame`, the index among all instants of
     the session, so a thinned recording keeps the numbers of the full one; `capture_time`, the timestamp of the files.
+    The viewer has numbers of single precision, so a world far from its origin (UTM, ECEF) is shifted, see
+    `geometry.local_origin`.
 
     Args:
         split: `map` or `query`.
@@ -153,7 +155,7 @@ def record_session(
         stream.log("world", viewer.world_axes(up), static=True)
         if local_map is not None:
             points, colors = sure_points(local_map)
-            viewer.log_points(stream, points, colors)
+            viewer.log_points(stream, points - plan.origin, colors)
             counts["points"] = len(points)
         color = viewer.rgb(color_of(session.device))
         for name, tracks in plan.tracks.items():
@@ -161,7 +163,7 @@ def record_session(
             lines = rr.LineStrips3D([track for track in tracks if len(track) > 1], colors=color)
             stream.log(f"world/{viewer.entity(name)}/trajectory", lines, static=True)
         if localized is not None:
-            _log_queries(stream, localized, session)
+            _log_queries(stream, localized, session, plan.origin)
             counts["queries"] = len(localized.poses)
         writer = _FrameWriter(stream, viewer.camera_depth_m(placed[:, :3, 3]), color_of(session.device))
         writer.announce(plan.frames)
@@ -246,6 +248,8 @@ class _Plan:
     depths: dict[tuple[int, str], list[int]]
     """Rows of the session's depth maps by timestamp and device."""
     rig_from_depth: Floats
+    origin: Floats
+    """(3,) what is subtracted from all world positions."""
 
     @classmethod
     def of(
@@ -265,6 +269,8 @@ class _Plan:
         poses = np.full((len(first), 4, 4), np.nan)
         if trajectory is not None:
             poses = trajectory.lookup(first["timestamp"].to_numpy(), first["device_id"].to_numpy(str))
+        origin = local_origin(poses[is_posed(poses), :3, 3])
+        poses = shifted(poses, -origin)
         shown = np.ones(len(first), bool)
         if keyframes is not None:
             listed = pd.MultiIndex.from_frame(session.keyframes(keyframes)[["timestamp", "device_id"]].astype(object))
@@ -290,7 +296,7 @@ class _Plan:
             devices, rig_from_depth = session.devices_of(times, session.depths["sensor_id"])
             for row, key in enumerate(zip(times.tolist(), devices.tolist(), strict=True)):
                 depths.setdefault(key, []).append(row)
-        return cls(session, frames, _tracks(first, poses), cameras, depths, rig_from_depth)
+        return cls(session, frames, _tracks(first, poses), cameras, depths, rig_from_depth, origin)
 
     def shots(self, number: int) -> list[_Shot]:
         """Return the images and depth maps to read for a frame."""
@@ -548,15 +554,17 @@ class _QueryPoses:
         return cls(poses, map_device, query_device, h5, lines)
 
 
-def _log_queries(stream: "rr.RecordingStream", queries: _QueryPoses, session: Session) -> None:
-    """Log the positions of queries (in a map session), and lines from queries to their references."""
+def _log_queries(stream: "rr.RecordingStream", queries: _QueryPoses, session: Session, origin: Floats) -> None:
+    """Log the positions of queries (in a map session), and lines from queries to their references, from an origin."""
     import rerun as rr
 
     poses = queries.poses
     if session.split == "map":
         labels = [f"{time} {device}" for time, device in zip(poses.timestamps, poses.device_ids, strict=True)]
-        dots = rr.Points3D(poses.world_from_device[:, :3, 3], colors=viewer.rgb(color_of(queries.query_device)),
-                           radii=rr.Radius.ui_points(4), labels=labels, show_labels=False)  # fmt: skip
+        centers = poses.world_from_device[:, :3, 3] - origin
+        dots = rr.Points3D(centers, colors=viewer.rgb(color_of(queries.query_device)), radii=rr.Radius.ui_points(4),
+                           labels=labels, show_labels=False)  # fmt: skip
         stream.log("world/queries/poses", dots, static=True)
     if queries.lines:
-        stream.log("world/queries/references", rr.LineStrips3D(queries.lines, colors=viewer.rgb(ORANGE)), static=True)
+        lines = rr.LineStrips3D([line - origin for line in queries.lines], colors=viewer.rgb(ORANGE))
+        stream.log("world/queries/references", lines, static=True)
