@@ -52,7 +52,7 @@ dataset:
 @pytest.fixture
 def hub(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[FakeHub]:
     """A hub on this machine in place of the real one."""
-    monkeypatch.setattr(transfer, "_WAITS_S", (0, 0, None))
+    monkeypatch.setattr(transfer, "_ATTEMPTS", 3)
     monkeypatch.setattr("huggingface_hub.constants.DOWNLOAD_CHUNK_SIZE", 1 << 18)  # only whole chunks are kept
     with serving(FakeHub()) as server:
         use_hub(monkeypatch, server.url, tmp_path)
@@ -298,7 +298,7 @@ def test_one_file_that_is_missing_ends_nothing(hub: FakeHub, manifest: Path) -> 
     message = failure(manifest)
     assert "2 of 6 files failed; the others are there" in message
     place = manifest.parent / "captures/PLACE/sessions/ios_map/images.txt"
-    assert f"cannot be fetched to {place}: " in message  # where to put it by hand
+    assert f"put it at {place}" in message
     assert "HTTP 404" in message
     assert "ios_map/sensors.txt" in found(manifest.parent)
     assert "ios_map/raw_data/ios_1/images/1.jpg" in found(manifest.parent)

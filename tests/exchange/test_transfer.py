@@ -3,6 +3,7 @@
 import random
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import pytest
 from tqdm import tqdm
@@ -16,7 +17,7 @@ BODY = random.Random(0).randbytes(600_000)
 
 @pytest.fixture
 def server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[FakeHub]:
-    monkeypatch.setattr(transfer, "_WAITS_S", (0, None))
+    monkeypatch.setattr(transfer, "_ATTEMPTS", 2)
     monkeypatch.setattr("huggingface_hub.constants.DOWNLOAD_CHUNK_SIZE", 1000)
     with serving(FakeHub()) as hub:
         use_hub(monkeypatch, hub.url, tmp_path)
@@ -51,3 +52,15 @@ def test_a_connection_that_brings_nothing_is_not_taken_up_forever(server: FakeHu
     with pytest.raises(Exception, match="peer closed connection"):
         fetch_to(tmp_path / "part", server)
     assert (tmp_path / "part").read_bytes() == BODY[:20_000]
+
+
+def test_a_connection_that_is_reset_is_taken_up_while_it_brings_data(
+    server: FakeHub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def reset(url: str, out: BinaryIO, resume_size: int, **options: Any) -> None:
+        out.write(BODY[resume_size : resume_size + 100_000])
+        raise RuntimeError("reset by peer")  # in place of the HTTP client's error, which http_get does not catch
+
+    monkeypatch.setattr("huggingface_hub.file_download.http_get", reset)
+    fetch_to(tmp_path / "part", server)
+    assert (tmp_path / "part").read_bytes() == BODY

@@ -24,7 +24,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
-from toolkit.errors import DownloadError, ManifestError
+from toolkit.errors import DownloadError, ManifestError, ToolkitError
 from toolkit.exchange.archives import FileError, require_space, safe_path, size_text, unpack
 from toolkit.exchange.datasets import arrange
 from toolkit.exchange.transfer import WHOLE, RemoteFile, fetch
@@ -118,9 +118,9 @@ class _Capture:
 
     def __post_init__(self) -> None:
         self.state = self.folder / STATE
-        self.origin = f"dataset {self.source.hub}" if self.source.hub else ", ".join(self.source.urls)
-        self.page = f"https://huggingface.co/datasets/{self.source.hub}" if self.source.hub else self.dataset.page
-        self.headers: dict[str, str] = {}
+        hub, page = self.source.hub, f"https://huggingface.co/datasets/{self.source.hub}"
+        self.origin = f"dataset {hub} ({self.source.revision})" if hub else ", ".join(self.source.urls)
+        self.page = page if hub else self.dataset.page
         self.files: list[RemoteFile] = []
         self.bar: Any = None
         self.done: set[tuple[str, str, str]] = set()
@@ -135,7 +135,12 @@ class _Capture:
 
     def list_files(self) -> None:
         """List the files of the requested sessions."""
-        listed = list(self._list_hub(self.source.hub) if self.source.hub else self._list_urls())
+        try:
+            listed = list(self._list_hub(self.source.hub) if self.source.hub else self._list_urls())
+        except ToolkitError:
+            raise
+        except Exception as error:  # the library's own, or its HTTP client's, which depends on its version
+            raise self._failure(f"{self.origin} cannot be listed", error) from error
         self.files = [file for file in listed if self.source.urls or self._wants(file.path)]
         if not self.files:
             folders = sorted({"/".join(file.path.split("/")[:2]) for file in listed})
@@ -147,16 +152,10 @@ class _Capture:
     def _list_hub(self, repo: str) -> Iterator[RemoteFile]:
         from huggingface_hub import HfApi, hf_hub_url
         from huggingface_hub.hf_api import RepoFile
-        from huggingface_hub.utils import build_hf_headers
 
-        self.headers = build_hf_headers()  # the token
-        try:
-            commit = HfApi().dataset_info(repo, revision=self.source.revision).sha or self.source.revision
-            entries = list(HfApi().list_repo_tree(repo, recursive=True, revision=commit, repo_type="dataset"))
-        except Exception as error:
-            raise self._failure(f"{self.origin} (revision {self.source.revision}) cannot be listed", error) from error
-        self.origin += f" ({self.source.revision}, commit {commit[:7]})"
-        for entry in entries:
+        commit = HfApi().dataset_info(repo, revision=self.source.revision).sha or self.source.revision
+        self.origin += f", commit {commit[:7]}"
+        for entry in HfApi().list_repo_tree(repo, recursive=True, revision=commit, repo_type="dataset"):
             if isinstance(entry, RepoFile):
                 path = PurePosixPath(self.dataset.into, safe_path(entry.path, self.origin)).as_posix()
                 url = hf_hub_url(repo, entry.path, repo_type="dataset", revision=commit)
@@ -170,23 +169,20 @@ class _Capture:
             name = PurePosixPath(unquote(urlsplit(url).path)).name
             if not name.lower().endswith(".zip"):
                 raise ManifestError(f"dataset.sources.{self.folder.name}.urls: {url} does not name a .zip archive.")
-            try:
-                response = get_session().head(url, headers=WHOLE, timeout=20)
-                hf_raise_for_status(response)
-                size = int(response.headers["Content-Length"])
-            except Exception as error:
-                raise self._failure(url, error, url) from error
+            response = get_session().head(url, headers=WHOLE, timeout=20)
+            hf_raise_for_status(response)
+            size = int(response.headers["Content-Length"])
             checksum, tag = self.source.sha256.get(name), response.headers.get("ETag", size)
             yield RemoteFile(name, url, size, f"sha256:{checksum}" if checksum else f"etag:{tag}")
 
-    def _failure(self, what: str, error: Exception, url: str = "") -> DownloadError:
-        """Return the error about a request that failed; a FileError if the server has no such file."""
+    def _failure(self, what: str, error: Exception) -> DownloadError:
+        """Return the error about a failed request to the hub or a URL; a FileError if the server has no such file."""
         kind = FileError if status_of(error) in (404, 416) else DownloadError
+        reason = failure_reason(error, self.page, ", ".join(self.source.urls))
         return kind(
-            f"{what}: {failure_reason(error, self.page, url)}.\nCheck the network, HTTPS_PROXY, HF_ENDPOINT and "
-            f"HF_HUB_OFFLINE; that you have access to {self.page} (for the hub, log in with `hf auth login`); and by "
-            f"{self.dataset.page} that `dataset.sources.{self.folder.name}` is right. Then run the same command: it "
-            "resumes the download."
+            f"{what}: {reason}.\nCheck the network, HTTPS_PROXY, HF_ENDPOINT and HF_HUB_OFFLINE; that you have access "
+            f"to {self.page} (for the hub, log in with `hf auth login`); and by {self.dataset.page} that "
+            f"`dataset.sources.{self.folder.name}` is right. Then run the same command: it resumes the download."
         )
 
     def _wants(self, path: str) -> bool:
@@ -299,16 +295,19 @@ class _Capture:
         return None
 
     def _fetch(self, file: RemoteFile, partial: Path, target: Path) -> None:
+        from huggingface_hub.utils import build_hf_headers
+
         for path in (partial, target):
             path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            fetch(file, partial, self.headers, self.bar)
+            fetch(file, partial, build_hf_headers() if self.source.hub else {}, self.bar)  # the token
         except Exception as error:  # of the disk, the library, or its HTTP client, which depends on its version
             if getattr(error, "errno", None) is not None:
                 raise
             if status_of(error) == 416:  # the file is shorter than the listing says
                 partial.unlink()
-            raise self._failure(f"{file.path}: cannot be fetched to {target}", error, file.url) from error
+            what = f"{file.path}: cannot be fetched from {file.url} (you can also put it at {target} yourself)"
+            raise self._failure(what, error) from error
         if not file.matches(partial):
             partial.unlink()
             raise FileError(

@@ -16,7 +16,7 @@ from typing import Any
 from toolkit.models.hub import status_of
 
 WHOLE = {"Accept-Encoding": "identity"}  # for each request: a compressed response could not be resumed in the middle
-_WAITS_S = (1, 2, 4, 8, 16, None)  # after each attempt; http_get has attempts of its own
+_ATTEMPTS = 6  # in a row that bring no data, besides those of http_get
 _RANGE_BYTES = 32 << 30  # largest range per request: the hub's content network does not answer requests for 50 GB
 
 
@@ -54,10 +54,13 @@ def fetch(file: RemoteFile, partial: Path, headers: Mapping[str, str], bar: Any)
     """
     from huggingface_hub.file_download import http_get
 
-    for wait_s in _WAITS_S:
+    partial.touch()
+    failures = 0
+    while True:
+        before = partial.stat().st_size
         try:
             with open(partial, "ab") as out:
-                if out.tell() > file.size:
+                if before > file.size:
                     out.truncate(0)
                 while (have := out.seek(0, os.SEEK_END)) < file.size:
                     end = min(have + _RANGE_BYTES, file.size)
@@ -65,7 +68,8 @@ def fetch(file: RemoteFile, partial: Path, headers: Mapping[str, str], bar: Any)
                     http_get(file.url, out, resume_size=have, headers=asked, expected_size=end, _tqdm_bar=bar)
             return
         except Exception as error:  # the type for a connection that broke depends on the HTTP client's version
+            failures = 1 if partial.stat().st_size > before else failures + 1
             is_of_the_machine = isinstance(error, ConnectionError) or getattr(error, "errno", None) is not None
-            if wait_s is None or is_of_the_machine or (status_of(error) or 500) < 500:
+            if failures == _ATTEMPTS or is_of_the_machine or (status_of(error) or 500) < 500:
                 raise
-            time.sleep(wait_s)
+            time.sleep(2**failures)
