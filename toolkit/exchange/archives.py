@@ -1,12 +1,13 @@
 """Unpack untrusted zip archives: regular files only, nothing outside the target folder, no more than the disk holds."""
 
-import re
 import shutil
 import stat
 import zipfile
 import zlib
 from collections.abc import Callable
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PureWindowsPath
+
+from pydantic import ByteSize
 
 from toolkit.errors import DownloadError, first_line
 
@@ -17,107 +18,59 @@ class FileError(DownloadError):
     """One file failed; the download of other files can continue."""
 
 
-def unpack(archive: Path, target: Path, target_path: Callable[[list[str]], str | None], name: str = "") -> int:
-    """Unpack a zip archive into a new folder and return the number of files written.
+def unpack(archive: Path, target: Path, target_path: Callable[[str], str | None], name: str) -> None:
+    """Unpack a zip archive into a new folder.
 
     Args:
-        target_path: maps the parts of a member's path to its path below `target` (with `/`), or to None to skip it.
-        name: archive name in messages and the progress bar; default: its file name.
+        target_path: maps a member's path to its path below `target` (with `/`), or to None to skip it.
+        name: name of the archive in messages and the progress bar.
 
     Raises:
         DownloadError: a member's path leaves the folder; a member is no regular file, is encrypted, or occurs twice;
-            the archive is damaged; or the disk is too small. Nothing is written outside `target`.
+            the archive is damaged, or all is skipped; the disk is too small. Nothing is written outside `target`.
     """
     from tqdm.auto import tqdm
 
-    name = name or archive.name
     try:
         with zipfile.ZipFile(archive) as zipped:
-            members = _members(zipped, target_path, name)
-            size = sum(member.file_size for member in members.values())
-            target.mkdir(parents=True)
-            require_space(target, size, "unpack fewer sessions (--sessions)")
-            with tqdm(total=size, desc=f"unpack {PurePosixPath(name).name}", unit="B", unit_scale=True) as bar:
-                for path, member in members.items():
-                    file = target / path
-                    file.parent.mkdir(parents=True, exist_ok=True)
-                    # zipfile stops at the size stated in the archive and verifies the checksum.
-                    with zipped.open(member) as source, open(file, "xb") as out:
-                        while chunk := source.read(1 << 20):
-                            bar.update(out.write(chunk))
-    except (zipfile.BadZipFile, zlib.error, EOFError) as error:
-        raise FileError(
-            f"{name}: incomplete or damaged zip archive: {first_line(error)}. Nothing of it was used. Run the same "
-            "command again; if the error persists, the published archive is damaged."
-        ) from error
-    except (NotImplementedError, RuntimeError) as error:
-        raise FileError(
-            f"{name}: cannot be unpacked here: {first_line(error)}. Unpack {archive} with another program."
-        ) from error
-    except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
-        raise FileError(
-            f"{name}: contains a file and a folder with the same name, {error.filename}. Nothing of it was used."
-        ) from error
-    return len(members)
+            members: dict[str, zipfile.ZipInfo] = {}
+            for info in zipped.infolist():
+                path = target_path(safe_path(info.filename, name))  # one unsafe path makes the whole archive suspect
+                if path is None or info.is_dir():
+                    continue
+                if path in members or stat.S_IFMT(info.external_attr >> 16) not in (0, stat.S_IFREG):
+                    raise FileError(f"{name}: contains {info.filename!r}, which is there twice, a link, or no file.")
+                members[path] = info
+            if not members:
+                listed = sorted({"/".join(path.split("/")[:3]) for path in zipped.namelist()})
+                raise FileError(f"{name}: contains no requested session. It has: {', '.join(listed[:20])}.")
+            require_space(archive.parent, sum(info.file_size for info in members.values()))
+            for path, info in tqdm(members.items(), desc=f"unpack {name.rpartition('/')[2]}", unit="file"):
+                info.filename = path
+                zipped.extract(info, target)  # stops at the size stated in the archive and verifies the checksum
+    # Damaged; encrypted, or compressed by an unknown method (both RuntimeError); a file and a folder of one name.
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, FileExistsError, NotADirectoryError) as error:
+        raise FileError(f"{name}: cannot be unpacked: {first_line(error)}. Nothing of it was used.") from error
 
 
-def _members(
-    zipped: zipfile.ZipFile, target_path: Callable[[list[str]], str | None], name: str
-) -> dict[str, zipfile.ZipInfo]:
-    """Return the members to unpack by target path. Raise FileError for links, encrypted files and duplicates."""
-    members: dict[str, zipfile.ZipInfo] = {}
-    for member in zipped.infolist():
-        parts = safe_parts(member.filename, name)  # skipped members too: one unsafe path makes the archive suspect
-        if member.is_dir() or (path := target_path(parts)) is None:
-            continue
-        mode = member.external_attr >> 16
-        if stat.S_IFMT(mode) not in (0, stat.S_IFREG, stat.S_IFDIR):
-            raise FileError(
-                f"{name}: contains {member.filename!r}, which is a link or a special file. Nothing of it was used: "
-                "the data may have been tampered with. Tell the publishers."
-            )
-        if member.flag_bits & 1:
-            raise FileError(f"{name}: {member.filename!r} is encrypted. Unpack it yourself with its password.")
-        if path in members:
-            raise FileError(f"{name}: contains {path} twice. Nothing of it was used. Tell the publishers.")
-        members[path] = member
-    return members
+def safe_path(name: str, where: str) -> str:
+    """Return an untrusted relative path with `/` only. Raise FileError if it leaves its folder on any system."""
+    path = PureWindowsPath(name)  # knows both separators, and drives
+    if path.anchor or ".." in path.parts or not path.parts or "\0" in name:
+        raise FileError(f"{where}: contains {name!r}, a path outside the target folder. Nothing of it was used.")
+    return path.as_posix()
 
 
-def top_folders(archive: Path) -> list[str]:
-    """Return up to 20 folders of an archive, at most three levels deep, for error messages."""
-    with zipfile.ZipFile(archive) as zipped:
-        return sorted({"/".join(name.split("/")[:3]) for name in zipped.namelist()})[:20]
-
-
-def safe_parts(name: str, where: str | Path) -> list[str]:
-    """Split an untrusted relative path into its parts. Raise FileError if it leaves its folder."""
-    path = name.replace("\\", "/")
-    parts = [part for part in path.split("/") if part not in ("", ".")]
-    if not parts or path.startswith("/") or ".." in parts or re.match("[A-Za-z]:", path) or "\0" in path:
-        raise FileError(
-            f"{where}: contains {name!r}, a path outside the target folder. Nothing of it was used: the data may have "
-            "been tampered with. Tell the publishers."
-        )
-    return parts
-
-
-def require_space(folder: Path, needed_bytes: int, alternative: str) -> None:
-    """Raise DownloadError if `needed_bytes` do not fit on the disk of `folder`; the message suggests `alternative`."""
-    free_bytes = shutil.disk_usage(folder).free
-    if needed_bytes * _SPACE_FACTOR > free_bytes:
-        needed = size_text(int(needed_bytes * _SPACE_FACTOR))
+def require_space(folder: Path, needed_bytes: int) -> None:
+    """Raise DownloadError if `needed_bytes` do not fit on the disk of `folder`."""
+    free, needed = shutil.disk_usage(folder).free, int(needed_bytes * _SPACE_FACTOR)
+    if needed > free:
         raise DownloadError(
-            f"{folder}: about {needed} are needed on this disk and {size_text(free_bytes)} are free. Free some space, "
-            f"set CAPTURES (or `captures` in the manifest) to a folder on another disk, or {alternative}."
+            f"{folder}: about {size_text(needed)} are needed on this disk and {size_text(free)} are free. Free some "
+            "space, set CAPTURES (or `captures` in the manifest) to a folder on another disk, or fetch fewer sessions "
+            "(--sessions)."
         )
 
 
-def size_text(count_bytes: int | None) -> str:
-    """Return a size such as `1.2 GB`; `?` for None."""
-    if count_bytes is None:
-        return "?"
-    for unit, scale in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if count_bytes >= scale:
-            return f"{count_bytes / scale:.1f} {unit}"
-    return f"{count_bytes} B"
+def size_text(count_bytes: int) -> str:
+    return ByteSize(count_bytes).human_readable(decimal=True, separator=" ")

@@ -17,7 +17,7 @@ _KEY_COLUMNS = {file: int(columns[0][0] == "timestamp") for file, columns in COL
 _KEY_COLUMNS |= {"pointclouds.txt": 1, "queries.txt": 1}
 
 
-def arrange(sessions: str | Path, names: Mapping[str, str]) -> list[str]:
+def arrange(sessions: Path, names: Mapping[str, str]) -> list[str]:
     """Rename the sessions of a data set. Split a session by device if several new names refer to it.
 
     A session is split by its subsessions, whose names begin with `<device>_`. `queries.txt` is copied to
@@ -30,70 +30,51 @@ def arrange(sessions: str | Path, names: Mapping[str, str]) -> list[str]:
     Raises:
         CaptureError: a session to split has no subsession of a device, or an invalid subsession name.
     """
-    sessions = Path(sessions)
     notes = []
-    for old_name in dict.fromkeys(names.values()):
-        old = sessions / old_name
-        new = [sessions / name for name, source in names.items() if source == old_name]
+    for old in [sessions / name for name in dict.fromkeys(names.values())]:
+        new = [sessions / name for name, source in names.items() if source == old.name]
         if not old.is_dir() or new == [old]:
             continue
-        if len(new) == 1:
-            old.rename(new[0])
-        else:
+        if len(new) > 1:
             notes += _split(old, new)
-        for session in new:
-            if (session / "queries.txt").is_file():
-                (session / "proc").mkdir(exist_ok=True)
-                shutil.copyfile(session / "queries.txt", session / "proc" / "keyframes_original.txt")
+        else:
+            old.rename(new[0])
+        for session in [session for session in new if (session / "queries.txt").is_file()]:
+            (session / "proc").mkdir(exist_ok=True)
+            shutil.copyfile(session / "queries.txt", session / "proc" / "keyframes_original.txt")
     return notes
 
 
 def _split(old: Path, new: list[Path]) -> list[str]:
     """Split a session into one per device; return notes on what was left out."""
-    unclaimed = subsessions = set(_subsessions(old))
+    list_file = old / "proc" / "subsessions.txt"
+    lines = list_file.read_text(encoding="utf-8").splitlines() if list_file.is_file() else []
+    subsessions = {line.strip() for line in lines if line.strip() and not line.startswith("#")}
+    subsessions = subsessions or {path.name for path in (old / "raw_data").glob("*") if path.is_dir()}
     for name in subsessions:
-        require_name(name, "subsession", old / "proc" / "subsessions.txt")
+        require_name(name, "subsession", list_file)
+    unclaimed = set(subsessions)
     for session in new:
         device = session.name.rpartition("_")[0]
         own = {name for name in subsessions if name.startswith(f"{device}_")}
+        unclaimed -= own
         if not own:
             raise CaptureError(
                 f"{old.name}: expected subsessions of device {device!r}, named {device}_...; found "
                 f"{', '.join(sorted(subsessions)[:3]) or 'none'}. Remove {session.name} from dataset.sessions."
             )
-        unclaimed = unclaimed - own
         for file, column in _KEY_COLUMNS.items():
             if (old / file).is_file():
-                _copy_rows(old / file, session / file, column, own)
-        for name in own:
-            if (old / "raw_data" / name).is_dir():
-                (session / "raw_data").mkdir(parents=True, exist_ok=True)
-                (old / "raw_data" / name).rename(session / "raw_data" / name)
-    split_files = {old / file for file in _KEY_COLUMNS}
-    other_files = [path for path in old.rglob("*") if path.is_file() and path not in split_files]
+                (session / file).parent.mkdir(parents=True, exist_ok=True)
+                with open(old / file, encoding="utf-8") as rows, open(session / file, "w", encoding="utf-8") as out:
+                    for row in rows:
+                        key = (*row.split(","), *[""] * column)[column].strip().partition("/")[0]
+                        if row.startswith("#") or key in own:
+                            out.write(row)
+        (session / "raw_data").mkdir(parents=True, exist_ok=True)
+        for folder in [old / "raw_data" / name for name in own if (old / "raw_data" / name).is_dir()]:
+            folder.rename(session / "raw_data" / folder.name)
+    others = {path.relative_to(old).as_posix() for path in old.rglob("*") if path.is_file()} - _KEY_COLUMNS.keys()
     shutil.rmtree(old)
-    notes = []
-    if unclaimed:
-        notes.append(f"{old.name}: {len(unclaimed)} subsessions of other devices, such as {min(unclaimed)}")
-    if other_files:
-        example = other_files[0].name
-        notes.append(f"{old.name}: {len(other_files)} files that cannot be split by device, such as {example}")
-    return notes
-
-
-def _subsessions(session: Path) -> list[str]:
-    list_file = session / "proc" / "subsessions.txt"
-    if list_file.is_file():
-        lines = list_file.read_text(encoding="utf-8").splitlines()
-        return [line.strip() for line in lines if line.strip() and not line.startswith("#")]
-    return sorted(path.name for path in (session / "raw_data").glob("*") if path.is_dir())
-
-
-def _copy_rows(source: Path, target: Path, column: int, subsessions: set[str]) -> None:
-    """Copy the comments and the rows of the given subsessions."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with open(source, encoding="utf-8") as lines, open(target, "w", encoding="utf-8") as out:
-        for line in lines:
-            cells = line.split(",", column + 1)
-            if line.startswith("#") or (len(cells) > column and cells[column].strip().partition("/")[0] in subsessions):
-                out.write(line)
+    left_out = {"subsessions of other devices": unclaimed, "files that cannot be split by device": others}
+    return [f"{old.name}: {len(items)} {what}, such as {min(items)}" for what, items in left_out.items() if items]

