@@ -420,19 +420,12 @@ class SequenceSettings(Settings):
     the time."""
     scale_std: PositiveNumber = 0.02
     """Relative standard deviation of the scale of a recording's odometry."""
-    gravity_std_deg: PositiveNumber | None = None
-    """Standard deviation per axis, degrees, such as 0.5, of the up direction at the start of each piece of odometry. It
-    applies if one axis of the odometry's frame proves vertical in the map, and not if `online`. null: the odometry's
-    frame may be tilted by any angle."""
     max_gap_s: PositiveNumber = 10.0
     """A longer time without odometry counts as a loss of tracking: a new piece with its own frame begins."""
     max_speed_m_s: PositiveNumber = 15.0
     """A faster motion between two poses of the odometry also counts as a loss of tracking."""
     relocalize: bool = True
     """Localize queries again near their predicted pose if they are not `ok` or contradict the other queries."""
-    bundle_adjust: bool = False
-    """As a last step, fit the poses to the map points that `ok` queries observe, instead of to the poses of these
-    queries; has no effect if `online`."""
     online: bool = False
     """Estimate the pose of each query from earlier data only; other frames then get no pose."""
     length_s: PositiveNumber | None = None
