@@ -12,7 +12,6 @@ from tests.features.test_aliked import SETTINGS
 from tests.features.test_aliked import random_state as aliked_state
 from tests.features.test_lightglue import features, state
 from tests.features.test_superpoint import planted_state
-from tests.golden.formula import cameras
 from tests.localizers.test_network_predictor import HIGHER, WIDE, Photographs, assert_same
 from tests.models import test_da3 as da3
 from tests.models import test_omega as omega
@@ -129,14 +128,10 @@ def test_omega(device: None) -> None:
 @pytest.mark.slow
 def test_da3(device: None) -> None:
     model, images = da3.tiny(), torch.rand(2, 4, 3, 42, 56, generator=torch.Generator().manual_seed(0))
-    poses, K = cameras("pretend", 8, 42, 56)
-    poses[[0, 2, 4]] = np.nan
-    given = (torch.from_numpy(poses).unflatten(0, (2, 4)), torch.from_numpy(K).unflatten(0, (2, 4)))
-    for known in ((), given):
-        expected = model.to("cpu")(images, None, None, *known)
-        for name, found in model.to(DEVICE)(images.to(DEVICE), None, None, *known).items():
-            assert isinstance(found, PretendTensor)
-            torch.testing.assert_close(found.cpu(), expected[name], atol=1e-5, rtol=1e-4)
+    expected = model(images)
+    for name, found in model.to(DEVICE)(images.to(DEVICE)).items():
+        assert isinstance(found, PretendTensor)
+        torch.testing.assert_close(found.cpu(), expected[name], atol=1e-5, rtol=1e-4)
 
 
 def make_aliked(name: str) -> NetworkExtractor:

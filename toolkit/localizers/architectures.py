@@ -85,7 +85,7 @@ class Architecture(ABC):
         """Return the network, on the CPU.
 
         It has `encode(images)` and is called as `network(images, heads, tokens)`, which returns the outputs of its
-        heads. If it accepts cameras, also as `(images, heads, tokens, extrinsics, intrinsics)`, see `DepthAnything3`.
+        heads.
 
         Raises:
             WeightsError: the file does not belong to this network.

@@ -18,7 +18,7 @@ from toolkit.files import files_fingerprint
 from toolkit.geometry import invert, make_pose
 from toolkit.localizers.architectures import ARCHITECTURES, HEADS, Architecture, Size, estimate_bytes
 from toolkit.localizers.base import View
-from toolkit.localizers.placed import PlacedView, conditioned_views, input_cameras, shown_size
+from toolkit.localizers.placed import PlacedView, shown_size
 from toolkit.localizers.prediction import Prediction
 from toolkit.models.compute import PRECISIONS, Fitting, free_bytes, on_device, resolve_device, resolve_precision
 from toolkit.models.weights import resolve_weights
@@ -92,7 +92,6 @@ class NetworkPredictor:
         cache_bytes: int = CACHE_BYTES,
         architecture: Architecture = ARCHITECTURES["vggt"],
         compile: bool = False,  # noqa: A002
-        conditioned: bool = False,
     ) -> None:
         """
         Args:
@@ -103,8 +102,6 @@ class NetworkPredictor:
             cache_bytes: memory for encodings of map images, on the device if it has plenty, else on the CPU.
             architecture: the network.
             compile: see `PredictorSettings`.
-            conditioned: give the network the intrinsics of all views, and the poses of every other reference if there
-                are at least `placed.LEAST_REFERENCES`. Only for networks that accept cameras.
 
         Raises:
             ManifestError: the precision does not exist or is float16.
@@ -115,7 +112,6 @@ class NetworkPredictor:
             title = architecture.title
             raise ManifestError(f"dtype_compute is {dtype_compute!r}; {title} expects one of {', '.join(expected)}.")
         self._architecture, self.name = architecture, architecture.name
-        self.conditioned = conditioned
         self.checkpoint = resolve_weights(architecture.weights, checkpoint)
         self.compute_device, self.dtype_compute = compute_device, dtype_compute
         self._batch_size = batch_size
@@ -130,8 +126,7 @@ class NetworkPredictor:
         """Everything besides the views that the predictions depend on. The device only changes rounding."""
         weights = files_fingerprint([self.checkpoint])
         precision = str(self._dtype).removeprefix("torch.")
-        settings = {"name": self.name, "weights": weights, "dtype_compute": precision, "depth": True}
-        return settings | ({"conditioned": True} if self.conditioned else {})
+        return {"name": self.name, "weights": weights, "dtype_compute": precision, "depth": True}
 
     @cached_property
     def _device(self) -> "torch.device":
@@ -343,33 +338,22 @@ class NetworkPredictor:
             stacked = torch.stack([one.to(self._kept_on) for one in encoded.values()])
             alike.setdefault(len(encoded), []).append((number, group, list(encoded), stacked))
         for rows in alike.values():
-            shown = [[group[index] for index in readable] for _, group, readable, _ in rows]
-            output = self._forward(torch.stack([stacked for *_, stacked in rows]), shown).numpy()
-            for (number, group, readable, _), views, values in zip(rows, shown, output, strict=True):
-                conditioned = self._conditioned(views[: len(values)])
-                results[number] = self._prediction(group, readable[: len(values)], values, conditioned)
+            output = self._forward(torch.stack([stacked for *_, stacked in rows]), rows[0][1][0].size).numpy()
+            for (number, group, readable, _), values in zip(rows, output, strict=True):
+                results[number] = self._prediction(group, readable[: len(values)], values)
         return results
 
-    def _conditioned(self, views: Sequence[PlacedView]) -> NDArray[np.bool_]:
-        """Return which of the input views (S,) the network gets with their poses."""
-        return conditioned_views(views) if self.conditioned else np.zeros(len(views), bool)
-
-    def _forward(self, tokens: "Tensor", groups: Sequence[Sequence[PlacedView]]) -> "Tensor":
+    def _forward(self, tokens: "Tensor", size: Size) -> "Tensor":
         """Return outputs (B, S, 9 + 2 H W) on the CPU for tokens (B, S, P, C); S shrinks if the memory is too small."""
         import torch
 
-        size = groups[0][0].size
         while True:
             views = min(tokens.shape[1], self._most_views.get(size, tokens.shape[1]))
-            cameras = []
-            if any(self._conditioned(group[:views]).any() for group in groups):
-                poses, intrinsics = zip(*(input_cameras(group[:views]) for group in groups), strict=True)
-                cameras = [torch.from_numpy(np.stack(poses)), torch.from_numpy(np.stack(intrinsics))]
             new = Fitting(self._network(size), f"groups of {views} views", self._device)
             run = self._fitting.setdefault((views, size), new)
             try:
                 with torch.inference_mode():
-                    return run(tokens[:, :views], *cameras)
+                    return run(tokens[:, :views])
             except ToolkitError as error:
                 if self._makes_room():
                     continue
@@ -381,21 +365,19 @@ class NetworkPredictor:
             self._most_views[size] = max(_LEAST_VIEWS, views // 2)
             log.warning("continuing with the first %d views of each group", self._most_views[size])
 
-    def _network(self, size: Size) -> "Callable[..., Tensor]":
-        """Return the network as a function of tokens (B, S, P, C) and input cameras, if any, for images (H, W)."""
+    def _network(self, size: Size) -> "Callable[[Tensor], Tensor]":
+        """Return the network as a function of tokens (B, S, P, C) of images (H, W)."""
         import torch
 
-        def run(tokens: "Tensor", *cameras: "Tensor") -> "Tensor":
+        def run(tokens: "Tensor") -> "Tensor":
             images = torch.empty(*tokens.shape[:2], 3, *size, device="meta")
-            output = self._model(images, HEADS, tokens.float(), *cameras)
+            output = self._model(images, HEADS, tokens.float())
             dense = [output[name].flatten(2) for name in ("depth", "depth_conf")]
             return torch.cat([output["pose_enc"], *dense], dim=-1).cpu()
 
         return run
 
-    def _prediction(
-        self, group: list[PlacedView], shown: Sequence[int], output: NDArray[np.float32], conditioned: NDArray[np.bool_]
-    ) -> Prediction:
+    def _prediction(self, group: list[PlacedView], shown: Sequence[int], output: NDArray[np.float32]) -> Prediction:
         """Convert the network output (shown views, 9 + 2 H W) to the prediction of a group."""
         poses, intrinsics = np.full((len(group), 4, 4), np.nan), np.full((len(group), 3, 3), np.nan)
         size = group[0].size
@@ -406,7 +388,6 @@ class NetworkPredictor:
                 poses[index] = model_from_turned @ turned_from_cam(group[index].view.turns)
                 intrinsics[index] = group[index].intrinsics(K)
         map_from_image = np.stack([placed.map_from_image for placed in group])
-        mask = np.isin(np.arange(len(group)), np.array(shown)[conditioned]) if conditioned.any() else None
         depth = [placed.turned_back(np.full(size, np.nan, np.float32)) for placed in group]
         confidence = [placed.turned_back(np.zeros(size, np.float32)) for placed in group]
         maps = output[:, 9:].reshape(len(shown), 2, *size)
@@ -414,7 +395,7 @@ class NetworkPredictor:
             placed, outside = group[index], group[index].outside
             depth[index] = placed.turned_back(np.where(outside, np.float32(np.nan), depth_map))
             confidence[index] = placed.turned_back(np.where(outside, np.float32(np.nan), confidence_map))
-        return Prediction(poses, depth, confidence, map_from_image, intrinsics, mask)
+        return Prediction(poses, depth, confidence, map_from_image, intrinsics)
 
 
 _loaded: dict[tuple[Any, ...], Any] = {}

@@ -504,10 +504,6 @@ class PnpSettings(Settings):
     further features of `escalation` are used too."""
 
 
-CONDITIONED = ("da3-base", "da3-small")
-"""Names of the networks that accept known camera parameters as input."""
-
-
 class PredictorSettings(Settings):
     """The feed-forward network that predicts cameras and depth from a query image and its references."""
 
@@ -532,19 +528,6 @@ class PredictorSettings(Settings):
     tracks are used."""
     least_points: Natural = 20
     """If a reference sees fewer map points, its depth map in the capture is used instead, if there is one."""
-    conditioned: bool = False
-    """Give a network that accepts cameras (da3-base, da3-small) the known ones: the intrinsics of all views and, with
-    six or more references, the poses of every second reference. The other references align the prediction. Such
-    networks are meant to receive all cameras or none; the benefit of a part of them is not measured."""
-
-    @model_validator(mode="after")
-    def _conditioned_needs_a_network_with_cameras(self) -> Self:
-        if self.conditioned and self.name not in CONDITIONED:
-            raise ValueError(
-                f"conditioned is true, but {self.name} does not accept cameras; expected the name to be one of "
-                f"{', '.join(CONDITIONED)}, or conditioned: false"
-            )
-        return self
 
 
 Method = Annotated[
