@@ -4,6 +4,7 @@
 """
 
 import math
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -39,6 +40,15 @@ def _check_models(model: str | list[str]) -> str | list[str]:
         found = f"{twice[0]!r} twice" if twice else "'auto' in a list" if model else "an empty list"
         raise ValueError(f"found {found}, expected a name, or a list of different names such as [megaloc, vlad]")
     return model if len(model) > 1 else model[0]
+
+
+def _check_index(index: str) -> str:
+    if not re.fullmatch(r"(PCA\d+,)?(Flat|RaBitQ|HNSW\d+|IVF\d+,(Flat|RaBitQ|PQ\d+(x\d+)?))", index):
+        raise ValueError(
+            f"found {index!r}, expected Flat, RaBitQ, HNSW<links>, or IVF<cells> followed by Flat, RaBitQ or "
+            "PQ<codes>, behind PCA<dimensions> or not, such as PCA512,IVF4096,RaBitQ"
+        )
+    return index
 
 
 Unit = Literal["auto", "m"] | None
@@ -246,9 +256,9 @@ class RetrieveSettings(Settings):
     """Run FAISS on the GPU; needs a FAISS built with GPU support."""
     normalize: bool = True
     """Scale descriptors to unit length before the search, so that it compares by cosine similarity."""
-    index: str = "Flat"
-    """FAISS factory string of an approximate index for large maps, such as PCA512,IVF4096,RaBitQ. Flat: exact search
-    without an index."""
+    index: Annotated[str, AfterValidator(_check_index)] = "Flat"
+    """FAISS factory string of an approximate index for large maps: RaBitQ, HNSW32, or IVF4096 with Flat, RaBitQ or
+    PQ64, each also behind PCA, such as PCA512,IVF4096,RaBitQ. Flat: exact search without an index."""
     index_candidates: Positive = 1000
     """Candidates per query that an approximate index returns; they are then ranked by exact similarity."""
     nprobe: Positive | None = None
