@@ -1,11 +1,10 @@
-"""A street of N rendered map images from capture to report: seconds, memory and files of each stage, and how they grow.
+"""Rooms with N rendered map images, from capture to report: seconds, memory and files of each stage, and how they grow.
 
     python benchmarks/scale.py [--images 60 240] [--folder runs/scale] [--threads 2] [--resume] [--set KEY=VALUE]
     python benchmarks/scale.py --bookkeeping 10000 100000 [--folder runs/scale]
 
-The street goes on and on, so a longer one is more of the same: 12 m have 50 map images of 480 x 360 and 3 query
-images, of which every sixth is left out of the keyframe list, which makes 500 queries at 10,000. Captures are kept in
-FOLDER/N/STREET and used again. The run is headless, in a process of its own, with VLAD and SIFT alone: learned
+Each room has 50 map images of a phone, 480 x 360, and 3 or 4 queries, so more images are more of the same. Captures are
+kept in FOLDER/N/ROOMS and used again. The run is headless, in a process of its own, with VLAD and SIFT alone: learned
 features on a CPU take the same seconds for each image whatever the size, and hide what grows. Seconds are those of
 run.json, without starting a kernel; of `localize`, those until the map stands are a row of their own. Memory is that of
 all processes of the run, sampled twice a second: the sum of their proportional sets (PSS: a page that several have
@@ -13,7 +12,7 @@ mapped counts once in all), and of their resident sets (RSS: it counts in each).
 through log seconds over log images: 1 is linear. FOLDER/growth.png draws it, FOLDER/scale.md and scale.json hold the
 figures. With --resume, sizes that were measured before are taken as they were, and a stopped run goes on.
 
-With --bookkeeping, what needs no pixels, for maps of poses and random descriptors along such streets, each size in a
+With --bookkeeping, what needs no pixels, for maps of poses and random descriptors along straight walks, each size in a
 process of its own: peak memory is the process's largest resident set while a step runs, less what it had before.
 """
 
@@ -37,14 +36,15 @@ from common import add_out, check_out, in_own_process, limit_cores, markdown_tab
 
 from toolkit.files import SceneFiles
 
-FRAMES, QUERIES = 50, 3
-"""Map and query images of a block of the street."""
-SCENE = "STREET"
+FRAMES, STEP = 50, 8
+"""Map images of a room. It has half as many query images, of which every eighth is asked."""
+QUERIES = "keyframes_scale"
+SCENE = "ROOMS"
 STAGES = ("explore", "embed", "retrieve", "map", "localize", "evaluate", "visualize", "report")
 """Rows of the table; the map is the first part of the stage `localize`, and the report what follows the last stage."""
 MANIFEST: dict[str, Any] = {
-    "description": "A rendered street.",
-    "queries": "keyframes_pruned",
+    "description": "Rendered rooms.",
+    "queries": QUERIES,
     "embed": {"model": "vlad"},
     "localize": {"method": "pnp", "features": {"kinds": ["sift"], "escalation": []}},
 }
@@ -104,15 +104,22 @@ def _proportional_mb(pid: int) -> float:
 
 
 def render(folder: Path, images: int) -> Path:
-    """Render the street of about so many map images, if it is not there; whole blocks."""
-    from toolkit.synthetic import render_street
+    """Render whole rooms of about so many map images, if they are not there, and list the queries."""
+    from toolkit.capture import Session
+    from toolkit.synthetic import capture as rendering
+    from toolkit.synthetic.devices import DEVICES, scaled
 
-    blocks = max(1, round(images / FRAMES))
-    return render_street(folder / SCENE, blocks, round(images / blocks), QUERIES, progress=sys.stderr.isatty())
+    rendering.DEVICES = {"ios": scaled(DEVICES["ios"], 0.5)}  # this process renders nothing else
+    rooms = max(1, round(images / FRAMES))
+    capture = rendering.render_capture(folder / SCENE, rooms, round(images / rooms), progress=sys.stderr.isatty())
+    session = Session(capture / "sessions" / "ios_query")
+    asked = session.keyframes("keyframes_original").iloc[::STEP]
+    asked.to_csv(session.path / "proc" / f"{QUERIES}.txt", index=False, header=False)
+    return capture
 
 
 def measure(folder: Path, images: int, settings: list[str], resume: bool) -> dict[str, Any]:
-    """Run the chain on the street of so many images; return what it took."""
+    """Run the chain on rooms of so many images; return what it took."""
     capture = in_own_process(render, folder, images)
     record, run = folder / "measured.json", folder / "runs" / "scale"
     if resume and record.exists():
@@ -248,23 +255,19 @@ class Books:
         ]
 
     def write(self) -> None:
-        """Write both sessions, a phone's: a camera an image. 100 blocks stand in a row, the rows 40 m apart."""
+        """Write both sessions, a phone's: a camera an image. Images are 0.24 m apart in rows of 1,200 m, 40 m apart."""
         import pandas as pd
 
         from toolkit.capture import Trajectory, write_session
-        from toolkit.geometry import qt_from_pose
-        from toolkit.synthetic.devices import DEVICES, walk_street
-        from toolkit.synthetic.scene import BLOCK_M, Scene
+        from toolkit.geometry import make_pose, qt_from_pose
+        from toolkit.synthetic.devices import DEVICES, looking
 
         (sensor,) = DEVICES["ios"].sensors
-        poses: dict[str, list[np.ndarray]] = {"map": [], "query": []}
-        for index in range(max(1, round(self.images / FRAMES))):
-            origin = np.array([BLOCK_M[0] * (index % 100), 40.0 * (index // 100), 0.0])
-            walks = walk_street(Scene(origin, BLOCK_M, True), 0, {"map": FRAMES, "query": QUERIES}, "ios")
-            for (split, _), bodies in walks.items():
-                poses[split].append(bodies @ sensor.body_from_cam)
-        for split, of_blocks in poses.items():
-            qt = qt_from_pose(np.concatenate(of_blocks))
+        for split, step in (("map", 1), ("query", 17)):
+            numbers = np.arange(0, self.images, step)
+            centers = np.stack([0.24 * (numbers % 5000), 40.0 * (numbers // 5000), np.full(len(numbers), 1.6)], axis=1)
+            rotations = np.stack([looking(90 + 25 * np.sin(number / 12), 0, 0) for number in numbers])
+            qt = qt_from_pose(make_pose(rotations, centers))
             times = [10**9 * (1 + (split == "query")) + 10**6 * i for i in range(len(qt))]
             ids = [f"walk/cam_phone_{stamp}" for stamp in times]
             trajectory = Trajectory(times, ids, qt)
@@ -441,7 +444,7 @@ def _status_mb(name: str) -> float:
 
 
 def report_run(measured: list[dict[str, Any]], threads: int, plot: Path) -> str:
-    """Return the tables of rendered streets, and draw their growth."""
+    """Return the tables of rendered rooms, and draw their growth."""
     sizes = [float(one["images"]) for one in measured]
     nan = float("nan")
     stages = [stage for stage in STAGES if any(stage in one["seconds"] for one in measured)]
@@ -479,7 +482,7 @@ def report_books(sizes: list[int], found: list[dict[str, dict[str, float]]]) -> 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--images", type=int, nargs="+", default=[60, 240], help="map images of each street")
+    parser.add_argument("--images", type=int, nargs="+", default=[60, 240], help="map images of each size")
     parser.add_argument("--bookkeeping", type=int, nargs="+", metavar="IMAGES", help="instead: no pixels")
     parser.add_argument("--folder", type=Path, default=Path("runs/scale"), help="of captures, runs and results; kept")
     parser.add_argument("--threads", type=int, default=2)

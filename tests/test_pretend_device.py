@@ -12,7 +12,6 @@ from tests.features.test_aliked import SETTINGS
 from tests.features.test_aliked import random_state as aliked_state
 from tests.features.test_lightglue import features, state
 from tests.features.test_superpoint import planted_state
-from tests.golden.formula import cameras
 from tests.localizers.test_network_predictor import HIGHER, WIDE, Photographs, assert_same
 from tests.models import test_da3 as da3
 from tests.models import test_omega as omega
@@ -83,39 +82,7 @@ def test_vggt(device: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         for found, other in zip(there.predict(groups, groups), expected, strict=True):
             assert_same(found, other)
     assert there._cache.bytes > 0
-    assert all(isinstance(kept, PretendTensor) for kept in there._cache._kept.values())
-    # Where memory is short, the CPU holds what is kept.
-    monkeypatch.setattr(predictors, "free_bytes", lambda _: 2 << 30)
-    poor = NetworkPredictor(checkpoint, "pretend", "float32")
-    for found, other in zip(poor.predict(groups), expected, strict=True):
-        assert_same(found, other)
-    assert not any(isinstance(kept, PretendTensor) for kept in poor._cache._kept.values())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("part", ["encode", "forward"])
-def test_what_is_kept_gives_way_to_the_network(
-    device: None, part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setattr(VGGT, "from_checkpoint", lambda _, heads, compute_dtype: tiny(heads, compute_dtype))
-    checkpoint = tmp_path / "model.pt"
-    checkpoint.write_bytes(b"stands for weights")
-    photographs = Photographs(tmp_path)
-    groups = [photographs.group(*[WIDE] * 4) for _ in range(3)]
-    expected = NetworkPredictor(checkpoint, "cpu", "float32").predict(groups)
-    predictor = NetworkPredictor(checkpoint, "pretend", "float32")
-    predictor.predict(groups[:1])
-    run = getattr(predictor._model, part)
-
-    def fails(*arguments: object) -> object:
-        if predictor._kept_on.type != "cpu":
-            raise torch.OutOfMemoryError("out of memory")
-        return run(*arguments)
-
-    monkeypatch.setattr(predictor._model, part, fails)
-    for found, other in zip(predictor.predict(groups), expected, strict=True):
-        assert_same(found, other)
-    assert "the CPU will hold them" in caplog.text
+    assert not any(isinstance(kept, PretendTensor) for kept in there._cache._kept.values())
 
 
 def test_omega(device: None) -> None:
@@ -129,14 +96,10 @@ def test_omega(device: None) -> None:
 @pytest.mark.slow
 def test_da3(device: None) -> None:
     model, images = da3.tiny(), torch.rand(2, 4, 3, 42, 56, generator=torch.Generator().manual_seed(0))
-    poses, K = cameras("pretend", 8, 42, 56)
-    poses[[0, 2, 4]] = np.nan
-    given = (torch.from_numpy(poses).unflatten(0, (2, 4)), torch.from_numpy(K).unflatten(0, (2, 4)))
-    for known in ((), given):
-        expected = model.to("cpu")(images, None, None, *known)
-        for name, found in model.to(DEVICE)(images.to(DEVICE), None, None, *known).items():
-            assert isinstance(found, PretendTensor)
-            torch.testing.assert_close(found.cpu(), expected[name], atol=1e-5, rtol=1e-4)
+    expected = model(images)
+    for name, found in model.to(DEVICE)(images.to(DEVICE)).items():
+        assert isinstance(found, PretendTensor)
+        torch.testing.assert_close(found.cpu(), expected[name], atol=1e-5, rtol=1e-4)
 
 
 def make_aliked(name: str) -> NetworkExtractor:

@@ -229,7 +229,7 @@ def test_backends_write_the_same_and_files_are_reused(tiny: Path, tmp_path: Path
 
 def test_an_index_is_made_once_and_part_of_what_files_are_made_of(tiny: Path, tmp_path: Path) -> None:
     exact = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", tmp_path / "exact", {"topk": 3})
-    settings = {"topk": 3, "index": "IVF2,SQ8", "index_candidates": 5, "nprobe": 2}
+    settings = {"topk": 3, "index": "IVF2,Flat", "index_candidates": 5, "nprobe": 2}
     found = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", settings=settings)
     for row, expected in zip(found["path"], exact["path"], strict=True):
         assert Path(row).read_bytes() == Path(expected).read_bytes()
@@ -426,7 +426,7 @@ def test_references_come_from_where_radio_says(
 def test_masks_of_several_query_sessions_backends_and_an_index_are_joined(tiny: Path, tmp_path: Path) -> None:
     for session in ("ios_map", "ios_query", "hl_query"):
         write_wifi(tiny, session, {0: 0, 1: 1, 2: 2} if session.endswith("map") else {0: 2, 1: 1, 2: 0})
-    other = {"use_faiss": False}, {"index": "IVF2,SQ8", "index_candidates": 5, "nprobe": 2}
+    other = {"use_faiss": False}, {"index": "IVF2,Flat", "index_candidates": 5, "nprobe": 2}
     paths = []
     for number, settings in enumerate(({}, *other)):
         settings = {"topk": 2, "mask": {"radio": True, **WINDOW}, **settings}

@@ -11,7 +11,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.localized import write_queries
 from tests.localizers.drifting import PLACE, Drive, drive, lost_in_a_gap, small_motion
 from toolkit import geometry, sequence
 from toolkit.capture import Session, Trajectory
@@ -21,9 +20,7 @@ from toolkit.errors import ManifestError
 from toolkit.files import SceneFiles, map_record_path, pair_name
 from toolkit.localize import localize_pairs
 from toolkit.localizers.base import PoseEstimate
-from toolkit.localizers.correspondences import Correspondences, LocalizedQuery
 from toolkit.localizers.pose_graph import FAR
-from toolkit.localizers.recording import GRAPH_AGAIN
 from toolkit.retrieve import retrieve_pairs
 from toolkit.sequence import COLUMNS, sequence_pairs
 from toolkit.synthetic import capture as rendering
@@ -382,55 +379,6 @@ def test_no_piece_ends_in_a_wrong_room_that_looks_alike(alike: Alike) -> None:
         assert ((pieces["queries"] == 0) == pieces["status"].str.startswith("failed")).all()
         # A recording that is one piece has been where the rooms are told apart.
         assert (pieces["status"][pieces["frames"] > 550] == "ok").all()
-
-
-def seen_exactly(session: Session, truth: Trajectory, row: int) -> LocalizedQuery:
-    """Return what a query shows of 100 points 2 to 6 m before it, without any error."""
-    rng, key = np.random.default_rng(row), pd.DataFrame({"timestamp": [truth.timestamps[row]]})
-    [[image]] = session.rows_of_keyframes(key.assign(device_id=truth.device_ids[row]))
-    depth = rng.uniform(2, 6, (100, 1))
-    in_cam = np.concatenate([rng.uniform(-0.3, 0.3, (100, 2)) * depth, depth], axis=1)
-    camera = session.camera(session.images["sensor_id"].iloc[image])
-    world_from_cam = truth.world_from_device[row] @ session.rig_from_cam(np.array([image]))[0]
-    found = Correspondences(
-        np.zeros(100, int), np.asarray(camera.img_from_cam(in_cam)), geometry.transform(world_from_cam, in_cam),
-        np.full(100, -1), np.ones(100, bool), np.full(100, "sift/descriptors"),
-    )  # fmt: skip
-    return LocalizedQuery([session.image_names[image]], correspondences=found)
-
-
-def test_bundle_adjustment_on_request(place: Path, tmp_path: Path) -> None:
-    session, stem = Session(place / "sessions/ios_query"), tmp_path / "poses" / pair_name(place.name, "ios", "ios")
-    truth = session.ground_truth
-    assert truth is not None
-
-    def done(**settings: bool) -> pd.Series:
-        return sequence_pairs(
-            place / "sessions", stem.parent, {"relocalize": False, **settings}, map_device="ios", query_device="ios"
-        ).iloc[0]
-
-    def errors() -> np.ndarray:
-        found = Trajectory.read(f"{stem}_sequence.txt").lookup(truth.timestamps, truth.device_ids)
-        return np.asarray(geometry.pose_error(found, truth.world_from_device)[1])
-
-    shown = stem.with_name(f"{stem.name}.h5")
-    shown.write_bytes(b"torn")
-    assert done()["reason"] == "", "nothing of it is read"
-    before = errors()
-    assert str(shown) in done(bundle_adjust=True)["reason"]
-    shown.unlink()
-    assert f"{shown}: no correspondences of this pair" in done(bundle_adjust=True)["reason"]
-    rows = range(0, len(truth), 2)
-    keys = [(int(truth.timestamps[row]), str(truth.device_ids[row])) for row in rows]
-    queries = dict(zip(keys, (seen_exactly(session, truth, row) for row in rows), strict=True))
-    write_queries(shown, queries)
-    assert not done(bundle_adjust=True)["skipped"]
-    assert errors().max() < min(0.005, 0.5 * before.max())
-    steps = pd.read_csv(f"{stem}_sequence_steps.csv")
-    assert (steps["step"] == GRAPH_AGAIN).sum() == len(rows)
-    assert done(bundle_adjust=True)["skipped"]
-    write_queries(shown, {keys[0]: LocalizedQuery(["nowhere.jpg"]), **dict(list(queries.items())[1:])})
-    assert "has no image nowhere.jpg" in done(bundle_adjust=True)["reason"]
 
 
 def test_a_map_session_has_no_odometry(place: Path) -> None:

@@ -433,7 +433,7 @@ def test_what_builds_on_a_failed_stage_is_skipped(here: Path) -> None:
         ("embed", {"model": "vald"}, "'vald'. Did you mean 'vlad'. Known: auto, megaloc"),
         ("embed", {"settings": {"model": ["vlad", "megalok"]}}, "Did you mean 'megaloc'"),
         ("embed", {"compute_device": "cude"}, "found 'cude'. Meaning: Device of the network: auto, cpu, cuda"),
-        ("retrieve", {"settings": {"index": "IVF4096,Flot"}}, "retrieve.index: found 'IVF4096,Flot'"),
+        ("retrieve", {"settings": {"index": "IVF4096,Flot"}}, "index: found 'IVF4096,Flot', expected Flat"),
         ("evaluate", {"pairs": "ios"}, "pairs: found 'ios'"),
         ("evaluate", {"pairs": [["ios"]]}, "pairs"),
         ("embed", {"batch_size": 0.5}, "batch_size"),

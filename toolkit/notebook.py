@@ -29,7 +29,6 @@ from toolkit.manifest import (
     LocalizeSettings,
     Manifest,
     RerankSettings,
-    RetrieveSettings,
     Settings,
     nearest,
 )
@@ -422,10 +421,6 @@ def check_names(settings: Settings) -> None:
 
         kinds = [kind for kind in (*settings.features.kinds, *settings.features.escalation) if kind != "auto"]
         matchers_of(kinds or ["sift", "aliked"], settings.matcher.name)
-    elif isinstance(settings, RetrieveSettings) and settings.index != "Flat":
-        from toolkit.embedders.index import check_factory
-
-        check_factory(settings.index)
 
 
 def check_values(name: str, values: Mapping[str, Any]) -> None:

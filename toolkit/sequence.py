@@ -4,8 +4,7 @@ import glob
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, nullcontext
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import product
@@ -20,7 +19,6 @@ from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import default_workers, prefetch
 from toolkit.capture.tables import POSE_NAMES, POSES_UNIT, KeyIndex, as_strings, in_unit_of_poses, read_query_table
-from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import INTERNAL, OF_THE_DATA, ArtifactError, reason_of
 from toolkit.files import (
     SceneFiles,
@@ -36,10 +34,7 @@ from toolkit.files import (
 )
 from toolkit.geometry import Floats, Ints, pose_error
 from toolkit.localizers.base import PoseEstimate, RoughPose, stds_of
-from toolkit.localizers.bundle import Observations
-from toolkit.localizers.correspondences import LocalizedQueries
 from toolkit.localizers.frames import LocalizedFrames, SequenceLocalizer, localize_sequence
-from toolkit.localizers.gravity import measured_gravity
 from toolkit.localizers.map import Map
 from toolkit.localizers.odometry import (
     UNKNOWN_COVARIANCE,
@@ -141,8 +136,6 @@ def _place_pair(
     if session.odometry is None:
         raise ArtifactError(f"{session.path} has no trajectories.txt: there is no odometry of {session.id}.")
     inputs = {poses: "poses", table: "table of the queries"}
-    if settings.bundle_adjust:
-        inputs[poses.with_suffix(".h5")] = "correspondences"
     for path, what in inputs.items():
         if not path.exists():
             raise ArtifactError(f"{path}: no {what} of this pair. Localize first.")
@@ -157,12 +150,7 @@ def _place_pair(
     skipped = skip_existing and is_current(out, record)
     if not skipped:
         again = _Relocalizer(poses_dir, capture.name, map_device, session) if settings.relocalize else None
-        singles, map_session = _SingleQueries.read(poses, table), capture[f"{map_device}_map"]
-        adjust = settings.bundle_adjust
-        with closing(LocalizedQueries(poses.with_suffix(".h5"))) if adjust else nullcontext() as correspondences:
-            frames, steps, trajectory = _frames(
-                session, singles, settings, again, lambda: up_of_cameras(map_session.world_from_cam()), correspondences
-            )
+        frames, steps, trajectory = _frames(session, _SingleQueries.read(poses, table), settings, again)
         unit = read_map_record(map_record_path(poses_dir, capture.name, map_device))["unit"]
         csvs = {out.with_suffix(".csv"): in_unit_of_poses(frames, unit), out.with_name(f"{out.stem}_steps.csv"): steps}
         for path, rows in csvs.items():
@@ -301,12 +289,7 @@ class _Relocalizer:
 
 
 def _frames(
-    session: Session,
-    singles: _SingleQueries,
-    settings: SequenceSettings,
-    relocalizer: _Relocalizer | None,
-    map_up: Callable[[], Floats],
-    correspondences: LocalizedQueries | None,
+    session: Session, singles: _SingleQueries, settings: SequenceSettings, relocalizer: _Relocalizer | None
 ) -> tuple[pd.DataFrame, pd.DataFrame, Trajectory]:
     """Return the table of all frames and queries, the table of steps, and the trajectory of the frames with a pose."""
     tables, poses, covariances = list[pd.DataFrame](), list[Floats](), list[Floats]()
@@ -320,15 +303,13 @@ def _frames(
             online += _step_rows(piece, _online_steps(piece, settings))
         settings = with_measured_drift([(piece.motion, piece.posed) for piece in pieces], settings)
         pieces = [piece.part(rows) for piece in pieces for rows in cut(piece.motion, piece.posed, settings)]
-    gravity = measured_gravity([(piece.motion, piece.posed) for piece in pieces], map_up, settings)
     numbers = Counter[str]()
     for piece in pieces:
         motion, queries, frames = piece.motion, piece.posed, piece.posed.frames
         with_odometry[piece.query[piece.query_frames]] = True
         keys = pd.DataFrame({"timestamp": motion.timestamps, "device_id": piece.device_ids})
         again = None if relocalizer is None else partial(relocalizer, keys)
-        observe = None if correspondences is None else partial(_observations, session, correspondences, keys)
-        done = localize_piece(motion, queries, piece.query_frames, settings, again, gravity, observe)
+        done = localize_piece(motion, queries, piece.query_frames, settings, again)
         placed = done.placed
         steps += _step_rows(piece, done.steps)
         table = pd.DataFrame(dict.fromkeys(COLUMNS), index=range(len(motion)))
@@ -360,26 +341,6 @@ def _frames(
     times, device_ids = with_pose["timestamp"].to_numpy(np.int64), with_pose["device_id"].to_list()
     trajectory = Trajectory.from_poses(times, device_ids, all_poses[posed], all_covariances[posed])
     return frames_table, pd.concat([part.astype(object) for part in steps + online], ignore_index=True), trajectory
-
-
-def _observations(
-    session: Session, correspondences: LocalizedQueries, keys: pd.DataFrame, frame: int, again: PoseEstimate | None
-) -> Observations | None:
-    """Return the observations of a frame's query, from its estimate `again` or, if None, its first estimate."""
-    query = keys.iloc[[frame]]
-    key = int(query["timestamp"].iloc[0]), str(query["device_id"].iloc[0])
-    if again is not None:
-        [rows], matches = session.rows_of_keyframes(query), again.correspondences
-    elif key in correspondences:
-        stored = correspondences[key]
-        matches = stored.correspondences
-        if missing := [name for name in stored.images if name not in session.row_of_name]:
-            raise ArtifactError(f"{correspondences.path}: {session.path} has no image {missing[0]}. Localize again.")
-        rows = np.array([session.row_of_name[name] for name in stored.images], np.int64)
-    else:
-        return None
-    cameras = session.cameras(rows)
-    return Observations.of(matches, cameras, session.rig_from_cam(rows))
 
 
 def _step_rows(piece: _Piece, steps: Mapping[str, Floats]) -> Iterator[pd.DataFrame]:

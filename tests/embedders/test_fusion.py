@@ -237,7 +237,7 @@ def test_retrieval_ranks_by_the_fused_similarity(place: Path) -> None:
             assert [best["path"] for best in line["topk"]] == [paths[1][index] for index in order[number]]
             np.testing.assert_allclose([best["score"] for best in line["topk"]], scores[number], atol=1e-7)
     assert retrieve_pairs(sessions, out, settings={"topk": 5})["skipped"].all()
-    of_index = {"topk": 5, "index": "IVF2,SQ8", "index_candidates": 11, "nprobe": 2}
+    of_index = {"topk": 5, "index": "IVF2,Flat", "index_candidates": 11, "nprobe": 2}
     exact = [Path(path).read_text() for path in table["path"]]
     found = retrieve_pairs(sessions, out, settings=of_index)
     assert [Path(path).read_text() for path in found["path"]] == exact, "all but one are candidates"

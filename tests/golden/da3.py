@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from tests.golden.formula import cameras, numbers, photographs
+from tests.golden.formula import numbers, photographs
 
 HERE = Path(__file__).parent
 SIZES = ("da3-base", "da3-small")
@@ -17,10 +17,7 @@ CASES: dict[str, dict[str, Any]] = {
     "two": {"scene": "house", "views": 2, "size": (70, 98)},
     "four": {"scene": "house", "views": 4, "size": (112, 84)},
     "first": {"scene": "house", "views": 4, "size": (112, 84), "reference": "first"},
-    "all": {"scene": "house", "views": 4, "size": (70, 98), "told": (0, 1, 2, 3)},
-    "some": {"scene": "house", "views": 4, "size": (112, 84), "told": (1, 3)},
 }
-"""Of each, what is told of cameras: nothing, or the cameras of these views."""
 PICTURES = {
     "landscape": (480, 640),
     "portrait": (640, 360),
@@ -33,7 +30,6 @@ PICTURES = {
 # Endings of names, and what a layer's numbers are multiplied by beside 1 / sqrt(fan in).
 _GAINS = {
     "patch_embed.proj.weight": 0.1,
-    "pose_branch.fc2.weight": 0.1,
     "cam_dec.backbone.0.weight": 6.0,
     "cam_dec.backbone.2.weight": 1.4,
     "fc_t.weight": 1.0,
@@ -42,15 +38,13 @@ _GAINS = {
     "conv1.weight": 1.4,
     "output_conv2.2.weight": 0.2,
 }
-# Norms of which the output goes on as tokens; those are kept small, so that the epsilons of norms are seen.
-_SMALL_NORMS = ("pretrained.norm.", "cam_enc.token_norm.", "cam_enc.trunk_norm.")
 
 
 def weight(name: str, shape: tuple[int, ...], normed: bool = False) -> torch.Tensor:
     """Return a parameter by its official name; `normed`: of queries and keys that are normalized after."""
     values = numbers(name, int(np.prod(shape))).reshape(shape)
     kind = name.rsplit(".", 1)[-1]
-    small = 0.1 if any(part in name for part in _SMALL_NORMS) else 1.0
+    small = 0.1 if "pretrained.norm." in name else 1.0  # its output goes on as tokens: the epsilons of norms are seen
     if kind == "gamma":
         values = 0.05 + 0.03 * values
     elif kind == "weight" and len(shape) == 1:  # of a norm
@@ -93,15 +87,11 @@ def state(shapes: dict[str, tuple[int, ...]]) -> dict[str, torch.Tensor]:
 
 
 def inputs(case: str) -> dict[str, Any]:
-    """Return images (S, 3, H, W); with cameras also `extrinsics` (S, 4, 4), NaN where not told, `intrinsics`."""
+    """Return images (S, 3, H, W), and how to choose the reference if the case says it."""
     spec = CASES[case]
     found: dict[str, Any] = {"images": photographs(spec["scene"], spec["views"], *spec["size"])}
     if "reference" in spec:
         found["reference"] = spec["reference"]
-    if "told" in spec:
-        poses, K = cameras(spec["scene"], spec["views"], *spec["size"])
-        poses[[view not in spec["told"] for view in range(spec["views"])]] = np.nan
-        found |= {"extrinsics": torch.from_numpy(poses), "intrinsics": torch.from_numpy(K)}
     return found
 
 

@@ -6,8 +6,6 @@
 
 From the top of this repository. The official code runs as it is, on a CPU in float32, with weights by formula. What it
 imports for its outputs and services only is replaced by nothing, and torchvision by the three transforms of its loader.
-For cameras that are told of some views its own parts are put together: its encoder on these views, its learned token of
-a view that is not the reference for the others.
 
 A tolerance is ten times the largest difference among computations that are equal on paper: one thread, attention
 written out, oneDNN off, float64. Takes two minutes.
@@ -79,12 +77,11 @@ def official(size: str) -> Any:
 
 def run(network: Any, case: str, dtype: torch.dtype) -> dict[str, Any]:
     """Return all outputs of a case, in the order of its views, without the axis of scenes."""
-    from depth_anything_3.api import DepthAnything3
     from depth_anything_3.model.dinov2 import vision_transformer
     from depth_anything_3.model.reference_view_selector import restore_original_order
 
     given = inputs(case)
-    S, _, H, W = given["images"].shape
+    S = len(given["images"])
     images = ((given["images"] - MEAN) / STD)[None].to(dtype)
     trunk = network.backbone.pretrained
     seen: dict[str, Tensor] = {"reference": torch.zeros(1, dtype=torch.long)}
@@ -104,28 +101,14 @@ def run(network: Any, case: str, dtype: torch.dtype) -> dict[str, Any]:
     hooks.append(network.backbone.register_forward_hook(lambda _m, _i, out: seen.update(feats=out[0])))
     with patch.object(vision_transformer, "select_reference_view", selects):
         options = {"ref_view_strategy": given.get("reference", "saddle_balanced")}
-        if "extrinsics" not in given:
-            output = network(images, **options)
-        else:
-            told = list(CASES[case]["told"])
-            poses, K = (given[name][None, told].to(dtype) for name in ("extrinsics", "intrinsics"))
-            poses = DepthAnything3._normalize_extrinsics(None, poses)
-            if len(told) == S:
-                output = network(images, poses, K, **options)
-            else:
-                tokens = trunk.camera_token[:, 1:].repeat(1, S, 1)
-                tokens[:, told] = network.cam_enc(poses, K, (H, W))
-                feats, _ = network.backbone(images, cam_token=tokens, export_feat_layers=[], **options)
-                output = network._process_depth_head(feats, H, W)
-                output = network._process_camera_estimation(feats, H, W, output)
+        output = network(images, **options)
     for hook in hooks:
         hook.remove()
     reference = seen.pop("reference")
     feats = seen.pop("feats")
-    moved = S >= 3 and "extrinsics" not in given
     found = {
         "block2": seen["block2"][0],
-        "block3": (restore_original_order(seen["block3"], reference) if moved else seen["block3"])[0],
+        "block3": (restore_original_order(seen["block3"], reference) if S >= 3 else seen["block3"])[0],
         "tokens": torch.stack([patches[0] for patches, _ in feats]),
         "camera_tokens": feats[-1][1][0],
         "pose_enc": seen["pose_enc"][0],

@@ -32,7 +32,6 @@ from toolkit.features.lightglue import LightGlueMatcher
 from toolkit.features.network import NetworkExtractor
 from toolkit.features.superpoint import SuperPointExtractor
 from toolkit.localizers import network
-from toolkit.localizers.architectures import ARCHITECTURES, estimate_bytes
 from toolkit.localizers.base import View
 from toolkit.localizers.network import NetworkPredictor
 from toolkit.manifest import AlikedSettings
@@ -200,29 +199,18 @@ def test_megaloc_goes_on_in_smaller_batches(weights: dict[str, Path], caplog: py
     assert torch.cuda.memory_allocated() == baseline
 
 
-@pytest.mark.parametrize("views", [6, 11])
-def test_estimates_are_as_measured(weights: dict[str, Path], views: int) -> None:
-    predictor = NetworkPredictor(weights["vggt"], "cuda", "float32", cache_bytes=0)
+def test_vggt_goes_on_with_what_fits(weights: dict[str, Path], caplog: pytest.LogCaptureFixture) -> None:
+    predictor = NetworkPredictor(weights["vggt"], "cuda", "float32", batch_size=24, cache_bytes=0)
     predictor.predict([group(2)])
-    before = torch.cuda.memory_allocated()
-    torch.cuda.reset_peak_memory_stats()
-    predictor.predict([group(views)])
-    peak = torch.cuda.max_memory_allocated() - before
-    estimate = estimate_bytes(ARCHITECTURES["vggt"], 1, views, (294, 518), on_cpu=False)
-    print(f"VGGT, {views} views: {peak / 1e6:.0f} MB, estimated {estimate / 1e6:.0f} MB")
-    assert 0.9 * peak < estimate < 3 * peak
-
-
-def test_vggt_goes_on_with_what_fits(weights: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    """The estimate is wrong here: the memory runs out in earnest."""
-    predictor = NetworkPredictor(weights["vggt"], "cuda", "float32", batch_size=8, cache_bytes=0)
-    expected = [predictor.predict([group(6)])[0] for _ in range(8)]
     baseline = torch.cuda.memory_allocated()
-    monkeypatch.setattr(network, "free_bytes", lambda _: 1 << 60)
-    leave(1.5 * estimate_bytes(ARCHITECTURES["vggt"], 2, 6, (294, 518), on_cpu=False))
-    found = predictor.predict([group(6) for _ in range(8)])
-    for one, other in zip(found, expected, strict=True):
-        np.testing.assert_allclose(one.model_from_cams, other.model_from_cams, atol=1e-3)
+    torch.cuda.reset_peak_memory_stats()
+    [expected] = predictor.predict([group(6)])
+    leave(1.5 * (torch.cuda.max_memory_allocated() - baseline))
+    with caplog.at_level(logging.WARNING):
+        found = predictor.predict([group(6) for _ in range(24)])
+    assert "24 groups of 6 views do not fit the memory of cuda" in caplog.text
+    for one in found:
+        np.testing.assert_allclose(one.model_from_cams, expected.model_from_cams, atol=1e-3)
     assert torch.cuda.memory_allocated() == baseline
 
 

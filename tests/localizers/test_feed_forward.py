@@ -11,7 +11,6 @@ from typing import Any, ClassVar
 import h5py
 import numpy as np
 import pandas as pd
-import pycolmap
 import pytest
 from numpy.typing import NDArray
 
@@ -27,7 +26,6 @@ from toolkit.localizers.feed_forward import (
     FeedForwardAnswer,
     FeedForwardLocalizer,
     QueryPrediction,
-    _other_focal,
 )
 from toolkit.localizers.prediction import Prediction
 from toolkit.localizers.simulated import SimulatedPredictor
@@ -81,56 +79,26 @@ def test_the_covariance_is_that_of_the_rig(world: World) -> None:
     assert abs(far.estimate.position_std_m / np.hypot(arm_m, near.estimate.position_std_m) - 1) < 0.2
 
 
-class Told(SimulatedPredictor):
-    """Is told the poses of the first references, and gives them back."""
+class Refocused(SimulatedPredictor):
+    """Predicts focal lengths that are off by factors."""
 
-    told = 0
     focal_factors = (1.0, 1.0)
     """Of the query's focal length, and of the references'."""
 
     def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
         found = []
         for group, prediction in zip(groups, super().predict(groups), strict=True):
-            conditioned = np.arange(len(group)) - 1 < self.told
-            conditioned[0] = False
             K = np.stack([view.camera.calibration_matrix() for view in group])
             K[:, [0, 1], [0, 1]] *= np.where(np.arange(len(group)) == 0, *self.focal_factors)[:, None]
-            found.append(replace(prediction, conditioned=conditioned, intrinsics=K))
+            found.append(replace(prediction, intrinsics=K))
         return found
-
-
-def test_told_cameras_say_nothing_of_a_networks_focal_lengths() -> None:
-    """It errs by 30 % of all photographs but those that it was told of."""
-    camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=100, height=80, params=[100.0, 50, 40])
-    told = np.array([False, True, True, True, True, False, False, False])
-    K = np.tile(camera.calibration_matrix(), (8, 1, 1))
-    K[~told, [[0], [1]], [[0], [1]]] *= 1.3
-    prediction = Prediction(np.tile(np.eye(4), (8, 1, 1)), intrinsics=K, conditioned=told)
-    assert np.isnan(_other_focal(prediction, [camera] * 8))
-    assert _other_focal(replace(prediction, conditioned=None), [camera] * 8) == pytest.approx(130)
-
-
-def test_references_whose_poses_were_told_confirm_nothing(world: World) -> None:
-    queries, _ = world.queries("ios")
-    predictor = Told(world.sessions, world.files.maps, **LOW)  # type: ignore[arg-type]
-    count = len(answers_of(world.localizer(predictor), queries)[0].cameras[0].references)
-    predictor.told = count - 1
-    for answer in answers_of(world.localizer(predictor), queries):
-        assert answer.estimate.num_inliers == 1
-        assert answer.estimate.status == "low_confidence"
-    predictor.told = count - 3
-    for answer in answers_of(world.localizer(predictor), queries):
-        assert answer.estimate.num_inliers == 3
-    predictor.told = count
-    for answer in answers_of(world.localizer(predictor), queries):
-        assert answer.estimate.status == "failed: no usable reference"
 
 
 @pytest.mark.parametrize(("factors", "sees"), [((1.3, 1.0), 1.3), ((1.3, 1.3), None), ((1.1, 1.0), None)])
 def test_a_network_sees_a_wrong_camera(world: World, factors: tuple[float, float], sees: float | None) -> None:
     """One that errs alike of all photographs, or by 10 %, tells nothing."""
     queries, _ = world.queries("ios")
-    predictor = Told(world.sessions, world.files.maps, **LOW)  # type: ignore[arg-type]
+    predictor = Refocused(world.sessions, world.files.maps, **LOW)  # type: ignore[arg-type]
     predictor.focal_factors = factors
     for (query, _), answer in zip(queries, answers_of(world.localizer(predictor), queries), strict=True):
         estimate, focal_px = answer.estimate, query.views[0].camera.mean_focal_length()

@@ -20,13 +20,13 @@ from toolkit.capture.check import check_capture
 from toolkit.errors import CaptureError
 from toolkit.geometry import invert, make_pose, rotation_angle_deg, transform
 from toolkit.synthetic import capture as capture_writing
-from toolkit.synthetic import render_capture, render_street, textures
+from toolkit.synthetic import render_capture, textures
 from toolkit.synthetic.capture import World
-from toolkit.synthetic.devices import DEVICES, Sensor, looking, scaled, walk_street, walks
+from toolkit.synthetic.devices import DEVICES, Sensor, looking, scaled, walks
 from toolkit.synthetic.light import paint
 from toolkit.synthetic.recording import Emitter, emitters_of, odometry_of, received, scans
 from toolkit.synthetic.render import Rays, render
-from toolkit.synthetic.scene import BLOCK_M, Quad, Scene, build_block, build_room
+from toolkit.synthetic.scene import Quad, Scene, build_room
 
 
 def coarse_room(seed: int, index: int, look: int | None = None) -> Scene:
@@ -215,50 +215,6 @@ def test_queries_are_away_from_the_map_but_see_it() -> None:
                 assert (np.abs(local[:, :2]) < [w / 2 - 0.8, d / 2 - 0.8]).all()
                 assert (local[:, 2] > 0.5).all()
                 assert (local[:, 2] < 2).all()
-
-
-def test_the_walk_through_a_street_goes_on_from_block_to_block() -> None:
-    blocks = [walk_street(build_block(0, index), 0, {"map": 50, "query": 3}, "ios") for index in range(3)]
-    for split, part in (("map", 0), ("map", 1)):
-        poses = np.concatenate([block[split, part] for block in blocks])
-        steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-        assert len(poses) == 3 * 25
-        assert steps.max() < 0.6
-        assert rotation_angle_deg((invert(poses[:-1]) @ poses[1:])[:, :3, :3]).max() < 16
-        assert np.ptp(poses[:, 0, 3]) == pytest.approx(3 * BLOCK_M[0], abs=0.5)
-    assert [len(blocks[0]["query", part]) for part in range(2)] == [2, 1]
-
-
-@pytest.mark.slow
-def test_a_street_is_seen_beyond_its_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def coarse_block(seed: int, index: int) -> Scene:
-        block = build_block(seed, index)
-        for quad in block.quads:
-            quad.ppm /= 2
-        return block
-
-    monkeypatch.setattr(capture_writing, "build_block", coarse_block)
-    render = partial(render_street, frames=4, queries=1, progress=False)
-    folders = [render(tmp_path / name, blocks=blocks) for name, blocks in (("ALONE", 1), ("STREET", 2))]
-    assert render(folders[1], blocks=2) == folders[1]
-    alone, street = (Capture.open(folder)["ios_map"] for folder in folders)
-    assert (len(alone.images), len(street.images)) == (4, 8)
-    assert len(Capture.open(folders[1])["ios_query"].images) == 2
-    assert not (street.path / "depths.txt").exists()
-    camera = street.camera(street.images["sensor_id"][0])
-    assert (camera.width, camera.height) == (480, 360)
-    differing = {}
-    for row, name in enumerate(alone.image_names):
-        other = street.row_of_name[name]
-        pose = alone.world_from_cam()[row]
-        np.testing.assert_array_equal(pose, street.world_from_cam()[other])
-        images = [cv2.imread(str(one.image_path(at))).astype(int) for one, at in ((alone, row), (street, other))]
-        differing[pose[0, 3]] = (abs(images[0] - images[1]).max(axis=2) > 40).mean()
-    # Who stands at the end of the first block sees the second one where there is one.
-    assert differing[max(differing)] > 0.1
-    assert differing[min(differing)] < 0.02
-    with pytest.raises(CaptureError, match="blocks"):
-        render(tmp_path / "NONE", blocks=0)
 
 
 def digest(folder: Path) -> dict[str, str]:

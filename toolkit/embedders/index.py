@@ -8,7 +8,6 @@ import logging
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +26,6 @@ faiss: Any = typed_faiss  # its type stubs are incomplete
 
 EXACT = "Flat"
 """Factory string of the exact search, which needs no index."""
-_EXPECTED = (
-    f"Expected a string of FAISS's index factory, such as PCA512,IVF4096,RaBitQ; {EXACT} searches without an index."
-)
 _BLOCK_BYTES = 128 << 20
 """Vectors added to an index at a time, bytes of float32: bounds the memory."""
 _TRAIN_BYTES = 1 << 30
@@ -57,39 +53,15 @@ class VectorIndex:
             allowed: (N,) rows that may be returned; None: all.
         """
         count = min(self.candidates, self.index.ntotal)
-        if allowed is None:
-            return self._search(query, count)
-        try:
-            return self._search(query, count, faiss.IDSelectorBitmap(np.packbits(allowed, bitorder="little")))
-        except RuntimeError:  # LSH, PQ, NSG and some other indexes do not support selectors
-            return self._search_and_filter(query, count, allowed)
-
-    def _search(self, query: NDArray[np.float32], count: int, selector: Any = None) -> Ints:
+        selector = None if allowed is None else faiss.IDSelectorBitmap(np.packbits(allowed, bitorder="little"))
         _, rows = self.index.search(query, count, params=self._parameters(self.index, selector))
         return np.asarray(rows, np.int64)
-
-    def _search_and_filter(self, query: NDArray[np.float32], count: int, allowed: NDArray[np.bool_]) -> Ints:
-        """Search without a selector: ask for more rows until `count` of them are allowed."""
-        candidates = np.full((len(query), count), -1, np.int64)
-        for row, vector in zip(candidates, query[:, None], strict=True):
-            depth = count
-            while True:
-                rows = self._search(vector, depth)[0]
-                rows = rows[(rows >= 0) & allowed[rows]][:count]
-                if len(rows) == count or depth == self.index.ntotal:
-                    break
-                depth = min(4 * depth, self.index.ntotal)
-            row[: len(rows)] = rows
-        return candidates
 
     def _parameters(self, index: Any, selector: Any) -> Any:
         index = faiss.downcast_index(index)
         selection = {} if selector is None else {"sel": selector}
         if isinstance(index, faiss.IndexPreTransform):
             return faiss.SearchParametersPreTransform(index_params=self._parameters(index.index, selector))
-        if isinstance(index, faiss.IndexRefine):
-            base = self._parameters(index.base_index, selector)
-            return faiss.IndexRefineSearchParameters(k_factor=index.k_factor, base_index_params=base)
         if isinstance(index, faiss.IndexIVF):
             nprobe = self.nprobe or max(16, index.nlist // 32)
             if isinstance(index, faiss.IndexIVFRaBitQ):
@@ -207,29 +179,11 @@ def _is_needed(settings: RetrieveSettings, vectors: StoredVectors) -> bool:
     index = faiss.downcast_index(empty)
     least = [settings.index_candidates]
     if isinstance(index, faiss.IndexPreTransform):
-        least += [index.chain.at(step).d_out for step in range(index.chain.size())]
+        least.append(index.chain.at(0).d_out)
         index = faiss.downcast_index(index.index)
     if isinstance(index, faiss.IndexIVF):
         least.append(index.nlist)
     return len(vectors) > max(least)
-
-
-def check_factory(factory: str) -> None:
-    """Check that FAISS's index factory accepts a string for at least one usual descriptor length.
-
-    Raises:
-        ManifestError: it does not.
-    """
-    reasons = []
-    for dim in () if factory == EXACT else (8448, 15360, 512):  # MegaLoc, a length with many divisors, VLAD
-        try:
-            faiss.index_factory(dim, factory)
-        except RuntimeError as error:
-            reasons.append(_reason(error))
-        else:
-            return
-    if reasons:
-        raise ManifestError(f"retrieve.index: found {factory!r} ({reasons[0]}). {_EXPECTED}")
 
 
 def _empty(vectors: StoredVectors, factory: str) -> Any:
@@ -240,7 +194,7 @@ def _empty(vectors: StoredVectors, factory: str) -> Any:
     except RuntimeError as error:
         raise ManifestError(
             f"retrieve.index: {factory!r} cannot hold vectors of {vectors.dim} dimensions ({_reason(error)}). "
-            f"{_EXPECTED}"
+            f"{EXACT} searches without an index."
         ) from error
 
 
@@ -286,7 +240,7 @@ def _reason(error: RuntimeError) -> str:
 
 
 def _train(index: Any, vectors: StoredVectors) -> None:
-    """Train the steps of an index in order. Steps after PCA see shorter vectors, so more of them fit in memory."""
+    """Train PCA, if the index starts with it, then the rest. Behind PCA vectors are shorter, so more fit in memory."""
     rng = np.random.default_rng(0)
     index = faiss.downcast_index(index)
     transforms = list[Callable[[NDArray[np.float32]], NDArray[np.float32]]]()
@@ -305,12 +259,9 @@ def _train(index: Any, vectors: StoredVectors) -> None:
     if not isinstance(index, faiss.IndexPreTransform):
         _train_last(index, sample)
         return
-    for step in range(index.chain.size()):
-        transform = faiss.downcast_VectorTransform(index.chain.at(step))
-        if not transform.is_trained:
-            train = partial(_train_pca, transform) if isinstance(transform, faiss.PCAMatrix) else transform.train
-            train(sample(transform.d_in, _TRAIN_PER_UNIT * transform.d_out))
-        transforms.append(transform.apply)
+    pca = faiss.downcast_VectorTransform(index.chain.at(0))
+    _train_pca(pca, sample(pca.d_in, _TRAIN_PER_UNIT * pca.d_out))
+    transforms.append(pca.apply)
     _train_last(faiss.downcast_index(index.index), sample)
     index.is_trained = True
 

@@ -21,12 +21,6 @@ if TYPE_CHECKING:
 
 Size = tuple[int, int]
 HEADS = ("camera", "depth")
-_KEPT = 32
-"""Bytes per token value that any network keeps of the layers for the depth head, see `Memory`."""
-_DENSE_FRAMES = 8
-"""Frames that the depth head processes at once; one on a CPU."""
-_RESULT_PIXEL = 24
-"""Bytes per pixel of the result."""
 
 
 @dataclass(frozen=True)
@@ -44,21 +38,6 @@ class Layout:
     """(S, 2) in pixels of the network images."""
 
 
-@dataclass(frozen=True)
-class Memory:
-    """Peak memory of a network in bytes, beside its weights, measured in float32.
-
-    A token value is one of views x tokens x channels.
-    """
-
-    trunk: int
-    """Bytes per token value inside a block."""
-    dense_pixel: int
-    """Bytes per pixel of a frame in the depth head."""
-    dense: int
-    """Bytes of the depth head that do not depend on the number of pixels."""
-
-
 class Architecture(ABC):
     """A network that predicts cameras and depth of the views of one scene."""
 
@@ -73,9 +52,6 @@ class Architecture(ABC):
     weights: WeightsSource
     patch: int
     """Side of a patch, pixels."""
-    special_tokens: int
-    """Tokens of a view beside its patches."""
-    memory: Memory
 
     @abstractmethod
     def lay_out(self, sizes: Sequence[Size]) -> Layout:
@@ -85,7 +61,7 @@ class Architecture(ABC):
         """Return the network, on the CPU.
 
         It has `encode(images)` and is called as `network(images, heads, tokens)`, which returns the outputs of its
-        heads. If it accepts cameras, also as `(images, heads, tokens, extrinsics, intrinsics)`, see `DepthAnything3`.
+        heads.
 
         Raises:
             WeightsError: the file does not belong to this network.
@@ -118,31 +94,6 @@ class Architecture(ABC):
         return import_module(f"toolkit.models.{self.package}")
 
 
-def estimate_bytes(
-    architecture: Architecture,
-    groups: int,
-    views: int,
-    size: Size,
-    channels: int = 1024,
-    on_cpu: bool = True,
-) -> int:
-    """Return the memory in bytes that a network needs, beside its weights, for a batch of groups of views.
-
-    Args:
-        architecture: the network.
-        groups, views: number of groups, and of views per group.
-        size: (H, W) of the network images.
-        channels: channels of a token.
-        on_cpu: whether it runs on a CPU, where the depth head processes one frame at a time.
-    """
-    (height, width), memory, frames = size, architecture.memory, groups * views
-    patches = (height // architecture.patch) * (width // architecture.patch)
-    numbers = frames * (architecture.special_tokens + patches) * channels
-    together = 1 if on_cpu else min(frames, _DENSE_FRAMES)
-    dense = memory.dense_pixel * height * width * together + memory.dense
-    return _KEPT * numbers + max(memory.trunk * numbers, dense) + _RESULT_PIXEL * frames * height * width
-
-
 class VggtArchitecture(Architecture):
     """VGGT-1B, with uncropped photographs.
 
@@ -156,8 +107,6 @@ class VggtArchitecture(Architecture):
     package = "vggt"
     weights = weights.VGGT
     patch = 14
-    special_tokens = 5
-    memory = Memory(trunk=42, dense_pixel=1500, dense=32 << 20)
     _side = 518
 
     def lay_out(self, sizes: Sequence[Size]) -> Layout:
@@ -181,8 +130,6 @@ class OmegaArchitecture(Architecture):
     package, network = "omega", "VGGTOmega"
     weights = weights.VGGT_OMEGA
     patch = 16
-    special_tokens = 17
-    memory = Memory(trunk=42, dense_pixel=630, dense=0)
 
     def lay_out(self, sizes: Sequence[Size]) -> Layout:
         from toolkit.models.omega.preprocess import cropped_size, resized_size
@@ -202,13 +149,11 @@ class Da3Architecture(Architecture):
 
     package, network = "da3", "DepthAnything3"
     patch = 14
-    special_tokens = 1
 
-    def __init__(self, name: str, channels: int, memory: Memory) -> None:
+    def __init__(self, name: str, channels: int) -> None:
         self.name = name
         self.weights = weights.DA3[name]
         self.title = self.weights.model
-        self.memory = memory
         self._channels = channels
 
     def lay_out(self, sizes: Sequence[Size]) -> Layout:
@@ -229,15 +174,13 @@ class Da3Architecture(Architecture):
         return network
 
 
-_DA3_BASE = Memory(trunk=44, dense_pixel=750, dense=0)
-_DA3_SMALL = Memory(trunk=44, dense_pixel=505, dense=0)
 ARCHITECTURES: dict[str, Architecture] = {
     architecture.name: architecture
     for architecture in (
         VggtArchitecture(),
         OmegaArchitecture(),
-        Da3Architecture("da3-base", 768, _DA3_BASE),
-        Da3Architecture("da3-small", 384, _DA3_SMALL),
+        Da3Architecture("da3-base", 768),
+        Da3Architecture("da3-small", 384),
     )
 }
 """The networks by name of the predictor."""

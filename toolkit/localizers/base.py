@@ -43,8 +43,6 @@ class View:
     turns: int = 0
     """Counter-clockwise quarter turns that make the image upright, see `capture.upright`. Networks get the turned
     image; their outputs are turned back to the stored image."""
-    world_from_cam: Floats | None = None
-    """(4, 4), known for map images; used by networks that accept poses, see `Prediction.conditioned`."""
 
 
 @dataclass(frozen=True)

@@ -172,9 +172,7 @@ class FeedForwardLocalizer:
         """Return a map image as the network gets it."""
         name = self.map.image_names[index]
         row = self._session.row_of_name[name]
-        turns = int(self._turns[row])
-        pose = self.map.world_from_cams[index]
-        return View(name, self._session.image_path(row), self.map.cameras[index], True, turns, pose)
+        return View(name, self._session.image_path(row), self.map.cameras[index], True, int(self._turns[row]))
 
     def _choose(self, references: References) -> Ints:
         """Choose the references of one query image."""
@@ -223,8 +221,7 @@ class FeedForwardLocalizer:
             return CameraAnswer(references, prediction, reason=reason)
         ratios = [self._depth_ratios(int(index), prediction, view) for view, index in enumerate(references, start=1)]
         world = self.map.world_from_cams[references]
-        conditioned = np.zeros(len(references), bool) if prediction.conditioned is None else prediction.conditioned[1:]
-        alignment = align_to_map(model[1:], world, ~conditioned, ratios if any(len(r) for r in ratios) else None)
+        alignment = align_to_map(model[1:], world, depth_ratios=ratios if any(len(r) for r in ratios) else None)
         if not np.isfinite(alignment.rotation_std_deg):
             reason = alignment.reason or "the rotation is unknown"
             return CameraAnswer(references, prediction, alignment, reason=reason, depth_ratios=tuple(ratios))
@@ -321,8 +318,7 @@ def _other_focal(prediction: Prediction, cameras: Sequence[pycolmap.Camera]) -> 
     predicted_px = prediction.intrinsics[:, [0, 1], [0, 1]].mean(axis=1)
     ratios = predicted_px / [camera.mean_focal_length() for camera in cameras]
     logs = np.log(np.where(np.isfinite(ratios) & (ratios > 0), ratios, np.nan))
-    conditioned = np.zeros(len(cameras), bool) if prediction.conditioned is None else prediction.conditioned
-    of_references = logs[1:][np.isfinite(logs[1:]) & ~conditioned[1:]]
+    of_references = logs[1:][np.isfinite(logs[1:])]
     if not len(of_references) or not np.isfinite(logs[0]):
         return np.nan
     middle = float(np.median(of_references))

@@ -10,12 +10,9 @@ import pycolmap
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit import geometry
-from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import CameraError, ImageError
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import PoseEstimate, RoughPose, carried_over
-from toolkit.localizers.bundle import Observations
-from toolkit.localizers.gravity import measured_gravity
 from toolkit.localizers.map import Map
 from toolkit.localizers.odometry import Odometry, cut, with_measured_drift
 from toolkit.localizers.picture import Picture, localize_image
@@ -113,8 +110,6 @@ def localize_sequence(
             for rows in pieces
             for part in cut(odometry.part(rows), queries.part(rows), settings)
         ]
-    tracks = [(odometry.part(rows), queries.part(rows)) for rows in pieces]
-    gravity = measured_gravity(tracks, lambda: up_of_cameras(map_.session.world_from_cam()), settings)
     for number, rows in enumerate(pieces):
         piece[rows] = number
         frames = np.array([frame for frame in single if rows.start <= frame < rows.stop], np.int64)
@@ -122,13 +117,8 @@ def localize_sequence(
         def localize_again(todo: Sequence[tuple[int, RoughPose]], start: int = rows.start) -> list[PoseEstimate]:
             return [localize(images[start + frame], cams_of_frames[start + frame], near) for frame, near in todo]
 
-        def observe(frame: int, again: PoseEstimate | None, start: int = rows.start) -> Observations:
-            estimate, cams = again or single[start + frame], cams_of_frames[start + frame]
-            rig = np.eye(4)[None] if rig_from_cams is None else np.asarray(rig_from_cams, np.float64)
-            return Observations.of(estimate.correspondences, cams if isinstance(cams, list | tuple) else [cams], rig)
-
         relocalize = localize_again if settings.relocalize else None
-        done = localize_piece(*tracks[number], frames - rows.start, settings, relocalize, gravity, observe)
+        done = localize_piece(odometry.part(rows), queries.part(rows), frames - rows.start, settings, relocalize)
         again |= {rows.start + frame: estimate for frame, estimate in done.again.items()}
         placed.append(done.placed)
     return LocalizedFrames(

@@ -1,10 +1,10 @@
-"""A network as a predictor: batching of views, choice of device, cache of encodings, and limits of memory."""
+"""A network as a predictor: batching of views, choice of device, and cache of encodings."""
 
 import logging
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,11 +16,11 @@ from toolkit.capture.turning import turn_image, turned_from_cam
 from toolkit.errors import ImageError, ManifestError, ToolkitError, first_line
 from toolkit.files import files_fingerprint
 from toolkit.geometry import invert, make_pose
-from toolkit.localizers.architectures import ARCHITECTURES, HEADS, Architecture, Size, estimate_bytes
+from toolkit.localizers.architectures import ARCHITECTURES, HEADS, Architecture, Size
 from toolkit.localizers.base import View
-from toolkit.localizers.placed import PlacedView, conditioned_views, input_cameras, shown_size
+from toolkit.localizers.placed import PlacedView, shown_size
 from toolkit.localizers.prediction import Prediction
-from toolkit.models.compute import PRECISIONS, Fitting, free_bytes, on_device, resolve_device, resolve_precision
+from toolkit.models.compute import PRECISIONS, Fitting, on_device, resolve_device, resolve_precision
 from toolkit.models.weights import resolve_weights
 
 if TYPE_CHECKING:
@@ -35,10 +35,6 @@ CACHE_BYTES = 2 << 30
 """Size of the cache for encodings of map images: 500 of them at 518 x 392 in float32, twice as many in bfloat16."""
 _GROUPS_AT_A_TIME = 8  # on a CPU 1: one group keeps it busy, and a batch needs more memory and is not faster
 _IMAGES_AT_A_TIME = 8
-# The accelerator holds the cache itself if it has this many times CACHE_BYTES free beside the weights.
-_ROOM_FOR_CACHE = 4
-# Share of the free memory to plan with; the rest is for other programs and for errors of the estimate.
-_MEMORY_SHARE = 0.8
 _LEAST_VIEWS = 2  # the query and one reference
 
 
@@ -68,11 +64,6 @@ class TokenCache:
         while self.bytes > self.max_bytes:
             self.bytes -= self._kept.popitem(last=False)[1].nbytes
 
-    def clear(self) -> None:
-        """Empty the cache."""
-        self._kept.clear()
-        self.bytes = 0
-
 
 class NetworkPredictor:
     """Runs a network. The constructor finds the weights, the first prediction loads them.
@@ -92,7 +83,6 @@ class NetworkPredictor:
         cache_bytes: int = CACHE_BYTES,
         architecture: Architecture = ARCHITECTURES["vggt"],
         compile: bool = False,  # noqa: A002
-        conditioned: bool = False,
     ) -> None:
         """
         Args:
@@ -100,11 +90,9 @@ class NetworkPredictor:
             compute_device, dtype_compute: see `models.compute`. float16 is refused, as activations of the trunk may
                 overflow it; `auto` takes float32 where it would choose float16. The heads always run in float32.
             batch_size: largest number of groups per batch; None takes a default for the device.
-            cache_bytes: memory for encodings of map images, on the device if it has plenty, else on the CPU.
+            cache_bytes: memory of the CPU for encodings of map images.
             architecture: the network.
             compile: see `PredictorSettings`.
-            conditioned: give the network the intrinsics of all views, and the poses of every other reference if there
-                are at least `placed.LEAST_REFERENCES`. Only for networks that accept cameras.
 
         Raises:
             ManifestError: the precision does not exist or is float16.
@@ -115,7 +103,6 @@ class NetworkPredictor:
             title = architecture.title
             raise ManifestError(f"dtype_compute is {dtype_compute!r}; {title} expects one of {', '.join(expected)}.")
         self._architecture, self.name = architecture, architecture.name
-        self.conditioned = conditioned
         self.checkpoint = resolve_weights(architecture.weights, checkpoint)
         self.compute_device, self.dtype_compute = compute_device, dtype_compute
         self._batch_size = batch_size
@@ -130,8 +117,7 @@ class NetworkPredictor:
         """Everything besides the views that the predictions depend on. The device only changes rounding."""
         weights = files_fingerprint([self.checkpoint])
         precision = str(self._dtype).removeprefix("torch.")
-        settings = {"name": self.name, "weights": weights, "dtype_compute": precision, "depth": True}
-        return settings | ({"conditioned": True} if self.conditioned else {})
+        return {"name": self.name, "weights": weights, "dtype_compute": precision, "depth": True}
 
     @cached_property
     def _device(self) -> "torch.device":
@@ -148,14 +134,6 @@ class NetworkPredictor:
     def _model(self) -> Any:
         return _load_network(self._architecture, self.checkpoint, self._dtype, self._device, self._compile)
 
-    @cached_property
-    def _kept_on(self) -> "torch.device":
-        """Device that holds the cache."""
-        import torch
-
-        plenty = free_bytes(self._device) >= _ROOM_FOR_CACHE * self._cache.max_bytes
-        return self._device if plenty else torch.device("cpu")
-
     def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
         """Return a prediction for each group of views. The first view of a group is the query.
 
@@ -164,10 +142,10 @@ class NetworkPredictor:
 
         - The file is missing, cannot be decoded, or does not have the size of its camera. If this is the query, the
           whole prediction is NaN, without depth, and gives the reason.
-        - The group does not fit the memory; then its last references are left out.
+        - The group alone does not fit the memory; then it is halved, and its last references are left out.
 
         No other error is raised for a group, and groups do not influence each other. Groups with equal numbers of views
-        and equal image size run in one batch, as far as the memory allows.
+        and equal image size run in one batch. A batch that does not fit the memory is halved.
 
         Args:
             groups: views of photographs.
@@ -184,10 +162,10 @@ class NetworkPredictor:
         for number, group in enumerate(placed):
             if group:
                 alike.setdefault((len(group), group[0].size), []).append(number)
-        for (views, size), numbers in alike.items():
-            batch_size, views = self._plan(len(numbers), views, size)
+        batch_size = self._batch_size or (1 if self._device.type == "cpu" else _GROUPS_AT_A_TIME)
+        for numbers in alike.values():
             batches = [numbers[start : start + batch_size] for start in range(0, len(numbers), batch_size)]
-            encoded = self._encoded([[placed[number][:views] for number in batch] for batch in batches], begun)
+            encoded = self._encoded([[placed[number] for number in batch] for batch in batches], begun)
             for batch, tokens in zip(batches, encoded, strict=True):
                 for number, prediction in self._run(batch, [placed[number] for number in batch], tokens).items():
                     results[number] = prediction
@@ -197,24 +175,6 @@ class NetworkPredictor:
         """Return the views of a group with their places in network images of one size."""
         layout = self._architecture.lay_out([shown_size(view) for view in group])
         return [PlacedView(view, layout, number) for number, view in enumerate(group)]
-
-    def _plan(self, count: int, views: int, size: Size) -> Size:
-        """Return the number of groups per batch and of views per group that fit the free memory."""
-        channels = self._model.channels
-        on_cpu = self._device.type == "cpu"
-        estimate = partial(estimate_bytes, self._architecture, size=size, channels=channels, on_cpu=on_cpu)
-        growing = 0 if self._kept_on.type == "cpu" else self._cache.max_bytes - self._cache.bytes
-        free = int(_MEMORY_SHARE * free_bytes(self._device)) - growing
-        batch = min(self._batch_size or (1 if on_cpu else _GROUPS_AT_A_TIME), count)
-        while batch > 1 and estimate(batch, views) > free:
-            batch -= 1
-        fitting = views
-        while fitting > _LEAST_VIEWS and estimate(batch, fitting) > free:
-            fitting -= 1
-        if fitting < views:
-            log.warning("%d views of %d x %d need %.1f GB of memory, %s has %.1f GB to spare: using the first %d",
-                        views, *size[::-1], estimate(1, views) / 1e9, self._device, free / 1e9, fitting)  # fmt: skip
-        return batch, fitting
 
     def _read_ahead(self, groups: Sequence[list[PlacedView]], following: Sequence[list[PlacedView]]) -> "_Begun":
         """Start to decode the first photographs of the following groups; return those that the last call started.
@@ -303,29 +263,11 @@ class NetworkPredictor:
         for start in range(0, len(images), _IMAGES_AT_A_TIME):
             part = images[start : start + _IMAGES_AT_A_TIME]
             batch = torch.stack([image for _, image in part])
-            try:
-                encoded = fitting(batch)
-            except ToolkitError:
-                if not self._makes_room():
-                    raise
-                encoded = fitting(batch)
-            for (placed, _), of_image in zip(part, encoded.to(self._kept_on, dtype), strict=True):
+            for (placed, _), of_image in zip(part, fitting(batch).to("cpu", dtype), strict=True):
                 tokens[placed.key] = of_image.clone()  # a view would keep the whole batch in memory
                 if placed.view.in_map:
                     self._cache.put(placed.key, tokens[placed.key])
         return tokens
-
-    def _makes_room(self) -> bool:
-        """Move the cache to the CPU, empty; tell whether that frees memory of the device."""
-        import torch
-
-        if self._kept_on.type == "cpu" or not self._cache.bytes:
-            return False
-        log.warning("%s has no more room for the encodings of map images: the CPU will hold them", self._device)
-        self._cache.clear()
-        self._fitting.clear()
-        self._kept_on = torch.device("cpu")
-        return True
 
     def _run(
         self, numbers: Sequence[int], groups: Sequence[list[PlacedView]], tokens: "Sequence[list[Tensor | str]]"
@@ -340,39 +282,26 @@ class NetworkPredictor:
                 results[number] = _nothing(len(group), of_group[0])
                 continue
             encoded = {index: one for index, one in enumerate(of_group) if not isinstance(one, str)}
-            stacked = torch.stack([one.to(self._kept_on) for one in encoded.values()])
+            stacked = torch.stack(list(encoded.values()))
             alike.setdefault(len(encoded), []).append((number, group, list(encoded), stacked))
         for rows in alike.values():
-            shown = [[group[index] for index in readable] for _, group, readable, _ in rows]
-            output = self._forward(torch.stack([stacked for *_, stacked in rows]), shown).numpy()
-            for (number, group, readable, _), views, values in zip(rows, shown, output, strict=True):
-                conditioned = self._conditioned(views[: len(values)])
-                results[number] = self._prediction(group, readable[: len(values)], values, conditioned)
+            output = self._forward(torch.stack([stacked for *_, stacked in rows]), rows[0][1][0].size).numpy()
+            for (number, group, readable, _), values in zip(rows, output, strict=True):
+                results[number] = self._prediction(group, readable[: len(values)], values)
         return results
 
-    def _conditioned(self, views: Sequence[PlacedView]) -> NDArray[np.bool_]:
-        """Return which of the input views (S,) the network gets with their poses."""
-        return conditioned_views(views) if self.conditioned else np.zeros(len(views), bool)
-
-    def _forward(self, tokens: "Tensor", groups: Sequence[Sequence[PlacedView]]) -> "Tensor":
+    def _forward(self, tokens: "Tensor", size: Size) -> "Tensor":
         """Return outputs (B, S, 9 + 2 H W) on the CPU for tokens (B, S, P, C); S shrinks if the memory is too small."""
         import torch
 
-        size = groups[0][0].size
         while True:
             views = min(tokens.shape[1], self._most_views.get(size, tokens.shape[1]))
-            cameras = []
-            if any(self._conditioned(group[:views]).any() for group in groups):
-                poses, intrinsics = zip(*(input_cameras(group[:views]) for group in groups), strict=True)
-                cameras = [torch.from_numpy(np.stack(poses)), torch.from_numpy(np.stack(intrinsics))]
             new = Fitting(self._network(size), f"groups of {views} views", self._device)
             run = self._fitting.setdefault((views, size), new)
             try:
                 with torch.inference_mode():
-                    return run(tokens[:, :views], *cameras)
+                    return run(tokens[:, :views])
             except ToolkitError as error:
-                if self._makes_room():
-                    continue
                 if views <= _LEAST_VIEWS:
                     raise ToolkitError(
                         f"The memory of {self._device} does not hold {self._architecture.title} with {views} views of "
@@ -381,21 +310,19 @@ class NetworkPredictor:
             self._most_views[size] = max(_LEAST_VIEWS, views // 2)
             log.warning("continuing with the first %d views of each group", self._most_views[size])
 
-    def _network(self, size: Size) -> "Callable[..., Tensor]":
-        """Return the network as a function of tokens (B, S, P, C) and input cameras, if any, for images (H, W)."""
+    def _network(self, size: Size) -> "Callable[[Tensor], Tensor]":
+        """Return the network as a function of tokens (B, S, P, C) of images (H, W)."""
         import torch
 
-        def run(tokens: "Tensor", *cameras: "Tensor") -> "Tensor":
+        def run(tokens: "Tensor") -> "Tensor":
             images = torch.empty(*tokens.shape[:2], 3, *size, device="meta")
-            output = self._model(images, HEADS, tokens.float(), *cameras)
+            output = self._model(images, HEADS, tokens.float())
             dense = [output[name].flatten(2) for name in ("depth", "depth_conf")]
             return torch.cat([output["pose_enc"], *dense], dim=-1).cpu()
 
         return run
 
-    def _prediction(
-        self, group: list[PlacedView], shown: Sequence[int], output: NDArray[np.float32], conditioned: NDArray[np.bool_]
-    ) -> Prediction:
+    def _prediction(self, group: list[PlacedView], shown: Sequence[int], output: NDArray[np.float32]) -> Prediction:
         """Convert the network output (shown views, 9 + 2 H W) to the prediction of a group."""
         poses, intrinsics = np.full((len(group), 4, 4), np.nan), np.full((len(group), 3, 3), np.nan)
         size = group[0].size
@@ -406,7 +333,6 @@ class NetworkPredictor:
                 poses[index] = model_from_turned @ turned_from_cam(group[index].view.turns)
                 intrinsics[index] = group[index].intrinsics(K)
         map_from_image = np.stack([placed.map_from_image for placed in group])
-        mask = np.isin(np.arange(len(group)), np.array(shown)[conditioned]) if conditioned.any() else None
         depth = [placed.turned_back(np.full(size, np.nan, np.float32)) for placed in group]
         confidence = [placed.turned_back(np.zeros(size, np.float32)) for placed in group]
         maps = output[:, 9:].reshape(len(shown), 2, *size)
@@ -414,7 +340,7 @@ class NetworkPredictor:
             placed, outside = group[index], group[index].outside
             depth[index] = placed.turned_back(np.where(outside, np.float32(np.nan), depth_map))
             confidence[index] = placed.turned_back(np.where(outside, np.float32(np.nan), confidence_map))
-        return Prediction(poses, depth, confidence, map_from_image, intrinsics, mask)
+        return Prediction(poses, depth, confidence, map_from_image, intrinsics)
 
 
 _loaded: dict[tuple[Any, ...], Any] = {}

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from toolkit import geometry
 from toolkit.errors import ManifestError
 from toolkit.geometry import Floats, Ints
-from toolkit.localizers.gravity import Gravity
 from toolkit.localizers.odometry import (
     Odometry,
     PosedQueries,
@@ -83,13 +82,8 @@ def place_online(odometry: Odometry, queries: PosedQueries, frames: Ints, settin
     return piece
 
 
-def place_piece(
-    odometry: Odometry, queries: PosedQueries, settings: SequenceSettings, gravity: Gravity | None = None
-) -> PlacedPiece:
+def place_piece(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> PlacedPiece:
     """Return the poses of a piece of odometry, from the poses of single queries in it.
-
-    Args:
-        gravity: the up direction in the odometry and the map; None: unknown.
 
     Raises:
         ManifestError: GTSAM is not installed.
@@ -98,15 +92,13 @@ def place_piece(
     if not len(queries):
         nothing = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan), np.zeros(0, bool)
         return PlacedPiece(*nothing, np.full(count, "failed: no query of this piece has a pose", object))
-    if gravity is not None:
-        queries = gravity.upright(odometry, queries, settings)
     best = place(odometry, queries, settings)[0]
     used, seen = best.members, set[bytes]()
     for _ in range(_ROUNDS):
         chosen = queries.choose(used)
         scale = fitted_scale(odometry, chosen, settings)
         moved = odometry.scaled(scale)
-        poses, covariances = _optimized(moved, chosen, settings, gravity)
+        poses, covariances = _optimized(moved, chosen, settings)
         seen.add(used.tobytes())
         # Use the queries that fit the solution, whether or not they voted for this placement.
         fit = np.flatnonzero(_chi2(poses, covariances, queries) < _CHI2_999)
@@ -145,14 +137,12 @@ def _chi2(poses: Floats, covariances: Floats, queries: PosedQueries) -> Floats:
     return np.asarray(np.einsum("qi,qi->q", difference, np.linalg.solve(total, difference[..., None])[..., 0]))
 
 
-def _optimized(
-    odometry: Odometry, queries: PosedQueries, settings: SequenceSettings, gravity: Gravity | None
-) -> tuple[Floats, Floats]:
+def _optimized(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> tuple[Floats, Floats]:
     """Solve the pose graph. Return world_from_rig (N, 4, 4) and covariances (N, 6, 6)."""
     gtsam = require_gtsam()
-    graph, values = motion_graph(odometry, queries, settings, gravity), gtsam.Values()
+    graph, values = _motion_graph(odometry, queries, settings), gtsam.Values()
     for number, pose in enumerate(first_guess(odometry, queries)):
-        values.insert(number, gtsam.Pose3(rigid(pose)))
+        values.insert(number, gtsam.Pose3(_rigid(pose)))
     result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     marginals = gtsam.Marginals(graph, result)
     numbers = range(len(odometry))
@@ -160,10 +150,8 @@ def _optimized(
     return poses, np.stack([marginals.marginalCovariance(number) for number in numbers])
 
 
-def motion_graph(
-    odometry: Odometry, queries: PosedQueries, settings: SequenceSettings, gravity: Gravity | None
-) -> Any:
-    """Return GTSAM's graph of N poses, with factors for odometry steps, poses of queries, and the up direction."""
+def _motion_graph(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> Any:
+    """Return GTSAM's graph of N poses, with factors for odometry steps and poses of queries."""
     gtsam = require_gtsam()
     graph = gtsam.NonlinearFactorGraph()
     steps = geometry.invert(odometry.odom_from_rig[:-1]) @ odometry.odom_from_rig[1:]
@@ -175,23 +163,16 @@ def motion_graph(
     rotation_std, position_std = np.maximum(rotation_std, 1e-4), np.maximum(position_std, 1e-3)
     for number, step in enumerate(steps):
         noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([rotation_std[number], position_std[number]], 3))
-        graph.add(gtsam.BetweenFactorPose3(number, number + 1, gtsam.Pose3(rigid(step)), noise))
+        graph.add(gtsam.BetweenFactorPose3(number, number + 1, gtsam.Pose3(_rigid(step)), noise))
     kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(3.0)
     for frame, pose, covariance in zip(queries.frames.tolist(), queries.world_from_rig, floored(queries.covariances),
                                        strict=True):  # fmt: skip
         noise = gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Gaussian.Covariance(covariance))
-        graph.add(gtsam.PriorFactorPose3(frame, gtsam.Pose3(rigid(pose)), noise))
-    if gravity is not None:
-        # Only at the first pose, because tilt drifts after it. Robust, because a piece may lean by far more than its
-        # standard deviation.
-        noise = gtsam.noiseModel.Isotropic.Sigma(2, np.deg2rad(gravity.std_deg))
-        in_rig = odometry.odom_from_rig[0, :3, :3].T @ gravity.in_odometry
-        up = gtsam.Unit3(gravity.in_map), gtsam.noiseModel.Robust.Create(kernel, noise), gtsam.Unit3(in_rig)
-        graph.add(gtsam.AttitudeFactorPose3(0, *up))
+        graph.add(gtsam.PriorFactorPose3(frame, gtsam.Pose3(_rigid(pose)), noise))
     return graph
 
 
-def rigid(pose: Floats) -> Floats:
+def _rigid(pose: Floats) -> Floats:
     """Return a pose (4, 4) with an exact rotation; rotations in files are rounded."""
     return geometry.pose_from_qt(geometry.qt_from_pose(pose))
 

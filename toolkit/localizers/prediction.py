@@ -29,9 +29,6 @@ class Prediction:
     map; the center of the top-left pixel is (0.5, 0.5) in both."""
     intrinsics: Floats | None = None
     """(S, 3, 3) K in pixels of the photographs; NaN where unknown."""
-    conditioned: NDArray[np.bool_] | None = None
-    """(S,) views whose map poses were inputs of the network. Their predicted poses agree with the map by construction,
-    so only the other views are aligned to it. None: no pose was an input."""
     reason: str = ""
     """Why the cameras are missing, if known."""
 

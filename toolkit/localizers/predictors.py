@@ -28,7 +28,6 @@ def open_predictor(settings: LocalizeSettings, capture: Capture, map_dir: Path) 
             settings.dtype_compute,
             architecture=ARCHITECTURES[predictor.name],
             compile=predictor.compile,
-            conditioned=predictor.conditioned,
         )
     log.warning("predictor: simulated looks up the true poses of the queries. Its poses are no results.")
     sessions = [*capture.usable("map"), *capture.usable("query")]

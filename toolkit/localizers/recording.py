@@ -12,8 +12,6 @@ import numpy as np
 from toolkit import geometry
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import PoseEstimate, RoughPose, agree, stds_of
-from toolkit.localizers.bundle import Observations, Observe, adjusted
-from toolkit.localizers.gravity import Gravity
 from toolkit.localizers.odometry import UNKNOWN_COVARIANCE, Odometry, PosedQueries, place, vote_weights
 from toolkit.localizers.pose_graph import PlacedPiece, place_online, place_piece
 from toolkit.manifest import SequenceSettings
@@ -36,11 +34,9 @@ class LocalizedPiece:
     """world_from_rig (A, 4, 4) of the query frames after each of `STEPS`, NaN for none."""
 
 
-GRAPH_AGAIN = "graph again"
-"""The step of the second pose graph; only with bundle adjustment, else the second graph is the result."""
 STEPS = ("voted", "graph", "again")
 """`voted`: rigid odometry placed where most single poses agree. `graph`: the first pose graph. `again`: single poses,
-after doubtful queries were localized again. The second pose graph, or bundle adjustment after it, gives the result."""
+after doubtful queries were localized again. The second pose graph gives the result."""
 
 
 @fixed_sums
@@ -50,8 +46,6 @@ def localize_piece(
     query_frames: Ints,
     settings: SequenceSettings,
     again: Relocalize | None = None,
-    gravity: Gravity | None = None,
-    observe: Observe | None = None,
 ) -> LocalizedPiece:
     """Return the poses of a piece of odometry: of all frames, or only of the queries if `settings.online`.
 
@@ -59,14 +53,11 @@ def localize_piece(
         queries: the queries that have a pose.
         query_frames: (A,) frames of all queries, ascending.
         again: localizes queries again that are not `ok` or do not fit the graph; None: keep their poses.
-        gravity: the up direction in the odometry and the map; None: unknown. Not used online, because it is measured
-            with all pieces.
-        observe: returns the map points that a query observes, for `settings.bundle_adjust`.
 
     Raises:
         ManifestError: GTSAM is not installed.
     """
-    first = _placed(odometry, queries, query_frames, settings, gravity)
+    first = _placed(odometry, queries, query_frames, settings)
     sure = queries.frames[first.used & queries.trusted]
     predicted = query_frames[np.isfinite(first.world_from_rig[query_frames]).all(axis=(1, 2))]
     doubtful = np.setdiff1d(predicted, sure).tolist()
@@ -76,55 +67,25 @@ def localize_piece(
         rough = [RoughPose(pose, *std) for pose, std in zip(first.world_from_rig[doubtful], stds, strict=True)]
         relocalized = dict(zip(doubtful, again(list(zip(doubtful, rough, strict=True))), strict=True))
     all_queries = with_relocalized(queries, relocalized)
-    second = first if all_queries is queries else _placed(odometry, all_queries, query_frames, settings, gravity)
+    second = first if all_queries is queries else _placed(odometry, all_queries, query_frames, settings)
     singles = np.full((len(odometry), 4, 4), np.nan)
     singles[queries.frames] = queries.world_from_rig
     voted = np.full((len(query_frames), 4, 4), np.nan)
     if len(queries) and not settings.online:
-        voters = queries if gravity is None else gravity.upright(odometry, queries, settings)
-        agreeing = queries.choose(place(odometry, voters, settings)[0].members)
+        agreeing = queries.choose(place(odometry, queries, settings)[0].members)
         voted = _median_placement(odometry, agreeing) @ odometry.odom_from_rig[query_frames]
     graph = first.world_from_rig[query_frames]
     for frame, estimate in relocalized.items():
         if estimate.world_from_rig is not None:
             singles[frame] = estimate.world_from_rig
     steps = dict(zip(STEPS, (voted, graph, singles[query_frames]), strict=True))
-    if settings.bundle_adjust and observe is not None and not settings.online:
-        steps[GRAPH_AGAIN] = second.world_from_rig[query_frames]
-        second = _adjusted(odometry, second, all_queries, relocalized, observe, settings, gravity)
     return LocalizedPiece(second, all_queries, relocalized, steps)
 
 
-def _adjusted(
-    odometry: Odometry,
-    placed: PlacedPiece,
-    queries: PosedQueries,
-    relocalized: Mapping[int, PoseEstimate],
-    observe: Observe,
-    settings: SequenceSettings,
-    gravity: Gravity | None,
-) -> PlacedPiece:
-    """Return a piece after bundle adjustment with the observations of the used `ok` queries."""
-    used, observations = queries.choose(placed.used), dict[int, Observations]()
-    if not np.isfinite(placed.world_from_rig).all():
-        return placed
-    for frame, pose, trusted in zip(used.frames.tolist(), used.world_from_rig, used.trusted, strict=True):
-        again = relocalized.get(frame)
-        # A frame may have its first pose in the graph beside the one found again: take the observations of this one.
-        same = again is not None and again.world_from_rig is not None and np.allclose(again.world_from_rig, pose)
-        ok = again is not None and again.status == "ok" if same else trusted
-        observed = observe(frame, again if same else None) if ok else None
-        if observed is not None and len(observed.points):
-            observations[frame] = observed
-    return adjusted(odometry, placed, used, observations, settings, gravity) if observations else placed
-
-
-def _placed(
-    odometry: Odometry, queries: PosedQueries, query_frames: Ints, settings: SequenceSettings, gravity: Gravity | None
-) -> PlacedPiece:
+def _placed(odometry: Odometry, queries: PosedQueries, query_frames: Ints, settings: SequenceSettings) -> PlacedPiece:
     if settings.online:
         return place_online(odometry, queries, query_frames, settings)
-    return place_piece(odometry, queries, settings, gravity)
+    return place_piece(odometry, queries, settings)
 
 
 def _median_placement(odometry: Odometry, agreeing: PosedQueries) -> Floats:

@@ -4,6 +4,7 @@
 """
 
 import math
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -39,6 +40,15 @@ def _check_models(model: str | list[str]) -> str | list[str]:
         found = f"{twice[0]!r} twice" if twice else "'auto' in a list" if model else "an empty list"
         raise ValueError(f"found {found}, expected a name, or a list of different names such as [megaloc, vlad]")
     return model if len(model) > 1 else model[0]
+
+
+def _check_index(index: str) -> str:
+    if not re.fullmatch(r"(PCA\d+,)?(Flat|RaBitQ|HNSW\d+|IVF\d+,(Flat|RaBitQ|PQ\d+(x\d+)?))", index):
+        raise ValueError(
+            f"found {index!r}, expected Flat, RaBitQ, HNSW<links>, or IVF<cells> followed by Flat, RaBitQ or "
+            "PQ<codes>, behind PCA<dimensions> or not, such as PCA512,IVF4096,RaBitQ"
+        )
+    return index
 
 
 Unit = Literal["auto", "m"] | None
@@ -246,9 +256,9 @@ class RetrieveSettings(Settings):
     """Run FAISS on the GPU; needs a FAISS built with GPU support."""
     normalize: bool = True
     """Scale descriptors to unit length before the search, so that it compares by cosine similarity."""
-    index: str = "Flat"
-    """FAISS factory string of an approximate index for large maps, such as PCA512,IVF4096,RaBitQ. Flat: exact search
-    without an index."""
+    index: Annotated[str, AfterValidator(_check_index)] = "Flat"
+    """FAISS factory string of an approximate index for large maps: RaBitQ, HNSW32, or IVF4096 with Flat, RaBitQ or
+    PQ64, each also behind PCA, such as PCA512,IVF4096,RaBitQ. Flat: exact search without an index."""
     index_candidates: Positive = 1000
     """Candidates per query that an approximate index returns; they are then ranked by exact similarity."""
     nprobe: Positive | None = None
@@ -420,19 +430,12 @@ class SequenceSettings(Settings):
     the time."""
     scale_std: PositiveNumber = 0.02
     """Relative standard deviation of the scale of a recording's odometry."""
-    gravity_std_deg: PositiveNumber | None = None
-    """Standard deviation per axis, degrees, such as 0.5, of the up direction at the start of each piece of odometry. It
-    applies if one axis of the odometry's frame proves vertical in the map, and not if `online`. null: the odometry's
-    frame may be tilted by any angle."""
     max_gap_s: PositiveNumber = 10.0
     """A longer time without odometry counts as a loss of tracking: a new piece with its own frame begins."""
     max_speed_m_s: PositiveNumber = 15.0
     """A faster motion between two poses of the odometry also counts as a loss of tracking."""
     relocalize: bool = True
     """Localize queries again near their predicted pose if they are not `ok` or contradict the other queries."""
-    bundle_adjust: bool = False
-    """As a last step, fit the poses to the map points that `ok` queries observe, instead of to the poses of these
-    queries; has no effect if `online`."""
     online: bool = False
     """Estimate the pose of each query from earlier data only; other frames then get no pose."""
     length_s: PositiveNumber | None = None
@@ -514,10 +517,6 @@ class PnpSettings(Settings):
     further features of `escalation` are used too."""
 
 
-CONDITIONED = ("da3-base", "da3-small")
-"""Names of the networks that accept known camera parameters as input."""
-
-
 class PredictorSettings(Settings):
     """The feed-forward network that predicts cameras and depth from a query image and its references."""
 
@@ -542,19 +541,6 @@ class PredictorSettings(Settings):
     tracks are used."""
     least_points: Natural = 20
     """If a reference sees fewer map points, its depth map in the capture is used instead, if there is one."""
-    conditioned: bool = False
-    """Give a network that accepts cameras (da3-base, da3-small) the known ones: the intrinsics of all views and, with
-    six or more references, the poses of every second reference. The other references align the prediction. Such
-    networks are meant to receive all cameras or none; the benefit of a part of them is not measured."""
-
-    @model_validator(mode="after")
-    def _conditioned_needs_a_network_with_cameras(self) -> Self:
-        if self.conditioned and self.name not in CONDITIONED:
-            raise ValueError(
-                f"conditioned is true, but {self.name} does not accept cameras; expected the name to be one of "
-                f"{', '.join(CONDITIONED)}, or conditioned: false"
-            )
-        return self
 
 
 Method = Annotated[

@@ -30,8 +30,8 @@ DEVICE_NAME = r"auto|cpu|mps|cuda(:\d+)?"
 """Regular expression of device names."""
 PRECISIONS = ("auto", "float32", "bfloat16", "float16")
 RUNNING = threading.RLock()
-"""Held while a network runs. Networks in several threads at once would need memory that each of them counts as free,
-and would restore the settings of torch (`full_float32`, `without_cudnn`, number of threads) that another has set."""
+"""Held while a network runs. Networks in several threads at once would need their memory together, and would restore
+the settings of torch (`full_float32`, `without_cudnn`, number of threads) that another has set."""
 
 
 def resolve_device(name: str = "auto") -> "torch.device":
@@ -205,18 +205,6 @@ def on_device(model: "torch.nn.Module", device: "torch.device", title: str) -> "
     )
 
 
-def free_bytes(device: "torch.device") -> int:
-    """Return the free memory of a device; for Apple's GPU and the CPU, the machine's free memory."""
-    import psutil
-    import torch
-
-    if device.type == "cuda":
-        # Memory that torch has reserved but not allocated is free for the network.
-        reserved = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-        return int(torch.cuda.mem_get_info(device)[0]) + reserved
-    return int(psutil.virtual_memory().available)
-
-
 @contextmanager
 def full_float32(device: "torch.device") -> Iterator[None]:
     """Multiply float32 in full precision on a GPU inside the context, whatever the process has set.
@@ -270,10 +258,12 @@ def _copy_stream(device: "torch.device") -> "torch.cuda.Stream":
 class Fitting:
     """Runs a function on a device, one at a time; splits batches into smaller ones after one did not fit its memory."""
 
-    def __init__(self, run: "Callable[..., torch.Tensor]", what: str, device: "torch.device | None" = None) -> None:
+    def __init__(
+        self, run: "Callable[[torch.Tensor], torch.Tensor]", what: str, device: "torch.device | None" = None
+    ) -> None:
         """
         Args:
-            run: maps one or more tensors (B, ...) to (B, ...), each row independently.
+            run: maps a tensor (B, ...) to (B, ...), each row independently.
             what: name of the rows in the plural, for messages.
             device: where to run; None: the device of the batch.
         """
@@ -282,12 +272,11 @@ class Fitting:
         self._what = what
         self._limit: int | None = None
 
-    def __call__(self, batch: "torch.Tensor", *others: "torch.Tensor") -> "torch.Tensor":
-        """Return `run(batch, *others)`.
+    def __call__(self, batch: "torch.Tensor") -> "torch.Tensor":
+        """Return `run(batch)`.
 
         If the batch does not fit, halves it as often as needed, logs a warning, and remembers the size that fits.
-        Moves the parts of the batch to the device; splits `others` (B, ...) likewise, but leaves them where they are.
-        Computes float32 in full precision, see `full_float32`.
+        Moves the parts of the batch to the device. Computes float32 in full precision, see `full_float32`.
 
         Raises:
             ToolkitError: not even one row fits.
@@ -301,8 +290,7 @@ class Fitting:
             count = min(self._limit or len(batch), len(batch) - start)
             try:
                 with RUNNING, full_float32(device):
-                    part = slice(start, start + count)
-                    parts.append(self._run(batch[part].to(device), *(other[part] for other in others)))
+                    parts.append(self._run(batch[start : start + count].to(device)))
                 start += count
                 continue
             except RuntimeError as error:

@@ -1,3 +1,3 @@
 """Render captures with exact ground truth, for demos, tests and benchmarks."""
 
-from toolkit.synthetic.capture import render_capture, render_street
+from toolkit.synthetic.capture import render_capture

@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,11 +23,11 @@ import numpy as np
 from toolkit.errors import CaptureError
 from toolkit.files import read_json, write_folder
 from toolkit.geometry import Floats, invert, pose_from_qt
-from toolkit.synthetic.devices import DEVICES, Device, Sensor, scaled, walk_street, walks
+from toolkit.synthetic.devices import DEVICES, Device, Sensor, walks
 from toolkit.synthetic.light import paint
 from toolkit.synthetic.recording import PICTURE_S, RADIOS, RATE_HZ, emitters_of, every_frame, scans, tracked
 from toolkit.synthetic.render import Rays, render
-from toolkit.synthetic.scene import Quad, Scene, build_block, build_room, named_rng
+from toolkit.synthetic.scene import Quad, Scene, build_room, named_rng
 from toolkit.synthetic.textures import Image
 
 if TYPE_CHECKING:
@@ -38,14 +38,13 @@ FORMAT = 3  # increase it when the same settings produce other bytes
 
 @dataclass(frozen=True)
 class World:
-    """Settings of the rendered world. A place is a room, or a block of the street."""
+    """Settings of the rendered world."""
 
-    places: int
-    frames: int  # map frames per place
-    queries: int  # query frames per place
+    rooms: int
+    frames: int  # map frames per room
+    queries: int  # query frames per room
     seed: int
     look_alikes: bool = False
-    street: bool = False  # a street instead of rooms
     alike: bool = False
     seconds: int = 0  # length of a query recording; 0: as long as its images take
     losses: int = 0  # tracking losses per query recording
@@ -53,37 +52,23 @@ class World:
     radio: bool = False
 
     @property
-    def devices(self) -> dict[str, Device]:
-        """The recording devices. A street has only a phone with small images, to render many images fast."""
-        return {"ios": scaled(DEVICES["ios"], 0.5)} if self.street else DEVICES
-
-    @property
     def hours(self) -> int:
         """Whole hours that are long enough for one subsession."""
-        return 1 + int(max(PICTURE_S * self.places * (self.frames + 8), self.seconds) / 3600)
+        return 1 + int(max(PICTURE_S * self.rooms * (self.frames + 8), self.seconds) / 3600)
 
     @property
     def stay_s(self) -> float:
         """Seconds spent in each room of a recording of length `seconds`; the walk to the next room takes half of it."""
-        return self.seconds / (1.5 * self.places - 0.5)
+        return self.seconds / (1.5 * self.rooms - 0.5)
 
     def look(self, index: int) -> int:
-        """Return the index of the place whose appearance a place has."""
-        return 0 if self.alike and index == self.places - 1 else index
+        """Return the index of the room whose appearance a room has."""
+        return 0 if self.alike and index == self.rooms - 1 else index
 
     def build(self, index: int) -> Scene:
-        """Return a place without textures."""
-        if not self.street:
-            return build_room(self.seed, index, self.look(index))
-        block = build_block(self.seed, index)
-        block.quads = [replace(quad, ppm=quad.ppm / 2) for quad in block.quads]
-        return block
+        """Return a room without textures."""
+        return build_room(self.seed, index, self.look(index))
 
-    def walk(self, scene: Scene, index: int, name: str) -> dict[tuple[str, int], Floats]:
-        """Return the poses world_from_body (N, 4, 4) of one device in one place, by split and subsession number."""
-        if self.street:
-            return walk_street(scene, self.seed, {"map": self.frames, "query": self.queries}, name)
-        return walks(scene, self.seed, index, self.frames, name)
 
 
 @dataclass
@@ -156,12 +141,12 @@ def _names(name: str, sensor: Sensor, subsession: str, timestamp: int) -> tuple[
     return f"{subsession}/{label}", f"{label}/", f"{timestamp}-{label}"
 
 
-def _plan_place(world: World, scene: Scene, index: int, tables: dict[str, Tables]) -> Iterator[Shot]:
-    """Add one place's frames to the tables of all sessions, and yield its images."""
+def _plan_room(world: World, scene: Scene, index: int, tables: dict[str, Tables]) -> Iterator[Shot]:
+    """Add one room's frames to the tables of all sessions, and yield its images."""
     import pycolmap
 
-    for name, device in world.devices.items():
-        for (split, part), bodies in world.walk(scene, index, name).items():
+    for name, device in DEVICES.items():
+        for (split, part), bodies in walks(scene, world.seed, index, world.frames, name).items():
             session, table = f"{name}_{split}", tables[f"{name}_{split}"]
             subsession, start = _subsession(name, split, part, world.hours)
             table.subsessions[subsession] = start
@@ -183,7 +168,7 @@ def _plan_place(world: World, scene: Scene, index: int, tables: dict[str, Tables
                     path = f"{subsession}/{folder}{stem}.jpg"
                     table.images.append((timestamp, sensor_id, path))
                     depth_path = None
-                    if split == "map" and not world.street:
+                    if split == "map":
                         depth_path = f"{subsession}/depths/{folder.removeprefix('images/')}{stem}.png"
                         table.depths.append((timestamp, sensor_id, depth_path))
                     world_from_cam = world_from_body @ sensor.body_from_cam
@@ -230,7 +215,7 @@ def _poses_between(table: Tables, world: World, name: str) -> list[tuple[int, st
         times, pictured_poses = np.array([row[0] for row in rows]), np.stack([row[2] for row in rows])
         for time_us, pose in zip(*every_frame(times, pictured_poses, start, world.seconds), strict=True):
             if int(time_us) not in device_ids:
-                device_ids[int(time_us)] = table.add_frame(name, world.devices[name], recording, int(time_us))[0]
+                device_ids[int(time_us)] = table.add_frame(name, DEVICES[name], recording, int(time_us))[0]
             poses.append((int(time_us), device_ids[int(time_us)], pose))
     return poses
 
@@ -263,7 +248,7 @@ def _write_session(path: Path, world: World, table: Tables, rooms: list[Scene]) 
             rng, emitters = named_rng(world.seed, kind, recording), emitters_of(world.seed, rooms, kind)
             scanned.setdefault(kind, []).extend(scans(rng, times[rows], measured[rows], emitters, rooms, sensor_id))
         if split == "query":  # in a map session of few images, some pieces of odometry would contain no image
-            rng, device = named_rng(world.seed, "odometry", recording), world.devices[name]
+            rng, device = named_rng(world.seed, "odometry", recording), DEVICES[name]
             parts = PICTURE_S * RATE_HZ if long else 1.0
             kept[rows], measured[rows] = tracked(
                 rng, times[rows], measured[rows], device.drift, parts, world.losses, world.gaps
@@ -337,35 +322,8 @@ def render_capture(
     options = {"look_alikes": look_alikes, "alike": alike, "seconds": seconds, "losses": losses, "gaps": gaps}
     settings |= {name: int(value) for name, value in {**options, "radio": radio}.items() if value}
     queries = max(2, frames // 2)
-    world = World(rooms, frames, queries, seed, look_alikes, False, alike, seconds, losses, gaps, radio)
+    world = World(rooms, frames, queries, seed, look_alikes, alike, seconds, losses, gaps, radio)
     return _render(Path(out), world, settings, progress)
-
-
-def render_street(
-    out: str | Path, blocks: int = 2, frames: int = 50, queries: int = 4, seed: int = 0, progress: bool = True
-) -> Path:
-    """Render a street seen by a phone with small images, for maps of many images; return the capture's folder.
-
-    The street consists of different blocks of 12 m; neighboring blocks see each other. The overlap of an image with
-    others depends on `frames` only, so the number of blocks scales the map without changing its density. Speed: 15
-    images/s per core.
-
-    Args:
-        out: as for `render_capture`.
-        blocks: number of blocks, at least 1.
-        frames: map images per block, at least 2; half look at one side of the street, half at the other.
-        queries: query images per block.
-        seed: the same seed gives the same bytes.
-
-    Raises:
-        CaptureError: a setting is out of range, or `out` contains something other than a rendered capture.
-    """
-    if blocks < 1 or frames < 2 or queries < 1 or seed < 0:
-        raise CaptureError(
-            f"Expected blocks, queries >= 1, frames >= 2, seed >= 0; found {blocks=}, {queries=}, {frames=}, {seed=}."
-        )
-    settings = {"format": FORMAT, "blocks": blocks, "frames": frames, "queries": queries, "seed": seed}
-    return _render(Path(out), World(blocks, frames, queries, seed, street=True), settings, progress)
 
 
 def _render(out: Path, world: World, settings: dict[str, int], progress: bool) -> Path:
@@ -398,48 +356,38 @@ def _render(out: Path, world: World, settings: dict[str, int], progress: bool) -
 
 
 def _render_sessions(out: Path, world: World, progress: bool) -> None:
-    """Render the images of all sessions, place by place, and write the sessions' files."""
+    """Render the images of all sessions, room by room, and write the sessions' files."""
     from tqdm.auto import tqdm
 
     from toolkit.capture.images import default_workers
 
     sessions = out / "sessions"
-    tables = {f"{name}_{split}": Tables() for name in world.devices for split in ("map", "query")}
-    images = world.places * sum(len(d.sensors) for d in world.devices.values()) * (world.frames + world.queries)
+    tables = {f"{name}_{split}": Tables() for name in DEVICES for split in ("map", "query")}
+    images = world.rooms * sum(len(d.sensors) for d in DEVICES.values()) * (world.frames + world.queries)
     rays: dict[tuple[float, ...], Rays] = {}
-    scenes: dict[int, Scene] = {}
     with (
         tqdm(total=images, desc="render", unit="image", disable=not progress) as bar,
         ThreadPoolExecutor(default_workers()) as pool,  # a thread may need 150 MB
     ):
         try:
-            for index in range(world.places):
-                neighbors = (index, index - 1, index + 1) if world.street else (index,)
-                visible = [i for i in neighbors if 0 <= i < world.places]
-                for i in visible:
-                    if i not in scenes:
-                        scenes[i] = world.build(i)
-                        look = world.look(i)
-                        paint_quad = partial(paint, scenes[i], world.seed, look, look_alikes=world.look_alikes)
-                        for _ in pool.map(paint_quad, range(len(scenes[i].quads))):
-                            pass
-                scenes = {i: scenes[i] for i in visible}
-                scene = scenes[index]
-                # Only the current place contributes its sky, which is not lit.
-                quads = scene.quads + [quad for i in visible[1:] for quad in scenes[i].quads if quad.lit]
+            for index in range(world.rooms):
+                scene = world.build(index)
+                paint_quad = partial(paint, scene, world.seed, world.look(index), look_alikes=world.look_alikes)
+                for _ in pool.map(paint_quad, range(len(scene.quads))):
+                    pass
                 tasks = []
-                for shot in _plan_place(world, scene, index, tables):
+                for shot in _plan_room(world, scene, index, tables):
                     key = tuple(shot.camera.params)
                     if shot.device.rig_from_body is not None and key not in rays:
                         rays[key] = Rays.of(shot.camera)
-                    tasks.append(pool.submit(_take, shot, quads, rays.get(key), sessions, world.seed))
+                    tasks.append(pool.submit(_take, shot, scene.quads, rays.get(key), sessions, world.seed))
                 for task in tasks:
                     task.result()
                     bar.update()
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-    rooms = [world.build(index) for index in range(world.places)] if world.radio else []
+    rooms = [world.build(index) for index in range(world.rooms)] if world.radio else []
     for session, table in tables.items():
         _write_session(sessions / session, world, table, rooms)
 

@@ -169,30 +169,3 @@ def walks(scene: Scene, seed: int, index: int, frames: int, name: str) -> dict[t
             best, cost = np.where(turn_cost < cost, turn, best), np.minimum(turn_cost, cost)
         poses["query", part] = _turn(query, best)
     return poses
-
-
-def walk_street(scene: Scene, seed: int, counts: dict[str, int], name: str) -> dict[tuple[str, int], Floats]:
-    """Return the poses world_from_body (N, 4, 4) of one device along one block, by split and subsession number.
-
-    The first subsession walks on one side of the middle of the street and looks at the opposite front; the second walks
-    on the other side. Queries walk closer to the middle and in other directions of view. The sway is a function of the
-    position in the street, so a walk is continuous from block to block.
-
-    Args:
-        counts: number of frames of each split, `map` and `query`, over both subsessions.
-    """
-    device, length = DEVICES[name], scene.size[0]
-    poses: dict[tuple[str, int], Floats] = {}
-    for split, total in counts.items():
-        for part, (count, side) in enumerate(((total - total // 2, 1), (total // 2, -1))):
-            rng = named_rng(seed, "street", name, split, part)
-            x = scene.origin[0] + length * ((np.arange(count) + 0.5) / max(1, count) - 0.5)
-            waves = rng.uniform(0, 2 * np.pi, (5, 2))
-            y, z, yaw, pitch, roll = (0.6 * np.sin(0.7 * x + a) + 0.4 * np.sin(1.9 * x + b) for a, b in waves)
-            y = scene.origin[1] + (0.3 * y - side * (1.6 if split == "map" else 0.8)) * np.ones(count)
-            z = device.height_m + 0.05 * z
-            yaw = side * 90 + (25 if split == "map" else 15) * yaw
-            turns = zip(yaw, device.sway_deg * pitch, device.sway_deg * roll, strict=True)
-            rotations = np.array([looking(*turn) for turn in turns]).reshape(-1, 3, 3)
-            poses[split, part] = make_pose(rotations, np.stack([x, y, z], -1)) @ invert(BODY_FROM_LEVEL_CAM)
-    return poses

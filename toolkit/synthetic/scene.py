@@ -1,4 +1,4 @@
-"""The rooms and streets of the rendered capture, built from textured rectangles. `light.paint` makes the textures.
+"""The rooms of the rendered capture, built from textured rectangles. `light.paint` makes the textures.
 
 Each random generator is seeded by the seed and the name of the thing it draws, not by the order of work.
 """
@@ -222,13 +222,6 @@ KINDS: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
-BLOCK_M = (12.0, 9.0, 5.4)
-STREET_WALLS = (0, 2)  # the walls along x
-STREET_THINGS = [
-    "planter", "bench", "crates", "posters", "door", "painting", "board", "window", "shelf", "cabinet", "posters",
-]  # fmt: skip
-
-
 def _build_wall(scene: Scene, wall: int, material: Material) -> None:
     (x, y, yaw), (w, d, h) = scene.at_wall(wall, 0.0, -0.008), scene.size
     length = w if wall % 2 == 0 else d
@@ -297,23 +290,6 @@ def build_room(seed: int, index: int, look: int | None = None) -> Scene:
     for k in range(4):
         _furnish_wall(scene, rng, k, kind["things"])
     _furnish_middle(scene, rng)
-    return scene
-
-
-def build_block(seed: int, index: int) -> Scene:
-    """Return block `index` of a street along x: two fronts and the ground between them."""
-    rng = named_rng(seed, index, "block")
-    w, d, _ = BLOCK_M
-    scene = Scene(np.array([w * index, 0.0, 0.0]), BLOCK_M, outdoor=True)
-    for k in STREET_WALLS:
-        bricks = [BRICK, SANDSTONE, MOSAIC, SLATE][int(rng.integers(4))]
-        size = tuple(rng.uniform([0.07, 0.2], [0.22, 0.45]))
-        _build_wall(scene, k, partial(tex.cells, size=size, colors=np.asarray(bricks) * rng.uniform(0.8, 1.2)))
-    slabs = partial(tex.cells, size=(0.5, 0.5), colors=SLATE, stagger="none", jitter=0.15, motifs=True)
-    scene.plate((-w / 2, d / 2, 0), (1, 0, 0), (0, -1, 0), w, d, slabs, 160)
-    _build_sky(scene)
-    for k in STREET_WALLS:
-        _furnish_wall(scene, rng, k, STREET_THINGS)
     return scene
 
 

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from toolkit.models.da3.backbone import Backbone, choose_reference
-from toolkit.models.da3.cameras import cameras_from_pose_encoding, normalized_poses, pose_encoding
-from toolkit.models.da3.heads import CameraEncoder, CameraHead
+from toolkit.models.da3.cameras import cameras_from_pose_encoding
+from toolkit.models.da3.heads import CameraHead
 from toolkit.models.dpt import dense_output
 from toolkit.models.multiview import MultiView
 from toolkit.models.vggt.heads import DenseHead
@@ -28,8 +28,8 @@ _SIZES = (768, 384)
 class DepthAnything3(MultiView):
     """The network: predicts cameras and depth of photographs. The defaults are the official sizes of Base.
 
-    It omits the official branch for rays and head for Gaussians. `from_checkpoint` tells Base from Small by the shapes
-    of the tensors.
+    It omits the official branch for rays, head for Gaussians and encoder of known cameras. `from_checkpoint` tells Base
+    from Small by the shapes of the tensors.
     """
 
     title = "Depth Anything 3"
@@ -37,6 +37,7 @@ class DepthAnything3(MultiView):
     known_heads = HEADS
     prefixes: ClassVar = {"camera": "cam_dec.", "depth": "head."}
     unused = (
+        "cam_enc.",
         "gs_head.",
         "gs_adapter.",
         *(f"head.scratch.refinenet{level}_aux." for level in range(1, 5)),
@@ -53,8 +54,6 @@ class DepthAnything3(MultiView):
         num_heads: int = 12,
         grid: int = 37,
         alternate_from: int = 4,
-        camera_depth: int = 4,
-        camera_num_heads: int = 16,
         dense_layers: Sequence[int] = (5, 7, 9, 11),
         dense_channels: Sequence[int] = (96, 192, 384, 768),
         dense_features: int = 128,
@@ -62,10 +61,9 @@ class DepthAnything3(MultiView):
         """
         Args:
             heads: the heads to create, of `HEADS`.
-            compute_dtype: float32 or bfloat16, for the trunk's matrix products and attention. Sums, norms, heads and
-                the encoder of known cameras are float32.
+            compute_dtype: float32 or bfloat16, for the trunk's matrix products and attention. Sums, norms and
+                heads are float32.
             dim, depth, num_heads, grid, alternate_from: sizes of the trunk, see `Backbone`.
-            camera_depth, camera_num_heads: sizes of the encoder of known cameras.
             dense_layers: the four blocks that the depth head reads.
             dense_channels, dense_features: channels of the depth head.
 
@@ -76,7 +74,6 @@ class DepthAnything3(MultiView):
         self.dense_layers = tuple(dense_layers)
         self.backbone = nn.ModuleDict({"pretrained": Backbone(dim, depth, num_heads, grid, alternate_from)})
         set_matrix_type(self.backbone, compute_dtype)
-        self.cam_enc = CameraEncoder(dim, camera_depth, camera_num_heads)
         if "camera" in self.heads:
             self.cam_dec = CameraHead(2 * dim)
         if "depth" in self.heads:
@@ -108,17 +105,9 @@ class DepthAnything3(MultiView):
         images: Tensor,
         heads: Sequence[str] | None = None,
         patch_tokens: Tensor | None = None,
-        extrinsics: Tensor | None = None,
-        intrinsics: Tensor | None = None,
         reference: str = "saddle_balanced",
     ) -> dict[str, Tensor]:
         """Return the predictions of the heads under the official names, float32.
-
-        The network can use known cameras. Officially, the cameras of all views are known, or of none. If only some are
-        known, they are encoded together, and the other views get the learned token of views that are not the reference;
-        their predicted cameras are then in the frame, and nearly in the unit, of the known ones. As in the official
-        interface, known poses are made relative to the first known camera and divided by the median distance of the
-        known cameras from it (itself included; at least 0.1).
 
         Args:
             images: (B, S, 3, H, W) or (S, 3, H, W), RGB in [0, 1], sides multiples of 14: S views of each of B
@@ -126,11 +115,7 @@ class DepthAnything3(MultiView):
             heads: the heads to compute, of those that this network has; None: all.
             patch_tokens: (B, S, 1 + P, C), or (S, 1 + P, C) like the images, from `encode`, if already computed. Then
                 only the shape of `images` is read: `torch.empty(shape, device="meta")` will do.
-            extrinsics: `cam_from_world` (B, S, 3 or 4, 4) of known cameras, in any common frame and unit; NaN if the
-                pose of a view is unknown. Without the axis B if the images have none. On any device.
-            intrinsics: K (B, S, 3, 3), pixels of `images`; only the focal lengths of known cameras are used. Axes and
-                device as for `extrinsics`.
-            reference: how to choose the view whose frame is the world if no camera is known; see `choose_reference`.
+            reference: how to choose the view whose frame is the world; see `choose_reference`.
 
         Returns:
             For "camera": `pose_enc` (B, S, 9), see `cameras_from_pose_encoding`, and the cameras computed from it:
@@ -139,13 +124,10 @@ class DepthAnything3(MultiView):
             1. Cameras and depth share one scale, which is not metric. B = 1 for images with four axes.
 
         Raises:
-            ValueError: wrong shape, a head that this network does not have, an unknown way to choose the reference, or
-                a known pose without intrinsics.
+            ValueError: wrong shape, a head that this network does not have, or an unknown way to choose the reference.
         """
         size, heads, tokens = self._checked(images, heads, patch_tokens)
         cameras = self._camera_tokens(tokens, reference)
-        if extrinsics is not None:
-            self._encode_known(cameras, *_known(extrinsics, intrinsics, (*cameras.shape[:2],)), size)
         last = len(self.trunk.blocks) - 1
         read = {last, *(self.dense_layers if "depth" in heads else ())}
         rows, columns = size[0] // PATCH, size[1] // PATCH
@@ -160,7 +142,7 @@ class DepthAnything3(MultiView):
         return output
 
     def _camera_tokens(self, tokens: Tensor, reference: str) -> Tensor:
-        """Return the learned camera tokens (B, S, C) for tokens from `encode`, if no camera is known.
+        """Return the learned camera tokens (B, S, C) for tokens from `encode`.
 
         The official code also moves the reference view to the front, which changes rounding only.
         """
@@ -168,36 +150,6 @@ class DepthAnything3(MultiView):
         is_reference = torch.arange(tokens.shape[1], device=tokens.device) == chosen[:, None]
         reference_token, other_token = self.trunk.camera_token[0]
         return torch.where(is_reference[..., None], reference_token, other_token)
-
-    def _encode_known(
-        self, cameras: Tensor, extrinsics: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]
-    ) -> None:
-        """Replace the camera tokens (B, S, C) of scenes with known cameras, see `forward`."""
-        for scene, poses, K in zip(cameras, extrinsics, intrinsics, strict=True):
-            known = np.isfinite(poses).all(axis=(1, 2))
-            if known.any():
-                encoding = torch.from_numpy(pose_encoding(normalized_poses(poses[known]), K[known], size)).float()
-                scene[:] = self.trunk.camera_token[0, 1]
-                views = torch.from_numpy(np.flatnonzero(known)).to(scene.device)
-                scene[views] = self.cam_enc(encoding.to(scene.device)[None])[0]
-
-
-def _known(extrinsics: Tensor, intrinsics: Tensor | None, views: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Check known cameras; return poses and intrinsics as float64, with the axes B and S."""
-    if intrinsics is None:
-        raise ValueError("extrinsics are given without intrinsics; expected both for a known camera.")
-    poses, K = (np.asarray(tensor.detach().cpu(), np.float64) for tensor in (extrinsics, intrinsics))
-    if poses.ndim == K.ndim == 3:
-        poses, K = poses[None], K[None]
-    if poses.shape not in ((*views, 3, 4), (*views, 4, 4)) or K.shape != (*views, 3, 3):
-        raise ValueError(
-            f"extrinsics have shape {tuple(extrinsics.shape)} and intrinsics {tuple(intrinsics.shape)}; expected "
-            f"{(*views, 3, 4)} and {(*views, 3, 3)} for these images."
-        )
-    known = np.isfinite(poses).all(axis=(2, 3))
-    if not (K[known][:, [0, 1], [0, 1]] > 0).all():
-        raise ValueError("a view has a known pose and no intrinsics; expected focal lengths above 0, or a pose of NaN.")
-    return poses, K
 
 
 def _cameras(pose_enc: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
