@@ -12,7 +12,6 @@ from toolkit.capture import (
     camera_text,
     parse_camera,
     read_depth,
-    tables,
     write_depth,
     write_session,
 )
@@ -336,8 +335,7 @@ def test_an_image_under_two_keys_is_refused(tmp_path: Path) -> None:
         session.image_path(0)
 
 
-def test_line_numbers_hold_across_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tables, "_BLOCK_BYTES", 1000)
+def test_line_numbers_hold_in_a_long_file(tmp_path: Path) -> None:
     rows = [f"{t}, cam, a/{t}.jpg" for t in range(3000)]
     path = write(tmp_path / "ios_map", {"images.txt": "# header\n" + "\n".join(rows)})
     assert Session.open(path).images["path"].tolist() == [f"a/{t}.jpg" for t in range(3000)]

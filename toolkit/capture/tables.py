@@ -1,18 +1,15 @@
 """Text tables of the capture format: their columns, a fast reader, and an index of rows by key.
 
 The reader accepts comma-separated values with `#` comments and blank lines anywhere, spaces around values, Windows line
-ends and a byte-order mark. Columns beyond the expected ones are ignored or kept as one text. A file is cut into blocks
-of whole lines, and Arrow splits and converts two blocks at a time. No Python code loops over rows, and yet error
-messages name the line.
+ends and a byte-order mark. Columns beyond the expected ones are ignored or kept as one text; their number varies from
+line to line, which the CSV readers of Arrow and pandas refuse. So Arrow's functions on texts split the lines and
+convert the columns. Only malformed values are looked at one by one, and error messages name the line.
 """
 
 import errno
 import logging
-import os
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -150,7 +147,9 @@ def read_table(path: Path, columns: Columns, strict: bool = True, extra: bool = 
             line number, the text found and what was expected.
     """
     try:
-        spans = _line_blocks(path)
+        if path.exists() and not path.is_file():  # opening a pipe blocks forever, reading a device never ends
+            raise OSError(errno.EINVAL, "not a file")
+        table = _parse(path, path.read_bytes(), columns, extra)
     except FileNotFoundError:
         message = f"file not found; expected lines of `{_layout(columns)}`"
         if strict:
@@ -159,19 +158,7 @@ def read_table(path: Path, columns: Columns, strict: bool = True, extra: bool = 
         return TextTable(path, empty, np.zeros(0, np.int64), [(0, message)], False)
     except OSError as error:
         raise CaptureError(f"File cannot be read: {path} ({error.strerror}). Expected a text file.") from None
-
-    def parse(span: tuple[int, int]) -> _Block:
-        start, end = span
-        with open(path, "rb") as stream:
-            stream.seek(start)
-            return _parse_block(stream.read(end - start), start == 0, columns, extra)
-
-    with ThreadPoolExecutor(2) as pool:
-        blocks = list(pool.map(parse, spans))
-    first = np.cumsum([0, *(block.count for block in blocks)])[:-1]
-    problems = [
-        (int(start + line), fault) for start, block in zip(first, blocks, strict=True) for line, fault in block.problems
-    ]
+    problems = table.problems
     if strict and problems:
         line, fault = problems[0]
         more = f" ({len(problems) - 1} more such lines.)" if len(problems) > 1 else ""
@@ -179,25 +166,7 @@ def read_table(path: Path, columns: Columns, strict: bool = True, extra: bool = 
             f"{path}, line {line}: {fault}. Correct or remove the line; "
             f"`python -m toolkit check CAPTURE` lists all problems.{more}"
         )
-    kinds = dict(columns) | ({"extra": TEXT} if extra else {})
-    values = {
-        # A block's column is freed as it is joined, so that the table is never in memory twice.
-        name: pa.concat_arrays([pa.array([], _ARROW_TYPES[kind]), *(block.columns.pop(name) for block in blocks)])
-        for name, kind in kinds.items()
-    }
-    lines = [np.zeros(0, np.int64), *(start + block.lines for start, block in zip(first, blocks, strict=True))]
-    return TextTable(path, values, np.concatenate(lines), problems, any(block.has_extra for block in blocks))
-
-
-@dataclass
-class _Block:
-    """Rows of a block of lines; line numbers count from 1 within the block."""
-
-    columns: dict[str, pa.Array]
-    lines: Ints
-    count: int
-    problems: list[tuple[int, str]]
-    has_extra: bool
+    return table
 
 
 _MOST = {METERS: FARTHEST_M, LATITUDE: 90.0, LONGITUDE: 180.0}
@@ -207,47 +176,23 @@ _ARROW_TYPES = {
     **dict.fromkeys((NUMBER, *_MOST), pa.float64()),
     **dict.fromkeys((ID, PATH, TEXT), pa.large_string()),
 }
-# Small enough that two blocks need little memory, large enough to hide the overhead of a block.
-_BLOCK_BYTES = 1 << 20
 
 
 def _layout(columns: Columns) -> str:
     return ", ".join(name for name, _ in columns)
 
 
-def _line_blocks(path: Path) -> list[tuple[int, int]]:
-    """Cut a file into spans of bytes that end at line ends."""
-    borders = [0]
-    if path.exists() and not path.is_file():  # opening a pipe blocks forever, reading a device never ends
-        raise OSError(errno.EINVAL, "not a file")
-    with open(path, "rb") as stream:
-        size = stream.seek(0, os.SEEK_END)
-        while borders[-1] < size:
-            stream.seek(min(borders[-1] + _BLOCK_BYTES, size))
-            stream.readline()
-            borders.append(stream.tell())
-    return list(pairwise(borders))
-
-
-def _parse_block(data: bytes, first: bool, columns: Columns, keep_extra: bool) -> _Block:
-    """Split and convert the lines of `data`; `first`: they are the first lines of the file."""
-    if first and data.startswith(b"\xef\xbb\xbf"):  # byte-order mark, which Windows editors write
-        data = data[3:]
-    if not data.endswith(b"\n"):
-        data += b"\n"
+def _parse(path: Path, data: bytes, columns: Columns, keep_extra: bool) -> TextTable:
+    """Split and convert the lines of a file."""
+    texts = data.removeprefix(b"\xef\xbb\xbf").split(b"\n")  # without the byte-order mark of Windows editors
     problems: list[tuple[int, str]] = []
     if _fault(data.replace(b"\r\n", b"\n")):
-        texts = data.split(b"\n")
         for number, line in enumerate(texts, 1):
             if fault := _fault(line):
                 problems.append((number, fault))
                 texts[number - 1] = b"#"  # a comment, so that the line is skipped below
-        data = b"\n".join(texts)
-    ends = np.flatnonzero(np.frombuffer(data, np.uint8) == ord("\n"))
-    offsets = np.zeros(len(ends) + 1, np.int64)
-    offsets[1:] = ends + 1
-    text = pa.LargeStringArray.from_buffers(len(ends), pa.py_buffer(offsets), pa.py_buffer(data))
-    text = pc.ascii_trim_whitespace(text)
+    text = pc.ascii_trim_whitespace(pa.array(texts, pa.large_string()))
+    del data, texts  # large files need the memory for their columns
     kept = pc.invert(pc.or_(pc.starts_with(text, "#"), pc.equal(text, "")))
     text, lines = text.filter(kept), np.flatnonzero(kept.to_numpy(zero_copy_only=False)) + 1
 
@@ -287,7 +232,7 @@ def _parse_block(data: bytes, first: bool, columns: Columns, keep_extra: bool) -
     if bad.any():
         good_rows = pa.array(~bad)
         arrays, lines = {name: array.filter(good_rows) for name, array in arrays.items()}, lines[~bad]
-    return _Block(arrays, lines, len(ends), sorted(problems), has_extra)
+    return TextTable(path, arrays, lines, sorted(problems), has_extra)
 
 
 _EXPECTED = {
@@ -310,15 +255,14 @@ def convert(column: pa.Array, kind: str) -> tuple[pa.Array, NDArray[np.bool_]]:
     wrong = np.zeros(len(column), bool)
     try:
         converted = column.cast(_ARROW_TYPES[kind])
-    except pa.ArrowInvalid:  # find the malformed values one by one
-        scalars = []
-        for row, value in enumerate(column):
+    except pa.ArrowInvalid:  # find the malformed values among those that are not plain numbers
+        plain = pc.match_substring_regex(column, r"^-?\d{1,18}$" if kind == INTEGER else r"^-?\d{1,18}(\.\d{1,18})?$")
+        for row in np.flatnonzero(~plain.to_numpy(zero_copy_only=False)):
             try:
-                scalars.append(value.cast(_ARROW_TYPES[kind]).as_py())
+                column[row].cast(_ARROW_TYPES[kind])
             except pa.ArrowInvalid:
                 wrong[row] = True
-                scalars.append(0)
-        converted = pa.array(scalars, _ARROW_TYPES[kind])
+        converted = pc.if_else(pa.array(wrong), "0", column).cast(_ARROW_TYPES[kind])
     if kind == INTEGER:  # Arrow reads 0x10 as 16
         for prefix in ("0x", "0X"):
             wrong |= pc.starts_with(column, prefix).to_numpy(zero_copy_only=False)
