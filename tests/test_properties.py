@@ -31,7 +31,7 @@ from toolkit.capture.names import is_bad_name
 from toolkit.capture.tables import COLUMNS, KeyIndex, read_query_table, read_table
 from toolkit.embedders.search import search
 from toolkit.errors import ArtifactError, CaptureError, ManifestError, ToolkitError
-from toolkit.exchange.submission import Entry, Submission
+from toolkit.exchange.submission import Submission
 from toolkit.features.groups import GroupWriter
 from toolkit.files import read_references
 from toolkit.localizers.alignment import Sim3, align_to_map
@@ -302,16 +302,15 @@ def test_any_text_is_a_table_of_queries_or_an_error_with_its_file(content: bytes
 def test_a_submission_holds_the_poses(qt: np.ndarray, data: st.DataObject, tmp_path: Path) -> None:
     assume((np.linalg.norm(qt[:, :4], axis=1) > 1e-5).all())
     keys = data.draw(st.lists(st.tuples(times, ids), min_size=len(qt), max_size=len(qt)))
-    entry = Entry(
-        "P", "ios", "hl", "P_map_ios_query_hl.txt", poses=Trajectory([k[0] for k in keys], [k[1] for k in keys], qt)
-    )
-    entry.queries = pd.DataFrame(keys, columns=["timestamp", "device_id"]).assign(pose="ok", reason="")
-    path = Submission("mine\n", [entry], {}, "leave-out", tmp_path / "s.zip").write() if len(qt) else None
-    if path is None:
+    if not keys:
         return
+    trajectory = Trajectory([key[0] for key in keys], [key[1] for key in keys], qt)
+    queries = pd.DataFrame(keys, columns=["timestamp", "device_id"]).assign(file="P.txt", pose="ok", reason="")
+    pairs = pd.DataFrame([{"file": "P.txt"}])
+    path = Submission(tmp_path / "s.zip", "mine\n", {"P.txt": trajectory}, queries, pairs).write()
     with zipfile.ZipFile(path) as archive:
         assert archive.testzip() is None
-        (tmp_path / "back.txt").write_bytes(archive.read(entry.name))
+        (tmp_path / "back.txt").write_bytes(archive.read("P.txt"))
     back = Trajectory.read(tmp_path / "back.txt")
     np.testing.assert_array_equal(back.qt, qt)
     assert back.device_ids.tolist() == [key[1] for key in keys]

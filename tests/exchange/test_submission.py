@@ -130,7 +130,7 @@ def test_equal_runs_give_equal_bytes(run: Path, tmp_path: Path) -> None:
 def test_what_failed_is_filled_from_the_best_reference_and_said_so(run: Path, tmp_path: Path) -> None:
     make_poses(run, "HYDRO", "ios", "hl", (300,))
     submission = collect([run], "Ours.")
-    row = submission.table().set_index("file").loc["HYDRO_map_ios_query_hl.txt"]
+    row = submission.table.set_index("file").loc["HYDRO_map_ios_query_hl.txt"]
     counts = {"asked": 3, "written": 2, "ok": 0, "low_confidence": 1, "filled": 1, "left_out": 1, "not_asked": 0}
     assert row[list(counts)].to_dict() == counts
     assert row["state"] == "1 left out, 1 filled"
@@ -154,7 +154,7 @@ def test_what_failed_can_be_left_out(run: Path, tmp_path: Path) -> None:
     with zipfile.ZipFile(path) as archive:
         assert archive.read("description.txt") == b"Ours.\n"
     files.retrieval("ios", "hl").unlink()
-    left = collect([run], "Ours.").entries[1].queries
+    left = collect([run], "Ours.").queries.query("file == 'HYDRO_map_ios_query_hl.txt'")
     assert left["reason"].str.contains("no retrieval to fill it from: .*jsonl is missing").all()
 
 
@@ -165,15 +165,15 @@ def test_poses_of_the_sequence_are_taken_where_asked_for(run: Path, tmp_path: Pa
     rows = pd.DataFrame({"timestamp": times, "device_id": ids, "status": "low_confidence: drift"})
     rows.to_csv(files.sequence_txt("ios", "hl").with_suffix(".csv"), index=False)
     submission = collect([run], "Ours.", sequence=True)
-    assert [entry.name for entry in submission.entries if entry.poses is not None] == ["HYDRO_map_ios_query_hl.txt"]
-    assert "of the stage `sequence`" in submission.missing[0].state
-    row = submission.table().set_index("file").loc["HYDRO_map_ios_query_hl.txt"]
+    assert list(submission.poses) == ["HYDRO_map_ios_query_hl.txt"]
+    assert "of the stage `sequence`" in submission.table["state"][0]
+    row = submission.table.set_index("file").loc["HYDRO_map_ios_query_hl.txt"]
     assert (row["written"], row["low_confidence"], row["not_asked"]) == (3, 3, 1)
     found = poses_in(submission.write(), "HYDRO_map_ios_query_hl.txt", tmp_path)
     np.testing.assert_allclose(found.qt, qt[:0:-1], atol=1e-15)
     single = files.poses_txt("ios", "hl")
     write_sidecar(files.sequence_txt("ios", "hl"), {}, made_from=[single])
-    assert collect([run], "Ours.", sequence=True).entries
+    assert collect([run], "Ours.", sequence=True).poses
     single.write_text(single.read_text() + "# localized again\n")
     with pytest.raises(ArtifactError, match=single.name):
         collect([run], "Ours.", sequence=True)
@@ -185,7 +185,7 @@ def test_poses_of_the_sequence_are_taken_where_asked_for(run: Path, tmp_path: Pa
 def test_missing_pairs_are_reported_and_the_rest_is_written(run: Path) -> None:
     SceneFiles(run, "HYDRO").poses_txt("spot", "ios").unlink()
     submission = collect([run], "Ours.")
-    assert [entry.name for entry in submission.missing] == ["HYDRO_map_spot_query_ios.txt"]
+    assert submission.missing == ["HYDRO_map_spot_query_ios.txt"]
     assert "17 of 18 pairs" in submission.text()
     assert "Missing: HYDRO_map_spot_query_ios.txt." in submission.text()
     with zipfile.ZipFile(submission.write()) as archive:
@@ -208,7 +208,7 @@ def test_another_scene_has_the_pairs_of_its_capture(tmp_path: Path) -> None:
     capture = make_capture(tmp_path / "data", "HOME")
     make_poses(tmp_path / "run", "HOME", "ios", "hl")
     submission = collect([tmp_path / "run"], captures=[capture])
-    assert len(submission.entries) == 9
+    assert len(submission.table) == 9
     assert len(submission.missing) == 8
     with pytest.raises(ManifestError, match=r"HOME: .*--capture PATH/HOME"):
         collect([tmp_path / "run"])
@@ -220,7 +220,7 @@ def test_a_scene_of_lamar_is_like_any_other(tmp_path: Path) -> None:
     """It has the pairs of the sessions that `download` makes, and the zip does not follow LaMAR's combine script."""
     capture = make_capture(tmp_path / "data", "CAB")
     make_poses(tmp_path / "run", "CAB", "ios", "ios")
-    table = collect([tmp_path / "run"], captures=[capture], scenes=["CAB"]).table().set_index("file")
+    table = collect([tmp_path / "run"], captures=[capture], scenes=["CAB"]).table.set_index("file")
     assert table["written"].sum() == table["written"]["CAB_map_ios_query_ios.txt"] == 3
 
 
@@ -233,7 +233,7 @@ def test_devices_and_links_are_those_of_the_runs_manifest(tmp_path: Path) -> Non
     record = {"stages": [{"scene": "HOME", "parameters": {"sessions_root": str(capture / "sessions")}}]}
     manifest = {"extra_devices": [{"key": "drone", "sessions": {"query": "q_drone"}}], "allow_outside": True}
     (files.run / "run.json").write_text(json.dumps(record | {"manifest": manifest}))
-    table = collect([files.run]).table().set_index("file")
+    table = collect([files.run]).table.set_index("file")
     assert table.loc["HOME_map_ios_query_drone.txt", "written"] == 3
     assert export_intrinsics(files.run, "HOME", "ios", "drone", tmp_path / "queries.txt") == 3
 
@@ -242,7 +242,7 @@ def test_poses_that_nobody_asked_for_are_not_written(run: Path, tmp_path: Path, 
     """As when poses are keyed by a camera where the list asks for its rig."""
     path = captures[0] / "sessions" / "hl_query" / "proc" / f"{LIST}.txt"
     path.write_text("300, s/rig_300\n400, s/rig_400\n")
-    row = collect([run], failed="leave-out").table().set_index("file").loc["HYDRO_map_ios_query_hl.txt"]
+    row = collect([run], failed="leave-out").table.set_index("file").loc["HYDRO_map_ios_query_hl.txt"]
     assert row[["asked", "written", "left_out", "not_asked"]].tolist() == [2, 1, 1, 2]
     assert row["state"] == "1 left out, 2 not asked"
 
@@ -267,9 +267,9 @@ def test_malformed_poses_are_refused_with_file_line_and_key(
 
 def test_a_key_that_is_listed_twice_is_answered_once(run: Path, captures: list[Path]) -> None:
     path = captures[0] / "sessions" / "ios_query" / "proc" / f"{LIST}.txt"
-    once = collect([run]).table()
+    once = collect([run]).table
     path.write_text(path.read_text() + path.read_text().splitlines()[0] + "\n")
-    pd.testing.assert_frame_equal(collect([run]).table(), once)
+    pd.testing.assert_frame_equal(collect([run]).table, once)
 
 
 def test_wrong_values_name_the_known_ones(run: Path, tmp_path: Path) -> None:

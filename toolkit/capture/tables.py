@@ -149,7 +149,7 @@ def read_table(path: Path, columns: Columns, strict: bool = True, extra: bool = 
     try:
         if path.exists() and not path.is_file():  # opening a pipe blocks forever, reading a device never ends
             raise OSError(errno.EINVAL, "not a file")
-        data = path.read_bytes()
+        table = _parse(path, path.read_bytes(), columns, extra)
     except FileNotFoundError:
         message = f"file not found; expected lines of `{_layout(columns)}`"
         if strict:
@@ -158,7 +158,6 @@ def read_table(path: Path, columns: Columns, strict: bool = True, extra: bool = 
         return TextTable(path, empty, np.zeros(0, np.int64), [(0, message)], False)
     except OSError as error:
         raise CaptureError(f"File cannot be read: {path} ({error.strerror}). Expected a text file.") from None
-    table = _parse(path, data, columns, extra)
     problems = table.problems
     if strict and problems:
         line, fault = problems[0]
@@ -193,6 +192,7 @@ def _parse(path: Path, data: bytes, columns: Columns, keep_extra: bool) -> TextT
                 problems.append((number, fault))
                 texts[number - 1] = b"#"  # a comment, so that the line is skipped below
     text = pc.ascii_trim_whitespace(pa.array(texts, pa.large_string()))
+    del data, texts  # large files need the memory for their columns
     kept = pc.invert(pc.or_(pc.starts_with(text, "#"), pc.equal(text, "")))
     text, lines = text.filter(kept), np.flatnonzero(kept.to_numpy(zero_copy_only=False)) + 1
 

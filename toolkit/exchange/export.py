@@ -338,5 +338,5 @@ def _require_poses(path: Path) -> Path:
 
 
 def _session(run: str | Path, scene: str, session_id: str, capture: str | Path | None) -> Session:
-    with open_captures([Path(run)], [] if capture is None else [capture], [scene]) as captures:
-        return captures[scene][session_id]
+    with open_captures([Path(run)], [] if capture is None else [capture], [scene]) as capture_of:
+        return capture_of(scene)[session_id]

@@ -48,7 +48,7 @@ PRIOR_STD = (0.2, 0.02, 0.02, 0.05)  # prior standard deviations of the four `Mi
 FOCALS = (0.45, 0.7, 1.1, 1.7, 2.6, 4.0)  # focal lengths of the cameras to try, over the longer side of the image
 MORE = 1.5  # such a camera fits if it has this many times the inliers of the stated one
 FEW = 0.3  # share of inliers among the matches below which other cameras are tried if the first step is certain
-VERY_FEW = 0.1  # share below which they are tried in any case
+VERY_FEW = 0.2  # share below which they are tried in any case
 TRIALS = 1000  # samples of their RANSAC
 ABSURD = 0.2  # smallest change of the intrinsics, relatively, that makes another camera another
 
