@@ -1,26 +1,26 @@
 """How probable is it that a pose is right? Fits the weights of `toolkit/localizers/confidence.py`.
 
-    python benchmarks/confidence.py [--seeds 0 1 2] [--rooms 3] [--frames 6] [--rows ROWS.csv] [--out FILE.md]
-        [--run CAPTURE RUN]... [--held-out SCENE]...
+    python benchmarks/confidence.py FOLDER CAPTURE... [--rendered 0 1] [--alike 0 1] [--rows ROWS.csv] [--out FILE.md]
+        [--held-out SCENE]...
 
-For each seed a capture is rendered with a sparse map, and with the same doors, windows, shelves, cabinets and crates in
-all rooms. Its queries are localized as they are, and darkened, blurred and half hidden; with references that see the
-same, with one such among wrong ones, and with none (the place is not found: every pose is wrong). `--run` adds the
-queries of a finished run of a capture with ground truth. Each row says what the localizer knows of a pose, and whether
-it is wrong: beyond 5 degrees or 0.5 m.
+Each capture with ground truth is copied to FOLDER in several ways (`WAYS`): query images darkened, blurred, put into
+fog or half hidden, poses of the map moved and turned at random, focal lengths of the map too long. Captures are also
+rendered: rooms with the same doors, windows, shelves and crates (--rendered), and two rooms that are copies of each
+other (--alike). Each copy goes through the stages as users run them, with SIFT alone or with the defaults (`WAYS`); a
+further call makes only what is missing. Each row says what the localizer knows of a pose, and whether it is wrong:
+beyond 5 degrees or 0.5 m.
 
-A logistic regression is fitted, with a ridge of 1 on standardized terms and the sign of each weight given, and tried on
-what it was not fitted on: on each scene (seed or run) by the weights of the others, and on the scenes held out by the
-weights of all. The tables tell how many poses each stated probability has, and how many of them are right; and of those
-that are called `ok` (99 % or more) how many are wrong, with the upper end of the one-sided 95 % interval (Clopper,
-Pearson 1934). Rows are kept in --rows after each map, and a further call adds seeds.
+A logistic regression is fitted to the poses that no other check refuses, with a ridge of 1 on standardized terms and
+the sign of each weight given. Each scene (a recording's hour of a capture, in all ways) is judged by weights fitted on
+the others, scenes held out by the weights of all others. The tables tell how many poses each stated probability has,
+and how many of them are right; and of those that are called `ok` (99 % or more) how many are wrong, with the upper end
+of the one-sided 95 % interval (Clopper, Pearson 1934), by scene and by way.
 """
 
 import argparse
-import tempfile
-from collections.abc import Iterator
+import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -28,129 +28,120 @@ import pandas as pd
 from common import add_out, check_out, limit_cores, markdown_table, write_out
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from toolkit.capture import Session
-    from toolkit.localizers.pnp import PnpLocalizer
-
 WRONG = (5.0, 0.5)  # degrees, meters
 CONFIDENCE = 0.95
 OK = 0.99
-SIGNS = (0, 1, 1, 1, -1, -1, -1, 1)
+SIGNS = {"log_inliers": 1, "inlier_ratio": 1, "coverage": 1, "rival_support": -1, "log_position_std": -1,
+         "log_rotation_std": -1, "log_agreement": 1}  # fmt: skip
 """Of the weights: more inliers never make a pose less probable, whatever some hundred rows say."""
 BINS = (0.0, 0.1, 0.5, 0.9, 0.99, 1.0)
-DEGRADATIONS = ("none", "dark", "blurred", "hidden", "dark, hidden")
-REFERENCES = ("right", "one right", "wrong")
-DEVICES = ("ios", "hl", "spot")
+DEGRADATIONS = ("none", "dark", "blurred", "fog", "hidden", "dark, hidden")
 
 Image = NDArray[np.uint8]
+Floats = NDArray[np.float64]
+
+
+class Way(NamedTuple):
+    """How a capture is made hard."""
+
+    degraded: bool = False
+    """Whether query images are degraded, each in a way drawn from `DEGRADATIONS`."""
+    most_rotation_deg: float = 0.0
+    most_shift: float = 0.0
+    """Standard deviations of the noise of the map's poses are drawn up to these, degrees and meters."""
+    most_focal: float = 0.0
+    """The focal lengths of the map are too long by a share drawn up to this."""
+    defaults: bool = False
+    """Whether unsure queries are localized again with learned features."""
+
+
+WAYS = {
+    "as it is": Way(),
+    "degraded": Way(degraded=True),
+    "map poses": Way(degraded=True, most_rotation_deg=2.0, most_shift=0.03),
+    "map focal length": Way(degraded=True, most_focal=0.15),
+    "degraded, defaults": Way(degraded=True, defaults=True),
+}
 
 
 def degrade(image: Image, how: str, rng: np.random.Generator) -> Image:
-    """Return a gray image (H, W) as a worse camera, or one in the way of others, would have taken it."""
-    height, width = image.shape
+    """Return an image (H, W, 3) as a worse camera, in worse weather, or behind something, would have taken it."""
+    height, width = image.shape[:2]
     if "hidden" in how:
-        kept = np.zeros(image.shape, np.uint8)
+        kept = np.zeros((height, width, 1), np.uint8)
         size = rng.uniform(0.15, 0.5) * np.array([width, height])
         x, y = (rng.uniform(0, 1, 2) * (np.array([width, height]) - size)).astype(int)
         kept[y : y + int(size[1]), x : x + int(size[0])] = 1
-        clutter = cv2.resize(rng.integers(0, 255, (height // 8, width // 8), np.uint8), (width, height))
+        clutter = cv2.resize(rng.integers(0, 255, (height // 8, width // 8, 3), np.uint8), (width, height))
         image = np.where(kept, image, clutter).astype(np.uint8)
     if "blurred" in how:
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), rng.uniform(1.5, 5)), np.uint8)
+    if "fog" in how:
+        image = np.clip(rng.uniform(0.1, 0.3) * image + 150 + rng.normal(0, 3, image.shape), 0, 255).astype(np.uint8)
     if "dark" in how:
         noisy = image * rng.uniform(0.05, 0.2) + rng.normal(0, rng.uniform(1, 4), image.shape)
         image = np.clip(noisy, 0, 255).astype(np.uint8)
     return image
 
 
-def choose_references(
-    world_from_cam: NDArray[np.float64], world_from_maps: NDArray[np.float64], how: str, rng: np.random.Generator
-) -> list[int]:
-    """Return map images for a query camera: `right` ones look the same way near by, `wrong` ones stand rooms away."""
-    apart = np.linalg.norm(world_from_maps[:, :3, 3] - world_from_cam[:3, 3], axis=1)
-    facing = world_from_maps[:, :3, 2] @ world_from_cam[:3, 2]
-    near = np.argsort(apart - 4 * facing, kind="stable")
-    right = near[apart[near] < 12][: 3 if how == "right" else 1]
-    far = np.flatnonzero(apart >= 12)
-    wrong = rng.permutation(far)[:5]
-    return {"right": right, "one right": np.concatenate([right, wrong[:4]]), "wrong": wrong}[how].tolist()
+def harden(capture: Path, copy: Path, way: Way, seed: int) -> None:
+    """Write a copy of a capture, made hard."""
+    from scipy.spatial.transform import Rotation
+
+    from toolkit.capture import Capture, Trajectory
+
+    partial = copy.with_name(f"{copy.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    shutil.copytree(capture, partial)
+    rng = np.random.default_rng(seed)
+    opened = Capture.open(partial)
+    for session in (opened[name] for name in opened.session_ids):
+        if session.id.endswith("_query"):
+            for row in range(len(session.images) if way.degraded else 0):
+                path = session.image_path(row)
+                image = cv2.imread(str(path))
+                assert image is not None, path
+                cv2.imwrite(str(path), degrade(image.astype(np.uint8), str(rng.choice(DEGRADATIONS)), rng))
+            continue
+        rotation_deg, shift = rng.uniform(0, way.most_rotation_deg), rng.uniform(0, way.most_shift)
+        if way.most_rotation_deg:
+            path = session.path / "trajectories.txt"
+            given = Trajectory.read(path)
+            poses = given.world_from_device
+            turns = Rotation.from_rotvec(rng.normal(0, rotation_deg, (len(poses), 3)), degrees=True)
+            poses[:, :3, :3] = poses[:, :3, :3] @ turns.as_matrix()
+            poses[:, :3, 3] += rng.normal(0, shift, (len(poses), 3))
+            Trajectory.from_poses(given.timestamps, given.arrow_ids, poses).write(path)
+        if way.most_focal:
+            factor = 1 + rng.uniform(0, way.most_focal)
+            path = session.path / "sensors.txt"
+            path.write_text("".join(_longer(line, factor) for line in path.read_text().splitlines(keepends=True)))
+    partial.rename(copy)
 
 
-def localize_session(
-    session: "Session", localizer: "PnpLocalizer", seed: int, workers: int
-) -> Iterator[list[dict[str, Any]]]:
-    """Yield for each query of a session a row by degradation and choice of references."""
-    from toolkit.capture.images import prefetch, read_image
-    from toolkit.features.sift import SiftExtractor
-    from toolkit.geometry import pose_error
-    from toolkit.localizers.base import Query, References, View
-    from toolkit.localizers.confidence import EVIDENCE
-
-    extractor = SiftExtractor()
-    keyframes = session.keyframes("keyframes_original")
-    assert session.ground_truth is not None
-    truth = session.ground_truth.lookup(keyframes["timestamp"].to_numpy(np.int64), keyframes["device_id"])
-    rows_of_queries = session.rows_of_keyframes(keyframes)
-
-    def localize(index: int) -> list[dict[str, Any]]:
-        rows = rows_of_queries[index]
-        images = [read_image(session.image_path(int(row)), gray=True) for row in rows]
-        cameras = [session.camera(session.images["sensor_id"].iloc[row]) for row in rows]
-        views = [
-            View(session.image_name(int(row)), image, camera, in_map=False)
-            for row, image, camera in zip(rows, images, cameras, strict=True)
-        ]
-        rig_from_cams = session.rig_from_cam(rows)
-        found_rows = []
-        for turn, how in enumerate(DEGRADATIONS):
-            rng = np.random.default_rng([seed, index, turn])
-            features = extractor.extract([degrade(image, how, rng) for image in images])
-            query = Query(views, rig_from_cams, [[of_image] for of_image in features])
-            for chosen in REFERENCES:
-                world_from_cams = truth[index] @ rig_from_cams
-                poses = localizer.map.world_from_cams
-                references = [
-                    References.of(choose_references(pose, poses, chosen, rng)) for pose in world_from_cams
-                ]
-                found = localizer.localize(query, references)
-                row = {"scene": f"seed {seed}", "seed": seed, "session": session.id}
-                row |= {"query": index, "images": how, "references": chosen}
-                row |= {"status": found.status, "posed": found.world_from_rig is not None, "wrong": False}
-                row |= {"rotation_error_deg": float("nan"), "translation_error_m": float("nan")}
-                if found.world_from_rig is not None:
-                    rotation_deg, distance_m = pose_error(found.world_from_rig, truth[index])
-                    row["wrong"] = bool(rotation_deg > WRONG[0] or distance_m > WRONG[1])
-                    row |= {"rotation_error_deg": float(rotation_deg), "translation_error_m": float(distance_m)}
-                found_rows.append(row | {name: getattr(found, name) for name in EVIDENCE})
-        return found_rows
-
-    return prefetch(localize, range(len(rows_of_queries)), workers)
+def _longer(line: str, factor: float) -> str:
+    """Return a line of sensors.txt, a camera's focal lengths times a factor."""
+    fields = [field.strip() for field in line.strip().split(",")]
+    if fields[0].startswith("#") or fields[2] != "camera":
+        return line
+    both = not fields[3].startswith("SIMPLE_") and fields[3] not in ("RADIAL", "RADIAL_FISHEYE")
+    for column in (6, 7)[: 1 + both]:
+        fields[column] = repr(float(fields[column]) * factor)
+    return ", ".join(fields) + "\n"
 
 
-def measure(
-    folder: Path, seed: int, rooms: int, frames: int, workers: int, done: set[str]
-) -> Iterator[list[dict[str, Any]]]:
-    """Render a capture and yield the rows of each map, but of those of the devices that are done."""
-    from toolkit.capture import Capture
-    from toolkit.features.stores import extract_session
-    from toolkit.localizers.mapping import build_map
-    from toolkit.localizers.matches import MappedFeatures
-    from toolkit.localizers.pnp import PnpLocalizer
-    from toolkit.synthetic import render_capture
+def localize(capture: Path, run: Path, defaults: bool) -> None:
+    """Localize the queries of a capture in all of its maps."""
+    from toolkit.embed import embed_sessions
+    from toolkit.files import SceneFiles
+    from toolkit.localize import localize_pairs
+    from toolkit.retrieve import retrieve_pairs
 
-    scene = folder / f"SEED{seed}"
-    capture = Capture.open(render_capture(scene, rooms, frames, seed, progress=False, look_alikes=True))
-    for device in [device for device in capture.devices if device not in done]:
-        session = capture[f"{device}_map"]
-        store = extract_session(session, folder / f"features{seed}", workers=workers)
-        local_map = build_map(session, store, folder / f"{device}{seed}.npz", workers=workers)
-        localizer = PnpLocalizer([MappedFeatures(local_map, store)])
-        yield [
-            row | {"map": device}
-            for asked in capture.devices
-            for rows in localize_session(capture[f"{asked}_query"], localizer, seed, workers)
-            for row in rows
-        ]
+    files = SceneFiles(run, capture.name)
+    embed_sessions(capture / "sessions", files.embeddings, features_dir=files.features)
+    retrieve_pairs(capture / "sessions", files.embeddings, files.retrieval_dir)
+    settings = {} if defaults else {"features": ["sift"]}
+    localize_pairs(capture / "sessions", files.retrieval_dir, files.poses_dir, files.features, files.maps, settings)
 
 
 def rows_of_run(capture_path: Path, run: Path) -> pd.DataFrame:
@@ -168,7 +159,9 @@ def rows_of_run(capture_path: Path, run: Path) -> pd.DataFrame:
         table = pd.read_csv(path, dtype={"device_id": str}).rename(columns=POSES_UNIT)
         rotation_deg, distance_m = pose_errors(Trajectory.read(path.with_suffix(".txt")), truth, table)
         wrong = (rotation_deg > WRONG[0]) | (distance_m > WRONG[1])
-        tables.append(table.assign(scene=capture.name, posed=np.isfinite(distance_m), wrong=wrong))
+        refused = table["status"].str.startswith("low_confidence: ")
+        made = {"pair": path.stem, "posed": np.isfinite(distance_m), "wrong": wrong, "refused": refused}
+        tables.append(table.assign(**made, rotation_error_deg=rotation_deg, translation_error_m=distance_m))
     return pd.concat(tables, ignore_index=True)
 
 
@@ -176,9 +169,9 @@ def fit(rows: pd.DataFrame, ridge: float = 1.0) -> NDArray[np.float64]:
     """Return the weights of `terms` that tell right poses from wrong ones best."""
     from scipy.optimize import minimize
 
-    from toolkit.localizers.confidence import EVIDENCE, terms
+    from toolkit.localizers.confidence import EVIDENCE, WEIGHTS, terms
 
-    rows = rows[rows["posed"]]
+    rows = rows[rows["posed"] & ~rows["refused"]]
     x = terms({name: rows[name].to_numpy(np.float64) for name in EVIDENCE})
     known = np.isfinite(x).all(axis=1)
     x, right = x[known], ~rows["wrong"].to_numpy(bool)[known]
@@ -192,18 +185,22 @@ def fit(rows: pd.DataFrame, ridge: float = 1.0) -> NDArray[np.float64]:
         slope = -sign / (1 + np.exp(np.clip(margin, -500, 500)))
         return float(np.logaddexp(0, -margin).sum() + ridge / 2 * penalty @ penalty), z.T @ slope + ridge * penalty
 
-    bounds = [(None, None) if s == 0 else (0, None) if s > 0 else (None, 0) for s in SIGNS]
+    limits = {0: (None, None), 1: (0, None), -1: (None, 0)}
+    bounds = [limits[SIGNS.get(name, 0)] for name in WEIGHTS]
     scaled = minimize(loss, np.zeros(x.shape[1]), jac=True, method="L-BFGS-B", bounds=bounds).x / spread
     scaled[0] -= scaled[1:] @ mean[1:]
     return np.asarray(scaled, np.float64)
 
 
 def stated(rows: pd.DataFrame, weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the probability of each row, 0 where there is no pose or no deviation."""
-    from toolkit.localizers.confidence import EVIDENCE, probability_right
+    """Return the probability of each row, bounded as in the localizer; 0 where there is no pose or no deviation."""
+    from toolkit.localizers.confidence import EVIDENCE, bounded_by_deviation, bounded_by_rivals, probability_right
 
     evidence = {name: rows[name].to_numpy(np.float64) for name in EVIDENCE}
-    return np.where(rows["posed"], probability_right(evidence, weights), 0.0)
+    alone = np.where(rows["posed"], probability_right(evidence, weights), 0.0)
+    rivals = [[rival] if rival > 0 else [] for rival in rows["rival_support"]]
+    bounded = map(bounded_by_rivals, alone, rivals)
+    return np.array(list(map(bounded_by_deviation, bounded, rows["position_std_m"], rows["rotation_std_deg"])))
 
 
 def judge(rows: pd.DataFrame, probability: NDArray[np.float64]) -> dict[str, float]:
@@ -212,7 +209,7 @@ def judge(rows: pd.DataFrame, probability: NDArray[np.float64]) -> dict[str, flo
 
     from toolkit.manifest import PnpSettings
 
-    accepted = (probability >= OK) & (rows["rival_support"] <= PnpSettings().ok_rival_support)
+    accepted = (probability >= OK) & ~rows["refused"] & (rows["rival_support"] <= PnpSettings().ok_rival_support)
     wrong, count = int((accepted & rows["wrong"]).sum()), int(accepted.sum())
     right = int((rows["posed"] & ~rows["wrong"]).sum())
     upper = float(beta.ppf(CONFIDENCE, wrong + 1, count - wrong)) if count > wrong else 1.0
@@ -232,16 +229,17 @@ def markdown(rows: pd.DataFrame, held_out: list[str]) -> str:
     probability[other.index] = stated(other, weights)
     text = [f"{len(rows)} queries, weights fitted on {len(learned)}:", ""]
     text += [markdown_table(["term", "weight"], [[n, f"{w:.4f}"] for n, w in zip(WEIGHTS, weights, strict=True)]), ""]
-    table = []
-    for scene, part in [*rows.groupby("scene"), ("all", rows)]:
-        judged = judge(part, probability[part.index].to_numpy())
-        name = f"{scene} (held out)" if scene in held_out else str(scene)
-        table.append([name, f"{len(part)}", f"{part['posed'].sum()}", f"{(part['posed'] & part['wrong']).sum()}",
-                      f"{judged['accepted']}", f"{judged['wrong']}", f"{100 * judged['upper']:.2f} %",
-                      f"{100 * judged['found']:.1f} %"])  # fmt: skip
-    header = ["scene", "queries", "posed", "wrong", "ok", "ok and wrong", "at most", "right ones called ok"]
-    text += [markdown_table(header, table), ""]
-    posed = rows[rows["posed"]]
+    for column in ("scene", "way", "escalated"):
+        table = []
+        for group, part in [*rows.groupby(column), ("all", rows)]:
+            judged = judge(part, probability[part.index].to_numpy())
+            name = f"{group} (held out)" if group in held_out else str(group)
+            table.append([name, f"{len(part)}", f"{part['posed'].sum()}", f"{(part['posed'] & part['wrong']).sum()}",
+                          f"{judged['accepted']}", f"{judged['wrong']}", f"{100 * judged['upper']:.2f} %",
+                          f"{100 * judged['found']:.1f} %"])  # fmt: skip
+        header = [column, "queries", "posed", "wrong", "ok", "ok and wrong", "at most", "right ones called ok"]
+        text += [markdown_table(header, table), ""]
+    posed = rows[rows["posed"] & ~rows["refused"]]
     bins = pd.cut(probability[posed.index], BINS, include_lowest=True)
     table = []
     for interval, part in posed.groupby(bins, observed=True):
@@ -251,34 +249,52 @@ def markdown(rows: pd.DataFrame, held_out: list[str]) -> str:
     return "\n".join(text) + "\n"
 
 
+def make_rows(folder: Path, captures: list[Path], rendered: list[int], alike: list[int]) -> pd.DataFrame:
+    """Return the rows of all captures in all ways; make what is not there."""
+    from toolkit.synthetic import render_capture
+
+    captures = list(captures)
+    for name, seeds, options in (("ROOMS", rendered, {"look_alikes": True}), ("ALIKE", alike, {"alike": True})):
+        for seed in seeds:
+            capture = folder / "rendered" / f"{name}{seed}"
+            if not capture.exists():
+                render_capture(capture, 3 if name == "ROOMS" else 2, 6, seed, progress=False, **options)
+            captures.append(capture)
+    tables = []
+    for name, way in WAYS.items():
+        for seed, capture in enumerate(captures):
+            copy = folder / name / capture.name
+            if not copy.exists():
+                copy.parent.mkdir(exist_ok=True)
+                harden(capture, copy, way, seed)
+            run = folder / "runs" / name
+            localize(copy, run, way.defaults)
+            rows = rows_of_run(copy, run)
+            hour = rows["device_id"].str.extract(r"\d{4}-\d\d-\d\d[-_](\d\d)", expand=False)
+            scene = capture.name.removesuffix("_HARD")
+            rows["scene"] = scene if len(hour.unique()) > 3 else (scene + " " + hour.fillna("")).str.strip()
+            tables.append(rows.assign(capture=capture.name, way=name, escalated=rows["agreement"] > 0))
+            wrong = (rows["posed"] & rows["wrong"]).sum()
+            print(f"{capture.name}, {name}: {len(rows)} queries, {wrong} wrong poses", flush=True)
+    return pd.concat(tables, ignore_index=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--run", type=Path, nargs=2, action="append", default=[], help="a capture and a run of it")
+    parser.add_argument("folder", type=Path, help="for hard captures and their runs")
+    parser.add_argument("captures", type=Path, nargs="*", help="captures with ground truth")
+    parser.add_argument("--rendered", type=int, nargs="*", default=[], help="seeds of rooms to render")
+    parser.add_argument("--alike", type=int, nargs="*", default=[], help="seeds of pairs of equal rooms to render")
     parser.add_argument("--held-out", action="append", default=[], help="scene that nothing is fitted on")
-    parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2], help="captures to render (default: 0 1 2)")
-    parser.add_argument("--rooms", type=int, default=3, help="rooms of each (default: %(default)s)")
-    parser.add_argument("--frames", type=int, default=6, help="map frames a room and device (default: %(default)s)")
     parser.add_argument("--threads", type=int, default=2, help="cores (default: %(default)s)")
-    parser.add_argument("--rows", type=Path, help="CSV that rows are added to; maps in it are not made again")
+    parser.add_argument("--rows", type=Path, help="write the rows to this CSV")
     add_out(parser)
     options = parser.parse_args()
     check_out(parser, options.out)
     limit_cores(options.threads)
-    kept = options.rows is not None and options.rows.is_file()
-    rows = pd.read_csv(options.rows) if kept else pd.DataFrame()
-    made = {"rooms": options.rooms, "frames": options.frames}
-    if kept and (not made.keys() <= set(rows) or (rows[list(made)] != list(made.values())).to_numpy().any()):
-        parser.error(f"--rows {options.rows}: its rows are of other --rooms or --frames; name another file.")
-    for seed in options.seeds:
-        done = set(rows.loc[rows["seed"] == seed, "map"]) if len(rows) else set()
-        if len(done) == len(DEVICES):
-            continue
-        with tempfile.TemporaryDirectory() as folder:
-            for part in measure(Path(folder), seed, options.rooms, options.frames, options.threads, done):
-                rows = pd.concat([rows, pd.DataFrame(part).assign(**made)], ignore_index=True)
-                if options.rows is not None:
-                    rows.to_csv(options.rows, index=False)
-    rows = pd.concat([rows, *(rows_of_run(*run) for run in options.run)], ignore_index=True)
+    rows = make_rows(options.folder, options.captures, options.rendered, options.alike)
+    if options.rows is not None:
+        rows.to_csv(options.rows, index=False)
     text = markdown(rows, options.held_out)
     print(text)
     write_out(options.out, text, {"rows": rows.to_dict("records")})

@@ -8,7 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from toolkit.localizers.confidence import WEIGHTS, bounded_by_rivals, probability_right
+from toolkit.capture import Capture
+from toolkit.geometry import pose_error
+from toolkit.localizers.confidence import WEIGHTS, bounded_by_deviation, bounded_by_rivals, probability_right
 
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "confidence.py"
 
@@ -29,6 +31,7 @@ def confidence() -> ModuleType:
 def rows(count: int, **columns: object) -> pd.DataFrame:
     plain = {"scene": "a", "posed": True, "wrong": False, "num_inliers": 100, "inlier_ratio": 0.5, "coverage": 0.5}
     plain |= {"rival_support": 0.0, "agreement": 0, "position_std_m": 0.01, "rotation_std_deg": 0.1}
+    plain |= {"refused": False, "way": "as it is", "escalated": False}
     return pd.DataFrame([plain | columns] * count)
 
 
@@ -42,7 +45,7 @@ def test_the_fit_finds_the_weights_that_made_the_rows(confidence: ModuleType) ->
     weights = dict(zip(WEIGHTS, confidence.fit(made), strict=True))
     assert weights["log_inliers"] == pytest.approx(2, abs=0.15)
     assert weights["rival_support"] == pytest.approx(-5, abs=0.4)
-    probability = confidence.stated(made, np.array(list(weights.values())))
+    probability = probability_right(made, np.array(list(weights.values())))
     for low, high in ((0.2, 0.5), (0.5, 0.8), (0.8, 0.95), (0.95, 1)):
         part = (probability >= low) & (probability < high)
         assert (~made["wrong"][part]).mean() == pytest.approx(probability[part].mean(), abs=0.03)
@@ -90,13 +93,39 @@ def test_scenes_are_judged_by_weights_of_others(confidence: ModuleType) -> None:
 
 
 def test_degradations_keep_the_picture_and_make_it_worse(confidence: ModuleType) -> None:
-    image = np.random.default_rng(0).integers(0, 255, (90, 120), np.uint8)
+    image = np.random.default_rng(0).integers(0, 255, (90, 120, 3), np.uint8)
     made = {how: confidence.degrade(image, how, np.random.default_rng(1)) for how in confidence.DEGRADATIONS}
     assert all(one.shape == image.shape and one.dtype == np.uint8 for one in made.values())
     np.testing.assert_array_equal(made["none"], image)
     assert made["dark"].mean() < 0.3 * image.mean()
     assert 0.02 < (made["hidden"] == image).mean() < 0.5
     assert made["blurred"].std() < 0.6 * image.std()
+
+
+def test_deviations_bound_the_probability() -> None:
+    assert bounded_by_deviation(0.97, 0.01, 0.1) == 0.97
+    assert bounded_by_deviation(1.0, 0.5, 0.1) < 0.9, "an error of 0.5 m is as probable as not"
+    assert bounded_by_deviation(1.0, 0.01, 5.0) < 0.9
+    assert bounded_by_deviation(1.0, np.nan, 0.1) == 0
+    bounds = [bounded_by_deviation(1.0, position_std_m, 0.1) for position_std_m in np.linspace(0, 2, 11)]
+    assert bounds == sorted(bounds, reverse=True)
+
+
+def test_a_capture_is_made_hard(confidence: ModuleType, small_capture: Path, tmp_path: Path) -> None:
+    way = confidence.Way(degraded=True, most_rotation_deg=2.0, most_shift=0.03, most_focal=0.15)
+    confidence.harden(small_capture, tmp_path / "hard", way, 0)
+    given, hard = Capture.open(small_capture), Capture.open(tmp_path / "hard")
+    rotation_deg, shift = pose_error(hard["ios_map"].world_from_cam(), given["ios_map"].world_from_cam())
+    assert 0 < np.median(rotation_deg) < 5
+    assert 0 < np.median(shift) < 0.1
+    focals = [session.camera(session.images["sensor_id"][0]).mean_focal_length() for session in (
+        given["ios_map"], hard["ios_map"], given["ios_query"], hard["ios_query"])]  # fmt: skip
+    assert 1 < focals[1] / focals[0] < 1.15
+    assert focals[2] == focals[3]
+    before, after = (
+        [capture["ios_query"].image_path(row).read_bytes() for row in range(3)] for capture in (given, hard)
+    )
+    assert before != after
 
 
 def test_rivals_bound_the_probability() -> None:

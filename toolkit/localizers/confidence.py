@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.special import expit
+from scipy.stats import chi2
 
 from toolkit.geometry import Floats
 
@@ -33,6 +34,25 @@ RIVAL_SLOPE = 10.7
 Then 1 % of all `ok` poses are wrong in the worst case, ten rendered captures whose two rooms are copies (`demo-data
 --alike`, seeds 0 to 9, SIFT, 2026-11-27); there alone, 6.2 would be the most probable value. Where nothing is a copy
 (STRECHA_HARD), none of the 13 poses with a rival above 0.5 is wrong."""
+
+
+LIMITS = (0.5, 5.0)  # meters, degrees: a pose within them is correct
+MARGIN = 1.5  # factor on stated deviations, which are right only to about as much
+
+
+def bounded_by_deviation(probability: float, position_std_m: float, rotation_std_deg: float) -> float:
+    """Return the probability that a pose is correct, at most what its standard deviations leave.
+
+    The probability that normal errors with `MARGIN` times these deviations, equal along three axes, are within
+    `LIMITS`.
+
+    Args:
+        probability: that of the pose without this bound.
+        position_std_m, rotation_std_deg: of the pose, as in `EVIDENCE`.
+    """
+    stds = MARGIN * np.array([position_std_m, rotation_std_deg]) / np.sqrt(3)
+    within = chi2.cdf((np.array(LIMITS) / np.maximum(stds, 1e-9)) ** 2, 3)
+    return float(min(probability, np.nan_to_num(within.prod(), nan=0.0)))
 
 
 def bounded_by_rivals(probability: float, supports: Sequence[float]) -> float:

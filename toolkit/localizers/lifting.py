@@ -18,8 +18,9 @@ from toolkit.localizers.depth_scale import DEPTH_NOISE
 from toolkit.localizers.feed_forward import CameraAnswer, FeedForwardAnswer, FeedForwardLocalizer
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.matches import MappedFeatures
-from toolkit.localizers.pnp import PnpLocalizer
+from toolkit.localizers.pnp import GUIDED_WEIGHT, PnpLocalizer
 from toolkit.localizers.rig import Matches, RigQuery, least_squares_covariance
+from toolkit.localizers.robust import Bools
 from toolkit.manifest import PnpSettings
 from toolkit.threads import fixed_sums
 
@@ -184,29 +185,32 @@ class _LiftedLocalizer(PnpLocalizer):
         super().__init__([mapped.with_map(lifted_map.local_map)], settings, seed)
         self._lifted_map = lifted_map
 
-    def _covariance(self, query: RigQuery, rig_from_world: Floats, matches: Matches) -> Floats | None:
+    def _covariance(
+        self, query: RigQuery, rig_from_world: Floats, guided: Matches, found_twice: Bools
+    ) -> Floats | None:
         lifted_map, local_map = self._lifted_map, self._lifted_map.local_map
-        source = lifted_map.image[matches.point]
+        source = lifted_map.image[guided.point]
         images = np.unique(source[source >= 0])
         if not len(images):
-            return super()._covariance(query, rig_from_world, matches)
-        of_pose, of_point = query.jacobians(rig_from_world, matches, local_map.points)
-        of_scales = np.zeros((len(matches), 2, len(images)))
+            return super()._covariance(query, rig_from_world, guided, found_twice)
+        of_pose, of_point = query.jacobians(rig_from_world, guided, local_map.points)
+        of_scales = np.zeros((len(guided), 2, len(images)))
         for number, image in enumerate(images):
             rows = source == image
             # A relative change s of the scale moves a point by s times its offset from the camera of the image.
-            offset = local_map.points[matches.point[rows]] - local_map.world_from_cams[image, :3, 3]
+            offset = local_map.points[guided.point[rows]] - local_map.world_from_cams[image, :3, 3]
             of_scales[rows, :, number] = np.einsum("okj,oj->ok", of_point[rows], offset)
-        noise = self._noise_of_points(query, matches, of_point)
+        noise = self._noise_of_points(query, guided, of_point)
         noise[source >= 0] = 0  # the reprojection error of a lifted point already includes its own noise
         information = np.zeros((6 + len(images),) * 2)
         information[6:, 6:] = np.linalg.inv(_scale_covariance([lifted_map.depths[int(image)] for image in images]))
         # Rotations, translations and scales have similar magnitudes, so one condition number covers all of them.
         covariance = least_squares_covariance(
             np.concatenate([of_pose, of_scales], axis=2),
-            query.errors_px(rig_from_world, matches, local_map.points),
+            query.errors_px(rig_from_world, guided, local_map.points),
             noise,
             information,
+            np.where(found_twice, 1.0, GUIDED_WEIGHT),
         )
         return None if covariance is None else covariance[:6, :6]
 

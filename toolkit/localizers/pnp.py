@@ -27,15 +27,16 @@ from toolkit.localizers.base import (
     WithoutNetwork,
     agree,
 )
-from toolkit.localizers.confidence import EVIDENCE, bounded_by_rivals, probability_right
+from toolkit.localizers.confidence import EVIDENCE, bounded_by_deviation, bounded_by_rivals, probability_right
 from toolkit.localizers.correspondences import Correspondences, Rival
 from toolkit.localizers.matches import MapMatcher, MappedFeatures, MatchCache, Vicinity
 from toolkit.localizers.misfit import find_misfit
 from toolkit.localizers.rig import Matches, RigQuery, least_squares_covariance
+from toolkit.localizers.robust import Bools
 from toolkit.manifest import PnpSettings
 from toolkit.threads import fixed_sums
 
-PNP_FORMAT = 4
+PNP_FORMAT = 5
 """Version of the poses. Increase when the same settings and files give other poses."""
 FIRST_REFERENCES = {2: 200, 4: 100}
 """Number of references per image to match first -> independent inliers that their pose needs to be kept. The next
@@ -43,6 +44,9 @@ number, and finally all references, are matched if the pose has fewer, or if too
 RIVAL_SHARE = 0.25
 """Smallest number of matches by descriptors that agree with a rival, as a share of those that agree with the pose. Such
 a rival may have most of the guided matches, as references of one place hide those of its double."""
+GUIDED_WEIGHT = 0.5
+"""Weight in the covariance of a match that only the search near the pose found. Errors over stated deviations then have
+medians of 0.7 (drone), 0.9, 1.4 (kitchen) and 1.0 (STRECHA); with 0: 0.2, 0.9, 1.1, 0.8; with 1: 0.9, 1.0, 1.6, 1.2."""
 VIEWS = 4
 """Number of references whose keypoints are stored with the correspondences: those that observe the most of them."""
 
@@ -341,9 +345,6 @@ class PnpLocalizer(WithoutNetwork):
                 correspondences=self._rejected(matches),
             )
         errors, rivals = query.errors_px(rig_from_world, guided, self.map.points), self._rivals(hypotheses)
-        # Guided matches were searched near the pose, so their errors are small wherever it is. Only those that were
-        # also found by descriptors alone measure its accuracy.
-        found_twice = guided[np.isin(guided.rows(), inliers.rows())]
         unguided = matches[~np.isin(matches.rows(), guided.rows())]
         unguided_agree = query.errors_deg(rig_from_world, unguided, self.map.points) < settings.max_error_deg
         all_matches = Matches.pooled([guided, unguided])
@@ -354,7 +355,7 @@ class PnpLocalizer(WithoutNetwork):
         estimate = PoseEstimate(
             status="ok",
             world_from_rig=geometry.invert(rig_from_world),
-            covariance=self._covariance(query, rig_from_world, found_twice),
+            covariance=self._covariance(query, rig_from_world, guided, np.isin(guided.rows(), inliers.rows())),
             num_matches=len(matches),
             num_inliers=independent,
             num_guided=len(guided),
@@ -368,6 +369,7 @@ class PnpLocalizer(WithoutNetwork):
         )
         evidence = {name: getattr(estimate, name) for name in EVIDENCE}
         probability = bounded_by_rivals(float(probability_right(evidence)), [rival.support for rival in rivals])
+        probability = bounded_by_deviation(probability, estimate.position_std_m, estimate.rotation_std_deg)
         estimate = replace(estimate, p_correct=probability)
         certain = estimate.p_correct >= settings.ok_probability and estimate.rival_support <= settings.ok_rival_support
         return estimate if certain else replace(estimate, status="low_confidence")
@@ -408,11 +410,18 @@ class PnpLocalizer(WithoutNetwork):
             view_pixels=np.concatenate([np.zeros((0, 2)), *(pixels for _, _, pixels in views)]),
         )
 
-    def _covariance(self, query: RigQuery, rig_from_world: Floats, matches: Matches) -> Floats | None:
-        """Return the covariance (6, 6) of a pose estimated from matches; None if it is undefined."""
-        of_pose, of_point = query.jacobians(rig_from_world, matches, self.map.points)
-        errors = query.errors_px(rig_from_world, matches, self.map.points)
-        of_matches = least_squares_covariance(of_pose, errors, self._noise_of_points(query, matches, of_point))
+    def _covariance(
+        self, query: RigQuery, rig_from_world: Floats, guided: Matches, found_twice: Bools
+    ) -> Floats | None:
+        """Return the covariance (6, 6) of a pose estimated from guided matches; None if it is undefined.
+
+        Guided matches were searched near the pose, so their errors are small wherever it is. Only those that were also
+        found by descriptors alone (`found_twice`) measure the spread of the errors; the others count for less.
+        """
+        of_pose, of_point = query.jacobians(rig_from_world, guided, self.map.points)
+        errors = query.errors_px(rig_from_world, guided, self.map.points)
+        weights, noise = np.where(found_twice, 1.0, GUIDED_WEIGHT), self._noise_of_points(query, guided, of_point)
+        of_matches = least_squares_covariance(of_pose, errors, noise, weights=weights)
         return None if of_matches is None else of_matches + self._noise_of_poses
 
     def _noise_of_points(self, query: RigQuery, matches: Matches, of_point: Floats) -> Floats:

@@ -261,7 +261,11 @@ class RigQuery:
 
 
 def least_squares_covariance(
-    jacobian: Floats, errors_px: Floats, noise_px2: Floats, prior_information: Floats | None = None
+    jacobian: Floats,
+    errors_px: Floats,
+    noise_px2: Floats,
+    prior_information: Floats | None = None,
+    weights: Floats | None = None,
 ) -> Floats | None:
     """Return the covariance (U, U) of a least squares estimate of U unknowns from K projections; None if undefined.
 
@@ -275,13 +279,17 @@ def least_squares_covariance(
         noise_px2: (K, 2, 2), covariance of each projection due to its point, square pixels. Projections whose
             covariance is not finite are left out.
         prior_information: (U, U), information on the unknowns from other sources.
+        weights: (K,), at most 1, of the information of the projections. The spread of the errors is that of the
+            projections of weight 1. None: all have it.
     """
+    weights = np.ones(len(errors_px)) if weights is None else weights
     valid = np.isfinite(noise_px2).all(axis=(1, 2))
-    jacobian, errors_px, noise_px2 = jacobian[valid], errors_px[valid], noise_px2[valid]
-    if len(errors_px) < 4:
+    measured = errors_px[valid & (weights == 1)]
+    if len(measured) < 4:
         return None
+    jacobian, noise_px2 = jacobian[valid] * np.sqrt(weights[valid])[:, None, None], noise_px2[valid]
     # Two coordinates per point, six parameters of the pose.
-    variance = float((errors_px**2).sum()) / max(2 * len(errors_px) - 6, 1)
+    variance = float((measured**2).sum()) / max(2 * len(measured) - 6, 1)
     prior = np.zeros((jacobian.shape[2],) * 2) if prior_information is None else prior_information
     information = np.einsum("oki,okj->ij", jacobian, jacobian) + variance * prior
     if not np.isfinite(information).all() or np.linalg.cond(information) > 1e14:
