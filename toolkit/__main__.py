@@ -142,7 +142,7 @@ def compare(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the resampling for the intervals.")] = 0,
     as_json: Json = False,
 ) -> None:
-    """Compare runs and write a page: recall with intervals, queries won and lost, time, memory, settings."""
+    """Compare runs: recall with intervals, queries won and lost, time, memory, settings. Write notebook and page."""
     _compare(runs, print, as_json, out, pictures, seed)
 
 
@@ -467,15 +467,20 @@ def _compare(
     runs: list[Path], tell: Callable[..., None], as_json: bool, out: Path | None = None, pictures: int = 4,
     seed: int = 0,
 ) -> None:  # fmt: skip
-    """Compare runs, print the result, and write its page."""
-    from toolkit.show.comparison import compare_runs, write_comparison
+    """Compare runs and print the result; execute the notebook on them, and write it as a page."""
+    from toolkit.notebook import execute, notebook_path, write_page
+    from toolkit.show.comparison import compare_runs
 
     comparison = compare_runs(runs, seed)
-    page = write_comparison(comparison, out, pictures)
+    if not as_json:
+        tell(comparison.text())
+    page = (out or runs[0].resolve().parent / f"{comparison.file_name()}.html").resolve()
+    parameters = {"runs": [str(run.resolve()) for run in runs], "pictures": pictures, "seed": seed}
+    notebook, _ = execute(notebook_path("compare"), page.with_suffix(".ipynb"), parameters)
+    write_page(notebook, page)
     if as_json:
         _print_json(comparison.summary() | {"page": str(page)})
     else:
-        tell(comparison.text())
         tell(f"Comparison: {page}")
 
 
