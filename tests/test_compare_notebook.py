@@ -44,5 +44,5 @@ def test_the_command_executes_it_and_writes_a_page(
     assert {"runs": 2, "queries": 2, "won": 1, "lost": 0}.items() <= counts.items()
     text = page.read_text()
     assert not re.search(r'(src|href)="(?!data:|#)|import\(|No description', text), "it needs nothing else"
-    assert "the capture PLACE is no longer where the run read it" in text
+    assert "No picture of hl query" in text
     assert "compare_runs(" not in text

@@ -36,6 +36,8 @@ export_app = typer.Typer(help="Write files for other tools.", no_args_is_help=Tr
 app.add_typer(import_app, name="import")
 app.add_typer(export_app, name="export")
 
+MOST_LETTERS = 100
+"""Length of the name of a comparison's files, at most."""
 USAGE, INTERRUPTED = 2, 130
 """Exit codes of typer: a wrong option; Ctrl-C."""
 
@@ -471,10 +473,11 @@ def _compare(
     from toolkit.notebook import execute, notebook_path, write_page
     from toolkit.show.comparison import compare_runs
 
-    comparison = compare_runs(runs, seed)
+    comparison = compare_runs(list(map(str, runs)), seed)
     if not as_json:
         tell(comparison.text())
-    page = (out or runs[0].resolve().parent / f"{comparison.file_name()}.html").resolve()
+    name = f"compare_{'_'.join(comparison.names)}"[:MOST_LETTERS]
+    page = (out or runs[0].resolve().parent / f"{name}.html").resolve()
     parameters = {"runs": [str(run.resolve()) for run in runs], "pictures": pictures, "seed": seed}
     notebook, _ = execute(notebook_path("compare"), page.with_suffix(".ipynb"), parameters)
     write_page(notebook, page)

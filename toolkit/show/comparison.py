@@ -3,7 +3,7 @@
 Everything is read from the files of the runs; no query is localized again.
 """
 
-import math
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -15,14 +15,13 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from toolkit.capture import Capture
 from toolkit.capture.devices import extra_devices
 from toolkit.capture.names import allow_outside
 from toolkit.errors import ArtifactError, ToolkitError
 from toolkit.files import SceneFiles, require_current, require_whole
 from toolkit.geometry import Floats, Ints
 from toolkit.show.figures import BLUE, GREEN, ORANGE, SKY, VERMILLION, new_figure, number, percent, styled
-from toolkit.show.localized import LocalizedPair
+from toolkit.show.inspection import InspectedPair
 from toolkit.show.metrics import is_below, named_as_meters, parse_threshold, unit_of
 from toolkit.show.report import off_by, read_run, seconds_text, threshold_text
 from toolkit.show.stills import draw_localization
@@ -71,12 +70,6 @@ class Comparison:
     """seconds and memory_mb, by stage and run; the last stage is all of them."""
     messages: Sequence[str]
 
-    def file_name(self) -> str:
-        """Return a name for a file of the comparison: the names of the runs, if that is not too long."""
-        names = [name.replace("/", "-") for name in self.names]
-        stem = "_".join(names)
-        return f"compare_{stem if len(stem) <= 100 else f'{names[0]}_and_{len(names) - 1}_more'}"
-
     def text(self) -> str:
         """Return a short table of all pairs together, with the numbers of queries won and lost."""
         tables, pairs = readable(self), self.queries.groupby(_PAIR).ngroups
@@ -90,18 +83,17 @@ class Comparison:
     def summary(self) -> dict[str, Any]:
         """Return the comparison as plain values for scripts, with every pair and every query won or lost."""
 
-        def plain(table: pd.DataFrame) -> pd.DataFrame:
-            finite = table.replace(np.inf, np.nan).astype(object)  # JSON has no infinity
-            return finite.where(finite.notna(), None)
+        def plain(table: pd.DataFrame) -> list[dict[str, Any]]:  # JSON has neither infinity nor NaN
+            return list(json.loads(table.to_json(orient="records", double_precision=15)))
 
-        stages = plain(self.resources).groupby("stage", sort=False)
+        stages = self.resources.groupby("stage", sort=False)
         return {
             "runs": dict(zip(self.names, map(str, self.folders), strict=True)),
             "queries": len(self.queries),
-            "recall": plain(self.recall).to_dict("records"),
-            "changes": plain(self.changes).to_dict("records"),
+            "recall": plain(self.recall),
+            "changes": plain(self.changes),
             "settings": self.settings.to_dict("index"),
-            "resources": {stage: rows.droplevel("stage").to_dict("index") for stage, rows in stages},
+            "resources": {stage: dict(zip(self.names, plain(rows), strict=True)) for stage, rows in stages},
             "messages": list(self.messages),
         }
 
@@ -125,10 +117,9 @@ def compare_runs(run_dirs: Sequence[str | Path], seed: int = SEED, resamples: in
         ArtifactError: a folder is not a run, is not evaluated, has a torn table or no query with ground truth; or the
             runs have no query in common, or their lengths have different units.
     """
-    folders = [] if isinstance(run_dirs, str) else list(map(Path, run_dirs))
-    if len(folders) < 2:
-        given = run_dirs if isinstance(run_dirs, str) else [str(folder) for folder in folders]
-        raise ArtifactError(f"compare: found {given!r}, expected a list of two or more run folders.")
+    if isinstance(run_dirs, str) or len(run_dirs) < 2:
+        raise ArtifactError(f"compare: found {run_dirs!r}, expected a list of two or more run folders.")
+    folders = list(map(Path, run_dirs))
     records = [read_run(folder / "run.json") for folder in folders]
     tables = [_read_errors(folder, record) for folder, record in zip(folders, records, strict=True)]
     names, messages = _names(folders), list[str]()
@@ -247,10 +238,8 @@ def _thresholds(table: pd.DataFrame) -> list[str]:
 
 def _names(folders: Sequence[Path]) -> list[str]:
     """Return a short, unique name for each run."""
-    paths = [folder.resolve() for folder in folders]
-    ambiguous = {path.name for path in paths if len({other for other in paths if other.name == path.name}) > 1}
-    names = [f"{path.parent.name}/{path.name}" if path.name in ambiguous else path.name for path in paths]
-    return [f"{name} ({names[:i].count(name) + 1})" if name in names[:i] else name for i, name in enumerate(names)]
+    names = [folder.resolve().name for folder in folders]
+    return [f"{name} ({i})" if names.count(name) > 1 else name for i, name in enumerate(names, 1)]
 
 
 # Counting
@@ -312,7 +301,7 @@ def _settings(manifests: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
 
 def _resources(stages: Mapping[str, Sequence[Mapping[str, Any]]]) -> pd.DataFrame:
     rows = [
-        (stage, name, _measured(row, "seconds"), _measured(row, "peak_memory_mb"))
+        (stage, name, row.get("seconds") or 0.0, row.get("peak_memory_mb") or 0.0)
         for name, of_run in stages.items()
         for row in of_run
         for stage in (str(row.get("stage")), ALL)
@@ -321,12 +310,6 @@ def _resources(stages: Mapping[str, Sequence[Mapping[str, Any]]]) -> pd.DataFram
     all_stages = [*(name for name in table["stage"].unique() if name != ALL), ALL]
     every = pd.MultiIndex.from_product([all_stages, stages], names=["stage", "run"])
     return table.groupby(["stage", "run"]).agg({"seconds": "sum", "memory_mb": "max"}).reindex(every)
-
-
-def _measured(row: Mapping[str, Any], name: str) -> float:
-    """Return a number from a stage's row; 0 if it has none."""
-    value = row.get(name)
-    return float(value) if isinstance(value, int | float) and math.isfinite(value) else 0.0
 
 
 # Showing
@@ -402,7 +385,7 @@ def _readable_changes(comparison: Comparison) -> pd.DataFrame:
     table, unit = comparison.changes, unit_of(*comparison.thresholds)
     rows = table.loc[_spread(range(len(table)), MOST_ROWS)].to_dict("records")
     numbers = [comparison.names.index(row["run"]) for row in rows]
-    return pd.DataFrame({
+    shown = pd.DataFrame({
         "run": [row["run"] for row in rows],
         "change": [row["change"] for row in rows],
         "at": [_limits(comparison, row["at"]) for row in rows],
@@ -411,7 +394,8 @@ def _readable_changes(comparison: Comparison) -> pd.DataFrame:
         "off in the run": [off_by(row, after=f"_{i}", unit=unit) for i, row in zip(numbers, rows, strict=True)],
         "status": [row[f"status_{i}"].replace("_", " ") for i, row in zip(numbers, rows, strict=True)],
         "image": list(map(_name, rows)),
-    }).set_index("run")  # fmt: skip
+    })  # fmt: skip
+    return shown.set_index("run")
 
 
 def draw_changes(comparison: Comparison, most: int) -> "Iterator[tuple[str, list[tuple[str, Figure]]]]":
@@ -442,11 +426,9 @@ def draw_changes(comparison: Comparison, most: int) -> "Iterator[tuple[str, list
 def _draw_query(comparison: Comparison, query: Mapping[str, Any], run: str) -> "tuple[str, Figure]":
     """Draw a query as a run has localized it, from stored correspondences; return also a title."""
     i = comparison.names.index(run)
-    record, files = comparison.records[i], SceneFiles(comparison.folders[i], query["scene"])
-    manifest = record["manifest"]
+    manifest, files = comparison.records[i]["manifest"], SceneFiles(comparison.folders[i], query["scene"])
     with extra_devices(manifest.get("extra_devices", [])), allow_outside(manifest.get("allow_outside", False)):
-        capture = Capture.open(_capture_of(record, query["scene"], comparison.folders[i]))
-        pair = LocalizedPair.open(capture, query["map_device"], query["query_device"], files.poses_dir, files.maps)
+        pair = InspectedPair(query["map_device"], query["query_device"], files.poses_dir).localized
         with closing(pair.queries):
             same = (pair.table["timestamp"] == query["timestamp"]) & (pair.table["device_id"] == query["device_id"])
             if not same.any():
@@ -454,15 +436,6 @@ def _draw_query(comparison: Comparison, query: Mapping[str, Any], run: str) -> "
             k = int(np.flatnonzero(same)[0])
             title = f"{run}: {pair.table['status'].iloc[k]}"
             return title, draw_localization(pair.details(k), title=title, unit=pair.unit)
-
-
-def _capture_of(record: Mapping[str, Any], scene: str, folder: Path) -> Path:
-    """Return the folder of a scene's capture from the record of a run."""
-    for row in record["stages"]:
-        root = (row.get("parameters") or {}).get("sessions_root")
-        if row.get("scene") == scene and root and Path(root).is_dir():
-            return Path(root).parent
-    raise ArtifactError(f"{folder}: the capture {scene} is no longer where the run read it, so no query can be drawn.")
 
 
 def _name(change: Mapping[str, Any]) -> str:
