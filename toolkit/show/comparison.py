@@ -123,7 +123,7 @@ def compare_runs(run_dirs: Sequence[str | Path], seed: int = SEED, resamples: in
     records = [read_run(folder / "run.json") for folder in folders]
     tables = [_read_errors(folder, record) for folder, record in zip(folders, records, strict=True)]
     names, messages = _names(folders), list[str]()
-    limits = [_thresholds(table) for table in tables]
+    limits = [[name.removeprefix("loss@") for name in table if name.startswith("loss@")] for table in tables]
     units = [unit_of(*names_of) for names_of in limits]
     for folder, record, unit, limit in zip(folders, records, units, limits, strict=True):
         if unit != units[0]:
@@ -155,7 +155,10 @@ def compare_runs(run_dirs: Sequence[str | Path], seed: int = SEED, resamples: in
     for scene in queries["scene"].unique():
         if len({str(record["inputs"].get(scene)) for record in records}) > 1:
             messages.append(f"{scene}: its files were changed, moved or copied between the runs.")
-    hits = _hits(queries, len(tables), limits[0])
+    errors = [queries[[f"{name}_{i}" for name in _ERRORS]].to_numpy(float).T for i in range(len(tables))]
+    limits_of = [parse_threshold(name) for name in limits[0]]
+    hits = np.array([[is_below(turned, moved, limit) for limit in limits_of] for turned, moved in errors])
+    hits = np.moveaxis(hits, 2, 0)  # (Q, R, T), whether each query is within each threshold in each run
     return Comparison(
         *(folders, names, records, limits[0], queries),
         _recall(queries, hits, names, limits[0], seed, resamples),
@@ -212,6 +215,8 @@ def _read_errors(folder: Path, record: Mapping[str, Any]) -> pd.DataFrame:
         table = named_as_meters(table)
         if lacking := [name for name in (*QUERY[1:], *_RESULT) if name not in table]:
             raise ArtifactError(f"{path}: column {lacking[0]!r} is missing. Run its stage evaluate again.")
+        if not any(name.startswith("loss@") for name in table):
+            raise ArtifactError(f"{path}: a column `loss@...`, which names a threshold, is missing. Evaluate again.")
         tables.append(table.assign(scene=scene))
     if not tables:
         raise ArtifactError(
@@ -229,13 +234,6 @@ def _read_errors(folder: Path, record: Mapping[str, Any]) -> pd.DataFrame:
     return errors
 
 
-def _thresholds(table: pd.DataFrame) -> list[str]:
-    thresholds = [name.removeprefix("loss@") for name in table.columns if name.startswith("loss@")]
-    if not thresholds:
-        raise ArtifactError("errors.csv: a column `loss@...`, which names a threshold, is missing. Evaluate again.")
-    return thresholds
-
-
 def _names(folders: Sequence[Path]) -> list[str]:
     """Return a short, unique name for each run."""
     names = [folder.resolve().name for folder in folders]
@@ -243,13 +241,6 @@ def _names(folders: Sequence[Path]) -> list[str]:
 
 
 # Counting
-
-
-def _hits(queries: pd.DataFrame, runs: int, thresholds: Sequence[str]) -> NDArray[np.bool_]:
-    """Return whether each query is within each threshold in each run, (Q, R, T)."""
-    errors = [[queries[f"{name}_{i}"].to_numpy(float) for name in _ERRORS] for i in range(runs)]
-    hits = [[is_below(degrees, meters, parse_threshold(name)) for name in thresholds] for degrees, meters in errors]
-    return np.asarray(np.moveaxis(np.array(hits, bool), 2, 0))
 
 
 def _recall(
@@ -330,9 +321,7 @@ def draw_differences(comparison: Comparison) -> "Figure":
     for panel, threshold in zip(panels, comparison.thresholds, strict=True):
         for k, run in enumerate(others):
             rows = table[(table["run"] == run) & (table["threshold"] == threshold)]
-            middle, low, high = (
-                100 * rows[name].to_numpy(float) for name in ("difference", "difference_low", "difference_high")
-            )
+            middle, low, high = 100 * rows[["difference", "difference_low", "difference_high"]].to_numpy(float).T
             y = np.arange(len(pairs)) + 0.6 * ((k + 1) / (len(others) + 1) - 0.5)
             color = _COLORS[k % len(_COLORS)]
             panel.hlines(y, low, high, color=color, lw=2)
@@ -356,12 +345,11 @@ def readable(comparison: Comparison) -> dict[str, pd.DataFrame]:
                "cores": record["machine"].get("cores", "?"), **record["versions"]}
         for name, folder, record in zip(comparison.names, comparison.folders, comparison.records, strict=True)
     }  # fmt: skip
-    used = comparison.resources
-    resources = pd.DataFrame({"time": used["seconds"].map(seconds_text), "peak memory": used["memory_mb"].map(_memory)})
+    seconds, memory_mb = comparison.resources["seconds"], comparison.resources["memory_mb"]
     return {
         "recall": _readable_recall(comparison),
         "changes": _readable_changes(comparison),
-        "resources": resources,
+        "resources": pd.DataFrame({"time": seconds.map(seconds_text), "peak memory": memory_mb.map(_memory)}),
         "settings": comparison.settings,
         "origins": pd.DataFrame(origins).fillna("–"),
     }

@@ -53,6 +53,13 @@ WORST, MOST_REASONS = 10, 12
 """Rows listed for a scene: the worst queries, and the reasons why queries have no pose."""
 LONG = 30
 """Letters from which the text of a table is wrapped."""
+LINKED = {
+    "Recordings in 3D, opened by .venv/bin/rerun FILE": "visualization/*.rrd",
+    "Tables of the evaluation": "evaluation/*.csv",
+    "Poses, device to world": "poses/*.txt",
+    "Statuses, a row for each query": "poses/*.csv",
+    "References, a line for each image": "retrieval/*.jsonl",
+}
 STATUS_COLUMNS = [
     "timestamp", "device_id", "image", "reason", "status", "num_inliers", "position_std_m", "seconds",
     "first_status", "first_seconds",
@@ -187,20 +194,17 @@ def _stage_name(row: dict[str, Any]) -> str:
 def _stages(run: dict[str, Any], run_dir: Path) -> Markup:
     rows = []
     for row in run["stages"]:
-        name = " ".join(str(part) for part in (row.get("stage", ""), row.get("part")) if part)
         counts = ", ".join(f"{value} {key.replace('_', ' ')}" for key, value in (row.get("counts") or {}).items())
         rows.append({
             "scene": row.get("scene") or "",
-            "stage": _anchor(name, run_dir, run_dir / str(row.get("notebook") or "")),
+            "stage": _anchor(_stage_name({**row, "scene": ""}), run_dir, run_dir / str(row.get("notebook") or "")),
             "status": row.get("status", ""),
             "time": row.get("seconds"),
             "of it work": row.get("work_seconds", row.get("kernel_seconds")),
             "peak memory": row.get("peak_memory_mb") or None,
             "counts": counts,
         })  # fmt: skip
-    numbers: dict[str, Write] = {
-        "time": seconds_text, "of it work": seconds_text, "peak memory": "{:.0f} MB".format
-    }  # fmt: skip
+    numbers: dict[str, Write] = {"time": seconds_text, "of it work": seconds_text, "peak memory": "{:.0f} MB".format}
     # As objects, or pandas would turn links into plain text.
     frame = pd.DataFrame(rows, dtype=object).astype(dict.fromkeys(numbers if rows else (), float))
     caption = "Time and peak memory of every stage; names link to the executed notebooks"
@@ -311,22 +315,14 @@ def _read_table(path: Path, messages: list[str]) -> pd.DataFrame:
 def _read_statuses(files: SceneFiles, messages: list[str]) -> pd.DataFrame:
     """Return `STATUS_COLUMNS` of every query of every pair, with or without ground truth."""
     tables = []
-    for (map_device, query_device), stem in _pairs_of(files).items():
-        table = _read_table(stem.with_name(f"{stem.name}.csv"), messages)
-        if "status" in table:
-            table = table.reindex(columns=STATUS_COLUMNS)
-            tables.append(table.assign(map_device=map_device, query_device=query_device))
+    for path in sorted(files.poses_dir.glob("*.csv")):
+        map_device, query_device = pair_devices(path.stem)
+        if map_device and query_device and not of_sequence(path.stem):
+            table = _read_table(path, messages)
+            if "status" in table:
+                table = table.reindex(columns=STATUS_COLUMNS)
+                tables.append(table.assign(map_device=map_device, query_device=query_device))
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
-
-
-def _pairs_of(files: SceneFiles) -> dict[tuple[str, str], Path]:
-    """Return the path of the results, without suffix, of each pair (map device, query device) that has any."""
-    pairs = {}
-    for path in sorted([*files.poses_dir.glob("*.csv"), *files.poses_dir.glob("*.txt")]):
-        devices = pair_devices(path.stem)
-        if all(devices) and not of_sequence(path.stem):
-            pairs[devices] = path.with_suffix("")
-    return pairs
 
 
 def _verdict(
@@ -431,13 +427,11 @@ def _matrix(table: pd.DataFrame, column: str, title: str, write: Write = percent
 def _scores(table: pd.DataFrame, caption: str, thresholds: list[str]) -> Markup:
     """Return a table with columns of recall and median errors."""
     small, factor = small_unit(unit_of(*thresholds))
-    recall = [f"recall {threshold_text(name)}" for name in thresholds]
-    turned, moved, wrong = "median [°]", f"median [{small}]", "ok but wrong"
-    names = {"map_device": "map", "query_device": "query", "ok_wrong": wrong, "low_confidence": "low confidence"}
-    names |= {"state": "note", "median_rotation_deg": turned, "median_translation_m": moved}
-    names |= dict(zip(thresholds, recall, strict=True))
-    formats = dict.fromkeys([*recall, wrong], _share) | {turned: number, moved: lambda length: number(factor * length)}
-    return _table(table.rename(columns=names), caption, formats)
+    shares = {name: f"recall {threshold_text(name)}" for name in thresholds} | {"ok_wrong": "ok but wrong"}
+    names = {"map_device": "map", "query_device": "query", "low_confidence": "low confidence", "state": "note"}
+    names |= {"median_rotation_deg": "median [°]", "median_translation_m": f"median [{small}]", **shares}
+    formats: dict[str, Write] = {"median [°]": number, f"median [{small}]": lambda length: number(factor * length)}
+    return _table(table.rename(columns=names), caption, formats | dict.fromkeys(shares.values(), _share))
 
 
 def _pairs(recall: pd.DataFrame, thresholds: list[str]) -> Markup:
@@ -583,23 +577,11 @@ def _retrieval(retrieval: pd.DataFrame, headlines: list[tuple[str, str]], unit: 
 
 def _links(files: SceneFiles, older: Collection[str]) -> dict[str, Markup]:
     """Link the files of a scene, except for those named `older`, by what they are."""
-    pairs = _pairs_of(files).values()
-    kinds = {
-        "Recordings in 3D, opened by .venv/bin/rerun FILE": files.visualization.glob("*.rrd"),
-        "Tables of the evaluation": files.evaluation.glob("*.csv"),
-        "Poses (device to world)": (Path(f"{stem}.txt") for stem in pairs),
-        "Statuses, a row for each query": (Path(f"{stem}.csv") for stem in pairs),
-        "References of each image": (files.retrieval_dir / f"{stem.name}.jsonl" for stem in pairs),
-    }
     found = {
-        kind: [path for path in sorted(paths) if path.is_file() and path.name not in older]
-        for kind, paths in kinds.items()
+        kind: [_anchor(path.name, files.run, path) for path in sorted(files.root.glob(name)) if path.name not in older]
+        for kind, name in LINKED.items()
     }
-    return {
-        kind: Markup(" ").join(_anchor(path.name, files.run, path) for path in paths)
-        for kind, paths in found.items()
-        if paths
-    }
+    return {kind: Markup(" ").join(links) for kind, links in found.items() if links}
 
 
 # Text
