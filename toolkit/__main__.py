@@ -139,7 +139,9 @@ def run(
 @app.command()
 def compare(
     runs: Annotated[list[Path], typer.Argument(help="Two or more run folders, compared with the first.")],
-    out: Annotated[Path | None, typer.Option(help="HTML file, else compare_<names>.html beside the first run.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="HTML file, the notebook beside it; else compare_<names>.html by the first run.")
+    ] = None,
     pictures: Annotated[int, typer.Option(min=0, help="Number of queries won or lost to draw, per run.")] = 4,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the resampling for the intervals.")] = 0,
     as_json: Json = False,
