@@ -1,13 +1,15 @@
 """Notebook 07, which is no stage: clean as committed, and it runs on runs that are there."""
 
+import json
+import re
 from pathlib import Path
 
 import nbformat
 import pytest
 
 from tests.show.test_comparison import GOOD, LOST, PAIRS, write_run
-from toolkit.notebook import NOTEBOOKS, notebook_parameters
-from toolkit.pipeline import execute, handed_counts
+from toolkit.__main__ import main
+from toolkit.notebook import NOTEBOOKS, handed_counts, notebook_parameters
 
 PATH = NOTEBOOKS / "07_compare.ipynb"
 
@@ -28,9 +30,19 @@ def test_it_is_committed_clean() -> None:
 
 
 @pytest.mark.slow
-def test_it_runs(tmp_path: Path) -> None:
+def test_the_command_executes_it_and_writes_a_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     runs = [write_run(tmp_path / name, {PAIRS[0]: [GOOD, error]}) for name, error in (("a", LOST), ("b", GOOD))]
-    parameters = {"runs": list(map(str, runs)), "pictures": 0, "out": str(tmp_path / "page.html")}
-    content, _ = execute(PATH, tmp_path / "out.ipynb", parameters)
-    assert {"runs": 2, "queries": 2, "won": 1, "lost": 0}.items() <= handed_counts(content).items()
-    assert (tmp_path / "page.html").is_file()
+    monkeypatch.setattr("sys.argv", ["toolkit", "compare", *map(str, runs), "--pictures", "1", "--json"])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 0
+    page = Path(json.loads(capsys.readouterr().out)["page"])
+    assert page == tmp_path / "compare_a_b.html"
+    counts = handed_counts(nbformat.read(page.with_suffix(".ipynb"), as_version=4))
+    assert {"runs": 2, "queries": 2, "won": 1, "lost": 0}.items() <= counts.items()
+    text = page.read_text()
+    assert not re.search(r'(src|href)="(?!data:|#)|import\(|No description', text), "it needs nothing else"
+    assert "No picture of hl query" in text
+    assert "compare_runs(" not in text

@@ -36,6 +36,8 @@ export_app = typer.Typer(help="Write files for other tools.", no_args_is_help=Tr
 app.add_typer(import_app, name="import")
 app.add_typer(export_app, name="export")
 
+MOST_LETTERS = 100
+"""Length of the name of a comparison's files, at most."""
 USAGE, INTERRUPTED = 2, 130
 """Exit codes of typer: a wrong option; Ctrl-C."""
 
@@ -137,12 +139,14 @@ def run(
 @app.command()
 def compare(
     runs: Annotated[list[Path], typer.Argument(help="Two or more run folders, compared with the first.")],
-    out: Annotated[Path | None, typer.Option(help="HTML file, else compare_<names>.html beside the first run.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="HTML file, the notebook beside it; else compare_<names>.html by the first run.")
+    ] = None,
     pictures: Annotated[int, typer.Option(min=0, help="Number of queries won or lost to draw, per run.")] = 4,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the resampling for the intervals.")] = 0,
     as_json: Json = False,
 ) -> None:
-    """Compare runs and write a page: recall with intervals, queries won and lost, time, memory, settings."""
+    """Compare runs: recall with intervals, queries won and lost, time, memory, settings. Write notebook and page."""
     _compare(runs, print, as_json, out, pictures, seed)
 
 
@@ -467,15 +471,21 @@ def _compare(
     runs: list[Path], tell: Callable[..., None], as_json: bool, out: Path | None = None, pictures: int = 4,
     seed: int = 0,
 ) -> None:  # fmt: skip
-    """Compare runs, print the result, and write its page."""
-    from toolkit.show.comparison import compare_runs, write_comparison
+    """Compare runs and print the result; execute the notebook on them, and write it as a page."""
+    from toolkit.notebook import execute, notebook_path, write_page
+    from toolkit.show.comparison import compare_runs
 
-    comparison = compare_runs(runs, seed)
-    page = write_comparison(comparison, out, pictures)
+    comparison = compare_runs(list(map(str, runs)), seed)
+    if not as_json:
+        tell(comparison.text())
+    name = f"compare_{'_'.join(comparison.names)}"[:MOST_LETTERS]
+    page = (out or runs[0].resolve().parent / f"{name}.html").resolve()
+    parameters = {"runs": [str(run.resolve()) for run in runs], "pictures": pictures, "seed": seed}
+    notebook, _ = execute(notebook_path("compare"), page.with_suffix(".ipynb"), parameters)
+    write_page(notebook, page)
     if as_json:
         _print_json(comparison.summary() | {"page": str(page)})
     else:
-        tell(comparison.text())
         tell(f"Comparison: {page}")
 
 

@@ -59,6 +59,16 @@ UPSTREAM: dict[str, tuple[str, ...]] = {
     "visualize": ("retrieve", "localize", "sequence"),
 }
 
+# nbconvert's page, without the scripts that it loads from other servers, and with `alt` in the metadata of pictures.
+_PAGE = """{% extends "lab/index.html.j2" %}
+{% block html_head_js %}{% endblock %}
+{% block html_head_js_mathjax %}{% endblock %}
+{% block html_head_js_mermaidjs %}{% endblock %}
+{% set img = "<img alt='%s'" %}
+{% block data_png scoped %}{{ super() | replace("<img", img | format(output.metadata.alt | e)) }}{% endblock %}
+{% block data_jpg scoped %}{{ super() | replace("<img", img | format(output.metadata.alt | e)) }}{% endblock %}
+"""
+
 if TEXT_BARS in os.environ:
     # Every stage imports its progress bar from tqdm.auto, after this module.
     tqdm.auto.tqdm = tqdm.std.tqdm
@@ -569,6 +579,15 @@ def execute(
             except NotJSONError:  # cut short by the error that is being raised, e.g. a full disk
                 partial.unlink()
     return notebook, memory.stop()
+
+
+def write_page(notebook: Any, page: Path) -> None:
+    """Write an executed notebook without its code as an HTML file, which needs no other file and no network."""
+    from nbconvert import HTMLExporter
+
+    hidden = {"exclude_input": True, "exclude_input_prompt": True, "exclude_output_prompt": True}
+    exporter = HTMLExporter(raw_template=_PAGE, **hidden)
+    write_text(page, exporter.from_notebook_node(notebook, {"metadata": {"name": page.stem}})[0])
 
 
 def _cell_error(error: "PapermillExecutionError", output: Path) -> StageError:

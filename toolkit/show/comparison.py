@@ -3,11 +3,10 @@
 Everything is read from the files of the runs; no query is localized again.
 """
 
-import math
-import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import json
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,27 +15,15 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from toolkit.capture import Capture
 from toolkit.capture.devices import extra_devices
 from toolkit.capture.names import allow_outside
 from toolkit.errors import ArtifactError, ToolkitError
-from toolkit.files import SceneFiles, require_current, require_whole, write_text
+from toolkit.files import SceneFiles, require_current, require_whole
 from toolkit.geometry import Floats, Ints
-from toolkit.show.figures import BLUE, GREEN, ORANGE, SKY, VERMILLION, new_figure, number, percent, save_figure, styled
-from toolkit.show.localized import LocalizedPair
+from toolkit.show.figures import BLUE, GREEN, ORANGE, SKY, VERMILLION, new_figure, number, percent, styled
+from toolkit.show.inspection import InspectedPair
 from toolkit.show.metrics import is_below, named_as_meters, parse_threshold, unit_of
-from toolkit.show.report import (
-    PICTURE_BUDGET,
-    Album,
-    Cell,
-    Picture,
-    Table,
-    off_by,
-    page_template,
-    read_run,
-    seconds_text,
-    threshold_text,
-)
+from toolkit.show.report import off_by, read_run, seconds_text, threshold_text
 from toolkit.show.stills import draw_localization
 
 if TYPE_CHECKING:
@@ -47,16 +34,14 @@ INTERVAL = (2.5, 97.5)
 """Percentiles of the resamples that bound an interval."""
 ALL = "all"
 """Value of the scene and device columns in rows that sum over all pairs."""
-MOST_PICTURES, MOST_ROWS = 4, 20
-"""Queries won or lost that the page draws, and that it lists."""
-MOST_LETTERS = 32
-"""Length of an image name beyond which the page shows only the file name."""
+MOST_ROWS, MOST_LETTERS = 20, 32
+"""Queries won or lost that are listed; letters of an image name beyond which only the file name is shown."""
 QUERY = ["scene", "map_device", "query_device", "timestamp", "device_id"]
 _PAIR = QUERY[:3]
 _ERRORS = ["rotation_error_deg", "translation_error_m"]
-_NEEDED = [*QUERY[1:], "status", *_ERRORS]
+_RESULT = ["status", *_ERRORS]
 # Manifest keys that differ between any two runs, so they are not compared.
-_NAMES = ("name", "description", "output_root")
+_NAMES = ["name", "description", "output_root"]
 _COLORS = (VERMILLION, BLUE, GREEN, ORANGE, SKY)
 
 
@@ -66,6 +51,7 @@ class Comparison:
 
     folders: Sequence[Path]
     names: Sequence[str]
+    """Of the runs; each is different."""
     records: Sequence[Mapping[str, Any]]
     """Content of each `run.json`."""
     thresholds: Sequence[str]
@@ -77,53 +63,37 @@ class Comparison:
     """One row per pair, threshold and run, and the same for all pairs together: recall and its difference to the first
     run (0 to 1), each with the `_low` and `_high` of its interval; numbers of queries, won and lost."""
     changes: pd.DataFrame
-    """One row per query that a run won or lost. Columns `QUERY`; run (its number), change, at (thresholds)."""
+    """The rows of `queries` that a run won or lost, with the columns run, change, at (thresholds)."""
     settings: pd.DataFrame
-    """Settings that differ: key, and one column per run."""
+    """Settings that differ, by their key; one column per run."""
     resources: pd.DataFrame
-    """One row per stage, and one for all stages: stage; `seconds_<i>` and `memory_mb_<i>` of each run i."""
-    messages: Sequence[str] = field(default_factory=list)
+    """seconds and memory_mb, by stage and run; the last stage is all of them."""
+    messages: Sequence[str]
 
     def text(self) -> str:
         """Return a short table of all pairs together, with the numbers of queries won and lost."""
-        rows = self.recall[self.recall["scene"] == ALL]
-        width = max(map(len, self.names))
-        lines = [f"{len(self.queries)} queries in {self.queries.groupby(_PAIR).ngroups} pairs, recall in % [95 %]"]
-        for threshold, group in rows.groupby("threshold", sort=False):
-            lines.append(f"at {threshold_text(str(threshold))}")
-            for row in group.to_dict("records"):
-                line = f"  {self.names[row['run']]:<{width}}  {_interval(row, 'recall')}"
-                if row["run"]:
-                    line += f"   {_interval(row, 'difference')}   {row['won']} won, {row['lost']} lost"
-                lines.append(line)
-        lines.append("time and peak memory; reused results, also those of another run, count as none")
-        total = self.resources.iloc[-1]
-        for i, name in enumerate(self.names):
-            seconds, memory = seconds_text(total[f"seconds_{i}"]), _memory(total[f"memory_mb_{i}"])
-            lines.append(f"  {name:<{width}}  {seconds}, {memory}")
-        for row in self.settings.to_dict("records"):
-            lines.append(f"{row['key']}: " + " | ".join(row[f"run_{i}"] for i in range(len(self.names))))
-        return "\n".join([*lines, *(f"Note: {message}" for message in self.messages)])
+        tables, pairs = readable(self), self.queries.groupby(_PAIR).ngroups
+        recall = tables["recall"].xs((ALL, ALL), level=["map", "query"]).drop(columns="queries")
+        resources = tables["resources"].loc[ALL]
+        parts = [f"{len(self.queries)} queries in {pairs} pairs, recall in % [95 %]", recall.to_string()]
+        parts += ["time and peak memory; reused results, also those of another run, count as none"]
+        parts += [resources.to_string()] + ([self.settings.to_string()] if len(self.settings) else [])
+        return "\n".join([*parts, *(f"Note: {message}" for message in self.messages)])
 
     def summary(self) -> dict[str, Any]:
         """Return the comparison as plain values for scripts, with every pair and every query won or lost."""
-        changes = self.changes.assign(run=[self.names[i] for i in self.changes["run"]])
-        recall = self.recall.assign(run=[self.names[i] for i in self.recall["run"]])
-        tables = {"recall": recall, "changes": changes, "resources": self.resources}
-        finite = {name: table.replace(np.inf, np.nan) for name, table in tables.items()}  # JSON has no infinity
-        plain = {name: table.astype(object).where(table.notna(), None) for name, table in finite.items()}
+
+        def plain(table: pd.DataFrame) -> list[dict[str, Any]]:  # JSON has neither infinity nor NaN
+            return list(json.loads(table.to_json(orient="records", double_precision=15)))
+
+        stages = self.resources.groupby("stage", sort=False)
         return {
             "runs": dict(zip(self.names, map(str, self.folders), strict=True)),
             "queries": len(self.queries),
-            **{name: plain[name].to_dict("records") for name in ("recall", "changes")},
-            "settings": self.settings.set_index("key").set_axis(self.names, axis="columns").to_dict("index"),
-            "resources": {
-                row["stage"]: {
-                    name: {column: row[f"{column}_{i}"] for column in ("seconds", "memory_mb")}
-                    for i, name in enumerate(self.names)
-                }
-                for row in plain["resources"].to_dict("records")
-            },
+            "recall": plain(self.recall),
+            "changes": plain(self.changes),
+            "settings": self.settings.to_dict("index"),
+            "resources": {stage: dict(zip(self.names, plain(rows), strict=True)) for stage, rows in stages},
             "messages": list(self.messages),
         }
 
@@ -147,14 +117,13 @@ def compare_runs(run_dirs: Sequence[str | Path], seed: int = SEED, resamples: in
         ArtifactError: a folder is not a run, is not evaluated, has a torn table or no query with ground truth; or the
             runs have no query in common, or their lengths have different units.
     """
-    folders = [] if isinstance(run_dirs, str) else list(map(Path, run_dirs))
-    if len(folders) < 2:
-        given = run_dirs if isinstance(run_dirs, str) else [str(folder) for folder in folders]
-        raise ArtifactError(f"compare: found {given!r}, expected a list of two or more run folders.")
+    if isinstance(run_dirs, str) or len(run_dirs) < 2:
+        raise ArtifactError(f"compare: found {run_dirs!r}, expected a list of two or more run folders.")
+    folders = list(map(Path, run_dirs))
     records = [read_run(folder / "run.json") for folder in folders]
     tables = [_read_errors(folder, record) for folder, record in zip(folders, records, strict=True)]
     names, messages = _names(folders), list[str]()
-    limits = [_thresholds(table) for table in tables]
+    limits = [[name.removeprefix("loss@") for name in table if name.startswith("loss@")] for table in tables]
     units = [unit_of(*names_of) for names_of in limits]
     for folder, record, unit, limit in zip(folders, records, units, limits, strict=True):
         if unit != units[0]:
@@ -173,9 +142,9 @@ def compare_runs(run_dirs: Sequence[str | Path], seed: int = SEED, resamples: in
                 f"{folder}: evaluation/errors.csv has a query twice, expected one row each. Perhaps this run was "
                 "evaluated at each camera and the others at each device; evaluate it with the same `at` as the others."
             )
-    queries = tables[0][[*keys, *({"image"} & {*tables[0]})]]
-    for table in tables[1:]:
-        queries = queries.merge(table[keys], on=keys)
+    results = [table.set_index(keys)[_RESULT].add_suffix(f"_{i}") for i, table in enumerate(tables)]
+    images = tables[0].set_index(keys).filter(["image"])
+    queries = pd.concat([images, *results], axis="columns", join="inner").reset_index()
     counts = ", ".join(f"{name} {len(table)}" for name, table in zip(names, tables, strict=True))
     if queries.empty:
         raise ArtifactError(
@@ -186,16 +155,16 @@ def compare_runs(run_dirs: Sequence[str | Path], seed: int = SEED, resamples: in
     for scene in queries["scene"].unique():
         if len({str(record["inputs"].get(scene)) for record in records}) > 1:
             messages.append(f"{scene}: its files were changed, moved or copied between the runs.")
-    for i, table in enumerate(tables):
-        columns = {name: f"{name}_{i}" for name in ("status", *_ERRORS)}
-        queries = queries.merge(table[[*keys, *columns]].rename(columns=columns), on=keys)
-    hits = _hits(queries, len(tables), limits[0])
+    errors = [queries[[f"{name}_{i}" for name in _ERRORS]].to_numpy(float).T for i in range(len(tables))]
+    limits_of = [parse_threshold(name) for name in limits[0]]
+    hits = np.array([[is_below(turned, moved, limit) for limit in limits_of] for turned, moved in errors])
+    hits = np.moveaxis(hits, 2, 0)  # (Q, R, T), whether each query is within each threshold in each run
     return Comparison(
         *(folders, names, records, limits[0], queries),
-        _recall(queries, hits, limits[0], seed, resamples),
-        _changes(queries, hits, limits[0]),
-        _settings([record["manifest"] for record in records]),
-        _resources([record["stages"] for record in records]),
+        _recall(queries, hits, names, limits[0], seed, resamples),
+        _changes(queries, hits, names, limits[0]),
+        _settings({name: record["manifest"] for name, record in zip(names, records, strict=True)}),
+        _resources({name: record["stages"] for name, record in zip(names, records, strict=True)}),
         messages,
     )
 
@@ -244,8 +213,10 @@ def _read_errors(folder: Path, record: Mapping[str, Any]) -> pd.DataFrame:
         except (OSError, ValueError, OverflowError) as error:
             raise ArtifactError(f"{path}: not a table of errors ({error}). Run its stage evaluate again.") from None
         table = named_as_meters(table)
-        if lacking := [name for name in _NEEDED if name not in table]:
+        if lacking := [name for name in (*QUERY[1:], *_RESULT) if name not in table]:
             raise ArtifactError(f"{path}: column {lacking[0]!r} is missing. Run its stage evaluate again.")
+        if not any(name.startswith("loss@") for name in table):
+            raise ArtifactError(f"{path}: a column `loss@...`, which names a threshold, is missing. Evaluate again.")
         tables.append(table.assign(scene=scene))
     if not tables:
         raise ArtifactError(
@@ -263,110 +234,73 @@ def _read_errors(folder: Path, record: Mapping[str, Any]) -> pd.DataFrame:
     return errors
 
 
-def _thresholds(table: pd.DataFrame) -> list[str]:
-    thresholds = [name.removeprefix("loss@") for name in table.columns if name.startswith("loss@")]
-    if not thresholds:
-        raise ArtifactError("errors.csv: a column `loss@...`, which names a threshold, is missing. Evaluate again.")
-    return thresholds
-
-
 def _names(folders: Sequence[Path]) -> list[str]:
     """Return a short, unique name for each run."""
-    paths = [folder.resolve() for folder in folders]
-    ambiguous = {path.name for path in paths if len({other for other in paths if other.name == path.name}) > 1}
-    names = [f"{path.parent.name}/{path.name}" if path.name in ambiguous else path.name for path in paths]
-    return [f"{name} ({names[:i].count(name) + 1})" if name in names[:i] else name for i, name in enumerate(names)]
+    names = [folder.resolve().name for folder in folders]
+    return [f"{name} ({i})" if names.count(name) > 1 else name for i, name in enumerate(names, 1)]
 
 
 # Counting
 
 
-def _hits(queries: pd.DataFrame, runs: int, thresholds: Sequence[str]) -> NDArray[np.bool_]:
-    """Return whether each query is within each threshold in each run, (Q, R, T)."""
-    errors = [[queries[f"{name}_{i}"].to_numpy(float) for name in _ERRORS] for i in range(runs)]
-    hits = [[is_below(degrees, meters, parse_threshold(name)) for name in thresholds] for degrees, meters in errors]
-    return np.asarray(np.moveaxis(np.array(hits, bool), 2, 0))
-
-
 def _recall(
-    queries: pd.DataFrame, hits: NDArray[np.bool_], thresholds: Sequence[str], seed: int, resamples: int
+    queries: pd.DataFrame,
+    hits: NDArray[np.bool_],
+    names: Sequence[str],
+    thresholds: Sequence[str],
+    seed: int,
+    resamples: int,
 ) -> pd.DataFrame:
-    rows_of_pair = queries.groupby(_PAIR, sort=False).indices
-    everything = np.arange(len(queries))
-    rows: list[dict[str, Any]] = []
-    for pair, chosen in [*rows_of_pair.items(), ((ALL, ALL, ALL), everything)]:
+    groups = {**queries.groupby(_PAIR, sort=False).indices, (ALL, ALL, ALL): np.arange(len(queries))}
+    index = pd.MultiIndex.from_product([thresholds, names], names=["threshold", "run"])
+    tables = {}
+    for pair, chosen in groups.items():
         within, first = hits[chosen], hits[chosen][:, :1]
         unit = queries.iloc[chosen].groupby(["scene", "timestamp", "device_id"], sort=False).ngroup().to_numpy()
         recall, difference = bootstrap(within, unit, seed, resamples)
         shares = within.mean(axis=0)
-        won, lost = (within & ~first).sum(axis=0), (first & ~within).sum(axis=0)
-        rows += [
-            {
-                **dict(zip(_PAIR, pair, strict=True)),
-                "threshold": threshold,
-                "run": run,
-                "queries": len(chosen),
-                "recall": shares[run, t],
-                "recall_low": recall[0, run, t],
-                "recall_high": recall[1, run, t],
-                "difference": shares[run, t] - shares[0, t],
-                "difference_low": difference[0, run, t],
-                "difference_high": difference[1, run, t],
-                "won": int(won[run, t]),
-                "lost": int(lost[run, t]),
-            }
-            for t, threshold in enumerate(thresholds)
-            for run in range(hits.shape[1])
-        ]
-    return pd.DataFrame(rows)
+        of_runs = {
+            "recall": shares, "recall_low": recall[0], "recall_high": recall[1],
+            "difference": shares - shares[0], "difference_low": difference[0], "difference_high": difference[1],
+            "won": (within & ~first).sum(axis=0), "lost": (first & ~within).sum(axis=0),
+        }  # fmt: skip
+        columns = {name: values.T.ravel() for name, values in of_runs.items()}
+        tables[pair] = pd.DataFrame({"queries": len(chosen), **columns}, index)
+    return pd.concat(tables, names=_PAIR).reset_index()
 
 
-def _changes(queries: pd.DataFrame, hits: NDArray[np.bool_], thresholds: Sequence[str]) -> pd.DataFrame:
+def _changes(
+    queries: pd.DataFrame, hits: NDArray[np.bool_], names: Sequence[str], thresholds: Sequence[str]
+) -> pd.DataFrame:
     """List for each run the queries lost, then those won; those that changed at the most thresholds first."""
     parts = []
-    for run in range(1, hits.shape[1]):
+    for run, name in enumerate(names[1:], 1):
         for change, changed in (("lost", hits[:, 0] & ~hits[:, run]), ("won", ~hits[:, 0] & hits[:, run])):
             order = np.argsort(-changed.sum(axis=1), kind="stable")
             chosen = order[changed[order].any(axis=1)]
-            at = ["; ".join(name for name, yes in zip(thresholds, changed[k], strict=True) if yes) for k in chosen]
-            parts.append(queries.iloc[chosen].assign(run=run, change=change, at=at))
+            at = ["; ".join(np.array(thresholds)[changed[k]]) for k in chosen]
+            parts.append(queries.iloc[chosen].assign(run=name, change=change, at=at))
     return pd.concat(parts, ignore_index=True)
 
 
-def _settings(manifests: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Return the settings that differ between runs."""
-    flat = [dict(_leaves(manifest)) for manifest in manifests]
-    keys = [key for key in dict.fromkeys(key for leaves in flat for key in leaves) if key not in _NAMES]
-    texts = [[str(leaves[key]) if key in leaves else "–" for leaves in flat] for key in keys]
-    rows = [[key, *values] for key, values in zip(keys, texts, strict=True) if len(set(values)) > 1]
-    return pd.DataFrame(rows, columns=["key", *(f"run_{i}" for i in range(len(manifests)))])
+def _settings(manifests: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
+    """Return the settings that differ between runs, as texts."""
+    columns = {name: pd.json_normalize(dict(manifest)).T.astype(str) for name, manifest in manifests.items()}
+    table = pd.concat(columns, axis="columns").droplevel(1, axis="columns").drop(_NAMES, errors="ignore").fillna("–")
+    return table[table.nunique(axis="columns") > 1]
 
 
-def _leaves(tree: Mapping[str, Any], above: str = "") -> Iterable[tuple[str, Any]]:
-    for key, value in tree.items():
-        if isinstance(value, dict) and value:
-            yield from _leaves(value, f"{above}{key}.")
-        else:
-            yield f"{above}{key}", value
-
-
-def _resources(stages: Sequence[Sequence[Mapping[str, Any]]]) -> pd.DataFrame:
-    names = dict.fromkeys(str(row.get("stage")) for rows in stages for row in rows)
-    table = []
-    for name in (*names, ALL):
-        line: dict[str, Any] = {"stage": name}
-        for i, rows in enumerate(stages):
-            stage_rows = [row for row in rows if name in (ALL, row.get("stage"))]
-            line[f"seconds_{i}"] = sum(_measured(row, "seconds") for row in stage_rows) if stage_rows else math.nan
-            line[f"memory_mb_{i}"] = max((_measured(row, "peak_memory_mb") for row in stage_rows), default=math.nan)
-        table.append(line)
-    return pd.DataFrame(table)
-
-
-def _measured(row: Mapping[str, Any], name: str) -> float:
-    """Return a number from a stage's row; 0 if it has none."""
-    value = row.get(name)
-    return float(value) if isinstance(value, int | float) and math.isfinite(value) else 0.0
+def _resources(stages: Mapping[str, Sequence[Mapping[str, Any]]]) -> pd.DataFrame:
+    rows = [
+        (stage, name, row.get("seconds") or 0.0, row.get("peak_memory_mb") or 0.0)
+        for name, of_run in stages.items()
+        for row in of_run
+        for stage in (str(row.get("stage")), ALL)
+    ]
+    table = pd.DataFrame(rows, columns=["stage", "run", "seconds", "memory_mb"])
+    all_stages = [*(name for name in table["stage"].unique() if name != ALL), ALL]
+    every = pd.MultiIndex.from_product([all_stages, stages], names=["stage", "run"])
+    return table.groupby(["stage", "run"]).agg({"seconds": "sum", "memory_mb": "max"}).reindex(every)
 
 
 # Showing
@@ -375,25 +309,23 @@ def _measured(row: Mapping[str, Any], name: str) -> float:
 @styled
 def draw_differences(comparison: Comparison) -> "Figure":
     """Draw for each pair the difference of recall to the first run, with its interval."""
-    table = comparison.recall[comparison.recall["run"] > 0]
+    others = comparison.names[1:]
+    table = comparison.recall[comparison.recall["run"] != comparison.names[0]]
     pairs = list(dict.fromkeys(map(tuple, table[_PAIR].to_numpy())))
     several = table["scene"].nunique() > 2
     labels = [
         "all pairs" if pair[0] == ALL else f"{f'{pair[0]}: ' * several}{pair[2]} in {pair[1]} map" for pair in pairs
     ]
-    runs = range(1, len(comparison.names))
-    figure = new_figure(3.6 * len(comparison.thresholds) + 1.5, 0.24 * len(pairs) * max(2, len(runs)) + 1.4)
+    figure = new_figure(3.6 * len(comparison.thresholds) + 1.5, 0.24 * len(pairs) * max(2, len(others)) + 1.4)
     panels = np.ravel(figure.subplots(1, len(comparison.thresholds), sharey=True, sharex=True, squeeze=False))
     for panel, threshold in zip(panels, comparison.thresholds, strict=True):
-        for run in runs:
+        for k, run in enumerate(others):
             rows = table[(table["run"] == run) & (table["threshold"] == threshold)]
-            middle, low, high = (
-                100 * rows[name].to_numpy(float) for name in ("difference", "difference_low", "difference_high")
-            )
-            y = np.arange(len(pairs)) + 0.6 * (run / (len(comparison.names)) - 0.5)
-            color = _COLORS[(run - 1) % len(_COLORS)]
+            middle, low, high = 100 * rows[["difference", "difference_low", "difference_high"]].to_numpy(float).T
+            y = np.arange(len(pairs)) + 0.6 * ((k + 1) / (len(others) + 1) - 0.5)
+            color = _COLORS[k % len(_COLORS)]
             panel.hlines(y, low, high, color=color, lw=2)
-            panel.plot(middle, y, "o", color=color, ms=5, label=comparison.names[run])
+            panel.plot(middle, y, "o", color=color, ms=5, label=run)
         panel.axvline(0, color="0.4", lw=0.8)
         panel.set(title=f"at {threshold_text(threshold)}", xlabel="difference of recall [percentage points]")
         panel.set_yticks(range(len(pairs)), labels)
@@ -401,136 +333,100 @@ def draw_differences(comparison: Comparison) -> "Figure":
     lowest, highest = panels[0].get_xlim()
     panels[0].set_xlim(min(lowest, -5), max(highest, 5))  # small differences should look small
     figure.suptitle(f"Recall minus that of {comparison.names[0]}, with intervals of 95 %")
-    if len(runs) > 1:
+    if len(others) > 1:
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     return figure
 
 
 def readable(comparison: Comparison) -> dict[str, pd.DataFrame]:
-    """Return the tables of the page as text: `recall`, `changes`, `resources` and `settings`; some may be empty."""
-    recall = {threshold_text(name): _frame(_recall_table(comparison, name)) for name in comparison.thresholds}
-    makers = {"changes": _changes_table, "resources": _resources_table, "settings": _settings_table}
-    tables = {name: _frame(make(comparison)) for name, make in makers.items()}
-    return {"recall": pd.concat(recall, names=["at"]), **tables}
+    """Return the tables as texts: `recall`, `changes`, `resources`, `settings` and `origins`; some may be empty."""
+    origins = {
+        name: {"folder": str(folder), "created": record["created"], "code": record["code"] or "not known",
+               "cores": record["machine"].get("cores", "?"), **record["versions"]}
+        for name, folder, record in zip(comparison.names, comparison.folders, comparison.records, strict=True)
+    }  # fmt: skip
+    seconds, memory_mb = comparison.resources["seconds"], comparison.resources["memory_mb"]
+    return {
+        "recall": _readable_recall(comparison),
+        "changes": _readable_changes(comparison),
+        "resources": pd.DataFrame({"time": seconds.map(seconds_text), "peak memory": memory_mb.map(_memory)}),
+        "settings": comparison.settings,
+        "origins": pd.DataFrame(origins).fillna("–"),
+    }
 
 
-def _frame(table: Table | None) -> pd.DataFrame:
-    if table is None:
-        return pd.DataFrame()
-    frame = pd.DataFrame([[cell.text for cell in row] for row in table.rows], columns=table.columns)
-    return frame.set_index(table.columns[0])
+def _readable_recall(comparison: Comparison) -> pd.DataFrame:
+    """List recall in %, with its interval, and the differences in percentage points, one threshold after the other."""
+    table = pd.concat(of_limit for _, of_limit in comparison.recall.groupby("threshold", sort=False))
+    rows = table.to_dict("records")
+    table["at"], table["recall"] = table["threshold"].map(threshold_text), [_interval(row, "recall") for row in rows]
+    table["difference"] = [_interval(row, "difference") for row in rows]
+    changes = ["difference", "won", "lost"]  # the first run is compared with itself
+    table[changes] = table[changes].astype(object).where(table["run"] != comparison.names[0], "")
+    index = ["at", *(["scene"] if table["scene"].nunique() > 2 else []), "map", "query", "run"]
+    table = table.rename(columns={"map_device": "map", "query_device": "query"}).set_index(index)
+    return table[["queries", "recall", *changes]]
 
 
-def draw_change(comparison: Comparison, row: int) -> "list[tuple[str, Figure]]":
-    """Draw a query that was won or lost, as localized by the first run and by the other, from stored correspondences.
-
-    Args:
-        row: row of `comparison.changes`.
-
-    Returns:
-        A title and a figure for each of the two runs.
-
-    Raises:
-        ToolkitError: the capture has moved, or a run has not kept the correspondences.
-    """
-    change = comparison.changes.iloc[row]
-    drawn = []
-    for i in (0, int(change["run"])):
-        record, files = comparison.records[i], SceneFiles(comparison.folders[i], change["scene"])
-        manifest = record["manifest"]
-        with extra_devices(manifest.get("extra_devices", [])), allow_outside(manifest.get("allow_outside", False)):
-            capture = Capture.open(_capture_of(record, change["scene"], comparison.folders[i]))
-            devices = change["map_device"], change["query_device"]
-            pair = LocalizedPair.open(capture, *devices, files.poses_dir, files.maps)
-            with closing(pair.queries):
-                same = (pair.table[["timestamp", "device_id"]] == change[["timestamp", "device_id"]]).all(axis=1)
-                if not same.any():
-                    raise ArtifactError(f"{files.poses_dir / pair.name}.csv: no row of query {change['timestamp']}.")
-                k = int(np.flatnonzero(same)[0])
-                title = f"{comparison.names[i]}: {pair.table['status'].iloc[k]}"
-                drawn.append((title, draw_localization(pair.details(k), title=title, unit=pair.unit)))
-    return drawn
+def _readable_changes(comparison: Comparison) -> pd.DataFrame:
+    """List the queries won and lost, or a regular sample of `MOST_ROWS` of them."""
+    table, unit = comparison.changes, unit_of(*comparison.thresholds)
+    rows = table.loc[_spread(range(len(table)), MOST_ROWS)].to_dict("records")
+    numbers = [comparison.names.index(row["run"]) for row in rows]
+    shown = pd.DataFrame({
+        "run": [row["run"] for row in rows],
+        "change": [row["change"] for row in rows],
+        "at": [_limits(comparison, row["at"]) for row in rows],
+        "query": [f"{row['query_device']} in {row['map_device']} map" for row in rows],
+        f"off in {comparison.names[0]}": [off_by(row, after="_0", unit=unit) for row in rows],
+        "off in the run": [off_by(row, after=f"_{i}", unit=unit) for i, row in zip(numbers, rows, strict=True)],
+        "status": [row[f"status_{i}"].replace("_", " ") for i, row in zip(numbers, rows, strict=True)],
+        "image": list(map(_name, rows)),
+    })  # fmt: skip
+    return shown.set_index("run")
 
 
-def _capture_of(record: Mapping[str, Any], scene: str, folder: Path) -> Path:
-    """Return the folder of a scene's capture from the record of a run."""
-    for row in record["stages"]:
-        root = (row.get("parameters") or {}).get("sessions_root")
-        if row.get("scene") == scene and root and Path(root).is_dir():
-            return Path(root).parent
-    raise ArtifactError(f"{folder}: the capture {scene} is no longer where the run read it, so no query can be drawn.")
-
-
-def write_comparison(comparison: Comparison, path: str | Path | None = None, pictures: int = MOST_PICTURES) -> Path:
-    """Write the page of a comparison, one self-contained file, and return its path.
-
-    Args:
-        path: HTML file; None: `compare_<names>.html` beside the first run.
-        pictures: number of queries won or lost to draw for each run; 0 draws none.
-    """
-    if path is None:
-        stem = "_".join(name.replace("/", "-") for name in comparison.names)
-        if len(stem) > 100:
-            stem = f"{comparison.names[0].replace('/', '-')}_and_{len(comparison.names) - 1}_more"
-        path = comparison.folders[0].resolve().parent / f"compare_{stem}.html"
-    names, messages, looks = comparison.names, list(comparison.messages), list[tuple[str, list[Picture]]]()
-    with tempfile.TemporaryDirectory() as folder:
-        album = Album(Path(folder), PICTURE_BUDGET, [])
-
-        def picture(drawn: "Figure", title: str, caption: str = "") -> Picture:
-            path = save_figure(drawn, Path(folder) / "picture.png")
-            return replace(album.picture(path, title, caption), path="")  # the file is temporary
-
-        caption = "Right of the line a run is better than the first; an interval that crosses it may be chance."
-        figure = picture(draw_differences(comparison), "Differences", caption)
-        for title, drawn in draw_changes(comparison, pictures):
-            shown = [picture(of_run, name) for name, of_run in drawn]
-            if not drawn:
-                messages.append(title)
-            elif all(one.data for one in shown):
-                looks.append((title, shown))
-    page = page_template("comparison.html.j2").render(
-        run={"name": f"{names[1] if len(names) == 2 else f'{len(names) - 1} runs'} against {names[0]}"},
-        folders=list(zip(names, map(str, comparison.folders), comparison.records, strict=True)),
-        messages=messages,
-        tiles=_tiles(comparison),
-        recall=[_recall_table(comparison, name) for name in comparison.thresholds],
-        figure=figure,
-        changes=_changes_table(comparison),
-        looks=looks,
-        resources=_resources_table(comparison),
-        settings=_settings_table(comparison),
-    )
-    write_text(path, page)
-    return Path(path)
-
-
-def draw_changes(
-    comparison: Comparison, most: int = MOST_PICTURES
-) -> "Iterator[tuple[str, list[tuple[str, Figure]]]]":
+def draw_changes(comparison: Comparison, most: int) -> "Iterator[tuple[str, list[tuple[str, Figure]]]]":
     """Draw a regular sample of the queries won and lost; yield a title, and the titles and figures of both runs.
 
-    Without figures, the title says why that query cannot be drawn.
+    Without figures, the title says why that query cannot be drawn: the capture has moved, or a run has not kept the
+    correspondences.
 
     Args:
         most: number of queries of each run; half of them lost and half won, if there are enough of both.
     """
     table = comparison.changes
-    for run in range(1, len(comparison.names)):
+    for run in comparison.names[1:]:
         rows = [table.index[(table["run"] == run) & (table["change"] == change)].tolist() for change in ("lost", "won")]
         half = max(most // 2, most - len(rows[1]))
         lost = _spread(rows[0], half)
         for row in [*lost, *_spread(rows[1], most - len(lost))]:
-            change = table.loc[row]
+            change = table.loc[row].to_dict()
             query = f"{change['query_device']} query {_name(change)}"
-            outcome = f"{change['change']} by {comparison.names[run]} at {_limits(comparison, change['at'])}"
+            outcome = f"{change['change']} by {run} at {_limits(comparison, change['at'])}"
             try:
-                yield f"{query} in the {change['map_device']} map: {outcome}", draw_change(comparison, row)
+                drawn = [_draw_query(comparison, change, name) for name in (comparison.names[0], run)]
+                yield f"{query} in the {change['map_device']} map: {outcome}", drawn
             except (ToolkitError, OSError) as error:
                 yield f"No picture of {query}: {error}", []
 
 
-def _name(change: "pd.Series[Any] | Mapping[str, Any]") -> str:
+def _draw_query(comparison: Comparison, query: Mapping[str, Any], run: str) -> "tuple[str, Figure]":
+    """Draw a query as a run has localized it, from stored correspondences; return also a title."""
+    i = comparison.names.index(run)
+    manifest, files = comparison.records[i]["manifest"], SceneFiles(comparison.folders[i], query["scene"])
+    with extra_devices(manifest.get("extra_devices", [])), allow_outside(manifest.get("allow_outside", False)):
+        pair = InspectedPair(query["map_device"], query["query_device"], files.poses_dir).localized
+        with closing(pair.queries):
+            same = (pair.table["timestamp"] == query["timestamp"]) & (pair.table["device_id"] == query["device_id"])
+            if not same.any():
+                raise ArtifactError(f"{files.poses_dir / pair.name}.csv: no row of query {query['timestamp']}.")
+            k = int(np.flatnonzero(same)[0])
+            title = f"{run}: {pair.table['status'].iloc[k]}"
+            return title, draw_localization(pair.details(k), title=title, unit=pair.unit)
+
+
+def _name(change: Mapping[str, Any]) -> str:
     """Return the name of a query: its image name, shortened to the file name if long; else its timestamp."""
     image = change.get("image")
     name = image if isinstance(image, str) else str(change["timestamp"])
@@ -549,94 +445,13 @@ def _limits(comparison: Comparison, at: str) -> str:
     return "; ".join(map(threshold_text, names))
 
 
-def _tiles(comparison: Comparison) -> list[tuple[str, str]]:
-    rows = comparison.recall[(comparison.recall["scene"] == ALL) & (comparison.recall["run"] > 0)]
-    tiles = []
-    shown = comparison.thresholds if len(comparison.names) == 2 else comparison.thresholds[:1]
-    for row in rows[rows["threshold"].isin(shown)].to_dict("records"):
-        where = f"{comparison.names[row['run']]} at {threshold_text(row['threshold'])}"
-        text = f"points of recall [{_bounds(row, 'difference')}], {row['won']} won and {row['lost']} lost: {where}"
-        tiles.append((_signed(row["difference"]), text))
-    return tiles
-
-
-def _recall_table(comparison: Comparison, threshold: str) -> Table:
-    """List the recall of two runs side by side, or of more runs in one row each, so that any number fits the page."""
-    row_per_run = len(comparison.names) > 2
-    columns = ["map", "query", "queries", *(["run", "recall"] if row_per_run else comparison.names)]
-    columns += ["difference", "won", "lost"]
-    rows = []
-    chosen = comparison.recall[comparison.recall["threshold"] == threshold]
-    for pair, group in chosen.groupby(_PAIR, sort=False):
-        by_run = group.to_dict("records")
-        several = chosen["scene"].nunique() > 2 and pair[0] != ALL
-        cells = [f"{pair[0]} {pair[1]}" if several else pair[1], pair[2], by_run[0]["queries"]]
-        recalls = [Cell(_interval(row, "recall"), 0.9 * row["recall"]) for row in by_run]
-        changes = [[_interval(row, "difference"), row["won"], row["lost"]] for row in by_run]
-        changes[0] = [""] * 3  # the first run is compared with itself
-        if row_per_run:
-            named = zip(comparison.names, recalls, changes, strict=True)
-            rows += [[*cells, name, recall, *change] for name, recall, change in named]
-        else:
-            rows.append([*cells, *recalls, *changes[1]])
-    caption = f"Recall at {threshold_text(threshold)} in %, and its differences in percentage points"
-    return Table(caption, columns, rows)
-
-
-def _changes_table(comparison: Comparison) -> Table | None:
-    """List the queries won and lost; None if there are none."""
-    table, unit = comparison.changes, unit_of(*comparison.thresholds)
-    if table.empty:
-        return None
-    rows = []
-    several = len(comparison.names) > 2
-    for row in table.loc[_spread(range(len(table)), MOST_ROWS)].to_dict("records"):
-        i = row["run"]
-        texts = [comparison.names[i]] if several else []
-        texts += [row["change"], _limits(comparison, row["at"]), f"{row['query_device']} in {row['map_device']} map"]
-        texts += [off_by(row, after=f"_{j}", unit=unit) for j in (0, i)]
-        rows.append([*texts, row[f"status_{i}"].replace("_", " "), _name(row)])
-    rest = f"; {MOST_ROWS} of them, all with --json" if len(table) > MOST_ROWS else ""
-    counts = table["change"].value_counts()
-    caption = f"Queries within a threshold in one run only: {counts.get('won', 0)} won, {counts.get('lost', 0)} lost"
-    columns = ["run"] if several else []
-    columns += ["change", "at", "query", f"off in {comparison.names[0]}"]
-    columns += ["off in the run" if several else f"off in {comparison.names[1]}", "status", "image"]
-    return Table(caption + rest, columns, rows)
-
-
-def _resources_table(comparison: Comparison) -> Table:
-    columns, rows = ["stage"], []
-    for name in comparison.names:
-        columns += [f"{name}: time", "peak memory"]
-    longest = comparison.resources.filter(like="seconds_").iloc[:-1].max(axis=None)
-    for row in comparison.resources.to_dict("records"):
-        cells = [row["stage"]]
-        for i in range(len(comparison.names)):
-            seconds = row[f"seconds_{i}"]
-            bar = seconds / longest if row["stage"] != ALL and seconds > 0 else None
-            cells += [Cell(seconds_text(seconds), bar=bar), _memory(row[f"memory_mb_{i}"])]
-        rows.append(cells)
-    return Table("Time and peak memory of every stage, including the start-up of its notebook", columns, rows)
-
-
-def _settings_table(comparison: Comparison) -> Table | None:
-    if comparison.settings.empty:
-        return None
-    return Table("Settings that differ", ["setting", *comparison.names], comparison.settings.to_numpy().tolist())
-
-
 def _signed(share: float) -> str:
     return f"{'+' if share > 0 else '−' if share < 0 else ''}{percent(abs(share))}"
 
 
-def _bounds(row: Mapping[str, Any], name: str) -> str:
-    write = _signed if name == "difference" else percent
-    return f"{write(row[f'{name}_low'])}, {write(row[f'{name}_high'])}"
-
-
 def _interval(row: Mapping[str, Any], name: str) -> str:
-    return f"{(_signed if name == 'difference' else percent)(row[name])} [{_bounds(row, name)}]"
+    write = _signed if name == "difference" else percent
+    return f"{write(row[name])} [{write(row[f'{name}_low'])}, {write(row[f'{name}_high'])}]"
 
 
 def _memory(megabytes: float) -> str:

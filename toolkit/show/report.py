@@ -5,13 +5,15 @@ import glob
 import json
 import math
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
+from zlib import crc32
 
 import pandas as pd
+from markupsafe import Markup, escape
 
 from toolkit.capture.tables import POSES_UNIT
 from toolkit.errors import ArtifactError
@@ -41,15 +43,23 @@ from toolkit.show.metrics import (
 from toolkit.show.pictures import as_jpeg
 from toolkit.show.sequences import CHANGES
 
-if TYPE_CHECKING:
-    from jinja2 import Template
-
+Write = Callable[[Any], str]
+"""Function that writes a number of a table."""
 PICTURE_BUDGET = 7_000_000
 """Bytes of all pictures of a page. Base64 makes them a third larger, so the page stays below 10 MB."""
 MAX_WIDTH = 1600
 """Width of an embedded picture, pixels, at most."""
 WORST, MOST_REASONS = 10, 12
 """Rows listed for a scene: the worst queries, and the reasons why queries have no pose."""
+LONG = 30
+"""Letters from which the text of a table is wrapped."""
+LINKED = {
+    "Recordings in 3D, opened by .venv/bin/rerun FILE": "visualization/*.rrd",
+    "Tables of the evaluation": "evaluation/*.csv",
+    "Poses, device to world": "poses/*.txt",
+    "Statuses, a row for each query": "poses/*.csv",
+    "References, a line for each image": "retrieval/*.jsonl",
+}
 STATUS_COLUMNS = [
     "timestamp", "device_id", "image", "reason", "status", "num_inliers", "position_std_m", "seconds",
     "first_status", "first_seconds",
@@ -92,43 +102,6 @@ class Picture:
     """Too wide to be readable when scaled to a phone."""
 
 
-@dataclass
-class Cell:
-    text: str
-    shade: float | None = None
-    """Darkness of the background, 0 to 1; None: no background."""
-    bar: float | None = None
-    """Length of a bar below the text, 0 to 1; None: no bar."""
-    link: str = ""
-    """Relative to the run folder."""
-
-    @property
-    def percent(self) -> int:
-        """Shade in percent."""
-        return round(100 * min(max(self.shade or 0.0, 0.0), 1.0))
-
-
-@dataclass
-class Matrix:
-    """A table of map devices (rows) by query devices (columns)."""
-
-    title: str
-    queries: list[str]
-    rows: list[tuple[str, list[Cell]]]
-
-
-@dataclass
-class Table:
-    """A plain table. Values in its rows that are not cells become text cells."""
-
-    caption: str
-    columns: list[str]
-    rows: list[list[Any]]
-
-    def __post_init__(self) -> None:
-        self.rows = [[cell if isinstance(cell, Cell) else Cell(str(cell)) for cell in row] for row in self.rows]
-
-
 def write_report(run_dir: str | Path) -> Path:
     """Write `report.html` from the `run.json`, tables and pictures of a run folder, and return its path.
 
@@ -140,6 +113,8 @@ def write_report(run_dir: str | Path) -> Path:
     Raises:
         ArtifactError: `run.json` is missing or torn.
     """
+    from jinja2 import StrictUndefined, Template
+
     run_dir = Path(run_dir)
     run = read_run(run_dir / "run.json")
     left_out: list[str] = []
@@ -148,7 +123,9 @@ def write_report(run_dir: str | Path) -> Path:
         # Every scene gets an equal share, or the first scenes would leave no room for the last.
         album = Album(run_dir, PICTURE_BUDGET // len(run["scenes"]), left_out)
         scenes.append(_scene(SceneFiles(run_dir, name), str(run["inputs"].get(name, "")), album))
-    page = page_template("report.html.j2").render(
+    source = Path(__file__).with_suffix(".html.j2").read_text(encoding="utf-8")
+    template = Template(source, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    page = template.render(
         run=run,
         scenes=scenes,
         stages=_stages(run, run_dir),
@@ -161,20 +138,6 @@ def write_report(run_dir: str | Path) -> Path:
     )
     write_text(run_dir / "report.html", page)
     return run_dir / "report.html"
-
-
-def page_template(name: str) -> "Template":
-    """Load a page template from this module's folder."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template(name)
 
 
 def read_run(path: Path) -> dict[str, Any]:
@@ -228,40 +191,36 @@ def _stage_name(row: dict[str, Any]) -> str:
     return " ".join(str(part) for part in (row.get("scene"), row.get("stage"), row.get("part")) if part)
 
 
-def _stages(run: dict[str, Any], run_dir: Path) -> Table:
+def _stages(run: dict[str, Any], run_dir: Path) -> Markup:
     rows = []
-    longest = max((float(row.get("seconds") or 0) for row in run["stages"]), default=0.0)
-    largest = max((float(row.get("peak_memory_mb") or 0) for row in run["stages"]), default=0.0)
     for row in run["stages"]:
-        seconds, work = row.get("seconds"), row.get("work_seconds", row.get("kernel_seconds"))
         counts = ", ".join(f"{value} {key.replace('_', ' ')}" for key, value in (row.get("counts") or {}).items())
-        memory = row.get("peak_memory_mb")
-        notebook = run_dir / str(row.get("notebook") or "")
-        name = " ".join(str(part) for part in (row.get("stage", ""), row.get("part")) if part)
-        rows.append([
-            row.get("scene") or "",
-            Cell(name, link=_link(run_dir, notebook) if notebook.is_file() else ""),
-            row.get("status", ""),
-            Cell(seconds_text(seconds), bar=float(seconds) / longest if seconds and longest else None),
-            seconds_text(work),
-            Cell(f"{memory:.0f} MB" if memory else "–", bar=float(memory) / largest if memory else None),
-            counts,
-        ])  # fmt: skip
+        rows.append({
+            "scene": row.get("scene") or "",
+            "stage": _anchor(_stage_name({**row, "scene": ""}), run_dir, run_dir / str(row.get("notebook") or "")),
+            "status": row.get("status", ""),
+            "time": row.get("seconds"),
+            "of it work": row.get("work_seconds", row.get("kernel_seconds")),
+            "peak memory": row.get("peak_memory_mb") or None,
+            "counts": counts,
+        })  # fmt: skip
+    numbers: dict[str, Write] = {"time": seconds_text, "of it work": seconds_text, "peak memory": "{:.0f} MB".format}
+    # As objects, or pandas would turn links into plain text.
+    frame = pd.DataFrame(rows, dtype=object).astype(dict.fromkeys(numbers if rows else (), float))
     caption = "Time and peak memory of every stage; names link to the executed notebooks"
-    return Table(caption, ["scene", "stage", "status", "time", "of it work", "peak memory", "counts"], rows)
+    return _table(frame, caption, numbers, ["time", "peak memory"])
 
 
-def _not_done(run: dict[str, Any]) -> Table | None:
+def _not_done(run: dict[str, Any]) -> Markup:
     """List the items that stages left out, and why."""
-    stages_of: dict[tuple[str, str, str], list[str]] = {}
-    for row in run["stages"]:
-        for item in row.get("left_out") or ():
-            key = str(row.get("scene") or ""), str(item.get("what", "")), str(item.get("reason", ""))
-            stages_of.setdefault(key, []).append(str(row.get("stage", "")))
-    if not stages_of:
-        return None
-    rows = [[*key, ", ".join(dict.fromkeys(stages))] for key, stages in stages_of.items()]
-    return Table("Left out, and why", ["scene", "what", "reason", "stages"], rows)
+    rows = [
+        (str(row.get("scene") or ""), str(item.get("what", "")), str(item.get("reason", "")), str(row.get("stage", "")))
+        for row in run["stages"]
+        for item in row.get("left_out") or ()
+    ]
+    table = pd.DataFrame(rows, columns=["scene", "what", "reason", "stages"]).drop_duplicates()
+    stages = table.groupby(["scene", "what", "reason"], sort=False)["stages"].agg(", ".join)
+    return _table(stages.reset_index(), "Left out, and why")
 
 
 # A scene
@@ -305,11 +264,7 @@ def _scene(files: SceneFiles, fingerprint: str, album: "Album") -> dict[str, Any
     samples = [path for path in stills if path.name.startswith("localization")]
     recordings = [path for path in stills if of_sequence(path.name)]
     maps = [path for path in stills if path not in (*worst, *samples, *recordings)]
-    figures = {
-        files.evaluation / f"{name}.png": texts
-        for name, texts in EVALUATION_FIGURES.items()
-        if f"{name}.png" not in older
-    }
+    figures = {files.evaluation / f"{name}.png": texts for name, texts in EVALUATION_FIGURES.items()}
     return {
         "name": files.scene,
         "fingerprint": fingerprint,
@@ -318,17 +273,14 @@ def _scene(files: SceneFiles, fingerprint: str, album: "Album") -> dict[str, Any
         "headlines": headlines,
         "messages": messages,
         "remarks": remarks,
-        "recall": [
-            _matrix(recall, column, f"Recall at {threshold_text(column)} [%]", percent, lambda v: 0.9 * v)
-            for column in thresholds
-        ],
+        "recall": [_matrix(recall, column, f"Recall at {threshold_text(column)} [%]") for column in thresholds],
         "medians": thresholds and [
             _matrix(recall, "median_rotation_deg", "Median rotation error [°]", number),
             _matrix(
                 recall, "median_translation_m", f"Median translation error [{small}]", lambda v: number(v * factor)
             ),
         ],
-        "pairs": _pairs(recall, thresholds) if len(recall) else None,
+        "pairs": _pairs(recall, thresholds),
         "losses": _losses(losses),
         "missed": int(losses["missed"].sum()) if "missed" in losses else 0,
         "failures": _failures(statuses),
@@ -337,15 +289,15 @@ def _scene(files: SceneFiles, fingerprint: str, album: "Album") -> dict[str, Any
         "retrieval_note": note,
         # Pictures of failures come first, while there is room: they are the hardest to understand from tables alone.
         "worst_pictures": [album.picture(path) for path in worst],
-        "figures": [album.picture(path, *texts) for path, texts in figures.items() if path.is_file()],
-        "steps": _steps(sequences, thresholds) if len(sequences) else None,
-        "changes": _changes(changes, unit) if len(changes) else None,
+        "figures": [
+            album.picture(path, *texts) for path, texts in figures.items() if path.is_file() and path.name not in older
+        ],
+        "steps": _steps(sequences, thresholds),
+        "changes": _changes(changes, unit),
         "sequences": [album.picture(path) for path in recordings],
         "maps": [album.picture(path) for path in maps],
         "samples": [album.picture(path) for path in samples],
-        "recordings": _linked(files.run, (p for p in files.visualization.glob("*.rrd") if p.name not in older)),
-        "files": _files(files, older),
-        "others": _linked(files.run, (path for path in files.evaluation.glob("*.csv") if path.name not in older)),
+        "links": _links(files, older),
     }
 
 
@@ -363,22 +315,14 @@ def _read_table(path: Path, messages: list[str]) -> pd.DataFrame:
 def _read_statuses(files: SceneFiles, messages: list[str]) -> pd.DataFrame:
     """Return `STATUS_COLUMNS` of every query of every pair, with or without ground truth."""
     tables = []
-    for (map_device, query_device), stem in _pairs_of(files).items():
-        table = _read_table(stem.with_name(f"{stem.name}.csv"), messages)
-        if "status" in table:
-            table = table.reindex(columns=STATUS_COLUMNS)
-            tables.append(table.assign(map_device=map_device, query_device=query_device))
+    for path in sorted(files.poses_dir.glob("*.csv")):
+        map_device, query_device = pair_devices(path.stem)
+        if map_device and query_device and not of_sequence(path.stem):
+            table = _read_table(path, messages)
+            if "status" in table:
+                table = table.reindex(columns=STATUS_COLUMNS)
+                tables.append(table.assign(map_device=map_device, query_device=query_device))
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
-
-
-def _pairs_of(files: SceneFiles) -> dict[tuple[str, str], Path]:
-    """Return the path of the results, without suffix, of each pair (map device, query device) that has any."""
-    pairs = {}
-    for path in sorted([*files.poses_dir.glob("*.csv"), *files.poses_dir.glob("*.txt")]):
-        devices = pair_devices(path.stem)
-        if all(devices) and not of_sequence(path.stem):
-            pairs[devices] = path.with_suffix("")
-    return pairs
 
 
 def _verdict(
@@ -431,152 +375,176 @@ def _escalation(statuses: pd.DataFrame) -> list[str]:
     ]
 
 
-def _matrix(table: pd.DataFrame, column: str, title: str, text: Any, shade: Any = lambda value: None) -> Matrix:
-    queries = list(dict.fromkeys(table["query_device"]))
-    values = table.set_index(["map_device", "query_device"])[column].to_dict()
-    rows = []
-    for map_ in dict.fromkeys(table["map_device"]):
-        cells = [values.get((map_, query), math.nan) for query in queries]
-        rows.append((map_, [Cell("–") if math.isnan(v) else Cell(text(v), shade(v)) for v in cells]))
-    return Matrix(title, queries, rows)
+# Tables
 
 
-def _pairs(recall: pd.DataFrame, thresholds: list[str]) -> Table:
-    columns: dict[str, tuple[str, Any]] = {"map_device": ("map", str), "query_device": ("query", str)}
-    for name in ("queries", "localized", "ok", "low_confidence", "failed"):
-        columns[name] = name.replace("_", " "), lambda count: "–" if pd.isna(count) else f"{count:.0f}"
-    columns |= {name: (f"recall {threshold_text(name)}", _share) for name in thresholds}
-    columns["median_rotation_deg"] = "median [°]", number
+def _table(frame: pd.DataFrame, caption: str, formats: Mapping[str, Write] = {}, bars: Sequence[str] = ()) -> Markup:
+    """Return a table as HTML, in a region that scrolls; empty if it has no rows. A named axis shows its labels.
+
+    Args:
+        formats: functions that write the numbers of columns. Without one, a number has no decimals. Shares are shaded.
+        bars: columns with bars behind their numbers.
+    """
+    from pandas.io.formats.style import Styler
+
+    if not len(frame):
+        return Markup()
+    # An identifier made from the content: equal runs should have equal pages.
+    style = Styler(frame, uuid=f"{crc32((caption + frame.to_csv()).encode()):x}", cell_ids=False)
+    style.format(lambda value: f"{value:.0f}" if isinstance(value, float) else escape(value), na_rep="–")
+    for name in frame.columns.intersection([*formats]):
+        style.format(formats[name], subset=[name], na_rep="–")
+    style.map(_shade, subset=[name for name in frame if formats.get(name) in (percent, _share)])
+    style.bar(subset=[name for name in bars if frame[name].max() > 0], color="#14629f40", vmin=0)
+    texts = frame.select_dtypes(exclude="number").astype(str)
+    long = [name for name in texts if texts[name].str.len().max() > LONG]
+    style.set_table_styles({name: [{"selector": "", "props": "text-align: left"}] for name in texts})
+    style.set_td_classes(pd.DataFrame("long", frame.index, long))
+    style.format_index(escape, axis="index").format_index(escape, axis="columns")
+    style.set_caption(Markup("<span>{}</span>").format(caption))
+    if frame.columns.name:
+        style.set_table_attributes('class="matrix"')
+    else:
+        style.hide(axis="index")
+    html = re.sub(r'class="(col|row)_heading', r'scope="\1" class="\1_heading', style.to_html())  # for screen readers
+    region = Markup('<div class="scroll" role="region" tabindex="0" aria-label="{}">{}</div>')
+    return region.format(caption, Markup(html))
+
+
+def _shade(share: float) -> str:
+    if math.isnan(share):
+        return ""
+    return f"background: rgb(20 98 159 / {90 * share:.0f}%)" + ("; color: #fff" if share > 0.6 else "")
+
+
+def _matrix(table: pd.DataFrame, column: str, title: str, write: Write = percent) -> Markup:
+    """Return a table of map devices (rows) by query devices (columns)."""
+    values = table.set_index(["map_device", "query_device"])[column].unstack().rename_axis(columns="map \\ query")
+    values = values.loc[table["map_device"].unique(), table["query_device"].unique()].rename_axis(index=None)
+    return _table(values, title, dict.fromkeys(values, write))
+
+
+def _scores(table: pd.DataFrame, caption: str, thresholds: list[str]) -> Markup:
+    """Return a table with columns of recall and median errors."""
     small, factor = small_unit(unit_of(*thresholds))
-    columns["median_translation_m"] = f"median [{small}]", lambda length: number(factor * length)
-    columns["ok_wrong"] = "ok but wrong", lambda share: _share(share).text
-    columns["state"] = "note", lambda state: "" if state == "evaluated" else state
-    shown = {name: column for name, column in columns.items() if name in recall}
-    rows = [[write(row[name]) for name, (_, write) in shown.items()] for row in recall.to_dict("records")]
-    titles = [title for title, _ in shown.values()]
-    return Table("Counts of queries, recall and median errors of every pair", titles, rows)
+    shares = {name: f"recall {threshold_text(name)}" for name in thresholds} | {"ok_wrong": "ok but wrong"}
+    names = {"map_device": "map", "query_device": "query", "low_confidence": "low confidence", "state": "note"}
+    names |= {"median_rotation_deg": "median [°]", "median_translation_m": f"median [{small}]", **shares}
+    formats: dict[str, Write] = {"median [°]": number, f"median [{small}]": lambda length: number(factor * length)}
+    return _table(table.rename(columns=names), caption, formats | dict.fromkeys(shares.values(), _share))
 
 
-def _steps(sequences: pd.DataFrame, thresholds: list[str]) -> Table:
+def _pairs(recall: pd.DataFrame, thresholds: list[str]) -> Markup:
+    columns = ["map_device", "query_device", "queries", "localized", "ok", "low_confidence", "failed", *thresholds]
+    columns += ["median_rotation_deg", "median_translation_m", "ok_wrong", "state"]
+    shown = recall[[name for name in columns if name in recall]].replace({"state": {"evaluated": ""}})
+    return _scores(shown, "Counts of queries, recall and median errors of every pair", thresholds)
+
+
+def _steps(sequences: pd.DataFrame, thresholds: list[str]) -> Markup:
     """List recall and median errors after each step of the sequence stage, over all pairs."""
-    small, factor = small_unit(unit_of(*thresholds))
-    rows = []
-    for step, pairs in sequences.groupby("step", sort=False):
-        shares = [_share(float(pairs[name].mean())) for name in thresholds]
-        turned, moved = (float(pairs[f"median_{name}"].median()) for name in ("rotation_deg", "translation_m"))
-        queries, rescued, broken = (int(pairs[name].sum()) for name in ("queries", *CHANGES))
-        rows.append([step, queries, *shares, number(turned), number(factor * moved), rescued, broken])
-    titles = ["step", "queries", *(f"recall {threshold_text(name)}" for name in thresholds)]
-    titles += ["median [°]", f"median [{small}]", *CHANGES]
+    if not len(sequences):
+        return Markup()
+    medians = dict.fromkeys(["median_rotation_deg", "median_translation_m"], "median")
+    over_pairs = {"queries": "sum", **dict.fromkeys(thresholds, "mean"), **medians, **dict.fromkeys(CHANGES, "sum")}
     caption = "Queries after each step of the sequence stage: mean recall and median error of the pairs"
-    return Table(caption, titles, rows)
+    return _scores(sequences.groupby("step", sort=False).agg(over_pairs).reset_index(), caption, thresholds)
 
 
-def _changes(changes: pd.DataFrame, unit: str) -> Table:
+def _changes(changes: pd.DataFrame, unit: str) -> Markup:
     """List queries that the sequence stage broke or rescued."""
-    rows = []
-    for row in changes.sort_values("change", kind="stable")[:WORST].to_dict("records"):
-        errors = [off_by(row, of, unit=unit) for of in ("single_", "")]
-        query = f"{row['query_device']} in {row['map_device']} map"
-        rows.append([query, row["change"], *errors, row["device_id"], row["timestamp"]])
+    if not len(changes):
+        return Markup()
+    shown = changes.sort_values("change", kind="stable")[:WORST]
+    off = {of: [off_by(row, of, unit=unit) for row in shown.to_dict("records")] for of in ("single_", "")}
+    columns = {"query": _queries(shown), "change": shown["change"], "single": off["single_"], "sequence": off[""]}
+    table = pd.DataFrame({**columns, "device": shown["device_id"], "timestamp [µs]": shown["timestamp"]})
     counts = changes["change"].value_counts()
     caption = ", ".join(f"{counts.get(name, 0)} {name}" for name in CHANGES)
-    caption = f"Queries within the last threshold only with or only without their sequence: {caption}"
-    return Table(caption, ["query", "change", "single", "sequence", "device", "timestamp [µs]"], rows)
+    return _table(table, f"Queries within the last threshold only with or only without their sequence: {caption}")
 
 
-def _losses(losses: pd.DataFrame) -> Table | None:
+def _losses(losses: pd.DataFrame) -> Markup:
     """List the losses by reason: the sum over the pairs of each map device, and over all pairs."""
     if "threshold" not in losses or losses["threshold"].isna().all():
-        return None
-    rows = []
-    for threshold, group in losses.dropna(subset=["threshold"]).groupby("threshold", sort=False):
-        maps = [(str(map_), of_map) for map_, of_map in group.groupby("map_device", sort=False)]
-        for name, pairs in [*maps, ("all", group)]:
-            queries = pairs["queries"].sum()
-            shares = [pairs[reason].sum() / queries for reason in REASONS]
-            label = threshold_text(str(threshold)) if name == maps[0][0] else ""
-            cells = [Cell(f"{percent(share)} %", 1.2 * share) for share in shares]
-            rows.append([label, name, f"{queries:.0f}", f"{pairs['missed'].sum():.0f}", *cells])
+        return Markup()
+    sums = {
+        threshold_text(str(threshold)): pd.concat([pairs, pairs.assign(map_device="all")])
+        .groupby("map_device", sort=False)[["queries", "missed", *REASONS]]
+        .sum()
+        for threshold, pairs in losses.groupby("threshold", sort=False)
+    }
+    table = pd.concat(sums, names=["threshold", "map"]).reset_index()
+    table[[*REASONS]] = table[[*REASONS]].div(table["queries"], axis="index")
     caption = "Queries missed at each threshold, and the share of all queries lost for each reason"
-    return Table(caption, ["threshold", "map", "queries", "missed", *REASONS], rows)
+    return _table(table, caption, dict.fromkeys(REASONS, _share))
 
 
-def _failures(statuses: pd.DataFrame) -> Table | None:
+def _failures(statuses: pd.DataFrame) -> Markup:
     """Count the queries without a pose by reason."""
-    if not len(statuses):
-        return None
-    failed = statuses[statuses["status"].str.startswith("failed")]
+    failed = statuses[statuses["status"].str.startswith("failed")] if len(statuses) else statuses
     if not len(failed):
-        return None
+        return Markup()
     # Drop details in parentheses: they differ from query to query for the same reason.
     reasons = failed["status"].str.removeprefix("failed").str.replace(r" \(.*", "", regex=True).str.lstrip(": ")
-    groups = sorted(failed.groupby(reasons.rename("reason")), key=lambda item: (-len(item[1]), item[0]))
-    rows = []
-    for reason, group in groups[:MOST_REASONS]:
-        pairs = group.groupby(["query_device", "map_device"]).size().sort_values(ascending=False)
-        where = ", ".join(f"{q} in {m} map {count}" for (q, m), count in pairs.items())
-        rows.append([reason, len(group), where])
-    if rest := sum(len(group) for _, group in groups[MOST_REASONS:]):
-        rows.append(["other reasons", rest, ""])
-    return Table("Queries without a pose, by reason", ["reason", "queries", "where"], rows)
+    groups = _queries(failed).groupby(reasons.rename("reason"))
+    where = groups.agg(lambda pairs: ", ".join(f"{pair} {count}" for pair, count in pairs.value_counts().items()))
+    table = pd.DataFrame({"queries": groups.size(), "where": where})
+    table = table.sort_values("queries", ascending=False, kind="stable")
+    caption = "Queries without a pose, by reason"
+    if rest := table["queries"][MOST_REASONS:].sum():
+        caption += f"; {rest} more have other reasons"
+    return _table(table[:MOST_REASONS].reset_index(), caption)
 
 
-def _wrong_ok(errors: pd.DataFrame, unit: str) -> Table | None:
-    """List the poses that are called ok but are wrong, the largest errors first; None if there are none."""
-    if not len(errors) or not (errors["status"] == "ok").any():
-        return None
+def _wrong_ok(errors: pd.DataFrame, unit: str) -> Markup:
+    """List the poses that are called ok but are wrong, the largest errors first."""
+    if not len(errors):
+        return Markup()
     called_ok = errors[errors["status"] == "ok"]
-    right = is_below(
-        called_ok["rotation_error_deg"].to_numpy(float), called_ok["translation_error_m"].to_numpy(float), WRONG
-    )
-    wrong = called_ok[~right].sort_values("translation_error_m", ascending=False)
-    if not len(wrong):
-        return None
+    turned, moved = called_ok[["rotation_error_deg", "translation_error_m"]].to_numpy(float).T
+    wrong = called_ok[~is_below(turned, moved, WRONG)].sort_values("translation_error_m", ascending=False)
     limit = f"{WRONG[0]:g}°, {WRONG[1]:g} {unit}"
     caption = f"{len(wrong)} of {len(called_ok)} poses that are called ok are wrong: beyond {limit}."
-    rows = []
-    for row in wrong.head(WORST).to_dict("records"):
-        name = _shown_names(row["image"]) if isinstance(row.get("image"), str) else f"{row['timestamp']}"
-        what = f"off by {off_by(row, unit=unit)}"
-        if "p_correct" in row and not pd.isna(row["p_correct"]):
-            what += f", stated to be right with {row['p_correct']:.1%}"
-        if row.get("rival_support", 0) > 0:
-            what += f", a rival has {row['rival_support']:.0%} of its support"
-        rows.append([f"{row['query_device']} in {row['map_device']} map, {name}", what])
     if len(wrong) > WORST:
-        rows.append([f"and {len(wrong) - WORST} more", "see evaluation/errors.csv"])
-    return Table(caption, ["query", "what"], rows)
+        caption += f" These are the {WORST} worst; evaluation/errors.csv has all."
+    return _listed(wrong[:WORST], caption, unit)
 
 
-def _worst(queries: pd.DataFrame, thresholds: list[str]) -> Table | None:
+def _worst(queries: pd.DataFrame, thresholds: list[str]) -> Markup:
     """List the queries with the largest errors or, without ground truth, with the least support."""
     if not len(queries):
-        return None
-    has_truth = "rotation_error_deg" in queries
+        return Markup()
     threshold = parse_threshold(thresholds[0]) if thresholds else THRESHOLDS[0]
     unit = unit_of(*thresholds)
     worst = queries.iloc[worst_first(queries, threshold)[:WORST]]
-    if has_truth:
+    caption = f"The {len(worst)} least supported; there is no ground truth to compare with"
+    if "rotation_error_deg" in queries:
         caption = f"The {len(worst)} worst, by the larger of rotation error / {threshold[0]:g}° and "
         caption += f"translation error / {threshold[1]:g} {unit}"
-    else:
-        caption = f"The {len(worst)} least supported; there is no ground truth to compare with"
-    has_names = "image" in worst and bool(worst["image"].notna().all())  # tables of earlier versions have none
-    has_reasons = not has_truth and "reason" in worst and bool(worst["reason"].notna().any())
-    columns = ["query", *(["off by", "why"] if has_truth else []), "status", "inliers"]
-    columns += ["why"] if has_reasons else []
-    columns += ["image"] if has_names else ["device", "timestamp [µs]"]
-    rows = []
-    for row in worst.to_dict("records"):
-        texts = [f"{row['query_device']} in {row['map_device']} map"]
-        texts += [off_by(row, unit=unit), _why(row)] if has_truth else []
-        inliers = "–" if pd.isna(row["num_inliers"]) else f"{row['num_inliers']:.0f}"
-        texts += [str(row["status"]).replace("_", " "), inliers]
-        texts += [row["reason"] if isinstance(row["reason"], str) else "–"] if has_reasons else []
-        texts += [_shown_names(row["image"])] if has_names else [row["device_id"], row["timestamp"]]
-        rows.append(texts)
-    return Table(caption, columns, rows)
+    return _listed(worst, caption, unit)
+
+
+def _listed(queries: pd.DataFrame, caption: str, unit: str) -> Markup:
+    """Return a table with a row for each query."""
+    table, names = pd.DataFrame({"query": _queries(queries)}), {"reason": "why"}
+    if "rotation_error_deg" in queries:
+        rows, names = queries.to_dict("records"), {}
+        table["off by"] = [off_by(row, unit=unit) for row in rows]
+        table["why"] = [_why(row) for row in rows]
+    table["status"], table["inliers"] = queries["status"].str.replace("_", " "), queries["num_inliers"]
+    names |= {"p_correct": "stated to be right", "rival_support": "support of a rival"}
+    if "image" in queries and queries["image"].notna().all():
+        table["image"] = queries["image"].map(_shown_names)
+    else:  # tables of earlier versions have no names
+        names |= {"device_id": "device", "timestamp": "timestamp [µs]"}
+    known = queries.filter([*names]).dropna(axis="columns", how="all").rename(columns=names)
+    formats = {"stated to be right": "{:.1%}".format, "support of a rival": "{:.0%}".format}
+    return _table(table.join(known), caption, formats)
+
+
+def _queries(table: pd.DataFrame) -> "pd.Series[str]":
+    return table["query_device"] + " in " + table["map_device"] + " map"
 
 
 def _shown_names(images: str) -> str:
@@ -592,14 +560,14 @@ def _why(row: dict[str, Any]) -> str:
     return missed[-1] if missed else "within every threshold" if losses else ""
 
 
-def _retrieval(retrieval: pd.DataFrame, headlines: list[tuple[str, str]], unit: str) -> tuple[list[Matrix], str]:
+def _retrieval(retrieval: pd.DataFrame, headlines: list[tuple[str, str]], unit: str) -> tuple[list[Markup], str]:
     ks = [column for column in retrieval.columns if column.startswith("recall@")]
     done = retrieval.dropna(subset=ks) if ks else retrieval.iloc[:0]
     if not len(done):
         return [], ""
     titles = {k: f"In the first {k.removeprefix('recall@')} [%]" for k in ks}
     titles["in_map"] = "Anywhere in the map [%]"
-    matrices = [_matrix(retrieval, c, titles[c], percent, lambda v: 0.9 * v) for c in titles if c in done]
+    matrices = [_matrix(retrieval, column, titles[column]) for column in titles if column in done]
     first = ks[-1].removeprefix("recall@")
     headlines.append((f"{percent(done[ks[-1]].mean())} %", f"have a good reference in the first {first}"))
     reach = f"{done['radius_m'].iloc[0]:g} {unit}"
@@ -607,23 +575,13 @@ def _retrieval(retrieval: pd.DataFrame, headlines: list[tuple[str, str]], unit: 
     return matrices, f"{note}same way to within {done['angle_deg'].iloc[0]:g}°."
 
 
-def _files(files: SceneFiles, older: Collection[str]) -> Table | None:
-    """Link the files of each pair, except for those named `older`."""
-    rows = []
-    for (map_device, query_device), stem in _pairs_of(files).items():
-        paths = {
-            "poses": stem.with_name(f"{stem.name}.txt"),
-            "statuses": stem.with_name(f"{stem.name}.csv"),
-            "references": files.retrieval(map_device, query_device),
-            "recording": files.visualization / f"{stem.name}.rrd",
-        }
-        links = [
-            Cell(name, link=_link(files.run, path)) if path.is_file() and path.name not in older else "–"
-            for name, path in paths.items()
-        ]
-        rows.append([map_device, query_device, *links])
-    caption = "Files of each pair: poses (device to world), a status row for each query, references of each image"
-    return Table(caption, ["map", "query", "poses", "statuses", "references", "recording"], rows) if rows else None
+def _links(files: SceneFiles, older: Collection[str]) -> dict[str, Markup]:
+    """Link the files of a scene, except for those named `older`, by what they are."""
+    found = {
+        kind: [_anchor(path.name, files.run, path) for path in sorted(files.root.glob(name)) if path.name not in older]
+        for kind, name in LINKED.items()
+    }
+    return {kind: Markup(" ").join(links) for kind, links in found.items() if links}
 
 
 # Text
@@ -634,8 +592,9 @@ def _link(run_dir: Path, path: Path) -> str:
     return quote(path.relative_to(run_dir).as_posix())
 
 
-def _linked(run_dir: Path, paths: Iterable[Path]) -> list[Cell]:
-    return [Cell(path.name, link=_link(run_dir, path)) for path in sorted(paths)]
+def _anchor(text: str, run_dir: Path, path: Path) -> str:
+    """Return a link to a file as HTML; only the text if there is no such file."""
+    return Markup('<a href="{}">{}</a>').format(_link(run_dir, path), text) if path.is_file() else text
 
 
 def _natural(path: Path) -> list[Any]:
@@ -643,8 +602,8 @@ def _natural(path: Path) -> list[Any]:
     return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
 
 
-def _share(share: float) -> Cell:
-    return Cell("–") if math.isnan(share) else Cell(f"{percent(share)} %", 0.9 * share)
+def _share(share: float) -> str:
+    return f"{percent(share)} %"
 
 
 def _length(length: float, unit: str) -> str:
