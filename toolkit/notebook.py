@@ -337,7 +337,7 @@ def _run_stage(stage: str, sessions: Path, files: SceneFiles) -> None:
     """Run `embed`, `retrieve` or `localize` with the settings of the run that results are taken from, or defaults."""
     run = _finished_run(files.run.parent, files.scene)
     content = read_json(run / RECORD).get("manifest", {}) if run else {}
-    manifest = Manifest.model_validate(content or {"name": "by-hand", "captures": [str(sessions.parent)]})
+    manifest = Manifest.of(content or {"name": "by-hand", "captures": [str(sessions.parent)]})
     settings, queries = manifest.stage(stage).given(), manifest.queries
     if stage == "embed":
         from toolkit.embed import embed_sessions
