@@ -71,11 +71,13 @@ class Settings(BaseModel):
 
     @classmethod
     def of(cls, *layers: "Settings | Mapping[str, Any] | None") -> Self:
-        """Return the defaults, overridden by the layers in turn; a later layer wins.
+        """Return the defaults, overridden by the layers in turn; a later layer wins. One whole model stays as it is.
 
         Raises:
             ManifestError: a key is unknown or a value is not valid; names the key and what was expected.
         """
+        if len(layers) == 1 and isinstance(layers[0], cls):
+            return layers[0]
         merged: dict[str, Any] = {}
         for layer in layers:
             given = layer.given() if isinstance(layer, Settings) else layer or {}
