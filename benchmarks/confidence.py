@@ -207,9 +207,9 @@ def judge(rows: pd.DataFrame, probability: NDArray[np.float64]) -> dict[str, flo
     """Return what is called `ok`, and how wrong it is."""
     from scipy.stats import beta
 
-    from toolkit.manifest import PnpSettings
+    from toolkit.localizers.pnp import MAX_RIVAL_SUPPORT
 
-    accepted = (probability >= OK) & ~rows["refused"] & (rows["rival_support"] <= PnpSettings().ok_rival_support)
+    accepted = (probability >= OK) & ~rows["refused"] & (rows["rival_support"] <= MAX_RIVAL_SUPPORT)
     wrong, count = int((accepted & rows["wrong"]).sum()), int(accepted.sum())
     right = int((rows["posed"] & ~rows["wrong"]).sum())
     upper = float(beta.ppf(CONFIDENCE, wrong + 1, count - wrong)) if count > wrong else 1.0

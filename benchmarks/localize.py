@@ -26,6 +26,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 from common import add_out, check_out, in_own_process, limit_cores, markdown_table, part_of_capture, write_out
@@ -163,7 +164,8 @@ def measure_toolkit(
     return measured
 
 
-PLAIN: dict[str, Any] = {"features": ["sift"], "pnp": {"guided_radii_deg": (), "clear_inlier_ratio": 0.0}}
+PLAIN = {"GUIDED_RADII_DEG": (), "CLEAR_INLIER_RATIO": 0.0}
+"""Constants of `localizers/pnp.py` of the plain setting: no guided matching, no search for rivals."""
 
 
 def localize_plainly(sessions_root: Path, run: Path, queries: str, threads: int) -> list[float]:
@@ -171,12 +173,14 @@ def localize_plainly(sessions_root: Path, run: Path, queries: str, threads: int)
     from toolkit import localize
     from toolkit.files import SceneFiles
     from toolkit.localizers import map as map_module
+    from toolkit.localizers import pnp
 
     files = SceneFiles(run, sessions_root.parent.name)
     inner = _time_parts(localize, map_module)
     started = _clocks()
     folders = (files.retrieval_dir, run / "plain_poses", files.features, files.maps)
-    localize.localize_pairs(sessions_root, *folders, PLAIN, queries=queries, workers=threads)
+    with mock.patch.multiple(pnp, **PLAIN):
+        localize.localize_pairs(sessions_root, *folders, {"features": ["sift"]}, queries=queries, workers=threads)
     return [float(value) for value in _clocks() - started - inner["features"] - inner["map"]]
 
 

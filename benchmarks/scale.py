@@ -344,7 +344,6 @@ class Books:
         from toolkit.geometry import invert, transform
         from toolkit.localizers.local_map import LocalMap
         from toolkit.localizers.tiles import JoinedImages, join_tiles
-        from toolkit.manifest import MapSettings
 
         def keypoints(image: int) -> np.ndarray:
             seen = self.points[self.obs_point[slice(*self.starts[image : image + 2])]]
@@ -362,7 +361,6 @@ class Books:
             self.tiles,
             lambda number: LocalMap.load(tiles / f"{number}.npz"),
             images,
-            MapSettings(),
             self.run / "joined",
         )
         assert len(joined.points) > 0.99 * len(self.points)

@@ -23,7 +23,7 @@ QUERIES = "keyframes_original"
 
 
 def embed(capture: Path, files: SceneFiles) -> pd.DataFrame:
-    settings = {"model": "vlad", "vlad": {"words": 8, "dim": 32}}
+    settings = {"model": "vlad"}
     return embed_sessions(
         capture / "sessions", files.embeddings, settings, device="ios", features_dir=files.features
     )  # fmt: skip

@@ -9,6 +9,7 @@ import pytest
 
 from tests.calls import call
 from tests.localized import write_queries
+from toolkit import evaluate
 from toolkit.capture import Trajectory, write_session
 from toolkit.errors import CaptureError, ToolkitError
 from toolkit.evaluate import draw_evaluation, evaluate_scene, pose_errors, recall
@@ -155,8 +156,10 @@ def evaluate_ios(scene, **options):
     return call(evaluate_scene, *scene, options.pop("out", None), map_device="ios", query_device="ios", **options)
 
 
-def test_scene_tables(scene, tmp_path):
-    result = evaluate_ios(scene, retrieval_radius_m=5, retrieval_ks=(1, 2), out=tmp_path / "out")
+def test_scene_tables(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(evaluate, "RETRIEVAL_RADIUS_M", 5)
+    monkeypatch.setattr(evaluate, "RETRIEVAL_KS", (1, 2))
+    result = evaluate_ios(scene, out=tmp_path / "out")
     (row,) = result.recall.to_dict("records")
     assert row["state"] == "evaluated"
     counts = [row[c] for c in ("queries", "localized", "ok", "low_confidence", "failed")]

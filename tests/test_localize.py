@@ -662,7 +662,7 @@ def test_poses_are_made_anew_if_another_map_tells_which_way_up_the_images_are(ca
     assert [skipped(**predicts), skipped(**predicts)] == [False, True]
     with_poses(capture, lambda poses: poses @ np.diag([1.0, -1, -1, 1]), "hl_map/trajectories.txt")
     assert [skipped(**predicts), skipped(**predicts)] == [False, True]
-    as_stored = {**predicts, "predictor": {"name": "simulated", "upright": False}}
+    as_stored = {"method": "pnp"}
     assert [skipped(**as_stored), skipped(**as_stored)] == [False, True]
     with_poses(capture, lambda poses: poses @ np.diag([1.0, -1, -1, 1]), "hl_map/trajectories.txt")
     assert skipped(**as_stored), "nothing is turned"
@@ -788,7 +788,7 @@ def test_a_picture_is_turned_for_what_the_run_turned_images_for(
 ) -> None:
     files = finished[0]
     place = Map.open(files.run, files.scene, "ios")
-    place.settings = LocalizeSettings.of({"method": "feed_forward", "predictor": {"upright": upright is None}})
+    place.settings = LocalizeSettings.of({"method": "feed_forward"})
     place.embed_settings = EmbedSettings.of({"upright": upright})  # type: ignore[misc]
     learned = Learned(np.ones(place._descriptors[0].shape[1], np.float32))
     place.embedders = [learned]  # type: ignore[misc]
@@ -798,7 +798,7 @@ def test_a_picture_is_turned_for_what_the_run_turned_images_for(
     camera = pycolmap.Camera(model="PINHOLE", width=10, height=20, params=[10, 10, 5, 10])
     localize_image(place, np.zeros((20, 10), np.uint8), camera, turns=[1])
     assert learned.seen == [(10, 20, 3) if upright is None else (20, 10, 3)]
-    assert asked[0].views[0].turns == (1 if upright is None else 0)
+    assert asked[0].views[0].turns == 1
 
 
 def test_a_picture_of_nothing_has_no_pose(small_capture: Path, opened: Map) -> None:
@@ -863,9 +863,8 @@ def test_a_localizer_of_another_method_sees_images_upright_as_its_settings_say(
 ) -> None:
     directions: list[object] = []
     monkeypatch.setattr(maps, "upright_turns", lambda _, direction: directions.append(direction))
-    for predictor in ({"name": "simulated"}, {"name": "simulated", "upright": False}):
-        settings = {"method": "feed_forward", "predictor": predictor, "world_up": [0, 0, 1]}
-        create_localizer(LocalizeSettings.of(opened.settings, settings), opened)
+    settings = {"method": "feed_forward", "predictor": {"name": "simulated"}, "world_up": [0, 0, 1]}
+    create_localizer(LocalizeSettings.of(opened.settings, settings), opened)
     assert directions == [[0, 0, 1]]
 
 

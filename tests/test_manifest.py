@@ -17,6 +17,7 @@ from toolkit.manifest import (
     describe,
     load_manifest,
 )
+from toolkit.manifest import settings as settings_module
 from toolkit.manifest.messages import nested_model
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -287,12 +288,25 @@ def test_every_setting_has_a_meaning() -> None:
     assert len(sections) > 15
 
 
+def test_stages_have_few_settings_and_a_former_one_is_told_where_its_constant_is(tmp_path: Path) -> None:
+    models = [model for model in vars(settings_module).values() if isinstance(model, type)]
+    sections = [model for model in models if issubclass(model, Settings)]
+    assert sum(len(section.model_fields) for section in sections) <= 90
+    for section in sections:
+        for file, names in section.constants.items():
+            assert (REPOSITORY / "toolkit" / file).is_file()
+            assert not {*names.split()} & {*section.model_fields}
+    path = write(tmp_path, "captures: [here]\nlocalize: {pnp: {guided_images: 9}}\n")
+    with pytest.raises(ManifestError, match=r"'localize\.pnp\.guided_images': .* in toolkit/localizers/matches\.py\."):
+        load_manifest(path)
+
+
 def test_a_plain_value_stands_for_the_field_that_matters(tmp_path: Path) -> None:
     localize = "localize: {matcher: mutual, features: [sift], predictor: simulated}"
     manifest = load_manifest(
-        write(tmp_path, f"captures: [here]\n{localize}\n"), ["localize.matcher.min_confidence=0.3"]
+        write(tmp_path, f"captures: [here]\n{localize}\n"), ["localize.matcher.checkpoint=/w.pt"]
     )
-    assert manifest.localize.matcher == MatcherSettings(name="mutual", min_confidence=0.3)
+    assert manifest.localize.matcher == MatcherSettings(name="mutual", checkpoint="/w.pt")
     assert manifest.localize.features.kinds == ["sift"]
     assert manifest.localize.predictor.name == "simulated"
     assert LocalizeSettings.of({"features": ("sift",)}).features.kinds == ["sift"]

@@ -15,7 +15,8 @@ import pandas as pd
 import pytest
 
 from toolkit import notebook, pipeline
-from toolkit.manifest import OPTIONAL, STAGES, Manifest
+from toolkit.errors import ManifestError
+from toolkit.manifest import OPTIONAL, STAGES, Manifest, RetrieveSettings
 from toolkit.notebook import notebook_parameters, notebook_path
 
 # What the pipeline sets for a run, so that a manifest has it once and not in a section.
@@ -76,6 +77,18 @@ def test_parameters_are_of_the_run_or_settings_with_their_defaults(stage: str) -
     assert parameters.pop("settings") == {}, "the door to all other settings"
     chosen = {name: value for name, value in parameters.items() if name not in OF_THE_RUN}
     assert type(section).of(chosen) == type(section)(), "a cell's defaults are those of the tree"
+
+
+def test_a_stage_gets_the_parameters_of_its_notebook_and_then_its_dict(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = {"topk": 3, "index": "a variable of the user", "settings": {"mask": {"gps": True}}}
+    monkeypatch.setattr(notebook, "_user_names", lambda: names)
+    folders = notebook.Folders({}, "retrieve")
+    assert folders.settings == RetrieveSettings.of({"topk": 3, "mask": {"gps": True}})
+    names["settings"] = {"topk": 4}  # the cell has run again, with another value
+    assert folders.settings.topk == 4
+    names["settings"] = {"topk": "many"}
+    with pytest.raises(ManifestError, match=r"topk: found 'many'"):
+        folders.settings  # noqa: B018
 
 
 @pytest.mark.parametrize("stage", FUNCTIONS)

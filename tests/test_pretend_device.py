@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.features.test_aliked import SETTINGS
+from tests.features.test_aliked import SETTINGS, Small
 from tests.features.test_aliked import random_state as aliked_state
 from tests.features.test_lightglue import features, state
 from tests.features.test_superpoint import planted_state
@@ -20,7 +20,6 @@ from tests.models.test_vggt import tiny
 from tests.pretend import DEVICE, PretendTensor, pretending, resolved
 from toolkit.embedders import megaloc, search
 from toolkit.features import lightglue, network
-from toolkit.features.aliked import AlikedExtractor
 from toolkit.features.lightglue import LightGlueMatcher
 from toolkit.features.network import NetworkExtractor
 from toolkit.features.superpoint import SuperPointExtractor
@@ -103,7 +102,7 @@ def test_da3(device: None) -> None:
 
 
 def make_aliked(name: str) -> NetworkExtractor:
-    return AlikedExtractor(aliked_state(), name, settings=AlikedSettings.of(SETTINGS))
+    return Small(aliked_state(), name, settings=AlikedSettings.of(SETTINGS))
 
 
 def make_superpoint(name: str) -> NetworkExtractor:

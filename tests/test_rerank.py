@@ -68,14 +68,15 @@ def test_matches_of_one_scene_are_inliers(right: int) -> None:
     assert 0.85 * right <= found <= right + 0.1 * (200 - right)
 
 
-def test_distortion_is_taken_into_account() -> None:
+def test_distortion_is_taken_into_account(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform([-4, -3, 4], [4, 3, 6], (400, 3))  # up to the edges, where distortion is large
     pixels_a = np.asarray(WIDE.img_from_cam(points))
     pixels_b = np.asarray(BENT.img_from_cam(transform(invert(turned(-8, (1.2, 0.1, 0.3))), points)))
     seen = ((pixels_a > 0) & (pixels_a < [960, 720]) & (pixels_b > 0) & (pixels_b < [640, 480])).all(axis=1)
     pixels_a, pixels_b, scores = pixels_a[seen], pixels_b[seen], np.ones(seen.sum())
-    settings = RerankSettings(max_error_deg=0.08)
+    settings = RerankSettings()
+    monkeypatch.setattr(verification, "MAX_ERROR_DEG", 0.08)
     ideal = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=BENT.params[:4])
     assert count_inliers(WIDE, pixels_a, BENT, pixels_b, scores, settings) > 0.95 * seen.sum()
     assert count_inliers(WIDE, pixels_a, ideal, pixels_b, scores, settings) < 0.5 * seen.sum()

@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 
 from tests.test_embed import HL_RIG
+from toolkit import retrieve as retrieve_stage
 from toolkit.capture import Capture
 from toolkit.capture.masks import Masks, near
 from toolkit.embed import embed_sessions
@@ -279,8 +280,8 @@ def test_only_listed_keyframes(tiny: Path, tmp_path: Path) -> None:
 
 
 def test_vectors_of_two_vocabularies_are_not_compared(tiny: Path, tmp_path: Path) -> None:
-    """One device is embedded again with other settings; the vectors have the same length."""
-    embed_sessions(tiny / "sessions", tmp_path / "embeddings", {"vlad": {"min_scale_px": 3}}, device="ios")
+    """One device is embedded again with another seed; the vectors have the same length."""
+    embed_sessions(tiny / "sessions", tmp_path / "embeddings", {"seed": 1}, device="ios")
     table = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings").set_index(["map_device", "query_device"])
     for pair in (("ios", "hl"), ("hl", "ios")):
         assert {f"{name}.npy" for name in ("ios_a", "hl_a")} <= {*re.findall(r"\w+\.npy", table["reason"][pair])}, pair
@@ -371,8 +372,10 @@ def test_a_vector_that_is_not_finite_stops_its_own_pairs_alone(tiny: Path, tmp_p
         assert [row["topk"] for row in lines(before)] == [row["topk"] for row in lines(after)]
 
 
-WINDOW = {"window_s": 4e-6}
-"""The tiny capture has an image each microsecond or ten."""
+@pytest.fixture
+def short_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tiny capture has an image each microsecond or ten."""
+    monkeypatch.setattr(retrieve_stage, "WINDOW_S", 4e-6)
 
 
 def write_wifi(capture: Path, session: str, walls: dict[int, int]) -> None:
@@ -387,6 +390,7 @@ def first_walls(path: str | Path) -> list[int]:
     return [(int(record["topk"][0]["timestamp"]) - 1000) // 10 for record in lines(path)]
 
 
+@pytest.mark.usefixtures("short_window")
 def test_references_come_from_where_radio_says(
     tiny: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -403,16 +407,16 @@ def test_references_come_from_where_radio_says(
     write_wifi(tiny, "hl_query", {0: 2, 1: 1})
     assert retrieve()["skipped"], "radio that is not asked for makes no difference"
     assert "without_radio" not in without
-    row = retrieve(radio=True, **WINDOW)
+    row = retrieve(radio=True)
     assert not row["skipped"]
     assert first_walls(row["path"]) == [2, 2, 1, 1, 2, 2]
     assert [len(record["topk"]) for record in lines(row["path"])] == [4, 4, 4, 4, 9, 9], "images of one scan are equal"
     assert row["without_radio"] == 2
     assert "radio leaves the whole map to 2 of 6 query images" in caplog.text
-    again = retrieve(radio=True, **WINDOW)
+    again = retrieve(radio=True)
     assert (again["skipped"], again["without_radio"]) == (True, 2)
     write_wifi(tiny, "hl_map", {0: 2, 1: 1, 2: 0})
-    row = retrieve(radio=True, **WINDOW)
+    row = retrieve(radio=True)
     assert not row["skipped"], "other signals"
     assert first_walls(row["path"]) == [0, 0, 1, 1, 2, 2]
     row = retrieve()
@@ -423,13 +427,14 @@ def test_references_come_from_where_radio_says(
             retrieve(radio=True)
 
 
+@pytest.mark.usefixtures("short_window")
 def test_masks_of_several_query_sessions_backends_and_an_index_are_joined(tiny: Path, tmp_path: Path) -> None:
     for session in ("ios_map", "ios_query", "hl_query"):
         write_wifi(tiny, session, {0: 0, 1: 1, 2: 2} if session.endswith("map") else {0: 2, 1: 1, 2: 0})
     other = {"use_faiss": False}, {"index": "IVF2,Flat", "index_candidates": 5, "nprobe": 2}
     paths = []
     for number, settings in enumerate(({}, *other)):
-        settings = {"topk": 2, "mask": {"radio": True, **WINDOW}, **settings}
+        settings = {"topk": 2, "mask": {"radio": True}, **settings}
         out = tmp_path / str(number)
         table = retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", out, settings, map_device="ios")
         paths.append(table["path"])
@@ -438,6 +443,7 @@ def test_masks_of_several_query_sessions_backends_and_an_index_are_joined(tiny: 
         assert len({Path(path).read_bytes() for path in same}) == 1
 
 
+@pytest.mark.usefixtures("short_window")
 def test_references_come_from_near_rough_poses_and_fixes(tiny: Path, tmp_path: Path) -> None:
     rough = tmp_path / "rough.txt"
     rough.write_text("1000, ios_a/cam, 1, 0, 0, 0, 20, 0, 0\n1010, ios_a/cam, 1, 0, 0, 0, 900, 0, 0\n")
@@ -452,14 +458,14 @@ def test_references_come_from_near_rough_poses_and_fixes(tiny: Path, tmp_path: P
     row = retrieve(poses=str(rough), poses_distance_m=2)
     assert first_walls(row["path"]) == [2, 1, 2]
     assert row["without_poses"] == 2
-    row = retrieve(gps=True, **WINDOW)
+    row = retrieve(gps=True)
     assert first_walls(row["path"]) == [0, 2, 2]
     assert row["without_gps"] == 0
-    row = retrieve(gps=True, poses=str(rough), poses_distance_m=2, **WINDOW)
+    row = retrieve(gps=True, poses=str(rough), poses_distance_m=2)
     assert first_walls(row["path"]) == [2, 2, 2], "a rough pose outdoes the fix that contradicts it"
     assert (row["without_poses"], row["without_gps"]) == (2, 1)
     rough.write_text(rough.read_text().replace(" 900", " 10"))
-    again = retrieve(gps=True, poses=str(rough), poses_distance_m=2, **WINDOW)
+    again = retrieve(gps=True, poses=str(rough), poses_distance_m=2)
     assert (again["skipped"], again["without_poses"]) == (False, 1)
     with pytest.raises(ManifestError, match=r"retrieve\.mask\.poses: no such file: .*nowhere\.txt.*trajectories\.txt"):
         retrieve(poses=str(tmp_path / "nowhere.txt"))

@@ -78,7 +78,7 @@ NUMBERS = """
 import hashlib, sys
 import cv2, numpy as np
 from threadpoolctl import threadpool_limits
-from toolkit.embedders.vlad import Vlad, VladSettings
+from toolkit.embedders import vlad
 from toolkit.features.features import KINDS
 from toolkit.features.matching import MutualMatcher
 from toolkit.features.sift import SiftExtractor
@@ -87,9 +87,10 @@ rng = np.random.default_rng(0)
 noise = [cv2.GaussianBlur(rng.integers(0, 256, (240, 320), np.uint8), (0, 0), 2.0) for _ in range(3)]
 with threadpool_limits(int(sys.argv[1]), "blas"):
     images = SiftExtractor().extract([*noise, np.roll(noise[0], 9, axis=1)])
-    vlad = Vlad.learn(lambda: iter(images), len(images), VladSettings(words=32))
+    vlad.MAX_WORDS = 32
+    learned = vlad.Vlad.learn(lambda: iter(images), len(images))
     matches = MutualMatcher.of(KINDS["sift"]).match([(images[0], images[3])])[0]
-arrays = [images[0].keypoints, images[0].descriptors, vlad.centroids, vlad.local_projection, vlad._whitened(
+arrays = [images[0].keypoints, images[0].descriptors, learned.centroids, learned.local_projection, learned._whitened(
     images[0].descriptors / np.float32(512)), matches.indices, matches.scores]
 print(len(matches.indices), *(hashlib.sha1(np.ascontiguousarray(array)).hexdigest()[:8] for array in arrays))
 """

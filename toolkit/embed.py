@@ -297,7 +297,6 @@ def _vocabulary(capture: Capture, folders: _Folders, settings: EmbedSettings, sk
         rows_by_session.setdefault(name, []).append(row)
     chosen = {name: np.array(rows) for name, rows in rows_by_session.items()}
     record = {
-        "vlad": settings.vlad.model_dump(),
         "features": SiftExtractor().settings,
         "images": {name: _images_fingerprint(capture[name], rows) for name, rows in chosen.items()},
         "seed": settings.seed,
@@ -314,7 +313,7 @@ def _vocabulary(capture: Capture, folders: _Folders, settings: EmbedSettings, sk
         for name, image in tqdm(keys, desc="vocabulary", unit="image"):
             yield stores[name][image]
 
-    vlad = Vlad.learn(features, len(keys), settings.vlad, settings.seed)
+    vlad = Vlad.learn(features, len(keys), settings.seed)
     vlad.save(path)
     write_sidecar(path, record)
     return path

@@ -64,6 +64,13 @@ ERROR_COLUMNS = ["map_device", "query_device", "timestamp", "device_id", "image"
                  "p_correct", "position_std_m", "rotation_error_deg", "translation_error_m"]  # fmt: skip
 DETAILS = ("num_inliers", "p_correct", "position_std_m")
 """Columns copied from a pair's table to the table of errors."""
+RETRIEVAL_KS = (1, 5, 10)
+"""Retrieval recall is reported for these numbers of references."""
+RETRIEVAL_RADIUS_M = 8.0
+"""Largest distance of a correct reference from the query: meters, or half of the median depth where that is above
+16 m."""
+RETRIEVAL_ANGLE_DEG = 45.0
+"""Largest angle between the viewing directions of a correct reference and the query, degrees; roll is ignored."""
 _PAIR = ["map_device", "query_device"]
 
 
@@ -110,7 +117,6 @@ def evaluate_scene(
         raise ToolkitError(f"Unknown at={at!r}. Known: device, camera.")
     settings = EvaluateSettings.of(settings)
     limits = tuple((float(degrees), float(meters)) for degrees, meters in settings.thresholds)
-    near = settings.retrieval_radius_m, settings.retrieval_angle_deg
     capture = Capture.from_sessions_root(sessions_root)
     map_devices = capture.devices_with("map", map_device)
     rows: dict[str, list[dict[str, Any]]] = {"recall": [], "retrieval": [], "losses": []}
@@ -155,8 +161,7 @@ def evaluate_scene(
             elif references_dir is not None:
                 path = Path(references_dir) / f"{name}.jsonl"
                 row, good = _retrieval_recall(
-                    *(path, keys, truth, capture[f"{map_}_map"], settings.retrieval_ks),
-                    *(near, length, record["length"] or length),
+                    path, keys, truth, capture[f"{map_}_map"], length, record["length"] or length
                 )
                 rows["retrieval"].append({**pair, **row})
                 if good is None:
@@ -425,15 +430,12 @@ def _retrieval_recall(
     keys: pd.DataFrame,
     truth: Trajectory | None,
     map_session: Session,
-    ks: Sequence[int],
-    limits: tuple[float, float],
     length: float,
     map_length: float,
 ) -> tuple[dict[str, Any], NDArray[np.bool_] | None]:
     """Return a pair's row of the table `retrieval`, and whether each query has a good reference (None if unreadable).
 
     Args:
-        limits: largest distance, in map lengths, and angle (degrees) between a query and a good reference.
         length: the unit of lengths in the table, in the unit of the poses.
         map_length: `Survey.length`, in the unit of the poses: far scenes show the same from further apart.
     """
@@ -452,7 +454,7 @@ def _retrieval_recall(
         state = f"unreadable retrieval file ({type(error).__name__}: {error})"
         return {"state": state, "queries": len(keys)}, None
     cameras = poses_of(truth, index) @ device_from_cam  # type: ignore[arg-type]
-    reach = limits[0] * map_length, limits[1]
+    reach = RETRIEVAL_RADIUS_M * map_length, RETRIEVAL_ANGLE_DEG
     near = _is_near(references, cameras[:, None], reach)
     best = np.where(near.any(1), near.argmax(1), np.inf)
     in_map = _near_any(cameras, map_session.world_from_cam(), reach)
@@ -460,9 +462,9 @@ def _retrieval_recall(
     frame = index.assign(rank=best, in_map=in_map).groupby(["timestamp", "device_id"], as_index=False)
     by_device = keys.merge(frame.agg(rank=("rank", "min"), in_map=("in_map", "any")), how="left")
     rank = by_device["rank"].fillna(np.inf).to_numpy(float)
-    row: dict[str, Any] = {"state": "evaluated", "queries": len(keys), "angle_deg": limits[1]}
+    row: dict[str, Any] = {"state": "evaluated", "queries": len(keys), "angle_deg": RETRIEVAL_ANGLE_DEG}
     row["radius_m"] = round(reach[0] / length, 4)
-    row |= {f"recall@{k}": float(np.mean(rank < k)) for k in ks}
+    row |= {f"recall@{k}": float(np.mean(rank < k)) for k in RETRIEVAL_KS}
     return {**row, "in_map": float(by_device["in_map"].eq(True).mean())}, np.isfinite(rank)
 
 

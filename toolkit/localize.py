@@ -299,7 +299,7 @@ class _Stage(Remade):
         if predictor is not None:
             record |= {
                 "predictor": {"name": predictor.name} | predictor.settings,
-                "references": settings.predictor.model_dump(exclude={"name", "checkpoint", "batch_size", "compile"}),
+                "references": settings.predictor.num_references,
                 "depths": map_session.depths_fingerprint,
             }
         return record

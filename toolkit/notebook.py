@@ -75,10 +75,15 @@ if TEXT_BARS in os.environ:
 
 
 class Folders:
-    """The resolved folders of a notebook, as attributes; displayed as a table."""
+    """The resolved folders of a notebook, as attributes; displayed as a table. `settings` are those of its stage."""
 
-    def __init__(self, folders: dict[str, Path]) -> None:
-        self._folders = folders
+    def __init__(self, folders: dict[str, Path], stage: str) -> None:
+        self._folders, self._stage = folders, stage
+
+    @property
+    def settings(self) -> Any:
+        """The settings model of the stage, from the notebook's parameters as they are now."""
+        return stage_settings(self._stage, _user_names())
 
     def __getattr__(self, name: str) -> Path:
         folders = self.__dict__.get("_folders", {})
@@ -127,7 +132,7 @@ def start(stage: str, sessions_root: str | None = None, **folders: str | None) -
             if folder and run_log is None and defaults[name] == defaults["out_dir"]:
                 _require_outside_of_runs(name, path, sessions)
             resolved[name] = path
-    return Folders(resolved)
+    return Folders(resolved, stage)
 
 
 def _require_outside_of_runs(name: str, folder: Path, sessions: Path) -> None:
@@ -347,7 +352,7 @@ def _run_stage(stage: str, sessions: Path, files: SceneFiles) -> None:
     """Run `embed`, `retrieve` or `localize` with the settings of the run that results are taken from, or defaults."""
     run = _finished_run(files.run.parent, files.scene)
     content = read_json(run / RECORD).get("manifest", {}) if run else {}
-    manifest = Manifest.model_validate(content or {"name": "by-hand", "captures": [str(sessions.parent)]})
+    manifest = Manifest.of(content or {"name": "by-hand", "captures": [str(sessions.parent)]})
     settings, queries = manifest.stage(stage).given(), manifest.queries
     if stage == "embed":
         from toolkit.embed import embed_sessions
@@ -414,6 +419,19 @@ def _check_devices_and_queries(stage: str, sessions: Path) -> None:
             raise CaptureError(f"{found} {nearest(values[name], [*present, 'all'])}")
 
 
+def stage_settings(stage: str, values: Mapping[str, Any]) -> Settings:
+    """Return the settings of a stage from the parameters of its notebook, overridden by its dict `settings`.
+
+    Raises:
+        ManifestError: a value or a name is wrong; names the parameter, what was found and what was expected.
+    """
+    section = type(Manifest.defaults(stage))
+    known = notebook_parameters(notebook_path(stage)).keys() & values.keys()
+    settings = section.of({key: values[key] for key in section.model_fields if key in known}, values.get("settings"))
+    check_names(settings)
+    return settings
+
+
 def check_names(settings: Settings) -> None:
     """Refuse unknown names of embedders, local features, matchers and indices.
 
@@ -444,13 +462,11 @@ def check_values(name: str, values: Mapping[str, Any]) -> None:
         ManifestError: names the parameter, what was found and what was expected.
     """
     path = notebook_path(name)
-    parameters = {key: (default, values[key]) for key, default in notebook_parameters(path).items() if key in values}
-    if name in STAGES:
-        section = type(Manifest(name="x", captures=["x"]).stage(name))
-        settings = parameters.pop("settings", ({}, {}))[1]
-        named = {key: parameters.pop(key)[1] for key in list(parameters) if key in section.model_fields}
-        check_names(section.of(named, settings))
-    for key, (default, value) in parameters.items():
+    checked = {"settings", *type(stage_settings(name, values)).model_fields} if name in STAGES else set()
+    for key, default in notebook_parameters(path).items():
+        if key in checked or key not in values:
+            continue
+        value = values[key]
         if key == "pairs":
             pairs = value if isinstance(value, list | tuple) else [value]
             fits = value is None or all(isinstance(pair, list | tuple) and len(pair) == 2 for pair in pairs)

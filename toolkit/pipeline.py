@@ -51,7 +51,6 @@ from toolkit.manifest import (
     load_manifest,
     nearest,
 )
-from toolkit.manifest.messages import nested_model
 from toolkit.models.weights import WeightsSource, check_weights, find_weights, resolve_weights
 from toolkit.notebook import (
     UPSTREAM,
@@ -557,25 +556,10 @@ def _jobs(manifest: Manifest, stage: str, capture: Path, files: SceneFiles, forc
 
 
 def settings_parameters(settings: Settings, known: Iterable[str]) -> dict[str, Any]:
-    """Return settings as notebook parameters: one per name in its parameters cell, and a dict `settings` of the rest.
-
-    Args:
-        settings: only values that were set count, not defaults.
-        known: names of the notebook's parameters.
-    """
-    named: dict[str, Any] = {}
-    rest: dict[str, Any] = {}
-    for key, value in settings.given().items():
-        inner = nested_model(type(settings).model_fields[key].annotation)
-        if key not in known:
-            rest[key] = value
-        elif inner is not None and issubclass(inner, Settings) and isinstance(value, dict):
-            if inner.shorthand in value:
-                named[key] = value.pop(inner.shorthand)
-            rest |= {key: value} if value else {}
-        else:
-            named[key] = value
-    return named | ({"settings": rest} if rest else {})
+    """Return settings that were set as notebook parameters: those in its parameters cell, and a dict of the rest."""
+    given = settings.given()
+    rest = {key: value for key, value in given.items() if key not in known}
+    return {key: value for key, value in given.items() if key in known} | ({"settings": rest} if rest else {})
 
 
 def _parts(manifest: Manifest, stage: str, capture: Path) -> list[tuple[str, dict[str, Any]]]:

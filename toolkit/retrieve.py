@@ -33,6 +33,14 @@ __all__ = ["load_embeddings", "retrieve_pairs", "search"]
 log = logging.getLogger(__name__)
 
 _INDEX_SETTINGS = {"index", "index_candidates", "nprobe"}
+MAX_ANGLE_DEG = 90.0
+"""Largest angle between the viewing directions of a rough pose and a map camera, degrees; roll is ignored."""
+GPS_MARGIN_M = 25.0
+"""Largest distance between two GPS fixes, meters, beyond twice the sum of their stated accuracies."""
+RADIO_SHARE = 0.025
+"""Share of the map images that a radio mask keeps, as in the benchmark."""
+WINDOW_S = 2.0
+"""Largest time difference between an image and the radio scans and GPS fixes used for it, seconds."""
 _CHOICE = 3
 """Map images that a radio mask leaves per reference, at least. Radio knows the place but not the viewing direction, so
 the descriptors must have some to choose from."""
@@ -289,12 +297,12 @@ def _masks(
     images = database.session, database.rows, query.session, query.rows
     priors = dict[str, Masks]()
     if poses is not None:
-        priors["poses"] = pose_masks(poses, *images, mask.poses_distance_m, mask.poses_angle_deg)
+        priors["poses"] = pose_masks(poses, *images, mask.poses_distance_m, MAX_ANGLE_DEG)
     if mask.gps:
-        priors["gps"] = gps_masks(*images, mask.gps_margin_m, mask.window_s)
+        priors["gps"] = gps_masks(*images, GPS_MARGIN_M, WINDOW_S)
     if mask.radio:
-        least = max(_CHOICE * settings.topk, int(np.ceil(mask.radio_share * len(database.rows))))
-        priors["radio"] = radio_masks(*images, least, mask.window_s)
+        least = max(_CHOICE * settings.topk, int(np.ceil(RADIO_SHARE * len(database.rows))))
+        priors["radio"] = radio_masks(*images, least, WINDOW_S)
     if not priors:
         return None, {}
     masks, counts = combine(list(priors.values()))
@@ -311,12 +319,11 @@ def _mask_record(settings: MaskSettings, *sessions: Session) -> dict[str, Any]:
     record: dict[str, Any] = {}
     names: list[str] = []
     if settings.poses:
-        limits = [settings.poses_distance_m, settings.poses_angle_deg]
-        record["poses"] = [file_fingerprint(settings.poses), *limits]
+        record["poses"] = [file_fingerprint(settings.poses), settings.poses_distance_m, MAX_ANGLE_DEG]
     if settings.gps:
-        record["gps"], names = [settings.gps_margin_m, settings.window_s], ["gps.txt"]
+        record["gps"], names = [GPS_MARGIN_M, WINDOW_S], ["gps.txt"]
     if settings.radio:
-        record["radio"], names = [settings.radio_share, settings.window_s], [*names, *SIGNALS]
+        record["radio"], names = [RADIO_SHARE, WINDOW_S], [*names, *SIGNALS]
     if names:
         paths = [session.path / name for session in sessions for name in (*names, SUBSESSIONS)]
         record["files"] = [file_fingerprint(path) if path.exists() else None for path in paths]

@@ -67,6 +67,9 @@ COLUMNS = (
 again near its predicted pose, empty for none. `used`: the query's own pose agrees with the result of its piece.
 `moved_m` and `turned_deg` are the differences between the query's result and its first single pose. If the unit of the
 poses is unknown, lengths are named by `in_unit_of_poses`."""
+WINDOWS_S = (10.0, 20.0)
+"""For comparison, the poses that the setting `online` would give from single queries are also written: for each of
+these lengths of earlier data, in seconds, and for all earlier data."""
 STEP_COLUMNS = ("step", "timestamp", "device_id", *POSE_NAMES)
 """Columns of `<pair>_sequence_steps.csv`: the poses of queries after each of `STEPS`."""
 
@@ -359,10 +362,8 @@ def _online_steps(piece: _Piece, settings: SequenceSettings) -> dict[str, Floats
 
     Poses found again near a predicted pose are not used, because later queries helped to predict them.
     """
-    if not settings.windows_s:
-        return {}
     steps, frames = {}, piece.query_frames
-    for length_s in (*settings.windows_s, None):
+    for length_s in (*WINDOWS_S, None):
         past = settings.model_copy(update={"online": True, "length_s": length_s})
         name = "online" if length_s is None else f"online {length_s:g} s"
         steps[name] = place_online(piece.motion, piece.posed, frames, past).world_from_rig[frames]
@@ -395,7 +396,7 @@ def _pieces(session: Session, singles: _SingleQueries, settings: SequenceSetting
     for recording, rows in recordings_of(session, odometry).items():
         own = np.flatnonzero((within == recording) | (names == recording))
         whole = Odometry(odometry.timestamps[rows], poses[rows])
-        for part in whole.split(settings):
+        for part in whole.split():
             piece, devices = whole.part(part), odometry.device_ids[rows[part]]
             between, interpolated = piece.at(times[own])
             piece, order = piece.joined(times[own[between]], interpolated)

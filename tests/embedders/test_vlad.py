@@ -7,14 +7,20 @@ import numpy as np
 import pytest
 
 from toolkit.embedders import create_embedder, resolve_name
-from toolkit.embedders.vlad import Vlad, VladSettings
+from toolkit.embedders import vlad as vlad_module
+from toolkit.embedders.vlad import MIN_SCALE_PX, Vlad
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError, WeightsError
 from toolkit.features.features import LocalFeatures
 
-SETTINGS = VladSettings(words=16, local_dim=16, min_features=20, sample_descriptors=3000)
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = {"MAX_WORDS": 16, "LOCAL_DIM": 16, "MIN_FEATURES": 20, "SAMPLE_DESCRIPTORS": 3000}
+    for name, value in sizes.items():
+        monkeypatch.setattr(vlad_module, name, value)
 
 
-def features_of(descriptors: np.ndarray, scale: float = SETTINGS.min_scale_px) -> LocalFeatures:
+def features_of(descriptors: np.ndarray, scale: float = MIN_SCALE_PX) -> LocalFeatures:
     count = len(descriptors)
     root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
     quantized = np.clip(np.round(root * 512), 0, 255).astype(np.uint8)
@@ -38,7 +44,7 @@ def places(count: int, views: int, noise: float, seed: int) -> list[LocalFeature
 
 
 def learn(images: list[LocalFeatures], seed: int = 0) -> Vlad:
-    return Vlad.learn(lambda: iter(images), len(images), SETTINGS, seed)
+    return Vlad.learn(lambda: iter(images), len(images), seed)
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
@@ -73,12 +79,10 @@ def test_batches_do_not_matter() -> None:
     np.testing.assert_allclose(vlad.embed(database), singly, atol=1e-6)
 
 
-def test_shrinkage_follows_the_number_of_images() -> None:
+def test_shrinkage_follows_the_number_of_images(monkeypatch: pytest.MonkeyPatch) -> None:
     def spread(prior: int) -> float:
-        settings = VladSettings(words=16, local_dim=16, prior_images=prior)
-        images = places(4, 3, 0.3, seed=2)
-        vlad = Vlad.learn(lambda: iter(images), len(images), settings)
-        lengths = np.linalg.norm(vlad.projection, axis=0)
+        monkeypatch.setattr(vlad_module, "PRIOR_IMAGES", prior)
+        lengths = np.linalg.norm(learn(places(4, 3, 0.3, seed=2)).projection, axis=0)
         return float(lengths.max() / lengths.min())
 
     assert spread(0) > 1.5, "no prior: whitened"

@@ -7,11 +7,12 @@ from numpy.typing import NDArray
 
 from tests.models.test_aliked_network import photograph, random_state
 from toolkit.errors import ToolkitError, WeightsError
+from toolkit.features import aliked
 from toolkit.features.aliked import AlikedExtractor
 from toolkit.features.features import LocalFeatures, create_extractor
 from toolkit.manifest import AlikedSettings, FeaturesSettings
 
-SETTINGS = {"model": "aliked-t16", "min_long_side": 0, "max_keypoints": 60}
+SETTINGS = {"model": "aliked-t16", "max_keypoints": 60}
 
 
 @pytest.fixture(scope="module")
@@ -19,8 +20,14 @@ def extractor() -> AlikedExtractor:
     return make()
 
 
-def make(**settings: int | float | str) -> AlikedExtractor:
-    return AlikedExtractor(random_state(), "cpu", settings=AlikedSettings.of(SETTINGS, settings))
+class Small(AlikedExtractor):
+    """Photographs are not enlarged, which would take long."""
+
+    min_long_side = 0
+
+
+def make(dtype: str = "auto", **settings: int | float | str) -> AlikedExtractor:
+    return Small(random_state(), "cpu", dtype, settings=AlikedSettings.of(SETTINGS, settings))
 
 
 def assert_equal(found: LocalFeatures, expected: LocalFeatures, factor: float = 1.0) -> None:
@@ -41,7 +48,7 @@ def test_shapes_and_order(extractor: AlikedExtractor) -> None:
     np.testing.assert_array_equal(found.scales, 1)
     assert extractor.settings["name"] == "aliked"
     assert extractor.settings["dtype_compute"] == "float32"
-    assert make(threshold=0.5).settings != extractor.settings != make(nms_radius=3).settings
+    assert make(max_keypoints=50).settings != extractor.settings != make(max_long_side=500).settings
 
 
 @pytest.mark.parametrize("factor", [2, 3])
@@ -52,7 +59,9 @@ def test_keypoints_are_in_the_pixels_of_the_photograph(extractor: AlikedExtracto
     assert_equal(found, expected, factor)
     assert found.image_size == (100 * factor, 75 * factor)
     # Enlarged photographs differ a little, so their size and their corners are looked at alone.
-    (found,) = make(min_long_side=100 * factor, max_keypoints=2000).extract([small])
+    enlarging = make(max_keypoints=2000)
+    enlarging.min_long_side = 100 * factor
+    (found,) = enlarging.extract([small])
     assert found.image_size == (100, 75)
     assert 97 < found.keypoints[:, 0].max() < 100
     assert found.keypoints.min() > 0
@@ -91,8 +100,7 @@ def test_a_batch_is_its_images_one_by_one(extractor: AlikedExtractor) -> None:
 @pytest.mark.parametrize("dtype", ["bfloat16", "float16"])
 def test_positions_keep_their_precision(extractor: AlikedExtractor, dtype: str) -> None:
     image = photograph(64, 1000)  # bfloat16 cannot tell x = 325 from 324
-    coarse = AlikedExtractor(random_state(), "cpu", dtype, settings=AlikedSettings.of(SETTINGS))
-    (expected,), (found,) = extractor.extract([image]), coarse.extract([image])
+    (expected,), (found,) = extractor.extract([image]), make(dtype).extract([image])
     distance = np.linalg.norm(found.keypoints[:, None] - expected.keypoints, axis=2).min(axis=1)
     assert np.median(distance) < 0.1
     assert found.keypoints[:, 0].max() > 900
@@ -105,8 +113,9 @@ def test_tiny_photographs(extractor: AlikedExtractor, size: tuple[int, int]) -> 
     assert (len(found) > 0) <= (min(size) > 4)
 
 
-def test_nothing_to_find() -> None:
-    (found,) = make(threshold=1.0).extract([photograph(64, 96)])
+def test_nothing_to_find(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(aliked, "MIN_SCORE", 1.0)
+    (found,) = make().extract([photograph(64, 96)])
     assert found.keypoints.shape == (0, 2)
     assert found.descriptors.shape == (0, 64)
     assert make().extract([]) == []

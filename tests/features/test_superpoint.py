@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from toolkit.errors import ManifestError, ToolkitError, WeightsError
+from toolkit.features import superpoint
 from toolkit.features.features import LocalFeatures, create_extractor
 from toolkit.features.superpoint import SuperPointExtractor
 from toolkit.manifest import FeaturesSettings, SuperPointSettings
@@ -98,10 +99,11 @@ def test_same_as_the_network_of_the_package(extractor: SuperPointExtractor) -> N
 
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])  # bfloat16 cannot tell x = 325 from 324
-def test_a_white_pixel_is_found_where_it_is(dtype: str) -> None:
+def test_a_white_pixel_is_found_where_it_is(monkeypatch: pytest.MonkeyPatch, dtype: str) -> None:
+    monkeypatch.setattr(superpoint, "BORDER", 0)
     image = np.zeros((8, 350), np.uint8)
     image[6, 8 * 40 + 1] = 255
-    (found,) = planted(dtype, border=0).extract([image])
+    (found,) = planted(dtype).extract([image])
     np.testing.assert_array_equal(found.keypoints, [[8 * 40 + COLUMN + 0.5, ROW + 0.5]])
 
 
@@ -141,13 +143,14 @@ def test_the_border_is_that_of_the_photograph(height: int, expected: list[float]
     assert len(found) == 4 * len(expected)  # of 5 cells in a row; in the last, x = 37 is too close to the right
 
 
-def test_gray_and_color(extractor: SuperPointExtractor) -> None:
+def test_gray_and_color(extractor: SuperPointExtractor, monkeypatch: pytest.MonkeyPatch) -> None:
     gray = photograph(3, 48, 64)
     same, again = extractor.extract([np.repeat(gray[:, :, None], 3, axis=2), gray])
     assert_equal(same, again)
     red = np.zeros((40, 40, 3), np.uint8)
     red[8:16, 8:16, 0] = 255
-    (found,) = planted(threshold=0.2).extract([red])
+    monkeypatch.setattr(superpoint, "MIN_RESPONSE", 0.2)
+    (found,) = planted().extract([red])
     gray_of_red = 76  # of 255, by ITU-R BT.601
     expected = torch.tensor([40 * gray_of_red / 255, 10] + 63 * [0.0]).softmax(0)[0]
     assert found.scores[0] == pytest.approx(float(expected), rel=1e-3)
@@ -195,7 +198,7 @@ def test_nothing_to_find() -> None:
 def test_the_fingerprint_tells_weights_and_settings_apart(extractor: SuperPointExtractor) -> None:
     assert planted(batch_size=7).settings == planted().settings
     assert planted().settings["weights"] != extractor.settings["weights"]
-    assert planted(threshold=0.1).settings != planted("bfloat16", threshold=0.1).settings != planted().settings
+    assert planted(max_keypoints=9).settings != planted("bfloat16", max_keypoints=9).settings != planted().settings
 
 
 def test_wrong_settings() -> None:

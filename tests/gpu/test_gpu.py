@@ -16,7 +16,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from tests.features.test_aliked import SETTINGS
+from tests.features.test_aliked import SETTINGS, Small
 from tests.features.test_lightglue import features
 from tests.features.test_lightglue import state as lightglue_state
 from tests.features.test_superpoint import planted_state
@@ -27,7 +27,6 @@ from tests.models.test_megaloc import golden
 from toolkit import pipeline
 from toolkit.embedders.megaloc import MegaLocEmbedder
 from toolkit.errors import ToolkitError
-from toolkit.features.aliked import AlikedExtractor
 from toolkit.features.lightglue import LightGlueMatcher
 from toolkit.features.network import NetworkExtractor
 from toolkit.features.superpoint import SuperPointExtractor
@@ -227,7 +226,7 @@ def test_weights_that_do_not_fit_end_the_run(weights: dict[str, Path]) -> None:
 @pytest.mark.parametrize(
     "make",
     [
-        lambda device, dtype: AlikedExtractor(aliked_state(), device, dtype, settings=AlikedSettings.of(SETTINGS)),
+        lambda device, dtype: Small(aliked_state(), device, dtype, settings=AlikedSettings.of(SETTINGS)),
         lambda device, dtype: SuperPointExtractor(planted_state(), device, dtype),
     ],
     ids=["aliked", "superpoint"],

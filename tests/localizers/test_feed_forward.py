@@ -23,6 +23,7 @@ from toolkit.files import SceneFiles
 from toolkit.localize import COLUMNS, PREDICTION_COLUMNS
 from toolkit.localizers.base import PoseEstimate, QueryInput, References, View
 from toolkit.localizers.feed_forward import (
+    MAX_DEPTH_POINTS,
     FeedForwardAnswer,
     FeedForwardLocalizer,
     QueryPrediction,
@@ -182,7 +183,7 @@ def test_depth_maps_stand_in_for_points(world: World) -> None:
                     obs_point=np.zeros(0, np.int64))  # fmt: skip
     localizer.map = empty
     points = localizer._points(0)
-    assert len(points) == localizer.settings.depth_points
+    assert len(points) == MAX_DEPTH_POINTS
     in_cam = [geometry.transform(world.map.cams_from_world[0], p) for p in (points, triangulated)]
     pixels = [np.asarray(world.map.cameras[0].img_from_cam(p)) for p in in_cam]
     near = np.linalg.norm(pixels[0][:, None] - pixels[1][None], axis=2).argmin(axis=0)
@@ -360,7 +361,6 @@ def test_the_network_is_never_replaced_by_the_simulation(
     [
         ({"predictor": {"name": "magic"}}, r"predictor\.name.*magic"),
         ({"predictor": {"num_references": 0}}, r"predictor\.num_references.*0"),
-        ({"predictor": {"candidates": 0}}, r"predictor\.candidates.*0"),
         ({"predictor": {"batch_size": 0}}, r"predictor\.batch_size.*0"),
         ({"predictor": {"name": "vggt"}, "compute_device": "tpu"}, r"compute_device.*tpu"),
         ({"predictor": {"name": "vggt"}, "dtype_compute": "int8"}, r"dtype_compute.*int8"),
@@ -470,7 +470,6 @@ def test_other_noise_references_or_weights_make_poses_anew(run: SceneFiles, smal
     assert not skipped()
     assert skipped(predictor={"batch_size": 1}, workers=2)
     assert not skipped(predictor={"num_references": 3})
-    assert not skipped(predictor={"candidates": 4})
     assert not skipped(seed=1)
     assert not skipped(method="hybrid")
 

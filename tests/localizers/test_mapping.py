@@ -22,7 +22,7 @@ from toolkit.files import sidecar_path
 from toolkit.localizers import mapping
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.mapping import MapSettings, build_map, select_pairs
-from toolkit.localizers.triangulation import triangulate
+from toolkit.localizers.triangulation import MAX_REPROJECTION_ERROR_PX, triangulate
 
 Floats = NDArray[np.float64]
 
@@ -238,7 +238,7 @@ def test_observations_agree_with_the_points() -> None:
         in_cam = geometry.transform(local_map.cams_from_world[image], local_map.points[point])
         projected = np.asarray(local_map.cameras[image].img_from_cam(in_cam))
         error = np.linalg.norm(projected - data.keypoints[image][keypoint], axis=1)
-        assert error.max() < 1.5 * MapSettings().max_reprojection_error_px
+        assert error.max() < 1.5 * MAX_REPROJECTION_ERROR_PX
     # Every point is seen by two images at least, and the counts are those of the observations.
     views = {(i, p) for i, p in zip(local_map.obs_image.tolist(), local_map.obs_point.tolist(), strict=True)}
     counts = np.bincount([p for _, p in views], minlength=len(local_map.points))
@@ -374,8 +374,8 @@ def test_a_current_map_is_loaded_and_another_is_built(
     assert json.loads(sidecar_path(path).read_text())["settings"]["map"]["pairs_per_image"] == 2
     for more in [
         {"inputs": "b"},
-        {"inputs": "b", "settings": quick.model_copy(update={"ratio": 0.8})},
-        {"inputs": "b", "settings": quick.model_copy(update={"ratio": 0.8}), "skip_existing": False},
+        {"inputs": "b", "settings": quick.model_copy(update={"pairs_per_image": 3})},
+        {"inputs": "b", "settings": quick.model_copy(update={"pairs_per_image": 3}), "skip_existing": False},
     ]:
         built.clear()
         build_map(session, store, path, **({"settings": quick} | more))

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from toolkit import geometry
 from toolkit.localizers.misfit import MAX_SHARES, Misfit, find_misfit
 from toolkit.localizers.rig import Matches, RigQuery
-from toolkit.manifest import PnpSettings
 
 Floats = NDArray[np.float64]
 MAX_ERROR_DEG = 0.45
@@ -117,10 +116,10 @@ def test_a_small_misfit_is_significant_but_no_reason_to_doubt() -> None:
 @pytest.mark.parametrize("factor", [0.1, 0.2, 0.33, 3.0, 5.0, 10.0])
 def test_an_absurd_focal_length_is_found_from_the_pose_that_it_gave(factor: float) -> None:
     """RANSAC finds some pose with it, from which no fit begins."""
-    camera, settings = changed(factor), PnpSettings(ransac_max_trials=1000)
+    camera = changed(factor)
     matches, points = scene(np.random.default_rng(1), np.eye(4)[None], 300, (4.0, 15.0))
     query = RigQuery([camera], np.eye(4)[None], [[]])
-    pose = query.ransac(matches, points, MAX_ERROR_DEG, settings, seed=0)
+    pose = query.ransac(matches, points, MAX_ERROR_DEG, seed=0, max_trials=1000)
     assert pose is not None
     misfit = find_misfit(query, pose, matches, points, MAX_ERROR_DEG)
     assert misfit is not None
@@ -132,7 +131,7 @@ def test_an_absurd_focal_length_is_found_from_the_pose_that_it_gave(factor: floa
 def test_other_absurd_intrinsics_are_doubted(camera: pycolmap.Camera) -> None:
     matches, points = scene(np.random.default_rng(1), np.eye(4)[None], 300, (4.0, 15.0))
     query = RigQuery([camera], np.eye(4)[None], [[]])
-    pose = query.ransac(matches, points, MAX_ERROR_DEG, PnpSettings(), seed=0)
+    pose = query.ransac(matches, points, MAX_ERROR_DEG, seed=0)
     misfit = None if pose is None else find_misfit(query, pose, matches, points, MAX_ERROR_DEG)
     assert pose is None or (misfit is not None and misfit.doubtful)
 

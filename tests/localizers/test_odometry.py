@@ -26,9 +26,9 @@ def test_losses_of_tracking_end_a_piece() -> None:
     times = np.array([0, 1, 2, 20, 21, 22, 23], np.int64) * 1_000_000  # a gap of 18 s
     poses = np.tile(np.eye(4), (7, 1, 1))
     poses[:, 0, 3] = [0, 1, 2, 3, 4, 64, 65]  # a step of 60 m in a second
-    assert Odometry(times, poses).split(SETTINGS) == [slice(0, 3), slice(3, 5), slice(5, 7)]
-    assert Odometry(times[:1], poses[:1]).split(SETTINGS) == [slice(0, 1)]
-    assert Odometry(times[:0], poses[:0]).split(SETTINGS) == []
+    assert Odometry(times, poses).split() == [slice(0, 3), slice(3, 5), slice(5, 7)]
+    assert Odometry(times[:1], poses[:1]).split() == [slice(0, 1)]
+    assert Odometry(times[:0], poses[:0]).split() == []
 
 
 def walk(rate_hz: float, seconds: float = 40.0) -> Odometry:
@@ -44,12 +44,12 @@ def walk(rate_hz: float, seconds: float = 40.0) -> Odometry:
 @pytest.mark.parametrize("rate_hz", [1.0, 5.0, 30.0])
 def test_a_walk_is_one_piece(rate_hz: float) -> None:
     odometry = walk(rate_hz)
-    assert odometry.split(SETTINGS) == [slice(0, len(odometry))]
+    assert odometry.split() == [slice(0, len(odometry))]
     missing = np.delete(np.arange(len(odometry)), np.arange(int(20 * rate_hz), int(24 * rate_hz)))
     silent = Odometry(odometry.timestamps[missing], odometry.odom_from_rig[missing])
-    assert silent.split(SETTINGS) == [slice(0, len(silent))]
+    assert silent.split() == [slice(0, len(silent))]
     fast = Odometry(odometry.timestamps[:2], odometry.scaled(10.0).odom_from_rig[:2])
-    assert fast.split(SETTINGS) == [slice(0, 2)]
+    assert fast.split() == [slice(0, 2)]
 
 
 @pytest.mark.parametrize("rate_hz", [5.0, 30.0])
@@ -59,13 +59,13 @@ def test_tracking_that_begins_again_where_the_device_is_is_a_loss(rate_hz: float
     poses = odometry.odom_from_rig.copy()
     poses[lost:] = geometry.invert(poses[lost]) @ poses[lost:]
     assert np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).max() < 75
-    assert Odometry(odometry.timestamps, poses).split(SETTINGS) == [slice(0, lost), slice(lost, len(poses))]
+    assert Odometry(odometry.timestamps, poses).split() == [slice(0, lost), slice(lost, len(poses))]
     # A few decimeters are enough, or a turn on the spot.
     about = Rotation.from_rotvec([0.0, 0.0, 1.6]).as_matrix()
     for off in (geometry.make_pose(np.eye(3), [0.0, 1.0, 0.0]), geometry.make_pose(about, np.zeros(3))):
         poses = odometry.odom_from_rig.copy()
         poses[lost:] = poses[lost - 1] @ off @ geometry.invert(poses[lost]) @ poses[lost:]
-        assert Odometry(odometry.timestamps, poses).split(SETTINGS) == [slice(0, lost), slice(lost, len(poses))]
+        assert Odometry(odometry.timestamps, poses).split() == [slice(0, lost), slice(lost, len(poses))]
 
 
 def test_drift_does_not_depend_on_the_number_of_steps() -> None:
@@ -178,7 +178,7 @@ def test_queries_tell_a_loss_of_tracking_that_no_step_shows(wrong: float) -> Non
     for seed in range(5):
         whole = drive(np.random.default_rng(seed), wrong=wrong)
         way = lost_in_a_gap(whole)
-        assert way.odometry.split(SETTINGS) == [slice(0, len(way.odometry))]
+        assert way.odometry.split() == [slice(0, len(way.odometry))]
         assert cut(way.odometry, way.queries, SETTINGS) == [slice(0, 21), slice(21, 37)]
         assert cut(whole.odometry, whole.queries, SETTINGS) == [slice(0, 40)]
         doubtful = replace(way.queries, trusted=~way.queries.trusted)

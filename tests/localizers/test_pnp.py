@@ -16,6 +16,7 @@ from tests.queries import ask, rests_on
 from toolkit import geometry
 from toolkit.features.features import DESCRIPTOR_SCALE, KINDS, LocalFeatures
 from toolkit.features.matching import MutualMatcher, PairMatches, unit_descriptors
+from toolkit.localizers import matches, pnp
 from toolkit.localizers.base import CAMERA, PoseEstimate, Prior
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.matches import MappedFeatures
@@ -337,13 +338,13 @@ def test_a_query_from_elsewhere_is_not_ok(room: World, seed: int) -> None:
 
 
 def test_a_keypoint_near_a_point_is_one_candidate_by_its_best_image(room: World) -> None:
-    seen, (mapped,), settings = room.look(PINHOLE, QUERY), room.localizer().matcher.mapped, PnpSettings()
+    seen, (mapped,) = room.look(PINHOLE, QUERY), room.localizer().matcher.mapped
     query = RigQuery([PINHOLE], np.eye(4)[None], [[seen]])
-    (group,) = mapped.candidates(query, 0, geometry.invert(QUERY), REFERENCES, 1.0, settings)
+    (group,) = mapped.candidates(query, 0, geometry.invert(QUERY), REFERENCES, 1.0)
     pairs = np.column_stack([group.keypoint, group.matches.point])
     assert len(np.unique(pairs, axis=0)) == len(pairs) > 500
     unit, best = unit_descriptors(seen.descriptors, mapped.kind.shorten), np.full(len(pairs), -1.0)
-    for image in (mapped.image(index, settings.max_map_features) for index in REFERENCES):
+    for image in map(mapped.image, REFERENCES):
         row = np.full(len(room.points), -1)
         row[image.points] = np.arange(len(image.points))
         at = np.flatnonzero(row[pairs[:, 1]] >= 0)
@@ -433,13 +434,13 @@ def test_a_rival_is_so_far_away_that_one_of_both_is_wrong(
 
 
 @pytest.mark.parametrize("unmapped", [0, 60])
-def test_of_two_places_the_one_that_matches_fit_better_wins(unmapped: int) -> None:
+def test_of_two_places_the_one_that_matches_fit_better_wins(monkeypatch: pytest.MonkeyPatch, unmapped: int) -> None:
     """With 60 points unmapped, the other place gets more guided matches, but with larger errors."""
     world, visible = twins(extra=0, unlike_m=0.007, unmapped=unmapped)
     pose = facing(0.1, 0.1, 0.3)
     seen = world.look(PINHOLE, pose, noise_px=0.2, only=visible)
-    localizer = world.localizer(ok_rival_support=0.9)
-    estimate = ask(localizer, [PINHOLE], np.eye(4)[None], [seen], [list(range(12))])
+    monkeypatch.setattr(pnp, "MAX_RIVAL_SUPPORT", 0.9)
+    estimate = ask(world.localizer(), [PINHOLE], np.eye(4)[None], [seen], [list(range(12))])
     check(estimate, pose, 0.2, 0.02)
     assert 0.3 < estimate.rival_support < (0.9 if unmapped else 0.75)
 
@@ -454,7 +455,7 @@ def test_what_is_there_once_decides_between_like_places() -> None:
 
 
 @pytest.mark.parametrize("place", range(5))
-def test_the_right_one_of_many_like_places_is_found(place: int) -> None:
+def test_the_right_one_of_many_like_places_is_found(monkeypatch: pytest.MonkeyPatch, place: int) -> None:
     """Only weak features, which are not matched at first, tell the places apart: each has to be tried."""
     rng = np.random.default_rng(0)
     shifts = np.array([[3.0 * index, 0, 0] for index in range(5)])
@@ -474,8 +475,9 @@ def test_the_right_one_of_many_like_places_is_found(place: int) -> None:
         for name in ("keypoints", "scales", "scores", "descriptors")
     }
     seen = LocalFeatures(**both, image_size=(640, 480))
-    localizer = world.localizer(max_query_features=len(strong), contested_references=10)
-    estimate = ask(localizer, [PINHOLE], np.eye(4)[None], [seen], [list(range(10))])
+    monkeypatch.setattr(matches, "MAX_QUERY_FEATURES", len(strong))
+    monkeypatch.setattr(pnp, "CONTESTED_REFERENCES", 10)
+    estimate = ask(world.localizer(), [PINHOLE], np.eye(4)[None], [seen], [list(range(10))])
     check(estimate, pose, 0.2, 0.02, status="low_confidence")  # four rivals with two thirds of its support
     assert 0.5 < estimate.p_correct < 0.99
 
@@ -522,13 +524,13 @@ def test_covariance_is_the_scatter_of_the_poses(rig: bool, map_noise_px: float) 
     assert estimate.rotation_std_deg == pytest.approx(np.degrees(np.sqrt(np.trace(estimate.covariance[:3, :3]))))
 
 
-def test_guided_matches_alone_make_no_pose_more_certain(room: World) -> None:
+def test_guided_matches_alone_make_no_pose_more_certain(room: World, monkeypatch: pytest.MonkeyPatch) -> None:
     """They follow the pose that they were sought about: only what was found without it counts."""
     seen = room.look(PINHOLE, QUERY)
     stds, guided = [], []
     for known_to_descriptors in (1536, 100):
-        localizer = room.localizer(max_query_features=known_to_descriptors)
-        found = ask(localizer, [PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
+        monkeypatch.setattr(matches, "MAX_QUERY_FEATURES", known_to_descriptors)
+        found = ask(room.localizer(), [PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
         stds.append(found.position_std_m)
         guided.append(found.num_guided)
     assert guided[1] > 0.9 * guided[0] > 150

@@ -76,7 +76,7 @@ class Street:
             lambda images, keypoints: np.column_stack([images, keypoints, keypoints]).astype(np.uint8),
         )
         folder.mkdir()
-        return join_tiles(tiles, load, images, MapSettings(), folder)
+        return join_tiles(tiles, load, images, folder)
 
     def truth(self, local_map: LocalMap) -> NDArray[np.int64]:
         """Return the true point of each observation."""
@@ -161,7 +161,7 @@ def test_a_keypoint_of_which_tiles_say_different_things_sees_one_point(tmp_path:
         street.names, [PINHOLE] * 8, street.poses, street.keypoints.__getitem__, lambda i, _: np.zeros((len(i), 3))
     )
     (tmp_path / "join").mkdir()
-    joined = join_tiles(tiles, load, images, MapSettings(), tmp_path / "join")
+    joined = join_tiles(tiles, load, images, tmp_path / "join")
     seen = np.column_stack([joined.obs_image, joined.obs_keypoint])
     assert len(np.unique(seen, axis=0)) == len(seen)
     truth = street.truth(joined)

@@ -95,11 +95,12 @@ def test_online_poses_know_the_past_alone(place: Path, tmp_path: Path) -> None:
     stem = tmp_path / "poses" / pair_name(place.name, "ios", "ios")
 
     def steps() -> pd.DataFrame:
-        sequence_of(place, tmp_path, windows_s=[10])
+        sequence_of(place, tmp_path)
         return pd.read_csv(f"{stem}_sequence_steps.csv").set_index(["step", "timestamp"])
 
     before, single = steps(), Trajectory.read(f"{stem}.txt")
-    assert list(dict.fromkeys(before.index.get_level_values(0))) == ["voted", "graph", "again", "online 10 s", "online"]
+    names = ["voted", "graph", "again", "online 10 s", "online 20 s", "online"]
+    assert list(dict.fromkeys(before.index.get_level_values(0))) == names
     last, poses = int(np.argmax(single.timestamps)), single.world_from_device.copy()
     poses[last, :3, 3] += 0.05
     Trajectory.from_poses(single.timestamps, single.device_ids, poses, single.covariances).write(f"{stem}.txt")
@@ -120,7 +121,7 @@ def test_drift_and_a_loss_that_later_queries_tell_change_no_online_pose(place: P
 
     def steps(poses: np.ndarray) -> pd.DataFrame:
         Trajectory.from_poses(single.timestamps, single.device_ids, poses, single.covariances).write(f"{stem}.txt")
-        sequence_of(place, tmp_path, windows_s=[10])
+        sequence_of(place, tmp_path)
         return pd.read_csv(f"{stem}_sequence_steps.csv").set_index(["step", "timestamp"])
 
     poses, rng = single.world_from_device, np.random.default_rng(1)

@@ -9,7 +9,6 @@ multiples of powers of two (`_POINT_STEP`, `_CENTROID_STEP`) whose products and 
 any order. The sample and the first centroids are chosen by a hash of each descriptor (`_keys`), not by its index.
 """
 
-import json
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
@@ -25,13 +24,30 @@ from toolkit.features.features import DESCRIPTOR_SCALE, LocalFeatures
 from toolkit.features.matching import unit_descriptors
 from toolkit.files import file_fingerprint, require_whole, write_atomic
 from toolkit.geometry import rounded, unit
-from toolkit.manifest import VladSettings
 from toolkit.threads import fixed_sums
 
 Floats = NDArray[np.float32]
 
-VLAD_FORMAT = 2
-"""Version of the vocabulary, part of its record. Increase when the same settings give another one."""
+VLAD_FORMAT = 3
+"""Version of the vocabulary, part of its record. Increase when the same images give another one."""
+MAX_WORDS = 256
+"""Largest number of visual words; fewer if the map has too few descriptors."""
+LOCAL_DIM = 64
+"""Dimensions of the local descriptors after PCA whitening."""
+MIN_SCALE_PX = 2.25
+"""Smallest scale of a keypoint: the standard deviation of its blob, in pixels of the stored image. Finer keypoints are
+the first to change with blur, noise and camera resolution."""
+MIN_FEATURES = 300
+"""If fewer keypoints reach `MIN_SCALE_PX`, this many of the coarsest are used instead."""
+MAX_DIM = 512
+"""Largest dimension of the global descriptor; the number of map images limits it too."""
+PRIOR_IMAGES = 2000
+"""Shrinkage of the whitening: a prior that all directions vary equally, with the weight of this many images. Whitening
+learned from a hundred images describes the places they show, not what repeats between places."""
+SAMPLE_DESCRIPTORS = 50_000
+"""Number of local descriptors from which the vocabulary is learned."""
+ITERATIONS = 15
+"""Iterations of k-means."""
 _SHORTEST = 1e-9  # shorter vectors are rounding errors, and are not normalized
 _CHUNK = 8192
 """Number of local descriptors that are assigned at once."""
@@ -45,7 +61,7 @@ _KEY_STEPS = 32
 
 
 _ARRAYS = ("local_projection", "local_offset", "local_scale", "centroids", "projection")
-"""What a vocabulary file holds, besides the settings."""
+"""What a vocabulary file holds."""
 
 
 class Vlad:
@@ -56,8 +72,7 @@ class Vlad:
     upright = False
     least_side = None
 
-    def __init__(self, settings: VladSettings, arrays: dict[str, Floats], fingerprint: str = ""):
-        self._settings = settings
+    def __init__(self, arrays: dict[str, Floats], fingerprint: str = ""):
         self._fingerprint = fingerprint
         self.local_projection = arrays["local_projection"]
         self.local_offset, self.local_scale = arrays["local_offset"], arrays["local_scale"]
@@ -69,7 +84,7 @@ class Vlad:
 
     @property
     def settings(self) -> dict[str, Any]:
-        return {"name": self.name, **self._settings.model_dump(), "vocabulary": self._fingerprint}
+        return {"name": self.name, "vocabulary": self._fingerprint}
 
     @fixed_sums
     def prepare(self, item: LocalFeatures | Floats) -> Floats:
@@ -77,7 +92,7 @@ class Vlad:
         if not isinstance(item, LocalFeatures):
             return item
         vector = np.zeros_like(self.centroids)
-        descriptors = _select(item, self._settings)
+        descriptors = _select(item)
         if len(descriptors):
             local = self._whitened(descriptors)
             nearest = _assign(local, self.centroids)
@@ -109,13 +124,7 @@ class Vlad:
 
     @classmethod
     @fixed_sums
-    def learn(
-        cls,
-        features: Callable[[], Iterable[LocalFeatures]],
-        count: int,
-        settings: VladSettings | None = None,
-        seed: int = 0,
-    ) -> "Vlad":
+    def learn(cls, features: Callable[[], Iterable[LocalFeatures]], count: int, seed: int = 0) -> "Vlad":
         """Learn vocabulary and projection from `count` map images; equal inputs give equal bytes.
 
         Args:
@@ -125,11 +134,10 @@ class Vlad:
         Raises:
             ToolkitError: the images have no local features.
         """
-        settings = settings or VladSettings()
-        share = -(-settings.sample_descriptors // max(count, 1))
+        share = -(-SAMPLE_DESCRIPTORS // max(count, 1))
         parts, all_keys = [], []
         for image in features():
-            descriptors = _select(image, settings)
+            descriptors = _select(image)
             keys = _keys(descriptors, seed)
             chosen = np.sort(np.argsort(keys, kind="stable")[:share])
             parts.append(descriptors[chosen])
@@ -140,16 +148,16 @@ class Vlad:
                 f"A VLAD vocabulary cannot be learned: {count} map images gave {len(sample)} local features. "
                 f"Check that they can be read and are not blank (`python -m toolkit check CAPTURE`)."
             )
-        arrays = _whitening(sample, settings.local_dim) | {
+        arrays = _whitening(sample, LOCAL_DIM) | {
             "centroids": np.zeros((0, 0), np.float32),
             "projection": np.zeros((0, 0), np.float32),
         }
-        local = cls(settings, arrays)._whitened(sample)
-        words = max(1, min(settings.words, len(local) // 8))
-        arrays["centroids"] = _kmeans(local, words, settings.iterations, np.concatenate(all_keys))
-        vlad = cls(settings, arrays)
+        local = cls(arrays)._whitened(sample)
+        words = max(1, min(MAX_WORDS, len(local) // 8))
+        arrays["centroids"] = _kmeans(local, words, ITERATIONS, np.concatenate(all_keys))
+        vlad = cls(arrays)
         vectors = np.stack(list(prefetch(vlad.prepare, features(), default_workers())))
-        vlad.projection = _principal_projection(vectors, settings)
+        vlad.projection = _principal_projection(vectors)
         return vlad
 
     @classmethod
@@ -158,9 +166,7 @@ class Vlad:
         require_whole(vocabulary)
         try:
             with np.load(vocabulary) as stored:
-                arrays = {name: stored[name] for name in stored.files}
-            settings = VladSettings(**json.loads(str(arrays.pop("settings"))))
-            return cls(settings, arrays, file_fingerprint(vocabulary))
+                return cls({name: stored[name] for name in _ARRAYS}, file_fingerprint(vocabulary))
         except FileNotFoundError:
             raise ArtifactError(f"No VLAD vocabulary {vocabulary}; run the embed stage first.") from None
         except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
@@ -169,18 +175,17 @@ class Vlad:
     def save(self, path: str | Path) -> None:
         """Write the vocabulary (.npz) and take the file's fingerprint as its own."""
         arrays = {name: getattr(self, name) for name in _ARRAYS}
-        settings = np.array(json.dumps(self._settings.model_dump()))
         with write_atomic(path) as temporary, open(temporary, "wb") as stream:
-            np.savez(stream, allow_pickle=False, settings=settings, **arrays)
+            np.savez(stream, allow_pickle=False, **arrays)
         self._fingerprint = file_fingerprint(path)
 
 
-def _select(image: LocalFeatures, settings: VladSettings) -> Floats:
-    """Return the RootSIFT vectors (N, 128) of the coarse keypoints, at least `min_features` if there are, in order."""
+def _select(image: LocalFeatures) -> Floats:
+    """Return the RootSIFT vectors (N, 128) of the coarse keypoints, at least `MIN_FEATURES` if there are, in order."""
     scales = image.scales
-    chosen = np.flatnonzero(scales >= settings.min_scale_px)
-    if len(chosen) < settings.min_features:
-        chosen = np.sort(np.argsort(-scales, kind="stable")[: settings.min_features])
+    chosen = np.flatnonzero(scales >= MIN_SCALE_PX)
+    if len(chosen) < MIN_FEATURES:
+        chosen = np.sort(np.argsort(-scales, kind="stable")[:MIN_FEATURES])
     return unit_descriptors(image.descriptors[chosen])
 
 
@@ -244,7 +249,7 @@ def _kmeans(points: Floats, words: int, iterations: int, keys: NDArray[np.uint32
     return centroids
 
 
-def _principal_projection(vectors: Floats, settings: VladSettings) -> Floats:
+def _principal_projection(vectors: Floats) -> Floats:
     """Return the projection (D, dim) to the map's principal directions, with shrunk whitening.
 
     The vectors are not centered: as long as no direction is dropped, map images rank by similarity to a query as they
@@ -252,11 +257,11 @@ def _principal_projection(vectors: Floats, settings: VladSettings) -> Floats:
     """
     count = len(vectors)
     energy, weights = np.linalg.eigh((vectors @ vectors.T).astype(np.float64))
-    order = np.argsort(-energy, kind="stable")[: settings.dim]
+    order = np.argsort(-energy, kind="stable")[:MAX_DIM]
     order = order[energy[order] > 1e-5 * energy.max()]
     energy = energy[order]
     basis = vectors.T @ (weights[:, order] / np.sqrt(energy)).astype(np.float32)
     mean_energy = energy.mean()
-    # Posterior of the energies, given a prior worth `prior_images` images with the mean energy in each direction.
-    shrunk = (count * energy + settings.prior_images * mean_energy) / (count + settings.prior_images)
+    # Posterior of the energies, given a prior worth `PRIOR_IMAGES` images with the mean energy in each direction.
+    shrunk = (count * energy + PRIOR_IMAGES * mean_energy) / (count + PRIOR_IMAGES)
     return (basis * np.sqrt(mean_energy / shrunk)).astype(np.float32)

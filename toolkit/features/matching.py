@@ -40,6 +40,9 @@ from toolkit.threads import fixed_sums
 
 log = logging.getLogger(__name__)
 
+MIN_CONFIDENCE = 0.1
+"""Smallest confidence of a match of a learned matcher."""
+
 
 @dataclass(frozen=True)
 class PairMatches:
@@ -265,7 +268,7 @@ def create_local_methods(
                 checkpoint=checkpoint_of(settings.matcher.checkpoint, name),
                 device=device,
                 dtype=dtype,
-                min_score=settings.matcher.min_confidence,
+                min_score=MIN_CONFIDENCE,
                 features=name,
             )
             methods.append(LocalMethod(name, extractor, network))

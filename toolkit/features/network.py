@@ -32,6 +32,8 @@ class NetworkExtractor(Remade):
     """Key of the features in `KINDS`."""
     title: ClassVar[str]
     """Name of the network in messages."""
+    min_long_side = 0
+    """Smaller images are enlarged to this length of the longer side, pixels."""
     defaults: ClassVar[AlikedSettings | SuperPointSettings]
 
     def __init__(
@@ -121,8 +123,7 @@ class NetworkExtractor(Remade):
             image = np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), np.uint8)
         height, width = image.shape[:2]
         long_side = max(height, width)
-        lower, upper = getattr(self._values, "min_long_side", 0), self._values.max_long_side
-        factor = min(max(long_side, lower), upper) / long_side
+        factor = min(max(long_side, self.min_long_side), self._values.max_long_side) / long_side
         if factor != 1:
             size = (max(1, round(width * factor)), max(1, round(height * factor)))
             interpolation = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC

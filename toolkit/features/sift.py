@@ -29,6 +29,8 @@ Levels = NDArray[np.int16]
 
 _FORMAT = 6
 """Version of the features, part of the settings. Increase when the same settings give other features."""
+MIN_CONTRAST = 0.01
+"""Smallest contrast of a keypoint, after the image's contrast is stretched to the full range."""
 _INTERVALS = 3
 """Number of levels per octave in which keypoints are detected."""
 _SIGMA = 1.6
@@ -120,7 +122,7 @@ class SiftExtractor(Remade):
             interpolation = cv2.INTER_AREA if size[0] < width else cv2.INTER_CUBIC
             image = np.asarray(cv2.resize(image, size, interpolation=interpolation), np.uint8)
         pyramid = _Pyramid(image, self._memory)
-        keypoints = _detect(pyramid, settings.contrast_threshold)
+        keypoints = _detect(pyramid, MIN_CONTRAST)
         if not len(keypoints.x):
             return LocalFeatures.none((width, height))
         keypoints = keypoints.take(np.argsort(-keypoints.response, kind="stable")[: settings.max_keypoints])

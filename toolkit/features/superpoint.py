@@ -19,6 +19,12 @@ from toolkit.models.weights import SUPERPOINT, given_or_resolved, load_checkpoin
 DESCRIPTOR_LENGTH = 256
 _CELL = 8
 """Side of the cells of the network's coarsest grid, pixels."""
+MIN_RESPONSE = 0.005
+"""Smallest response of a keypoint; responses are at most 1."""
+NMS_RADIUS = 4
+"""Radius of non-maximum suppression, pixels of the resized image: two keypoints are further apart in x or in y."""
+BORDER = 4
+"""Keypoints closer to the image border than this are dropped, pixels of the resized image."""
 
 
 class SuperPointExtractor(NetworkExtractor):
@@ -40,8 +46,8 @@ class SuperPointExtractor(NetworkExtractor):
             ) from error
         # `_forward` limits border and number of keypoints, because only it knows the unpadded size of the image.
         config = transformers.SuperPointConfig(
-            keypoint_threshold=float(self._values.threshold),
-            nms_radius=self._values.nms_radius,
+            keypoint_threshold=MIN_RESPONSE,
+            nms_radius=NMS_RADIUS,
             max_keypoints=-1,
             border_removal_distance=0,
         )
@@ -51,18 +57,17 @@ class SuperPointExtractor(NetworkExtractor):
         return network
 
     def _forward(self, batch: Tensor) -> Tensor:
-        settings, model = self._values, self._model
+        model, limit = self._model, self._values.max_keypoints
         size = batch.shape[1:]
         # Pad to whole cells by repeating the last column and row, so that the border of the image gives no edge.
         pixels = F.pad(batch[:, None].float() / 255, (0, -size[1] % _CELL, 0, -size[0] % _CELL), mode="replicate")
         with torch.autocast(batch.device.type, self._dtype, enabled=self._dtype != torch.float32):
             encoded = model.encoder(pixels).last_hidden_state
-        limit = settings.max_keypoints
         packed = torch.zeros(len(batch), limit, 3 + DESCRIPTOR_LENGTH, device=batch.device)
-        last = torch.tensor([size[1], size[0]], device=batch.device) - settings.border
+        last = torch.tensor([size[1], size[0]], device=batch.device) - BORDER
         for row, features in zip(packed, encoded.float().split(1), strict=True):
             keypoints, responses = model.keypoint_decoder(features)
-            inside = ((keypoints >= settings.border) & (keypoints < last)).all(dim=1)
+            inside = ((keypoints >= BORDER) & (keypoints < last)).all(dim=1)
             keypoints, responses = keypoints[inside], responses[inside]
             responses, order = responses.sort(descending=True, stable=True)
             keypoints, responses = keypoints[order[:limit]], responses[:limit]

@@ -18,6 +18,10 @@ from toolkit.threads import fixed_sums
 
 MAP_IMAGES_KEPT = 256
 """Number of map images whose features stay in memory, about 60 MB."""
+MAX_ERROR_DEG = 0.2
+"""Largest Sampson error of an inlier, as an angle seen from the camera, degrees."""
+MAX_TRIALS = 500
+"""Largest number of RANSAC samples, of five matches each; the best matches are sampled first."""
 
 
 class Verifier:
@@ -116,10 +120,10 @@ def verified_matches(
     options.loMethod = cv2.LOCAL_OPTIM_INNER_LO
     options.loIterations, options.loSampleSize = 5, 20
     options.confidence = 0.999
-    options.maxIterations = settings.max_trials
+    options.maxIterations = MAX_TRIALS
     options.randomGeneratorState = settings.seed
     options.isParallel = False
-    options.threshold = float(np.tan(np.radians(settings.max_error_deg)))
+    options.threshold = float(np.tan(np.radians(MAX_ERROR_DEG)))
     pinhole = np.eye(3), np.eye(3), np.zeros(5), np.zeros(5)  # the rays are calibrated already
     essential, mask = cv2.findEssentialMat(rays_a[finite], rays_b[finite], *pinhole, options)
     agree = np.flatnonzero(finite)[:0] if mask is None else np.flatnonzero(finite)[np.ravel(mask) > 0]

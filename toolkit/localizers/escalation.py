@@ -15,6 +15,10 @@ from toolkit.localizers.base import SEARCH_DEG, Localizer, PoseEstimate, Prior, 
 MAX_KNOWN = 3
 """Largest number of earlier poses of a query that all kinds of features judge."""
 
+SURE_POSITION_STD_M = 0.05
+"""An `ok` pose with at most this standard deviation of the position, meters, is precise enough; otherwise the further
+features of `escalation` are used too."""
+
 
 def is_sure(status: str, position_std_m: float, limit_m: float) -> bool:
     """Tell whether a pose is `ok` and precise, so that it needs no further features."""
@@ -56,7 +60,7 @@ class EscalatingLocalizer:
             first: localizes every query.
             second: its kinds of features are those of `first`, followed by the further ones.
             further: the further kinds of features.
-            sure_position_std_m: see `PnpSettings`.
+            sure_position_std_m: `SURE_POSITION_STD_M` in the unit of the poses.
             images_near: returns the map images that may show what a rig at a pose (4, 4) sees.
         """
         self.first, self.second, self._further, self._limit_m = first, second, further, sure_position_std_m

@@ -26,6 +26,11 @@ from toolkit.threads import fixed_sums
 FOCAL_TOLERANCE = 0.2
 """Difference between the log focal length ratios (predicted over stated) of query and references above which the stated
 focal length is wrong; several times the usual error of the networks."""
+MAX_DEPTH_POINTS = 200
+"""Largest number of map points per reference whose depth is compared with the prediction; those with the longest tracks
+are used."""
+MIN_POINTS = 20
+"""If a reference sees fewer map points, its depth map in the capture is used instead, if there is one."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +182,7 @@ class FeedForwardLocalizer:
     def _choose(self, references: References) -> Ints:
         """Choose the references of one query image."""
         in_map = references.images < len(self.map.image_names)  # larger indices are images of other kinds of features
-        candidates, scores = references.images[in_map][: self.settings.candidates], references.scores[in_map]
+        candidates = references.images[in_map]
         if not len(candidates):
             return candidates
         points = [self.map.observations(int(index))[1] for index in candidates]
@@ -185,7 +190,7 @@ class FeedForwardLocalizer:
         depth = np.einsum("oj,oj->o", self.map.cams_from_world[images, 2, :3], self.map.points[np.concatenate(points)])
         depth += self.map.cams_from_world[images, 2, 3]
         chosen = select_references(
-            scores[: len(candidates)],
+            references.scores[in_map],
             self.map.world_from_cams[candidates],
             self.settings.num_references,
             [self.map.cameras[int(index)] for index in candidates],
@@ -243,11 +248,11 @@ class FeedForwardLocalizer:
     def _points(self, image: int) -> Floats:
         """Return world points (P, 3) that a map image observes: triangulated, else from the capture's depth maps."""
         points = np.unique(self.map.observations(image)[1])
-        if len(points) >= self.settings.least_points:
-            order = np.argsort(-self.map.track_lengths(points), kind="stable")[: self.settings.depth_points]
+        if len(points) >= MIN_POINTS:
+            order = np.argsort(-self.map.track_lengths(points), kind="stable")[:MAX_DEPTH_POINTS]
             return self.map.points[points[order]]
         seen = self.seen_depth(image)
-        sample = np.linspace(0, len(seen) - 1, min(len(seen), self.settings.depth_points)).astype(np.int64)
+        sample = np.linspace(0, len(seen) - 1, min(len(seen), MAX_DEPTH_POINTS)).astype(np.int64)
         if not len(sample):
             return self.map.points[points]
         in_cam = lifted(self.map.cameras[image], seen.pixels[sample], seen.depth_m[sample])

@@ -102,7 +102,7 @@ def localize_sequence(
     single = {frame: localize(image, cams_of_frames[frame]) for frame, image in enumerate(images) if image is not None}
     piece, again = np.zeros(len(odometry), int), dict[int, PoseEstimate]()
     placed = list[PlacedPiece]()
-    pieces, queries = odometry.split(settings), queries_of(single)
+    pieces, queries = odometry.split(), queries_of(single)
     if not settings.online:
         settings = with_measured_drift([(odometry.part(rows), queries.part(rows)) for rows in pieces], settings)
         pieces = [
@@ -185,7 +185,7 @@ class SequenceLocalizer:
         self._timestamps.append(int(timestamp))
         self._poses.append(pose)
         latest = self._since(-4)
-        if latest.split(self.settings)[-1].start == len(latest) - 1:  # tracking was lost: start a new piece
+        if latest.split()[-1].start == len(latest) - 1:  # tracking was lost: start a new piece
             del self._timestamps[:-1], self._poses[:-1]
             self._queries, self._solved = queries_of({}), None
         if self.single is None:

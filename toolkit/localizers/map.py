@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import h5py
 import numpy as np
@@ -21,7 +21,7 @@ from toolkit.embedders import Embedder, Vectors, create_embedder, embedding_fold
 from toolkit.embedders.index import JoinedIndex, VectorIndex, load_index
 from toolkit.embedders.search import search
 from toolkit.embedders.stored import embedder_fingerprint
-from toolkit.errors import ArtifactError, ToolkitError
+from toolkit.errors import ArtifactError, ManifestError, ToolkitError
 from toolkit.features.features import KINDS, extract_turned
 from toolkit.features.groups import HDF5_ERRORS
 from toolkit.features.matching import AnyMethod, DeferredMethod, LocalMethod, create_local_methods, weights_files
@@ -41,7 +41,7 @@ from toolkit.files import (
 from toolkit.geometry import Floats, Ints, unit
 from toolkit.localizers.base import Localizer, PoseEstimate, References, RoughPose, ScaledLocalizer
 from toolkit.localizers.correspondences import MAPS
-from toolkit.localizers.escalation import EscalatingLocalizer
+from toolkit.localizers.escalation import SURE_POSITION_STD_M, EscalatingLocalizer
 from toolkit.localizers.feed_forward import FeedForwardLocalizer
 from toolkit.localizers.hybrid import HybridLocalizer
 from toolkit.localizers.local_map import Consistency, LocalMap, map_path
@@ -53,7 +53,7 @@ from toolkit.localizers.pnp import PnpLocalizer
 from toolkit.localizers.prediction import Predictor
 from toolkit.localizers.predictors import open_predictor
 from toolkit.localizers.survey import NOMINAL_DEPTH, USUAL_DEPTHS_M
-from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings, nearest
+from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings, Settings, nearest
 
 log = logging.getLogger(__name__)
 
@@ -256,8 +256,8 @@ class Map:
 
     @property
     def sure_position_std(self) -> float:
-        """The setting `sure_position_std_m` in the unit of the poses."""
-        return self.settings.pnp.sure_position_std_m * (1.0 if self.settings.unit else self.length)
+        """`SURE_POSITION_STD_M` in the unit of the poses."""
+        return SURE_POSITION_STD_M * (1.0 if self.settings.unit else self.length)
 
     @property
     def remarks(self) -> str:
@@ -322,12 +322,12 @@ class Map:
     @cached_property
     def embed_settings(self) -> EmbedSettings:
         """Embed settings of the run."""
-        return EmbedSettings.of(_read_settings(self._run.embeddings / "settings.json"))
+        return _read_settings(self._run.embeddings / "settings.json", EmbedSettings)
 
     @cached_property
     def retrieve_settings(self) -> RetrieveSettings:
         """Retrieve settings of the run."""
-        return RetrieveSettings.of(_read_settings(self._run.retrieval_dir / "settings.json"))
+        return _read_settings(self._run.retrieval_dir / "settings.json", RetrieveSettings)
 
     @cached_property
     def embedders(self) -> list[Embedder]:
@@ -459,7 +459,7 @@ class Map:
     @cached_property
     def _verification(self) -> tuple[LocalMethod, Verifier]:
         """Features and verifier of the run's rerank stage."""
-        settings = RerankSettings.of(_read_settings(self._run.reranked_dir / "settings.json"))
+        settings = _read_settings(self._run.reranked_dir / "settings.json", RerankSettings)
         (method,) = create_local_methods(settings)
         store = FeatureStore.of_session(self._run.features, f"{self.device}_map", method.extractor.settings)
         return method, Verifier(settings, method.matcher, store)
@@ -518,6 +518,8 @@ def how_localized(pair: Path) -> Localized:
         with h5py.File(pair, "r") as file:
             attributes = dict(file.attrs)
             return LocalizeSettings.of(json.loads(attributes[SETTINGS])), attributes, json.loads(attributes[MAPS])
+    except ManifestError:
+        raise ArtifactError(f"{pair}: another version of the toolkit has localized it. Localize again.") from None
     except (*HDF5_ERRORS, ToolkitError) as error:
         raise ArtifactError(f"{pair}: cannot read how it was localized ({error}). Localize again.") from None
 
@@ -528,8 +530,8 @@ def _last_localized(files: SceneFiles, pairs: Sequence[Path]) -> Localized:
     The last run is known by its settings file. File times would be unreliable, as clocks can be set back.
     """
     last = None
-    with suppress(ArtifactError):  # the run is of a version that wrote no such file
-        last = LocalizeSettings.of(_read_settings(files.poses_dir / "settings.json"))
+    with suppress(ArtifactError):  # the run is of a version that wrote no such file, or other settings
+        last = _read_settings(files.poses_dir / "settings.json", LocalizeSettings)
     localized, message = [], ""
     for pair in pairs:
         try:
@@ -541,14 +543,19 @@ def _last_localized(files: SceneFiles, pairs: Sequence[Path]) -> Localized:
     return next((one for one in localized if one[0] == last), localized[-1])
 
 
-def _read_settings(path: Path) -> dict[str, Any]:
+AnySettings = TypeVar("AnySettings", bound=Settings)
+
+
+def _read_settings(path: Path, model: type[AnySettings]) -> AnySettings:
     """Return the settings that a stage wrote beside its results.
 
     Raises:
-        ArtifactError: the file is missing or damaged.
+        ArtifactError: the file is missing, damaged, or of another version.
     """
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
+        return model.of(json.loads(path.read_text(encoding="utf-8")))
+    except ManifestError:
+        raise ArtifactError(f"{path}: another version of the toolkit wrote it. Run the stage again.") from None
     except (OSError, ValueError) as error:
         raise ArtifactError(f"{path}: cannot read the settings of the stage ({error}). Run the stage again.") from None
 
@@ -561,7 +568,7 @@ def session_fingerprint(session: Session) -> str:
 
 def needs_upright(settings: LocalizeSettings, kinds: Sequence[AnyMethod]) -> bool:
     """Tell whether a network that localizes needs upright images; `kinds` are the kinds of features."""
-    return (settings.predicts and settings.predictor.upright) or any(KINDS[kind.name].upright for kind in kinds)
+    return settings.predicts or any(KINDS[kind.name].upright for kind in kinds)
 
 
 def create_localizer(settings: LocalizeSettings, map: Map, predictor: Predictor | None = None) -> Localizer:  # noqa: A002
@@ -590,8 +597,7 @@ def create_localizer(settings: LocalizeSettings, map: Map, predictor: Predictor 
     if not settings.predicts:
         return _escalating(_scaled(pnp, map), settings, map)
     predictor = predictor or open_predictor(settings, map.capture, map.map_dir)
-    turns = map.turns_for(settings) if settings.predictor.upright else None
-    local_map = map.in_lengths[0].map
+    local_map, turns = map.in_lengths[0].map, map.turns_for(settings)
     feed_forward = FeedForwardLocalizer(local_map, map.session, predictor, settings.predictor, turns, map.length)
     if settings.method == "feed_forward":
         return _scaled(feed_forward, map)

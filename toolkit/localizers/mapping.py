@@ -28,7 +28,7 @@ from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.map_refinement import refined_poses
 from toolkit.localizers.survey import Survey, SurveyedImages
 from toolkit.localizers.tiles import JoinedImages, home_of, join_tiles, plan_tiles
-from toolkit.localizers.triangulation import triangulate
+from toolkit.localizers.triangulation import MAX_REPROJECTION_ERROR_PX, triangulate
 from toolkit.manifest import MapSettings
 from toolkit.runs.cluster import current_cluster
 from toolkit.threads import fixed_sums
@@ -37,6 +37,10 @@ _ToMatch = tuple[str, str, int, int]
 """A pair to match: group in the match file, fingerprint of the inputs of the matches, indices of the two images."""
 DEPTHS = (2.0, 4.0, 8.0, 16.0)
 """Depths at which the views of two images are compared, in map lengths (meters; see `Survey.length`)."""
+MAX_EPIPOLAR_ERROR_PX = 4.0
+"""Largest distance of a match from its epipolar line, on either side, pixels."""
+RATIO = 0.9
+"""Threshold of Lowe's ratio test among the candidates along the epipolar line."""
 MAX_REFINEMENTS = 3  # rounds of bundle adjustment
 MIN_NOISE_PX = 1.0  # noise of the direction to points of the map, pixels, from which poses are refined
 NOISE_LIMIT = 4.0  # limits of a map whose poses are refined, in multiples of the noise of the direction to its points
@@ -113,8 +117,7 @@ def match_pairs(
     load: Callable[[int], LocalFeatures],
     cameras: Sequence[pycolmap.Camera],
     world_from_cams: Floats,
-    max_error_px: float = 4.0,
-    ratio: float = 0.9,
+    max_error_px: float = MAX_EPIPOLAR_ERROR_PX,
     kind: FeatureKind = KINDS["sift"],
     workers: int = 1,
 ) -> Iterator[PairMatches]:
@@ -125,7 +128,6 @@ def match_pairs(
         load: returns the features of an image.
         cameras, world_from_cams: cameras and poses (N, 4, 4) of the N images.
         max_error_px: largest distance of a match from its epipolar line, in both images.
-        ratio: Lowe's ratio among the candidates along the line.
         kind: entry of the features in `KINDS`.
         workers: threads.
 
@@ -145,7 +147,7 @@ def match_pairs(
         angle_i, angle_j = (max_error_px / cameras[index].mean_focal_length() for index in (i, j))
         j_from_i = cams_from_world[j] @ world_from_cams[i]
         indices = match_along_epipolar_lines(
-            descriptors_i, descriptors_j, rays_i, rays_j, j_from_i, angle_i, angle_j, ratio, kind.epipolar_min_score
+            descriptors_i, descriptors_j, rays_i, rays_j, j_from_i, angle_i, angle_j, RATIO, kind.epipolar_min_score
         )
         if not len(indices):  # empty descriptors may have another length
             return PairMatches.none()
@@ -160,12 +162,12 @@ def map_settings(settings: MapSettings, seed: int) -> dict[str, Any]:
     return {**settings.model_dump(), "seed": seed, "format": _MAP_FORMAT}
 
 
-def _matcher_settings(settings: MapSettings, kind: FeatureKind) -> dict[str, Any]:
+def _matcher_settings(kind: FeatureKind, max_error_px: float = MAX_EPIPOLAR_ERROR_PX) -> dict[str, Any]:
     """Return everything that the matches of map images depend on besides features and poses."""
     return {
         "name": "epipolar",
-        "max_error_px": settings.max_epipolar_error_px,
-        "ratio": settings.ratio,
+        "max_error_px": max_error_px,
+        "ratio": RATIO,
         "min_score": kind.epipolar_min_score,
         **shorten_settings(kind.shorten),
     }
@@ -211,7 +213,7 @@ def build_map(
     settings = settings or MapSettings()
     map_record = {
         "map": map_settings(settings, seed),
-        "matcher": _matcher_settings(settings, _kind_of(features)),
+        "matcher": _matcher_settings(_kind_of(features)),
         "inputs": inputs,
         "metric": metric,
         "poses": fingerprint({name: pose.tolist() for name, pose in poses.items()}) if poses else "",
@@ -241,13 +243,10 @@ def _refined(given: "MapPlan", workers: int) -> "MapPlan":
         noise_px = np.radians(noise.direction_deg(depth)) * focal_px
         if plan is given and noise_px < MIN_NOISE_PX:
             break
-        limits = {
-            name: max(getattr(given.settings, name), NOISE_LIMIT * noise_px)
-            for name in ("max_epipolar_error_px", "max_reprojection_error_px")
-        }
-        settings = given.settings.model_copy(update={**limits, "tile_images": len(given.names)})
+        settings = given.settings.model_copy(update={"tile_images": len(given.names)})
         with temporary_folder(given.path) as folder:
-            wide = given.with_poses(plan.world_from_cams, folder / given.path.name, settings)
+            path = folder / given.path.name
+            wide = given.with_poses(plan.world_from_cams, path, settings, NOISE_LIMIT * noise_px)
             wide.match(0, False, workers)
             local_map = wide.triangulated(0)
             if plan is given and not given.survey.consistency(local_map).trusted:
@@ -275,11 +274,15 @@ class MapPlan(Remade):
         metric: bool = True,
         length: float | None = None,
         poses: Mapping[str, Floats] | None = None,
+        least_limit_px: float = 0.0,
     ):
-        """See `build_map`; `length` is the survey's length if it is known, which saves the survey."""
+        """See `build_map`; `length` is the survey's length if it is known, which saves the survey.
+
+        Limits of errors in pixels are at least `least_limit_px`.
+        """
         self.session, self.features, self.path, self.settings, self.seed = session, features, path, settings, seed
         names, world_from_cams = session.image_names, session.world_from_cam()
-        self._poses = poses
+        self._poses, self._least_limit_px = poses, least_limit_px
         for name, pose in (poses or {}).items():
             world_from_cams[session.row_of_name[name]] = pose
         posed = np.isfinite(world_from_cams).reshape(-1, 16).all(axis=1)
@@ -306,7 +309,7 @@ class MapPlan(Remade):
         # What was just matched is not read again. Only for a map of one tile: those of several may not fit into memory.
         self._matched: dict[tuple[int, int], Ints] = {}
         self._keypoints_of: dict[int, NDArray[np.float32]] = {}
-        self.matcher = _matcher_settings(settings, self.kind)
+        self.matcher = _matcher_settings(self.kind, max(MAX_EPIPOLAR_ERROR_PX, least_limit_px))
 
     @cached_property
     def survey(self) -> Survey:
@@ -326,12 +329,20 @@ class MapPlan(Remade):
     def of_worker(self) -> Any:
         """This plan for a worker, which gets the length and so needs no survey."""
         arguments = (self.session, self.features, self.path, self.settings, self.seed)
-        return MapPlan.elsewhere(*arguments, length=self.length, poses=self._poses)
+        more = {"length": self.length, "poses": self._poses, "least_limit_px": self._least_limit_px}
+        return MapPlan.elsewhere(*arguments, **more)
 
-    def with_poses(self, world_from_cams: Floats, path: Path, settings: MapSettings) -> "MapPlan":
+    def with_poses(
+        self, world_from_cams: Floats, path: Path, settings: MapSettings, least_limit_px: float = 0.0
+    ) -> "MapPlan":
         """Return the plan of the same map with other poses (N, 4, 4) of its images, file and settings."""
         poses = dict(zip(self.names, world_from_cams, strict=True))
-        plan = MapPlan(self.session, self.features, path, settings, self.seed, length=self.length, poses=poses)
+        plan = MapPlan(
+            *(self.session, self.features, path, settings, self.seed),
+            length=self.length,
+            poses=poses,
+            least_limit_px=least_limit_px,
+        )
         plan.survey = self.survey.with_poses(world_from_cams)
         return plan
 
@@ -381,7 +392,6 @@ class MapPlan(Remade):
             self.cameras,
             self.world_from_cams,
             self.matcher["max_error_px"],
-            self.matcher["ratio"],
             self.kind,
             workers,
         )
@@ -440,6 +450,7 @@ class MapPlan(Remade):
             [matches_of(i, j) for i, j in pairs.tolist()],
             self.settings,
             self.seed,
+            max(MAX_REPROJECTION_ERROR_PX, self._least_limit_px),
         ).scaled(self.length)
         points = local_map.points + origin
         local_map = replace(local_map, world_from_cams=poses, points=points, length=self.length)
@@ -465,11 +476,7 @@ class MapPlan(Remade):
                 self.triangulate(number, skip_existing)
         images = JoinedImages(self.names, self.cameras, self.world_from_cams, self.keypoints, self._colors)
         with temporary_folder(self.path) as folder:
-            self._save(
-                join_tiles(
-                    self.tiles, lambda number: LocalMap.load(self.tile_path(number)), images, self.settings, folder
-                )
-            )
+            self._save(join_tiles(self.tiles, lambda number: LocalMap.load(self.tile_path(number)), images, folder))
 
     def _save(self, local_map: LocalMap) -> None:
         local_map.judged(self.survey.consistency(local_map)).save(self.path)

@@ -17,8 +17,14 @@ from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import NetworkMatches, References
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.rig import Matches, RigQuery
-from toolkit.manifest import PnpSettings
 
+MAX_MAP_FEATURES = 1000
+"""Largest number of features per map image to match; those of the points with the longest tracks are used."""
+MAX_QUERY_FEATURES = 1536
+"""Largest number of features per query image to match by descriptors alone; those with the strongest response are used.
+Guided matching uses all features."""
+MAX_GUIDED_IMAGES = 12
+"""Number of covisible map images whose points are projected for guided matching."""
 CACHED_IMAGES = 256
 """Number of map images whose features stay in memory."""
 
@@ -79,7 +85,6 @@ class MappedFeatures:
         camera: int,
         kind: int,
         references: Sequence[int],
-        settings: PnpSettings,
         network_matches: NetworkMatches | None = None,
     ) -> list[tuple[Ints, Ints]]:
         """Match a query image with references.
@@ -88,15 +93,14 @@ class MappedFeatures:
             query: the query's cameras and features.
             camera, kind: indices of a query image, and of this kind among its features.
             references: indices of images in this map.
-            settings: limit the number of features for `mutual`.
             network_matches: matches that a network made earlier; None: match now.
 
         Returns:
             For each reference, the query keypoints (K,) and the map points (K,) that they match.
         """
         if isinstance(self.matcher, MutualMatcher):
-            unit = query.unit_descriptors(camera, kind, self.kind.shorten)[: settings.max_query_features]
-            images = [self.image(index, settings.max_map_features) for index in references]
+            unit = query.unit_descriptors(camera, kind, self.kind.shorten)[:MAX_QUERY_FEATURES]
+            images = [self.image(index) for index in references]
             pairs = [self.matcher.match_unit(unit, image.unit) for image in images]
             points = [image.points for image in images]
         else:  # a network needs the context of a feature, so it gets features without a point, too
@@ -113,10 +117,10 @@ class MappedFeatures:
             matches.append((keypoint[point >= 0], point[point >= 0]))
         return matches
 
-    def _image(self, index: int, max_features: int) -> MapImage:
-        """Return the features of a map image that observe points, at most `max_features`, longest tracks first."""
+    def _image(self, index: int) -> MapImage:
+        """Return the features of a map image that observe points, at most `MAX_MAP_FEATURES`, longest tracks first."""
         keypoint, point = self.map.observations(index)
-        order = np.argsort(-self.map.track_lengths(point), kind="stable")[:max_features]
+        order = np.argsort(-self.map.track_lengths(point), kind="stable")[:MAX_MAP_FEATURES]
         features = self.features[self.map.image_names[index]]
         kept = features.take(keypoint[order])
         unit = unit_descriptors(kept.descriptors, self.kind.shorten)
@@ -136,7 +140,6 @@ class MappedFeatures:
         rig_from_world: Floats,
         references: Sequence[int],
         radius_deg: float,
-        settings: PnpSettings,
     ) -> Iterator["Candidates"]:
         """Yield, for each query image, candidate matches of its keypoints with map points that project near them.
 
@@ -146,12 +149,11 @@ class MappedFeatures:
             rig_from_world: the pose, (4, 4).
             references: indices of images in this map; their points are projected.
             radius_deg: largest angle between a keypoint and the projection.
-            settings: limit the number of features of a map image.
         """
         references = [index for index in references if len(self.map.observations(index)[0])]
         if not references:
             return
-        images = [self.image(index, settings.max_map_features) for index in references]
+        images = [self.image(index) for index in references]
         # Several images may observe a point, which is projected once: `point`, `counts`, `starts` and `in_world` are
         # per point, `which`, `image_of`, `unit`, `depth` and `size` per observation.
         point, which = np.unique(np.concatenate([image.points for image in images]), return_inverse=True)
@@ -293,9 +295,8 @@ class Vicinity:
 class MapMatcher:
     """Matches queries with a map of several kinds of features. Each kind is matched alone; the matches are pooled."""
 
-    def __init__(self, mapped: Sequence[MappedFeatures], settings: PnpSettings) -> None:
+    def __init__(self, mapped: Sequence[MappedFeatures]) -> None:
         self.mapped = list(mapped)
-        self.settings = settings
         self.map = LocalMap.pooled([features.map for features in mapped])
         """The map with the points of all kinds, one kind after the other."""
         self._first_point = np.cumsum([0, *(len(features.map.points) for features in mapped)])
@@ -328,7 +329,7 @@ class MapMatcher:
                 made_earlier = network_matches[camera][kind] if network_matches else None
                 images = self._of_kind(kind, retrieved.images)
                 new = [image for image in images if (camera, kind, image) not in cache]
-                made_now = features.match(query, camera, kind, new, self.settings, made_earlier)
+                made_now = features.match(query, camera, kind, new, made_earlier)
                 cache |= {(camera, kind, image): pairs for image, pairs in zip(new, made_now, strict=True)}
                 for keypoint, point in (cache[camera, kind, image] for image in images):
                     columns.append(np.stack([np.full(len(point), camera), keypoint, point + self._first_point[kind]]))
@@ -341,17 +342,15 @@ class MapMatcher:
         candidates = [
             replace(group, matches=replace(group.matches, point=group.matches.point + int(self._first_point[kind])))
             for kind, features in enumerate(self.mapped)
-            for group in features.candidates(
-                query, kind, rig_from_world, self._of_kind(kind, images), radius_deg, self.settings
-            )
+            for group in features.candidates(query, kind, rig_from_world, self._of_kind(kind, images), radius_deg)
         ]
         return Vicinity(query, candidates, self.map.points, rig_from_world, radius_deg)
 
     def covisible(self, points: Ints) -> Ints:
-        """Return the map images that observe the most of some points, most first, at most `guided_images`."""
+        """Return the map images that observe the most of some points, most first, at most `MAX_GUIDED_IMAGES`."""
         counts = self.map.images_seeing(points)
         images = np.flatnonzero(counts)
-        return images[np.argsort(-counts[images], kind="stable")[: self.settings.guided_images]]
+        return images[np.argsort(-counts[images], kind="stable")[:MAX_GUIDED_IMAGES]]
 
     def kind_names(self, points: Ints) -> NDArray[np.str_]:
         """Return the name of the kind of features of each point."""
@@ -367,7 +366,7 @@ class MapMatcher:
         pixels = np.zeros((len(at), 2))
         kinds = np.searchsorted(self._first_point, points[at], side="right") - 1
         for kind in np.unique(kinds):
-            seen_by = self.mapped[kind].image(self._of_kind(int(kind), [image])[0], self.settings.max_map_features)
+            seen_by = self.mapped[kind].image(self._of_kind(int(kind), [image])[0])
             pixels[kinds == kind] = seen_by.keypoints[keypoint[observation[kinds == kind]]]
         return at, pixels
 

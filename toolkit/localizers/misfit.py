@@ -30,7 +30,6 @@ from toolkit.geometry import Floats
 from toolkit.localizers.base import CONFIRMED
 from toolkit.localizers.rig import Matches, RigQuery
 from toolkit.localizers.robust import Bools
-from toolkit.manifest import PnpSettings
 
 SIGNIFICANCE = 1e-4
 """False alarm rate: the probability that noise alone makes correct intrinsics look wrong."""
@@ -167,11 +166,11 @@ def _try_cameras(stated: "_Problem", start: "_Estimate", inliers: int) -> Misfit
         stated, start: the matches with the stated cameras, and the pose found with them.
         inliers: number of inliers of the stated cameras, with small changes of the intrinsics.
     """
-    best, misfit, settings = max(MORE * inliers, 12.0), None, PnpSettings(ransac_max_trials=TRIALS)
+    best, misfit = max(MORE * inliers, 12.0), None
     for share in FOCALS:
         cameras = [_simple(camera, share) for camera in stated.query.cameras]
         query = RigQuery(cameras, stated.query.rig_from_cams, [[] for _ in cameras])
-        pose = query.ransac(stated.matches, stated.points, stated.max_error_deg, settings, seed=0)
+        pose = query.ransac(stated.matches, stated.points, stated.max_error_deg, seed=0, max_trials=TRIALS)
         if pose is None:
             continue
         problem = _Problem(query, stated.matches, stated.points, stated.max_error_deg)

@@ -23,6 +23,10 @@ LEAST_STD_M, LEAST_STD_DEG = 0.01, 0.05
 covariance of the pose does not include."""
 JUMP_M, JUMP_DEG = 0.2, 20.0
 """Tracking was lost if a step is further than this from all steps that the largest acceleration allows."""
+MAX_GAP_S = 10.0
+"""A longer time without odometry counts as a loss of tracking: a new piece with its own frame begins."""
+MAX_SPEED_M_S = 15.0
+"""A faster motion between two poses also counts as a loss of tracking."""
 ACCELERATION_M_S2, ACCELERATION_DEG_S2 = 10.0, 500.0
 """Largest acceleration of a hand, a head or a wheel."""
 _BLIND_S = 0.8
@@ -99,13 +103,13 @@ class Odometry:
         order = np.argsort(times, kind="stable")
         return Odometry(times[order], np.concatenate([self.odom_from_rig, odom_from_rig])[order]), order
 
-    def split(self, settings: SequenceSettings) -> list[slice]:
+    def split(self) -> list[slice]:
         """Split at losses of tracking: gaps in time, and steps that no device makes.
 
         Such a step is too fast, or no possible acceleration leads to its speed from the speeds of the steps beside it.
         """
         seconds = np.diff(self.timestamps) / 1e6
-        lost = (seconds > settings.max_gap_s) | (np.diff(self.traveled_m) > settings.max_speed_m_s * seconds)
+        lost = (seconds > MAX_GAP_S) | (np.diff(self.traveled_m) > MAX_SPEED_M_S * seconds)
         ends = [0, *(np.flatnonzero(lost | self._jumps(seconds)) + 1).tolist(), len(self)]
         return [slice(start, end) for start, end in pairwise(ends) if end > start]
 

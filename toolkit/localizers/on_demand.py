@@ -22,7 +22,7 @@ from toolkit.features.matching import AnyMethod, PairMatches
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import NetworkMatches, PoseEstimate, Prior, Query, References, WithoutNetwork
 from toolkit.localizers.local_map import LocalMap
-from toolkit.localizers.mapping import instants, match_pairs, select_pairs
+from toolkit.localizers.mapping import MAX_EPIPOLAR_ERROR_PX, instants, match_pairs, select_pairs
 from toolkit.localizers.matches import MappedFeatures
 from toolkit.localizers.pnp import PnpLocalizer
 from toolkit.localizers.triangulation import triangulate
@@ -181,9 +181,7 @@ class OnDemandLocalizer(WithoutNetwork):
         cameras, poses = [posed.cameras[index] for index in images], posed.world_from_cams[images]
         loaded = [features[name] for name in names]
         pairs = select_pairs(poses, cameras, posed.instants[images], settings.pairs_per_image)
-        along_lines = match_pairs(
-            pairs, loaded.__getitem__, cameras, poses, settings.max_epipolar_error_px, settings.ratio, kind
-        )
+        along_lines = match_pairs(pairs, loaded.__getitem__, cameras, poses, kind=kind)
         matches = {(int(i), int(j)): pair.indices for (i, j), pair in zip(pairs, along_lines, strict=True)}
         number_of = {name: number for number, name in enumerate(names)}
         for of_image in query_matches:
@@ -204,7 +202,7 @@ class OnDemandLocalizer(WithoutNetwork):
                 ]
                 earlier = matches.get((i, j), np.zeros((0, 2), np.int64))
                 # A keypoint has one partner in an image: the first one found.
-                new = np.max(errors, axis=0) < settings.max_epipolar_error_px
+                new = np.max(errors, axis=0) < MAX_EPIPOLAR_ERROR_PX
                 new &= ~np.isin(through_query[:, 0], earlier[:, 0]) & ~np.isin(through_query[:, 1], earlier[:, 1])
                 matches[i, j] = np.concatenate([earlier, through_query[new]])
         ordered = sorted(matches)

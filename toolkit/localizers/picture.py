@@ -15,7 +15,7 @@ from toolkit.capture.images import pixels_of, stored_size
 from toolkit.capture.turning import turn_image
 from toolkit.errors import ArtifactError, CameraError, ImageError
 from toolkit.features.features import KINDS, LocalFeatures, extract_turned
-from toolkit.features.matching import AnyMethod, LocalMethod
+from toolkit.features.matching import LocalMethod
 from toolkit.features.sift import SiftExtractor
 from toolkit.features.stores import as_stored
 from toolkit.localizers.base import PoseEstimate, Prior, Query, RoughPose, View
@@ -72,11 +72,8 @@ def localize_image(
             f"{len(quarter_turns)} turns: expected the same number of each, and at least one."
         )
     pixels = [_Pixels(picture, intrinsics) for picture, intrinsics in zip(pictures, cameras, strict=True)]
-    kinds: list[AnyMethod] = [*place.kinds, *place.escalation]
-    learned = any(KINDS[kind.name].upright for kind in kinds)
-    upright = learned or place.settings.predictor.upright
     views = [
-        View(f"picture {number}", picture.image, intrinsics, in_map=False, turns=turn if upright else 0)
+        View(f"picture {number}", picture.image, intrinsics, in_map=False, turns=turn)
         for number, (picture, intrinsics, turn) in enumerate(zip(pixels, cameras, quarter_turns, strict=True), start=1)
     ]
     features = _extract(place, pixels, quarter_turns)

@@ -41,6 +41,24 @@ PNP_FORMAT = 5
 FIRST_REFERENCES = {2: 200, 4: 100}
 """Number of references per image to match first -> independent inliers that their pose needs to be kept. The next
 number, and finally all references, are matched if the pose has fewer, or if too few of the matches are inliers."""
+MIN_SHARED_POINTS = 12
+"""A map image that observes at least so many inliers shows their place, so it cannot be of a rival."""
+CLEAR_INLIER_RATIO = 0.56
+"""Above this share of inliers among the matches, no rival pose is searched: the remaining matches are usually too few
+to support one beyond `MAX_RIVAL_SUPPORT`."""
+CONTESTED_INLIER_RATIO = 0.4
+"""Below this share of inliers, the pose may mix two places: RANSAC runs again with the tighter `max_error_deg`, and
+separately for single references."""
+CONTESTED_REFERENCES = 4
+"""How many references, those with the most matches, then get a RANSAC of their own: several similar-looking places
+together can outvote the one reference that shows the right place."""
+MAX_RIVAL_SUPPORT = 0.8
+"""A pose is `ok` only if the best rival pose has at most this fraction of its support. With the default
+`ok_probability` the limit is 0.7, see `confidence.py`."""
+GUIDED_RADII_DEG = (0.7, 0.35)
+"""Guided matching: search radius around each projected map point, degrees; one pass per radius."""
+MAX_GUIDED_MATCHES = 1000
+"""Largest number of guided matches per camera; those with the most similar descriptors are kept."""
 RIVAL_SHARE = 0.25
 """Smallest number of matches by descriptors that agree with a rival, as a share of those that agree with the pose. Such
 a rival may have most of the guided matches, as references of one place hide those of its double."""
@@ -77,11 +95,15 @@ class PnpLocalizer(WithoutNetwork):
         self.seed = seed
         consistency = mapped[0].map.consistency
         self._noise_deg = consistency.direction_noise_deg
-        self.settings = _widened(settings or PnpSettings(), self._noise_deg)
+        settings = settings or PnpSettings()
+        # Noise of the map's poses asks for a wider search.
+        limit = max(settings.max_error_deg, 1.5 * self._noise_deg)
+        self.settings = settings.model_copy(update={"max_error_deg": limit})
+        self._radii_deg = [max(radius, 3 * self._noise_deg) for radius in GUIDED_RADII_DEG]
         stds = np.repeat([np.radians(consistency.rotation_noise_deg), consistency.position_noise], 3)
         self._noise_of_poses = np.diag(stds**2)
         """Covariance (6, 6) of a pose of the map. A query's pose is as far off as the map's poses around it are."""
-        self.matcher = MapMatcher(mapped, self.settings)
+        self.matcher = MapMatcher(mapped)
         self.map = self.matcher.map
 
     @property
@@ -149,7 +171,7 @@ class PnpLocalizer(WithoutNetwork):
             matches[self.map.track_lengths(matches.point) > 1],  # points with one observation are not triangulated
             self.map.points,
             self.settings.ransac_max_error_deg,
-            focal_alone=estimate.rival_support > self.settings.ok_rival_support,
+            focal_alone=estimate.rival_support > MAX_RIVAL_SUPPORT,
             noise_deg=self._noise_deg,
         )
         if misfit is None:
@@ -182,14 +204,14 @@ class PnpLocalizer(WithoutNetwork):
             return estimate  # each confirms the other
         rig_from_world = geometry.invert(prior.world_from_rig)
         vicinity = self.matcher.vicinity(query, rig_from_world, self._covisible(prior.images), prior.radius_deg)
-        near = vicinity.guided(rig_from_world, prior.radius_deg, self.settings.max_guided_matches)
+        near = vicinity.guided(rig_from_world, prior.radius_deg, MAX_GUIDED_MATCHES)
         start = self._ransac(query, near, self.settings.ransac_max_error_deg) if len(near) else None
         if start is None:
             return estimate
         hypothesis = self._improve(query, start, near)
         same = bool(hypotheses) and not _differ(hypotheses[0], hypothesis)
         support = hypotheses[0].support if hypotheses else 0.0
-        clearly_more = support <= self.settings.ok_rival_support * hypothesis.support  # a tie keeps the first estimate
+        clearly_more = support <= MAX_RIVAL_SUPPORT * hypothesis.support  # a tie keeps the first estimate
         as_much = hypothesis.support >= 0.99 * support  # found from two starts, one pose differs in the last digits
         if (as_much and estimate.status != "ok") if same else clearly_more:
             # The matches near the prior judge the pose: like matches by descriptors, they were made without it.
@@ -236,8 +258,8 @@ class PnpLocalizer(WithoutNetwork):
             inliers = first_matches[none if start is None else self._inliers(query, start, first_matches)]
             if self._independent(inliers) < enough:
                 start = None
-            elif len(inliers) > settings.clear_inlier_ratio * len(first_matches):
-                same_place = self.map.images_seeing(np.unique(inliers.point)) >= settings.min_inliers
+            elif len(inliers) > CLEAR_INLIER_RATIO * len(first_matches):
+                same_place = self.map.images_seeing(np.unique(inliers.point)) >= MIN_SHARED_POINTS
                 references = [
                     retrieved.take((np.arange(len(retrieved.images)) < count) | ~same_place[retrieved.images])
                     for retrieved in references
@@ -262,9 +284,9 @@ class PnpLocalizer(WithoutNetwork):
         hypotheses = [self._improve(query, start, matches)]
         inliers = self._inliers(query, hypotheses[0].rig_from_world, matches)
         share = float(inliers.mean())
-        if share > settings.clear_inlier_ratio:
+        if share > CLEAR_INLIER_RATIO:
             return hypotheses
-        if share < settings.contested_inlier_ratio:
+        if share < CONTESTED_INLIER_RATIO:
             other = self._ransac(query, first_matches, settings.max_error_deg)
             if other is not None:
                 hypotheses.append(self._improve(query, other, matches))
@@ -275,9 +297,9 @@ class PnpLocalizer(WithoutNetwork):
         other = self._ransac(query, rest, settings.ransac_max_error_deg, least_inliers=int(least))
         if other is not None:
             count = self._inliers(query, other, rest).sum()
-            if share < settings.contested_inlier_ratio or count >= least:
+            if share < CONTESTED_INLIER_RATIO or count >= least:
                 hypotheses.append(self._improve(query, other, matches))
-        if share < settings.contested_inlier_ratio:
+        if share < CONTESTED_INLIER_RATIO:
             self._add_by_reference(query, matches, references, hypotheses)
         return sorted(hypotheses, key=lambda hypothesis: -hypothesis.support)
 
@@ -288,7 +310,7 @@ class PnpLocalizer(WithoutNetwork):
         images = dict.fromkeys(int(index) for retrieved in references for index in retrieved.images)
         seen_in = {index: np.isin(matches.point, self.map.observations(index)[1]) for index in images}
         best = sorted(seen_in, key=lambda index: -int(seen_in[index].sum()))
-        for index in best[: self.settings.contested_references]:
+        for index in best[: CONTESTED_REFERENCES]:
             start = self._ransac(query, matches[seen_in[index]], self.settings.ransac_max_error_deg, least_inliers=5)
             if start is not None and not any(
                 agree(hypothesis.world_from_rig, geometry.invert(start)) for hypothesis in hypotheses
@@ -311,11 +333,11 @@ class PnpLocalizer(WithoutNetwork):
         pose, inliers = rig_from_world, matches[self._inliers(query, rig_from_world, matches)]
         min_matches = max(4, 0.5 * len(np.unique(inliers.point)))
         vicinity: Vicinity | None = None
-        for radius in settings.guided_radii_deg:
+        for radius in self._radii_deg:
             if vicinity is None or not vicinity.reaches(pose, radius):
                 images = self.matcher.covisible(np.unique(inliers.point))
                 vicinity = self.matcher.vicinity(query, pose, images, radius)
-            guided = vicinity.guided(pose, radius, settings.max_guided_matches)
+            guided = vicinity.guided(pose, radius, MAX_GUIDED_MATCHES)
             if len(guided) < min_matches:
                 break
             refined = query.refine(pose, guided, self.map.points)
@@ -371,7 +393,7 @@ class PnpLocalizer(WithoutNetwork):
         probability = bounded_by_rivals(float(probability_right(evidence)), [rival.support for rival in rivals])
         probability = bounded_by_deviation(probability, estimate.position_std_m, estimate.rotation_std_deg)
         estimate = replace(estimate, p_correct=probability)
-        certain = estimate.p_correct >= settings.ok_probability and estimate.rival_support <= settings.ok_rival_support
+        certain = estimate.p_correct >= settings.ok_probability and estimate.rival_support <= MAX_RIVAL_SUPPORT
         return estimate if certain else replace(estimate, status="low_confidence")
 
     def _agreement(self, inliers: Matches) -> int:
@@ -449,16 +471,7 @@ class PnpLocalizer(WithoutNetwork):
         return [Rival(other.world_from_rig, other.support / support) for other in kept[1:]]
 
     def _ransac(self, query: RigQuery, matches: Matches, max_error_deg: float, least_inliers: int = 0) -> Floats | None:
-        return query.ransac(matches, self.map.points, max_error_deg, self.settings, self.seed, least_inliers)
-
-
-def _widened(settings: PnpSettings, noise_deg: float) -> PnpSettings:
-    """Return settings that search as widely as noise of the map's poses asks for, given as an angle."""
-    if not noise_deg:
-        return settings
-    radii = [max(radius, 3 * noise_deg) for radius in settings.guided_radii_deg]
-    limit = max(settings.max_error_deg, 1.5 * noise_deg)
-    return settings.model_copy(update={"guided_radii_deg": radii, "max_error_deg": limit})
+        return query.ransac(matches, self.map.points, max_error_deg, self.seed, least_inliers)
 
 
 def _differ(hypothesis: _Hypothesis, other: _Hypothesis) -> bool:

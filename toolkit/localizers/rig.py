@@ -16,9 +16,12 @@ from toolkit.capture.cameras import projection_jacobian, view_bounds
 from toolkit.features.features import LocalFeatures, Shorten
 from toolkit.features.matching import unit_descriptors
 from toolkit.geometry import Floats, Ints
-from toolkit.manifest import PnpSettings
 
 RANSAC_CONFIDENCE = 0.999
+MAX_RANSAC_TRIALS = 5000
+"""Largest number of RANSAC samples."""
+MAX_RANSAC_MATCHES = 2500
+"""Largest number of matches given to RANSAC, chosen at random; guided matching finds the others again."""
 LOSS_PX = 1.0
 """Scale of the loss of a refinement from a rough pose, pixels."""
 LOSS_SHARE = 0.6
@@ -107,9 +110,9 @@ class RigQuery:
         matches: Matches,
         points: Floats,
         max_error_deg: float,
-        settings: PnpSettings,
         seed: int,
         least_inliers: int = 0,
+        max_trials: int = MAX_RANSAC_TRIALS,
     ) -> Floats | None:
         """Return the pose rig_from_world (4, 4) with the most inliers, by LO-RANSAC (PoseLib), or None.
 
@@ -119,17 +122,17 @@ class RigQuery:
             matches: K matches.
             points: (P, 3) the map points.
             max_error_deg: inlier threshold, as an angle.
-            settings: limits of RANSAC.
             seed: of the random generators.
             least_inliers: RANSAC may miss poses with fewer inliers, which saves time.
+            max_trials: largest number of samples.
         """
         if len(np.unique(matches.point)) < 4:
             return None
-        if len(matches) > settings.max_ransac_matches:
+        if len(matches) > MAX_RANSAC_MATCHES:
             chosen = np.random.default_rng(seed).permutation(len(matches))
             kept = np.zeros(len(matches), bool)
-            kept[chosen[: settings.max_ransac_matches]] = True
-            least_inliers = least_inliers * settings.max_ransac_matches // len(matches)
+            kept[chosen[: MAX_RANSAC_MATCHES]] = True
+            least_inliers = least_inliers * MAX_RANSAC_MATCHES // len(matches)
             matches = matches[kept]
         least_share = np.clip(least_inliers / len(matches), 1e-3, 0.99)
         trials = np.log(1 - RANSAC_CONFIDENCE) / np.log1p(-(least_share**3))  # to draw one sample of three inliers
@@ -137,7 +140,7 @@ class RigQuery:
             "success_prob": RANSAC_CONFIDENCE,
             "dyn_num_trials_mult": 1.0,
             "min_iterations": 100,
-            "max_iterations": int(np.clip(trials, 100, settings.ransac_max_trials)),
+            "max_iterations": int(np.clip(trials, 100, max_trials)),
             "seed": seed,
             "max_reproj_error": float(np.tan(np.radians(max_error_deg)) * self.focals_px.mean()),
         }

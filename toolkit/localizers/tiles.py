@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.local_map import LocalMap
 from toolkit.localizers.triangulation import refine_points
-from toolkit.manifest import MapSettings
 
 OPEN_TILES = 16
 """Number of tiles whose files are open at once during joining."""
@@ -85,7 +84,7 @@ class JoinedImages(NamedTuple):
 
 
 def join_tiles(
-    tiles: Sequence[Tile], load: Callable[[int], LocalMap], images: JoinedImages, settings: MapSettings, folder: Path
+    tiles: Sequence[Tile], load: Callable[[int], LocalMap], images: JoinedImages, folder: Path
 ) -> LocalMap:
     """Join the maps of tiles.
 
@@ -93,7 +92,6 @@ def join_tiles(
         tiles: the result of `plan_tiles`.
         load: returns the map of a tile, by index.
         images: all images of the map.
-        settings: settings of the refinement of points.
         folder: empty folder for temporary files and for the memory-mapped arrays of the joined map.
     """
     opened = lru_cache(OPEN_TILES)(load)
@@ -114,7 +112,6 @@ def join_tiles(
             [images.cameras[image] for image in seen],
             world_from_cams[seen],
             [images.keypoints(int(image)) for image in seen],
-            settings,
         )
         points, observations = refined.points, refined.observations
         observations[:, 0] = seen[observations[:, 0]]

@@ -18,6 +18,8 @@ _CHUNK = 2048
 """Number of points that are refined at once, so that their observations fit into the processor's cache."""
 _LEAST_DEPTH = 1e-3
 """Smallest depth of a point in front of a camera, map lengths."""
+MAX_REPROJECTION_ERROR_PX = 4.0
+"""Observations with a larger reprojection error, in pixels, are removed from a point's track."""
 
 
 def triangulate(
@@ -29,6 +31,7 @@ def triangulate(
     matches: Sequence[Ints],
     settings: MapSettings | None = None,
     seed: int = 0,
+    max_error_px: float = MAX_REPROJECTION_ERROR_PX,
 ) -> LocalMap:
     """Triangulate points from matches between images with known poses, which are kept fixed.
 
@@ -41,6 +44,7 @@ def triangulate(
         pairs: (Q, 2) indices of the images of each pair.
         matches: for each pair, indices (K, 2) of matched keypoints.
         settings, seed: of the triangulation.
+        max_error_px: largest reprojection error of an observation.
 
     Returns:
         The map; its points are gray.
@@ -49,8 +53,8 @@ def triangulate(
     # A function of its own, so that the memory that COLMAP takes, about 2 MB per image, is free afterward.
     origin = geometry.local_origin(np.asarray(world_from_cams)[:, :3, 3])
     local = geometry.shifted(world_from_cams, -origin)
-    tracks = _tracks(names, cameras, local, keypoints, pairs, matches, settings, seed)
-    refined = refine_points(*tracks, cameras, local, keypoints, settings)
+    tracks = _tracks(names, cameras, local, keypoints, pairs, matches, settings, seed, max_error_px)
+    refined = refine_points(*tracks, cameras, local, keypoints, max_error_px)
     points, observations = refined.points + origin, refined.observations
     return LocalMap(
         image_names=list(names),
@@ -74,6 +78,7 @@ def _tracks(
     matches: Sequence[Ints],
     settings: MapSettings,
     seed: int,
+    max_error_px: float,
 ) -> tuple[Floats, Ints]:
     """Return points (P, 3) triangulated by COLMAP, and their observations (n, 3), sorted: image, keypoint, point."""
     graph = pycolmap.CorrespondenceGraph()
@@ -104,7 +109,7 @@ def _tracks(
         triangulator.triangulate_image(options, index)
     triangulator.complete_all_tracks(options)
     triangulator.merge_all_tracks(options)
-    observations.filter_all_points3D(settings.max_reprojection_error_px, settings.min_triangulation_angle_deg)
+    observations.filter_all_points3D(max_error_px, settings.min_triangulation_angle_deg)
     xyz = {number: point.xyz for number, point in reconstruction.points3D.items()}
     ids = np.array(sorted(xyz), np.uint64)
     rows = [np.zeros((0, 3), np.int64)]
@@ -177,19 +182,19 @@ def refine_points(
     cameras: Sequence[pycolmap.Camera],
     world_from_cams: Floats,
     keypoints: Sequence[NDArray[np.float32]],
-    settings: MapSettings,
+    max_error_px: float = MAX_REPROJECTION_ERROR_PX,
     iterations: int = 8,
 ) -> RefinedPoints:
     """Minimize the reprojection errors of each point under a Cauchy loss of 1 px, by Gauss-Newton on all at once.
 
     Errors are measured on the undistorted image plane, times the focal length. Observations with a larger error than
-    `settings.max_reprojection_error_px` are then dropped, and points that fewer than two images observe.
+    `max_error_px` are then dropped, and points that fewer than two images observe.
 
     Args:
         points: (P, 3).
         observations: (n, 3) image, keypoint and point, sorted by image.
         cameras, world_from_cams, keypoints: of the images, as for `triangulate`.
-        settings: holds the limit.
+        max_error_px: largest reprojection error of an observation.
         iterations: number of Gauss-Newton steps.
     """
     if not len(observations):  # earlier tiles may have taken all points of a tile
@@ -220,7 +225,7 @@ def refine_points(
     error[order] = np.concatenate([errors for _, errors, _ in refined])
     in_front[order] = np.concatenate([front for _, _, front in refined])
     count = len(points)
-    good = in_front & ((error**2).sum(1) < settings.max_reprojection_error_px**2)
+    good = in_front & ((error**2).sum(1) < max_error_px**2)
     kept = observations[good]
     # Two keypoints of one image at one position (two orientations) are one view.
     views = np.unique(kept[:, 0] * count + kept[:, 2]) % count

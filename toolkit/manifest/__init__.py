@@ -25,7 +25,6 @@ from toolkit.manifest.settings import (
     SiftSettings,
     SuperPointSettings,
     VisualizeSettings,
-    VladSettings,
     checkpoint_of,
     describe,
 )

@@ -41,7 +41,7 @@ def explain(
         where = ".".join(keys) or source
         of_branch = path != [] and re.match(_BRANCH, path[-1]) is not None
         if problem["type"] == "extra_forbidden":
-            line = f"unknown key {where!r}. {nearest(keys[-1], _model_at(model, keys[:-1]).model_fields)}"
+            line = f"unknown key {where!r}{_why_unknown(keys[-1], _model_at(model, keys[:-1]))}"
         elif problem["type"] == "value_error":
             line = f"{where}: {problem['ctx']['error']}." if keys else f"{problem['ctx']['error']}."
         elif of_branch and problem["type"] in ("literal_error", "string_type") and isinstance(problem["input"], list):
@@ -57,6 +57,14 @@ def explain(
             line = f"{where}: found {problem['input']!r}. {_expected(problem, model, keys)}"
         lines.append(line + origin(keys))
     return "\n  ".join([f"{source}:", *dict.fromkeys(lines)])
+
+
+def _why_unknown(name: str, model: type[BaseModel]) -> str:
+    """Return the end of a message: the file if a former setting is a constant now, else the known keys."""
+    files = [file for file, names in getattr(model, "constants", {}).items() if name in names.split()]
+    if files:
+        return f": it is no setting any more, but a constant in toolkit/{files[0]}."
+    return f". {nearest(name, model.model_fields)}"
 
 
 def _expected(problem: Any, model: type[BaseModel], keys: list[str]) -> str:

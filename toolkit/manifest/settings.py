@@ -61,6 +61,8 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True)
     shorthand: ClassVar[str] = ""
     """Name of the field that a plain value sets: `matcher: mutual` means `matcher: {name: mutual}`."""
+    constants: ClassVar[dict[str, str]] = {}
+    """Former settings that are constants now, by their file in `toolkit/`, which the error for such a key names."""
 
     @model_validator(mode="before")
     @classmethod
@@ -69,11 +71,13 @@ class Settings(BaseModel):
 
     @classmethod
     def of(cls, *layers: "Settings | Mapping[str, Any] | None") -> Self:
-        """Return the defaults, overridden by the layers in turn; a later layer wins.
+        """Return the defaults, overridden by the layers in turn; a later layer wins. One whole model stays as it is.
 
         Raises:
             ManifestError: a key is unknown or a value is not valid; names the key and what was expected.
         """
+        if len(layers) == 1 and isinstance(layers[0], cls):
+            return layers[0]
         merged: dict[str, Any] = {}
         for layer in layers:
             given = layer.given() if isinstance(layer, Settings) else layer or {}
@@ -160,32 +164,10 @@ class ExploreSettings(Settings):
     """Unit of the poses: m, or null if unknown, and figures show no unit; auto: as the sessions' import has noted."""
 
 
-class VladSettings(Settings):
-    """VLAD: a global descriptor aggregated from SIFT descriptors; its vocabulary is learned from the map."""
-
-    words: Positive = 256
-    """Number of visual words; fewer if the map has too few descriptors."""
-    local_dim: Positive = 64
-    """Dimensions of the local descriptors after PCA whitening."""
-    min_scale_px: float = 2.25
-    """Smallest scale of a keypoint: the standard deviation of its blob, in pixels of the stored image.
-    Finer keypoints are the first to change with blur, noise and camera resolution."""
-    min_features: Natural = 300
-    """If fewer keypoints reach `min_scale_px`, use this many of the coarsest instead."""
-    dim: Positive = 512
-    """Largest dimension of the global descriptor; the number of map images limits it too."""
-    prior_images: Natural = 2000
-    """Shrinkage of the whitening: a prior that all directions vary equally, with the weight of this many images.
-    Whitening learned from a hundred images describes the places they show, not what repeats between places."""
-    sample_descriptors: Positive = 50_000
-    """Number of local descriptors from which the vocabulary is learned."""
-    iterations: Positive = 15
-    """Iterations of k-means."""
-
-
 class EmbedSettings(Settings):
     """Global descriptors of the images."""
 
+    constants = {"embedders/vlad.py": "vlad"}
     model: Annotated[str | list[str], AfterValidator(_check_models)] = "vlad"
     """Global descriptor: vlad (needs no weights), megaloc, or auto (megaloc if its weights are available, else vlad).
     A list such as [megaloc, vlad] fuses the similarities by their generalized harmonic mean."""
@@ -206,8 +188,6 @@ class EmbedSettings(Settings):
     """Scale descriptors to unit length."""
     dtype: Literal["float32", "float16"] = "float32"
     """Number type of the descriptors in the .npy files."""
-    vlad: VladSettings = VladSettings()
-    """Settings of `vlad`."""
     seed: Natural = 0
     """Random seed for learning the vocabulary."""
     world_up: Direction | None = None
@@ -225,23 +205,16 @@ class MaskSettings(Settings):
     prior without information, or one that contradicts those before it, is ignored.
     """
 
+    constants = {"retrieve.py": "poses_angle_deg gps_margin_m radio_share window_s"}
     poses: str | None = None
     """File with rough poses of the query devices in the map's frame, in the format of trajectories.txt; restricts the
     search to map images near these poses. null: no such prior."""
     poses_distance_m: PositiveNumber = 10.0
     """Largest distance between the rough pose and a map camera, in the unit of the poses."""
-    poses_angle_deg: PositiveNumber = 90.0
-    """Largest angle between the viewing directions of the rough pose and a map camera, degrees; roll is ignored."""
     gps: bool = False
     """Search only map images whose GPS fix (gps.txt) is near the query's; map images without a fix are kept."""
-    gps_margin_m: PositiveNumber = 25.0
-    """Largest distance between the two fixes, meters, beyond twice the sum of their stated accuracies."""
     radio: bool = False
     """Search only the map images whose WiFi and Bluetooth signals are most similar to the query's."""
-    radio_share: Share = 0.025
-    """Share of the map images that `radio` keeps; at least three times `topk`."""
-    window_s: PositiveNumber = 2.0
-    """Largest time difference between an image and the radio scans and GPS fixes used for it, seconds."""
 
 
 class RetrieveSettings(Settings):
@@ -272,29 +245,23 @@ class RetrieveSettings(Settings):
 class SiftSettings(Settings):
     """SIFT keypoints and descriptors."""
 
+    constants = {"features/sift.py": "contrast_threshold"}
     min_long_side: Natural = 640
     """Before detection, smaller images are enlarged to this length of the longer side, pixels."""
     max_long_side: Positive = 1280
     """Before detection, larger images are reduced to this length of the longer side, pixels."""
     max_keypoints: Positive = 3072
     """Largest number of keypoints per image; those with the strongest response are kept."""
-    contrast_threshold: Annotated[float, Field(ge=0)] = 0.01
-    """Smallest contrast of a keypoint, after the image's contrast is stretched to the full range."""
 
 
 class SuperPointSettings(Settings):
     """SuperPoint keypoints and descriptors."""
 
+    constants = {"features/superpoint.py": "threshold nms_radius border"}
     max_long_side: Annotated[int, Field(ge=8)] = 1024
     """Larger images are reduced to this length of the longer side, pixels; the aspect ratio is kept."""
     max_keypoints: Positive = 2048
     """Largest number of keypoints per image; those with the strongest response are kept."""
-    threshold: Annotated[float, Field(ge=0)] = 0.005
-    """Smallest response of a keypoint; responses are at most 1."""
-    nms_radius: Natural = 4
-    """Radius of non-maximum suppression, pixels of the resized image: two keypoints are further apart in x or in y."""
-    border: Natural = 4
-    """Keypoints closer to the image border than this are dropped, pixels of the resized image."""
 
 
 AlikedModel = Literal["aliked-n16", "aliked-n16rot", "aliked-n32", "aliked-t16"]
@@ -303,20 +270,14 @@ AlikedModel = Literal["aliked-n16", "aliked-n16rot", "aliked-n32", "aliked-t16"]
 class AlikedSettings(Settings):
     """ALIKED keypoints and descriptors."""
 
+    constants = {"features/aliked.py": "min_long_side threshold nms_radius"}
     model: AlikedModel = "aliked-n16"
     """Variant of the network: n16rot tolerates more in-plane rotation, n32 is larger, t16 is smaller."""
-    min_long_side: Natural = 640
-    """Smaller images are enlarged to this length of the longer side, pixels."""
     max_long_side: Annotated[int, Field(ge=32)] = 1024
     """Larger images are reduced to this length of the longer side, pixels; the aspect ratio is kept."""
     max_keypoints: Positive = 1024
     """Largest number of keypoints per image; those with the highest score are kept. With 2,048, LightGlue takes three
     times as long and poses hardly improve."""
-    threshold: Share = 0.02
-    """Smallest score of a keypoint. The authors' 0.2 leaves few keypoints in dark photographs; plain walls stay below
-    0.02."""
-    nms_radius: Positive = 2
-    """Radius of non-maximum suppression, pixels of the resized image: two maxima are further apart in x or in y."""
 
 
 Checkpoint = str | dict[Literal["superpoint", "aliked"], str]
@@ -372,19 +333,19 @@ class MatcherSettings(Settings):
     """Matching of the local features of a query image and a reference."""
 
     shorthand = "name"
+    constants = {"features/matching.py": "min_confidence"}
     name: str | None = None
     """mutual: mutual nearest neighbors; lightglue: the LightGlue network; null: the usual matcher of each kind of
     features."""
     checkpoint: Checkpoint | None = None
     """Weights file of a learned matcher, or one file per kind of features: `{aliked: <file>}`; null: use an installed
     package or a cache, else download."""
-    min_confidence: Share = 0.1
-    """Smallest confidence of a match of a learned matcher."""
 
 
 class RerankSettings(Settings):
     """Reranking: sorts retrieved images by their number of geometrically verified matches with the query image."""
 
+    constants = {"features/verification.py": "max_error_deg max_trials"}
     topn: Positive = 30
     """Retrieved images per query image to verify. It is also the number to retrieve, unless `retrieve.topk` is set."""
     topk: Positive = 10
@@ -395,10 +356,6 @@ class RerankSettings(Settings):
     """Matcher of the local features."""
     max_features: Positive = 1536
     """Largest number of features per image to match; those with the strongest response are used."""
-    max_error_deg: PositiveNumber = 0.2
-    """Largest Sampson error of an inlier, as an angle seen from the camera, degrees."""
-    max_trials: Positive = 500
-    """Largest number of RANSAC samples, of five matches each; the best matches are sampled first."""
     compute_device: ComputeDevice = "auto"
     """Device of the networks: auto, cpu, cuda, cuda:<number> or mps."""
     dtype_compute: Precision = "auto"
@@ -421,6 +378,7 @@ class RerankSettings(Settings):
 class SequenceSettings(Settings):
     """Poses of whole recordings: a pose graph joins the odometry of the device and the poses of single queries."""
 
+    constants = {"localizers/odometry.py": "max_gap_s max_speed_m_s", "sequence.py": "windows_s"}
     position_drift: PositiveNumber = 0.03
     """Position drift of the odometry: standard deviation per axis after 1 m, in meters; grows with the square root of
     the distance. If the motions between `ok` queries show more drift, this and `rotation_drift_deg` are raised to fit
@@ -430,19 +388,12 @@ class SequenceSettings(Settings):
     the time."""
     scale_std: PositiveNumber = 0.02
     """Relative standard deviation of the scale of a recording's odometry."""
-    max_gap_s: PositiveNumber = 10.0
-    """A longer time without odometry counts as a loss of tracking: a new piece with its own frame begins."""
-    max_speed_m_s: PositiveNumber = 15.0
-    """A faster motion between two poses of the odometry also counts as a loss of tracking."""
     relocalize: bool = True
     """Localize queries again near their predicted pose if they are not `ok` or contradict the other queries."""
     online: bool = False
     """Estimate the pose of each query from earlier data only; other frames then get no pose."""
     length_s: PositiveNumber | None = None
     """If `online`: seconds of earlier data that a pose uses; null: everything since the start of its piece."""
-    windows_s: list[PositiveNumber] = [10.0, 20.0]
-    """For comparison, the poses that `online` would give from single queries are also written: one variant for each of
-    these lengths of earlier data, in seconds, and one for all earlier data; `[]`: none."""
 
     @model_validator(mode="after")
     def _length_needs_online(self) -> Self:
@@ -454,14 +405,12 @@ class SequenceSettings(Settings):
 class MapSettings(Settings):
     """Triangulation of map points from the map images and their known poses."""
 
+    constants = {
+        "localizers/mapping.py": "max_epipolar_error_px ratio",
+        "localizers/triangulation.py": "max_reprojection_error_px",
+    }
     pairs_per_image: Positive = 14
     """Other map images that each map image is matched with."""
-    max_epipolar_error_px: PositiveNumber = 4.0
-    """Largest distance of a match from its epipolar line, on either side, pixels."""
-    ratio: PositiveNumber = 0.9
-    """Threshold of Lowe's ratio test among the candidates along the epipolar line."""
-    max_reprojection_error_px: PositiveNumber = 4.0
-    """Observations with a larger reprojection error, in pixels, are removed from a point's track."""
     min_triangulation_angle_deg: PositiveNumber = 1.5
     """Points with a smaller triangulation angle, degrees, are dropped, because their depth is unreliable."""
     refine_poses: bool = False
@@ -475,32 +424,15 @@ class MapSettings(Settings):
 class PnpSettings(Settings):
     """Pose estimation from matches with map points. Errors are angles seen from the camera, in degrees."""
 
-    max_map_features: Positive = 1000
-    """Largest number of features per map image to match; those of the points with the longest tracks are used."""
-    max_query_features: Positive = 1536
-    """Largest number of features per query image to match by descriptors alone; those with the strongest response are
-    used. Guided matching uses all features."""
+    constants = {
+        "localizers/pnp.py": "clear_inlier_ratio contested_inlier_ratio contested_references "
+        "guided_radii_deg max_guided_matches ok_rival_support",
+        "localizers/rig.py": "max_ransac_matches ransac_max_trials",
+        "localizers/matches.py": "guided_images max_map_features max_query_features",
+        "localizers/escalation.py": "sure_position_std_m",
+    }
     ransac_max_error_deg: PositiveNumber = 0.45
     """Largest reprojection error of an inlier in RANSAC, degrees."""
-    ransac_max_trials: Positive = 5000
-    """Largest number of RANSAC samples."""
-    clear_inlier_ratio: Share = 0.56
-    """Above this share of inliers among the matches, no rival pose is searched: the remaining matches are usually too
-    few to support one beyond `ok_rival_support`."""
-    contested_inlier_ratio: Share = 0.4
-    """Below this share of inliers, the pose may mix two places: RANSAC runs again with the tighter `max_error_deg`, and
-    separately for single references."""
-    contested_references: Natural = 4
-    """How many references, those with the most matches, then get a RANSAC of their own: several similar-looking places
-    together can outvote the one reference that shows the right place."""
-    guided_radii_deg: list[PositiveNumber] = [0.7, 0.35]
-    """Guided matching: search radius around each projected map point, degrees; one pass per radius."""
-    max_ransac_matches: Positive = 2500
-    """Largest number of matches given to RANSAC, chosen at random; guided matching finds the others again."""
-    max_guided_matches: Positive = 1000
-    """Largest number of guided matches per camera; those with the most similar descriptors are kept."""
-    guided_images: Positive = 12
-    """Number of covisible map images whose points are projected for guided matching."""
     max_error_deg: PositiveNumber = 0.17
     """Largest reprojection error of an inlier of the final pose, degrees."""
     min_inliers: Positive = 12
@@ -509,38 +441,24 @@ class PnpSettings(Settings):
     ok_probability: Share = 0.99
     """A pose is `ok` only if the estimated probability that it is right (within 5 degrees and 0.5 m) reaches this
     value; see `localizers/confidence.py`."""
-    ok_rival_support: PositiveNumber = 0.8
-    """A pose is `ok` only if the best rival pose has at most this fraction of its support. With the default
-    `ok_probability` the limit is 0.7, see `localizers/confidence.py`."""
-    sure_position_std_m: PositiveNumber = 0.05
-    """An `ok` pose with at most this standard deviation of the position, meters, is precise enough; otherwise the
-    further features of `escalation` are used too."""
 
 
 class PredictorSettings(Settings):
     """The feed-forward network that predicts cameras and depth from a query image and its references."""
 
     shorthand = "name"
+    constants = {"localizers/feed_forward.py": "depth_points least_points"}
     name: Literal["vggt", "vggt-omega", "da3-base", "da3-small", "simulated"] = "vggt"
     """Network of the methods `feed_forward` and `hybrid`. `simulated` looks up the true poses, for trials."""
     checkpoint: str | None = None
     """Weights file of the network; null: use the Hugging Face cache, else download."""
     num_references: Positive = 5
     """Map images that the network receives with each query image."""
-    candidates: Positive | None = None
-    """These map images are chosen from this many of the best retrieved images; null: from all."""
     batch_size: Positive = 4
     """Query devices per batch. Poses do not depend on it."""
     compile: bool = False
     """Compile the network with `torch.compile`: takes a minute or more at the start of each run and, on a CPU, needs a
     C++ compiler. Changes only the rounding."""
-    upright: bool = True
-    """Rotate images by quarter turns before the network, so that gravity points down."""
-    depth_points: Positive = 200
-    """Largest number of map points per reference whose depth is compared with the prediction; those with the longest
-    tracks are used."""
-    least_points: Natural = 20
-    """If a reference sees fewer map points, its depth map in the capture is used instead, if there is one."""
 
 
 Method = Annotated[
@@ -593,15 +511,9 @@ class LocalizeSettings(Settings):
 class EvaluateSettings(Settings):
     """Evaluation against ground truth."""
 
+    constants = {"evaluate.py": "retrieval_ks retrieval_radius_m retrieval_angle_deg"}
     thresholds: Annotated[list[Threshold], Field(min_length=1)] = [[1.0, 0.1], [5.0, 0.5], [5.0, 1.0]]
     """Pose recall is reported at these thresholds: rotation error in degrees, translation error in meters."""
-    retrieval_ks: list[Positive] = [1, 5, 10]
-    """Retrieval recall is reported for these numbers of references."""
-    retrieval_radius_m: PositiveNumber = 8.0
-    """Largest distance of a correct reference from the query: meters, or half of the median depth where that is above
-    16 m."""
-    retrieval_angle_deg: PositiveNumber = 45.0
-    """Largest angle between the viewing directions of a correct reference and the query, degrees; roll is ignored."""
 
 
 class VisualizeSettings(Settings):

@@ -18,7 +18,6 @@ from toolkit.errors import CaptureError
 from toolkit.files import image_name, pair_devices, read_references
 from toolkit.geometry import Floats, qt_from_pose, unit
 from toolkit.localizers.odometry import Odometry, recordings_of
-from toolkit.manifest import SequenceSettings
 from toolkit.show.figures import GREEN, ORANGE, VERMILLION, inches_to_pixels, new_figure, plain_log, styled
 from toolkit.show.metrics import is_posed
 from toolkit.show.top_view import ground_axes, places_of
@@ -67,7 +66,7 @@ def _odometry(session: Session) -> str:
     times, poses = session.odometry.timestamps, session.odometry.world_from_device
     pieces, seconds = 0, 0.0
     for rows in recordings_of(session, session.odometry).values():
-        pieces += len(Odometry(times[rows], poses[rows]).split(SequenceSettings()))
+        pieces += len(Odometry(times[rows], poses[rows]).split())
         seconds += np.ptp(times[rows]) / 1e6
     return f"{len(times):,} poses, {seconds:,.0f} s, {pieces:,} piece{'s' if pieces > 1 else ''}"
 
